@@ -34,7 +34,7 @@ from avmsf.config import DINO, PRESETS
 from avmsf.errors import AvmsfError, EvaluationError
 from avmsf.pipeline.features import choose_encoder
 from avmsf.pipeline.objectlooks import ObjectLooks
-from avmsf.tasks.config import SteerConfig
+from avmsf.tasks.config import GuidedEditConfig
 from avmsf.tasks.reference import Reference
 from avmsf.tasks.stableaudio import StableAudio
 from benchmarks.editing import labelled_objects, referred_task, spaces_of, strange_shapes, stranger
@@ -201,7 +201,7 @@ def measure(
     spaces = spaces_of(cast.labelled, seed=seed)
     settings = {} if steps is None else {"steps": steps}
     if clap is not None:
-        settings["preview_every"] = max(1, (steps or SteerConfig().steps) // PREVIEWS)
+        settings["preview_every"] = max(1, (steps or GuidedEditConfig().steps) // PREVIEWS)
     methods: tuple[EditMethod, ...]
     if model is not None:
         methods = towards_words(model, settings, generated=generated, paper=paper)

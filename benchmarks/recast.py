@@ -24,7 +24,7 @@ from avmsf.simulate.elastic import ElasticModes, elastic_modes
 from avmsf.simulate.material import CERAMIC, GLASS, IRON, PLASTIC, STEEL, WOOD, Material
 from avmsf.simulate.solid import Solid
 from avmsf.simulate.vibration import rayleigh
-from avmsf.tasks.recast import recast
+from avmsf.tasks.material import change_material
 from benchmarks.fem import bowl
 from benchmarks.report import Options, Report, Table, tell
 
@@ -48,12 +48,12 @@ _CHILD = """
 import json, sys
 from avmsf.field.store import load
 from avmsf.simulate.material import CERAMIC, GLASS
-from avmsf.tasks.recast import recast
+from avmsf.tasks.material import change_material
 from benchmarks.step import peak_gigabytes
 
 field = load(sys.argv[1])
 before = peak_gigabytes()
-recast(field, CERAMIC, GLASS)
+change_material(field, CERAMIC, GLASS)
 print(json.dumps((peak_gigabytes() - before) * 1e9 / 2**20))
 """
 
@@ -67,7 +67,7 @@ def recast_report(options: Options) -> Report:
         kept = replace(new, poisson=old.poisson)
         start, _ = _solved(solid, old, 1.0, count)
         begun = time.perf_counter()
-        found = recast(start, old, kept, size=size)
+        found = change_material(start, old, kept, size=size)
         seconds = time.perf_counter() - begun
         fresh, solve_seconds = _solved(solid, kept, size, count)
         frequency = float((found.bank.frequency / fresh.bank.frequency - 1).abs().max())

@@ -15,18 +15,24 @@ import torch
 import trimesh
 
 import avmsf
+from avmsf._utils.arrays import as_directions
+from avmsf.bench import score
 from avmsf.capture import Impacts
+from avmsf.capture.cameras import Camera, View
 from avmsf.capture.warning import CaptureWarning
 from avmsf.cli import main
-from avmsf.errors import ArrayError, AvmsfError, CaptureError, EvaluationError, FitError, PositionError
+from avmsf.errors import ArrayError, AvmsfError, CaptureError, EvaluationError, FitError, PositionError, PositionWarning
 from avmsf.field import FitConfig, SoundField
-from avmsf.pipeline import PipelineConfig
+from avmsf.pipeline import PRESETS, PipelineConfig
+from avmsf.simulate.material import CERAMIC, WOOD
+from avmsf.tasks import change_material
 from plate_capture import fill_plate
 from plate_field import RATE, plate_impacts
-from raising import raises
+from raising import raises, warns
 
 NAMES = {"Capture", "SoundField", "Surface", "evaluate", "extract_modes", "locate"}
 CONTACT = [0.05, 0.06, 0.0]
+CAMERA = Camera(torch.eye(4, dtype=torch.float64), (1.0, 1.0), (2.5, 2.0), 5, 4)
 
 
 @cache
@@ -233,8 +239,11 @@ def test_modes_are_extracted_from_a_capture_or_its_impacts():
         lambda: avmsf.extract_modes(capture()),
         lambda: field().locate(capture().impacts.sounds[0]),
         lambda: field().posterior([CONTACT]),
+        lambda: field().origin,
+        lambda: avmsf.evaluate(field(), capture()),
+        lambda: View("a.png", torch.zeros(4, 5, 3, dtype=torch.uint8), CAMERA),
     ],
-    ids=["capture", "impacts", "field", "bank", "modes", "map", "posterior"],
+    ids=["capture", "impacts", "field", "bank", "modes", "map", "posterior", "origin", "scores", "view"],
 )
 def test_what_is_printed_is_a_line_or_two(made):
     text = repr(made())
@@ -325,3 +334,71 @@ def test_contacts_between_the_vertices_of_a_coarse_mesh_are_on_the_object():
 def test_paths_may_be_strings(tmp_path):
     field().save(str(tmp_path / "a.safetensors"))
     assert Path(tmp_path / "a.safetensors").is_file()
+
+
+def test_values_of_another_type_are_refused_by_name(tmp_path):
+    """In a process without the checks of types that the tests add."""
+    field().save(tmp_path / "a.safetensors")
+    code = f"""
+import avmsf
+field = avmsf.SoundField.load({str(tmp_path / "a.safetensors")!r})
+capture = avmsf.Capture("plate", avmsf.capture.Impacts.of([[0, 0, 0]], [[0.0, 1.0]], 8000.0))
+for call in (
+    lambda: avmsf.extract_modes("bowl"),
+    lambda: avmsf.SoundField.fit(capture, seed="x"),
+    lambda: avmsf.SoundField.fit(capture, gain_model="bad"),
+    lambda: field.render([{CONTACT}], samples=-1),
+    lambda: field.render([{CONTACT}], samples=2.5),
+    lambda: avmsf.tasks.change_material(field, "ceramic", "paper"),
+):
+    try:
+        call()
+    except avmsf.errors.AvmsfError as error:
+        print(error.name, error.value)
+"""
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert said.splitlines() == [
+        "recordings str",
+        "seed x",
+        "gain_model bad",
+        "samples -1",
+        "samples 2.5",
+        "material paper",
+    ]
+
+
+def test_lists_are_taken_wherever_tensors_are():
+    contacts = [CONTACT, [0.1, 0.02, 0.0]]
+    assert torch.equal(field().dampings(contacts), field().dampings(torch.tensor(contacts, dtype=torch.float64)))
+    assert field().known(np.array(contacts)).mean.shape == (2, len(field().bank))
+    impacts = capture().impacts
+    scores = score(impacts.sounds.numpy(), impacts)
+    assert set(scores.mean().values()) == {0.0}
+    assert str(len(impacts)) in repr(scores)
+
+
+def test_directions_count_as_unit_vectors():
+    along, straight = [[0.0, 0.6, -0.8]], [[0.0, 0.0, 0.0]]
+    torch.testing.assert_close(as_directions(np.array(along) * 5, "directions", count=1).tolist(), along)
+    assert torch.equal(as_directions(straight, "directions", count=1), torch.zeros(1, 3).double())
+    assert torch.equal(field().render([CONTACT], straight), field().render([CONTACT]))
+
+
+def test_a_position_near_the_object_gives_a_warning():
+    points = field().gain_field.points
+    size = float((points.amax(0) - points.amin(0)).norm())
+    beside = [CONTACT, [CONTACT[0], CONTACT[1], 0.3 * size]]
+    with warns(PositionWarning, name="positions", row=1, value=pytest.approx(0.3 * size, rel=0.05)):
+        field().render(beside)
+    field().render(points)
+
+
+def test_materials_are_given_by_name():
+    by_name, given = (change_material(field(), *pair) for pair in (("ceramic", "Wood"), (CERAMIC, WOOD)))
+    assert torch.equal(by_name.bank.frequency, given.bank.frequency)
+
+
+def test_configurations_print_what_differs_from_the_defaults():
+    config = PipelineConfig(gain_model="smooth", fit=FitConfig(seed=3))
+    assert repr(config) == "PipelineConfig(gain_model='smooth', fit=FitConfig(seed=3))"
+    assert len(repr(PRESETS["paper"])) < 500

@@ -191,3 +191,15 @@ def test_playback_speed_and_rate_make_the_aircraft_a_small_thing(shared: Path) -
     # The recordings' README: the hammer's channel is in newtons, 15.2 N the first.
     assert impacts.forces[0].item() == pytest.approx(15.2, abs=0.05)
     assert impacts.sounds.dtype == torch.float32
+
+
+def test_errors_name_the_folder_and_its_file(tmp_path: Path) -> None:
+    with raises(CaptureError, file=tmp_path / "no") as nothing:
+        Capture.read(tmp_path / "no")
+    assert str(nothing.value).count(";") == 1
+    folder = tmp_path / "bowl"
+    folder.mkdir()
+    (folder / "impacts.csv").write_text("file,x,y,z\n001.wav,left,0,0\n")
+    with raises(CaptureError, file=folder / "impacts.csv", row=2, name="x", value="left") as cell:
+        Capture.read(folder)
+    assert str(cell.value).startswith(str(folder / "impacts.csv"))

@@ -24,9 +24,9 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
 from avmsf.simulate.material import CERAMIC, GLASS, STEEL, WOOD
 from avmsf.tasks.edits import EDITS
+from avmsf.tasks.material import RATIO_ONLY, change_material, rayleigh_damping
 from avmsf.tasks.materialstatistics import MaterialStatistics
-from avmsf.tasks.recast import RATIO_ONLY, rayleigh_damping, recast
-from avmsf.tasks.retune import retune
+from avmsf.tasks.modes import adjust_modes
 from made_audio import save_audio
 from made_fields import FIELDS, mixture, places
 from raising import raises
@@ -69,7 +69,7 @@ def test_a_material_by_its_name_with_pictures_sounds_and_numbers(field: Path, ca
     words = ["--material", "Wood", "--from", "ceramic", "--size", "2", "--plots", str(folder), "--json"]
     new = edited(field, *words)
     out, err = capsys.readouterr()
-    expect_same(new, recast(ceramic(), CERAMIC, WOOD, size=2.0))
+    expect_same(new, change_material(ceramic(), CERAMIC, WOOD, size=2.0))
     told = json.loads(out)
     assert told["edits"][0]["to"]["name"] == "wood"
     assert [row["frequency_after"] for row in told["modes"]] == pytest.approx(new.bank.frequency.tolist())
@@ -92,9 +92,9 @@ def test_a_material_by_its_name_with_pictures_sounds_and_numbers(field: Path, ca
 def test_constants_stand_in_place_of_the_tables(field: Path) -> None:
     new = edited(field, "--from", "ceramic", "--young", "1e10", "--beta", "2e-7", "--law", "ratio-only")
     custom = replace(CERAMIC, young=1e10, beta=2e-7)
-    expect_same(new, recast(ceramic(), CERAMIC, custom, law=RATIO_ONLY))
+    expect_same(new, change_material(ceramic(), CERAMIC, custom, law=RATIO_ONLY))
     other = edited(field, "--material", "glass", "--from", "ceramic", "--density", "5000", name="other")
-    expect_same(other, recast(ceramic(), CERAMIC, replace(GLASS, density=5000.0)))
+    expect_same(other, change_material(ceramic(), CERAMIC, replace(GLASS, density=5000.0)))
 
 
 def test_materials_that_damp_alike_are_both_named(capsys: Streams) -> None:
@@ -126,7 +126,9 @@ def test_sliders_follow_the_material_and_call_modes_by_their_old_frequencies(fie
     sliders = ["--pitch", "1.2", "--decay", "0.5", "--brightness", "3", "--mode-db", "852", "-inf"]
     new = edited(field, "--material", "wood", "--from", "ceramic", *sliders, "--mode-db", "2300", "6")
     levels = [0.0, -math.inf, 0.0, 0.0, 6.0]
-    expected = retune(recast(ceramic(), CERAMIC, WOOD), pitch=1.2, decay=0.5, brightness_db=3.0, gains_db=levels)
+    expected = adjust_modes(
+        change_material(ceramic(), CERAMIC, WOOD), pitch=1.2, decay=0.5, brightness_db=3.0, gains_db=levels
+    )
     expect_same(new, expected)
     for option in ("--mode-db", "--mode-pitch", "--mode-decay"):
         with raises(AvmsfError, name=option, value=1000.0) as caught:
@@ -137,9 +139,9 @@ def test_sliders_follow_the_material_and_call_modes_by_their_old_frequencies(fie
 def test_single_modes_have_a_pitch_and_a_decay_of_their_own(field: Path) -> None:
     words = ["--pitch", "1.2", "--mode-pitch", "850", "0.5", "--mode-pitch", "2300", "1.5", "--mode-decay", "1300", "4"]
     factors = {"pitch": [1.2, 0.6, 1.2, 1.2, 1.2 * 1.5], "decay": [1.0, 1.0, 4.0, 1.0, 1.0]}
-    expect_same(edited(field, *words), retune(ceramic(), **factors))
-    expect_same(edited(field, "--mode-decay", "390", "2"), retune(ceramic(), decay=[2.0, 1.0, 1.0, 1.0, 1.0]))
-    expect_same(edited(field, "--mode-pitch", "390", "2"), retune(ceramic(), pitch=[2.0, 1.0, 1.0, 1.0, 1.0]))
+    expect_same(edited(field, *words), adjust_modes(ceramic(), **factors))
+    expect_same(edited(field, "--mode-decay", "390", "2"), adjust_modes(ceramic(), decay=[2.0, 1.0, 1.0, 1.0, 1.0]))
+    expect_same(edited(field, "--mode-pitch", "390", "2"), adjust_modes(ceramic(), pitch=[2.0, 1.0, 1.0, 1.0, 1.0]))
 
 
 def test_silent_modes_are_said(field: Path, capsys: Streams) -> None:
@@ -185,7 +187,7 @@ def test_longer_decays_than_the_sounds_are_noted(field: Path, capsys: Streams, d
 def test_towards_a_recording_and_an_interrupted_edit_goes_on(
     field: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    target = retune(ceramic(), pitch=1.3).render(PLACES[:1])[0]
+    target = adjust_modes(ceramic(), pitch=1.3).render(PLACES[:1])[0]
     soundfile.write(field.with_name("like.wav"), torch.cat([torch.zeros(800), target]).numpy() / 50, int(RATE))
     words = ["--like", str(field.with_name("like.wav")), "--steps", "4", "--contacts", "2", "--preview-every", "2"]
     whole = edited(field, *words, "--json", name="whole")
@@ -194,7 +196,7 @@ def test_towards_a_recording_and_an_interrupted_edit_goes_on(
     assert float((whole.bank.frequency / FREQUENCY).median()) == pytest.approx(1.3, rel=0.1)
     shown = steering.SteerBar.show
 
-    def impatient(bar: steering.SteerBar, progress: steering.SteerProgress) -> None:
+    def impatient(bar: steering.SteerBar, progress: steering.GuidedEditProgress) -> None:
         shown(bar, progress)
         if progress.step == 2:
             raise KeyboardInterrupt
@@ -226,7 +228,7 @@ def test_towards_a_materials_sound(field: Path, capsys: Streams) -> None:
     ringing = wood.bank.damping / ceramic().bank.damping
     assert float(ringing.median()) > 3.0
     # What it is of is what it was made before, and what is made of it before is what the sound is led on from.
-    common = MaterialStatistics.recast(recast(ceramic(), GLASS, WOOD), WOOD, STEEL)
+    common = MaterialStatistics.transform(change_material(ceramic(), GLASS, WOOD), WOOD, STEEL)
     heard = common.reference(samples=2400, sample_rate=RATE, seed=3).describe()
     words = ["--from", "glass", "--material", "wood", "--pitch", "1", "--like-material", "steel", "--seed", "3"]
     both = edited(field, *words, *quick, name="both")
@@ -334,7 +336,7 @@ def test_settings_of_a_model_that_cannot_be_meant_are_refused_before_it_is_loade
 
 
 def test_towards_words(field: Path, monkeypatch: pytest.MonkeyPatch, capsys: Streams) -> None:
-    model = Echo(retune(ceramic(), pitch=1.02).render(PLACES[:1])[0])
+    model = Echo(adjust_modes(ceramic(), pitch=1.02).render(PLACES[:1])[0])
     loaded = []
 
     def load_model(source: str, **settings: object) -> Echo:
@@ -376,7 +378,7 @@ def test_towards_words_by_a_saved_model_and_an_interrupted_edit_goes_on(
     shown = steering.SteerBar.show
     steps = []
 
-    def impatient(bar: steering.SteerBar, progress: steering.SteerProgress) -> None:
+    def impatient(bar: steering.SteerBar, progress: steering.GuidedEditProgress) -> None:
         shown(bar, progress)
         steps.append(progress.step)
         if steps == [1]:

@@ -25,7 +25,7 @@ from avmsf.field.store import load, save
 from avmsf.modal.residual import Residual
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import read_splats, write_splats
-from avmsf.tasks.retune import retune
+from avmsf.tasks.modes import adjust_modes
 from capture_folder import fill
 from made_fields import BANK, SIDES, positional
 
@@ -291,7 +291,7 @@ def test_points_alone_are_noted(captured: bool, field_file: Path, tmp_path: Path
 
 
 def test_an_edited_field_is_not_paired_with_recordings(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
-    save(retune(load(field_file), pitch=2.0), tmp_path / "high.safetensors")
+    save(adjust_modes(load(field_file), pitch=2.0), tmp_path / "high.safetensors")
     rows = ["a.wav,0,0,0", "b.wav,0.01,0,0", "c.wav,0.02,0,0"]
     fill(tmp_path / "capture", rows=rows)
     pairs = []

@@ -182,10 +182,10 @@ def test_what_cannot_be_used_is_left_out_and_named(tmp_path: Path) -> None:
     (report,) = dataset.check().objects
     assert report.recordings == 3
     expected = (
-        ("7/audio/1/Force.wav", "missing"),
-        ("7/audio/2/striking_force.yaml", "missing"),
+        ("7/audio/1/Force.wav", "got none"),
+        ("7/audio/2/striking_force.yaml", "got none"),
         ("7/audio/3/striking_force.yaml", "got 0"),
-        ("contacts/7/4.npy", "missing"),
+        ("contacts/7/4.npy", "got none"),
         ("contacts/7/5.npy", "got float32 (3,)"),
         ("7/audio/6/mic.wav", "got 44100"),
         ("7/audio/7/mic.wav", "got 200000"),

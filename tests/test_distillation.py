@@ -9,9 +9,9 @@ import torch
 
 from avmsf.errors import AvmsfWarning, EditError
 from avmsf.tasks.clips import level, levelled
-from avmsf.tasks.config import DistillationConfig, SteerConfig
+from avmsf.tasks.config import DistillationConfig, GuidedEditConfig
 from avmsf.tasks.distillation import AudioDiffusion, DecoderDistillation, noised, partial_denoising
-from avmsf.tasks.steer import Guide, steer
+from avmsf.tasks.guided import Guide, edit_towards
 from raising import raises, warns
 from ringing_field import RATE, ringing_field, sound_of
 
@@ -193,10 +193,10 @@ def test_what_tells_models_apart_tells_guides_apart():
 def test_a_field_is_steered_to_what_the_model_wants():
     wanted = sound_of(ringing_field(pitch=1.02, damping=2.0))
     before, seen = ringing_field(), []
-    made = steer(
+    made = edit_towards(
         before,
         guide(Known(wanted), guidance=0.9),
-        config=SteerConfig(steps=40, contacts=2, preview_every=0, fft_sizes=(2048, 512)),
+        config=GuidedEditConfig(steps=40, contacts=2, preview_every=0, fft_sizes=(2048, 512)),
         progress=seen.append,
     )
     assert seen[-1].pitch == pytest.approx(1.02, abs=0.01)

@@ -16,7 +16,7 @@ from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesize
 from avmsf.tasks.listening import WINDOW, Blow, Listener
 from avmsf.tasks.locator import Locator
-from avmsf.tasks.retune import retune
+from avmsf.tasks.modes import adjust_modes
 from avmsf.tasks.ringing import Ringing
 from made_fields import BANK, positional
 from raising import raises
@@ -179,7 +179,7 @@ def test_ringing_is_followed_and_fitted_exactly() -> None:
 
 
 def test_modes_that_an_edit_made_silent_are_not_followed() -> None:
-    high = retune(locator().field, pitch=2.5)
+    high = adjust_modes(locator().field, pitch=2.5)
     audible = int(high.audible.sum())
     assert 0 < audible < len(BANK)
     listener = Listener(Locator.of(high))
@@ -206,7 +206,7 @@ def test_streams_that_cannot_be_listened_to_are_refused() -> None:
     with raises(LocationError, name="window", value=0.01):
         Listener(locator(), window=0.01)
     with raises(LocationError, name="field", value=0):
-        Listener(replace(locator(), field=retune(locator().field, pitch=1000.0)))
+        Listener(replace(locator(), field=adjust_modes(locator().field, pitch=1000.0)))
     with raises(LocationError, name="later", value=0.05):
         Listener(locator(), window=0.06, later=0.05)
     with raises(LocationError, name="rumble", value=4000.0):

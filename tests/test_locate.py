@@ -20,8 +20,8 @@ from avmsf.modal.synthesis import synthesize_phased
 from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
 from avmsf.tasks.locate import DOUBTFUL, STRANGE, UNLIKE, judged, locate
 from avmsf.tasks.locator import Locator
+from avmsf.tasks.modes import adjust_modes
 from avmsf.tasks.posterior import Force
-from avmsf.tasks.retune import retune
 from avmsf.tasks.slack import contacts_of
 from believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
 from raising import raises
@@ -354,10 +354,10 @@ def test_sounds_without_an_impact_are_refused(sound, name, value):
 
 def test_fields_that_were_edited_and_know_no_contacts_are_located_on_too():
     impacts = struck(2, seed=44)
-    for field in (true_field(), retune(true_field(), pitch=1.1)):
+    for field in (true_field(), adjust_modes(true_field(), pitch=1.1)):
         assert contacts_of(field) is None
         assert Locator.of(field).slack is None
-    higher = retune(replace(true_field(), origin=Origin(trained_on=("a", "b"))), pitch=1.1)
+    higher = adjust_modes(replace(true_field(), origin=Origin(trained_on=("a", "b"))), pitch=1.1)
     assert contacts_of(higher) == 2
     sound = higher.render(impacts.contacts[:1])[0]
     found = Locator.of(higher).locate(sound)
@@ -369,7 +369,7 @@ def test_contacts_that_a_field_does_not_use_are_not_counted():
     gains = elastic_field(contacts, drawn_gains(contacts, seed=1))
     assert contacts_of(sound_field(gains)) == 8
     assert contacts_of(sound_field(gains.without(torch.arange(8) < 3))) == 5
-    assert contacts_of(retune(sound_field(gains.without(torch.arange(8) < 3)), pitch=1.1)) == 5
+    assert contacts_of(adjust_modes(sound_field(gains.without(torch.arange(8) < 3)), pitch=1.1)) == 5
 
 
 def test_lengths_that_are_used_are_kept():

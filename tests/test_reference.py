@@ -230,7 +230,7 @@ def test_made_up_blows_have_the_statistics():
 
 def test_another_material_of_the_same_object():
     field = ringing_field()
-    found = MaterialStatistics.recast(field, CERAMIC, WOOD)
+    found = MaterialStatistics.transform(field, CERAMIC, WOOD)
     ratio = math.sqrt(WOOD.young / CERAMIC.young * CERAMIC.density / WOOD.density)
     assert (found.alpha, found.beta, found.name) == (WOOD.alpha, WOOD.beta, "wood")
     assert set(found.frequency.tolist()) <= set((ratio * field.bank.frequency).tolist())
@@ -280,7 +280,7 @@ def test_a_modes_size_does_not_depend_on_its_phase():
     field, turn = ringing_field(), torch.linspace(0.0, 1.5, 6)
     gains = field.gain_field.gains
     turned = replace(field, gain_field=Ahead(gains * torch.cos(turn), gains * torch.sin(turn)))
-    own, other = (MaterialStatistics.recast(each, CERAMIC, WOOD) for each in (field, turned))
+    own, other = (MaterialStatistics.transform(each, CERAMIC, WOOD) for each in (field, turned))
     torch.testing.assert_close(other.frequency, own.frequency)
     assert other.brightness == pytest.approx(own.brightness, rel=1e-5)
 

@@ -13,14 +13,14 @@ import pytest
 import torch
 
 from avmsf.errors import EditError
-from avmsf.tasks.config import STABLE_AUDIO, DistillationConfig, SteerConfig
+from avmsf.tasks.config import STABLE_AUDIO, DistillationConfig, GuidedEditConfig
 from avmsf.tasks.distillation import AudioDiffusion, DecoderDistillation, partial_denoising
+from avmsf.tasks.guided import GuidedEditProgress, edit_towards
 from avmsf.tasks.modaledit import ModalEdit, Struck
 from avmsf.tasks.parameters import HIERARCHICAL
 from avmsf.tasks.reference import Reference
 from avmsf.tasks.stableaudio import StableAudio
 from avmsf.tasks.stableaudiofiles import _expect_weights
-from avmsf.tasks.steer import SteerProgress, steer
 from made_audio import DIM, FRAMES, RATE, save_audio, tiny_pipeline
 from raising import raises
 from ringing_field import ringing_field, sound_of
@@ -152,13 +152,13 @@ def test_gradient_reaches_the_modes_and_leaves_the_weights(model):
     (sounds - targets).square().sum().backward()
     for name, value in vars(edit).items():
         assert float(value.grad.abs().max()) > 0, name
-    made = steer(field, guide, config=SteerConfig(steps=3, contacts=2, preview_every=0))
+    made = edit_towards(field, guide, config=GuidedEditConfig(steps=3, contacts=2, preview_every=0))
     for before, after in ((field.bank.frequency, made.bank.frequency), (field.bank.damping, made.bank.damping)):
         assert bool((before != after).all())
     assert bool((made.gain_field.scale != 1).all())
     now = {**model.pipeline.transformer.state_dict(), **model.pipeline.vae.state_dict()}
     assert all(torch.equal(now[name], each) for name, each in weights.items())
-    again = steer(field, guide, config=SteerConfig(steps=3, contacts=2, preview_every=0))
+    again = edit_towards(field, guide, config=GuidedEditConfig(steps=3, contacts=2, preview_every=0))
     assert torch.equal(again.bank.frequency, made.bank.frequency)
 
 
@@ -170,10 +170,10 @@ def test_what_the_decoder_says_is_the_target(model, monkeypatch):
     guide = DecoderDistillation(model, "duller", sample_rate=RATE, config=DistillationConfig(denoising=2))
     reference = Reference.of(model.decode(clean, samples=1600).mean(dim=1), sample_rate=RATE)
     field, still = ringing_field(seconds=0.2), replace(HIERARCHICAL, searches=False)
-    config = SteerConfig(steps=8, contacts=2, preview_every=0)
-    seen: list[SteerProgress] = []
-    by_words = steer(field, guide, config=config, parameters=still, progress=seen.append)
-    by_sound = steer(field, reference, config=config, parameters=still)
+    config = GuidedEditConfig(steps=8, contacts=2, preview_every=0)
+    seen: list[GuidedEditProgress] = []
+    by_words = edit_towards(field, guide, config=config, parameters=still, progress=seen.append)
+    by_sound = edit_towards(field, reference, config=config, parameters=still)
     # A random autoencoder's decoded sound is far from any ring: eight steps take a twentieth off.
     assert seen[-1].loss < 0.97 * seen[0].loss
     # Where a magnitude all but meets its target, rounding decides which way the loss would have it.

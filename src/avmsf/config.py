@@ -6,9 +6,10 @@ Importing this imports nothing that computes.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
-from avmsf.errors import SceneError, SimulationError
+from avmsf._utils.text import changes_repr
+from avmsf.errors import FitError, SceneError, SimulationError
 from avmsf.field.config import PAPER, FitConfig, GainModel
 from avmsf.modal.config import ExtractionMethod
 from avmsf.scene.splatconfig import SplatConfig
@@ -26,6 +27,8 @@ CACHE = ".avmsf"
 @dataclass(frozen=True)
 class ViewsConfig:
     """How views are made of what a folder holds."""
+
+    __repr__ = changes_repr
 
     source: Literal["best", "mesh"] = "best"
     """Source of the views: the best in the folder, photographs with cameras before a mesh, or the mesh."""
@@ -52,6 +55,8 @@ class ViewsConfig:
 @dataclass(frozen=True)
 class LiftConfig:
     """Settings of the features."""
+
+    __repr__ = changes_repr
 
     encoder: str = AUTO
     """What describes the images: the name of a DINOv2 model (such as facebook/dinov2-base), a folder that holds one,
@@ -102,6 +107,8 @@ class LiftConfig:
 class BodyConfig:
     """How finite-element models are made of an object's shape."""
 
+    __repr__ = changes_repr
+
     wall: float | None = None
     """Wall thickness of the object, meters; 0 for a solid object. By default several are tried, and the recordings
     decide."""
@@ -125,6 +132,8 @@ class BodyConfig:
 class SceneConfig:
     """Settings of all stages up to the features."""
 
+    __repr__ = changes_repr
+
     views: ViewsConfig = field(default_factory=ViewsConfig)
     """How views are made of what the folder holds."""
     splat: SplatConfig = field(default_factory=SplatConfig)
@@ -136,6 +145,8 @@ class SceneConfig:
 @dataclass(frozen=True)
 class PipelineConfig:
     """Settings of all stages."""
+
+    __repr__ = changes_repr
 
     gain_model: GainModel = "auto"
     """How gains vary over the object."""
@@ -154,6 +165,17 @@ class PipelineConfig:
     device: str | None = None
     """cpu or cuda; None takes the GPU where there is one. Features and training give the same result up to rounding,
     Gaussians differ; cached stages are used for either device."""
+
+    def __post_init__(self) -> None:
+        """Raise FitError for the name of no gain model or method, and for no modes."""
+        for name, known in (("gain_model", GainModel), ("method", ExtractionMethod)):
+            value = getattr(self, name)
+            if value not in get_args(known):
+                raise FitError.expected(f"one of {', '.join(get_args(known))}", value, name=name)
+        if self.time_zero not in (None, *get_args(TimeZero)):
+            raise FitError.expected(f"None or one of {', '.join(get_args(TimeZero))}", self.time_zero, name="time_zero")
+        if not isinstance(self.modes, int) or self.modes < 1:
+            raise FitError.expected("a whole number of 1 or more", self.modes, name="modes")
 
 
 def _scene_error(name: str, value: float | int, expected: str) -> SceneError:

@@ -101,6 +101,10 @@ class PositionError(ArrayError):
     """A position is not on the object."""
 
 
+class PositionWarning(AvmsfWarning):
+    """A position is nearer to the object than this is large, and not on it."""
+
+
 class CaptureError(AvmsfError):
     """A capture folder, its table, its settings or one of its sound files cannot be used."""
 

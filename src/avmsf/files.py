@@ -29,6 +29,13 @@ def way_out(error: OSError) -> str:
     return _WAYS_OUT.get(error.errno, "choose another folder")
 
 
+def unwritable(path: Path, error: Exception, *, raising: type[AvmsfError], unchanged: str = "") -> AvmsfError:
+    """Return the error of a file or folder that could not be written, for the reason that the system gives."""
+    advice = way_out(error) if isinstance(error, OSError) else "choose another folder"
+    reason = getattr(error, "strerror", None) or str(error)
+    return raising.expected("a writable path", reason, file=path, advice=unchanged + advice)
+
+
 def temporary_path(path: Path) -> Path:
     """Return a name, free in all likelihood, of a hidden file or folder in the same folder as `path`."""
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
@@ -51,12 +58,7 @@ def write_whole(path: Path, write: Callable[[Path], object], *, raising: type[Av
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        reason = error.strerror or str(error)
-        raise raising(
-            f"{path}: expected a writable path, got {reason!r}; an old file is unchanged; {way_out(error)}",
-            file=path,
-            value=reason,
-        ) from error
+        raise unwritable(path, error, raising=raising, unchanged="an old file is unchanged; ") from error
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)

@@ -40,7 +40,7 @@ def test_the_demo_goes_all_the_way(
     folder = tmp_path / "demo"
     assert main(["demo", str(folder), "--json"]) == 0
     out, err = capsys.readouterr()
-    assert all(f"{stage}: " in err for stage in ("check", "splat", "lift", "modes", "fit", "page"))
+    assert all(f"{stage}: " in err for stage in ("check", "splat", "features", "modes", "fit", "page"))
     told = json.loads((folder / "demo.json").read_text())
     error = {method: each["relative_stft"] for method, each in told["scores"].items()}
     assert error["lower bound: the held-out recordings' own gains"] < error["field"] < error["white noise"]

@@ -13,7 +13,7 @@ from avmsf.cli.options.edit import parse
 from avmsf.errors import AvmsfError
 from avmsf.field.store import load, save
 from avmsf.tasks.edits import EDITS
-from avmsf.tasks.retune import retune
+from avmsf.tasks.modes import adjust_modes
 from made_clap import save_clap
 from raising import raises
 from test_cli_edit import PLACES, RATE, Echo, ceramic
@@ -28,7 +28,7 @@ def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     pytest.importorskip("transformers", reason="needs pip install 'avmsf[eval]'")
     save_clap(tmp_path / "clap")
     save(ceramic(), tmp_path / "plate.safetensors")
-    model = Echo(retune(ceramic(), pitch=1.02).render(PLACES[:1])[0])
+    model = Echo(adjust_modes(ceramic(), pitch=1.02).render(PLACES[:1])[0])
     monkeypatch.setattr(steering.StableAudio, "load", lambda *_, **__: model)
     return [str(tmp_path / "plate.safetensors"), *QUICK, "--clap", str(tmp_path / "clap")]
 
@@ -66,7 +66,7 @@ def test_an_interrupted_edit_has_the_whole_curve(
     assert run(parse([*words, "--output", str(tmp_path / "whole.safetensors")])) == 0
     shown = steering.SteerBar.show
 
-    def impatient(bar: steering.SteerBar, progress: steering.SteerProgress) -> None:
+    def impatient(bar: steering.SteerBar, progress: steering.GuidedEditProgress) -> None:
         shown(bar, progress)
         if progress.step == 3:
             raise KeyboardInterrupt

@@ -24,7 +24,7 @@ from avmsf.field.uncertainty import (
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
 from avmsf.tasks.locator import Locator
-from avmsf.tasks.retune import retune
+from avmsf.tasks.modes import adjust_modes
 from believing_field import (
     BANK,
     DOWN,
@@ -170,7 +170,7 @@ def test_an_edited_field_is_as_sure_of_itself_as_before(made: type) -> None:
     contacts, others = bar_contacts(30)[:12], bar_contacts(30)[12:]
     values = drawn_gains(bar_contacts(30), seed=16)
     field = sound_field(made(contacts, values[:12]))
-    points, same = bar_points()[::5], retune(field)
+    points, same = bar_points()[::5], adjust_modes(field)
     assert has_posterior(same)
     assert fitted_mixture(same) is field.gain_field
     assert torch.equal(relative_gain_std(same, points), relative_gain_std(field, points))
@@ -193,8 +193,8 @@ def test_modes_that_an_edit_has_silenced_are_in_no_doubt() -> None:
     contacts = bar_contacts(12)
     gains = elastic_field(contacts, drawn_gains(contacts, seed=17))
     field = replace(sound_field(gains), residual=Residual(torch.zeros(9)))
-    above = retune(field, pitch=[1.0, 1.0, 4.0, 4.0])
-    mute = retune(field, gains_db=[0.0, 0.0, -math.inf, -math.inf])
+    above = adjust_modes(field, pitch=[1.0, 1.0, 4.0, 4.0])
+    mute = adjust_modes(field, gains_db=[0.0, 0.0, -math.inf, -math.inf])
     points = bar_points()[::5]
     assert torch.equal(relative_gain_std(above, points), relative_gain_std(mute, points))
     torch.testing.assert_close(
@@ -256,7 +256,7 @@ def test_what_cannot_be_said_is_refused() -> None:
     with raises(FitError, name="level", value=1.0):
         spectrum_band(field, contacts[0], level=1.0)
     with raises(FitError, name="field", value="edited"):
-        unedited_mixture(retune(field))
+        unedited_mixture(adjust_modes(field))
     with raises(FitError, name="parts", value=[6, 3, 2]):
         coverage(field, contacts, values[:, :3])
 

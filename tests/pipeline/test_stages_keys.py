@@ -26,7 +26,7 @@ from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.scene import Listener
 from avmsf.pipeline.stages import StageFolder
 from avmsf.simulate import nominal, recipe
-from avmsf.tasks import steercheckpoint
+from avmsf.tasks import guided_checkpoint
 from plate_capture import fill_plate
 from plate_field import plate_extraction, plate_features, plate_impacts
 from ringing_field import ringing_field
@@ -72,7 +72,7 @@ def fit_key() -> str:
 
 def edit_key() -> dict[str, str]:
     field = ringing_field()
-    return steercheckpoint.asked(field, field.gain_field.points[:2], {}, {})
+    return guided_checkpoint.asked(field, field.gain_field.points[:2], {}, {})
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,7 @@ def edit_key() -> dict[str, str]:
         (recipe, lambda: recipe.ObjectRecipe().elastic_values()),
         (nominal, body_key),
         (recipes, fit_key),
-        (steercheckpoint, edit_key),
+        (guided_checkpoint, edit_key),
     ],
     ids=["elastic modes", "body", "fit", "edit"],
 )

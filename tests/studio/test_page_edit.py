@@ -18,7 +18,7 @@ from avmsf.studio.modules import MODULES_VARIABLE
 from avmsf.studio.refusal import RefusedError
 from avmsf.studio.session import Session
 from avmsf.studio.worker import Voice
-from avmsf.tasks.steer import SteerProgress
+from avmsf.tasks.guided import GuidedEditProgress
 from opened_plate import open_plate, plate_field
 from page_plate import lay_out, plate_table
 from plate_page import LIVE, Open, Serve, answer, upload, words_on
@@ -50,7 +50,7 @@ class EditServer:
         """Whether answers to edits wait until `let_go`."""
         self.then: Callable[[], None] | None = None
         """What happens once between the next answer and what the page fetches upon it."""
-        self.led: list[SteerProgress] = []
+        self.led: list[GuidedEditProgress] = []
         """The steps of a lead."""
         self.beside: str | None = None
         """The file in which a lead is kept that another tab has forestalled; None where it is what is heard."""
@@ -564,10 +564,10 @@ def test_a_lead_says_at_once_that_it_begins_and_at_its_end_what_changed(edits: A
     assert "Undo reverts it" in words_on(page)
 
 
-def led_by(*steps: tuple[float, float]) -> list[SteerProgress]:
+def led_by(*steps: tuple[float, float]) -> list[GuidedEditProgress]:
     """Return a descent of these losses, NaN for none, and pitches."""
     count = len(steps)
-    return [SteerProgress(step, count, *each, 1.0, None) for step, each in enumerate(steps, start=1)]
+    return [GuidedEditProgress(step, count, *each, 1.0, None) for step, each in enumerate(steps, start=1)]
 
 
 def test_a_lead_that_another_tab_forestalled_is_told_to_be_kept_beside(edits: Any) -> None:

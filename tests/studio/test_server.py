@@ -46,8 +46,8 @@ from avmsf.studio.routes import PAGE
 from avmsf.studio.server import serve
 from avmsf.studio.studio import StudioConfig
 from avmsf.tasks.locator import Locator
-from avmsf.tasks.recast import recast
-from avmsf.tasks.retune import retune
+from avmsf.tasks.material import change_material
+from avmsf.tasks.modes import adjust_modes
 from avmsf.tasks.severalblows import locate_blows
 from capture_folder import fill, ring
 from opened_plate import RATE, blow, open_plate, plate_field, wav
@@ -134,7 +134,7 @@ def test_an_edit_is_heard_undone_and_saved(plate: Served) -> None:
     assert told["revision"] == 2
     assert "Poisson's ratio" in told["remarks"][0]
     after = plate.manifest()
-    expected = recast(plate_field("elastic"), CERAMIC, WOOD, size=2.0)
+    expected = change_material(plate_field("elastic"), CERAMIC, WOOD, size=2.0)
     assert np.allclose(tensor(plate, after, "frequency"), expected.bank.frequency, rtol=1e-12)
     # The page shows the object as it was; where a place sounds is on the object as it is now.
     points = torch.from_numpy(tensor(plate, before, "points").copy())
@@ -215,7 +215,7 @@ def test_a_descent_that_another_tab_has_overtaken_is_kept(
     wait = (
         "import os, time\nwhile not os.path.exists(sys.argv[2]): time.sleep(0.01)\nprint(json.dumps({'result': task}))"
     )
-    led = retune(plate_field("elastic"), pitch=1.25)
+    led = adjust_modes(plate_field("elastic"), pitch=1.25)
     save(led, tmp_path / "led")
     worker = (sys.executable, "-c", script + wait, str(tmp_path / "led"), str(tmp_path / "go"))
     start = plate.studio.jobs.start
@@ -378,7 +378,7 @@ def test_a_reconstruction_that_fails_says_why_and_one_can_be_stopped(tmp_path: P
 def test_the_field_that_a_job_made_is_opened_whatever_has_replaced_it_since(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = retune(plate_field(), pitch=1.25)
+    made = adjust_modes(plate_field(), pitch=1.25)
     save(made, tmp_path / "made")
     save(plate_field(), tmp_path / "replaced")
     script = (

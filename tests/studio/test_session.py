@@ -19,8 +19,8 @@ from avmsf.studio.editing import REST, Sliders
 from avmsf.studio.refusal import RefusedError
 from avmsf.studio.sampling import length_of, resample, sample
 from avmsf.studio.session import Revision, Session, file_name
-from avmsf.tasks.recast import recast
-from avmsf.tasks.retune import retune
+from avmsf.tasks.material import change_material
+from avmsf.tasks.modes import adjust_modes
 from made_fields import FIELDS
 from opened_plate import plate_field
 from raising import raises
@@ -56,8 +56,8 @@ def test_sliders_do_what_the_tasks_do() -> None:
     pitch = torch.full((5,), 0.8, dtype=torch.float64) * torch.tensor([1, 1, 1.01, 1, 1], dtype=torch.float64)
     decay = torch.full((5,), 2.0, dtype=torch.float64) * torch.tensor([1, 1, 0.5, 1, 1], dtype=torch.float64)
     levels = [0.0, -math.inf, 6.0, 0.0, 0.0]
-    wooden = recast(field, CERAMIC, WOOD, size=1.5)
-    assert same(edited, retune(wooden, pitch=pitch, decay=decay, brightness_db=1.0, gains_db=levels))
+    wooden = change_material(field, CERAMIC, WOOD, size=1.5)
+    assert same(edited, adjust_modes(wooden, pitch=pitch, decay=decay, brightness_db=1.0, gains_db=levels))
     assert any("Poisson's ratio" in words for words in remarks)
 
 

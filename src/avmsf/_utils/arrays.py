@@ -1,8 +1,9 @@
 """Arrays that users give, lists and numpy arrays among them, as tensors of a known shape."""
 
 import math
+import operator
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, SupportsIndex
 
 import numpy as np
 import torch
@@ -21,12 +22,29 @@ def as_vectors(values: ArrayLike, name: str, *, count: int | None = None) -> Flo
     Raises ArrayError for another shape, for another number of rows than `count`, and for values that are not finite.
     """
     found = as_floats(values, name)
-    rows = "contacts" if count is None else str(count)
+    rows = "rows" if count is None else str(count)
     if found.ndim != 2 or found.shape[1] != 3 or (count is not None and len(found) != count):
         single = f"; put a single one into a list, {name}=[[x, y, z]]" if found.shape == (3,) else ""
         shape = list(found.shape)
         raise ArrayError(f"{name}: expected an array [{rows}, 3], got {shape}{single}", name=name, value=shape)
     return _finite(found, name)
+
+
+def as_directions(values: ArrayLike, name: str, *, count: int) -> Float[Tensor, "rows 3"]:
+    """Return `count` vectors of length 1, or 0 where they are given so. Raises as `as_vectors`."""
+    vectors = as_vectors(values, name, count=count)
+    length = vectors.norm(dim=1, keepdim=True)
+    # What has unit length already stays as it is, to the last bit.
+    kept = ((length - 1.0).abs() < 1e-6) | (length == 0.0)
+    return torch.where(kept, vectors, vectors / length)
+
+
+def as_count(value: SupportsIndex, name: str) -> int:
+    """Return a whole number of 1 or more. Raises ArrayError for another."""
+    count = operator.index(value) if hasattr(value, "__index__") and not isinstance(value, bool) else 0
+    if count < 1:
+        raise ArrayError.expected("a whole number of 1 or more", value, name=name)
+    return count
 
 
 def as_numbers(values: float | int | ArrayLike, name: str, *, count: int) -> Float[Tensor, " rows"]:
@@ -51,8 +69,11 @@ def as_floats(values: float | int | ArrayLike, name: str) -> Float[Tensor, "*sha
     """Return numbers of any shape as floats on the CPU. Raises ArrayError for what are no numbers."""
     try:
         found = torch.as_tensor(values if isinstance(values, Tensor) else np.asarray(values))
-    except (ValueError, TypeError) as error:
-        raise ArrayError(f"{name}: expected numbers in an array or nested lists ({error})", name=name) from error
+    except (ValueError, TypeError, RuntimeError) as error:
+        got = "lists of different lengths or other values" if isinstance(values, Sequence) else repr(values)[:60]
+        raise ArrayError.expected(
+            "numbers in an array or nested lists of equal lengths", type(values).__name__, got=got, name=name
+        ) from error
     if found.is_complex():
         raise ArrayError(f"{name}: expected real numbers, got {found.dtype}", name=name, value=str(found.dtype))
     kept = isinstance(values, Tensor) and found.is_floating_point()

@@ -19,17 +19,17 @@ def usable_device(
     there or has no memory left.
     """
     wanted = name or ("cuda" if torch.cuda.is_available() else "cpu")
+    usable, cause = kinds or TRAINABLE, None
     try:
         place = torch.device(wanted)
-        if kinds and place.type not in kinds:
-            raise RuntimeError(f"{place.type}; only {' or '.join(kinds)} is supported")
-        torch.empty(1, device=place)
+        if not kinds or place.type in kinds:
+            torch.empty(1, device=place)
+            return place
     except (RuntimeError, AssertionError) as error:  # AssertionError: PyTorch was built without it
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise raising(
-            f"device: expected one that PyTorch can use, such as cpu, or cuda with an NVIDIA GPU, its driver and free "
-            f"memory, got {wanted} ({reason}); choose cpu",
-            name="device",
-            value=str(wanted),
-        ) from error
-    return place
+        cause = error
+    raise raising.expected(
+        f"{' or '.join(usable)}, where cuda needs an NVIDIA GPU, its driver and free memory",
+        str(wanted),
+        name="device",
+        advice="choose cpu",
+    ) from cause

@@ -166,8 +166,8 @@ class CaseRun:
 
     def _gaussians(self) -> GaussianCloud:
         if self.evaluation.clouds is None:
-            raise EvaluationError(
-                f"{self.identifier}: expected Gaussians, views or a mesh, found none", name=self.identifier
+            raise EvaluationError.expected(
+                "Gaussians, views or a mesh", name=self.identifier, advice="give one, or omit the method"
             )
         with self._sharing():
             return self.evaluation.clouds(self.identifier, self.case.views)

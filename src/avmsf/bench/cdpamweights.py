@@ -54,9 +54,8 @@ def find_weights() -> Path:
     # Importing the package would fail: it needs modules that it does not install, and names that numpy has dropped.
     found = importlib.util.find_spec("cdpam")
     if found is None or not found.submodule_search_locations:
-        raise EvaluationError(
-            "CDPAM: expected the package cdpam, found none; pip install 'avmsf[eval]', or omit CDPAM with --no-cdpam",
-            name="cdpam",
+        raise EvaluationError.expected(
+            "an installed package", name="cdpam", advice="pip install 'avmsf[eval]', or omit CDPAM with --no-cdpam"
         )
     return Path(found.submodule_search_locations[0]) / _FILE
 
@@ -87,10 +86,8 @@ def read_weights(path: Path) -> CdpamWeights:
         ) from error
     tensors = stored.get("state") if isinstance(stored, Mapping) else None
     if not isinstance(tensors, Mapping):
-        raise EvaluationError(
-            f"{path}: expected the trained weights of CDPAM under 'state', found none; {_INSTALL}",
-            file=path,
-            name="state",
+        raise EvaluationError.expected(
+            "the trained weights of CDPAM under 'state'", file=path, name="state", advice=_INSTALL
         )
     return CdpamWeights(tensors, digest)
 

@@ -28,12 +28,13 @@ def find_clap(source: str | Path) -> Path:
         return folder
     name = str(source)
     if not is_hub_name(source):
-        raise EvaluationError(
-            f"{name}: expected a folder with a CLAP model, or a name such as {', '.join(MODELS)}, found no "
-            "folder; check the path",
+        raise EvaluationError.expected(
+            f"a folder with a CLAP model, or a name such as {', '.join(MODELS)}",
+            name,
+            got="no such folder",
             file=folder,
             name="source",
-            value=name,
+            advice="check the path",
         )
     return _from_hub(name)
 
@@ -90,10 +91,12 @@ def _expect_clap(folder: Path) -> Path:
         " or ".join(each) for each in (_EXTRACTORS, _WEIGHTS) if not any((folder / name).is_file() for name in each)
     ]
     if lacking:
-        raise EvaluationError(
-            f"{folder}: expected a CLAP model, found no {' and no '.join(lacking)}; {_how_to_download(MODELS[0])}",
+        raise EvaluationError.expected(
+            "a CLAP model",
+            tuple(lacking),
+            got=f"none of its {' and '.join(lacking)}",
             file=folder,
-            value=tuple(lacking),
+            advice=_how_to_download(MODELS[0]),
         )
     return next(folder / name for name in _WEIGHTS if (folder / name).is_file())
 

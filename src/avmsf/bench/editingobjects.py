@@ -151,10 +151,12 @@ def heard_modes(bank: ModalBank, amplitudes: Tensor, *, sample_rate: float = mat
     energy = amplitudes.abs().double().square().mean(dim=0) / (4.0 * bank.damping)
     energy = torch.where(bank.frequency < 0.5 * sample_rate, energy, 0.0)
     if not bool(energy.max() > 0.0):
-        raise EvaluationError(
-            f"expected a mode with energy below half the sample rate, found none of {len(bank)}",
+        raise EvaluationError.expected(
+            "a mode with energy below half the sample rate",
+            len(bank),
+            got=f"none among {len(bank)}",
             name="bank",
-            value=len(bank),
+            advice="check the frequencies and amplitudes",
         )
     kept = energy >= energy.max() * 10.0 ** (_FAINTEST_DB / 10.0)
     return ModalBank(bank.frequency[kept], bank.damping[kept])
@@ -171,10 +173,12 @@ def recorded_objects(
     """
     held = [name for name in dataset.objects() if name in materials]
     if not held:
-        raise EvaluationError(
-            f"{dataset.name}: expected objects of known materials such as {', '.join(list(materials)[:3])}, found none",
+        raise EvaluationError.expected(
+            f"objects of known materials such as {', '.join(list(materials)[:3])}",
+            0,
+            got="none",
             name=dataset.name,
-            value=0,
+            advice="choose another dataset",
         )
     found = []
     for name in held:

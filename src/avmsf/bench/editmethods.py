@@ -20,11 +20,11 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import extract_sounds
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder, ShortTime
 from avmsf.simulate.material import MATERIALS
-from avmsf.tasks.config import DistillationConfig, SteerConfig
+from avmsf.tasks.config import DistillationConfig, GuidedEditConfig
 from avmsf.tasks.distillation import AudioDiffusion, DecoderDistillation
+from avmsf.tasks.guided import Guide, GuidedEditProgress, edit_towards
+from avmsf.tasks.material import change_material
 from avmsf.tasks.parameters import HIERARCHICAL, INDEPENDENT, PUBLISHED, SEARCHED, Parameterisation
-from avmsf.tasks.recast import recast
-from avmsf.tasks.steer import Guide, SteerProgress, steer
 
 GENERATED = 3.0
 """Seconds of a sound that is generated from a prompt only."""
@@ -75,14 +75,14 @@ class Recast:
     name: str = "physics"
 
     def edit(self, task: EditTask) -> Edited:
-        """Return the recast object. Raises EvaluationError for a material without constants."""
+        """Return the object in the new material. Raises EvaluationError for a material without constants."""
         for material in (task.object.material, task.target):
             if material not in MATERIALS:
                 raise EvaluationError(
                     f"expected a material of {', '.join(MATERIALS)}, got {material!r}", name="material", value=material
                 )
         old, new = MATERIALS[task.object.material], MATERIALS[task.target]
-        return heard(recast(task.object.sound_field, old, new), task)
+        return heard(change_material(task.object.sound_field, old, new), task)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,20 +93,20 @@ class Steered:
     guide: Callable[[EditTask], Guide]
     parameters: Parameterisation
     config: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of `SteerConfig` other than the seed, which is the task's."""
+    """Settings of `GuidedEditConfig` other than the seed, which is the task's."""
 
     def edit(self, task: EditTask) -> Edited:
         """Return the steered object."""
-        config = SteerConfig(**{"preview_every": 0, **self.config, "seed": task.seed})
+        config = GuidedEditConfig(**{"preview_every": 0, **self.config, "seed": task.seed})
         field, previews = task.object.sound_field, list[tuple[int, Tensor]]()
 
-        def keep(progress: SteerProgress) -> None:
+        def keep(progress: GuidedEditProgress) -> None:
             if progress.preview is not None and progress.place is not None:
                 if not previews:
                     previews.append((0, field.render(progress.place[None])[0]))
                 previews.append((progress.step, progress.preview))
 
-        edited = steer(field, self.guide(task), config=config, parameters=self.parameters, progress=keep)
+        edited = edit_towards(field, self.guide(task), config=config, parameters=self.parameters, progress=keep)
         return replace(heard(edited, task), previews=tuple(previews))
 
 
@@ -171,8 +171,8 @@ def towards_words(
 ) -> tuple[EditMethod, ...]:
     """Return the methods of the paper's table: as it was, generation (of a model that can), Audio-SDS, and ours.
 
-    `config` are settings of `SteerConfig`; `generated` is how many seconds direct generation makes. The `paper`'s form
-    has its parameters of an edit, and its extraction from generated sounds.
+    `config` are settings of `GuidedEditConfig`; `generated` is how many seconds direct generation makes. The `paper`'s
+    form has its parameters of an edit, and its extraction from generated sounds.
     """
 
     def guide(task: EditTask) -> Guide:
@@ -200,7 +200,7 @@ def heard(edited: SoundField, task: EditTask) -> Edited:
 
 def _reference(task: EditTask) -> Guide:
     if task.reference is None:
-        raise EvaluationError(
-            f"{task.object.name} to {task.target}: expected a reference, found none", name="reference"
+        raise EvaluationError.expected(
+            f"one for {task.object.name} to {task.target}", name="reference", advice="give the task one"
         )
     return task.reference

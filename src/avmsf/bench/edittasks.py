@@ -82,7 +82,9 @@ class EditTask:
     def words(self) -> str:
         """Return the prompt. Raises EvaluationError where there is none."""
         if self.prompt is None:
-            raise EvaluationError(f"{self.object.name} to {self.target}: expected a prompt, found none", name="prompt")
+            raise EvaluationError.expected(
+                f"one for {self.object.name} to {self.target}", name="prompt", advice="give the task one"
+            )
         return self.prompt
 
 

@@ -1,30 +1,32 @@
 """Splits into training and test recordings, and the scores of any renderer on the test recordings."""
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from avmsf._utils.summary import short_repr
+from avmsf._utils.arrays import ArrayLike, as_floats
 from avmsf.bench.cases import Places
 from avmsf.bench.conventions import PAPER, Convention
 from avmsf.bench.metrics import PerContact, default_fft_sizes, relative_stft_error, validate
 from avmsf.bench.renderer import Renderer
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import EvaluationError
+from avmsf.errors import EvaluationError, PositionWarning
 from avmsf.field.soundfield import SoundField
 from avmsf.scene.points import farthest_points
+from avmsf.wording import counted
 
 
 @dataclass(frozen=True, eq=False)
 class Scores:
     """How far rendered sounds are from recorded ones, by several metrics; lower is better."""
 
-    __repr__ = short_repr
+    def __repr__(self) -> str:
+        means = ", ".join(f"{metric} {value:.3g}" for metric, value in self.mean().items())
+        return f"Scores({counted(len(self.names), 'recording')}: {means})"
 
     convention: str
     """Name of the convention that the metrics follow, `relative_stft` apart, which is the same in all."""
@@ -94,13 +96,15 @@ def evaluate(
             name="sample_rate",
             value=impacts.sample_rate,
         )
-    with torch.no_grad():
+    with torch.no_grad(), warnings.catch_warnings():
+        # Reading the capture has warned of contacts off the object.
+        warnings.simplefilter("ignore", PositionWarning)
         sounds = renderer.render(impacts.contacts, directions=impacts.directions)
     return score(sounds, impacts, convention=convention, fft_sizes=fft_sizes)
 
 
 def score(
-    sounds: Float[Tensor, "..."],
+    sounds: ArrayLike,
     impacts: Impacts,
     *,
     convention: Convention = PAPER,
@@ -109,8 +113,10 @@ def score(
     """Score sounds that were made otherwise than by a renderer, row for row of the impacts.
 
     `relative_stft` with `fft_sizes` in samples, or else with `default_fft_sizes`, and the convention's metrics. Raises
-    EvaluationError for sounds that do not fit the impacts or are not finite, with the name of the impact.
+    EvaluationError for sounds that do not fit the impacts or are not finite, with the name of the impact, and
+    ArrayError for what are no numbers.
     """
+    sounds = as_floats(sounds, "sounds")
     validate(sounds, impacts.sounds, names=impacts.names)
     sizes = default_fft_sizes(impacts.sample_rate) if fft_sizes is None else tuple(fft_sizes)
     values = {"relative_stft": relative_stft_error(sounds, impacts.sounds, fft_sizes=sizes)}

@@ -37,10 +37,12 @@ def truth_at(truth: Truth, names: tuple[str, ...]) -> Truth:
     rows = {name: row for row, name in enumerate(truth.names)}
     unknown = [name for name in names if name not in rows]
     if unknown:
-        raise EvaluationError(
-            f"expected ground truth of all recordings, found none of {', '.join(unknown[:3])}; simulate it again",
+        raise EvaluationError.expected(
+            "the ground truth of all recordings",
+            tuple(unknown),
+            got=f"none of {', '.join(unknown[:3])}",
             name="names",
-            value=tuple(unknown),
+            advice="simulate the object again",
         )
     taken = [rows[name] for name in names]
     return replace(

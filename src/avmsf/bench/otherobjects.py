@@ -31,8 +31,8 @@ def draw_stranger(dataset: Dataset, identifier: str, train: Impacts, *, seed: in
         sound = _at_rate(impacts.sounds[row], impacts.sample_rate, train.sample_rate)
         samples = train.sounds.shape[1]
         return torch.nn.functional.pad(sound, (0, max(0, samples - len(sound))))[:samples].to(train.sounds.dtype)
-    raise EvaluationError(
-        f"{dataset.name}: expected another readable object than {identifier}, found none", name=identifier
+    raise EvaluationError.expected(
+        f"another readable object in {dataset.name}", name=identifier, advice="download more of the dataset"
     )
 
 

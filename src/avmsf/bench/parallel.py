@@ -140,8 +140,7 @@ def _ray() -> ModuleType:
     try:
         import ray
     except ImportError as error:
-        raise EvaluationError(
-            "--workers and --ray: expected the package ray, found none; pip install 'avmsf[scale]', or omit them",
-            name="ray",
+        raise EvaluationError.expected(
+            "an installed package", name="ray", advice="pip install 'avmsf[scale]', or omit --workers and --ray"
         ) from error
     return ray

@@ -34,17 +34,15 @@ class Recorded:
 
     def __post_init__(self) -> None:
         if len(self.contacts) != len(self.names):
-            raise EvaluationError(
-                f"expected a name for each of {len(self.contacts)} contacts, got {len(self.names)}",
-                name="names",
-                value=len(self.names),
+            raise EvaluationError.expected(
+                f"one for each of {len(self.contacts)} contacts", len(self.names), name="names"
             )
         if not self.folder.is_dir():
-            raise EvaluationError(
-                f"{self.folder}: expected a folder with the object's sounds, such as "
-                f"{self.path(self.names[0]).name if self.names else 'RECORDING.wav'}, found none; render them there, "
-                "or omit the object",
+            example = self.path(self.names[0]).name if self.names else "RECORDING.wav"
+            raise EvaluationError.expected(
+                f"a folder with the object's sounds, such as {example}",
                 file=self.folder,
+                advice="render them there, or omit the object",
             )
 
     def path(self, name: str) -> Path:
@@ -77,11 +75,12 @@ class Recorded:
         paths = [self.path(self.names[row]) for row in rows]
         present = [path for path in paths if path.is_file()]
         if not present:
-            raise EvaluationError(
-                f"{paths[0]}: the file is missing; render it as a mono wav of {self.samples} samples at "
-                f"{self.sample_rate:g} Hz",
+            raise EvaluationError.expected(
+                f"a mono wav of {self.samples} samples at {self.sample_rate:g} Hz",
+                got="no such file",
                 file=paths[0],
                 name=self.names[rows[0]],
+                advice="render it",
             )
         return present[0]
 

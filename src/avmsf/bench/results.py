@@ -105,10 +105,12 @@ class ResultsFolder:
         known = self.identity() if place.exists() else {**wanted, "methods": {}}
         # A kill may leave a hidden part of the file behind.
         if not place.exists() and self.path.is_dir() and any(self.path.glob("[!.]*")):
-            raise EvaluationError(
-                f"{self.path}: expected an empty folder or one with {IDENTITY}, found others; choose a new --output",
+            raise EvaluationError.expected(
+                f"an empty folder or one with {IDENTITY}",
+                got="other files",
                 file=self.path,
                 name="output",
+                advice="choose a new --output",
             )
         kept = known.pop("methods")
         for key in dict.fromkeys((*wanted, *known)):

@@ -47,9 +47,11 @@ def choose_objects(dataset: Dataset, protocol: EvaluationProtocol, asked: Sequen
         if group:
             return tuple(each for each in dataset.objects() if each in group)
         if protocol.required:
-            raise EvaluationError(
-                f"expected objects of the group {protocol.subset}, found none; name objects with --objects",
+            raise EvaluationError.expected(
+                f"objects of the group {protocol.subset}",
+                protocol.subset,
+                got="none",
                 name="subset",
-                value=protocol.subset,
+                advice="name objects with --objects",
             )
     return dataset.objects()

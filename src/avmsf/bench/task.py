@@ -21,12 +21,15 @@ Look = Literal["positions", "visual", "unaligned", "paper", "paper-positions", "
 the same without pooling; the paper's features of Gaussians, only their positions, and the features without pooling."""
 
 
+_OMIT = "give one, or omit the methods that need it"
+
+
 def _no_family() -> BodyFamily:
-    raise EvaluationError("expected a mesh or views of the object, found none", name="mesh")
+    raise EvaluationError.expected("a mesh or views of the object", name="mesh", advice=_OMIT)
 
 
 def _no_gaussians() -> GaussianCloud:
-    raise EvaluationError("expected views, a mesh or a .ply of Gaussians of the object, found none", name="gaussians")
+    raise EvaluationError.expected("views, a mesh or a .ply of the object", name="gaussians", advice=_OMIT)
 
 
 @dataclass(frozen=True, eq=False)

@@ -123,8 +123,8 @@ class Recording:
         return float(np.std(rest)) <= max(MAX_CHANNEL_DIFFERENCE * float(np.std(second)), step)
 
 
-def read_recording(path: Path, name: str | None = None) -> Recording:
-    """Read every channel of a sound file.
+def read_recording(path: Path, name: str | None = None, *, advice: str = "check the path") -> Recording:
+    """Read every channel of a sound file. `advice` says what to do where there is none of a similar name.
 
     Raises `CaptureError` where the file is missing, corrupt, empty or longer than `MAX_SAMPLES`, or holds samples that
     are not numbers or larger than `MAX_PEAK`.
@@ -133,14 +133,19 @@ def read_recording(path: Path, name: str | None = None) -> Recording:
     try:
         missing = not path.is_file()
     except OSError as error:
+        reason = repr(error.strerror)
         raise CaptureError(
-            f"{name[:80]}…: expected the name of a sound file ({error.strerror})", file=path, value=name
+            f"{name[:80]}…: expected the name of a sound file, got {reason}; {advice}", file=path, value=name
         ) from error
     if path.is_dir():
-        raise CaptureError(f"{name}: expected a sound file, got a folder", file=path)
+        raise CaptureError(f"{name}: expected a sound file, got a folder; name a file in it", file=path)
     if missing:
-        found, advice = _nearest_name(path)
-        raise CaptureError(f"{name}: expected a sound file, got none{advice}", file=path, value=found)
+        near = _nearest_name(path)
+        if not path.parent.is_dir():
+            advice = f"the folder {path.parent} does not exist either; {advice}"
+        elif near is not None:
+            advice = f"did you mean {near}?"
+        raise CaptureError(f"{name}: expected a sound file, got none; {advice}", file=path, value=near)
     return decode_recording(path, name)
 
 
@@ -268,14 +273,12 @@ def _refuse_long(file: soundfile.SoundFile, name: str) -> None:
         )
 
 
-def _nearest_name(path: Path) -> tuple[str | None, str]:
-    """Return the file with the most similar name to a path that does not exist, if any, and the end of an error."""
+def _nearest_name(path: Path) -> str | None:
+    """Return the file with the most similar name to a path that does not exist, if any."""
     if not path.parent.is_dir():
-        return None, f", nor the folder {path.parent}"
+        return None
     # The first by name: the order of a folder differs from disk to disk.
     listed = heapq.nsmallest(_MAX_NAMES_COMPARED, (other.name for other in path.parent.iterdir()))
     names = {name.lower(): name for name in listed}
     found = get_close_matches(path.name.lower(), names, n=1, cutoff=0.7)
-    if not found:
-        return None, ": copy it there, or remove its row from impacts.csv"
-    return names[found[0]], f" (did you mean {names[found[0]]}?)"
+    return names[found[0]] if found else None

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from avmsf._utils.summary import short_repr
 from avmsf.errors import CaptureError
 
 
@@ -119,6 +120,8 @@ class Camera:
 @dataclass(frozen=True, eq=False)
 class View:
     """One photograph with the camera that took it."""
+
+    __repr__ = short_repr
 
     name: str
     """The file's name, or another by which a message can speak of it."""

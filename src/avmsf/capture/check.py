@@ -71,7 +71,7 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
             sounds.append(_Sound(report.file, len(prepared.sound), rate, prepared.peak, start))
     refused = _check_contacts(folder, strikes, rows, settings=settings, problems=problems)
     if len(missing) > MAX_SUGGESTIONS:
-        refused.append(f"{TABLE}: expected a file for each row, {len(missing)} of {len(rows)} are missing")
+        refused.append(f"{TABLE}: expected a file for each row, got none for {len(missing)} of {len(rows)}")
     comparable = len(sounds) > 1 and len({each.rate for each in sounds}) == 1
     uncut = comparable and stay_uncut([each.start for each in sounds], rate=sounds[0].rate, settings=settings)
     if uncut:

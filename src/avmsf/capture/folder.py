@@ -34,6 +34,7 @@ from avmsf.capture.table import (
 from avmsf.capture.together import common_rate, judge_contacts, judge_levels, judge_surface
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError
+from avmsf.files import unwritable
 
 SETTINGS = "capture.toml"
 
@@ -89,7 +90,18 @@ def read_capture(folder: str | Path, settings: CaptureSettings | None = None) ->
     everything.
     """
     folder = Path(folder)
-    settings = settings or settings_of(folder)
+    try:
+        return _read_capture(folder, settings or settings_of(folder))
+    except CaptureError as error:
+        if str(error).startswith(str(folder)):
+            raise
+        # The table and the recordings are named as in the folder.
+        file = folder if error.file is None else folder / error.file
+        place = f"{file.parent}/" if str(error).startswith(file.name) else f"{folder}: "
+        raise type(error)(f"{place}{error}", **{**error.attributes, "file": file}) from error
+
+
+def _read_capture(folder: Path, settings: CaptureSettings) -> Capture:
     rows, remarks = read_rows(folder)
     strikes = [understand(row, settings) for row in rows]
     refuse_repeated_files(strikes)
@@ -109,7 +121,7 @@ def read_capture(folder: str | Path, settings: CaptureSettings | None = None) ->
     rate = common_rate([report.sample_rate or 0.0 for report in reports], names)
     cut = cut_together(recordings, names, rate=rate, settings=settings)
     for remark in remarks + cut.remarks + _summary(reports, folder):
-        warnings.warn(remark, stacklevel=2)
+        warnings.warn(remark, stacklevel=3)
     directions = [strike.direction for strike in strikes]
     forces = [each.newtons for each in recordings]
     impacts = Impacts(
@@ -133,7 +145,8 @@ def settings_of(folder: Path) -> CaptureSettings:
 
 def read_strike(folder: Path, strike: Strike, *, settings: CaptureSettings) -> tuple[Prepared, RecordingReport]:
     """Read, prepare and measure the recording of one row; `CaptureError` where it cannot be used."""
-    recording = read_recording(folder / strike.file, strike.file)
+    advice = f"copy it there, or remove its row from {TABLE}"
+    recording = read_recording(folder / strike.file, strike.file, advice=advice)
     prepared = prepare(recording, settings, newtons=strike.newtons)
     return prepared, measure(recording, prepared, settings=settings, line=strike.line)
 
@@ -158,7 +171,7 @@ def write_capture(capture: Capture, folder: str | Path, *, onsets_within: float 
             folder.rmdir()
         os.rename(begun, folder)
     except (OSError, soundfile.LibsndfileError) as error:
-        raise CaptureError(f"{folder}: the capture cannot be written ({error})", file=folder) from error
+        raise unwritable(folder, error, raising=CaptureError) from error
     finally:
         shutil.rmtree(begun, ignore_errors=True)
 
@@ -206,8 +219,8 @@ def _refuse_missing(folder: Path, strikes: list[Strike]) -> None:
     if len(missing) > 1:
         shown = f"{', '.join(missing[:5])}{', …' * (len(missing) > 5)}"
         raise CaptureError(
-            f"{TABLE}: expected a file for each row, {len(missing)} of {len(strikes)} are missing ({shown}); copy them "
-            f"into {folder}, or correct their names",
+            f"{folder / TABLE}: expected a file for each row, got none for {len(missing)} of {len(strikes)} "
+            f"({shown}); copy them there, or correct their names",
             file=folder / TABLE,
             name="file",
             value=missing,

@@ -26,6 +26,7 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.starts import shorten, start_with_impact
 from avmsf.capture.table import Strike, read_rows, understand
 from avmsf.errors import CaptureError
+from avmsf.files import unwritable
 
 MIN_PUSH_SHARE = 0.5
 """Share of its energy that a hammer's channel has within its push and one width on either side: most of it. The
@@ -107,7 +108,7 @@ def write_settings(folder: str | Path, proposals: Sequence[Proposal]) -> Path:
             f"{path}: expected no such file, got an existing one; add the proposed lines to it by hand", file=path
         ) from error
     except OSError as error:
-        raise CaptureError(f"{path}: cannot be written ({error.strerror or error})", file=path) from error
+        raise unwritable(path, error, raising=CaptureError) from error
     return path
 
 

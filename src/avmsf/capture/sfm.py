@@ -23,6 +23,7 @@ import numpy as np
 from avmsf.capture.views.pictures import SUFFIXES, Picture, PictureSizeError, read_mask, read_picture
 from avmsf.capture.warning import Remark
 from avmsf.errors import CaptureError
+from avmsf.files import unwritable
 
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 WORKER = Path(__file__).with_name("sfm_worker.py")
@@ -69,7 +70,7 @@ def estimate_cameras(
     output: str | Path,
     *,
     timeout: float = 3600.0,
-    seed: int = 0,
+    seed: int | None = None,
     camera_model: str = "SIMPLE_RADIAL",
     shared_camera: bool = True,
     features: int = 4096,
@@ -83,8 +84,8 @@ def estimate_cameras(
     Where `output` is the folder that holds `images/`, `read_views` reads it. What moves with the object counts, so
     masks are used where there are any: alpha channels, or files in `masks/` beside the images. All photographs come
     from one camera with one zoom unless `shared_camera` is false. `features` and `longest` bound the features of an
-    image and the pixels of the longer side on which they are sought. One and the same seed gives the same cameras to
-    the last bit with `threads=1`, and to about one part in 100,000 with more; None takes all cores.
+    image and the pixels of the longer side on which they are sought. One and the same seed (None is 0) gives the same
+    cameras to the last bit with `threads=1`, and to about one part in 100,000 with more; None takes all cores.
 
     The work runs in a process of its own, which ends with this call, whether that returns, raises, or is interrupted;
     `sparse/0` is whole or absent. Frame and scale of the result are arbitrary: see `align_similarity`. Warns with
@@ -101,7 +102,7 @@ def estimate_cameras(
         _write_job(
             begun,
             names,
-            seed=seed,
+            seed=0 if seed is None else seed,
             camera_model=camera_model,
             shared_camera=shared_camera,
             features=features,
@@ -116,7 +117,7 @@ def estimate_cameras(
         (output / "sparse").mkdir(exist_ok=True)
         os.rename(begun / "models" / str(models[0]["number"]), output / "sparse" / "0")
     except OSError as error:
-        raise CaptureError(f"{output}: the cameras cannot be written ({error})", file=output) from error
+        raise unwritable(output, error, raising=CaptureError) from error
     finally:
         shutil.rmtree(begun, ignore_errors=True)
     registered = tuple(models[0]["names"])
@@ -261,10 +262,13 @@ def _run_worker(begun: Path, *, timeout: float, progress: Callable[[MotionProgre
             _end(worker)
     if worker.returncode != 0 or not (begun / "result.json").is_file():
         stage, ending = _progress(log, 0.0).stage, _ending(worker.returncode)
-        raise CaptureError(
-            f"structure from motion failed in the stage {stage} ({ending}); its last output:\n{_last_lines(log)}",
+        advice = "where memory ran out, lower `features` or `longest`; " if ending == "SIGKILL" else ""
+        raise CaptureError.expected(
+            "structure from motion to end without an error",
+            ending,
+            got=f"{ending} in the stage {stage}",
             name=stage,
-            value=ending,
+            advice=f"{advice}its last output:\n{_last_lines(log)}",
         )
 
 
@@ -289,8 +293,7 @@ def _progress(log: Path, seconds: float) -> MotionProgress:
 def _ending(code: int) -> str:
     if code >= 0:
         return f"exit status {code}"
-    name = signal.Signals(-code).name
-    return name + (", as where memory runs out: lower `features` or `longest`" if name == "SIGKILL" else "")
+    return signal.Signals(-code).name
 
 
 def _last_lines(log: Path, count: int = 6) -> str:

@@ -94,7 +94,8 @@ def read_rows(folder: Path) -> tuple[list[Row], list[CaptureWarning]]:
     """
     path = folder / TABLE
     if not folder.is_dir():
-        raise CaptureError(f"{folder}: expected a folder, got none", file=folder)
+        kind = "a file" if folder.exists() else "none"
+        raise CaptureError.expected("a capture folder", got=kind, file=folder, advice="check the path")
     if not path.is_file():
         raise CaptureError(f"{folder}: expected {TABLE} in this folder, got none; {HOW_TO_WRITE}", file=path)
     lines, separator = read_cells(path)

@@ -14,6 +14,7 @@ import numpy as np
 from avmsf.capture.location import expect_free
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError
+from avmsf.files import unwritable
 
 JUDGED = 480
 """Pixels of the longer side on which sharpness is judged: less would hide a slight blur, more measures the noise."""
@@ -72,7 +73,7 @@ def pick_frames(
             folder.rmdir()
         os.rename(begun, folder)
     except OSError as error:
-        raise CaptureError(f"{folder}: the frames cannot be written ({error})", file=folder) from error
+        raise unwritable(folder, error, raising=CaptureError) from error
     finally:
         shutil.rmtree(begun, ignore_errors=True)
     if total < 0.95 * claimed:

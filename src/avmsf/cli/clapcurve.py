@@ -12,7 +12,7 @@ from avmsf.bench.clap import Clap
 from avmsf.errors import EditError
 from avmsf.field.soundfield import SoundField
 from avmsf.files import write_whole
-from avmsf.tasks.steer import SteerProgress
+from avmsf.tasks.guided import GuidedEditProgress
 
 CLAP = "clap"
 """The key of the scores in the last edit of a field's report."""
@@ -29,7 +29,7 @@ class ClapCurve:
         self.clap, self.prompt, self.field, self.kept = clap, prompt, field, kept
         self.scores = _read(kept, clap) if resumed and kept.is_file() else {}
 
-    def add(self, progress: SteerProgress) -> None:
+    def add(self, progress: GuidedEditProgress) -> None:
         """Score a preview, and the unedited field before the first one. Silent sounds have no score."""
         if progress.preview is None or progress.place is None:
             return

@@ -7,14 +7,13 @@ from pathlib import Path, PurePosixPath
 
 import torch
 from jaxtyping import Float64
-from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avmsf.capture.placement import TOLERANCE
 from avmsf.capture.table import read_cells
 from avmsf.cli.writing import OutputError
 from avmsf.errors import CaptureError, PositionError
-from avmsf.field.soundfield import SoundField, expect_near
+from avmsf.field.positions import expect_near
+from avmsf.field.soundfield import SoundField
 
 _COLUMNS = ("x", "y", "z")
 _NORMALS = ("nx", "ny", "nz")
@@ -78,14 +77,6 @@ def read_contacts(path: Path, *, meters: float) -> Contacts:
     directions = torch.tensor(normals, dtype=torch.float64)
     known = directions if bool(directions.any()) else None
     return Contacts(torch.tensor(places, dtype=torch.float64) * meters, tuple(names), known)
-
-
-def off_surface(contacts: Contacts, field: SoundField) -> list[tuple[str, float]]:
-    """Return the names of contacts that lie off the object by more than `TOLERANCE`, and their distances, meters."""
-    points = field.gain_field.points.detach().cpu().double()
-    distance, _ = cKDTree(points.numpy()).query(contacts.places.numpy())
-    limit = TOLERANCE * float((points.amax(0) - points.amin(0)).norm())
-    return [(name, float(each)) for name, each in zip(contacts.names, distance, strict=True) if each > limit]
 
 
 def refuse_far(contacts: Contacts, field: SoundField) -> None:

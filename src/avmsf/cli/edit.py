@@ -25,7 +25,7 @@ from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load, save
 from avmsf.plotting.edits import draw_clap_curves
 from avmsf.tasks.edits import EDITS, remarks, silenced
-from avmsf.tasks.retune import retune
+from avmsf.tasks.modes import adjust_modes
 
 MODES, SPECTROGRAMS, BEFORE, AFTER = "modes.png", "spectrograms.png", "before.wav", "after.wav"
 CURVE = "clap.png"
@@ -60,7 +60,7 @@ class Sliders(ModeOptions):
         ):
             for frequency, factor in given:
                 values[_called(frequency, named, option)] *= factor
-        return retune(field, pitch=pitch, decay=decay, brightness_db=self.brightness, gains_db=levels)
+        return adjust_modes(field, pitch=pitch, decay=decay, brightness_db=self.brightness, gains_db=levels)
 
 
 def _called(frequency: float, named: Float[Tensor, " modes"], option: str) -> int:

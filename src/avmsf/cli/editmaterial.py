@@ -7,7 +7,7 @@ from avmsf.cli.printing import say
 from avmsf.field.soundfield import SoundField
 from avmsf.simulate.material import Material, material_named
 from avmsf.tasks.madeof import made_of
-from avmsf.tasks.recast import LAWS, recast
+from avmsf.tasks.material import LAWS, change_material
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class MaterialChange(MaterialOptions):
 
     def apply(self, field: SoundField, *, old: Material) -> SoundField:
         """Return the field of an object of `old` in its new material."""
-        return recast(field, old, self.target(old), size=self.size, law=LAWS[self.law])
+        return change_material(field, old, self.target(old), size=self.size, law=LAWS[self.law])
 
 
 def old_material(field: SoundField) -> Material:

@@ -86,7 +86,7 @@ class OverallBar:
         self._advance(progress.step / progress.steps)
 
     def _lifting(self, progress: LiftProgress) -> None:
-        doing(f"lift: {progress.done} of {progress.total} views")
+        doing(f"features: {progress.done} of {progress.total} views")
         self._advance(progress.done / progress.total)
 
     def _advance(self, part: float) -> None:

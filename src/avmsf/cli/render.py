@@ -1,6 +1,7 @@
 """`avmsf render`: the sounds of impacts anywhere on the object."""
 
 import math
+import warnings
 from functools import partial
 from pathlib import Path
 
@@ -9,11 +10,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.capture.audio import MAX_SAMPLES
-from avmsf.cli.contacts import Contacts, contacts_at, off_surface, read_contacts, refuse_far
+from avmsf.cli.contacts import Contacts, contacts_at, read_contacts, refuse_far
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.render import Options
 from avmsf.cli.printing import print_result, say
 from avmsf.cli.writing import Level, OutputError, expect_writable, write_sound
+from avmsf.errors import PositionWarning
+from avmsf.field.positions import off_surface
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.modal.pulse import ForcePulse
@@ -38,8 +41,8 @@ def run(options: Options) -> int:
         )
     field = load(options.field)
     refuse_far(contacts, field)
-    for name, distance in off_surface(contacts, field):
-        say(f"note: the contact of {name} is {1e3 * distance:.3g} mm off the object; its nearest point is used")
+    for row, distance in off_surface(contacts.places, field.gain_field.points):
+        say(f"note: the contact of {contacts.names[row]} is {1e3 * distance:.3g} mm off the object")
     if options.force != 1 and not field.origin.per_newton:
         say(f"note: the forces are not known: {options.force:g} is relative to an average recorded impact")
     if round(field.sample_rate) != field.sample_rate:
@@ -116,14 +119,20 @@ def render_sounds(
     pulse: ForcePulse | None = None,
 ) -> Float[Tensor, "contacts samples"]:
     """Render impacts of `force` for `seconds`; raises `OutputError` for a time of less than a sample."""
-    if seconds is None:
-        return field.render(places, directions=directions, forces=force, pulse=pulse)
+    samples = None if seconds is None else _samples(seconds, field)
+    with warnings.catch_warnings():
+        # The notes have said it, with the names of the sounds.
+        warnings.simplefilter("ignore", PositionWarning)
+        return field.render(places, directions=directions, forces=force, samples=samples, pulse=pulse)
+
+
+def _samples(seconds: float, field: SoundField) -> int:
     samples = round(seconds * field.sample_rate) if math.isfinite(seconds) else 0
     if not 1 <= samples <= MAX_SAMPLES:
         raise OutputError.expected(
             f"more than 0 and at most {MAX_SAMPLES / field.sample_rate:g} s", seconds, name="--seconds"
         )
-    return field.render(places, directions=directions, forces=force, samples=samples, pulse=pulse)
+    return samples
 
 
 def _pulse(options: Options) -> ForcePulse | None:

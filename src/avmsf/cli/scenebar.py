@@ -63,8 +63,8 @@ class SceneBar:
 
     def lifting(self, progress: LiftProgress) -> None:
         """Take note of a view."""
-        doing(f"lift: {progress.view}, {progress.done} of {progress.total}")
-        self._show("lift", progress.done, progress.total, progress.view)
+        doing(f"features: {progress.view}, {progress.done} of {progress.total}")
+        self._show("features", progress.done, progress.total, progress.view)
 
     def _show(self, stage: str, done: int, total: int, words: str) -> None:
         self.bar.start()

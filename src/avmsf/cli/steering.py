@@ -21,11 +21,11 @@ from avmsf.field.soundfield import SoundField
 from avmsf.simulate.material import Material, material_named
 from avmsf.tasks.distillation import DecoderDistillation, expect_prompt
 from avmsf.tasks.edits import EDITS
+from avmsf.tasks.guided import Guide, GuidedEditProgress, edit_towards
 from avmsf.tasks.materialstatistics import MaterialStatistics
 from avmsf.tasks.parameters import PARAMETERISATIONS
 from avmsf.tasks.reference import Reference
 from avmsf.tasks.stableaudio import StableAudio
-from avmsf.tasks.steer import Guide, SteerProgress, steer
 
 _PREVIEW = Level("peak", -1.0)
 _GENERATED_SECONDS = 3.0
@@ -87,12 +87,12 @@ class Steering(GuideOptions):
             curve = ClapCurve(clap, self.prompt, field, kept, resumed=checkpoint.exists())
         with SteerBar(preview, sample_rate=field.sample_rate) as bar:
 
-            def progress(reached: SteerProgress) -> None:
+            def progress(reached: GuidedEditProgress) -> None:
                 if curve is not None:
                     curve.add(reached)
                 bar.show(reached)
 
-            edited = steer(
+            edited = edit_towards(
                 field, guide, config=self.config, parameters=PARAMETERISATIONS[self.parameters], progress=progress,
                 checkpoint=checkpoint,
             )  # fmt: skip
@@ -107,7 +107,7 @@ class Steering(GuideOptions):
     def _guide(self, field: SoundField, old: Material | None) -> Guide:
         if self.like_material is not None:
             assert old is not None
-            common = MaterialStatistics.recast(field, old, material_named(self.like_material))
+            common = MaterialStatistics.transform(field, old, material_named(self.like_material))
             return common.reference(samples=field.samples, sample_rate=field.sample_rate, seed=self.config.seed)
         if self.prompt is None:
             return Reference.read(self.like, sample_rate=field.sample_rate)
@@ -174,7 +174,7 @@ class SteerBar:
     ) -> None:
         self.bar.stop()
 
-    def show(self, progress: SteerProgress) -> None:
+    def show(self, progress: GuidedEditProgress) -> None:
         """Take note of one step."""
         loss, pitch = figure(progress.loss), figure(progress.pitch, 4)
         doing(f"step {progress.step} of {progress.steps}: loss {loss}, pitch x {pitch}")

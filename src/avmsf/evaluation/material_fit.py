@@ -318,7 +318,7 @@ def _expect_audible(family: BodyFamily, materials: Iterable[Material]) -> None:
                 return
     lowest = float(bodies[0].modes(next(iter(materials))).frequency[0])
     raise EvaluationError(
-        f"expected a body with modes from {BAND[0]:g} to {BAND[1]:g} Hz, got a lowest mode at {lowest:.3g} Hz; give "
+        f"expected an object with modes from {BAND[0]:g} to {BAND[1]:g} Hz, got a lowest mode at {lowest:.3g} Hz; give "
         "the mesh's unit",
         name="frequency",
         value=lowest,

@@ -130,13 +130,13 @@ resonator(frequency, damping, sine, cosine) = (step ~ (_, _)) : !, _ with {
   turn = 2.0 * PI * frequency / SR;
   zr = decay * cos(turn);
   zi = decay * sin(turn);
-  heard = frequency < 0.5 * SR;
-  step(re, im, x) = zr * re - zi * im + heard * sine * x, zr * im + zi * re + heard * cosine * x;
+  audible = frequency < 0.5 * SR;
+  step(re, im, x) = zr * re - zi * im + audible * sine * x, zr * im + zi * re + audible * cosine * x;
 };
-// Samples since the gate opened, from 1 on; 0 before the first blow.
-sinceBlow(gate) = count ~ _ with {
-  struck = (gate > 0) & (gate' <= 0);
-  count(before) = select2(struck, min(before + (before > 0), 1073741824), 1);
+// Samples since the gate opened, from 1 on; 0 before the first impact.
+sinceImpact(gate) = count ~ _ with {
+  opened = (gate > 0) & (gate' <= 0);
+  count(before) = select2(opened, min(before + (before > 0), 1073741824), 1);
 };
 // The part of half a sine that falls into each sample's time; all parts together are 1.
 pulse(contactTime, since) = (since > 0) * sin((from + to) * PI / 2.0) * sin((to - from) * PI / 2.0) with {
@@ -153,7 +153,7 @@ noise(since) = (since > 0) * (place < {samples}) * (noiseDraw, int(min(place, {s
 _STRIKE = """
 strike(contact, force, contactTime, gate) = force * pulse(contactTime, since) : bank(contact) : +(force * noise(since))
 with {
-  since = sinceBlow(gate);
+  since = sinceImpact(gate);
 };
 """
 _CONTROLS = """

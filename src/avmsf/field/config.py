@@ -4,6 +4,7 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Literal
 
+from avmsf._utils.text import changes_repr
 from avmsf.errors import FitError
 from avmsf.modal.config import scaled_fft_size
 
@@ -40,6 +41,8 @@ class AttentionShape:
 @dataclass(frozen=True)
 class FitConfig:
     """Settings of a fit. The defaults are the quick recipe; `PAPER` holds the paper's."""
+
+    __repr__ = changes_repr
 
     clusters: int = 16
     """Regions of the object that the network attends to (paper: 128, 256 or 512)."""
@@ -106,6 +109,8 @@ class FitConfig:
     """Seed of the random numbers: initial weights, noise in training, and rendered Gaussian noise."""
 
     def __post_init__(self) -> None:
+        if not isinstance(self.seed, int):
+            raise FitError.expected("a whole number", self.seed, name="seed")
         values = {name: value for name, value in asdict(self).items() if not isinstance(value, bool)}
         numbers = {name: value for name, value in values.items() if isinstance(value, int | float)}
         for name, value in numbers.items():

@@ -56,7 +56,7 @@ def spectral_target(
     """
     odd = [size for size in fft_sizes if size % 2]
     if odd:
-        raise ValueError(f"expected even FFT sizes, found {odd[0]}: half a window lies before a frame's center")
+        raise ValueError(f"expected even FFT sizes, got {odd[0]}: half a window lies before a frame's center")
     cut = sounds[:, :samples]
     windows = [torch.hann_window(size, dtype=cut.dtype, device=cut.device) for size in fft_sizes]
     tiny = torch.finfo(cut.dtype).tiny
@@ -86,7 +86,7 @@ def spectral_loss(
     contacts = len(target.magnitudes[0])
     if len(sounds) != contacts or sounds.shape[1] < target.samples:
         raise ValueError(
-            f"expected {contacts} sounds of {target.samples} samples or more, as the target's, found {len(sounds)} of "
+            f"expected {contacts} sounds of {target.samples} samples or more, as the target's, got {len(sounds)} of "
             f"{sounds.shape[1]}"
         )
     loss: Float[Tensor, ""] = _SpectralL1.apply(  # type: ignore[no-untyped-call]

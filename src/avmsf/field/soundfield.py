@@ -1,5 +1,6 @@
 """An object's sound at every contact: modes, a gain field, and noise."""
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,15 +10,17 @@ import torch
 from jaxtyping import Bool, Complex, Float, Float64
 from torch import Tensor
 
-from avmsf._utils.arrays import ArrayLike, as_numbers, as_vectors
+from avmsf._utils.arrays import ArrayLike, as_count, as_directions, as_numbers, as_vectors
+from avmsf._utils.progress import working
 from avmsf._utils.summary import short_repr
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
-from avmsf.errors import PositionError
+from avmsf.errors import PositionWarning
 from avmsf.field.config import FitConfig
 from avmsf.field.gainfield import GainField, Gains
 from avmsf.field.gains.model import MixtureGains
+from avmsf.field.positions import expect_near, off_surface
 from avmsf.field.scaledgains import ScaledGains, fitted_gains
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.alignment import Alignment
@@ -40,6 +43,8 @@ _BATCH = 32
 @dataclass(frozen=True)
 class Origin:
     """Where a field comes from."""
+
+    __repr__ = short_repr
 
     capture: str = ""
     """Name of the capture."""
@@ -124,7 +129,8 @@ class SoundField:
 
     Positions, directions and forces are lists, numpy arrays or tensors. Methods raise ArrayError for other shapes and
     for values that are not finite, and PositionError for a position that lies farther from the object than this is
-    large.
+    large; for one nearer but off the object they give a PositionWarning. Directions of any length count as unit
+    vectors; one of length zero goes straight into the surface.
     """
 
     bank: ModalBank
@@ -225,29 +231,40 @@ class SoundField:
         return GainPosterior(self._amplitudes(parts_of(self, contacts, ways)), std)
 
     def suggest(
-        self, count: SupportsIndex = 5, *, candidates: ArrayLike | None = None, unseen: bool = False
+        self,
+        count: SupportsIndex = 5,
+        *,
+        candidates: ArrayLike | None = None,
+        unseen: bool = False,
+        progress: bool = True,
     ) -> "Suggestions":
         """Return where the next `count` impacts lower the field's expected error most.
 
         `candidates` are the positions to choose from (object frame, meters, on the surface), without them all that a
         hammer reaches from outside. With `unseen` they are on all of the body's surface, also where no photograph shows
-        it. Raises FitError as `posterior` and as `avmsf.field.suggest.suggest`.
+        it. With `progress`, the standard error says that it works. Raises FitError as `posterior` and as
+        `avmsf.field.suggest.suggest`.
         """
         from avmsf.field.suggest import suggest
 
         pool = None if candidates is None else as_vectors(candidates, "candidates")
-        return suggest(self, count, candidates=pool, unseen=unseen)
+        with working("computing the expected error over the surface", shown=progress):
+            return suggest(self, count, candidates=pool, unseen=unseen)
 
-    def locate(self, recording: "Sound", *, sample_rate: float | int | None = None) -> "ContactMap":
+    def locate(
+        self, recording: "Sound", *, sample_rate: float | int | None = None, progress: bool = True
+    ) -> "ContactMap":
         """Return where on the object a recorded impact was: points with probabilities.
 
         `recording` is the path of a sound file, or the samples of one channel at `sample_rate` Hz (by default the
-        field's). The first recording takes seconds to minutes, in which the gains over the surface are computed.
-        `avmsf.locate` takes more arguments. Raises LocationError for a recording that is silent or too short.
+        field's). The first recording takes seconds to minutes, in which the gains over the surface are computed; with
+        `progress`, the standard error says so. `avmsf.locate` takes more arguments. Raises LocationError for a
+        recording that is silent or too short.
         """
         from avmsf.tasks.locate import locate
 
-        return locate(self, recording, sample_rate=sample_rate)
+        with working("locating the impact; the first takes seconds to minutes", shown=progress):
+            return locate(self, recording, sample_rate=sample_rate)
 
     def aligned(self, impacts: Impacts) -> Impacts:
         """Return recordings of the object with the starts that the field's sounds have."""
@@ -271,17 +288,18 @@ class SoundField:
         places, ways = self._impacts(contacts, directions)
         return self._amplitudes(self.known(places, directions=ways).parts)
 
-    def known(
-        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Gains:
+    def known(self, contacts: ArrayLike, *, directions: ArrayLike | None = None) -> Gains:
         """Return all that a sound needs at the contacts: both parts of the gains, and the factors on the dampings."""
+        places = as_vectors(contacts, "contacts")
+        ways = None if directions is None else as_directions(directions, "directions", count=len(places))
         with torch.no_grad():
-            return self.gain_field.point_estimate(contacts, directions)
+            return self.gain_field.point_estimate(places, ways)
 
-    def dampings(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts modes"]:
+    def dampings(self, contacts: ArrayLike) -> Float[Tensor, "contacts modes"]:
         """Return the dampings at the contacts, 1/s: the bank's where they are shared."""
-        factors = self.known(contacts).damping
-        shared = self.bank.damping.expand(len(contacts), -1)
+        places, _ = self._impacts(contacts, None)
+        factors = self.known(places).damping
+        shared = self.bank.damping.expand(len(places), -1)
         return shared if factors is None else shared * factors
 
     def render(
@@ -306,8 +324,8 @@ class SoundField:
         recorded background noise does not depend on the force of an impact.
         """
         contacts, ways = self._impacts(positions, directions)
-        length = self.samples if samples is None else samples
-        noise = None if self.residual.recordings is not None else self.noise(samples)
+        length = self.samples if samples is None else as_count(samples, "samples")
+        noise = None if self.residual.recordings is not None else self.noise(length)
         parts = [torch.zeros(0, length)]
         for rows in torch.split(torch.arange(len(contacts)), _BATCH):
             way = None if ways is None else ways[rows]
@@ -322,10 +340,19 @@ class SoundField:
     def _impacts(
         self, positions: ArrayLike, directions: ArrayLike | None
     ) -> tuple[Float[Tensor, "contacts 3"], Float[Tensor, "contacts 3"] | None]:
-        """Return positions and directions as tensors."""
+        """Return positions and directions as tensors. Warns of positions off the object."""
         contacts = as_vectors(positions, "positions")
         expect_near(contacts, self.gain_field.points)
-        return contacts, None if directions is None else as_vectors(directions, "directions", count=len(contacts))
+        off = off_surface(contacts, self.gain_field.points)
+        if off:
+            row, distance = max(off, key=lambda each: each[1])
+            message = (
+                f"positions, row {row}: expected positions on the object's points, got {len(off)} off them, this one "
+                f"by {1e3 * distance:.3g} mm; the gains there are extrapolated"
+            )
+            warnings.warn(PositionWarning(message, name="positions", row=row, value=distance), stacklevel=3)
+        ways = None if directions is None else as_directions(directions, "directions", count=len(contacts))
+        return contacts, ways
 
     def _amplitudes(self, parts: Float64[Tensor, "contacts modes 2"]) -> Complex[Tensor, "contacts modes"]:
         sines, cosines = parts.unbind(2)
@@ -352,7 +379,7 @@ class SoundField:
         Of the kind that the fit's configuration names: a fixed sequence of low fluctuation, or a Gaussian draw
         (paper, eq. 6), which differs with `samples`.
         """
-        length = self.samples if samples is None else samples
+        length = self.samples if samples is None else as_count(samples, "samples")
         if self.origin.config.residual_noise == "low-fluctuation":
             return low_fluctuation_noise(self.residual.magnitude, samples=length)
         generator = torch.Generator().manual_seed(self.origin.config.seed)
@@ -370,27 +397,4 @@ class SoundField:
             samples=samples,
             sample_rate=self.sample_rate,
             quadrature=None if known.quadrature is None else known.quadrature[:, rows],
-        )
-
-
-def expect_near(positions: Float[Tensor, "contacts 3"], points: Float[Tensor, "points 3"]) -> None:
-    """Raise PositionError for a position farther outside the box of an object's points than the object is large.
-
-    Such a position counts another unit, or is in another frame.
-    """
-    places, known = positions.double(), points.detach().cpu().double()
-    low, high = known.amin(0), known.amax(0)
-    size = float((high - low).norm())
-    outside = torch.clamp(torch.maximum(low - places, places - high), min=0).norm(dim=1)
-    far = torch.nonzero(~(outside <= size)).flatten()
-    if len(far):
-        row = int(far[0])
-        found = places[row].tolist()
-        where = ", ".join(f"{value:.4g}" for value in found)
-        raise PositionError(
-            f"positions, row {row}: expected positions on the object, in meters, got ({where}), "
-            f"{float(outside[row]):.3g} m outside an object {size:.3g} m across; check the unit and the frame",
-            name="positions",
-            row=row,
-            value=found,
         )

@@ -212,8 +212,7 @@ def _body_nodes(gains: MixtureGains) -> Float64[Tensor, "nodes 3"]:
     """Return places all over the body's surface. Raises FitError without a body."""
     if gains.body is None:
         raise FitError(
-            "unseen: expected a field with the object's surface, got one without a body; leave unseen out, or give "
-            "candidates",
+            "unseen: expected a field with the object's surface, got one without; leave unseen out, or give candidates",
             name="unseen",
             value=True,
         )

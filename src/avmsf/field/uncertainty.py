@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from avmsf._utils.arrays import Seed, generator_of
 from avmsf.errors import FitError
 from avmsf.field.gains.body import BodyGains
 from avmsf.field.gains.model import MixtureGains
@@ -154,18 +155,18 @@ def spectrum_band(
     *,
     direction: Float[Tensor, " 3"] | None = None,
     level: float = LEVEL,
-    seed: int = 0,
+    seed: Seed = None,
 ) -> SpectrumBand:
     """Return the interval of probability `level` of each band of the spectrum of an impact's sound.
 
     By drawing sounds: gains from their posterior, and the noise's mean energy added. `contact` in meters, `direction`
-    as in `SoundField.render`, `seed` for the draws. Raises as `fitted_mixture`, and FitError for a level that is not
-    between 0 and 1.
+    as in `SoundField.render`, `seed` for the draws, by default 0. Raises as `fitted_mixture`, and FitError for a level
+    that is not between 0 and 1.
     """
     _expect_level(level)
     contacts, along = contact[None], None if direction is None else direction[None]
     mean, spread = parts_of(field, contacts, along)[0], std_of(field, contacts, along)[0]
-    generator = torch.Generator().manual_seed(seed)
+    generator = generator_of(seed)
     drawn = mean + spread * torch.randn(_DRAWS, *mean.shape, generator=generator, dtype=torch.float64)
     spectra = torch.zeros(_DRAWS, field.samples // 2 + 1, dtype=torch.complex128)
     for modes in torch.split(torch.nonzero(field.audible).flatten(), _BATCH):

@@ -188,7 +188,7 @@ class SceneStages:
 
     def _lift_to_cloud(self, views: Sequence[View], encoder: Encoder) -> Lifted:
         cloud = read_splats(self.cloud.path)
-        self.listener.tell(f"lift: {encoder.name} of {len(views)} views onto {len(cloud)} Gaussians")
+        self.listener.tell(f"features: {encoder.name} of {len(views)} views onto {len(cloud)} Gaussians")
         rasterizer = choose_rasterizer(cloud.centers.device)
         return lift_to_cloud(
             cloud, views, encoder, self.config.lift, rasterizer=rasterizer, progress=self.listener.lifting
@@ -197,7 +197,7 @@ class SceneStages:
     def _lift_to_mesh(self, views: Sequence[View], encoder: Encoder) -> Lifted:
         surface = read_surface(self._source().path, meters=self.settings.surface_meters)
         points = self.config.lift.points
-        self.listener.tell(f"lift: {encoder.name} of {len(views)} views onto {points} points of the mesh")
+        self.listener.tell(f"features: {encoder.name} of {len(views)} views onto {points} points of the mesh")
         return lift_to_surface(surface, views, encoder, self.config.lift, progress=self.listener.lifting)
 
     def _keep_given(self, splats: Path) -> Kept:

@@ -84,7 +84,7 @@ def read_report(path: str | Path) -> dict[str, Any]:
 
 
 def _read(path: Path) -> tuple[str, dict[str, Tensor]]:
-    return read_tensors(path, _KEY, what="a file of features", advice="lift the features again", raising=SceneError)
+    return read_tensors(path, _KEY, what="a file of features", advice="compute the features again", raising=SceneError)
 
 
 def _understand(words: str, path: Path) -> dict[str, Any]:

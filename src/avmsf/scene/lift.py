@@ -152,7 +152,7 @@ def lift_points(
     """
     if not len(points) or not len(views):
         raise SceneError(
-            f"expected points and views to lift features from, got {len(points)} and {len(views)}",
+            f"expected points and views to compute features from, got {len(points)} and {len(views)}",
             name="views" if len(points) else "points",
             value=0,
         )

@@ -109,11 +109,11 @@ def _orbits(
     limit = reach * spacing if reach else torch.full_like(spacing, math.inf)
     orbits = []
     for rotation in symmetries.rotations:
-        tell(f"counterparts under {rotation}")
+        tell(f"symmetric points under {rotation}")
         turned = [rotation.turn(places, angle) for angle in rotation.angles(angles)[1:]]
         orbits.append(_counterparts(turned, tree, limit))
     for mirror in symmetries.mirrors:
-        tell(f"counterparts under {mirror}")
+        tell(f"symmetric points under {mirror}")
         orbits.append(_counterparts([mirror.reflect(places)], tree, limit))
     return orbits
 

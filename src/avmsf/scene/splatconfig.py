@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from avmsf._utils.text import changes_repr
 from avmsf.errors import SceneError
 
 _LEAST = {
@@ -38,6 +39,8 @@ _PARTS = ("coarse_until", "degree_every", "densify_from", "densify_until", "leas
 @dataclass(frozen=True)
 class SplatConfig:
     """Settings of the fit of Gaussians to views. The defaults suit a short run on a CPU."""
+
+    __repr__ = changes_repr
 
     steps: int = 2000
     """Optimizer steps, one view each; all schedules scale with them."""

@@ -107,7 +107,7 @@ class Symmetries:
         lines = [
             f"{each}: error {each.error:.2f}, {_sureness(each.error, self.tolerance, self.rejected)}"
             + (
-                f"; {100 * each.missing:.0f} % of the surface has its counterpart in a hole"
+                f"; {100 * each.missing:.0f} % of the surface is symmetric to a hole in the points"
                 if each.missing >= 0.02
                 else ""
             )

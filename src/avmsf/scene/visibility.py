@@ -91,11 +91,12 @@ def depth_of_cloud(cloud: GaussianCloud, rasterizer: Rasterizer) -> DepthMap:
 def depth_of_surface(surface: Surface) -> DepthMap:
     """Return a depth map by rays through each pixel's center to a surface. Raises SceneError without triangles."""
     if len(surface.faces) == 0:
-        raise SceneError(
-            f"expected a surface of triangles, which can hide points from a camera, got {len(surface.vertices)} "
-            "points; lift onto Gaussians instead, or give a mesh",
+        raise SceneError.expected(
+            "triangles, which can hide points from a camera",
+            0,
+            got=f"{len(surface.vertices)} points alone",
             name="surface",
-            value=0,
+            advice="compute the features of Gaussians instead, or give a mesh",
         )
     tracer = MeshTracer(TexturedMesh.plain(surface))
 

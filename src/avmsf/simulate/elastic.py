@@ -195,7 +195,7 @@ def _modes_up_to(highest: float, frequency: Float64[Tensor, " modes"]) -> int:
     if not count:
         raise SimulationError(
             f"highest: expected a limit above the lowest mode at {float(frequency[0]):g} Hz, got {highest:g} Hz; raise "
-            "it, or make the body larger or thinner",
+            "it, or make the object larger or thinner",
             name="highest",
             value=highest,
         )
@@ -273,7 +273,7 @@ def expect_whole(solid: Solid) -> None:
         volumes = torch.bincount(solid.parts, weights=solid.volumes)
         sizes = ", ".join(f"{volume:.3g}" for volume in volumes[:4].tolist())
         raise SimulationError(
-            f"expected a connected body, got {number} parts of {sizes}{', ...' if number > 4 else ''} m3; join them, "
+            f"expected a connected shape, got {number} parts of {sizes}{', ...' if number > 4 else ''} m3; join them, "
             "or use the largest",
             name="parts",
             value=number,

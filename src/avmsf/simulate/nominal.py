@@ -444,11 +444,13 @@ def _expect_settings(count: int, freedoms: int, walls: Sequence[float | None] | 
         raise SimulationError(f"freedoms: expected {FEWEST} or more, got {freedoms}", name="freedoms", value=freedoms)
     if walls is not None and not len(walls):
         raise SimulationError(
-            "walls: expected thicknesses in meters, or None for a solid body, got an empty list", name="walls", value=[]
+            "walls: expected thicknesses in meters, or None for a solid object, got an empty list",
+            name="walls",
+            value=[],
         )
     for row, wall in enumerate(walls or ()):
         if wall is not None and not 0 < wall < float("inf"):
-            raise SimulationError.expected("more than 0 m, or None for a solid body", wall, row=row, name="walls")
+            raise SimulationError.expected("more than 0 m, or None for a solid object", wall, row=row, name="walls")
 
 
 def _grouped(refused: Mapping[float | None, str]) -> list[str]:

@@ -118,7 +118,7 @@ class Solid:
 def no_tetrahedra() -> SimulationError:
     """Return the error of a body without volume."""
     return SimulationError(
-        "expected tetrahedra, got none: the body has no volume; give a sheet a thickness", name="cells", value=0
+        "expected tetrahedra, got none: the shape has no volume; give a sheet a thickness", name="cells", value=0
     )
 
 

@@ -67,7 +67,7 @@ def fill(surface: Surface, *, detail: float = 0.05, timeout: float = 600.0) -> S
 def expect_detail(detail: float) -> None:
     """Raise SimulationError for what is no length of edges over the body's size."""
     if not 0 < detail < 1:
-        raise SimulationError.expected("a part of the body's size, above 0 and below 1", detail, name="detail")
+        raise SimulationError.expected("a part of the object's size, above 0 and below 1", detail, name="detail")
 
 
 def _tetrahedralize(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarray, np.ndarray]:
@@ -112,7 +112,7 @@ def _largest(solid: Solid) -> Solid:
     if float(volumes[0]) < (1.0 - _LOST) * float(volumes.sum()):
         sizes = ", ".join(f"{volume:.3g}" for volume in volumes[:4].tolist())
         raise SimulationError(
-            f"expected a connected body, got {len(volumes)} parts of {sizes}{', ...' if len(volumes) > 4 else ''} m3; "
+            f"expected a connected shape, got {len(volumes)} parts of {sizes}{', ...' if len(volumes) > 4 else ''} m3; "
             "join them, or give one of them",
             name="parts",
             value=len(volumes),

@@ -88,7 +88,7 @@ def write_truth(truth: Truth, path: str | Path) -> None:
         words = json.dumps(record, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise SimulationError(
-            f"{path}: expected a recipe of finite numbers, strings, lists and dicts, got others ({error})",
+            f"{path}: expected settings of finite numbers, strings, lists and dicts, got others ({error})",
             file=path,
             name="recipe",
             value=str(error),
@@ -123,7 +123,7 @@ def _understand(words: str, path: Path) -> dict[str, Any]:
         found, writer, names = record["format"], record["version"], record["names"]
         listed = isinstance(names, list) and all(isinstance(name, str) for name in names)
         if found in (1, FORMAT) and not (listed and isinstance(record["recipe"], dict)):
-            raise ValueError("names or recipe of another type")
+            raise ValueError("names or settings of another type")
     except (ValueError, TypeError, KeyError) as error:
         raise SimulationError(
             f"{path}: expected the header of a simulated object's ground truth, got {error!r}; simulate the object "

@@ -15,8 +15,8 @@ from avmsf.simulate.material import MATERIALS, material_named
 from avmsf.studio.refusal import RefusedError, bad_request, echo
 from avmsf.tasks.edits import EDITS, remarks
 from avmsf.tasks.madeof import made_of
-from avmsf.tasks.recast import LAWS, recast
-from avmsf.tasks.retune import retune
+from avmsf.tasks.material import LAWS, change_material
+from avmsf.tasks.modes import adjust_modes
 
 _MATERIAL, _MODE = ("from", "to"), ("mode", "db", "pitch", "decay")
 _OLD_CONTROL = '"Present material"'
@@ -73,7 +73,7 @@ class Sliders:
     brightness: float = 0.0
     """Decibels an octave."""
     law: str = "displacement"
-    """What the recordings go with; see `recast`."""
+    """What the recordings go with; see `change_material`."""
     modes: tuple[ModeChange, ...] = field(default=())
 
     @classmethod
@@ -129,7 +129,7 @@ class Sliders:
             else:
                 old = material_named(self.old)
             new = old if self.material is None else material_named(self.material)
-            edited = recast(ground, old, new, size=self.size, law=LAWS[self.law])
+            edited = change_material(ground, old, new, size=self.size, law=LAWS[self.law])
         if (self.pitch, self.decay, self.brightness) != (1.0, 1.0, 0.0) or self.modes:
             edited = self._retuned(edited)
         entries = edited.origin.report.get(EDITS, [])[len(ground.origin.report.get(EDITS, [])) :]
@@ -145,7 +145,7 @@ class Sliders:
             levels[row.mode] += row.db
             pitch[row.mode] *= row.pitch
             decay[row.mode] *= row.decay
-        return retune(recasted, pitch=pitch, decay=decay, brightness_db=self.brightness, gains_db=levels)
+        return adjust_modes(recasted, pitch=pitch, decay=decay, brightness_db=self.brightness, gains_db=levels)
 
 
 REST = Sliders()

@@ -33,11 +33,11 @@ from avmsf.scene.lift import LiftProgress
 from avmsf.scene.splat import SplatProgress
 from avmsf.studio.lifeline import end_with_server
 from avmsf.studio.strikefiles import COMMAND
-from avmsf.tasks.config import SteerConfig
+from avmsf.tasks.config import GuidedEditConfig
 from avmsf.tasks.distillation import DecoderDistillation
+from avmsf.tasks.guided import Guide, GuidedEditProgress, edit_towards
 from avmsf.tasks.reference import Reference
 from avmsf.tasks.stableaudio import StableAudio
-from avmsf.tasks.steer import Guide, SteerProgress, steer
 
 Values = Mapping[str, Any]
 _RARELY = 10
@@ -81,7 +81,7 @@ class Voice:
         if progress.step % _RARELY == 0 or progress.step == progress.steps:
             self.step("fit", progress.step, progress.steps, f"{progress.stage}, loss {progress.loss:.3g}")
 
-    def steering(self, progress: SteerProgress) -> None:
+    def steering(self, progress: GuidedEditProgress) -> None:
         """Hear of an edit's descent."""
         words = f"loss {progress.loss:.3g}, pitch x {progress.pitch:.4g}"
         # In JSON there is no NaN.
@@ -138,8 +138,8 @@ def lead(task: Values, voice: Voice) -> Values:
         voice.tell("model: loading")
         model = StableAudio.load(task["model"])
         guide = DecoderDistillation(model, task["prompt"], sample_rate=field.sample_rate)
-    config = SteerConfig(steps=int(task["steps"]), preview_every=0)
-    save(steer(field, guide, config=config, progress=voice.steering), task["output"])
+    config = GuidedEditConfig(steps=int(task["steps"]), preview_every=0)
+    save(edit_towards(field, guide, config=config, progress=voice.steering), task["output"])
     return {"output": task["output"]}
 
 

@@ -12,7 +12,7 @@ _LARGEST_SEED = 1 << 40
 
 
 @dataclass(frozen=True)
-class SteerConfig:
+class GuidedEditConfig:
     """Optimization of a guided edit."""
 
     steps: int = 300
@@ -74,6 +74,6 @@ class DistillationConfig:
             raise _unfit(self, "guidance", "0 or more, such as 15")
 
 
-def _unfit(settings: SteerConfig | DistillationConfig, name: str, expected: str) -> EditError:
+def _unfit(settings: GuidedEditConfig | DistillationConfig, name: str, expected: str) -> EditError:
     value = getattr(settings, name)
     return EditError(f"{name}: expected {expected}, got {value}", name=name, value=value)

@@ -183,11 +183,12 @@ class DecoderDistillation:
                     continue
                 except torch.OutOfMemoryError as error:
                     if self.batch == 1:
-                        raise EditError(
-                            f"{self.model.name}: out of memory on {self.model.device} with a batch of 1; use fewer "
-                            "seconds, free memory, or choose the device cpu",
+                        raise EditError.expected(
+                            f"memory on {self.model.device} for one sound of {self.model.name}",
+                            1,
+                            got="too little",
                             name="batch",
-                            value=1,
+                            advice="use fewer seconds, free memory, or choose the device cpu",
                         ) from error
                 # Not before the error is gone: its traceback holds the tensors that filled the memory.
                 self._halve()

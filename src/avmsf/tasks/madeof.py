@@ -54,7 +54,7 @@ def made_of(field: SoundField, *, option: str) -> MadeOf:
 
 
 def _recast_to(edits: Sequence[object]) -> Material | None:
-    """Return the material of the last recast, None where there is none or what followed may have changed it."""
+    """Return the material of the last change of it, None where there is none or what followed may have changed it."""
     for entry in reversed(edits):
         kind = entry.get("edit") if isinstance(entry, dict) else None
         if kind not in _KEEPING:

@@ -8,7 +8,7 @@ import torch
 
 from avmsf.modal.bank import ModalBank
 from avmsf.simulate.material import MATERIALS, Material
-from avmsf.tasks.recast import rayleigh_damping
+from avmsf.tasks.material import rayleigh_damping
 
 FITS = 2.0
 """By which factor, up or down, the middle one of a field's dampings may miss a law that is said to fit."""

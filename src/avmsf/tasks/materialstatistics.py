@@ -11,6 +11,7 @@ from jaxtyping import Float, Float64
 from scipy.optimize import nnls
 from torch import Tensor
 
+from avmsf._utils.arrays import Seed, generator_of
 from avmsf.errors import EditError, ExtractionError
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.bank import ModalBank
@@ -57,7 +58,7 @@ class MaterialStatistics:
         number of gains.
         """
         if not banks or any(len(bank) == 0 for bank in banks):
-            raise EditError(f"{name}: expected modes of every object, found none", name="banks", value=0)
+            raise EditError.expected(f"modes of every object of {name}", 0, got="none", name="banks")
         if len(banks) != len(gains):
             raise EditError(
                 f"{name}: expected gains of all {len(banks)} objects, got those of {len(gains)}",
@@ -128,7 +129,7 @@ class MaterialStatistics:
         return cls.of_modes(banks, gains, name=name or found[0].parent.name)
 
     @classmethod
-    def recast(cls, field: SoundField, old: Material, new: Material) -> "MaterialStatistics":
+    def transform(cls, field: SoundField, old: Material, new: Material) -> "MaterialStatistics":
         """Return what a field's object would be like in another material, by the laws of linear elasticity.
 
         Its frequencies times sqrt(E'/E r/r'), the new material's damping, its own brightness.
@@ -174,8 +175,8 @@ class MaterialStatistics:
             )
         return torch.cat(made)
 
-    def reference(self, *, samples: int, sample_rate: float, count: int = 8, seed: int = 0) -> Reference:
-        """Return synthetic impacts as the reference of an edit."""
-        generator = torch.Generator().manual_seed(seed)
+    def reference(self, *, samples: int, sample_rate: float, count: int = 8, seed: Seed = None) -> Reference:
+        """Return synthetic impacts as the reference of an edit; without a `seed` those of the seed 0."""
+        generator = generator_of(seed)
         sounds = self.sounds(count, samples=samples, sample_rate=sample_rate, generator=generator)
         return Reference.of(sounds, sample_rate=sample_rate, name=self.name)

@@ -54,7 +54,7 @@ class ModalEdit:
 
     @property
     def decay_factor(self) -> float:
-        """Common factor on all decay times, as `retune`'s `decay`: 1 / kappa."""
+        """Common factor on all decay times, as `adjust_modes`'s `decay`: 1 / kappa."""
         return 1.0 / self.damping_factor
 
     def to(self, device: torch.device | str) -> "ModalEdit":

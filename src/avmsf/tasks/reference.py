@@ -125,10 +125,11 @@ def wav_files(paths: str | Path | Sequence[str | Path]) -> list[Path]:
     for path in given:
         found += sorted(each for each in path.iterdir() if each.suffix.lower() == ".wav") if path.is_dir() else [path]
     if not found:
-        raise EditError(
-            f"{', '.join(map(str, given)) or 'reference'}: expected wav files, found none",
+        raise EditError.expected(
+            "one or more wav files",
             file=given[0] if given else None,
             name="reference",
+            advice="give a sound file, or a folder with some",
         )
     return found
 

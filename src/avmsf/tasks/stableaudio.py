@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from avmsf._utils.arrays import Seed, generator_of
 from avmsf._utils.device import usable_device
 from avmsf.errors import EditError
 from avmsf.tasks.clips import lasting
@@ -76,10 +77,11 @@ class StableAudio:
         try:
             pipeline = pipeline.to(place)
         except torch.OutOfMemoryError as error:
-            raise EditError(
-                f"{name}: out of memory on {place}; free memory, or choose the device cpu",
+            raise EditError.expected(
+                f"one with memory for {name}",
+                str(place),
                 name="device",
-                value=str(place),
+                advice="free memory, or choose the device cpu",
             ) from error
         return cls(pipeline, name=name, seconds=seconds)
 
@@ -200,12 +202,14 @@ class StableAudio:
         prompt: str,
         *,
         seconds: float,
-        seed: int,
+        seed: Seed = None,
         negative: str | None = None,
         steps: int = 100,
         guidance: float = 7.0,
     ) -> Float[Tensor, " samples"]:
         """Return a sound made from words alone, mono at the model's rate, by the pipeline's own sampler.
+
+        Without a `seed` it is that of the seed 0.
 
         Raises `EditError` for an empty prompt, more seconds than the model has, and where memory runs out.
         """
@@ -215,14 +219,15 @@ class StableAudio:
             latents = self._sampled(words, seconds, seed, negative=negative, steps=steps, guidance=guidance)
             return self.decode(latents, samples=round(seconds * self.sample_rate))[0].mean(dim=0).cpu()
         except torch.OutOfMemoryError as error:
-            raise EditError(
-                f"{self.name}: out of memory on {self.device} during generation; free memory, or choose the device cpu",
+            raise EditError.expected(
+                f"one with memory for a sound of {self.name}",
+                str(self.device),
                 name="device",
-                value=str(self.device),
+                advice="free memory, or choose the device cpu",
             ) from error
 
     def _sampled(
-        self, words: str, seconds: float, seed: int, *, negative: str | None, steps: int, guidance: float
+        self, words: str, seconds: float, seed: Seed, *, negative: str | None, steps: int, guidance: float
     ) -> Float[Tensor, "1 dim frames"]:
         """Return the latents that the pipeline makes of words."""
         with warnings.catch_warnings():
@@ -235,7 +240,7 @@ class StableAudio:
                 negative_prompt=negative,
                 num_inference_steps=steps,
                 guidance_scale=guidance,
-                generator=torch.Generator().manual_seed(seed),
+                generator=generator_of(seed),
                 output_type="latent",
             ).audios
         return latents

@@ -34,12 +34,13 @@ def load_pipeline(source: str | Path, dtype: torch.dtype) -> tuple[Any, str]:
     folder = Path(source).expanduser()
     named = not folder.is_dir()
     if named and not is_hub_name(source):
-        raise EditError(
-            f"{source}: expected a folder with a {_CLASS}, or a name of the hub such as {STABLE_AUDIO}, found no "
-            "folder; check the path",
+        raise EditError.expected(
+            f"a folder with a {_CLASS}, or a name of the hub such as {STABLE_AUDIO}",
+            str(source),
+            got="no such folder",
             file=folder,
             name="source",
-            value=str(source),
+            advice="check the path",
         )
     name = str(source) if named else folder.resolve().name
     folder = _from_hub(kind, name) if named else folder
@@ -130,21 +131,24 @@ def _expect_pipeline(folder: Path) -> None:
         )
     lacking = [part for part in _PARTS if not (folder / part).is_dir()]
     if lacking:
-        raise EditError(
-            f"{folder}: expected the folders {', '.join(_PARTS)}, found no {', '.join(lacking)}; copy them again",
+        raise EditError.expected(
+            f"the folders {', '.join(_PARTS)}",
+            tuple(lacking),
+            got=f"no {', '.join(lacking)}",
             file=folder,
             name="parts",
-            value=tuple(lacking),
+            advice="copy them again",
         )
     bare = [part for part in _NETWORKS if not any((folder / part).glob("*.safetensors"))]
     if bare:
-        raise EditError(
-            f"{folder}: expected weights (*.safetensors) in {', '.join(bare)}, found none; accept the license at "
-            f"https://huggingface.co/{STABLE_AUDIO}, run hf auth login and hf download {STABLE_AUDIO} --local-dir "
-            f"{folder} --exclude 'model.*'",
+        raise EditError.expected(
+            f"weights (*.safetensors) in {', '.join(bare)}",
+            tuple(bare),
+            got="none",
             file=folder,
             name="weights",
-            value=tuple(bare),
+            advice=f"accept the license at https://huggingface.co/{STABLE_AUDIO}, run hf auth login and hf download "
+            f"{STABLE_AUDIO} --local-dir {folder} --exclude 'model.*'",
         )
 
 

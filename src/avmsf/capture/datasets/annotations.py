@@ -74,6 +74,8 @@ def _read(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
-        raise DatasetError(f"{path}: expected a file, found none", file=path) from error
+        raise DatasetError.expected("a file", file=path, advice="unpack or download it again") from error
     except (OSError, UnicodeDecodeError) as error:
-        raise DatasetError(f"{path}: expected UTF-8 text, got {error}", file=path) from error
+        raise DatasetError.expected(
+            "UTF-8 text", got="bytes of another kind", file=path, advice="unpack or download it again"
+        ) from error

@@ -26,7 +26,7 @@ class ArrayForm:
 def judge_array(path: Path, form: ArrayForm, *, shown: str) -> DatasetError | None:
     """Return the error of a file by its header and size alone, whose message calls it `shown`; or None."""
     if not path.is_file():
-        return DatasetError(f"{shown}: the file is missing; download or unpack it again", file=path)
+        return DatasetError(f"{shown}: expected a file, got none; download or unpack it again", file=path)
     try:
         with open(path, "rb") as file:
             version = np.lib.format.read_magic(file)
@@ -34,8 +34,10 @@ def judge_array(path: Path, form: ArrayForm, *, shown: str) -> DatasetError | No
             shape, column_major, dtype = read(file)
             start = file.tell()
             size = path.stat().st_size
-    except (OSError, ValueError) as error:
-        return DatasetError(f"{shown}: expected a NumPy array ({error}); download it again", file=path, name="header")
+    except (OSError, ValueError):
+        return DatasetError(
+            f"{shown}: expected a NumPy array, got other bytes; download it again", file=path, name="header"
+        )
     fits = len(shape) == len(form.shape) and all(
         wanted in (None, length) for wanted, length in zip(form.shape, shape, strict=True)
     )

@@ -102,11 +102,8 @@ def gather(
 def refuse_few(count: int, *, origin: str, reasons: Sequence[str]) -> None:
     """Raise DatasetError with the reasons where fewer than two recordings can be used."""
     if count < FEWEST:
-        raise DatasetError(
-            f"{origin}: expected at least {FEWEST} recordings with contacts, found {count} that can be used"
-            + (f": {listed(reasons)}" if reasons else ""),
-            name=origin,
-            value=count,
+        raise DatasetError.expected(
+            f"at least {FEWEST} usable recordings with contacts", count, name=origin, advice=listed(reasons)
         )
 
 
@@ -116,12 +113,12 @@ def judge_wav(path: Path, *, shown: str, rate: float, frames: int) -> DatasetErr
     Expected is one channel of at least so many frames at the rate, Hz.
     """
     if not path.is_file():
-        return DatasetError(f"{shown}: the file is missing", file=path)
+        return DatasetError(f"{shown}: expected a sound file, got none; unpack or download it again", file=path)
     try:
         header = soundfile.info(str(path))
     except (soundfile.LibsndfileError, OSError) as error:
         reason = getattr(error, "error_string", str(error)).strip().rstrip(".")
-        return DatasetError(f"{shown}: expected a sound file ({reason}); unpack or download it again", file=path)
+        return DatasetError(f"{shown}: expected a sound file, got {reason!r}; unpack or download it again", file=path)
     for name, found, expected in (
         ("sample rate", header.samplerate, int(rate)),
         ("number of channels", header.channels, 1),

@@ -52,7 +52,7 @@ class CaptureCollection:
         try:
             return read_capture(folder, settings_of(folder).starting(self._time_zero))
         except CaptureError as error:
-            raise DatasetError(f"{folder}: {error}", **error.attributes) from error
+            raise DatasetError(str(error), **error.attributes) from error
 
     def look(self, identifier: str) -> Look | None:
         """Return the capture's folder where there is anything in it to see. Raises DatasetError for an unknown one and
@@ -102,9 +102,8 @@ class CaptureCollection:
                 problems.append(str(error))
             except (soundfile.LibsndfileError, OSError):
                 there = (folder / strikes[-1].file).is_file()
-                problems.append(
-                    f"{strikes[-1].file}: {'not a readable sound file' if there else 'the file is missing'}"
-                )
+                got = "an unreadable one; export it again as wav" if there else "none; copy it there"
+                problems.append(f"{strikes[-1].file}: expected a sound file, got {got}")
             else:
                 files.append(strikes[-1].file)
                 rates.append(float(header.samplerate))

@@ -84,7 +84,7 @@ class ContactLists:
             return None
         return DatasetError(
             f"object {identifier}: expected contact {contact} in {', '.join(path.name for path in self.files)}, "
-            "found none",
+            "got none",
             file=self.files[0],
             name=contact,
         )

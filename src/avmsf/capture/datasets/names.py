@@ -19,7 +19,7 @@ from avmsf.capture.datasets.numbering import (
 from avmsf.errors import DatasetError
 
 _NUMBER_COLUMNS = ("id", "index")
-_EXPECTED = "expected a CSV file with the header id,name,material, or a JSON list of objects with these keys"
+_EXPECTED = "a CSV file with the header id,name,material, or a JSON list of objects with these keys"
 
 
 @dataclass(frozen=True)
@@ -79,11 +79,11 @@ def _entries(path: Path) -> list[_Entry]:
         text = read_text(path)
         records = _json_records(parse_json(text)) if path.suffix.lower() == ".json" else _csv_records(text)
     except FileNotFoundError as error:
-        raise DatasetError(f"{path}: {_EXPECTED}, found no such file", file=path) from error
+        raise DatasetError.expected(_EXPECTED, got="no such file", file=path, advice="check the path") from error
     except (OSError, ValueError, csv.Error) as error:
-        raise DatasetError(f"{path}: {_EXPECTED}, got {error}", file=path) from error
+        raise DatasetError.expected(_EXPECTED, got=str(error), file=path) from error
     if not records:
-        raise DatasetError(f"{path}: {_EXPECTED}, got none", file=path, value=0)
+        raise DatasetError.expected(_EXPECTED, 0, got="no entry", file=path)
     return [_entry(record, path, row) for row, record in records]
 
 
@@ -102,9 +102,7 @@ def _entry(record: Mapping[str, Any], path: Path, row: int) -> _Entry:
     cells = {str(key).strip().lower(): "" if value is None else str(value).strip() for key, value in record.items()}
     number = next((cells[key] for key in _NUMBER_COLUMNS if key in cells), None)
     if number is None or "name" not in cells:
-        raise DatasetError(
-            f"{path}, row {row}: {_EXPECTED}, got {', '.join(cells)}", file=path, row=row, value=tuple(cells)
-        )
+        raise DatasetError.expected(_EXPECTED, tuple(cells), got=", ".join(cells), file=path, row=row)
     if not (number.isascii() and number.isdecimal() and int(number) > 0) or not cells["name"]:
         raise DatasetError(
             f"{path}, row {row}: expected an id above 0 and a name, got {number!r} and {cells['name']!r}",

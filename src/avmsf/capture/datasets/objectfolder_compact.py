@@ -69,7 +69,7 @@ class ObjectFolderCompact:
         origin = f"{self.name}, object {identifier}"
         if lost:
             raise DatasetError(
-                f"{origin}: expected the {len(lost)} recordings {listed(lost)} of split.json, found none; unpack "
+                f"{origin}: expected the {len(lost)} recordings {listed(lost)} of split.json, got none of them; unpack "
                 "audio.tar.gz again",
                 file=self.folder / "split.json",
                 name=identifier,
@@ -119,7 +119,7 @@ class ObjectFolderCompact:
         reports = []
         for identifier in self.objects():
             contacts, problems, lost = self._examine(identifier)
-            named = [f"{file}: the file is missing, but split.json lists it" for file in lost]
+            named = [f"{file}: expected a file, as split.json lists it, got none" for file in lost]
             reports.append(ObjectReport(self.facts(identifier), len(contacts), (*named, *problems)))
         missing = [
             f"{part}: unpack {part}.tar.gz of the contact-localization benchmark in {self.folder}"
@@ -177,8 +177,8 @@ class ObjectFolderCompact:
         try:
             value = read_json(path)
         except FileNotFoundError as error:
-            raise DatasetError(
-                f"{path}: the file is missing; the contact-localization benchmark has it", file=path
+            raise DatasetError.expected(
+                "a file", file=path, advice="download it from the contact-localization benchmark"
             ) from error
         except (OSError, ValueError) as error:
             raise DatasetError(f"{path}: expected a JSON file, got {error}; download it again", file=path) from error
@@ -193,9 +193,7 @@ class ObjectFolderCompact:
     def _expect(self, identifier: str) -> None:
         if identifier not in self.objects():
             if not self.objects():
-                raise DatasetError(
-                    f"{self.folder}: expected recordings, found none; unpack audio.tar.gz", file=self.folder
-                )
+                raise DatasetError.expected("recordings", file=self.folder, advice="unpack audio.tar.gz there")
             refuse_unknown(identifier, self.objects(), self.name)
 
     def _examine(self, identifier: str) -> tuple[list[str], list[str], list[str]]:

@@ -190,11 +190,11 @@ class ObjectFolderRaw:
                 except DatasetError as error:
                     wrong.append(error)
             elif read is read_newtons:
-                wrong.append(DatasetError(f"{shown}/{name}: the file is missing", file=path))
+                wrong.append(DatasetError(f"{shown}/{name}: expected a file, got none; unpack it again", file=path))
         if self._contacts is not None:
             wrong.append(self._contacts.judge(identifier, contact))
         elif not any(wrong):
-            wrong.append(DatasetError(f"{shown}: expected contact coordinates, found none", file=folder))
+            wrong.append(DatasetError(f"{shown}: expected contact coordinates, got none", file=folder))
         return [str(error) for error in wrong if error is not None]
 
     def _blows(self, identifier: str, strikes: list[_Strike]) -> Iterator[Blow]:

@@ -145,7 +145,9 @@ class RealImpact:
     def _mesh(self, identifier: str) -> Surface:
         shown = f"{identifier}/{FOLDER}/{MESH}"
         if not (self.folder / shown).is_file():
-            raise DatasetError(f"{shown}: the file is missing; unpack {identifier}.zip again", file=self.folder / shown)
+            raise DatasetError(
+                f"{shown}: expected a file, got none; unpack {identifier}.zip again", file=self.folder / shown
+            )
         try:
             return read_surface(self.folder / shown)
         except CaptureError as error:
@@ -171,7 +173,7 @@ class RealImpact:
         wrong = [str(problem) for problem in problems.values() if problem is not None]
         usable = not any(problems[name] for name in NEEDED)
         if not (folder / MESH).is_file():
-            wrong.append(f"{FOLDER}/{MESH}: the file is missing; the closest microphone cannot be found")
+            wrong.append(f"{FOLDER}/{MESH}: expected a file to find the closest microphone, got none; unpack it again")
             usable = False
         count = len(np.unique(self._array(identifier, "vertexID.npy"))) if usable else 0
         return ObjectReport(self.facts(identifier), count, tuple(wrong))

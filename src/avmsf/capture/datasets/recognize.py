@@ -40,7 +40,7 @@ def open_dataset(
     kind = _kind(folder)
     if kind is None:
         guess = _guess(folder)
-        raise DatasetError(f"{folder}: expected {SOUGHT}; {guess.message}", file=folder, value=guess.found)
+        raise DatasetError(f"{folder}: expected {SOUGHT}, {guess.message}", file=folder, value=guess.found)
     for name, given, takers in (
         ("contacts", contacts, (ObjectFolderRaw,)),
         ("table", table, (ObjectFolderRaw, ObjectFolderCompact)),
@@ -97,7 +97,7 @@ def _guess(folder: Path) -> _Guess:
             return found
     names = sorted(path.name + "/" * path.is_dir() for path in folder.iterdir() if path.name[0] != ".")
     more = f" and {len(names) - 8} more" if len(names) > 8 else ""
-    return _Guess(f"found {', '.join(names[:8])}{more}" if names else "the folder is empty", tuple(names))
+    return _Guess(f"got {', '.join(names[:8])}{more}" if names else "got an empty folder", tuple(names))
 
 
 def _too_low(folder: Path) -> _Guess | None:
@@ -112,11 +112,11 @@ def _too_low(folder: Path) -> _Guess | None:
     for pattern, what, levels in signs:
         if _any(folder, pattern):
             parent = folder.resolve().parents[levels - 1]
-            return _Guess(f"found {what}; name the folder {parent}", str(parent))
+            return _Guess(f"got {what}; name the folder {parent}", str(parent))
     for levels, pattern in enumerate(("[0-9]*/[0-9]*.wav", "[0-9]*.wav")):
         place = [folder.resolve(), *folder.resolve().parents][levels]
         if place.name == "audio" and _any(folder, pattern):
-            return _Guess(f"found recordings of the compact copy; name the folder {place.parent}", str(place.parent))
+            return _Guess(f"got recordings of the compact copy; name the folder {place.parent}", str(place.parent))
     return None
 
 
@@ -137,7 +137,7 @@ def _half_compact(folder: Path) -> _Guess | None:
     lacking = [f"{part}{_archive_of(folder, part)}" for part in PARTS if part not in there]
     if "audio" in there:
         lacking.append("recordings in audio/")
-    message = f"found part of the compact copy ({', '.join(there)}); {', '.join(lacking)} missing"
+    message = f"got part of the compact copy ({', '.join(there)}); {', '.join(lacking)} missing"
     return _Guess(message, tuple(there))
 
 
@@ -149,7 +149,7 @@ def _half_raw(folder: Path) -> _Guess | None:
         return _Guess("found ObjectFolder Real without recordings; unpack the audio archives again", "audio/")
     found = tuple(sorted(objects, key=int)[:5])
     return _Guess(
-        f"found folders {', '.join(found)} without audio/; if they are ObjectFolder Real's objects, unpack "
+        f"got folders {', '.join(found)} without audio/; if they are ObjectFolder Real's objects, unpack "
         "audio_data_1_10.tar.gz and so on here (videos and tactile data are not used)",
         found,
     )
@@ -157,7 +157,7 @@ def _half_raw(folder: Path) -> _Guess | None:
 
 def _half_realimpact(folder: Path) -> _Guess | None:
     below = sorted(path.name for path in folder.glob(f"*/{FOLDER}") if path.is_dir())
-    message = f"found {FOLDER}/ without arrays; unpack RealImpact's archives again"
+    message = f"got {FOLDER}/ without arrays; unpack RealImpact's archives again"
     return _Guess(message, f"{FOLDER}/") if below else None
 
 
@@ -167,7 +167,7 @@ def _packed(folder: Path) -> _Guess | None:
         return None
     command = "unzip" if archives[0].endswith(".zip") else "tar -xf"
     more = f" and {len(archives) - 4} more" if len(archives) > 4 else ""
-    message = f"found archives, {', '.join(archives[:4])}{more}; unpack them, `{command} {archives[0]}` in {folder}"
+    message = f"got archives, {', '.join(archives[:4])}{more}; unpack them, `{command} {archives[0]}` in {folder}"
     return _Guess(message, tuple(archives))
 
 
@@ -184,7 +184,7 @@ def _no_folder(path: Path) -> DatasetError:
     if path.parent.is_dir():
         near = get_close_matches(path.name, [each.name for each in path.parent.iterdir() if each.is_dir()], n=1)
     meant = f"; did you mean {path.parent / near[0]}?" if near else ""
-    return DatasetError(f"{path}: expected a folder, found none{meant}", file=path, value=tuple(near))
+    return DatasetError(f"{path}: expected a folder, got none{meant}", file=path, value=tuple(near))
 
 
 def _any(folder: Path, pattern: str) -> bool:

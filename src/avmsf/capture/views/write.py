@@ -14,6 +14,7 @@ import numpy as np
 from avmsf.capture.cameras import View
 from avmsf.capture.location import expect_free
 from avmsf.errors import CaptureError
+from avmsf.files import unwritable
 
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -46,7 +47,7 @@ def write_views(views: Sequence[View], folder: str | Path) -> None:
             folder.rmdir()
         os.rename(begun, folder)
     except OSError as error:
-        raise CaptureError(f"{folder}: the views cannot be written ({error})", file=folder) from error
+        raise unwritable(folder, error, raising=CaptureError) from error
     finally:
         shutil.rmtree(begun, ignore_errors=True)
 

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from avmsf.cli.options.common import FieldFile, Printing, parse_options
-from avmsf.tasks.config import STABLE_AUDIO, DistillationConfig, SteerConfig
+from avmsf.tasks.config import STABLE_AUDIO, DistillationConfig, GuidedEditConfig
 
 _Pairs = tyro.conf.UseAppendAction[tuple[tuple[float, float], ...]]
 
@@ -72,7 +72,7 @@ class GuideOptions:
     like: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="WAV|FOLDER ...")] = ()
     """Recordings of impacts on another object to imitate: files or folders of them."""
     like_material: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Material to imitate statistically, with this object's modes recast by the laws of elasticity as the target;
+    """Material to imitate statistically, with this object's modes in it by the laws of elasticity as the target;
     --material follows these laws exactly."""
     model: Annotated[str, tyro.conf.arg(metavar="FOLDER|NAME")] = STABLE_AUDIO
     """Stable Audio pipeline: a folder, or its name on the hub."""
@@ -94,7 +94,7 @@ class GuideOptions:
     factors."""
     distillation: tyro.conf.OmitArgPrefixes[DistillationConfig] = field(default_factory=DistillationConfig)
     """Targets from the model."""
-    config: tyro.conf.OmitArgPrefixes[SteerConfig] = field(default_factory=SteerConfig)
+    config: tyro.conf.OmitArgPrefixes[GuidedEditConfig] = field(default_factory=GuidedEditConfig)
     """How the modes are optimized."""
 
 

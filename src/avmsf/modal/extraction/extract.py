@@ -60,9 +60,16 @@ def extract_modes(recordings: Capture | Impacts, method: ModeFinder | None = Non
 
     `method` is `HighResolution()` unless another is given. Recordings that are not final (`Impacts.before`) are aligned
     with one another first. Gains are the least-squares amplitudes of the modes over the whole of each sound. Raises
-    `ExtractionError` when no mode is found.
+    `ExtractionError` when no mode is found, and for recordings of another type.
     """
     impacts = recordings.impacts if isinstance(recordings, Capture) else recordings
+    if not isinstance(impacts, Impacts):
+        raise ExtractionError.expected(
+            "a Capture or Impacts",
+            type(impacts).__name__,
+            name="recordings",
+            advice="read a folder by avmsf.Capture.read(folder)",
+        )
     alignment = None if impacts.before is None or len(impacts) < 2 else align(impacts)
     final = impacts if alignment is None else alignment.apply(impacts)
     found = extract_sounds(final.sounds, sample_rate=impacts.sample_rate, method=method)

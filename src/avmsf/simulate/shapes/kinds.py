@@ -31,8 +31,8 @@ _ROUNDS = 4
 """Drafts until walls and size are both as asked for."""
 
 
-def make_shape(kind: str, *, seed: int = 0, size: float | None = None, wall: float | None = None) -> Shape:
-    """Return one individual of a kind in `KINDS`; another seed draws other proportions and colors.
+def make_shape(kind: str, *, seed: int | None = 0, size: float | None = None, wall: float | None = None) -> Shape:
+    """Return one individual of a kind in `KINDS`; another seed draws other proportions and colors, None the first.
 
     `size` is the longest side of its bounding box and `wall` the nominal thickness of its walls, meters; both are
     drawn where they are not given, and a size alone scales the walls with everything else. Raises SimulationError for
@@ -41,6 +41,7 @@ def make_shape(kind: str, *, seed: int = 0, size: float | None = None, wall: flo
     """
     if kind not in KINDS:
         raise SimulationError.expected(f"one of {', '.join(sorted(KINDS))}", kind, name="kind")
+    seed = 0 if seed is None else seed
     if seed < 0:
         raise SimulationError(f"seed: expected 0 or more, got {seed}", name="seed", value=seed)
     for name, value in (("size", size), ("wall", wall)):

@@ -19,10 +19,10 @@ from avmsf.field.soundfield import SoundField
 from avmsf.modal.config import scaled_fft_size
 from avmsf.scene.points import farthest_points
 from avmsf.tasks.clips import level
-from avmsf.tasks.config import SteerConfig
+from avmsf.tasks.config import GuidedEditConfig
+from avmsf.tasks.guided_checkpoint import asked
 from avmsf.tasks.modaledit import ModalEdit, Struck
 from avmsf.tasks.parameters import HIERARCHICAL, EditVariables, Parameterisation
-from avmsf.tasks.steercheckpoint import asked
 
 _PROBES = 16
 """Contacts, far apart, for the strongest modes, the start and the level."""
@@ -61,7 +61,7 @@ class Guide(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class SteerProgress:
+class GuidedEditProgress:
     """Progress of an edit."""
 
     step: int
@@ -80,13 +80,13 @@ class SteerProgress:
     """The contact of the preview, object frame, meters."""
 
 
-def steer(
+def edit_towards(
     field: SoundField,
     guide: Guide,
     *,
-    config: SteerConfig | None = None,
+    config: GuidedEditConfig | None = None,
     parameters: Parameterisation = HIERARCHICAL,
-    progress: Callable[[SteerProgress], None] | None = None,
+    progress: Callable[[GuidedEditProgress], None] | None = None,
     checkpoint: str | Path | None = None,
     device: torch.device | str = "cpu",
 ) -> SoundField:
@@ -99,7 +99,7 @@ def steer(
     same result. Raises `EditError` for a field that is silent, for a guide at another rate, for a checkpoint of another
     edit, and where the guide's targets or the loss are not finite.
     """
-    config = SteerConfig() if config is None else config
+    config = GuidedEditConfig() if config is None else config
     run = _Steering(field, guide, config, parameters, None if checkpoint is None else Path(checkpoint), device)
     return run.to_the_end(progress)
 
@@ -111,7 +111,7 @@ class _Steering:
         self,
         field: SoundField,
         guide: Guide,
-        config: SteerConfig,
+        config: GuidedEditConfig,
         parameters: Parameterisation,
         checkpoint: Path | None,
         device: torch.device | str,
@@ -151,7 +151,7 @@ class _Steering:
             self.variables.resume(state["variables"])
             self.step, self.spoilt = state["step"], state["spoilt"]
 
-    def to_the_end(self, progress: Callable[[SteerProgress], None] | None) -> SoundField:
+    def to_the_end(self, progress: Callable[[GuidedEditProgress], None] | None) -> SoundField:
         """Take the steps that are left and return the edited field."""
         try:
             while self.step < self.config.steps:
@@ -161,7 +161,7 @@ class _Steering:
                     due = every > 0 and (self.step % every == 0 or self.step == self.config.steps)
                     preview = self._preview() if due else None
                     factors, place = (edit.pitch_factor, edit.decay_factor), self.loudest_place if due else None
-                    progress(SteerProgress(self.step, self.config.steps, loss, *factors, preview, place))
+                    progress(GuidedEditProgress(self.step, self.config.steps, loss, *factors, preview, place))
                 if time.monotonic() - self.saved_at > _CHECKPOINT_SECONDS:
                     self._save()
         except KeyboardInterrupt:

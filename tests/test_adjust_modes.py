@@ -10,7 +10,7 @@ from avmsf.field.scaledgains import ScaledGains
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.residual import Residual
-from avmsf.tasks.retune import brightness_center, retune
+from avmsf.tasks.modes import adjust_modes, brightness_center
 from made_fields import BANK, FIELDS, places
 from raising import raises
 
@@ -37,7 +37,7 @@ def expect_same(found: SoundField, expected: SoundField) -> None:
 
 
 def test_without_values_nothing_changes():
-    before, after = field(), retune(field())
+    before, after = field(), adjust_modes(field())
     assert torch.equal(after.bank.frequency, before.bank.frequency)
     assert torch.equal(after.bank.damping, before.bank.damping)
     assert torch.equal(after.render(PLACES), before.render(PLACES))
@@ -46,7 +46,7 @@ def test_without_values_nothing_changes():
 @pytest.mark.parametrize("name", ["positional", "attention with dampings", "elastic"])
 def test_pitch_moves_frequencies_and_decay_the_ring_times(name):
     before, factors = field(name), torch.linspace(0.5, 1.5, 5, dtype=torch.float64)
-    after = retune(before, pitch=1.2, decay=factors)
+    after = adjust_modes(before, pitch=1.2, decay=factors)
     torch.testing.assert_close(after.bank.frequency, 1.2 * before.bank.frequency)
     torch.testing.assert_close(1 / after.bank.damping, factors / before.bank.damping)
     torch.testing.assert_close(
@@ -65,17 +65,17 @@ def test_brightness_is_decibels_an_octave_about_the_center():
     power = (known.mean.double() ** 2 + known.quadrature.double() ** 2).mean(0)
     by_hand = float((power * BANK.frequency.log()).sum() / power.sum())
     assert math.log(center) == pytest.approx(by_hand, rel=1e-6)
-    louder = change_db(before, retune(before, brightness_db=6.0))
+    louder = change_db(before, adjust_modes(before, brightness_db=6.0))
     torch.testing.assert_close(louder, 6.0 * torch.log2(BANK.frequency / center), rtol=0, atol=1e-5)
     # Heard where the modes come to lie.
-    high = retune(before, brightness_db=6.0, pitch=[1.0, 1.0, 1.0, 1.0, 2.0])
+    high = adjust_modes(before, brightness_db=6.0, pitch=[1.0, 1.0, 1.0, 1.0, 2.0])
     step = change_db(before, high) - 6.0 * torch.log2(high.bank.frequency / brightness_center(before, high.bank))
     assert float(step.abs().max()) < 1e-5
 
 
 def test_levels_raise_and_mute_single_modes(tmp_path):
     before = field()
-    after = retune(before, gains_db=[0.0, 6.0, -math.inf, -6.0, 0.0])
+    after = adjust_modes(before, gains_db=[0.0, 6.0, -math.inf, -6.0, 0.0])
     assert not bool(after.gains(PLACES)[:, 2].any())
     louder = change_db(before, after)
     assert louder[[0, 1, 3, 4]].tolist() == pytest.approx([0.0, 6.0, -6.0, 0.0], abs=1e-5)
@@ -89,22 +89,22 @@ def test_two_edits_are_the_one_with_both_and_an_edit_can_be_undone():
     one = {"pitch": 1.2, "decay": factors, "brightness_db": 4.0, "gains_db": 3 * factors}
     other = {"pitch": 0.7, "decay": 2.0, "brightness_db": -7.0, "gains_db": -4 * factors}
     both = {"pitch": 1.2 * 0.7, "decay": 2 * factors, "brightness_db": -3.0, "gains_db": -factors}
-    expect_same(retune(retune(before, **one), **other), retune(before, **both))
+    expect_same(adjust_modes(adjust_modes(before, **one), **other), adjust_modes(before, **both))
     back = {"pitch": 1 / 1.2, "decay": 1 / factors, "brightness_db": -4.0, "gains_db": -3 * factors}
-    expect_same(retune(retune(before, **one), **back), before)
-    assert isinstance(before.gain_field, type(retune(retune(before, **one), **other).gain_field.field))
+    expect_same(adjust_modes(adjust_modes(before, **one), **back), before)
+    assert isinstance(before.gain_field, type(adjust_modes(adjust_modes(before, **one), **other).gain_field.field))
     assert not isinstance(before.gain_field, ScaledGains)
 
 
 def test_modes_beyond_half_the_sample_rate_are_silent_and_come_back():
     before = field()
-    high = retune(before, pitch=2.0)
+    high = adjust_modes(before, pitch=2.0)
     assert high.origin.report["edits"][-1]["silent_hertz"] == [4600.0]
-    muted = retune(high, gains_db=[0.0, 0.0, 0.0, 0.0, -math.inf])
+    muted = adjust_modes(high, gains_db=[0.0, 0.0, 0.0, 0.0, -math.inf])
     assert torch.equal(high.render(PLACES), muted.render(PLACES))
     assert float((high.render(PLACES) - before.render(PLACES)).abs().max()) > 0
-    expect_same(retune(high, pitch=0.5), before)
-    gone = retune(before, pitch=100.0)
+    expect_same(adjust_modes(high, pitch=0.5), before)
+    gone = adjust_modes(before, pitch=100.0)
     assert len(gone.origin.report["edits"][-1]["silent_hertz"]) == 5
     # Nothing but the residual.
     assert float(gone.render(PLACES).abs().max()) < 1e-8
@@ -114,15 +114,15 @@ def test_values_that_cannot_be_are_refused():
     for name in ("pitch", "decay"):
         for value in (0.0, -1.0, math.inf, math.nan, [1.0, 1.0, 0.0, 1.0, 1.0]):
             with raises(EditError, name=name, row=2 if isinstance(value, list) else 0):
-                retune(field(), **{name: value})
+                adjust_modes(field(), **{name: value})
     with raises(EditError, name="pitch", row=4, value=math.inf):
-        retune(field(), pitch=[1.0, 1.1, 1.2, 1.3, math.inf])
+        adjust_modes(field(), pitch=[1.0, 1.1, 1.2, 1.3, math.inf])
     with raises(EditError, name="pitch", row=None, value=[3]):
-        retune(field(), pitch=[1.0, 1.0, 1.0])
+        adjust_modes(field(), pitch=[1.0, 1.0, 1.0])
     for value in (math.inf, math.nan):
         with raises(EditError, name="gains_db", row=0):
-            retune(field(), gains_db=value)
+            adjust_modes(field(), gains_db=value)
         with raises(EditError, name="brightness_db", row=None):
-            retune(field(), brightness_db=value)
+            adjust_modes(field(), brightness_db=value)
     with raises(EditError, name="gain factor", row=0, value=math.inf):
-        retune(field(), gains_db=1e5)
+        adjust_modes(field(), gains_db=1e5)

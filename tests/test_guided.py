@@ -8,16 +8,16 @@ import torch
 
 from avmsf.errors import EditError
 from avmsf.tasks.clips import level
-from avmsf.tasks.config import SteerConfig
+from avmsf.tasks.config import GuidedEditConfig
+from avmsf.tasks.guided import Guide, edit_towards
 from avmsf.tasks.modaledit import ModalEdit
+from avmsf.tasks.modes import adjust_modes
 from avmsf.tasks.parameters import HIERARCHICAL, INDEPENDENT, PUBLISHED, SEARCHED
 from avmsf.tasks.reference import Reference
-from avmsf.tasks.retune import retune
-from avmsf.tasks.steer import Guide, steer
 from raising import raises
 from ringing_field import RATE, SameGains, ringing_field, sound_of
 
-QUICK = SteerConfig(steps=12, contacts=2, preview_every=5, seconds=0.25, fft_sizes=(2048, 512))
+QUICK = GuidedEditConfig(steps=12, contacts=2, preview_every=5, seconds=0.25, fft_sizes=(2048, 512))
 
 
 @dataclass
@@ -49,7 +49,7 @@ def towards(**change: float) -> Towards:
 
 def trace(field, guide, **arguments):
     seen = []
-    made = steer(field, guide, progress=seen.append, **arguments)
+    made = edit_towards(field, guide, progress=seen.append, **arguments)
     return made, seen
 
 
@@ -71,14 +71,14 @@ def test_decay_means_in_every_edit_how_long_it_rings():
     # Modes move by themselves, too: what they have in common is their median.
     common = float((ringing_field().bank.damping / made.bank.damping).median())
     assert told == seen[-1].decay == pytest.approx(common, rel=0.1)
-    by_hand = retune(ringing_field(), decay=told)
+    by_hand = adjust_modes(ringing_field(), decay=told)
     assert float((by_hand.bank.damping / made.bank.damping).median()) == pytest.approx(1.0, rel=0.1)
     assert told < 0.9
 
 
 def test_a_target_that_is_met_moves_little():
     field = ringing_field()
-    made = steer(field, towards(), config=QUICK)
+    made = edit_towards(field, towards(), config=QUICK)
     torch.testing.assert_close(made.bank.frequency, field.bank.frequency, rtol=0.02, atol=0)
     torch.testing.assert_close(made.bank.damping, field.bank.damping, rtol=0.1, atol=0)
 
@@ -99,14 +99,14 @@ def test_level_is_no_part_of_the_edit():
     # Whatever the field's unit, and however loud what it shall sound like.
     for factor in (1.0, 1e-4):
         field = ringing_field(level=factor)
-        made = steer(field, towards(pitch=1.02, damping=2.0, level=factor), config=QUICK)
+        made = edit_towards(field, towards(pitch=1.02, damping=2.0, level=factor), config=QUICK)
         before, after = (level(sound_of(each), sample_rate=RATE) for each in (field, made))
         torch.testing.assert_close(after, before, rtol=1e-4, atol=0)
 
 
 def test_modes_beyond_the_count_follow_the_common_factors_alone():
     field = ringing_field()
-    made = steer(field, towards(pitch=1.01), config=replace(QUICK, modes=2))
+    made = edit_towards(field, towards(pitch=1.01), config=replace(QUICK, modes=2))
     entry = made.origin.report["edits"][-1]
     ratio = made.bank.frequency / field.bank.frequency / entry["pitch"]
     alone = (ratio - 1).abs() > 1e-9
@@ -161,7 +161,7 @@ def test_stiffness_keeps_modes_together():
         guide = Towards(sound_of(ringing_field()).roll(1) + sound_of(ringing_field(pitch=1.03)))
         parameters = replace(HIERARCHICAL, stiffness=stiffness)
         field = ringing_field()
-        made = steer(field, guide, config=replace(QUICK, steps=25), parameters=parameters)
+        made = edit_towards(field, guide, config=replace(QUICK, steps=25), parameters=parameters)
         return float((made.bank.frequency / field.bank.frequency).log().std())
 
     assert spread(100.0) < 0.3 * spread(0.0)
@@ -183,9 +183,9 @@ def test_an_interrupted_edit_goes_on_to_the_same_result(tmp_path, stop):
         if progress.step == stop:
             raise KeyboardInterrupt
 
-    whole = steer(field, guide, config=QUICK)
+    whole = edit_towards(field, guide, config=QUICK)
     with pytest.raises(KeyboardInterrupt):
-        steer(field, guide, config=QUICK, progress=interrupt, checkpoint=place)
+        edit_towards(field, guide, config=QUICK, progress=interrupt, checkpoint=place)
     resumed, seen = trace(field, guide, config=QUICK, checkpoint=place)
     assert [each.step for each in seen] == list(range(stop + 1, 13))
     assert torch.equal(resumed.bank.frequency, whole.bank.frequency)
@@ -195,25 +195,25 @@ def test_an_interrupted_edit_goes_on_to_the_same_result(tmp_path, stop):
 
 def test_seeds_reproduce_and_differ():
     field, guide = ringing_field(), replace(towards(pitch=1.02), noise=0.5)
-    first, again, other = (steer(field, guide, config=replace(QUICK, seed=seed)) for seed in (3, 3, 4))
+    first, again, other = (edit_towards(field, guide, config=replace(QUICK, seed=seed)) for seed in (3, 3, 4))
     assert torch.equal(first.bank.frequency, again.bank.frequency)
     assert not torch.equal(first.bank.frequency, other.bank.frequency)
 
 
 def test_a_checkpoint_of_another_edit_is_refused_by_name(tmp_path):
     place, guide = tmp_path / "state", towards(pitch=1.02)
-    steer(ringing_field(), guide, config=QUICK, checkpoint=place)
+    edit_towards(ringing_field(), guide, config=QUICK, checkpoint=place)
     with raises(EditError, file=place, value=["field"]):
-        steer(ringing_field(pitch=1.1), guide, config=QUICK, checkpoint=place)
+        edit_towards(ringing_field(pitch=1.1), guide, config=QUICK, checkpoint=place)
     with raises(EditError, file=place, value=["guide"]):
-        steer(ringing_field(), towards(pitch=1.03), config=QUICK, checkpoint=place)
+        edit_towards(ringing_field(), towards(pitch=1.03), config=QUICK, checkpoint=place)
     # How often previews come changes nothing.
-    steer(ringing_field(), guide, config=replace(QUICK, preview_every=3), checkpoint=place)
+    edit_towards(ringing_field(), guide, config=replace(QUICK, preview_every=3), checkpoint=place)
     with raises(EditError, file=place, value=["settings"]):
-        steer(ringing_field(), guide, config=replace(QUICK, steps=13), checkpoint=place)
+        edit_towards(ringing_field(), guide, config=replace(QUICK, steps=13), checkpoint=place)
     place.write_bytes(place.read_bytes()[:100])
     with raises(EditError, file=place, value=None):
-        steer(ringing_field(), guide, config=QUICK, checkpoint=place)
+        edit_towards(ringing_field(), guide, config=QUICK, checkpoint=place)
 
 
 def test_spoilt_targets_are_left_out():
@@ -226,20 +226,20 @@ def test_spoilt_targets_are_left_out():
 def test_nothing_but_spoilt_targets_ends_the_edit():
     guide = Towards(torch.full((1, 4000), math.nan))
     with raises(EditError, name="targets", value=20):
-        steer(ringing_field(), guide, config=replace(QUICK, steps=40))
+        edit_towards(ringing_field(), guide, config=replace(QUICK, steps=40))
 
 
 @pytest.mark.parametrize("parameters", [HIERARCHICAL, INDEPENDENT], ids=lambda each: each.name)
 def test_a_guide_at_another_rate_is_refused(parameters):
     reference = Reference.of(sound_of(ringing_field()), sample_rate=2 * RATE, name="bell.wav")
     with raises(EditError, name="sample_rate", value=2 * RATE):
-        steer(ringing_field(), reference, config=QUICK, parameters=parameters)
+        edit_towards(ringing_field(), reference, config=QUICK, parameters=parameters)
 
 
 def test_a_silent_field_is_refused():
     field = replace(ringing_field(), gain_field=SameGains(torch.zeros(6)))
     with raises(EditError, name="field", value=0.0):
-        steer(field, towards(), config=QUICK)
+        edit_towards(field, towards(), config=QUICK)
 
 
 @pytest.mark.parametrize(
@@ -248,7 +248,7 @@ def test_a_silent_field_is_refused():
 )
 def test_settings_that_cannot_be_meant(name, value):
     with raises(EditError, name=name, value=value):
-        SteerConfig(**{name: value})
+        GuidedEditConfig(**{name: value})
 
 
 def test_what_the_package_has_are_guides():

@@ -18,7 +18,7 @@ from torch import Tensor
 from avmsf.errors import EditError
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.modal.bank import ModalBank
-from avmsf.simulate.material import Material
+from avmsf.simulate.material import Material, material_named
 from avmsf.tasks.edits import EDITS, edited, muted
 
 
@@ -45,11 +45,12 @@ LAWS = {law.name: law for law in (DISPLACEMENT, VELOCITY, ACCELERATION, RATIO_ON
 """All of them, by name."""
 
 
-def recast(
-    field: SoundField, old: Material, new: Material, *, size: float = 1.0, law: GainLaw = DISPLACEMENT
+def change_material(
+    field: SoundField, old: Material | str, new: Material | str, *, size: float = 1.0, law: GainLaw = DISPLACEMENT
 ) -> SoundField:
     """Return the field of an object of the same shape, `size` times as large, in a new material.
 
+    Materials are given as such, or by their name in `avmsf.simulate.material.MATERIALS`.
     The dampings of the field are multiplied by the ratio of what the two materials' Rayleigh laws say, so that
     each mode's deviation from the law (by supports and radiation) stays in proportion; the same material changes
     nothing, and a third material in between gives the same result, unless it overdamps a mode.
@@ -62,8 +63,10 @@ def recast(
     damps beyond the critical damping, which have no tone: they are mute from then on, and keep the frequency and the
     damping that they had; and another Poisson's ratio, which changes shapes and takes a new solve.
 
-    Raises `EditError` for a size that is not positive, and where one of the materials has no damping and the other has.
+    Raises `EditError` for a size that is not positive, and where one of the materials has no damping and the other has,
+    and `SimulationError` for a name of no material.
     """
+    old, new = (material_named(each) if isinstance(each, str) else each for each in (old, new))
     _expect(old, new, size)
     before, mute = field.bank, muted(field)
     omega = torch.hypot(2.0 * math.pi * before.frequency, before.damping)

@@ -20,7 +20,7 @@ _POINTS = 256
 """Points of the object that a mode's strength is taken over, at most."""
 
 
-def retune(
+def adjust_modes(
     field: SoundField,
     *,
     pitch: Slider = 1.0,

@@ -20,9 +20,9 @@ from avmsf.simulate.material import CERAMIC, GLASS, PLASTIC, STEEL, WOOD, Materi
 from avmsf.simulate.plate import Plate, plate_modes, sample_contacts
 from avmsf.simulate.vibration import rayleigh
 from avmsf.tasks.edits import silenced
+from avmsf.tasks.material import ACCELERATION, DISPLACEMENT, LAWS, RATIO_ONLY, VELOCITY, change_material
 from avmsf.tasks.materialguess import guess_materials
-from avmsf.tasks.recast import ACCELERATION, DISPLACEMENT, LAWS, RATIO_ONLY, VELOCITY, recast
-from avmsf.tasks.retune import retune
+from avmsf.tasks.modes import adjust_modes
 from raising import raises
 
 RATE = 44100.0
@@ -89,14 +89,14 @@ def test_a_plate_of_another_material_and_size_is_the_one_in_closed_form(size):
     undamped = 3000.0
     expected = plate_modes(plate_of(OTHER, size=size), size * CONTACTS, highest=undamped * faster)
     # A plate's gains are pseudo-velocities, see `simulate.plate`.
-    found = recast(plate_field(steel, highest=undamped), steel, OTHER, size=size, law=VELOCITY)
+    found = change_material(plate_field(steel, highest=undamped), steel, OTHER, size=size, law=VELOCITY)
     torch.testing.assert_close(found.bank.frequency, expected.frequency, rtol=1e-13, atol=0)
     torch.testing.assert_close(found.bank.damping, expected.damping, rtol=1e-13, atol=0)
     gains = gains_of(found, size * CONTACTS)[0]
     torch.testing.assert_close(gains, expected.gains, rtol=0, atol=SMALL_FLOAT * float(expected.gains.abs().max()))
     # Displacements are those over the damped angular frequency, accelerations are times it.
     for law, power in ((DISPLACEMENT, 1.0), (ACCELERATION, -1.0)):
-        other = recast(plate_field(steel, highest=undamped), steel, OTHER, size=size, law=law)
+        other = change_material(plate_field(steel, highest=undamped), steel, OTHER, size=size, law=law)
         start = plate_modes(plate_of(steel), CONTACTS, highest=undamped).frequency
         ratio = gains_of(other, size * CONTACTS)[0] / gains
         torch.testing.assert_close(ratio, ((start / expected.frequency) ** power).expand_as(ratio), rtol=1e-5, atol=0)
@@ -117,7 +117,7 @@ def test_recasting_is_a_fresh_finite_element_solve(size):
         # Displacement of the last place, by a newton second at each.
         return field_of(angular / (2 * math.pi), damping, shapes * shapes[-1] / angular, scale * places)
 
-    found, fresh = recast(solved(CERAMIC, 1.0), CERAMIC, new, size=size), solved(new, size)
+    found, fresh = change_material(solved(CERAMIC, 1.0), CERAMIC, new, size=size), solved(new, size)
     frequency = (found.bank.frequency / fresh.bank.frequency - 1).abs()
     assert float(frequency.max()) < 1e-9
     assert float((found.bank.damping / fresh.bank.damping - 1).abs().max()) < 1e-8
@@ -133,40 +133,42 @@ def test_a_material_given_to_itself_and_one_by_way_of_another(law):
     field = replace(
         field, bank=ModalBank(field.bank.frequency, field.bank.damping * torch.linspace(0.5, 3.0, len(field.bank)))
     )
-    expect_same(recast(field, STEEL, STEEL, law=law), field, CONTACTS)
-    twice = recast(recast(field, STEEL, OTHER, size=0.5, law=law), OTHER, THIRD, size=3.0, law=law)
-    expect_same(twice, recast(field, STEEL, THIRD, size=1.5, law=law), 1.5 * CONTACTS)
-    expect_same(recast(twice, THIRD, STEEL, size=1 / 1.5, law=law), field, CONTACTS)
+    expect_same(change_material(field, STEEL, STEEL, law=law), field, CONTACTS)
+    twice = change_material(change_material(field, STEEL, OTHER, size=0.5, law=law), OTHER, THIRD, size=3.0, law=law)
+    expect_same(twice, change_material(field, STEEL, THIRD, size=1.5, law=law), 1.5 * CONTACTS)
+    expect_same(change_material(twice, THIRD, STEEL, size=1 / 1.5, law=law), field, CONTACTS)
     assert len(twice.origin.report["edits"]) == 2
 
 
 def test_the_name_says_the_last_material():
     field = plate_field(STEEL)
     field = replace(field, origin=replace(field.origin, capture="mug"))
-    glass = recast(field, STEEL, GLASS)
-    wood = recast(retune(glass, pitch=1.1), GLASS, WOOD)
-    larger = recast(wood, WOOD, WOOD, size=2.0)
-    names = [each.origin.capture for each in (recast(field, STEEL, STEEL), glass, wood, larger)]
+    glass = change_material(field, STEEL, GLASS)
+    wood = change_material(adjust_modes(glass, pitch=1.1), GLASS, WOOD)
+    larger = change_material(wood, WOOD, WOOD, size=2.0)
+    names = [each.origin.capture for each in (change_material(field, STEEL, STEEL), glass, wood, larger)]
     assert names == ["mug", "mug, glass", "mug, wood", "mug, wood"]
-    assert recast(larger, WOOD, GLASS).origin.capture == "mug, glass"
+    assert change_material(larger, WOOD, GLASS).origin.capture == "mug, glass"
 
 
 def test_a_modes_own_damping_stays_in_proportion_to_the_law():
     field = plate_field(GLASS)
     own = torch.linspace(0.3, 5.0, len(field.bank), dtype=torch.float64)
-    strange = recast(replace(field, bank=ModalBank(field.bank.frequency, field.bank.damping * own)), GLASS, WOOD)
-    plain = recast(field, GLASS, WOOD)
+    strange = change_material(
+        replace(field, bank=ModalBank(field.bank.frequency, field.bank.damping * own)), GLASS, WOOD
+    )
+    plain = change_material(field, GLASS, WOOD)
     # Its undamped frequency, which the law is taken at, has its own damping in it: 5e-6 of the frequency here.
     torch.testing.assert_close(strange.bank.damping / plain.bank.damping, own, rtol=1e-4, atol=0)
 
 
 def test_ratios_of_gains_between_places_stay():
     field = plate_field(CERAMIC)
-    found = recast(field, CERAMIC, WOOD, size=2.0)
+    found = change_material(field, CERAMIC, WOOD, size=2.0)
     before, after = gains_of(field, CONTACTS), gains_of(found, 2.0 * CONTACTS)
     change = after / before
     torch.testing.assert_close(change, change[:1, :1].expand_as(change), rtol=1e-6, atol=0)
-    ratio_only = recast(field, CERAMIC, WOOD, law=RATIO_ONLY)
+    ratio_only = change_material(field, CERAMIC, WOOD, law=RATIO_ONLY)
     expected = field.bank.frequency / ratio_only.bank.frequency
     change = gains_of(ratio_only, CONTACTS) / before
     torch.testing.assert_close(change, expected.expand_as(change), rtol=1e-6, atol=0)
@@ -174,7 +176,7 @@ def test_ratios_of_gains_between_places_stay():
 
 def test_modes_beyond_half_the_sample_rate_are_silent_reported_and_come_back():
     field = plate_field(PLASTIC, highest=5000.0)
-    found = recast(field, PLASTIC, OTHER)
+    found = change_material(field, PLASTIC, OTHER)
     silent = ~found.audible
     assert 0 < int(silent.sum()) < len(silent)
     told = found.origin.report["edits"][-1]
@@ -188,7 +190,7 @@ def test_modes_beyond_half_the_sample_rate_are_silent_reported_and_come_back():
         expected += torch.exp(-found.bank.damping[mode] * times) * waves
     # The residual is a millionth; float32 sums.
     torch.testing.assert_close(sounds.double(), expected, rtol=0, atol=2e-6 * float(expected.abs().max()))
-    expect_same(recast(found, OTHER, PLASTIC), field, CONTACTS)
+    expect_same(change_material(found, OTHER, PLASTIC), field, CONTACTS)
 
 
 def test_modes_without_a_tone_are_mute_and_named_and_stay_where_they_are():
@@ -197,13 +199,13 @@ def test_modes_without_a_tone_are_mute_and_named_and_stay_where_they_are():
     omega = torch.hypot(2 * math.pi * field.bank.frequency, field.bank.damping)
     dead = 0.5 * (4000.0 + GLASS.beta * omega**2) >= omega
     assert 0 < int(dead.sum()) < len(dead)
-    found = recast(field, GLASS, lossy)
+    found = change_material(field, GLASS, lossy)
     assert torch.equal(gains_of(found, CONTACTS).abs().amax((0, 1)) == 0, dead)
     told = found.origin.report["edits"][-1]
     assert told["overdamped_hertz"] == field.bank.frequency[dead].tolist()
     assert f"{int(dead.sum())} of {len(dead)} modes are overdamped" in told["remarks"][0]
     assert bool(torch.isfinite(found.render(CONTACTS)).all())
-    back = recast(found, lossy, GLASS)
+    back = change_material(found, lossy, GLASS)
     for name in ("frequency", "damping"):
         before = getattr(field.bank, name)
         assert torch.equal(getattr(found.bank, name)[dead], before[dead])
@@ -214,24 +216,27 @@ def test_modes_without_a_tone_are_mute_and_named_and_stay_where_they_are():
 
 
 def test_a_mute_mode_is_none_that_a_lower_pitch_brings_back():
-    found = recast(plate_field(GLASS), GLASS, replace(GLASS, alpha=4e5))
-    high = retune(found, pitch=1e3)
+    found = change_material(plate_field(GLASS), GLASS, replace(GLASS, alpha=4e5))
+    high = adjust_modes(found, pitch=1e3)
     assert not bool(high.audible.any())
     assert high.origin.report["edits"][-1]["silent_hertz"] == []
     assert not bool(silenced(high).any())
-    assert recast(high, GLASS, replace(GLASS, alpha=4e9)).origin.report["edits"][-1]["overdamped_hertz"] == []
+    assert change_material(high, GLASS, replace(GLASS, alpha=4e9)).origin.report["edits"][-1]["overdamped_hertz"] == []
 
 
 def test_another_poissons_ratio_is_said_with_what_it_would_do_to_a_plate():
     stiff = replace(STEEL, poisson=0.45)
-    (words,) = recast(plate_field(STEEL), STEEL, stiff).origin.report["edits"][-1]["remarks"]
+    (words,) = change_material(plate_field(STEEL), STEEL, stiff).origin.report["edits"][-1]["remarks"]
     lowest = [float(plate_modes(plate_of(each), CONTACTS).frequency[0]) for each in (STEEL, stiff)]
     assert f"about {100 * (lowest[1] / lowest[0] - 1):+.1f} %" in words
-    assert recast(plate_field(STEEL), STEEL, replace(STEEL, young=1e11)).origin.report["edits"][-1]["remarks"] == []
+    assert (
+        change_material(plate_field(STEEL), STEEL, replace(STEEL, young=1e11)).origin.report["edits"][-1]["remarks"]
+        == []
+    )
 
 
 def test_a_recast_field_is_a_field_like_any_other(tmp_path):
-    found = recast(plate_field(STEEL), STEEL, WOOD, size=0.5)
+    found = change_material(plate_field(STEEL), STEEL, WOOD, size=0.5)
     save(found, tmp_path / "wood.safetensors")
     loaded = load(tmp_path / "wood.safetensors")
     assert torch.equal(loaded.render(0.5 * CONTACTS), found.render(0.5 * CONTACTS))
@@ -242,23 +247,23 @@ def test_a_recast_field_is_a_field_like_any_other(tmp_path):
 def test_where_neither_material_damps_dampings_stay():
     bare = [replace(each, alpha=0.0, beta=0.0) for each in (STEEL, OTHER)]
     field = plate_field(STEEL)
-    assert torch.equal(recast(field, *bare).bank.damping, field.bank.damping)
+    assert torch.equal(change_material(field, *bare).bank.damping, field.bank.damping)
 
 
 def test_materials_and_sizes_that_cannot_be_are_refused():
     field, bare = plate_field(STEEL), replace(OTHER, name="aether", alpha=0.0, beta=0.0)
     for size in (0.0, -1.0, math.nan, math.inf):
         with raises(EditError, name="size") as caught:
-            recast(field, STEEL, OTHER, size=size)
+            change_material(field, STEEL, OTHER, size=size)
         assert caught.value.value is size
     with raises(EditError, name="new", value=(0.0, 0.0)):
-        recast(field, STEEL, bare)
+        change_material(field, STEEL, bare)
     with raises(EditError, name="old", value=(0.0, 0.0)):
-        recast(field, bare, STEEL)
+        change_material(field, bare, STEEL)
     with raises(EditError, name="damping", row=0, value=math.inf):
-        recast(field, STEEL, OTHER, size=1e-170)
+        change_material(field, STEEL, OTHER, size=1e-170)
     with raises(SimulationError, name="young", value=-1.0):
-        recast(field, STEEL, Material("lead", 1e4, -1.0, 0.4, 1.0, 0.0))
+        change_material(field, STEEL, Material("lead", 1e4, -1.0, 0.4, 1.0, 0.0))
 
 
 @pytest.mark.parametrize("material", [GLASS, WOOD, PLASTIC, STEEL], ids=lambda each: each.name)

@@ -1,0 +1,61 @@
+"""Whether positions lie on an object, by the points that its field knows."""
+
+import torch
+from jaxtyping import Float, Float64
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from avmsf.capture.placement import TOLERANCE
+from avmsf.errors import PositionError
+
+_FEW = 16
+"""Positions up to which all distances take less time than a tree of the points."""
+
+
+def expect_near(positions: Float[Tensor, "contacts 3"], points: Float[Tensor, "points 3"]) -> None:
+    """Raise PositionError for a position farther outside the box of an object's points than the object is large.
+
+    Such a position counts another unit, or is in another frame.
+    """
+    places, known = positions.double(), points.detach().cpu().double()
+    low, high = known.amin(0), known.amax(0)
+    size = float((high - low).norm())
+    outside = torch.clamp(torch.maximum(low - places, places - high), min=0).norm(dim=1)
+    far = torch.nonzero(~(outside <= size)).flatten()
+    if len(far):
+        row = int(far[0])
+        found = places[row].tolist()
+        where = ", ".join(f"{value:.4g}" for value in found)
+        raise PositionError(
+            f"positions, row {row}: expected positions on the object, in meters, got ({where}), "
+            f"{float(outside[row]):.3g} m outside an object {size:.3g} m across; check the unit and the frame",
+            name="positions",
+            row=row,
+            value=found,
+        )
+
+
+def off_surface(positions: Float[Tensor, "contacts 3"], points: Float[Tensor, "points 3"]) -> list[tuple[int, float]]:
+    """Return the rows of positions that lie off the object, and their distances from its points, meters.
+
+    Off it is what is farther from the nearest point than `TOLERANCE` of the diagonal of the points' box, and farther
+    than twice the greatest distance from a point to its neighbor.
+    """
+    known = points.detach().cpu().double()
+    distances = _distances(positions, known)
+    limit = TOLERANCE * float((known.amax(0) - known.amin(0)).norm())
+    if not bool((distances > limit).any()):
+        return []
+    neighbors, _ = cKDTree(known.numpy()).query(known.numpy(), k=2)
+    limit = max(limit, 2.0 * float(neighbors[:, -1].max()))
+    return [(row, float(distances[row])) for row in torch.nonzero(distances > limit).flatten().tolist()]
+
+
+def _distances(
+    positions: Float[Tensor, "contacts 3"], points: Float64[Tensor, "points 3"]
+) -> Float64[Tensor, " contacts"]:
+    """Return the distance of each position from the nearest of the points."""
+    places = positions.detach().cpu().double()
+    if len(places) <= _FEW:
+        return torch.cdist(places, points).amin(1)
+    return torch.from_numpy(cKDTree(points.numpy()).query(places.numpy())[0])
