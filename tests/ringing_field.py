@@ -31,7 +31,8 @@ class SameGains:
     def at(self, contacts, directions=None) -> Gains:
         return Gains(self.gains.expand(len(contacts), -1))
 
-    point_estimate = at
+    def point_estimate(self, contacts, directions=None) -> Gains:
+        return self.at(contacts, directions)
 
     def deviation(self, contacts, directions=None) -> None:
         return None

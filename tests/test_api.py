@@ -162,7 +162,10 @@ def test_the_posterior_is_narrow_where_an_impact_was_recorded():
     contacts = capture().impacts.contacts
     far = contacts.mean(0, keepdim=True) + torch.tensor([[0.15, 0.15, 0.0]])
     near, away = field().posterior(contacts), field().posterior(far)
-    assert torch.equal(near.mean, field().complex_gains(contacts))
+    rendered = field().complex_gains(contacts)
+    # Rendered gains have the signs of the mean and the magnitudes of all hypotheses, which nearly agree here.
+    assert bool((near.mean.abs() <= rendered.abs() * (1 + 1e-5)).all())
+    assert float((near.mean - rendered).abs().max()) < 0.05 * float(rendered.abs().max())
     assert near.std.shape == near.mean.shape
     assert float(near.std.mean()) < float(away.std.mean())
 

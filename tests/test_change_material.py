@@ -69,7 +69,7 @@ def plate_field(material: Material, *, size: float = 1.0, highest: float = 3000.
 
 
 def gains_of(field: SoundField, contacts: torch.Tensor) -> torch.Tensor:
-    known = field.known(contacts)
+    known = field.gain_field.at(contacts)
     return torch.stack([known.mean, known.quadrature]).double()
 
 

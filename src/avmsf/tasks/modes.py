@@ -71,7 +71,7 @@ def brightness_center(field: SoundField, bank: ModalBank | None = None) -> float
     gains = fitted_gains(field.gain_field)
     points = gains.points[:: max(1, math.ceil(len(gains.points) / _POINTS))]
     with torch.no_grad():
-        known = gains.at(points)
+        known = gains.point_estimate(points)
     power = known.power.mean(0)
     share = power / power.sum() if bool(power.any()) else torch.full_like(power, 1.0 / len(power))
     frequency = (field.bank if bank is None else bank).frequency
