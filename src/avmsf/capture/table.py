@@ -3,6 +3,7 @@
 import csv
 import io
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -144,6 +145,18 @@ def understand(row: Row, settings: CaptureSettings) -> Strike:
     return Strike(_inside(row.cells["file"], where), row.line, (contact[0], contact[1], contact[2]), direction, newtons)
 
 
+def read_strikes(folder: Path, settings: CaptureSettings) -> tuple[list[Strike], list[CaptureWarning]]:
+    """Return the parsed rows of the folder's `impacts.csv`, and warnings of columns that are not used.
+
+    Raises `CaptureError` as `read_rows` and `understand`, for two rows of one file, and where several are missing.
+    """
+    rows, remarks = read_rows(folder)
+    strikes = [understand(row, settings) for row in rows]
+    refuse_repeated_files(strikes)
+    _refuse_missing(folder, strikes)
+    return strikes, remarks
+
+
 def refuse_repeated_files(strikes: Sequence[Strike]) -> None:
     """Raise `CaptureError` where two rows name one file: one of the two contacts must be wrong."""
     lines: dict[str, int] = {}
@@ -155,6 +168,20 @@ def refuse_repeated_files(strikes: Sequence[Strike]) -> None:
                 value=strike.file,
             )
         lines[strike.file] = strike.line
+
+
+def _refuse_missing(folder: Path, strikes: Sequence[Strike]) -> None:
+    """Raise one `CaptureError` where several recordings are missing; for a single one its reader has more advice."""
+    missing = [strike.file for strike in strikes if not os.path.exists(folder / strike.file)]
+    if len(missing) > 1:
+        shown = f"{', '.join(missing[:5])}{', …' * (len(missing) > 5)}"
+        raise CaptureError(
+            f"{TABLE}: expected a file for each row, {len(missing)} of {len(strikes)} are missing ({shown}); copy them "
+            f"into {folder}, or correct their names",
+            file=folder / TABLE,
+            name="file",
+            value=missing,
+        )
 
 
 def fitting_units(written: float) -> str:

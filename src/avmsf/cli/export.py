@@ -6,9 +6,10 @@ from pathlib import Path
 
 import torch
 
-from avmsf.capture.folder import read_capture, settings_of
+from avmsf.capture.filenames import find_surface_file
+from avmsf.capture.folder import read_capture
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.surface import find_surface_file
+from avmsf.capture.settings import settings_of
 from avmsf.cli.options.export import Options, unused_options
 from avmsf.cli.printing import figure, print_result, say
 from avmsf.cli.render import METRES

@@ -10,7 +10,7 @@ from rich.console import Console
 from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf.bench.evaluation import Scores, split
 from avmsf.capture import CaptureSettings, Impacts, read_capture
-from avmsf.capture.folder import settings_of
+from avmsf.capture.settings import settings_of
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
 from avmsf.cli.heartbeat import doing

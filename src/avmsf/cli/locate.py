@@ -14,7 +14,7 @@ from avmsf.bench.contactpictures import draw_contact, write_contact_cloud
 from avmsf.bench.pictures import save_picture
 from avmsf.capture import CaptureSettings
 from avmsf.capture.audio import Recording, read_recording
-from avmsf.capture.folder import settings_of
+from avmsf.capture.settings import settings_of
 from avmsf.cli.contacts import Contacts, refuse_far
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.locate import Options

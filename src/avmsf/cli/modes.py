@@ -5,7 +5,7 @@ from dataclasses import asdict
 
 from avmsf.bench.pictures import draw_modes, expect_format, save_picture
 from avmsf.capture import CaptureSettings, read_capture
-from avmsf.capture.folder import settings_of
+from avmsf.capture.settings import settings_of
 from avmsf.cli.alignment import AlignmentReport
 from avmsf.cli.modetable import ModeRow, QualityRow, amplitudes, levels, mode_rows, quality_rows
 from avmsf.cli.options.modes import Options

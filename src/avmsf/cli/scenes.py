@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from avmsf.capture import CaptureSettings
-from avmsf.capture.folder import settings_of
+from avmsf.capture.settings import settings_of
 from avmsf.capture.together import expect_one_unit
 from avmsf.cli.options.scenes import SceneOptions
 from avmsf.cli.scenebar import SceneBar

@@ -7,7 +7,8 @@ import trimesh
 
 from avmsf.bench.pictures import expect_format, save_picture
 from avmsf.bench.surfacepictures import draw_surface
-from avmsf.capture.surface import Surface, SurfaceKind, find_surface, read_surface, write_surface
+from avmsf.capture.filenames import SurfaceKind
+from avmsf.capture.surface import Surface, find_surface, read_surface, write_surface
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.options.scenes import with_seed
 from avmsf.cli.options.surface import Options
