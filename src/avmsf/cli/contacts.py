@@ -12,7 +12,7 @@ from torch import Tensor
 
 from avmsf.capture.placement import TOLERANCE
 from avmsf.capture.table import read_cells
-from avmsf.cli.writing import OutputError
+from avmsf.cli.options.checks import OutputError
 from avmsf.errors import CaptureError, PositionError
 from avmsf.field.soundfield import SoundField, expect_near
 

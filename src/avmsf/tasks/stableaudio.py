@@ -19,8 +19,7 @@ from torch import Tensor, nn
 from avmsf._utils.device import usable_device
 from avmsf.errors import EditError
 from avmsf.tasks.clips import lasting
-from avmsf.tasks.config import STABLE_AUDIO
-from avmsf.tasks.distillation import expect_prompt
+from avmsf.tasks.config import STABLE_AUDIO, expect_prompt
 from avmsf.tasks.stableaudiofiles import digest, load_pipeline
 
 
