@@ -140,7 +140,7 @@ def test_output_that_nobody_reads_any_more_ends_quietly(field: Path) -> None:
 def test_a_terminal_is_told_that_something_goes_on_until_it_does(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    nothing = tmp_path / "nothing.safetensors"
+    nothing = tmp_path / "nothing.ply"
     nothing.write_bytes(b"")
 
     class Terminal(io.StringIO):
@@ -148,11 +148,11 @@ def test_a_terminal_is_told_that_something_goes_on_until_it_does(
             return True
 
     for stream, begins in (
-        (Terminal(), "loading ...\r           \ravmsf suggest: "),
-        (io.StringIO(), "avmsf suggest: "),
+        (Terminal(), "loading ...\r           \ravmsf info: "),
+        (io.StringIO(), "avmsf info: "),
     ):
         monkeypatch.setattr(sys, "stderr", stream)
-        assert main(["suggest", str(nothing)]) == 2
+        assert main(["info", str(nothing)]) == 2
         assert stream.getvalue().startswith(begins)
 
 
@@ -214,7 +214,7 @@ def test_a_capture_that_looks_wrong_is_noted_as_a_sentence(tmp_path: Path, capsy
 
 def test_modes_prints_the_plates(capture: Path, tmp_path: Path, capsys: Streams) -> None:
     picture = tmp_path / "modes.png"
-    assert main(["modes", str(capture), "--json", "--picture", str(picture)]) == 0
+    assert main(["modes", str(capture), "--json", "--plots", str(tmp_path)]) == 0
     out, err = capsys.readouterr()
     found = json.loads(out)
     impacts = read_capture(capture).impacts
@@ -341,7 +341,7 @@ def test_modes_of_the_paper_start_at_the_peak(capture: Path, monkeypatch: pytest
     assert asked == ["onset", "peak", "onset"]
 
 
-SHEET = ("--body.wall", "0.004", "--body.shapes", "8", "--body.freedoms", "1000")
+SHEET = ("--body.wall", "0.004", "--body.shapes", "8", "--body.dofs", "1000")
 
 
 def test_fit_says_why_elastic_mode_shapes_took_no_part(tmp_path: Path, capsys: Streams) -> None:

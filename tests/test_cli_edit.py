@@ -14,8 +14,8 @@ from avmsf.bench.editpictures import HeardModes
 from avmsf.cli import edit, main, steering
 from avmsf.cli.edit import run
 from avmsf.cli.editmaterial import old_material
+from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.edit import parse
-from avmsf.cli.writing import OutputError
 from avmsf.errors import AvmsfError, EditError
 from avmsf.field.gains.family import Sites
 from avmsf.field.soundfield import Origin, SoundField
@@ -54,7 +54,9 @@ def field(tmp_path: Path) -> Path:
 
 def edited(field: Path, *words: str, name: str = "new") -> SoundField:
     output = field.with_name(f"{name}.safetensors")
-    assert run(parse([str(field), "--output", str(output), *words])) == 0
+    options = parse([str(field), "--output", str(output), *words])
+    options.check_inputs()
+    assert run(options) == 0
     return load(output)
 
 
@@ -66,7 +68,7 @@ def expect_same(found: SoundField, expected: SoundField) -> None:
 
 def test_a_material_by_its_name_with_pictures_sounds_and_numbers(field: Path, capsys: Streams) -> None:
     folder = field.parent / "look"
-    words = ["--material", "Wood", "--from", "ceramic", "--size", "2", "--plots", str(folder), "--json"]
+    words = ["--to-material", "Wood", "--from", "ceramic", "--scale", "2", "--plots", str(folder), "--json"]
     new = edited(field, *words)
     out, err = capsys.readouterr()
     expect_same(new, change_material(ceramic(), CERAMIC, WOOD, size=2.0))
@@ -93,7 +95,7 @@ def test_constants_stand_in_place_of_the_tables(field: Path) -> None:
     new = edited(field, "--from", "ceramic", "--young", "1e10", "--beta", "2e-7", "--law", "ratio-only")
     custom = replace(CERAMIC, young=1e10, beta=2e-7)
     expect_same(new, change_material(ceramic(), CERAMIC, custom, law=RATIO_ONLY))
-    other = edited(field, "--material", "glass", "--from", "ceramic", "--density", "5000", name="other")
+    other = edited(field, "--to-material", "glass", "--from", "ceramic", "--density", "5000", name="other")
     expect_same(other, change_material(ceramic(), CERAMIC, replace(GLASS, density=5000.0)))
 
 
@@ -106,25 +108,25 @@ def test_materials_that_damp_alike_are_both_named(capsys: Streams) -> None:
 
 
 def test_the_old_material_is_told_by_the_dampings_or_the_last_edit(field: Path, capsys: Streams) -> None:
-    wood = edited(field, "--material", "wood", name="wood")
+    wood = edited(field, "--to-material", "wood", name="wood")
     assert wood.origin.report[EDITS][0]["from"]["name"] == "ceramic"
     printed = capsys.readouterr().err
     assert "ceramic assumed" in printed
     assert "factor of 1.1" in printed
     assert "fits equally well" not in printed
     edited(field.with_name("wood.safetensors"), "--pitch", "1.5", name="high")
-    back = edited(field.with_name("high.safetensors"), "--material", "ceramic", name="back")
+    back = edited(field.with_name("high.safetensors"), "--to-material", "ceramic", name="back")
     assert back.origin.report[EDITS][2]["from"]["name"] == "wood"
     assert "wood, from the last material edit" in capsys.readouterr().err
     strange = replace(ceramic(), bank=ModalBank(FREQUENCY, FREQUENCY))
     save(strange, field)
     with raises(AvmsfError, name="--from"):
-        edited(field, "--material", "wood")
+        edited(field, "--to-material", "wood")
 
 
 def test_sliders_follow_the_material_and_call_modes_by_their_old_frequencies(field: Path) -> None:
     sliders = ["--pitch", "1.2", "--decay", "0.5", "--brightness", "3", "--mode-db", "852", "-inf"]
-    new = edited(field, "--material", "wood", "--from", "ceramic", *sliders, "--mode-db", "2300", "6")
+    new = edited(field, "--to-material", "wood", "--from", "ceramic", *sliders, "--mode-db", "2300", "6")
     levels = [0.0, -math.inf, 0.0, 0.0, 6.0]
     expected = adjust_modes(
         change_material(ceramic(), CERAMIC, WOOD), pitch=1.2, decay=0.5, brightness_db=3.0, gains_db=levels
@@ -160,7 +162,7 @@ def test_silent_modes_are_said(field: Path, capsys: Streams) -> None:
 
 
 def test_info_names_the_new_material(field: Path, capsys: Streams) -> None:
-    edited(field, "--material", "glass", "--from", "ceramic")
+    edited(field, "--to-material", "glass", "--from", "ceramic")
     capsys.readouterr()
     assert main(["info", str(field.with_name("new.safetensors"))]) == 0
     assert "plate, glass" in capsys.readouterr().out
@@ -189,7 +191,16 @@ def test_towards_a_recording_and_an_interrupted_edit_goes_on(
 ) -> None:
     target = adjust_modes(ceramic(), pitch=1.3).render(PLACES[:1])[0]
     soundfile.write(field.with_name("like.wav"), torch.cat([torch.zeros(800), target]).numpy() / 50, int(RATE))
-    words = ["--like", str(field.with_name("like.wav")), "--steps", "4", "--contacts", "2", "--preview-every", "2"]
+    words = [
+        "--like",
+        str(field.with_name("like.wav")),
+        "--steps",
+        "4",
+        "--contacts-per-step",
+        "2",
+        "--preview-every",
+        "2",
+    ]
     whole = edited(field, *words, "--json", name="whole")
     told = json.loads(capsys.readouterr().out)
     assert told["edits"][0]["reference"] == "like.wav"
@@ -220,7 +231,7 @@ def test_towards_a_recording_and_an_interrupted_edit_goes_on(
 
 
 def test_towards_a_materials_sound(field: Path, capsys: Streams) -> None:
-    quick = ["--steps", "2", "--contacts", "2", "--preview-every", "0"]
+    quick = ["--steps", "2", "--contacts-per-step", "2", "--preview-every", "0"]
     wood = edited(field, "--like-material", "Wood", *quick, name="wood")
     assert "ceramic assumed" in capsys.readouterr().err
     (told,) = wood.origin.report[EDITS]
@@ -230,7 +241,7 @@ def test_towards_a_materials_sound(field: Path, capsys: Streams) -> None:
     # What it is of is what it was made before, and what is made of it before is what the sound is led on from.
     common = MaterialStatistics.transform(change_material(ceramic(), GLASS, WOOD), WOOD, STEEL)
     heard = common.reference(samples=2400, sample_rate=RATE, seed=3).describe()
-    words = ["--from", "glass", "--material", "wood", "--pitch", "1", "--like-material", "steel", "--seed", "3"]
+    words = ["--from", "glass", "--to-material", "wood", "--pitch", "1", "--like-material", "steel", "--seed", "3"]
     both = edited(field, *words, *quick, name="both")
     assert [each["edit"] for each in both.origin.report[EDITS]] == ["recast", "steer"]
     assert {name: both.origin.report[EDITS][1][name] for name in heard} == heard
@@ -243,7 +254,7 @@ def test_towards_a_materials_sound(field: Path, capsys: Streams) -> None:
 
 
 def test_edits_are_shown_by_what_they_did(field: Path, capsys: Streams) -> None:
-    words = ["--from", "ceramic", "--material", "wood", "--size", "2", "--alpha", "4000", "--pitch", "10"]
+    words = ["--from", "ceramic", "--to-material", "wood", "--scale", "2", "--alpha", "4000", "--pitch", "10"]
     edited(field, *words, "--mode-db", "850", "-inf", "--mode-db", "2300", "6", "--mode-decay", "1300", "4")
     assert main(["info", str(field.with_name("new.safetensors"))]) == 0
     lines = [line.strip() for line in capsys.readouterr().out.splitlines() if "edited" in line]
@@ -344,7 +355,7 @@ def test_towards_words(field: Path, monkeypatch: pytest.MonkeyPatch, capsys: Str
         return model
 
     monkeypatch.setattr(steering.StableAudio, "load", load_model)
-    words = ["--prompt", "a bell", "--negative", "wood", "--model", "here", "--steps", "40", "--contacts", "2"]
+    words = ["--prompt", "a bell", "--negative", "wood", "--model", "here", "--steps", "40", "--contacts-per-step", "2"]
     alone = field.with_name("generated.wav")
     new = edited(field, *words, "--model-seconds", "1", "--generated", str(alone), "--parameters", "published")
     assert soundfile.info(str(alone)).samplerate == RATE
@@ -365,7 +376,7 @@ def test_towards_words_by_a_saved_model_and_an_interrupted_edit_goes_on(
     pytest.importorskip("transformers")
     model = save_audio(field.with_name("tiny-audio"))
     words = ["--prompt", "a wooden bowl is hit", "--model", str(model), "--device", "cpu", "--denoising", "2"]
-    words += ["--steps", "2", "--contacts", "2", "--preview-every", "1", "--json"]
+    words += ["--steps", "2", "--contacts-per-step", "2", "--preview-every", "1", "--json"]
 
     def edit_to(name: str) -> int:
         return main(["edit", str(field), "--output", str(field.with_name(f"{name}.safetensors")), *words])
@@ -404,9 +415,9 @@ def test_what_cannot_be_done_is_said_before_any_work(field: Path, capsys: Stream
     refused("--like", ("--like", "--like-material"), "--like-material", "wood", "--like", "like.wav")
     refused("material", "cheese", "--like-material", "cheese")
     refused("prompt", "  ", "--prompt", "  ")
-    refused("material", "cheese", "--material", "cheese")
+    refused("material", "cheese", "--to-material", "cheese")
     refused("young", -1.0, "--from", "ceramic", "--young", "-1")
-    refused("size", 0.0, "--from", "ceramic", "--size", "0")
+    refused("size", 0.0, "--from", "ceramic", "--scale", "0")
     refused("pitch", 0.0, "--pitch", "0")
     refused(None, None, "--like", str(field.with_name("nowhere.wav")), file="nowhere.wav")
     refused("steps", 0, "--like", "like.wav", "--steps", "0")

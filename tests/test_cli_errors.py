@@ -42,7 +42,6 @@ WRONG: dict[str, dict[str, Any]] = {
     "check plate --settings wrong.toml": {"file": "wrong.toml", "name": "unit", "value": "miles"},
     "modes nowhere": {"file": "nowhere"},
     "modes plate --settings nowhere.toml": {"file": "nowhere.toml"},
-    "modes plate --picture modes.gif": {"file": "modes.gif", "value": ".gif"},
     "modes plate --modes 0": {"name": "modes", "value": 0},
     "fit nowhere -o f.safetensors": {"file": "nowhere"},
     "fit plate --output plate": {"file": "plate", "value": "folder"},

@@ -191,9 +191,15 @@ def test_a_page_is_a_folder_or_one_file(field_file: Path, tmp_path: Path, capsys
     assert "page: web, " in capsys.readouterr().out
 
 
+def export(words: list[str]) -> None:
+    options = parse(words)
+    options.check_inputs()
+    run(options)
+
+
 def refused(words: list[str]) -> AvmsfError:
     with pytest.raises(AvmsfError) as caught:
-        run(parse(words))
+        export(words)
     return caught.value
 
 

@@ -11,11 +11,9 @@ import torch
 import trimesh
 from torch import Tensor
 
-from avmsf.capture import CaptureSettings
 from avmsf.cli import main
-from avmsf.cli.locate import _settings as settings_asked
 from avmsf.cli.locate import run
-from avmsf.cli.options.locate import Options, parse
+from avmsf.cli.options.locate import parse
 from avmsf.errors import LocationError
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import load, save
@@ -221,17 +219,15 @@ def test_a_captures_settings_say_how_recordings_are_read(place: Place, tmp_path:
     assert run(parse([place.field, str(path)])) == 2
     assert "response_channel" in capsys.readouterr().out
     (tmp_path / "capture.toml").write_text("response_channel = 2\n")
-    printed, _ = located([place.field, str(path), "--capture", str(tmp_path)], capsys)
+    printed, _ = located([place.field, str(path), "--settings", str(tmp_path / "capture.toml")], capsys)
     assert printed["impacts"][0]["position"] == pytest.approx(place.points[STRUCK].tolist(), abs=0.01)
-    given, _ = located([place.field, str(path), "--settings", str(tmp_path / "capture.toml")], capsys)
-    assert given == printed
 
 
 def test_several_blows_are_read_as_one_is(place: Place, tmp_path: Path, capsys: Streams) -> None:
     hit = place.wav("mono.wav", place.blow(STRUCK))
     (tmp_path / "capture.toml").write_text("response_channel = 2\n")
     for words in ([], ["--several"]):
-        printed, _ = located([place.field, hit, "--capture", str(tmp_path), *words], capsys)
+        printed, _ = located([place.field, hit, "--settings", str(tmp_path / "capture.toml"), *words], capsys)
         assert printed["impacts"][0]["position"] == pytest.approx(place.points[STRUCK].tolist(), abs=0.01)
 
 
@@ -244,7 +240,7 @@ def test_what_cannot_be_done_is_said_in_one_line(place: Place, tmp_path: Path, c
         (place.field, str(tmp_path)): (str(tmp_path), "a folder"),
         (place.field, hit, "--probability", "1.5"): ("--probability", "1.5"),
         (place.field, hit, "--output", str(tmp_path / "file")): (str(tmp_path / "file"), "a file"),
-        (place.field, hit, "--capture", str(tmp_path / "nowhere")): ("nowhere", "a capture folder"),
+        (place.field, hit, "--settings", str(tmp_path / "nowhere")): ("nowhere", "a capture.toml"),
         (hit, hit): ("again.wav", "a sound field"),
     }
     for words, parts in wrong.items():
@@ -255,9 +251,3 @@ def test_what_cannot_be_done_is_said_in_one_line(place: Place, tmp_path: Path, c
         assert code == 2
         err = capsys.readouterr().err
         assert all(part in err for part in parts), err
-
-
-def test_another_capture_without_settings_of_its_own_is_read_as_captures_are(tmp_path: Path) -> None:
-    """Not as the field's own was: that is what is read by where no capture is named."""
-    assert settings_asked(Options(tmp_path / "field", (), capture=tmp_path)) == CaptureSettings()
-    assert settings_asked(Options(tmp_path / "field", ())) is None

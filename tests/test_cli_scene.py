@@ -188,7 +188,7 @@ def test_clouds_and_features_are_drawn(
 ) -> None:
     monkeypatch.setattr(infoclouds, "save_turntable", partial(save_turntable, frames=3))
     assert main(["info", str(kept / "cloud.ply"), "--plots", str(tmp_path / "a")]) == 0
-    words = ["info", str(kept / "features.safetensors"), "--cloud", str(kept / "cloud.ply"), "--clusters", "8"]
+    words = ["info", str(kept / "features.safetensors"), "--cloud", str(kept / "cloud.ply"), "--regions", "8"]
     assert main([*words, "--plots", str(tmp_path / "b")]) == 0
     out, _ = capsys.readouterr()
     assert "features: descriptors" in out

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from avmsf.cli import suggest as command
+from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.suggest import parse
 from avmsf.cli.suggest import run
-from avmsf.cli.writing import OutputError
 from avmsf.errors import FitError
 from avmsf.field.store import save
 from believing_field import bar_contacts, drawn_gains, elastic_field, positional_field, sound_field
@@ -81,10 +81,10 @@ def test_what_cannot_be_done_is_said_before_any_work(field: Path, tmp_path: Path
     settings = tmp_path / "capture.toml"
     settings.write_text("")
     with raises(FitError, name="--settings"):
-        run(parse([str(field), "--settings", str(settings)]))
+        parse([str(field), "--settings", str(settings)]).check_inputs()
     blocked = tmp_path / "file"
     blocked.write_text("")
     with raises(OutputError, file=blocked, value="file"):
-        run(parse([str(field), "--output", str(blocked)]))
+        parse([str(field), "--output", str(blocked)]).check_inputs()
     with raises(FitError, name="--unseen"):
-        run(parse([str(field), "--unseen", "--candidates", str(tmp_path)]))
+        parse([str(field), "--unseen", "--candidates", str(tmp_path)]).check_inputs()

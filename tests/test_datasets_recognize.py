@@ -202,7 +202,7 @@ def test_the_verb_prints_what_is_there(place: Path, capsys: pytest.CaptureFixtur
     write_mesh(place / "raw/mesh_16k/2.obj")
     assert verb.run(options.parse(["check", str(place / "raw/of")])) == 0
     out = capsys.readouterr().out
-    assert "1 of 1 objects" in out
+    assert "1 of 1 object can" in out
     assert "2 recordings" in out
     assert "objects 11 to 20" in out
     assert verb.run(options.parse(["check", str(place / "impact/RI"), "--json"])) == 0

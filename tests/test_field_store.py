@@ -26,9 +26,10 @@ from safetensors.torch import save as to_bytes
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import FieldFileError
 from avmsf.field.fit import fit
+from avmsf.field.header import FORMAT
 from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import Origin, SoundField
-from avmsf.field.store import FORMAT, load, save
+from avmsf.field.store import load, save
 from avmsf.simulate.plate import sample_contacts
 from plate_field import PLATE, QUICK, plate_extraction, plate_features, plate_impacts
 from raising import raises

@@ -172,7 +172,7 @@ def test_a_mesh_too_large_for_the_memory_is_refused_with_the_size_that_fits(monk
     with raises(SimulationError, name="surface") as caught:
         nominal_bodies(sheet(), walls=[0.004], freedoms=80_000)
     [reason] = caught.value.value
-    assert all(number in reason for number in ("80000", "1.6 GB", "freedoms=40000"))
+    assert all(number in reason for number in ("80000", "1.6 GB", "40000"))
     monkeypatch.setattr(nominalsolid, "_free_memory", lambda: None)
     assert nominal_bodies(sheet(), walls=[0.004], count=4, freedoms=2000).bodies
 

@@ -378,7 +378,18 @@ def test_the_command_makes_an_object_of_a_mesh_and_keeps_it(
     recipe: ObjectRecipe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["--mesh", str(recipe.mesh), "--thickness", "0.006", "--detail", "0.2", "--material", "glass"]
-    words += ["--contacts", "4", "--seconds", "1", "--views", "0", "--modes", "6", "--output", str(tmp_path / "mine")]
+    words += [
+        "--impacts",
+        "4",
+        "--seconds",
+        "1",
+        "--views",
+        "0",
+        "--elastic-modes",
+        "6",
+        "--output",
+        str(tmp_path / "mine"),
+    ]
     assert simulate.run(options.parse(words)) == 0
     assert "mine: done (1 of 1" in capsys.readouterr().err
     assert len(read_capture(tmp_path / "mine").impacts) == 4
@@ -400,7 +411,7 @@ def test_the_command_lists_and_knows_what_it_does_not_know(capsys: pytest.Captur
 
 def test_what_is_asked_of_a_named_object_holds_though_it_is_the_usual() -> None:
     # The example has 16 contacts at 44,100 Hz where a recipe usually has 40 at 48,000.
-    recipe = options.parse(["example", "--contacts", "40"]).recipe
+    recipe = options.parse(["example", "--impacts", "40"]).recipe
     assert (recipe.contacts, recipe.sample_rate, recipe.kind) == (40, 44100, "mug")
     recipe = options.parse(["mug-plastic", "--material", "ceramic"]).recipe
     assert recipe == replace(sim20_recipe("mug-plastic"), material="ceramic")

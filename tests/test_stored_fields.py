@@ -7,7 +7,7 @@ import torch
 from safetensors.torch import load_file
 
 from avmsf.field import SoundField
-from avmsf.field.store import FORMAT
+from avmsf.field.header import FORMAT
 from stored_fields import fields
 
 FILES = sorted((Path(__file__).parent / "data").glob("format-*/*.safetensors"))

@@ -37,7 +37,7 @@ class ViewsConfig:
     longest: int = 640
     """Pixels of a photograph's longer side; larger ones are scaled down."""
     masks: bool = True
-    """Whether photographs without masks get them, which needs a plain background."""
+    """Find the object in photographs without masks, which needs a plain background."""
     frames: int = 72
     """Frames to pick from a video."""
     rendered: int = 256
@@ -63,14 +63,14 @@ class LiftConfig:
     `descriptors` (built in, no download), or `auto`: DINOv2 base if it is available, else the built-in ones."""
     longest: int = 518
     """Pixels of the longer side of DINOv2's input images."""
-    background: Literal["inpainted", "kept"] = "inpainted"
+    background: Literal["inpainted", "kept"] = field(default="inpainted", metadata={"option": "encoder_background"})
     """Encoder input outside an object's mask: colors of the object continued, or the image unchanged (paper)."""
     weighting: Literal["plain", "visibility"] = "visibility"
     """Average over the views that see a point: weighted by visibility, or plain (paper)."""
     components: int = 32
     """Principal components of the features to use; 0 uses the features unchanged."""
     symmetry: bool = True
-    """Whether features are averaged over the symmetries of the object's shape."""
+    """Average the features over the symmetries of the object's shape."""
     missing: float = 0.1
     """Part of the object's surface that may have its counterpart in a hole of the points, for a symmetry to count: more
     where large parts of the object are in no view, up to .45."""
@@ -81,8 +81,8 @@ class LiftConfig:
     reach: float = 3.0
     """Point spacings within which the nearest point is a symmetric counterpart; 0 takes it at any distance (paper)."""
     positions: bool = True
-    """Whether the features begin with the points' positions relative to the object's size."""
-    size: float = 0.3
+    """Begin the features with the points' positions relative to the object's size."""
+    size: float = field(default=0.3, metadata={"option": "feature_size"})
     """Root mean square length of the features after positions, which are about .5 long; without them it is 1."""
     onto: Literal["mesh", "gaussians"] = "mesh"
     """Points of the features for a folder with a mesh only: on its surface, or Gaussians fitted to images of it."""
@@ -114,12 +114,12 @@ class BodyConfig:
     decide."""
     shapes: int = 80
     """Number of the lowest elastic mode shapes for the gains and for updating stiffness and density."""
-    freedoms: int = 40_000
+    freedoms: int = field(default=40_000, metadata={"option": "dofs"})
     """Approximate degrees of freedom of the finite elements."""
     supports: Literal["auto", "free", "try"] = "auto"
-    """Whether the object may have been held at its lowest face or point, or along a lower edge (z is upwards). auto:
-    tried if by leave-one-out the free body predicts little better than none. free: it lay on foam or hung. try: always
-    tried, which takes 10 to 30 s more."""
+    """Supports at the object's lowest face or point, or along a lower edge (z is upwards). auto: tried if by leave-
+    one-out the free body predicts little better than none. free: it lay on foam or hung. try: always tried, which
+    takes 10 to 30 s more."""
 
     def __post_init__(self) -> None:
         if self.wall is not None and not 0 <= self.wall < float("inf"):

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from avmsf.cli.demofolder import RECORD, record, replaced_whole
-from avmsf.cli.writing import OutputError
+from avmsf.cli.options.checks import OutputError
 from avmsf.errors import FolderInUseError
 from raising import raises
 

@@ -19,7 +19,7 @@ from raising import raises
 from test_cli_edit import PLACES, RATE, Echo, ceramic
 
 PROMPT = "a bell"
-QUICK = ("--prompt", PROMPT, "--model", "here", "--steps", "5", "--contacts", "2", "--preview-every", "2")
+QUICK = ("--prompt", PROMPT, "--model", "here", "--steps", "5", "--contacts-per-step", "2", "--preview-every", "2")
 
 
 @pytest.fixture

@@ -12,8 +12,8 @@ from avmsf.bench.surfacepictures import draw_surface
 from avmsf.capture import Surface, read_surface
 from avmsf.capture.views.write import write_views
 from avmsf.cli import main
-from avmsf.cli.surface import kind_of
-from avmsf.cli.writing import OutputError
+from avmsf.cli.options.checks import OutputError
+from avmsf.cli.options.surface import kind_of
 from avmsf.errors import EvaluationError
 from avmsf.field.store import save
 from believing_field import bar_contacts, drawn_gains, elastic_field, positional_field, sound_field
@@ -87,8 +87,8 @@ def test_the_picture_is_written_beside_the_surface_and_with_a_field(tmp_path: Pa
     folder = tmp_path / "slab"
     folder.mkdir()
     write_surface_file(folder)
-    assert main(["surface", str(folder), "--picture", str(tmp_path / "slab.png")]) == 0
-    assert (tmp_path / "slab.png").read_bytes().startswith(b"\x89PNG")
+    assert main(["surface", str(folder), "--plots", str(tmp_path)]) == 0
+    assert (tmp_path / "surface.png").read_bytes().startswith(b"\x89PNG")
     contacts = bar_contacts(6)
     for name, made in (("with", elastic_field), ("without", positional_field)):
         save(sound_field(made(contacts, drawn_gains(contacts, seed=1))), tmp_path / f"{name}.safetensors")

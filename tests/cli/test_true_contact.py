@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from avmsf.bench.sides import ALL_SIDES, view_from
 from avmsf.cli import locate as verb
 from avmsf.cli.locate import run
+from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.locate import parse
-from avmsf.cli.writing import OutputError
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import save
 from avmsf.modal.residual import Residual

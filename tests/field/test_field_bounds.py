@@ -12,7 +12,8 @@ from safetensors.torch import load as from_bytes
 from safetensors.torch import save as to_bytes
 
 from avmsf.cli import main
-from avmsf.cli.writing import OutputError, write_sound
+from avmsf.cli.options.checks import OutputError
+from avmsf.cli.writing import write_sound
 from avmsf.errors import FieldFileError
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import load, save

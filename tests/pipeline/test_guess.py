@@ -181,7 +181,7 @@ def test_recordings_are_not_passed_over(tmp_path: Path):
 def test_a_mesh_and_a_material_give_a_field_from_the_command_line(verb: str, tmp_path: Path, capsys):
     write_surface(box(LENGTH, WIDTH, HEIGHT), tmp_path / "surface.ply")
     output = tmp_path / "field.safetensors"
-    words = ["--material", "steel", "--modes", "12", "--body.freedoms", "6000", "--output", str(output)]
+    words = ["--material", "steel", "--modes", "12", "--body.dofs", "6000", "--output", str(output)]
     assert main([verb, str(tmp_path), *words]) == 0
     assert "No recordings" in capsys.readouterr().out
     field = load(output)

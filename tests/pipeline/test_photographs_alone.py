@@ -39,7 +39,7 @@ def slab(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_photographs_alone_give_elastic_mode_shapes(slab: Path, capsys: Streams) -> None:
-    bodies = ("--body.wall", "0", "--body.shapes", "12", "--body.freedoms", "3000", "--body.supports", "free")
+    bodies = ("--body.wall", "0", "--body.shapes", "12", "--body.dofs", "3000", "--body.supports", "free")
     assert main(["reconstruct", str(slab), *SMALL, *bodies, "--json"]) == 0
     made = json.loads(capsys.readouterr().out)
     report = made["report"]

@@ -26,6 +26,7 @@ import torch
 import trimesh
 from filelock import FileLock
 
+from avmsf.capture.filenames import SPLATS
 from avmsf.cli import main
 from avmsf.config import CACHE, PRESETS
 from avmsf.errors import AvmsfError, StudioError
@@ -33,7 +34,6 @@ from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load, save
 from avmsf.files import copy_whole
 from avmsf.localization.contact_map import enlarged
-from avmsf.pipeline.sources import SPLATS
 from avmsf.scene.ply import write_splats
 from avmsf.scene.start import StartPoints, starting_cloud
 from avmsf.scene.symmetrysearch import find_symmetries

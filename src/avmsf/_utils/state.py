@@ -9,6 +9,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from avmsf._utils.headers import read_header_text, unreadable
 from avmsf.errors import AvmsfError
 from avmsf.files import write_whole
 
@@ -20,42 +21,13 @@ def read_tensors(
 
     Raises `raising` for a file that is missing, damaged or of another kind: `what` it should be, and the `advice`.
     """
-    if not path.exists():
-        raise raising(f"{path}: expected {what}, got no such file; check the name, or {advice}", file=path)
+    text = read_header_text(path, key, what=what, advice=advice, raising=raising)
     try:
         with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            text = metadata.get(key)
-            if text is None:
-                raise raising(
-                    f"{path}: expected {what} with the metadata entry {key!r}, got another safetensors file; name "
-                    f"another, or {advice}",
-                    file=path,
-                    name=key,
-                    value=sorted(metadata),
-                )
             # Clones, for what the file maps into memory would change with it.
             return text, {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
-        found, helps = _guess(path, advice)
-        raise raising(f"{path}: expected {what}, got {found}; {helps}", file=path, value=found) from error
-
-
-def _guess(path: Path, advice: str) -> tuple[str, str]:
-    """Return what a file is that safetensors cannot read, and what to do."""
-    if path.is_dir():
-        return "a folder", "name the file in it"
-    try:
-        with open(path, "rb") as file:
-            start = file.read(9)
-    except OSError as error:
-        return f"an unreadable file ({error.strerror})", "check its permissions"
-    if not start:
-        return "an empty file", f"copy it again, or {advice}"
-    # Eight bytes of length, then the header's opening brace.
-    if start[8:] == b"{":
-        return "a truncated or damaged file", f"copy it again, or {advice}"
-    return f"a file that starts with {start[:8]!r}", f"name another, or {advice}"
+        raise unreadable(path, what=what, advice=advice, raising=raising) from error
 
 
 def write_checkpoint(

@@ -1,6 +1,5 @@
 """All methods by name; a method fits a renderer to an object's training recordings."""
 
-import difflib
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -12,9 +11,10 @@ from avmsf.bench.diffsoundmethod import DiffSoundMethod
 from avmsf.bench.fieldmethods import NETWORK, FieldMethod, UninformedField
 from avmsf.bench.gridfield import PAPER_GRID, QUICK_GRID, GridField
 from avmsf.bench.interpolation import SplineGains
+from avmsf.bench.names import PUBLISHED, RECORDED, SMALL, expect_method
 from avmsf.bench.recorded import Recorded
 from avmsf.bench.renderer import Renderer
-from avmsf.bench.sonicgaussmethod import PUBLISHED, SMALL, SmallSonicGaussMethod, SonicGaussMethod
+from avmsf.bench.sonicgaussmethod import SmallSonicGaussMethod, SonicGaussMethod
 from avmsf.bench.spectralmean import MeanSpectra
 from avmsf.bench.task import Look, Method, Task
 from avmsf.config import PRESETS, PipelineConfig
@@ -27,7 +27,6 @@ from avmsf.field.soundfield import SoundField
 
 NEIGHBORS = 3
 """Number of nearest recordings that are averaged (the paper's KNN), or all where there are fewer."""
-_RECORDED = "recorded:"
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ class RecordedMethod:
     @property
     def name(self) -> str:
         """`recorded:` and the folder."""
-        return f"{_RECORDED}{self.folder}"
+        return f"{RECORDED}{self.folder}"
 
     def __repr__(self) -> str:
         # What is in the files decides the figures, and a results folder must not keep those of other files.
@@ -177,20 +176,12 @@ def method_named(name: str) -> Method:
     """Return the method of this name. Raises EvaluationError that lists the known ones."""
     if name in METHODS:
         return METHODS[name]
+    expect_method(name)
     if name.partition(":")[0] == PUBLISHED[:-1]:
         return SonicGaussMethod(_given(name, PUBLISHED, "a folder", "with the published weights"))
     if name.partition(":")[0] == SMALL[:-1]:
         return SmallSonicGaussMethod(_given(name, SMALL, "a file", f"which this makes: {COMMAND}"))
-    if name.startswith(_RECORDED):
-        return RecordedMethod(_given(name, _RECORDED, "a folder", "with a folder of wav files for every object"))
-    near = difflib.get_close_matches(name, METHODS, n=1)
-    guess = f"; did you mean {near[0]}?" if near else ""
-    raise EvaluationError(
-        f"expected a method of {', '.join(METHODS)}, {PUBLISHED}FOLDER, {SMALL}FILE and {_RECORDED}FOLDER, got "
-        f"{name!r}{guess}",
-        name="method",
-        value=name,
-    )
+    return RecordedMethod(_given(name, RECORDED, "a folder", "with a folder of wav files for every object"))
 
 
 def _given(name: str, prefix: str, kind: Literal["a folder", "a file"], use: str) -> Path:

@@ -1,10 +1,9 @@
 """The experiments of the paper, as data: training and test contacts, metrics, and methods."""
 
-import difflib
 from dataclasses import dataclass
 
 from avmsf.bench.cases import Choosing, Closest, Farthest, FewerViews, Growing, LeaveOneOut, Shots
-from avmsf.errors import EvaluationError
+from avmsf.bench.names import expect_protocol
 
 BASELINE = "knn3"
 """The method that all others are compared with."""
@@ -134,10 +133,5 @@ PROTOCOLS = {
 
 def protocol_named(name: str) -> EvaluationProtocol:
     """Return the protocol of this name. Raises EvaluationError that lists the known ones."""
-    if name in PROTOCOLS:
-        return PROTOCOLS[name]
-    near = difflib.get_close_matches(name, PROTOCOLS, n=1)
-    guess = f"; did you mean {near[0]}?" if near else ""
-    raise EvaluationError(
-        f"expected a protocol of {', '.join(PROTOCOLS)}, got {name!r}{guess}", name="protocol", value=name
-    )
+    expect_protocol(name)
+    return PROTOCOLS[name]

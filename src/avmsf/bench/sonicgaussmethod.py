@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from avmsf._utils.device import usable_device
+from avmsf.bench.names import PUBLISHED, SMALL
 from avmsf.bench.task import Task
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.sonicgauss.published import PublishedSizes, PublishedSonicGauss, folder_digest
@@ -13,7 +14,6 @@ from avmsf.evaluation.sonicgauss.small import SmallWeights
 from avmsf.evaluation.sonicgauss.small_renderer import TUNING, SmallRenderer, fit_small
 from avmsf.evaluation.sonicgauss.tuning import TrainingConfig
 
-PUBLISHED, SMALL = "sonicgauss:", "sonicgauss-small:"
 """What the names of the methods begin with; a folder or a file follows."""
 
 

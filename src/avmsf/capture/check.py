@@ -5,10 +5,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from avmsf.capture.folder import read_strike, settings_of
+from avmsf.capture.folder import read_strike
 from avmsf.capture.measure import RecordingReport
 from avmsf.capture.prepare import Prepared, margin_length
-from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.starts import stay_uncut
 from avmsf.capture.surface import find_surface
 from avmsf.capture.table import TABLE, Row, Strike, read_rows, refuse_repeated_files, understand

@@ -18,25 +18,14 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.location import expect_free
 from avmsf.capture.measure import RecordingReport, measure, shared_problems
 from avmsf.capture.prepare import Prepared, prepare
-from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.settings import SETTINGS, CaptureSettings, settings_of
 from avmsf.capture.starts import cut_together, shorten
 from avmsf.capture.surface import Surface, find_surface, write_surface
-from avmsf.capture.table import (
-    DIRECTION,
-    FORCE,
-    REQUIRED,
-    TABLE,
-    Strike,
-    read_rows,
-    refuse_repeated_files,
-    understand,
-)
+from avmsf.capture.table import DIRECTION, FORCE, REQUIRED, TABLE, Strike, in_folder, read_strikes
 from avmsf.capture.together import common_rate, judge_contacts, judge_levels, judge_surface
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError
 from avmsf.files import unwritable
-
-SETTINGS = "capture.toml"
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,22 +79,12 @@ def read_capture(folder: str | Path, settings: CaptureSettings | None = None) ->
     everything.
     """
     folder = Path(folder)
-    try:
+    with in_folder(folder):
         return _read_capture(folder, settings or settings_of(folder))
-    except CaptureError as error:
-        if str(error).startswith(str(folder)):
-            raise
-        # The table and the recordings are named as in the folder.
-        file = folder if error.file is None else folder / error.file
-        place = f"{file.parent}/" if str(error).startswith(file.name) else f"{folder}: "
-        raise type(error)(f"{place}{error}", **{**error.attributes, "file": file}) from error
 
 
 def _read_capture(folder: Path, settings: CaptureSettings) -> Capture:
-    rows, remarks = read_rows(folder)
-    strikes = [understand(row, settings) for row in rows]
-    refuse_repeated_files(strikes)
-    _refuse_missing(folder, strikes)
+    strikes, remarks = read_strikes(folder, settings)
     remarks += judge_contacts(strikes, settings)
     surface = find_surface(folder, settings)
     if surface is not None:
@@ -135,12 +114,6 @@ def _read_capture(folder: Path, settings: CaptureSettings) -> Capture:
         after=cut.after,
     )
     return Capture(settings.name or folder.resolve().name, impacts, surface, settings)
-
-
-def settings_of(folder: Path) -> CaptureSettings:
-    """Read the folder's `capture.toml`, or return the defaults where there is none."""
-    path = folder / SETTINGS
-    return CaptureSettings.read(path) if path.is_file() else CaptureSettings()
 
 
 def read_strike(folder: Path, strike: Strike, *, settings: CaptureSettings) -> tuple[Prepared, RecordingReport]:
@@ -211,20 +184,6 @@ def _write_files(capture: Capture, folder: Path, *, onsets_within: float | None)
         + ("align = false\n" if onsets_within is None else ""),
         encoding="utf-8",
     )
-
-
-def _refuse_missing(folder: Path, strikes: list[Strike]) -> None:
-    """Raise one `CaptureError` where several recordings are missing; for a single one its reader has more advice."""
-    missing = [strike.file for strike in strikes if not os.path.exists(folder / strike.file)]
-    if len(missing) > 1:
-        shown = f"{', '.join(missing[:5])}{', …' * (len(missing) > 5)}"
-        raise CaptureError(
-            f"{folder / TABLE}: expected a file for each row, got none for {len(missing)} of {len(strikes)} "
-            f"({shown}); copy them there, or correct their names",
-            file=folder / TABLE,
-            name="file",
-            value=missing,
-        )
 
 
 def _file_names(names: tuple[str, ...]) -> list[str]:

@@ -18,11 +18,10 @@ from scipy.special import stdtrit
 
 from avmsf._utils.text_files import read_toml
 from avmsf.capture.audio import Recording, read_recording
-from avmsf.capture.folder import SETTINGS, settings_of
 from avmsf.capture.measure import HIGHEST_NOISE_DB, decibels, noise_level
 from avmsf.capture.onset import SECONDS_BEFORE, find_onset, find_pulse
 from avmsf.capture.prepare import Prepared, prepare
-from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.settings import SETTINGS, CaptureSettings, settings_of
 from avmsf.capture.starts import shorten, start_with_impact
 from avmsf.capture.table import Strike, read_rows, understand
 from avmsf.errors import CaptureError

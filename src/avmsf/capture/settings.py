@@ -11,6 +11,8 @@ from typing import Any, get_args
 from avmsf._utils.text_files import read_toml
 from avmsf.errors import CaptureError
 
+SETTINGS = "capture.toml"
+"""Name of the file in a capture folder."""
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254, "ft": 0.3048}
 USUAL_SECONDS = 3.0
 TIME_ZEROS = ("onset", "peak")
@@ -167,3 +169,9 @@ def _unknown_key(key: str, known: list[str]) -> CaptureError:
     return CaptureError(
         f"expected keys among {', '.join(known)}, got {key!r}{advice}", name=key, value=similar[0] if similar else None
     )
+
+
+def settings_of(folder: Path) -> CaptureSettings:
+    """Read the folder's `capture.toml`, or return the defaults where there is none."""
+    path = folder / SETTINGS
+    return CaptureSettings.read(path) if path.is_file() else CaptureSettings()

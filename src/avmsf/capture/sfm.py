@@ -20,7 +20,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from avmsf.capture.views.pictures import SUFFIXES, Picture, PictureSizeError, read_mask, read_picture
+from avmsf.capture.filenames import PICTURE_SUFFIXES
+from avmsf.capture.views.pictures import Picture, PictureSizeError, read_mask, read_picture
 from avmsf.capture.warning import Remark
 from avmsf.errors import CaptureError
 from avmsf.files import unwritable
@@ -152,7 +153,7 @@ def _stage_images(images: Path, begun: Path, *, shared_camera: bool) -> tuple[di
     Returns the images' names there with their true ones, and the names of those that cannot be read. Raises
     CaptureError for too few images, and for images of different sizes from one camera.
     """
-    found = sorted(path for path in images.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+    found = sorted(path for path in images.rglob("*") if path.suffix.lower() in PICTURE_SUFFIXES and path.is_file())
     names, lost, sizes = {}, [], {}
     for path in found:
         name = path.relative_to(images).as_posix()
@@ -168,7 +169,7 @@ def _stage_images(images: Path, begun: Path, *, shared_camera: bool) -> tuple[di
         _stage_mask(images, picture, name, begun / "masks" / f"{staged}.png")
     if len(names) < FEWEST:
         raise CaptureError(
-            f"{images}: expected at least {FEWEST} photographs ({', '.join(SUFFIXES)}), got {len(names)}"
+            f"{images}: expected at least {FEWEST} photographs ({', '.join(PICTURE_SUFFIXES)}), got {len(names)}"
             + (f" and {len(lost)} that cannot be read: {_some(lost)}" if lost else ""),
             file=images,
             name="photographs",

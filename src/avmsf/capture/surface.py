@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -11,13 +10,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_vectors
+from avmsf.capture.filenames import SurfaceKind, find_surface_file
 from avmsf.capture.mesh_file import load_parts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import ArrayError, CaptureError
-
-SurfaceKind = Literal["ply", "obj", "glb"]
-"""Formats that surfaces are written in."""
-SURFACE_FILES = ("surface.obj", "surface.ply", "surface.glb", "surface.stl")
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,18 +75,6 @@ def read_surface(path: str | Path, *, meters: float = 1.0) -> Surface:
     if not len(joined):
         raise CaptureError(f"{path}: expected points, got none; export the surface again", file=path, value=0)
     return Surface(torch.from_numpy((joined * meters).astype(np.float32)), torch.from_numpy(np.concatenate(faces)))
-
-
-def find_surface_file(folder: Path, settings: CaptureSettings) -> Path | None:
-    """Return the surface file that the settings name, or the first of the usual names; None where there is none."""
-    if settings.surface is not None:
-        named = Path(settings.surface)
-        if named.is_absolute() or ".." in named.parts:
-            raise CaptureError.expected(
-                "a file in the capture folder", settings.surface, file=folder, name="surface", advice="copy it there"
-            )
-        return folder / named
-    return next((folder / name for name in SURFACE_FILES if (folder / name).is_file()), None)
 
 
 def find_surface(folder: Path, settings: CaptureSettings) -> Surface | None:

@@ -3,7 +3,9 @@
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path, PurePosixPath
@@ -145,6 +147,32 @@ def understand(row: Row, settings: CaptureSettings) -> Strike:
     return Strike(_inside(row.cells["file"], where), row.line, (contact[0], contact[1], contact[2]), direction, newtons)
 
 
+@contextmanager
+def in_folder(folder: Path) -> Iterator[None]:
+    """Name the folder in a `CaptureError` whose files are named as in the folder."""
+    try:
+        yield
+    except CaptureError as error:
+        if str(error).startswith(str(folder)):
+            raise
+        file = folder if error.file is None else folder / error.file
+        place = f"{file.parent}/" if str(error).startswith(file.name) else f"{folder}: "
+        raise type(error)(f"{place}{error}", **{**error.attributes, "file": file}) from error
+
+
+def read_strikes(folder: Path, settings: CaptureSettings) -> tuple[list[Strike], list[CaptureWarning]]:
+    """Return the parsed rows of the folder's `impacts.csv`, and warnings of columns that are not used.
+
+    Raises `CaptureError` as `read_rows` and `understand`, for two rows of one file, and where several are missing.
+    """
+    with in_folder(folder):
+        rows, remarks = read_rows(folder)
+        strikes = [understand(row, settings) for row in rows]
+        refuse_repeated_files(strikes)
+        _refuse_missing(folder, strikes)
+    return strikes, remarks
+
+
 def refuse_repeated_files(strikes: Sequence[Strike]) -> None:
     """Raise `CaptureError` where two rows name one file: one of the two contacts must be wrong."""
     lines: dict[str, int] = {}
@@ -156,6 +184,20 @@ def refuse_repeated_files(strikes: Sequence[Strike]) -> None:
                 value=strike.file,
             )
         lines[strike.file] = strike.line
+
+
+def _refuse_missing(folder: Path, strikes: Sequence[Strike]) -> None:
+    """Raise one `CaptureError` where several recordings are missing; for a single one its reader has more advice."""
+    missing = [strike.file for strike in strikes if not os.path.exists(folder / strike.file)]
+    if len(missing) > 1:
+        shown = f"{', '.join(missing[:5])}{', …' * (len(missing) > 5)}"
+        raise CaptureError(
+            f"{folder / TABLE}: expected a file for each row, got none for {len(missing)} of {len(strikes)} "
+            f"({shown}); copy them there, or correct their names",
+            file=folder / TABLE,
+            name="file",
+            value=missing,
+        )
 
 
 def fitting_units(written: float) -> str:

@@ -42,6 +42,17 @@ VERBS = {
     "demo": "Run a complete example: from photographs and recordings of a mug to its sound field, sounds and images.",
 }
 """Each verb's module in this package and in `options`, and the first sentence of its help, in the order of the work."""
+RENAMED = {
+    "play": "studio",
+    "lift": "features",
+    "view-cloud": "info",
+    "show": "info",
+    "efficiency": "evaluate learning-curve",
+    "help": "--help",
+    "version": "--version",
+    "-V": "--version",
+}
+"""What does the work of verbs of earlier versions, and of words that other programs know."""
 CLOSED = 141
 """The exit code that shells give a command whose output nobody reads any more."""
 INTERRUPTED = 130
@@ -172,7 +183,7 @@ def _compilation_announced() -> AbstractContextManager[None]:
 def _explain(words: list[str]) -> int:
     """Print the list of verbs and return 0, or print that there is no such verb and return 2."""
     if words and words[0] not in ("-h", "--help"):
-        near = get_close_matches(words[0], VERBS, n=1)
+        near = [RENAMED[words[0]]] if words[0] in RENAMED else get_close_matches(words[0], VERBS, n=1)
         guess = f" Did you mean {near[0]}?" if near else ""
         problem = f"expected a command, got {printable(words[0])!r}.{guess} `avmsf --help` lists all."
         print(f"avmsf: {problem}", file=sys.stderr)
@@ -181,7 +192,7 @@ def _explain(words: list[str]) -> int:
     width = min(shutil.get_terminal_size().columns, _WIDEST)
     rows = {**VERBS, "--help": "Print this list.", "--version": "Print the version."}
     print("usage: avmsf COMMAND [OPTIONS]\n")
-    print("The sound of an object wherever it is struck, from a few recordings.")
+    print("The sound of an impact anywhere on an object, from a few recordings.")
     print("`avmsf COMMAND --help` explains a command; `avmsf demo` runs a complete example.\n")
     separator = "\n" + " " * indent
     for name, sentence in rows.items():

@@ -8,9 +8,9 @@ from pathlib import Path
 from rich.console import Console
 
 from avmsf.capture import CaptureReport, CaptureSettings, CaptureWarning, Impacts, check, read_capture
-from avmsf.capture.folder import SETTINGS
 from avmsf.capture.measure import shared_problems
 from avmsf.capture.proposals import Proposal, propose_settings, settings_text, write_settings
+from avmsf.capture.settings import SETTINGS
 from avmsf.cli.alignment import AlignmentReport
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.check import Options

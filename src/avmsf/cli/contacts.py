@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf.capture.table import read_cells
-from avmsf.cli.writing import OutputError
+from avmsf.cli.options.checks import OutputError
 from avmsf.errors import CaptureError, PositionError
 from avmsf.field.positions import expect_near
 from avmsf.field.soundfield import SoundField

@@ -4,7 +4,8 @@ from dataclasses import asdict
 
 from avmsf.capture.datasets import DatasetReport, ObjectReport, open_dataset
 from avmsf.cli.options.dataset import Options
-from avmsf.cli.printing import console, print_json, say, table
+from avmsf.cli.printing import console, next_command, print_json, say, table
+from avmsf.wording import counted
 
 UNREADABLE = 2
 
@@ -24,8 +25,10 @@ def run(options: Options) -> int:
         return UNREADABLE
     recordings = sum(each.recordings for each in report.objects)
     screen.print(
-        f"{readable} of {len(report.objects)} objects can be read, with {recordings} recordings", soft_wrap=True
+        f"{readable} of {counted(len(report.objects), 'object')} can be read, with {counted(recordings, 'recording')}",
+        soft_wrap=True,
     )
+    next_command("avmsf evaluate farthest", options.dataset)
     return 0
 
 

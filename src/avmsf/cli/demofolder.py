@@ -7,7 +7,7 @@ from pathlib import Path
 
 from avmsf._utils.locks import write_lock
 from avmsf._utils.text_files import read_json
-from avmsf.cli.writing import OutputError
+from avmsf.cli.options.checks import OutputError
 from avmsf.files import way_out
 
 FORMAT = "avmsf demo 1"

@@ -16,10 +16,10 @@ from avmsf.cli import INTERRUPTED
 from avmsf.cli.clapcurve import CLAP
 from avmsf.cli.contacts import contacts_at, refuse_far
 from avmsf.cli.editmaterial import MaterialChange
-from avmsf.cli.options.edit import ModeOptions, Options
+from avmsf.cli.options.edit import AFTER, BEFORE, CURVE, MODES, SPECTROGRAMS, ModeOptions, Options
 from avmsf.cli.printing import console, decimals, figure, next_command, print_json, say, table
 from avmsf.cli.steering import Steering, beside
-from avmsf.cli.writing import Level, OutputError, expect_writable, write_sound
+from avmsf.cli.writing import Level, write_sound
 from avmsf.errors import EditError
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load, save
@@ -27,9 +27,6 @@ from avmsf.plotting.edits import draw_clap_curves
 from avmsf.tasks.edits import EDITS, remarks, silenced
 from avmsf.tasks.modes import adjust_modes
 
-MODES, SPECTROGRAMS, BEFORE, AFTER = "modes.png", "spectrograms.png", "before.wav", "after.wav"
-CURVE = "clap.png"
-"""What the folder of pictures holds."""
 _LISTED = 20
 """Modes in the table, those of most energy."""
 _CANDIDATES = 64
@@ -41,12 +38,6 @@ _NEAR = 0.02
 @dataclass(frozen=True)
 class Sliders(ModeOptions):
     """Every mode by hand."""
-
-    @property
-    def asked(self) -> bool:
-        """Whether anything changes."""
-        single = self.mode_db or self.mode_pitch or self.mode_decay
-        return (self.pitch, self.decay, self.brightness) != (1.0, 1.0, 0.0) or bool(single)
 
     def apply(self, field: SoundField, *, named: Float[Tensor, " modes"]) -> SoundField:
         """Return the retuned field; modes are called by the frequencies `named`, Hz."""
@@ -79,7 +70,6 @@ def _called(frequency: float, named: Float[Tensor, " modes"], option: str) -> in
 def run(options: Options) -> int:
     """Edit, write, and print the result; return 130 where Ctrl-C stopped it."""
     asked = _Edit.of(options)
-    _expect(options, asked)
     old = load(options.field)
     contact = _contact(old, options.position)
     try:
@@ -153,35 +143,6 @@ def _edited(options: Options, asked: _Edit, field: SoundField) -> SoundField:
     if asked.steering.asked:
         field = asked.steering.apply(field, output=options.output, old=old)
     return field
-
-
-def _expect(options: Options, asked: _Edit) -> None:
-    """Raise before any work for what cannot be done or written."""
-    asked.steering.expect_usable()
-    if asked.change.law != MaterialChange.law and not asked.change.asked:
-        raise EditError.expected("--material, --size or a constant of a material with it", name="--law")
-    if options.position is not None and options.plots is None:
-        raise EditError("--position: expected --plots with it, got none", name="--position")
-    if asked.change.old is not None and not (asked.change.asked or asked.steering.like_material):
-        raise EditError.expected("--material, --size, a constant or --like-material with it", name="--from")
-    if not (asked.change.asked or asked.sliders.asked or asked.steering.asked):
-        raise EditError(
-            "expected an edit, got none: give --material, --size or a constant of a material, --pitch, --decay, "
-            "--brightness, --mode-db, --mode-pitch or --mode-decay, --prompt, --like or --like-material",
-            name="options",
-        )
-    expect_writable(options.output)
-    if asked.steering.generated is not None:
-        expect_writable(asked.steering.generated)
-    if options.output.exists() and options.field.exists() and options.output.samefile(options.field):
-        raise OutputError(
-            f"{options.output}: expected another file than the field to edit; choose another --output",
-            file=options.output,
-            name="--output",
-        )
-    if options.plots is not None:
-        for name in (MODES, SPECTROGRAMS, BEFORE, AFTER, CURVE):
-            expect_writable(options.plots / name)
 
 
 def _contact(field: SoundField, at: tuple[float, float, float] | None) -> Float[Tensor, " 3"]:

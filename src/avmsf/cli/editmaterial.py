@@ -14,17 +14,6 @@ from avmsf.tasks.material import LAWS, change_material
 class MaterialChange(MaterialOptions):
     """Another material and size, by the laws of linear modal analysis: the shape stays."""
 
-    @property
-    def constants(self) -> dict[str, float]:
-        """The constants that are given."""
-        given = {name: getattr(self, name) for name in ("young", "density", "poisson", "alpha", "beta")}
-        return {name: value for name, value in given.items() if value is not None}
-
-    @property
-    def asked(self) -> bool:
-        """Whether anything changes."""
-        return self.material is not None or self.size != 1.0 or bool(self.constants)
-
     def made_of(self, field: SoundField) -> Material:
         """Return a field's material before the change; prints its source where it is not given.
 

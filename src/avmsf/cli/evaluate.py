@@ -27,7 +27,7 @@ from avmsf.capture.datasets import CaptureCollection, open_dataset
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.objectbar import ObjectBar
-from avmsf.cli.options.evaluate import Options
+from avmsf.cli.options.evaluate import Options, words_of
 from avmsf.cli.printing import console, decimals, print_json, say, table
 from avmsf.config import AUTO, PRESETS, LiftConfig, SceneConfig, TimeZero, ViewsConfig
 from avmsf.errors import EvaluationError
@@ -48,7 +48,7 @@ def run(options: Options) -> int:
         protocol = replace(protocol, choosing=Growing(options.counts, options.starts))
     elif options.counts or options.starts != Options.starts or options.metric != Options.metric:
         say(f"note: --counts, --starts and --metric are not used by {protocol.name}, only by {LEARNING_CURVE}")
-    methods = tuple(method_named(name) for name in _words(options.methods) or protocol.methods)
+    methods = tuple(method_named(name) for name in words_of(options.methods) or protocol.methods)
     workers = Workers(options.workers, options.ray)
     # All paths are made absolute: workers may run in folders of their own.
     contacts, table_of_names = (
@@ -56,12 +56,13 @@ def run(options: Options) -> int:
     )
     dataset = open_dataset(options.data.resolve(), contacts=contacts, table=table_of_names, time_zero=options.time_zero)
     title = title_of(dataset, options.data)
-    objects = choose_objects(dataset, protocol, _words(options.objects))
+    objects = choose_objects(dataset, protocol, words_of(options.objects))
     folder = (options.output or Path("evaluation") / title / protocol.name).resolve()
     evaluation = evaluation_of(options, dataset, title, protocol, methods, folder)
     _note_start(methods, options.time_zero)
     results, groups = ResultsFolder(folder), members(dataset)
-    say(f"{protocol.name} on {title}: {len(objects)} objects, {len(methods)} methods, results in {folder}")
+    work = f"{counted(len(objects), 'object')}, {counted(len(methods), 'method')}"
+    say(f"{protocol.name} on {title}: {work}, results in {folder}")
     try:
         run_shown(evaluation, objects, results, workers, after_each=partial(write_summary, results, subsets=groups))
         summary = write_summary(results, subsets=groups)
@@ -221,10 +222,6 @@ def looks_of(methods: Sequence[Method], protocol: EvaluationProtocol) -> frozens
 def title_of(dataset: Dataset, folder: Path) -> str:
     """Return a dataset's name in reports: captures by their folder, which identifies them."""
     return folder.resolve().name if isinstance(dataset, CaptureCollection) else dataset.name
-
-
-def _words(given: Sequence[str]) -> tuple[str, ...]:
-    return tuple(word for each in given for word in each.split(",") if word)
 
 
 def _print(part: Section, screen: Console) -> None:

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import torch
 
-from avmsf.capture.folder import read_capture, settings_of
+from avmsf.capture.filenames import find_surface_file
+from avmsf.capture.folder import read_capture
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.surface import find_surface_file
+from avmsf.capture.settings import settings_of
 from avmsf.cli.options.export import Options, unused_options
-from avmsf.cli.printing import figure, print_result, say
+from avmsf.cli.printing import figure, next_command, print_result, say
 from avmsf.cli.render import METRES
 from avmsf.config import CACHE
 from avmsf.errors import ExportError
@@ -54,8 +55,6 @@ _ENDINGS = frozenset(
 
 def run(options: Options) -> int:
     """Read, write, and print the size and what is left out."""
-    if options.points is not None and options.points < 1:
-        raise ExportError(f"--points: expected 1 or more, got {options.points}", name="--points", value=options.points)
     expect_name(options)
     for sentence in unused_options(options):
         say(f"note: {sentence}")
@@ -79,6 +78,8 @@ def run(options: Options) -> int:
         "notes": list(written.remarks),
     }
     print_result(text, values, json=options.json)
+    if options.field.is_file():
+        next_command("avmsf studio", options.field)
     return 0
 
 

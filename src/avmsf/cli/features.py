@@ -4,9 +4,9 @@ import shlex
 
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.options.features import Options
+from avmsf.cli.options.scenes import with_seed
 from avmsf.cli.printing import console, next_command, print_json, say
 from avmsf.cli.scenes import features_words, opened_scene, stage_line
-from avmsf.cli.writing import expect_writable
 from avmsf.config import SceneConfig
 from avmsf.files import copy_whole
 from avmsf.scene.featurestore import read_report
@@ -14,9 +14,7 @@ from avmsf.scene.featurestore import read_report
 
 def run(options: Options) -> int:
     """Make the features; return 130 where Ctrl-C stopped it."""
-    if options.output is not None:
-        expect_writable(options.output)
-    config = SceneConfig(options.views, options.splat, options.config)
+    config = with_seed(SceneConfig(options.views, options.splat, options.config), options.config.seed or None)
     try:
         with opened_scene(options, config, command="avmsf features") as scene:
             features = scene.features
@@ -35,6 +33,6 @@ def run(options: Options) -> int:
     if options.json:
         print_json({"features": str(options.output or features.path), **report})
     made = shlex.quote(str(options.output or features.path))
-    network = "--preset paper" if options.preset == "paper" else "--gain-model network"
-    next_command("avmsf fit", options.folder, f"--features {made} {network} -o field.safetensors")
+    model = "--preset paper" if options.preset == "paper" else "--gain-model visual"
+    next_command("avmsf fit", options.folder, f"--features {made} {model} -o field.safetensors")
     return 0

@@ -10,17 +10,15 @@ from rich.console import Console
 from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf.bench.evaluation import Scores, split
 from avmsf.capture import CaptureSettings, Impacts, read_capture
-from avmsf.capture.folder import settings_of
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
 from avmsf.cli.heartbeat import doing
+from avmsf.cli.options.checks import read_settings
 from avmsf.cli.options.fit import Options
 from avmsf.cli.printing import console, next_command, print_json, say
 from avmsf.cli.progress import FitBar
 from avmsf.cli.scores import compare, parts_words, quality_words, score_table, score_values
-from avmsf.cli.writing import expect_writable
 from avmsf.errors import FitError
-from avmsf.field.gains.elastic import Elastic
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import save
 from avmsf.pipeline.fitting import discard_unfinished, fit_capture, unfinished
@@ -35,9 +33,8 @@ _SHOWN = 8
 
 def run(options: Options) -> int:
     """Fit, write, and print a summary; return 130 where Ctrl-C stopped it."""
-    expect_writable(options.output)
     usable_device(options.device, raising=FitError, kinds=TRAINABLE)
-    known = settings_of(options.capture) if options.settings is None else CaptureSettings.read(options.settings)
+    known = read_settings(options.capture, options.settings)
     if options.material is not None:
         return _run_guess(options, options.material, known)
     capture = read_capture(options.capture, capture_settings_of(options.pipeline, known))
@@ -118,7 +115,6 @@ def fitted_values(
 
 def _run_guess(options: Options, material: str, settings: CaptureSettings) -> int:
     """Compute a field without recordings, write it and print a summary."""
-    refuse_with_material(options)
     guessed = guess_field(
         known_surface(options.capture, settings),
         material,
@@ -136,31 +132,13 @@ def _run_guess(options: Options, material: str, settings: CaptureSettings) -> in
     return 0
 
 
-def refuse_with_material(options: Any) -> None:
-    """Raise FitError for options of `fit` or `reconstruct` that need recordings, given with --material."""
-    names = ("train_fraction", "train_count", "features")
-    given = [name for name in names if getattr(options, name, None) is not None]
-    if options.gain_model not in ("auto", Elastic.kind):
-        given.append("gain_model")
-    if options.body.supports == "try":
-        given.append("body.supports")
-    if options.time_zero is not None:
-        given.append("time_zero")
-    if given:
-        option = f"--{given[0].replace('_', '-')}"
-        raise FitError(
-            f"{option}: expected recordings, got --material, which computes a field without them; leave one out",
-            name=option,
-            value="--material",
-        )
-
-
 def show_guess(guessed: SoundField, output: Path, *, json: bool) -> None:
     """Print a summary of a field without recordings in the file `output`."""
     screen = console(errors=json)
     for words in quality_words(guessed, output):
         screen.print(words, soft_wrap=True)
     screen.print(f"wrote {output}", soft_wrap=True)
+    next_command("avmsf render", output, "--position X Y Z -o impact.wav")
     if json:
         report = guessed.origin.report
         values = {"field": str(output), "capture": guessed.origin.capture, "modes": len(guessed.bank)}
@@ -171,8 +149,6 @@ def part_contacts(
     impacts: Impacts, *, fraction: float | None, count: int | None, start: int
 ) -> tuple[Impacts, Impacts | None]:
     """Return the recordings to fit to and those to score on, None where all are fitted to."""
-    if count is not None and fraction is not None:
-        raise FitError("expected --train-count or --train-fraction, got both; leave one out", name="--train-count")
     if fraction is not None:
         return split(impacts, fraction=fraction, start=start)
     if count is not None:

@@ -28,7 +28,7 @@ from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.field.uncertainty import has_posterior, relative_gain_std, spectrum_band, training_contacts
 from avmsf.pipeline.record import RECORD
-from avmsf.scene.featurestore import holds_features
+from avmsf.scene.featureheader import holds_features
 from avmsf.scene.points import farthest_points
 
 _DRAWN_POINTS = 4000

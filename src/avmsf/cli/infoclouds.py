@@ -66,7 +66,7 @@ def _draw_features(features: FeatureField, report: dict[str, Any], options: Opti
         shown,
         title=f"{options.file.name}: {features.encoder} on {len(features.points)} points",
         colors=None if options.cloud is None else _colors_of(options.cloud, features),
-        clusters=min(options.clusters, len(features.points)),
+        clusters=min(options.regions, len(features.points)),
         symmetries=symmetries,
         up=_UP[options.up],
     )

@@ -14,12 +14,10 @@ from avmsf.bench.contactpictures import draw_contact, write_contact_cloud
 from avmsf.bench.pictures import save_picture
 from avmsf.capture import CaptureSettings
 from avmsf.capture.audio import Recording, read_recording
-from avmsf.capture.folder import settings_of
 from avmsf.cli.contacts import Contacts, refuse_far
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.locate import Options
-from avmsf.cli.printing import console, figure, print_json, say
-from avmsf.cli.writing import OutputError, expect_writable
+from avmsf.cli.printing import console, figure, next_command, print_json, say
 from avmsf.errors import AvmsfError, LocationError
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
@@ -36,15 +34,7 @@ UNLOCATED = 2
 
 def run(options: Options) -> int:
     """Locate, print and draw; return 2 where a recording could not be located."""
-    if not options.recordings:
-        raise OutputError("expected one recording or more after the field, such as HIT.wav", name="recordings", value=0)
-    if not 0.0 < options.probability < 1.0:
-        raise OutputError.expected(
-            "a probability between 0 and 1, such as 0.9", options.probability, name="--probability"
-        )
-    if options.output is not None:
-        expect_writable(options.output / "impact.png")
-    settings = _settings(options)
+    settings = None if options.settings is None else CaptureSettings.read(options.settings)
     force = None if options.force is None else Force(options.force)
     known = _Known(load(options.field))
     truth = _true_contact(options, known.field)
@@ -73,6 +63,7 @@ def run(options: Options) -> int:
             if contact is not None and options.output is not None:
                 values |= _draw(contact, options.output, _name(path, taken), values, truth)
             found.append(values)
+    next_command("avmsf suggest", options.field)
     if options.json:
         print_json({"field": str(options.field), "quality": verdict, "impacts": found, "failures": failures})
     return UNLOCATED if failures or any(each["position"] is None for each in found) else 0
@@ -120,19 +111,6 @@ def _blows(
     if several:
         return [*locate_blows(known.field, recording, settings=settings, force=force, locator=known.locator)]
     return [(None, locate(known.field, recording, settings=settings, force=force, locator=known.locator))]
-
-
-def _settings(options: Options) -> CaptureSettings | None:
-    """Return how recordings are read. Raises OutputError for a capture folder that is not there."""
-    if options.settings is not None:
-        return CaptureSettings.read(options.settings)
-    if options.capture is None:
-        return None
-    if not options.capture.is_dir():
-        raise OutputError.expected(
-            "a capture folder", file=options.capture, name="--capture", advice="check the name, or leave it out"
-        )
-    return settings_of(options.capture)
 
 
 def _true_contact(options: Options, field: SoundField) -> Float64[Tensor, " 3"] | None:

@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import asdict
 
-from avmsf.bench.pictures import draw_modes, expect_format, save_picture
-from avmsf.capture import CaptureSettings, read_capture
-from avmsf.capture.folder import settings_of
+from avmsf.bench.pictures import draw_modes, save_picture
+from avmsf.capture import read_capture
 from avmsf.cli.alignment import AlignmentReport
 from avmsf.cli.modetable import ModeRow, QualityRow, amplitudes, levels, mode_rows, quality_rows
+from avmsf.cli.options.checks import read_settings
 from avmsf.cli.options.modes import Options
 from avmsf.cli.printing import console, decimals, figure, next_command, print_json, say, table
 from avmsf.modal.extraction.extract import extract_modes
@@ -23,9 +23,7 @@ leave-one-out, 50 % by chance."""
 
 def run(options: Options) -> int:
     """Print the modes."""
-    if options.picture is not None:
-        expect_format(options.picture)
-    known = settings_of(options.capture) if options.settings is None else CaptureSettings.read(options.settings)
+    known = read_settings(options.capture, options.settings)
     capture = read_capture(options.capture, capture_settings_of(options.pipeline, known))
     impacts = capture.impacts
     count = counted(len(impacts), "recording")
@@ -45,10 +43,11 @@ def run(options: Options) -> int:
     aligned = AlignmentReport.of(extraction, impacts)
     for sentence in [] if aligned is None else aligned.sentences():
         screen.print(sentence, soft_wrap=True)
-    if options.picture is not None:
+    if options.plots is not None:
+        picture = options.plots / "modes.png"
         drawn = f"{len(rows)} poles of {capture.name}, {len(modes)} of them modes"
-        save_picture(draw_modes(extraction.bank, level, title=drawn), options.picture)
-        say(f"wrote {options.picture}")
+        save_picture(draw_modes(extraction.bank, level, title=drawn), picture)
+        say(f"wrote {picture}")
     if options.json:
         print_json(
             {

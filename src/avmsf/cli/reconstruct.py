@@ -6,15 +6,15 @@ from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
-from avmsf.cli.fit import fitted_values, part_contacts, print_fitted, refuse_with_material, show_guess
+from avmsf.cli.fit import fitted_values, part_contacts, print_fitted, show_guess
 from avmsf.cli.heartbeat import doing
+from avmsf.cli.options.checks import read_settings
 from avmsf.cli.options.reconstruct import Options
 from avmsf.cli.printing import console, figure, next_command, print_json, say, table
 from avmsf.cli.progress import FitBar
 from avmsf.cli.scenebar import SceneBar
-from avmsf.cli.scenes import features_words, settings_for
+from avmsf.cli.scenes import features_words
 from avmsf.cli.scores import compare
-from avmsf.cli.writing import expect_writable
 from avmsf.errors import FitError
 from avmsf.field.fit import Progress
 from avmsf.field.store import load
@@ -26,10 +26,8 @@ from avmsf.pipeline.stages import StageFolder
 
 def run(options: Options) -> int:
     """Reconstruct, and print a summary; return 130 where Ctrl-C stopped it."""
-    if options.output is not None:
-        expect_writable(options.output)
     usable_device(options.device, raising=FitError, kinds=TRAINABLE)
-    settings = capture_settings_of(options.pipeline, settings_for(options))
+    settings = capture_settings_of(options.pipeline, read_settings(options.folder, options.settings))
     if options.material is not None:
         return _run_guess(options, options.material, settings)
     capture = read_capture(options.folder, settings)
@@ -85,7 +83,6 @@ def run(options: Options) -> int:
 
 def _run_guess(options: Options, material: str, settings: CaptureSettings) -> int:
     """Compute a field without recordings, and print a summary."""
-    refuse_with_material(options)
     try:
         with SceneBar() as bar, StageFolder(options.kept).lock("avmsf reconstruct"):
             made = reconstruct_guess(

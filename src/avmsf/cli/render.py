@@ -5,22 +5,21 @@ import warnings
 from functools import partial
 from pathlib import Path
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.capture.audio import MAX_SAMPLES
 from avmsf.cli.contacts import Contacts, contacts_at, read_contacts, refuse_far
 from avmsf.cli.heartbeat import doing
+from avmsf.cli.options.checks import OutputError, expect_writable
 from avmsf.cli.options.render import Options
-from avmsf.cli.printing import print_result, say
-from avmsf.cli.writing import Level, OutputError, expect_writable, write_sound
+from avmsf.cli.printing import next_command, print_result, say
+from avmsf.cli.writing import Level, write_sound
 from avmsf.errors import PositionWarning
 from avmsf.field.positions import off_surface
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.modal.pulse import ForcePulse
-from avmsf.simulate.recipe import LONGEST
 
 _MUCH_SOFTER = 20.0
 """Decibels below the recorded impact from which a softer hammer's sound is noted."""
@@ -31,14 +30,6 @@ def run(options: Options) -> int:
     """Render and write."""
     contacts = _contacts(options)
     paths = _paths(options.output, contacts)
-    for name in ("force", "level_db"):
-        value, option = getattr(options, name), f"--{name.replace('_', '-')}"
-        if not math.isfinite(value):
-            raise OutputError(f"{option}: expected a finite number, got {value}", name=option, value=value)
-    if options.force <= 0:
-        raise OutputError.expected(
-            "a force above 0", options.force, name="--force", advice="--direction says which way it acts"
-        )
     field = load(options.field)
     refuse_far(contacts, field)
     for row, distance in off_surface(contacts.places, field.gain_field.points):
@@ -71,32 +62,16 @@ def run(options: Options) -> int:
     text = f"wrote {wrote}: {seconds:.3g} s at {field.sample_rate:g} Hz, {options.coding}"
     values = {"files": list(map(str, paths)), "sample_rate": field.sample_rate, "seconds": seconds, "peak": peak}
     print_result(text, values, json=options.json)
+    next_command("avmsf export", options.field, "--to web -o page")
     return 0
 
 
 def _contacts(options: Options) -> Contacts:
-    """Return the contacts of the options or of their table; raises `OutputError` for none, both or not finite ones."""
+    """Return the contacts of the options or of their table."""
     meters = METRES[options.unit]
-    if bool(options.position) == (options.contact_table is not None):
-        raise OutputError(
-            "expected contacts either by --position X Y Z, once or more, or by --contact-table TABLE.csv",
-            name="--position",
-            value=len(options.position),
-        )
-    if options.direction and len(options.direction) != len(options.position):
-        raise OutputError(
-            f"--direction: expected one for each --position, got {len(options.direction)} for {len(options.position)}",
-            name="--direction",
-            value=len(options.direction),
-        )
     if options.contact_table is not None:
         return read_contacts(options.contact_table, meters=meters)
-    contacts = contacts_at(options.position, meters=meters, directions=options.direction)
-    wrong = torch.nonzero(~torch.isfinite(contacts.places).all(1)).flatten().tolist()
-    if wrong:
-        found = contacts.places[wrong[0]].tolist()
-        raise OutputError.expected("finite coordinates", found, row=wrong[0], name="--position")
-    return contacts
+    return contacts_at(options.position, meters=meters, directions=options.direction)
 
 
 def _say_softer(hard: Float[Tensor, " samples"], soft: Float[Tensor, " samples"], contact_time: float) -> None:
@@ -136,8 +111,6 @@ def _samples(seconds: float, field: SoundField) -> int:
 
 
 def _pulse(options: Options) -> ForcePulse | None:
-    if not 0 <= options.contact_time <= LONGEST:
-        raise OutputError.expected(f"seconds from 0 to {LONGEST:g}", options.contact_time, name="--contact-time")
     return ForcePulse(options.contact_time, options.pulse) if options.contact_time else None
 
 

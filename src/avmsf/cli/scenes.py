@@ -4,9 +4,8 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from avmsf.capture import CaptureSettings
-from avmsf.capture.folder import settings_of
 from avmsf.capture.together import expect_one_unit
+from avmsf.cli.options.checks import read_settings
 from avmsf.cli.options.scenes import SceneOptions
 from avmsf.cli.scenebar import SceneBar
 from avmsf.config import SceneConfig
@@ -15,18 +14,13 @@ from avmsf.pipeline.stages import Kept, StageFolder
 from avmsf.scene.symmetry import Symmetries
 
 
-def settings_for(options: SceneOptions) -> CaptureSettings:
-    """Return the settings of the folder's capture, or the defaults."""
-    return settings_of(options.folder) if options.settings is None else CaptureSettings.read(options.settings)
-
-
 @contextmanager
 def opened_scene(options: SceneOptions, config: SceneConfig, *, command: str) -> Iterator[SceneStages]:
     """Yield the stages of the options' folder, which show their progress and are locked for the command.
 
     Raises SceneError for a folder without views of the object.
     """
-    settings = settings_for(options)
+    settings = read_settings(options.folder, options.settings)
     expect_one_unit(options.folder, settings)
     stages = StageFolder(options.kept)
     with SceneBar() as bar:

@@ -7,7 +7,6 @@ from avmsf.cli import INTERRUPTED
 from avmsf.cli.objectbar import ObjectBar
 from avmsf.cli.options.simulate import Options
 from avmsf.cli.printing import console, next_command, print_json, print_result, say, table
-from avmsf.errors import SimulationError
 from avmsf.simulate.material import MATERIALS
 from avmsf.simulate.recipe import ObjectRecipe
 from avmsf.simulate.shapes import KINDS
@@ -22,8 +21,7 @@ def run(options: Options) -> int:
         if options.json:
             print_json({"objects": list(SIM20), "shapes": list(KINDS), "materials": list(MATERIALS)})
         return 0
-    if options.output is None:
-        raise SimulationError("--output: expected a folder, got none; --list names the objects", name="output")
+    assert options.output is not None
     recipes, folder = _chosen(options, options.output)
     try:
         with ObjectBar() as bar:
@@ -45,14 +43,6 @@ def run(options: Options) -> int:
 def _chosen(options: Options, output: Path) -> tuple[dict[str, ObjectRecipe], Path]:
     """Return the recipes by their folders' names, and the folder that holds these."""
     if options.what == SET:
-        for name in ("kind", "mesh", "material", "seed"):
-            if getattr(options.recipe, name) != getattr(ObjectRecipe(), name):
-                value = getattr(options.recipe, name)
-                raise SimulationError(
-                    f"--{name}: expected none with {SET}, got {value}; leave it out",
-                    name=name,
-                    value=str(value),
-                )
         changes = {
             each.name: getattr(options.recipe, each.name)
             for each in fields(ObjectRecipe)

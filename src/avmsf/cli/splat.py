@@ -1,10 +1,10 @@
 """`avmsf splat`: a folder's photographs, video or mesh in, Gaussians out."""
 
 from avmsf.cli import INTERRUPTED
+from avmsf.cli.options.scenes import with_seed
 from avmsf.cli.options.splat import Options
 from avmsf.cli.printing import next_command, print_result, say
 from avmsf.cli.scenes import opened_scene, stage_line
-from avmsf.cli.writing import expect_writable
 from avmsf.config import SceneConfig
 from avmsf.files import copy_whole
 from avmsf.scene.ply import read_splats
@@ -12,9 +12,7 @@ from avmsf.scene.ply import read_splats
 
 def run(options: Options) -> int:
     """Make the Gaussians; return 130 where Ctrl-C stopped it."""
-    if options.output is not None:
-        expect_writable(options.output)
-    config = SceneConfig(views=options.views, splat=options.config)
+    config = with_seed(SceneConfig(views=options.views, splat=options.config), options.config.seed or None)
     try:
         with opened_scene(options, config, command="avmsf splat") as scene:
             cloud = scene.cloud

@@ -1,12 +1,10 @@
 """Guided edits on the command line, by a prompt, recordings or a material: guide, progress and previews."""
 
 import dataclasses
-import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -16,10 +14,9 @@ from avmsf.cli.heartbeat import doing, verbosity
 from avmsf.cli.options.edit import GuideOptions
 from avmsf.cli.printing import console, figure, say
 from avmsf.cli.writing import Level, write_sound
-from avmsf.errors import EditError
 from avmsf.field.soundfield import SoundField
 from avmsf.simulate.material import Material, material_named
-from avmsf.tasks.distillation import DecoderDistillation, expect_prompt
+from avmsf.tasks.distillation import DecoderDistillation
 from avmsf.tasks.edits import EDITS
 from avmsf.tasks.guided import Guide, GuidedEditProgress, edit_towards
 from avmsf.tasks.materialstatistics import MaterialStatistics
@@ -30,8 +27,6 @@ from avmsf.tasks.stableaudio import StableAudio
 _PREVIEW = Level("peak", -1.0)
 _GENERATED_SECONDS = 3.0
 """Duration of a sound that is generated from a prompt only."""
-_OF_THE_MODEL = ("--model", "--negative", "--model-seconds", "--device", "--generated", "--clap")
-"""Options that only a prompt needs."""
 
 
 @dataclass(frozen=True)
@@ -42,49 +37,18 @@ class Steering(GuideOptions):
     continues from it to the same result.
     """
 
-    @property
-    def asked(self) -> bool:
-        """Whether there is a guide."""
-        return bool(self._guides)
-
-    def expect_usable(self) -> None:
-        """Raise before a field or a model is loaded, `SimulationError` for a material that is not known.
-
-        And `EditError` for more than one guide, an empty prompt, and settings of a guide that is not given.
-        """
-        if len(self._guides) > 1:
-            raise EditError(
-                f"expected one of --prompt, --like and --like-material, got {' and '.join(self._guides)}; use one "
-                "after the other",
-                name=self._guides[0],
-                value=tuple(self._guides),
-            )
-        if self.like_material is not None:
-            material_named(self.like_material)
-        if not self._guides:
-            given = [*(name for name in _changed(self) if name == "--parameters"), *_changed(self.config)]
-            _expect_unchanged(given, "--prompt, --like or --like-material")
-        if self.prompt is None:
-            own = [name for name in _changed(self) if name in _OF_THE_MODEL]
-            _expect_unchanged([*own, *_changed(self.distillation)], "--prompt")
-            return
-        expect_prompt(self.prompt)
-        if self.clap is not None and self.config.preview_every == 0:
-            raise EditError.expected("--preview-every 1 or more with it, such as 50", 0, got="0", name="--clap")
-        if self.model_seconds is not None and not 0 < self.model_seconds < math.inf:
-            raise EditError.expected("more than 0, such as 3", self.model_seconds, name="--model-seconds")
-
     def apply(self, field: SoundField, *, output: Path, old: Material | None) -> SoundField:
         """Return the edited field; its state and preview are written next to `output`, its later file.
 
         `old` is the field's material, needed only for `like_material`.
         """
-        guide = self._guide(field, old)
         preview, checkpoint = beside(output, "preview.wav"), beside(output, "checkpoint")
         curve: ClapCurve | None = None
         if self.clap is not None and self.prompt is not None:
             clap, kept = Clap.load(self.clap), beside(output, "clap.json")
             curve = ClapCurve(clap, self.prompt, field, kept, resumed=checkpoint.exists())
+        # After CLAP: a wrong name of its network is refused before the large model is loaded.
+        guide = self._guide(field, old)
         with SteerBar(preview, sample_rate=field.sample_rate) as bar:
 
             def progress(reached: GuidedEditProgress) -> None:
@@ -97,12 +61,6 @@ class Steering(GuideOptions):
                 checkpoint=checkpoint,
             )  # fmt: skip
         return edited if curve is None else _with_scores(edited, curve)
-
-    @property
-    def _guides(self) -> list[str]:
-        given = {"--prompt": self.prompt is not None, "--like": bool(self.like)}
-        given["--like-material"] = self.like_material is not None
-        return [name for name, present in given.items() if present]
 
     def _guide(self, field: SoundField, old: Material | None) -> Guide:
         if self.like_material is not None:
@@ -131,22 +89,6 @@ def _with_scores(field: SoundField, curve: ClapCurve) -> SoundField:
     *others, last = field.origin.report[EDITS]
     report = {**field.origin.report, EDITS: [*others, {**last, CLAP: curve.record()}]}
     return dataclasses.replace(field, origin=dataclasses.replace(field.origin, report=report))
-
-
-def _changed(options: Any) -> list[str]:
-    """Return which options of a dataclass are not at their defaults, as the command line calls them."""
-    return [
-        f"--{each.name.replace('_', '-')}"
-        for each in dataclasses.fields(options)
-        if each.default is not dataclasses.MISSING and getattr(options, each.name) != each.default
-    ]
-
-
-def _expect_unchanged(given: list[str], wanted: str) -> None:
-    if given:
-        raise EditError(
-            f"{' and '.join(given)}: expected {wanted} as well, got none", name=given[0], value=tuple(given)
-        )
 
 
 class SteerBar:

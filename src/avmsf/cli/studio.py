@@ -5,14 +5,11 @@ import sys
 
 from avmsf.cli.options.studio import Options
 from avmsf.cli.printing import print_json, say
-from avmsf.cli.writing import OutputError
 from avmsf.errors import StudioError
 
 
 def run(options: Options) -> int:
     """Serve the page until Ctrl-C."""
-    if options.modes < 1:
-        raise OutputError(f"--modes: expected 1 or more, got {options.modes}", name="modes", value=options.modes)
     try:
         from avmsf.studio.modules import fetch_modules, find_modules
         from avmsf.studio.opening import open_target
@@ -29,8 +26,7 @@ def run(options: Options) -> int:
         say(f"the page's libraries are in {fetch_modules()}")
         if options.target is None:
             return 0
-    if options.target is None:
-        raise StudioError("expected a field, a capture folder, a folder of images or a mesh, got none", name="target")
+    assert options.target is not None
     opened = open_target(options.target, object=options.object, capture=options.capture)
     if find_modules() is None:
         say("the page loads three and spark from cdn.jsdelivr.net; --fetch-modules downloads them once")

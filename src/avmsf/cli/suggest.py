@@ -2,6 +2,7 @@
 
 import csv
 import io
+import shlex
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,28 +12,19 @@ from avmsf.bench.doubtpictures import draw_doubt
 from avmsf.bench.pictures import save_picture
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli.heartbeat import doing
-from avmsf.cli.options.suggest import Options
-from avmsf.cli.printing import console, figure, print_json, say, table
-from avmsf.cli.writing import expect_writable, write_text
-from avmsf.errors import FitError
+from avmsf.cli.options.suggest import PICTURE, TABLE, Options
+from avmsf.cli.printing import console, figure, next_command, print_json, say, table
+from avmsf.cli.writing import write_text
 from avmsf.field.store import load
 from avmsf.field.suggest import Suggestions, suggest
 from avmsf.field.uncertainty import relative_gain_std, unedited_mixture
 
-TABLE, PICTURE = "suggested.csv", "suggested.png"
-"""What the folder of results holds."""
 _DRAWN_POINTS = 4000
 
 
 def run(options: Options) -> int:
     """Suggest, print and draw."""
-    if options.settings is not None and options.candidates is None:
-        raise FitError("--settings: expected it with --candidates, got it without; leave it out", name="--settings")
-    if options.unseen and options.candidates is not None:
-        raise FitError("--unseen: expected it without --candidates, got both; leave one out", name="--unseen")
     paths = {} if options.output is None else {name: options.output / name for name in (TABLE, PICTURE)}
-    for path in paths.values():
-        expect_writable(path)
     field = load(options.field)
     gains = unedited_mixture(field)
     names: tuple[str, ...] | None = None
@@ -68,6 +60,7 @@ def run(options: Options) -> int:
         save_picture(picture, paths[PICTURE])
         for path in paths.values():
             say(f"wrote {path}")
+    next_command(f"avmsf fit CAPTURE -o {shlex.quote(str(options.field))}")
     if options.json:
         print_json(
             {

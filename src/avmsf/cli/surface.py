@@ -1,19 +1,16 @@
 """`avmsf surface`: a folder's mesh, photographs or video in, the object's surface out."""
 
-from pathlib import Path
-from typing import get_args
-
 import trimesh
 
-from avmsf.bench.pictures import expect_format, save_picture
+from avmsf.bench.pictures import save_picture
 from avmsf.bench.surfacepictures import draw_surface
-from avmsf.capture.surface import Surface, SurfaceKind, find_surface, read_surface, write_surface
+from avmsf.capture.surface import Surface, find_surface, read_surface, write_surface
 from avmsf.cli import INTERRUPTED
+from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.scenes import with_seed
-from avmsf.cli.options.surface import Options
+from avmsf.cli.options.surface import Options, kind_of
 from avmsf.cli.printing import next_command, print_result, say
 from avmsf.cli.scenes import opened_scene, stage_line
-from avmsf.cli.writing import OutputError, expect_writable
 from avmsf.config import SceneConfig
 from avmsf.files import write_whole
 from avmsf.pipeline.reconstruct import keep_surface, object_shape
@@ -21,10 +18,6 @@ from avmsf.pipeline.reconstruct import keep_surface, object_shape
 
 def run(options: Options) -> int:
     """Make and write the surface; return 130 where Ctrl-C stopped it."""
-    if options.output is not None:
-        expect_writable(options.output)
-    if options.picture is not None:
-        expect_format(options.picture)
     kind = "ply" if options.output is None else kind_of(options.output)
     config = with_seed(SceneConfig(views=options.views, splat=options.splat), options.seed)
     try:
@@ -39,28 +32,14 @@ def run(options: Options) -> int:
         return INTERRUPTED
     lines = [surface_words(surface)]
     lines += [stage_line(name, made) for name, made in {**scene.made(), "surface": kept}.items()]
-    if options.picture is not None:
-        save_picture(draw_surface(surface, title=f"{options.folder.resolve().name}: surface"), options.picture)
-    lines += [f"wrote {path}" for path in (options.output, options.picture) if path is not None]
+    picture = None if options.plots is None else options.plots / "surface.png"
+    if picture is not None:
+        save_picture(draw_surface(surface, title=f"{options.folder.resolve().name}: surface"), picture)
+    lines += [f"wrote {path}" for path in (options.output, picture) if path is not None]
     values = {"surface": str(options.output or kept.path), "triangles": len(surface.faces)}
     print_result("\n".join(lines), values, json=options.json)
     next_command("avmsf reconstruct", options.folder, "-o field.safetensors")
     return 0
-
-
-def kind_of(path: Path) -> SurfaceKind:
-    """Return the format of a file by its suffix. Raises OutputError for another."""
-    kinds: tuple[SurfaceKind, ...] = get_args(SurfaceKind)
-    for kind in kinds:
-        if path.suffix.lower() == f".{kind}":
-            return kind
-    raise OutputError(
-        f"{path}: expected a name that ends in {', '.join(f'.{kind}' for kind in kinds)}, got "
-        f"{path.suffix or 'no suffix'}; rename it",
-        file=path,
-        name="suffix",
-        value=path.suffix,
-    )
 
 
 def surface_words(surface: Surface) -> str:

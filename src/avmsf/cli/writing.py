@@ -12,18 +12,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.render import Coding
-from avmsf.errors import AvmsfError
 from avmsf.files import write_whole
 
 SUBTYPES = {"float32": "FLOAT", "int16": "PCM_16"}
 _LARGEST_INT16 = 2**15 - 1
 FULL_SCALE: dict[Coding, float] = {"float32": 1.0, "int16": _LARGEST_INT16 / 2**15}
 """Largest sample of each format."""
-
-
-class OutputError(AvmsfError):
-    """An option or an output of a command cannot be used."""
 
 
 @dataclass(frozen=True)
@@ -79,15 +75,3 @@ def write_sound(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: fl
 def write_text(path: Path, text: str) -> None:
     """Write a text file."""
     write_whole(path, lambda place: place.write_bytes(text.encode()))
-
-
-def expect_writable(path: Path) -> None:
-    """Raise `OutputError` where no file can be written at `path`: before work of minutes, not after."""
-    if path.is_dir():
-        raise OutputError(f"{path}: expected the name of a file, got a folder", file=path, value="folder")
-    folder = path.parent
-    existing = next(place for place in (folder, *folder.resolve().parents) if place.exists())
-    if not existing.is_dir():
-        raise OutputError(
-            f"{path}: expected a folder at {existing}, got a file; choose another folder", file=existing, value="file"
-        )

@@ -33,9 +33,9 @@ class AttentionShape:
     feature_scale: float
     """Factor on the features as the network reads them."""
     spatial_damping: bool = False
-    """Whether damping, too, depends on the contact."""
+    """Let the dampings depend on the contact too."""
     projection: bool = False
-    """Whether what attention reads is projected before it is joined with the contact's feature."""
+    """Project what attention reads before it is joined with the contact's feature."""
 
 
 @dataclass(frozen=True)
@@ -55,18 +55,18 @@ class FitConfig:
     layers: int = 3
     """Hidden layers."""
     projection: bool = False
-    """Whether what attention reads is projected before it is joined with the contact's feature (paper)."""
+    """Project what attention reads before it is joined with the contact's feature (paper)."""
     feature_scale: float = 4.0
     """Factor on the features as the network reads them: larger lets gains change over shorter distances."""
     warmup_rate: float = 3e-3
     """Adam's step at the start of the warm-up; it falls on a cosine to a tenth."""
     learning_rate: float = 1e-3
-    """Adam's step at the start of the end-to-end stage, likewise (paper: 1e-2, 5e-3 or 1e-3)."""
+    """Adam's step at the start of the end-to-end stage; it falls on a cosine to a tenth (paper: 1e-2, 5e-3 or 1e-3)."""
     correction_rate: float = 1e-2
-    """Likewise for frequencies, in widths of their modes, and for the logarithms of dampings."""
+    """Adam's step for frequencies, in widths of their modes, and for the logarithms of dampings."""
     noise_rate: float = 0.0
-    """Likewise for the logarithms of the residual noise's magnitudes (paper). With 0 they are measured instead, after
-    the other parameters are trained, since training ends 2.3 dB too low: see docs/decisions/residual-level.md."""
+    """Adam's step for the logarithms of the residual noise's magnitudes (paper). With 0 they are measured instead,
+    after the other parameters are trained, since training ends 2.3 dB too low: see docs/decisions/residual-level.md."""
     weight_decay: float = 1.0
     """Decoupled weight decay on the network's matrices."""
     warmup_steps: int = 1000
@@ -87,19 +87,19 @@ class FitConfig:
     interleave: int = 2
     """Each step compares every n-th frame, in turn; 1 compares all frames at every step, as the paper does."""
     spectral_norm: Literal["each", "common"] = "each"
-    """Whether each resolution's distance is divided by its recordings' norm, or all by one number (paper)."""
+    """Divisor of each resolution's distance. each: the norm of its recordings. common: one number for all (paper)."""
     early: int = 8192
     """Length of the beginning that is compared again, samples at 44.1 and 48 kHz."""
     early_weight: float = 1.0
     """Weight of that beginning (paper: .5, 1 or 2)."""
     damping: Literal["shared", "per-contact", "validated"] = "validated"
-    """Whether dampings vary with the contact; `validated` fits both and takes the better at validation contacts."""
+    """Dampings for all contacts or for each; `validated` fits both and takes the better at validation contacts."""
     validation: float = 0.25
     """Part of the training positions that choices are validated on; with fewer than 6 positions none are."""
     phase: Literal["common", "sine"] = "common"
     """Initial phases of the modes: each the common one of the training recordings, or sines (paper, eq. 3)."""
     residual: bool = True
-    """Whether noise is modeled in addition to the modes."""
+    """Model noise in addition to the modes."""
     residual_start: Literal["beneath-modes", "quietest"] = "beneath-modes"
     """What its training starts from: the recordings without the modes, or their lowest-energy segments (paper)."""
     residual_noise: Literal["low-fluctuation", "gaussian"] = "low-fluctuation"

@@ -25,12 +25,12 @@ from torch import Tensor
 
 from avmsf._utils.records import RecordError, count_of, like, record_of
 from avmsf._utils.state import read_tensors
-from avmsf._utils.text_files import parse_json
 from avmsf.capture.audio import HIGHEST_RATE, LOWEST_RATE, MAX_PEAK, MAX_SAMPLES
 from avmsf.capture.settings import CaptureSettings
-from avmsf.errors import AvmsfError, FieldFileError
+from avmsf.errors import FieldFileError
 from avmsf.field.config import FitConfig
 from avmsf.field.gainfield import GainField
+from avmsf.field.header import ADVICE, FORMAT, KEY, UNREADABLE, WHAT, damaged, key_of, record_of_text, value_of
 from avmsf.field.scaledgains import FITTED, ScaledGains
 from avmsf.field.soundfield import FieldQuality, Origin, SoundField
 from avmsf.files import write_whole
@@ -38,9 +38,6 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.alignment import Alignment
 from avmsf.modal.residual import Residual
 
-FORMAT = 8
-"""Number of this format; it grows with every change that older versions could not read. Later versions read it."""
-_KEY = "avmsf"
 _GAINS, _ALIGNMENT = "gains.", "alignment."
 _POSITIVE = ("bank.frequency", "bank.damping")
 _MAX = {"bank.frequency": 1e9, "bank.damping": 1e9, "residual.magnitude": MAX_PEAK}
@@ -48,8 +45,6 @@ _MAX = {"bank.frequency": 1e9, "bank.damping": 1e9, "residual.magnitude": MAX_PE
 _KINDS: dict[str, type[GainField]] = {**FITTED, ScaledGains.kind: ScaledGains}
 """The gain fields that a file may hold, by what it calls them."""
 _SAVE_AGAIN = "fit and save the field again"
-_UNREADABLE = (ValueError, TypeError, KeyError, RuntimeError, AvmsfError)
-"""What a record of another form raises; RuntimeError: torch, of sizes beyond 2^63 and of damaged values."""
 
 
 def save(field: SoundField, path: str | Path) -> None:
@@ -70,15 +65,15 @@ def save(field: SoundField, path: str | Path) -> None:
         ) from error
     try:
         header = _Header.of(json.loads(words))
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         raise FieldFileError(
             f"{path}: expected a field that can be loaded: {error}",
             file=path,
-            name=_key_of(error),
-            value=_value_of(error),
+            name=key_of(error),
+            value=value_of(error),
         ) from error
     _expect_tensors(tensors, header.skeleton, path)
-    content = to_bytes(tensors, {_KEY: words})
+    content = to_bytes(tensors, {KEY: words})
     write_whole(path, lambda place: place.write_bytes(content))
 
 
@@ -89,35 +84,17 @@ def load(path: str | Path) -> SoundField:
     tensor is missing, unexpected, of another shape or dtype, or not finite.
     """
     path = Path(path)
-    words, tensors = read_tensors(
-        path, _KEY, what="a sound field", advice="fit and save it again", raising=FieldFileError
-    )
+    words, tensors = read_tensors(path, KEY, what=WHAT, advice=ADVICE, raising=FieldFileError)
+    record = record_of_text(words, path)
     try:
-        record = parse_json(words)
-        found, writer = record["format"], record["version"]
-        if found != FORMAT:
-            raise FieldFileError(
-                f"{path}: expected a sound field of format {FORMAT}, got format {found} of avmsf {writer} "
-                f"(this is avmsf {version('avmsf')}); "
-                + (_remake(record, path) if isinstance(found, int) and found < FORMAT else "install a newer avmsf"),
-                file=path,
-                name="format",
-                value=found,
-            )
         header = _Header.of(record)
         _expect_tensors(tensors, header.skeleton, path)
         named = {name.removeprefix(_GAINS): each for name, each in tensors.items() if name.startswith(_GAINS)}
         gains = _KINDS[header.kind].restore(header.gain_field, named)
     except FieldFileError:
         raise
-    except _UNREADABLE as error:
-        raise FieldFileError(
-            f"{path}: expected the header of a sound field of format {FORMAT}, got another or a damaged one "
-            f"({type(error).__name__}: {error}); fit and save the field again",
-            file=path,
-            name=_key_of(error),
-            value=_value_of(error),
-        ) from error
+    except UNREADABLE as error:
+        raise damaged(path, error) from error
     return SoundField(
         ModalBank(tensors["bank.frequency"], tensors["bank.damping"]),
         gains,
@@ -145,7 +122,7 @@ class _Header:
 
     @classmethod
     def of(cls, record: Mapping[str, Any]) -> "_Header":
-        """Return the header of a file's record. Raises one of `_UNREADABLE`, also for sounds that no recording has."""
+        """Return the header of a file's record. Raises one of `UNREADABLE`, also for sounds that no recording has."""
         sizes, gains, origin = (dict(like(record[name], {}, name)) for name in ("sizes", "gains", "origin"))
         rate, samples = float(like(record["sample_rate"], 1.0, "sample_rate")), count_of(record["samples"], "samples")
         # Those of the recordings that a field is fitted to.
@@ -232,26 +209,6 @@ def _alignment(record: Mapping[str, Any] | None, tensors: Mapping[str, Tensor]) 
         return None
     named = {name.removeprefix(_ALIGNMENT): each for name, each in tensors.items() if name.startswith(_ALIGNMENT)}
     return Alignment.restore(named, record["names"], record["keys"])
-
-
-def _key_of(error: Exception) -> str | None:
-    """Return the key of a record that an error is about, where it is known."""
-    if isinstance(error, AvmsfError):
-        return error.name
-    return str(error.args[0]) if isinstance(error, KeyError) else None
-
-
-def _value_of(error: Exception) -> Any:
-    return error.value if isinstance(error, AvmsfError) else None
-
-
-def _remake(record: Mapping[str, Any], path: Path) -> str:
-    """Return the command that makes the field of an older file again."""
-    report = record["origin"]["report"]
-    verb = "reconstruct" if (report.get("pipeline") or {}).get("scene") else "fit"
-    material = f" --material {report['material']['name']}" if "guess" in report else ""
-    capture = record["origin"]["capture"]
-    return f"fit it again: avmsf {verb} FOLDER{material} --output {path}, where FOLDER is that of {capture!r}"
 
 
 def _expect_tensors(tensors: dict[str, Tensor], skeleton: dict[str, Tensor], path: Path) -> None:

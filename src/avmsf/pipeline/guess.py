@@ -8,8 +8,9 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
+from avmsf.capture.filenames import SURFACE_FILES
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.surface import SURFACE_FILES, Surface, find_surface, read_surface
+from avmsf.capture.surface import Surface, find_surface, read_surface
 from avmsf.capture.table import TABLE, read_cells
 from avmsf.capture.together import NARROWEST, WIDEST
 from avmsf.config import BodyConfig

@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 from avmsf.capture.cameras import View
+from avmsf.capture.filenames import no_views
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.surface import read_surface
 from avmsf.capture.views import read_sparse_points, read_views
@@ -162,11 +163,7 @@ class SceneStages:
 
     def _source(self) -> Source:
         if self.source is None:
-            raise SceneError(
-                f"{self.folder}: expected photographs (transforms.json, a COLMAP model or a folder images/), a video, "
-                "a mesh (surface.obj, .ply, .glb, .stl) or Gaussians (splats.ply), got none",
-                file=self.folder,
-            )
+            raise no_views(self.folder)
         return self.source
 
     def _start(self, views: Sequence[View]) -> StartPoints | None:

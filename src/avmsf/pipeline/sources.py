@@ -9,24 +9,19 @@ from typing import Literal
 import torch
 
 from avmsf.capture.cameras import View
+from avmsf.capture.filenames import PICTURE_SUFFIXES, SPLATS, VIDEO_SUFFIXES, find_surface_file
 from avmsf.capture.meshviews import orbit_cameras, render_views
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.sfm import FEWEST, estimate_cameras
-from avmsf.capture.surface import find_surface_file
 from avmsf.capture.texturedmesh import read_textured_mesh
 from avmsf.capture.video import pick_frames
 from avmsf.capture.views import find_foreground, read_views
 from avmsf.capture.views.colmap import find_model
-from avmsf.capture.views.pictures import SUFFIXES
 from avmsf.capture.views.write import write_views
 from avmsf.config import ViewsConfig
 from avmsf.errors import SceneError
 from avmsf.pipeline.stages import Kept, StageFolder, digest_files
 from avmsf.scene.points import farthest_points
-
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-SPLATS = ("splats.ply", "point_cloud.ply")
-"""Names under which a folder may hold Gaussians that were made elsewhere."""
 
 Kind = Literal["cameras", "photographs", "video", "mesh"]
 Tell = Callable[[str], None]
@@ -180,4 +175,4 @@ def _keep_motion(source: Source, stages: StageFolder, config: ViewsConfig, *, te
 def _images(folder: Path, *, deep: bool) -> list[Path]:
     """Return the image files in a folder, sorted, and `deep` in those beneath it; none where there is no folder."""
     paths = folder.rglob("*") if deep else folder.glob("*")
-    return sorted(path for path in paths if path.suffix.lower() in SUFFIXES and path.is_file())
+    return sorted(path for path in paths if path.suffix.lower() in PICTURE_SUFFIXES and path.is_file())

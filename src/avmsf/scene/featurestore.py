@@ -16,13 +16,11 @@ from avmsf._utils.state import read_tensors
 from avmsf._utils.text_files import parse_json
 from avmsf.errors import SceneError
 from avmsf.files import write_whole
+from avmsf.scene.featureheader import KEY
 from avmsf.scene.features import FeatureField
 
 FORMAT = 1
 """Number of this format; it grows with every change that older versions could not read."""
-_KEY = "avmsf_features"
-_LONGEST_HEADER = 100_000_000
-"""Bytes of a header, as the format bounds them."""
 
 
 def save_features(features: FeatureField, path: str | Path, *, report: dict[str, Any] | None = None) -> None:
@@ -52,7 +50,7 @@ def save_features(features: FeatureField, path: str | Path, *, report: dict[str,
             file=path,
             name="report",
         ) from error
-    content = to_bytes(tensors, {_KEY: words})
+    content = to_bytes(tensors, {KEY: words})
     write_whole(path, lambda place: place.write_bytes(content), raising=SceneError)
 
 
@@ -84,7 +82,7 @@ def read_report(path: str | Path) -> dict[str, Any]:
 
 
 def _read(path: Path) -> tuple[str, dict[str, Tensor]]:
-    return read_tensors(path, _KEY, what="a file of features", advice="compute the features again", raising=SceneError)
+    return read_tensors(path, KEY, what="a file of features", advice="compute the features again", raising=SceneError)
 
 
 def _understand(words: str, path: Path) -> dict[str, Any]:
@@ -123,13 +121,3 @@ def _expect_values(tensors: dict[str, Tensor], path: Path) -> None:
                 file=path,
                 name=name,
             )
-
-
-def holds_features(path: Path) -> bool:
-    """Return whether the header of a file says that it holds features, and not for example a field."""
-    try:
-        with path.open("rb") as file:
-            length = int.from_bytes(file.read(8), "little")
-            return f'"{_KEY}"'.encode() in file.read(min(length, _LONGEST_HEADER))
-    except OSError:
-        return False

@@ -1,7 +1,7 @@
 """Settings of the fit of Gaussians to views: one flat record, which is also the command line's options."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from avmsf._utils.text import changes_repr
@@ -63,7 +63,9 @@ class SplatConfig:
     Gaussians lie below the surface, since none may extend beyond the object's outline."""
     start_flatness: float = 0.3
     """Initial thickness of a Gaussian whose normal is known, relative to its width."""
-    background: tuple[float, float, float] | Literal["found", "random"] = "found"
+    background: tuple[float, float, float] | Literal["found", "random"] = field(
+        default="found", metadata={"metavar": "R G B|found|random"}
+    )
     """Red, green, blue behind the object, 0 to 1. `random` uses another color behind the masked object every step;
     `found` uses the color around the masks if it is plain, else `random`."""
     halvings: int = 2
@@ -102,7 +104,7 @@ class SplatConfig:
     """Opacity below which a Gaussian is removed."""
     reset_every: int = 0
     """Steps between resets of all opacities to twice `least_opacity`; 0 never resets them."""
-    dissent: float = 0.05
+    dissent: float = field(default=0.05, metadata={"option": "wrong_masks"})
     """Fraction of the views whose masks may be wrong."""
     seed: int = 0
     """Seed of the order of the views, backgrounds and splits."""

@@ -342,7 +342,7 @@ class _Maker:
         if error > LARGEST_ERROR:
             self._tell(
                 f"{body_name(wall)}: mesh too coarse, relative error of the lowest frequencies about {error:.0%}; "
-                f"allow freedoms={4 * freedoms}"
+                f"allow {4 * freedoms} degrees of freedom (--body.dofs)"
             )
         return modes
 
@@ -372,7 +372,7 @@ class _Maker:
         except MemoryError as error:
             raise SimulationError(
                 f"expected enough memory for {size} degrees of freedom, got too little; use "
-                f"freedoms={max(freedoms // 2, FEWEST)}, or close other programs",
+                f"{max(freedoms // 2, FEWEST)} (--body.dofs), or close other programs",
                 name="freedoms",
                 value=size,
             ) from error

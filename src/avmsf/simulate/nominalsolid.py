@@ -51,7 +51,7 @@ def expect_memory(freedoms: int) -> None:
         fitting = int(measured * (free / (_CAUTION * peak)) ** (1.0 / power)) // 1000 * 1000
         raise SimulationError(
             f"expected about {needed / 1e9:.2g} GB of free memory for {freedoms} degrees of freedom, got "
-            f"{free / 1e9:.2g} GB; use freedoms={max(fitting, FEWEST)}, or close other programs",
+            f"{free / 1e9:.2g} GB; use {max(fitting, FEWEST)} (--body.dofs), or close other programs",
             name="memory",
             value=free,
         )
@@ -136,7 +136,7 @@ def _near(make: Callable[[float], Solid], freedoms: int, *, first: float) -> Sol
     if best is None:
         least = min(tried.values())
         raise SimulationError(
-            f"expected a mesh of {freedoms} degrees of freedom, got {least} at least; allow freedoms={least}, or "
+            f"expected a mesh of {freedoms} degrees of freedom, got {least} at least; allow these (--body.dofs), or "
             "simplify the mesh",
             name="freedoms",
             value=least,

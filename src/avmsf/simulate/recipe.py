@@ -56,7 +56,7 @@ class Imperfections:
     stiffness: float = 0.05
     """Variation of Young's modulus over the body, root mean square of its logarithm."""
     density: float = 0.02
-    """Variation of the density, likewise."""
+    """Variation of the density over the body, root mean square of its logarithm."""
     support: float = 15.0
     """Resonance frequency of the object on three soft springs under it, Hz."""
     support_damping: float = 0.015
@@ -126,28 +126,28 @@ class ObjectRecipe:
     mesh: Path | None = None
     """A mesh or scan instead of a shape: obj, ply, glb or stl, in meters."""
     thickness: float | None = None
-    """Wall thickness, meters. None draws that of a shape at random, and makes a mesh a solid body; with a thickness the
-    mesh is the outside of a wall."""
+    """Wall thickness, meters. By default that of a shape is drawn at random, and a mesh is a solid body; with a
+    thickness the mesh is the outside of a wall."""
     material: str = "ceramic"
     """Name in the table of materials."""
     seed: int = 0
     """Random seed of the shape's proportions, the contacts, the noise and the imperfections."""
     size: float | None = None
-    """Longest side of the bounding box, meters; None for that of the random shape or of the mesh."""
+    """Longest side of the bounding box, meters; by default that of the random shape or of the mesh."""
     up: Literal["x", "y", "z"] = "z"
     """Upward axis: the hammer comes from above or from the side."""
-    modes: int = 64
+    modes: int = field(default=64, metadata={"option": "elastic_modes"})
     """Number of elastic modes to compute, the lowest; those above 45 % of the sample rate are left out."""
     detail: float = 0.04
     """Edge length of the tetrahedra in a mesh, over its diagonal. Shapes have tetrahedra of their own."""
-    contacts: int = 40
+    contacts: int = field(default=40, metadata={"option": "impacts"})
     """Number of impacts."""
     sample_rate: int = 48000
     """Sample rate, Hz."""
     seconds: float = 2.0
     """Length of each recording that is used, from its onset. The files are longer."""
     noise_db: float | None = -30.0
-    """Room noise: its root mean square over that of the noiseless sounds after the impacts, dB; None for none."""
+    """Room noise: its root mean square over that of the noiseless sounds after the impacts, dB; None for no noise."""
     microphone: tuple[float, float, float] = (0.45, -0.35, 0.4)
     """Position of the microphone from the center of the object's bounding box, meters."""
     views: int = 72

@@ -90,7 +90,7 @@ def _tetrahedralize(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarr
         except subprocess.TimeoutExpired as error:
             raise SimulationError(
                 f"expected tetrahedra of {len(skin.faces)} triangles within {timeout:g} s, got none; simplify the "
-                "mesh, or use a larger detail or fewer freedoms",
+                "mesh, or use a larger detail or fewer degrees of freedom",
                 name="timeout",
                 value=timeout,
             ) from error
@@ -98,7 +98,7 @@ def _tetrahedralize(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarr
             last = ended.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["no message"]
             raise SimulationError(
                 f"pytetwild: expected exit status 0, got {ended.returncode} ({last[0][:200]}); simplify the mesh, or "
-                "change detail or freedoms",
+                "change detail or the degrees of freedom",
                 name="pytetwild",
                 value=ended.returncode,
             )
@@ -130,8 +130,8 @@ def _expect_likeness(solid: Solid, skin: Skin, *, tolerance: float, advice: str)
     if lost > _LOST:
         raise SimulationError(
             f"expected tetrahedra within {tolerance:.2g} m of the mesh, got {lost:.0%} of it without "
-            f"({skin.open_edges} open edges, or thin walls); use a smaller detail or more freedoms, close the mesh, or "
-            f"{advice}",
+            f"({skin.open_edges} open edges, or thin walls); use a smaller detail or more degrees of freedom, close "
+            f"the mesh, or {advice}",
             name="detail",
             value=lost,
         )

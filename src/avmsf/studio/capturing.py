@@ -17,10 +17,9 @@ from typing import Any
 import soundfile
 
 from avmsf.capture.audio import Recording
-from avmsf.capture.folder import settings_of
 from avmsf.capture.measure import RecordingReport, measure
 from avmsf.capture.prepare import prepare
-from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.table import TABLE, Row, Strike, understand
 from avmsf.errors import AvmsfError, CaptureError
 from avmsf.studio.judgements import Judgements, plain

@@ -6,9 +6,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from avmsf.capture.folder import settings_of
-from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.surface import find_surface_file
+from avmsf.capture.filenames import SPLATS, find_surface_file
+from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.table import TABLE
 from avmsf.config import CACHE
 from avmsf.errors import StudioError
@@ -16,7 +15,7 @@ from avmsf.export.objectfile import holds_gaussians
 from avmsf.files import copy_whole
 from avmsf.pipeline.reconstruct import FIELD, SURFACE
 from avmsf.pipeline.scene import CLOUD
-from avmsf.pipeline.sources import SPLATS, find_source, find_splats
+from avmsf.pipeline.sources import find_source, find_splats
 
 MESHES = (".obj", ".ply", ".glb", ".stl")
 """Suffixes of the meshes that a capture may have as its surface."""

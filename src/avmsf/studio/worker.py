@@ -18,7 +18,7 @@ from typing import Any, TextIO
 
 from avmsf._utils.memory import NO_MEMORY, lacks_memory
 from avmsf.capture import read_capture
-from avmsf.capture.folder import settings_of
+from avmsf.capture.settings import settings_of
 from avmsf.capture.warning import CaptureWarning
 from avmsf.config import CACHE, PRESETS, SceneConfig
 from avmsf.errors import AvmsfError

@@ -1,7 +1,7 @@
 """Settings of guided edits: importing this imports nothing that computes."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from avmsf.errors import EditError
@@ -17,9 +17,9 @@ class GuidedEditConfig:
 
     steps: int = 300
     """Steps; Audio-SDS reports about 1,000."""
-    contacts: int = 10
+    contacts: int = field(default=10, metadata={"option": "contacts_per_step"})
     """Contacts of each step, drawn again from the whole surface."""
-    modes: int = 128
+    modes: int = field(default=128, metadata={"option": "free_modes"})
     """Number of modes, the loudest, with own factors; the others follow the common factors."""
     seconds: float | None = None
     """Duration of each sound that is compared; by default that of the field's sounds."""
@@ -77,3 +77,12 @@ class DistillationConfig:
 def _unfit(settings: GuidedEditConfig | DistillationConfig, name: str, expected: str) -> EditError:
     value = getattr(settings, name)
     return EditError(f"{name}: expected {expected}, got {value}", name=name, value=value)
+
+
+def expect_prompt(prompt: str) -> str:
+    """Return a prompt without surrounding blanks. Raises `EditError` for an empty one."""
+    if not prompt.strip():
+        raise EditError(
+            'expected a prompt, such as "a wooden bowl is struck", got an empty one', name="prompt", value=prompt
+        )
+    return prompt.strip()

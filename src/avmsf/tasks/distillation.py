@@ -16,7 +16,7 @@ from torch import Tensor
 
 from avmsf.errors import AvmsfWarning, EditError
 from avmsf.tasks.clips import lasting, levelled, resampled
-from avmsf.tasks.config import DistillationConfig
+from avmsf.tasks.config import DistillationConfig, expect_prompt
 from avmsf.tasks.modaledit import ModalEdit, Struck
 
 
@@ -112,15 +112,6 @@ def partial_denoising(
         clean = model.denoised(noisy, above, conditioning, guidance=guidance)
         noisy = noised(clean, (noisy - torch.cos(angle) * clean) / torch.sin(angle), below)
     return clean
-
-
-def expect_prompt(prompt: str) -> str:
-    """Return a prompt without surrounding blanks. Raises `EditError` for an empty one."""
-    if not prompt.strip():
-        raise EditError(
-            'expected a prompt, such as "a wooden bowl is struck", got an empty one', name="prompt", value=prompt
-        )
-    return prompt.strip()
 
 
 class DecoderDistillation:

@@ -20,8 +20,7 @@ from avmsf._utils.arrays import Seed, generator_of
 from avmsf._utils.device import usable_device
 from avmsf.errors import EditError
 from avmsf.tasks.clips import lasting
-from avmsf.tasks.config import STABLE_AUDIO
-from avmsf.tasks.distillation import expect_prompt
+from avmsf.tasks.config import STABLE_AUDIO, expect_prompt
 from avmsf.tasks.stableaudiofiles import digest, load_pipeline
 
 

@@ -7,13 +7,12 @@ import soundfile
 
 from avmsf.capture.datasets.dataset import DatasetReport, Look, ObjectFacts, ObjectReport
 from avmsf.capture.datasets.numbering import in_order, refuse_unknown
-from avmsf.capture.folder import Capture, read_capture, settings_of
-from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.surface import find_surface_file
+from avmsf.capture.filenames import PICTURE_SUFFIXES, find_surface_file
+from avmsf.capture.folder import Capture, read_capture
+from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.table import TABLE, read_rows, refuse_repeated_files, understand
 from avmsf.capture.together import common_rate
 from avmsf.capture.views.colmap import find_model
-from avmsf.capture.views.pictures import SUFFIXES
 from avmsf.errors import CaptureError, DatasetError
 
 _SEEN_IN = ("*.mp4", "*.mov", "*.m4v", "*.avi", "*.mkv", "*.webm", "splats.ply", "point_cloud.ply", "transforms.json")
@@ -130,7 +129,7 @@ def _shows(folder: Path, settings: CaptureSettings) -> bool:
     pictures = (folder / "images").rglob("*") if (folder / "images").is_dir() else folder.iterdir()
     return (
         (surface is not None and surface.is_file())
-        or any(path.suffix.lower() in SUFFIXES for path in pictures)
+        or any(path.suffix.lower() in PICTURE_SUFFIXES for path in pictures)
         or any(next(folder.glob(pattern), None) for pattern in _SEEN_IN)
         or find_model(folder) is not None
     )

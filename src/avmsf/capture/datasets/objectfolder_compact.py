@@ -19,12 +19,12 @@ from avmsf.capture.datasets.meshes import find_mesh
 from avmsf.capture.datasets.names import facts_of, read_names
 from avmsf.capture.datasets.numbering import in_order, refuse_unknown, shared_remarks
 from avmsf.capture.datasets.objectfolder_raw import FRAMES, RATE
+from avmsf.capture.datasets.signs import PARTS
 from avmsf.capture.folder import Capture
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.surface import Surface, find_surface
 from avmsf.errors import CaptureError, DatasetError
 
-PARTS = ("audio", "contacts", "global_gt_points", "split.json", "scale.json")
 """What a complete copy holds; pictures, touch and spectrograms beside them are not used."""
 POINTS = ArrayForm("float64", (1024, 3))
 SETTINGS = CaptureSettings(normalize="none")

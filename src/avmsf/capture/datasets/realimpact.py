@@ -22,6 +22,7 @@ from avmsf.capture.datasets.numbering import (
     refuse_unknown,
     shared_remarks,
 )
+from avmsf.capture.datasets.signs import FOLDER, SOUNDS
 from avmsf.capture.folder import Capture
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.surface import Surface, read_surface
@@ -30,8 +31,6 @@ from avmsf.errors import CaptureError, DatasetError
 RATE = 48_000.0
 """Of all recordings, Hz; no file tells it."""
 ROWS = 3000
-FOLDER = "preprocessed"
-SOUNDS = "deconvolved_0db.npy"
 MESH = "transformed.obj"
 FORMS = {
     SOUNDS: ArrayForm("float32", (ROWS, None)),

@@ -12,7 +12,6 @@ from PIL import Image, ImageFile, JpegImagePlugin, PngImagePlugin, WebPImagePlug
 
 from avmsf.errors import CaptureError
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 MAX_PIXELS = 200_000_000
 """Pixels of a picture: as many as the largest sensors of cameras and telephones have (16,320 x 12,240). Reading one
 takes 0.6 GB in 8 bits, 3 GB with 16 bits and alpha; a PNG file of 110 kB may claim 900 million."""

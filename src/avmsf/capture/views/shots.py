@@ -7,8 +7,8 @@ from pathlib import Path, PurePosixPath
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf.capture.filenames import PICTURE_SUFFIXES
 from avmsf.capture.views.lenses import Lens
-from avmsf.capture.views.pictures import SUFFIXES
 from avmsf.capture.warning import Remark
 from avmsf.errors import CaptureError
 
@@ -50,7 +50,7 @@ def without_camera(shots: Sequence[Shot], folder: Path) -> list[str]:
         candidates = set(images.rglob("*"))
     else:
         candidates = {path for parent in {shot.image.parent for shot in shots} for path in parent.glob("*")}
-    strangers = [path for path in candidates if path.suffix.lower() in SUFFIXES and path.resolve() not in known]
+    strangers = [path for path in candidates if path.suffix.lower() in PICTURE_SUFFIXES and path.resolve() not in known]
     return sorted(path.relative_to(images).as_posix() if images.is_dir() else path.name for path in strangers)
 
 

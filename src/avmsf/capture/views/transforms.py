@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from avmsf._utils.text_files import read_json
+from avmsf.capture.filenames import PICTURE_SUFFIXES
 from avmsf.capture.location import Location
 from avmsf.capture.views.lenses import Lens
-from avmsf.capture.views.pictures import SUFFIXES
 from avmsf.capture.views.poses import TOLERANCE, opencv_from_opengl, rigid
 from avmsf.capture.views.shots import Shot, Shots, listed, refuse_many
 from avmsf.capture.warning import Remark
@@ -154,9 +154,9 @@ def _text(frame: dict[str, Any], key: str, where: Location) -> str:
 
 def _with_suffix(path: Path) -> Path:
     """Return the file itself, or the image file of that name where the suffix was left out."""
-    if path.suffix.lower() in SUFFIXES or path.is_file():
+    if path.suffix.lower() in PICTURE_SUFFIXES or path.is_file():
         return path
-    spellings = [path.with_name(path.name + suffix) for small in SUFFIXES for suffix in (small, small.upper())]
+    spellings = [path.with_name(path.name + suffix) for small in PICTURE_SUFFIXES for suffix in (small, small.upper())]
     return next((spelling for spelling in spellings if spelling.is_file()), path)
 
 

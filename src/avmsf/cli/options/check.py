@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import tyro
 
+from avmsf.capture.table import read_rows
+from avmsf.cli.options.checks import read_settings
 from avmsf.cli.options.common import CaptureFolder, Flag, Printing, SettingsFile, parse_options
 
 
@@ -23,6 +25,14 @@ class Options(Printing):
     write_settings: Flag = False
     """Write the proposed settings, with the reasons, to the folder's capture.toml, and check with them. An existing
     capture.toml is not changed."""
+
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        if not self.json:
+            # JSON reports also what is wrong with the folder as a whole.
+            read_settings(self.capture, self.settings)
+            read_rows(self.capture)
 
 
 def parse(words: Sequence[str]) -> Options:

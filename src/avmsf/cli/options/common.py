@@ -1,9 +1,6 @@
 """What the options of all verbs have in common: how they are parsed, shown and checked."""
 
-import os
-import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from types import NoneType, UnionType
@@ -12,13 +9,15 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
+from avmsf.cli.options.helptext import described_fields, one_column, paragraphs
 from avmsf.errors import AvmsfError
+from avmsf.field.header import read_record
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 """An option that is off unless it is given."""
 Unit = Literal["m", "cm", "mm", "in", "ft"]
-_WIDEST = 129
-"""Columns of help: in wider ones tyro sets its boxes side by side."""
+_RENAMED = {"--at": "--position", "--picture": "--plots"}
+"""Options of earlier versions, and what they are called now."""
 T = TypeVar("T")
 
 
@@ -32,10 +31,25 @@ class Existing:
 
     what: str
 
+    def check(self, path: Path) -> None:
+        """Raise `InputError` where nothing is at the path."""
+        if not path.exists():
+            raise InputError.expected(self.what, got="no such file or folder", file=path, advice="check the name")
 
-FieldFile = Annotated[
-    Path, tyro.conf.arg(metavar="FIELD.safetensors"), Existing("a field file, as avmsf fit writes it")
-]
+
+@dataclass(frozen=True)
+class ExistingField(Existing):
+    """Marks the path of a field's file that this version has to be able to read."""
+
+    what: str = "a field file, as avmsf fit writes it"
+
+    def check(self, path: Path) -> None:
+        """Raise `InputError` where nothing is at the path, `FieldFileError` for a file that is no field."""
+        super().check(path)
+        read_record(path)
+
+
+FieldFile = Annotated[Path, tyro.conf.arg(metavar="FIELD.safetensors"), ExistingField()]
 CaptureFolder = Annotated[Path, tyro.conf.arg(metavar="CAPTURE"), Existing("a capture folder, with impacts.csv")]
 SettingsFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml"), Existing("a capture.toml")]
 OutputFolder = Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")]
@@ -51,7 +65,7 @@ class Common:
     """Print each step of the work as it begins."""
 
     def check_inputs(self) -> None:
-        """Raise `InputError` for the first input that does not exist."""
+        """Raise `InputError` for the first input that does not exist, and for what a command's own checks find."""
         hints = get_type_hints(type(self), include_extras=True)
         for each in fields(self):
             expected = _expected(hints[each.name])
@@ -59,10 +73,7 @@ class Common:
             if expected is None or value is None:
                 continue
             for path in value if isinstance(value, tuple) else (value,):
-                if not path.exists():
-                    raise InputError.expected(
-                        expected, got="no such file or folder", file=path, advice="check the name"
-                    )
+                expected.check(path)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,32 +87,26 @@ class Printing(Common):
 def parse_options(
     kind: type[T], verb: str, words: Sequence[str], *, description: str | None = None, default: T | None = None
 ) -> T:
-    """Return the options that the words spell; leaves by SystemExit for help and for what cannot be understood."""
+    """Return the options that the words spell; leaves by SystemExit for help and for what cannot be understood.
+
+    Raises `InputError` for an option that has another name now.
+    """
+    for word in words:
+        if word in _RENAMED:
+            raise InputError.expected(_RENAMED[word], got=word, name=word)
     given: dict[str, Any] = {} if default is None else {"default": default}
     with one_column():
         return tyro.cli(
-            kind, prog=f"avmsf {verb}", args=words, description=description, registry=REGISTRY, **given
+            kind, prog=f"avmsf {verb}", args=words, description=paragraphs(description or kind.__doc__ or ""),
+            registry=REGISTRY, **given,
         )  # fmt: skip
 
 
-@contextmanager
-def one_column() -> Iterator[None]:
-    """Let help have one column of boxes, however wide the terminal is."""
-    before = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = str(min(_WIDEST, shutil.get_terminal_size().columns))
-    try:
-        yield
-    finally:
-        del os.environ["COLUMNS"]
-        if before is not None:
-            os.environ["COLUMNS"] = before
-
-
-def _expected(hint: Any) -> str | None:
+def _expected(hint: Any) -> Existing | None:
     """Return what a type's paths have to be; None where it has no such mark."""
     for each in getattr(hint, "__metadata__", ()):
         if isinstance(each, Existing):
-            return each.what
+            return each
     inner = get_args(hint)
     return next((found for each in inner if (found := _expected(each)) is not None), None)
 
@@ -130,6 +135,30 @@ def _optional(info: PrimitiveTypeInfo) -> Any:
     )
 
 
+class _Words(tuple[str, ...]):
+    """The words of a choice, as an error lists them."""
+
+    def __str__(self) -> str:
+        return ", ".join(self)
+
+
+def _choice(info: PrimitiveTypeInfo) -> Any:
+    """Read one of several words; an error lists them as words."""
+    if get_origin(info.type) is not Literal:
+        return None
+    values = {str(each): each for each in get_args(info.type)}
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=f"{{{','.join(values)}}}",
+        instance_from_str=lambda words: values[words[0]],
+        is_instance=lambda value: value in values.values(),
+        str_from_instance=lambda value: [str(value)],
+        choices=_Words(values),
+    )
+
+
 REGISTRY = ConstructorRegistry()
 """How types are read and shown."""
+REGISTRY.primitive_rule(_choice)
 REGISTRY.primitive_rule(_optional)
+REGISTRY.struct_rule(described_fields)

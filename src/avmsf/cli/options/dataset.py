@@ -7,7 +7,9 @@ from typing import Annotated
 
 import tyro
 
-from avmsf.cli.options.common import REGISTRY, Existing, Printing, one_column
+from avmsf.capture.datasets.signs import expect_signs
+from avmsf.cli.options.common import REGISTRY, Existing, Printing
+from avmsf.cli.options.helptext import one_column
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,11 @@ class Options(Printing):
     """ObjectFolder Real's contacts: a folder of arrays, or one of SonicGauss's lists."""
     table: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), Existing("a table of objects")] = None
     """A CSV or JSON list id, name, material of ObjectFolder Real's objects, numbered as published."""
+
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        expect_signs(self.dataset)
 
 
 def parse(words: Sequence[str]) -> Options:

@@ -1,32 +1,43 @@
 """Options of `avmsf edit`."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
+from avmsf.cli.options.checks import OutputError, expect_device, expect_writable
 from avmsf.cli.options.common import FieldFile, Printing, parse_options
-from avmsf.tasks.config import STABLE_AUDIO, DistillationConfig, GuidedEditConfig
+from avmsf.cli.options.helptext import option_of
+from avmsf.errors import EditError
+from avmsf.simulate.material import material_named
+from avmsf.tasks.config import STABLE_AUDIO, DistillationConfig, GuidedEditConfig, expect_prompt
 
 _Pairs = tyro.conf.UseAppendAction[tuple[tuple[float, float], ...]]
+
+MODES, SPECTROGRAMS, BEFORE, AFTER = "modes.png", "spectrograms.png", "before.wav", "after.wav"
+CURVE = "clap.png"
+"""What the folder of pictures holds."""
+_OF_THE_MODEL = ("--model", "--negative", "--model-seconds", "--device", "--generated", "--clap")
+"""Options that only a prompt needs."""
 
 
 @dataclass(frozen=True)
 class MaterialOptions:
     """Change material and size by the laws of linear modal analysis; the shape stays."""
 
-    material: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    material: Annotated[str | None, tyro.conf.arg(name="to-material", metavar="NAME")] = None
     """New material: ceramic, glass, wood, plastic, iron, polycarbonate or steel."""
     old: Annotated[str | None, tyro.conf.arg(name="from", metavar="NAME")] = None
     """Present material; by default estimated from the dampings of the modes."""
-    size: float = 1.0
+    size: Annotated[float, tyro.conf.arg(name="scale")] = 1.0
     """Lengths of the new object relative to the old one."""
     young: float | None = None
-    """Young's modulus of the new material in Pa, instead of the table's, as for the others below; without --material,
-    instead of the present material's."""
+    """Young's modulus of the new material in Pa, instead of the table's, as for the others below; without
+    --to-material, instead of the present material's."""
     density: float | None = None
     """Density of the new material in kg/m3."""
     poisson: float | None = None
@@ -38,6 +49,17 @@ class MaterialOptions:
     law: Literal["displacement", "velocity", "acceleration", "ratio-only"] = "displacement"
     """Quantity that the recordings are proportional to, which decides the level of each mode; ratio-only is the paper's
     law, which leaves mass and size out."""
+
+    @property
+    def constants(self) -> dict[str, float]:
+        """The constants that are given."""
+        given = {name: getattr(self, name) for name in ("young", "density", "poisson", "alpha", "beta")}
+        return {name: value for name, value in given.items() if value is not None}
+
+    @property
+    def asked(self) -> bool:
+        """Whether anything changes."""
+        return self.material is not None or self.size != 1.0 or bool(self.constants)
 
 
 @dataclass(frozen=True)
@@ -57,6 +79,12 @@ class ModeOptions:
     mode_decay: Annotated[_Pairs, tyro.conf.arg(metavar="HZ FACTOR")] = ()
     """Factor on the decay time of the mode at this frequency, in addition to --decay."""
 
+    @property
+    def asked(self) -> bool:
+        """Whether anything changes."""
+        single = self.mode_db or self.mode_pitch or self.mode_decay
+        return (self.pitch, self.decay, self.brightness) != (1.0, 1.0, 0.0) or bool(single)
+
 
 @dataclass(frozen=True)
 class GuideOptions:
@@ -73,7 +101,7 @@ class GuideOptions:
     """Recordings of impacts on another object to imitate: files or folders of them."""
     like_material: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Material to imitate statistically, with this object's modes in it by the laws of elasticity as the target;
-    --material follows these laws exactly."""
+    --to-material follows these laws exactly."""
     model: Annotated[str, tyro.conf.arg(metavar="FOLDER|NAME")] = STABLE_AUDIO
     """Stable Audio pipeline: a folder, or its name on the hub."""
     negative: Annotated[str | None, tyro.conf.arg(metavar="TEXT")] = None
@@ -92,10 +120,52 @@ class GuideOptions:
     a penalty. published: the paper's form, a factor on all frequencies and single modes without a penalty, gains times
     f1/f2 at the end. independent: only single modes (Audio-SDS). searched: the same after a search for common
     factors."""
-    distillation: tyro.conf.OmitArgPrefixes[DistillationConfig] = field(default_factory=DistillationConfig)
+    distillation: Annotated[tyro.conf.OmitArgPrefixes[DistillationConfig], tyro.conf.arg(name="")] = field(
+        default_factory=DistillationConfig
+    )
     """Targets from the model."""
-    config: tyro.conf.OmitArgPrefixes[GuidedEditConfig] = field(default_factory=GuidedEditConfig)
+    config: Annotated[tyro.conf.OmitArgPrefixes[GuidedEditConfig], tyro.conf.arg(name="")] = field(
+        default_factory=GuidedEditConfig
+    )
     """How the modes are optimized."""
+
+    @property
+    def asked(self) -> bool:
+        """Whether there is a guide."""
+        return bool(self._guides)
+
+    def expect_usable(self) -> None:
+        """Raise before a field or a model is loaded, `SimulationError` for a material that is not known.
+
+        And `EditError` for more than one guide, an empty prompt, and settings of a guide that is not given.
+        """
+        if len(self._guides) > 1:
+            raise EditError(
+                f"expected one of --prompt, --like and --like-material, got {' and '.join(self._guides)}; use one "
+                "after the other",
+                name=self._guides[0],
+                value=tuple(self._guides),
+            )
+        if self.like_material is not None:
+            material_named(self.like_material)
+        if not self._guides:
+            given = [*(name for name in _changed(self) if name == "--parameters"), *_changed(self.config)]
+            _expect_unchanged(given, "--prompt, --like or --like-material")
+        if self.prompt is None:
+            own = [name for name in _changed(self) if name in _OF_THE_MODEL]
+            _expect_unchanged([*own, *_changed(self.distillation)], "--prompt")
+            return
+        expect_prompt(self.prompt)
+        if self.clap is not None and self.config.preview_every == 0:
+            raise EditError.expected("--preview-every 1 or more with it, such as 50", 0, got="0", name="--clap")
+        if self.model_seconds is not None and not 0 < self.model_seconds < math.inf:
+            raise EditError.expected("more than 0, such as 3", self.model_seconds, name="--model-seconds")
+
+    @property
+    def _guides(self) -> list[str]:
+        given = {"--prompt": self.prompt is not None, "--like": bool(self.like)}
+        given["--like-material"] = self.like_material is not None
+        return [name for name, present in given.items() if present]
 
 
 @dataclass(frozen=True)
@@ -110,11 +180,17 @@ class Options(Printing):
     """Field file, as `avmsf fit` writes it."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="NEW.safetensors")]
     """File to write the edited field to."""
-    change: tyro.conf.OmitArgPrefixes[MaterialOptions] = dataclasses.field(default_factory=MaterialOptions)
+    change: Annotated[tyro.conf.OmitArgPrefixes[MaterialOptions], tyro.conf.arg(name="material")] = dataclasses.field(
+        default_factory=MaterialOptions
+    )
     """Material and size."""
-    sliders: tyro.conf.OmitArgPrefixes[ModeOptions] = dataclasses.field(default_factory=ModeOptions)
+    sliders: Annotated[tyro.conf.OmitArgPrefixes[ModeOptions], tyro.conf.arg(name="modes")] = dataclasses.field(
+        default_factory=ModeOptions
+    )
     """Modes."""
-    steering: tyro.conf.OmitArgPrefixes[GuideOptions] = dataclasses.field(default_factory=GuideOptions)
+    steering: Annotated[tyro.conf.OmitArgPrefixes[GuideOptions], tyro.conf.arg(name="guided-edit")] = dataclasses.field(
+        default_factory=GuideOptions
+    )
     """Guided edits."""
     plots: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Folder for modes.png, spectrograms.png, before.wav and after.wav; with --clap also clap.png, the score over the
@@ -122,7 +198,56 @@ class Options(Printing):
     position: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
     """Contact of these sounds in meters, on the object as it was; by default where it is loudest."""
 
+    def check_inputs(self) -> None:
+        """Raise the package's errors for an edit that cannot be done or written."""
+        super().check_inputs()
+        self.steering.expect_usable()
+        expect_device(self.steering.device, raising=EditError)
+        for name in (self.change.material, self.change.old):
+            if name is not None:
+                material_named(name)
+        if self.change.law != MaterialOptions.law and not self.change.asked:
+            raise EditError.expected("--to-material, --scale or a constant of a material with it", name="--law")
+        if self.position is not None and self.plots is None:
+            raise EditError("--position: expected --plots with it, got none", name="--position")
+        if self.change.old is not None and not (self.change.asked or self.steering.like_material):
+            raise EditError.expected("--to-material, --scale, a constant or --like-material with it", name="--from")
+        if not (self.change.asked or self.sliders.asked or self.steering.asked):
+            raise EditError(
+                "expected an edit, got none: give --to-material, --scale or a constant of a material, --pitch, "
+                "--decay, --brightness, --mode-db, --mode-pitch or --mode-decay, --prompt, --like or --like-material",
+                name="options",
+            )
+        expect_writable(self.output)
+        if self.steering.generated is not None:
+            expect_writable(self.steering.generated)
+        if self.output.exists() and self.field.exists() and self.output.samefile(self.field):
+            raise OutputError(
+                f"{self.output}: expected another file than the field to edit; choose another --output",
+                file=self.output,
+                name="--output",
+            )
+        if self.plots is not None:
+            for name in (MODES, SPECTROGRAMS, BEFORE, AFTER, CURVE):
+                expect_writable(self.plots / name)
+
 
 def parse(words: Sequence[str]) -> Options:
     """Return the options that the words spell."""
     return parse_options(Options, "edit", words)
+
+
+def _changed(options: Any) -> list[str]:
+    """Return which options of a dataclass are not at their defaults, as the command line calls them."""
+    return [
+        option_of(each)
+        for each in dataclasses.fields(options)
+        if each.default is not dataclasses.MISSING and getattr(options, each.name) != each.default
+    ]
+
+
+def _expect_unchanged(given: list[str], wanted: str) -> None:
+    if given:
+        raise EditError(
+            f"{' and '.join(given)}: expected {wanted} as well, got none", name=given[0], value=tuple(given)
+        )

@@ -7,8 +7,12 @@ from typing import Annotated, Literal
 
 import tyro
 
+from avmsf.bench.names import expect_method, expect_protocol
+from avmsf.capture.datasets.signs import expect_signs
+from avmsf.cli.options.checks import expect_device, expect_modes
 from avmsf.cli.options.common import Existing, Flag, OutputFolder, Printing, parse_options
 from avmsf.config import BodyConfig, Geometry, LiftConfig, TimeZero
+from avmsf.errors import EvaluationError
 from avmsf.modal.config import ExtractionMethod
 from avmsf.scene.splatconfig import SplatConfig
 
@@ -31,7 +35,7 @@ class Options(Printing):
     methods: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
     """Methods, separated by commas or blanks; by default those of the protocol."""
     objects: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
-    """Objects, likewise; by default those of the protocol."""
+    """Objects, separated by commas or blanks; by default those of the protocol."""
     output: OutputFolder = None
     """Folder of results; by default evaluation/DATASET/PROTOCOL in the current folder."""
     cache: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
@@ -89,7 +93,22 @@ class Options(Printing):
     """Also draw figures/OBJECT.png: spectrograms of the recording and of all methods, 20 Hz to 20 kHz, first second;
     with localize also each field's heat maps of three recordings, with the true contact marked."""
 
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        expect_protocol(self.protocol)
+        for name in words_of(self.methods):
+            expect_method(name)
+        expect_device(self.device, raising=EvaluationError)
+        expect_modes(self.modes)
+        expect_signs(self.data)
+
 
 def parse(words: Sequence[str]) -> Options:
     """Return the options that the words spell."""
     return parse_options(Options, "evaluate", words)
+
+
+def words_of(given: Sequence[str]) -> tuple[str, ...]:
+    """Return words that commas or blanks separate."""
+    return tuple(word for each in given for word in each.split(",") if word)

@@ -8,7 +8,10 @@ from typing import Annotated
 import tyro
 
 from avmsf.cli.options.common import Existing, Flag, Printing, Unit, parse_options
+from avmsf.cli.options.helptext import option_of
+from avmsf.errors import ExportError
 from avmsf.export.formats import Axis, Format, Precision
+from avmsf.field.header import read_record
 from avmsf.modal.config import PulseShape
 
 _USED: dict[Format, tuple[str, ...]] = {
@@ -73,6 +76,14 @@ class Options(Printing):
     rate: float | None = None
     """Sample rate in Hz of a field in the demo's layout, which does not hold it."""
 
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        if self.points is not None and self.points < 1:
+            raise ExportError.expected("1 or more", self.points, name="--points")
+        if not self.field.is_dir():
+            read_record(self.field)
+
 
 def parse(words: Sequence[str]) -> Options:
     """Return the options that the words spell."""
@@ -86,6 +97,6 @@ def unused_options(options: Options) -> list[str]:
     for each in fields(options):
         if each.name in _OF_SOME and each.name not in used and getattr(options, each.name) != each.default:
             others = ", ".join(name for name, known in _USED.items() if each.name in known) or "the demo's folders"
-            option = f"--{each.name.replace('_', '-')}"
+            option = option_of(each)
             sentences.append(f"{option} is not used by --to {options.to}, only by {others}")
     return sentences

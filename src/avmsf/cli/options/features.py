@@ -7,6 +7,7 @@ from typing import Annotated
 
 import tyro
 
+from avmsf.cli.options.checks import expect_writable
 from avmsf.cli.options.common import parse_options
 from avmsf.cli.options.presets import preset_of, with_defaults
 from avmsf.cli.options.scenes import SceneOptions
@@ -19,6 +20,7 @@ class Options(SceneOptions):
     """Compute visual features on an object's surface, equal at points that are symmetric to each other.
 
     Views and Gaussians are made first if the cache does not have them. `avmsf fit --features` reads the result.
+    --seed is the seed of all stages.
     """
 
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FEATURES.safetensors")] = None
@@ -29,8 +31,15 @@ class Options(SceneOptions):
     """How Gaussians are fitted."""
     preset: Preset = "default"
     """Defaults of all settings; paper: features as published. `--preset paper --help` shows its values."""
-    config: tyro.conf.OmitArgPrefixes[LiftConfig] = field(default_factory=LiftConfig)
+    config: Annotated[tyro.conf.OmitArgPrefixes[LiftConfig], tyro.conf.arg(name="features")] = field(
+        default_factory=LiftConfig
+    )
     """How features are made."""
+
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        expect_writable(self.output)
 
 
 def parse(words: Sequence[str]) -> Options:

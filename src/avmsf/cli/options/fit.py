@@ -3,15 +3,18 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
+from avmsf.cli.options.checks import expect_capture, expect_device, expect_modes, expect_writable
 from avmsf.cli.options.common import Existing, Printing, SettingsFile, parse_options
 from avmsf.cli.options.presets import preset_of, preset_values, with_defaults
 from avmsf.config import BodyConfig, PipelineConfig, Preset, SceneConfig, TimeZero
+from avmsf.errors import EvaluationError, FitError
 from avmsf.field.config import FitConfig, GainModel
 from avmsf.modal.config import ExtractionMethod
+from avmsf.simulate.material import material_named
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,7 @@ class Options(Printing):
     """Fit to all recordings at this fraction of the contacts, spread as far apart as possible, and compute the error
     at the others. Contacts closer than 1 % of the extent of all count as one."""
     train_count: int | None = None
-    """Fit to all recordings at this number of contacts, likewise."""
+    """Fit to all recordings at this number of contacts, spread as far apart as possible."""
     start: int = 0
     """Row of impacts.csv, counted from 0, whose contact this choice starts from."""
     features: Annotated[
@@ -63,7 +66,9 @@ class Options(Printing):
     """Defaults of all settings. default: takes seconds to minutes. paper: everything as published, the middle of each
     published list; takes hours. `--preset paper --help` shows its values. Features are those of --features; `avmsf
     reconstruct` computes the preset's."""
-    config: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)
+    config: Annotated[tyro.conf.OmitArgPrefixes[FitConfig], tyro.conf.arg(name="fit")] = field(
+        default_factory=FitConfig
+    )
     """How the field is fitted."""
 
     @property
@@ -74,6 +79,19 @@ class Options(Printing):
             self.gain_model, self.body, scene, self.config, self.extraction, self.modes, start, self.device
         )
 
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        expect_writable(self.output)
+        expect_device(self.device, raising=FitError)
+        expect_modes(self.modes)
+        expect_split(self.train_fraction, self.train_count)
+        if self.material is None:
+            expect_capture(self.capture, self.settings)
+        else:
+            material_named(self.material)
+            refuse_with_material(self)
+
 
 def parse(words: Sequence[str]) -> Options:
     """Return the options that the words spell, with the preset's settings as defaults."""
@@ -81,3 +99,30 @@ def parse(words: Sequence[str]) -> Options:
     # Views and features are made beforehand.
     del values["scene"]
     return parse_options(with_defaults(Options, values), "fit", words, description=Options.__doc__)
+
+
+def expect_split(fraction: float | None, count: int | None) -> None:
+    """Raise `FitError` for both a fraction and a count, `EvaluationError` for a fraction that is no part."""
+    if count is not None and fraction is not None:
+        raise FitError("expected --train-count or --train-fraction, got both; leave one out", name="--train-count")
+    if fraction is not None and not 0.0 < fraction < 1.0:
+        raise EvaluationError.expected("a fraction of training contacts between 0 and 1", fraction, name="fraction")
+
+
+def refuse_with_material(options: Any) -> None:
+    """Raise FitError for options of `fit` or `reconstruct` that need recordings, given with --material."""
+    names = ("train_fraction", "train_count", "features")
+    given = [name for name in names if getattr(options, name, None) is not None]
+    if options.gain_model not in ("auto", "elastic"):
+        given.append("gain_model")
+    if options.body.supports == "try":
+        given.append("body.supports")
+    if options.time_zero is not None:
+        given.append("time_zero")
+    if given:
+        option = f"--{given[0].replace('_', '-')}"
+        raise FitError(
+            f"{option}: expected recordings, got --material, which computes a field without them; leave one out",
+            name=option,
+            value="--material",
+        )

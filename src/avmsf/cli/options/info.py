@@ -7,7 +7,10 @@ from typing import Annotated, Literal
 
 import tyro
 
+from avmsf.cli.options.checks import expect_capture
 from avmsf.cli.options.common import Existing, Printing, SettingsFile, parse_options
+from avmsf.field.header import read_record
+from avmsf.scene.featureheader import holds_features
 
 
 @dataclass(frozen=True)
@@ -29,10 +32,19 @@ class Options(Printing):
     cloud.png and turntable.gif. Features: features.png and turntable.gif."""
     cloud: Annotated[Path | None, tyro.conf.arg(metavar="CLOUD.ply"), Existing("Gaussians, as a .ply file")] = None
     """Features: also draw the colors of the Gaussians that the features lie on."""
-    clusters: int = 64
+    regions: int = 64
     """Features: number of regions to draw."""
     up: Literal["x", "y", "z"] = "z"
     """Gaussians and features: axis that points up."""
+
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        suffix = self.file.suffix.lower()
+        if suffix != ".ply" and not (suffix == ".safetensors" and holds_features(self.file)):
+            read_record(self.file)
+            if self.capture is not None:
+                expect_capture(self.capture, self.settings)
 
 
 def parse(words: Sequence[str]) -> Options:

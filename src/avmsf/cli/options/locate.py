@@ -7,6 +7,7 @@ from typing import Annotated
 
 import tyro
 
+from avmsf.cli.options.checks import OutputError, expect_writable
 from avmsf.cli.options.common import Existing, FieldFile, Flag, OutputFolder, Printing, SettingsFile, parse_options
 
 _Recording = Annotated[Path, Existing("a recording")]
@@ -23,10 +24,8 @@ class Options(Printing):
     """Field file, as `avmsf fit` writes it."""
     recordings: tyro.conf.Positional[Annotated[tuple[_Recording, ...], tyro.conf.arg(metavar="RECORDING.wav ...")]]
     """Recordings of impacts on the same object: wav, flac or another format that libsndfile reads."""
-    capture: Annotated[Path | None, tyro.conf.arg(metavar="CAPTURE"), Existing("a capture folder")] = None
-    """Read the recordings by this folder's capture.toml; by default like the recordings of the fit."""
     settings: SettingsFile = None
-    """Read the recordings by this capture.toml."""
+    """Read the recordings by this capture.toml; by default like the recordings of the fit."""
     several: Flag = False
     """The recordings hold several impacts each; locate every one of them."""
     force: float | None = None
@@ -39,6 +38,20 @@ class Options(Printing):
     one blue."""
     output: OutputFolder = None
     """Folder for a heat map and a colored point cloud of every impact, NAME.png and NAME.ply."""
+
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        if not self.recordings:
+            raise OutputError(
+                "expected one recording or more after the field, such as HIT.wav", name="recordings", value=0
+            )
+        if not 0.0 < self.probability < 1.0:
+            raise OutputError.expected(
+                "a probability between 0 and 1, such as 0.9", self.probability, name="--probability"
+            )
+        if self.output is not None:
+            expect_writable(self.output / "impact.png")
 
 
 def parse(words: Sequence[str]) -> Options:

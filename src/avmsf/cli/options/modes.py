@@ -7,6 +7,7 @@ from typing import Annotated
 
 import tyro
 
+from avmsf.cli.options.checks import expect_capture, expect_modes
 from avmsf.cli.options.common import CaptureFolder, Printing, SettingsFile, parse_options
 from avmsf.cli.options.presets import preset_of, preset_values, with_defaults
 from avmsf.config import PipelineConfig, Preset, TimeZero
@@ -30,8 +31,14 @@ class Options(Printing):
     """Defaults of all settings; paper: the published method, from the peak on."""
     settings: SettingsFile = None
     """Use this capture.toml instead of the folder's own."""
-    picture: Annotated[Path | None, tyro.conf.arg(metavar="FILE.png")] = None
-    """Draw the modes to this file, which ends in .png, .pdf or .svg."""
+    plots: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Draw the modes to modes.png in this folder."""
+
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        expect_modes(self.modes)
+        expect_capture(self.capture, self.settings)
 
     @property
     def pipeline(self) -> PipelineConfig:

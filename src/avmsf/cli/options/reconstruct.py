@@ -7,7 +7,11 @@ from typing import Annotated
 
 import tyro
 
+from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.table import read_strikes
+from avmsf.cli.options.checks import expect_modes, expect_writable
 from avmsf.cli.options.common import parse_options
+from avmsf.cli.options.fit import expect_split, refuse_with_material
 from avmsf.cli.options.presets import preset_of, preset_values, with_defaults
 from avmsf.cli.options.scenes import SceneOptions, with_seed
 from avmsf.config import (
@@ -22,6 +26,7 @@ from avmsf.config import (
 from avmsf.field.config import FitConfig, GainModel
 from avmsf.modal.config import ExtractionMethod
 from avmsf.scene.splatconfig import SplatConfig
+from avmsf.simulate.material import material_named
 
 
 @dataclass(frozen=True)
@@ -40,7 +45,7 @@ class Options(SceneOptions):
     """Fit to all recordings at this fraction of the contacts, spread as far apart as possible, and compute the error
     at the others. Contacts closer than 1 % of the extent of all count as one."""
     train_count: int | None = None
-    """Fit to all recordings at this number of contacts, likewise."""
+    """Fit to all recordings at this number of contacts, spread as far apart as possible."""
     start: int = 0
     """Row of impacts.csv, counted from 0, whose contact this choice starts from."""
     extraction: ExtractionMethod = "high-resolution"
@@ -74,6 +79,23 @@ class Options(SceneOptions):
         fit = self.fit if self.seed is None else replace(self.fit, seed=self.seed)
         start = self.time_zero
         return PipelineConfig(self.gain_model, self.body, scene, fit, self.extraction, self.modes, start, self.device)
+
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        expect_writable(self.output)
+        expect_modes(self.modes)
+        expect_split(self.train_fraction, self.train_count)
+        if self.material is not None:
+            material_named(self.material)
+            refuse_with_material(self)
+
+    def expect_folder(self, settings: CaptureSettings) -> None:
+        """Raise `CaptureError` for a table that cannot be used; only without recordings the folder needs views."""
+        if self.material is None:
+            read_strikes(self.folder, settings)
+        else:
+            super().expect_folder(settings)
 
 
 def parse(words: Sequence[str]) -> Options:

@@ -1,5 +1,6 @@
 """Options of `avmsf render`."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,8 +8,10 @@ from typing import Annotated, Literal
 
 import tyro
 
+from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.common import Existing, FieldFile, Printing, Unit, parse_options
 from avmsf.modal.config import PulseShape
+from avmsf.simulate.recipe import LONGEST
 
 Coding = Literal["float32", "int16"]
 Points = tyro.conf.UseAppendAction[tuple[tuple[float, float, float], ...]]
@@ -50,6 +53,34 @@ class Options(Printing):
     """Additional gain in dB."""
     coding: Coding = "float32"
     """Format of the samples. float32 holds any level; int16 rejects sounds that would clip."""
+
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        if bool(self.position) == (self.contact_table is not None):
+            raise OutputError(
+                "expected contacts either by --position X Y Z, once or more, or by --contact-table TABLE.csv",
+                name="--position",
+                value=len(self.position),
+            )
+        if self.direction and len(self.direction) != len(self.position):
+            raise OutputError(
+                f"--direction: expected one for each --position, got {len(self.direction)} for {len(self.position)}",
+                name="--direction",
+                value=len(self.direction),
+            )
+        for row, place in enumerate(self.position):
+            if not all(map(math.isfinite, place)):
+                raise OutputError.expected("finite coordinates", list(place), row=row, name="--position")
+        if not math.isfinite(self.level_db):
+            raise OutputError.expected("a finite number", self.level_db, name="--level-db")
+        if not 0 < self.force < math.inf:
+            advice = "--direction says which way it acts"
+            raise OutputError.expected("a finite force above 0", self.force, name="--force", advice=advice)
+        if not 0 <= self.contact_time <= LONGEST:
+            raise OutputError.expected(f"seconds from 0 to {LONGEST:g}", self.contact_time, name="--contact-time")
+        if self.seconds is not None and not 0 < self.seconds < math.inf:
+            raise OutputError.expected("more than 0", self.seconds, name="--seconds")
 
 
 def parse(words: Sequence[str]) -> Options:

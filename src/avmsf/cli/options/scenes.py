@@ -6,8 +6,12 @@ from typing import Annotated
 
 import tyro
 
+from avmsf.capture.filenames import expect_views
+from avmsf.capture.settings import CaptureSettings
+from avmsf.cli.options.checks import expect_device, read_settings
 from avmsf.cli.options.common import Existing, Printing, SettingsFile
 from avmsf.config import CACHE, SceneConfig
+from avmsf.errors import SceneError
 
 
 @dataclass(frozen=True)
@@ -22,6 +26,16 @@ class SceneOptions(Printing):
     """Use this capture.toml instead of the folder's own."""
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda")] = None
     """Device for Gaussians (with gsplat), DINOv2 and training; by default the GPU if there is one."""
+
+    def check_inputs(self) -> None:
+        """Raise the package's errors for a folder that shows nothing of the object, and an unknown device."""
+        super().check_inputs()
+        expect_device(self.device, raising=SceneError)
+        self.expect_folder(read_settings(self.folder, self.settings))
+
+    def expect_folder(self, settings: CaptureSettings) -> None:
+        """Raise `SceneError` for a folder that shows nothing of the object."""
+        expect_views(self.folder, settings)
 
     @property
     def kept(self) -> Path:

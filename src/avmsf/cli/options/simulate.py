@@ -8,6 +8,7 @@ from typing import Annotated
 import tyro
 
 from avmsf.cli.options.common import Flag, InputError, Printing, parse_options
+from avmsf.errors import SimulationError
 from avmsf.simulate.example import EXAMPLE
 from avmsf.simulate.recipe import ObjectRecipe
 from avmsf.simulate.sim20 import SET, sim20_recipe
@@ -35,8 +36,16 @@ class Options(Printing):
     """The object, its impacts, recordings and images; for an object of the set, what differs from it."""
 
     def check_inputs(self) -> None:
-        """Raise `InputError` also for a mesh that does not exist."""
+        """Raise `InputError` also for a mesh that does not exist, `SimulationError` for options that do not fit."""
         super().check_inputs()
+        if self.output is None and not self.list:
+            raise SimulationError("--output: expected a folder, got none; --list names the objects", name="output")
+        for name in ("kind", "mesh", "material", "seed") if self.what == SET else ():
+            value = getattr(self.recipe, name)
+            if value != getattr(ObjectRecipe(), name):
+                raise SimulationError(
+                    f"--{name}: expected none with {SET}, got {value}; leave it out", name=name, value=str(value)
+                )
         if (mesh := self.recipe.mesh) is not None and not mesh.is_file():
             raise InputError.expected(
                 "a mesh: obj, ply, glb or stl", got="no such file or folder", file=mesh, advice="check the name"

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import tyro
 
+from avmsf.cli.options.checks import expect_writable
 from avmsf.cli.options.common import parse_options
 from avmsf.cli.options.scenes import SceneOptions
 from avmsf.config import ViewsConfig
@@ -18,14 +19,22 @@ class Options(SceneOptions):
     """Fit 3D Gaussians to photographs, a video or a mesh, as a .ply file that any 3DGS viewer opens.
 
     Views and Gaussians are cached. Repeat an interrupted command to continue it.
+    --seed is the seed of all stages.
     """
 
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="CLOUD.ply")] = None
     """Copy the Gaussians to this file."""
     views: ViewsConfig = field(default_factory=ViewsConfig)
     """How views are made."""
-    config: tyro.conf.OmitArgPrefixes[SplatConfig] = field(default_factory=SplatConfig)
+    config: Annotated[tyro.conf.OmitArgPrefixes[SplatConfig], tyro.conf.arg(name="Gaussians")] = field(
+        default_factory=SplatConfig
+    )
     """How Gaussians are fitted."""
+
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        expect_writable(self.output)
 
 
 def parse(words: Sequence[str]) -> Options:

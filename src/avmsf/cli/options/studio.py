@@ -7,8 +7,10 @@ from typing import Annotated
 
 import tyro
 
+from avmsf.cli.options.checks import expect_modes
 from avmsf.cli.options.common import Existing, Flag, Printing, parse_options
 from avmsf.config import Preset
+from avmsf.errors import StudioError
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,15 @@ class Options(Printing):
     """Settings of a reconstruction; paper: everything as published, which takes hours."""
     fetch_modules: Flag = False
     """First download the page's libraries with npm, so that it works without a network from then on."""
+
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        expect_modes(self.modes)
+        if self.target is None and not self.fetch_modules:
+            raise StudioError(
+                "expected a field, a capture folder, a folder of images or a mesh, got none", name="target"
+            )
 
 
 def parse(words: Sequence[str]) -> Options:

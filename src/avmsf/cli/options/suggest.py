@@ -7,7 +7,12 @@ from typing import Annotated
 
 import tyro
 
+from avmsf.cli.options.checks import expect_capture, expect_writable
 from avmsf.cli.options.common import Existing, FieldFile, Flag, OutputFolder, Printing, SettingsFile, parse_options
+from avmsf.errors import FitError
+
+TABLE, PICTURE = "suggested.csv", "suggested.png"
+"""What the folder of results holds."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +36,18 @@ class Options(Printing):
     """Use this capture.toml instead of the candidates' own."""
     output: OutputFolder = None
     """Folder for suggested.csv, the list of contacts, and suggested.png, the contacts on the object."""
+
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        if self.settings is not None and self.candidates is None:
+            raise FitError("--settings: expected it with --candidates, got it without; leave it out", name="--settings")
+        if self.unseen and self.candidates is not None:
+            raise FitError("--unseen: expected it without --candidates, got both; leave one out", name="--unseen")
+        if self.candidates is not None:
+            expect_capture(self.candidates, self.settings)
+        if self.output is not None:
+            expect_writable(self.output / TABLE)
 
 
 def parse(words: Sequence[str]) -> Options:

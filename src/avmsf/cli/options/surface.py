@@ -3,10 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_args
 
 import tyro
 
+from avmsf.capture.filenames import SurfaceKind
+from avmsf.cli.options.checks import OutputError, expect_writable
 from avmsf.cli.options.common import parse_options
 from avmsf.cli.options.scenes import SceneOptions
 from avmsf.config import ViewsConfig
@@ -25,14 +27,36 @@ class Options(SceneOptions):
 
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="SURFACE.ply")] = None
     """Write the surface to this file, which ends in .ply, .obj or .glb; surface.ply in the cache is always written."""
-    picture: Annotated[Path | None, tyro.conf.arg(metavar="FILE.png")] = None
-    """Draw the surface and two cross-sections to this file, which ends in .png, .pdf or .svg."""
+    plots: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Draw the surface and two cross-sections to surface.png in this folder."""
     seed: int | None = None
     """Seed of all stages; by default each stage's own."""
     views: ViewsConfig = field(default_factory=ViewsConfig)
     """How views are made."""
     splat: SplatConfig = field(default_factory=SplatConfig)
     """How Gaussians are fitted."""
+
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        expect_writable(self.output)
+        if self.output is not None:
+            kind_of(self.output)
+
+
+def kind_of(path: Path) -> SurfaceKind:
+    """Return the format of a file by its suffix. Raises OutputError for another."""
+    kinds: tuple[SurfaceKind, ...] = get_args(SurfaceKind)
+    for kind in kinds:
+        if path.suffix.lower() == f".{kind}":
+            return kind
+    raise OutputError(
+        f"{path}: expected a name that ends in {', '.join(f'.{kind}' for kind in kinds)}, got "
+        f"{path.suffix or 'no suffix'}; rename it",
+        file=path,
+        name="suffix",
+        value=path.suffix,
+    )
 
 
 def parse(words: Sequence[str]) -> Options:

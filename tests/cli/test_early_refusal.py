@@ -1,0 +1,91 @@
+"""Mistakes that need no computation are refused before torch, which takes seconds to load."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from avmsf.bench.methods import METHODS
+from avmsf.bench.names import METHOD_NAMES, PROTOCOL_NAMES
+from avmsf.bench.protocols import PROTOCOLS
+
+STORED = Path(__file__).parents[1] / "data" / "format-8" / "mixture.safetensors"
+REFUSED = (
+    "fit cells -o f.safetensors",
+    "fit empty -o f.safetensors",
+    "fit good -o f.safetensors --device tpu",
+    "fit good -o f.safetensors --train-fraction 2",
+    "fit good -o f.safetensors --train-fraction 0.5 --train-count 4",
+    "fit good -o f.safetensors --modes 0",
+    "fit good -o f.safetensors --material cheese",
+    "check empty",
+    "modes empty",
+    "modes good --modes 0",
+    "splat empty",
+    "features empty",
+    "surface empty",
+    "surface good -o s.stl",
+    "reconstruct empty",
+    "reconstruct empty --material glass",
+    "info wrong.safetensors",
+    "info newer.safetensors",
+    "locate wrong.safetensors good/001.wav",
+    "locate field.safetensors",
+    "suggest wrong.safetensors",
+    "suggest field.safetensors --unseen --candidates good",
+    "export wrong.safetensors --to web -o page",
+    "render wrong.safetensors --position 0 0 0 -o s",
+    "render field.safetensors -o s",
+    "render field.safetensors --position 0 0 0 -o s --force 0",
+    "edit field.safetensors -o new.safetensors",
+    "edit field.safetensors -o field.safetensors --pitch 2",
+    "evaluate nope good",
+    "evaluate farthest good --methods nope",
+    "evaluate farthest empty",
+    "simulate",
+    "dataset check empty",
+    "studio",
+    "play field.safetensors",
+)
+CODE = """
+import contextlib, io, json, sys
+from avmsf.cli import main
+found = {}
+for words in json.loads(sys.argv[1]):
+    with contextlib.redirect_stderr(io.StringIO()) as said:
+        code = main(words.split())
+    found[words] = [code, len(said.getvalue().splitlines()), "torch" in sys.modules]
+    if "torch" in sys.modules:
+        break
+print(json.dumps(found))
+"""
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    (tmp_path / "empty").mkdir()
+    for name, cell in (("good", "0.1"), ("cells", "left")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "impacts.csv").write_text(f"file,x,y,z\n001.wav,0,0,0\n002.wav,{cell},0,0\n")
+    for each in ("001.wav", "002.wav"):
+        (tmp_path / "good" / each).touch()
+    (tmp_path / "wrong.safetensors").write_bytes(b"RIFF and so on")
+    field = STORED.read_bytes()
+    (tmp_path / "field.safetensors").write_bytes(field)
+    (tmp_path / "newer.safetensors").write_bytes(field.replace(b'\\"format\\": 8', b'\\"format\\": 9', 1))
+    return tmp_path
+
+
+def test_no_refusal_loads_torch(place: Path) -> None:
+    command = [sys.executable, "-c", CODE, json.dumps(REFUSED)]
+    ran = subprocess.run(command, cwd=place, capture_output=True, text=True, timeout=120, check=True, env=os.environ)
+    found = json.loads(ran.stdout)
+    assert found == {words: [2, 1, False] for words in REFUSED}
+
+
+def test_names_are_those_of_the_methods_and_protocols() -> None:
+    assert tuple(METHODS) == METHOD_NAMES
+    assert tuple(PROTOCOLS) == PROTOCOL_NAMES

@@ -1,0 +1,52 @@
+"""What `--help` prints of every verb, and hints for names of earlier versions."""
+
+import re
+
+import pytest
+
+from avmsf.cli import RENAMED, VERBS, main
+from avmsf.cli.options.edit import parse as parse_edit
+from avmsf.cli.options.simulate import parse as parse_simulate
+
+Streams = pytest.CaptureFixture[str]
+COLUMNS = 80
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_help_fills_the_terminal_and_states_only_defaults_that_say_something(
+    verb: str, capsys: Streams, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(COLUMNS))
+    with pytest.raises(SystemExit) as left:
+        main([*(("dataset", "check") if verb == "dataset" else (verb,)), "--help"])
+    assert left.value.code == 0
+    page = capsys.readouterr().out
+    assert max(map(len, page.splitlines())) <= COLUMNS
+    assert not re.search(r"\(default: (None|False|True)?\)|\[[A-Z]+ \[|\bINT\b|\bFLOAT\b|\bWhether\b", page)
+
+
+def test_an_option_may_have_another_name_than_its_setting() -> None:
+    words = ["field", "-o", "new", "--free-modes", "3", "--contacts-per-step", "2", "--to-material", "wood"]
+    edit = parse_edit([*words, "--scale", "2"])
+    assert (edit.steering.config.modes, edit.steering.config.contacts) == (3, 2)
+    assert (edit.change.material, edit.change.size) == ("wood", 2.0)
+    recipe = parse_simulate(["--elastic-modes", "5", "--impacts", "4"]).recipe
+    assert (recipe.modes, recipe.contacts) == (5, 4)
+
+
+@pytest.mark.parametrize("word", RENAMED)
+def test_verbs_of_earlier_versions_lead_to_those_of_today(word: str, capsys: Streams) -> None:
+    assert main([word]) == 2
+    assert RENAMED[word] in capsys.readouterr().err
+
+
+def test_an_option_of_an_earlier_version_leads_to_that_of_today(capsys: Streams) -> None:
+    assert main(["render", "field.safetensors", "--at", "0", "0", "0", "-o", "s"]) == 2
+    assert "--position" in capsys.readouterr().err
+
+
+def test_words_of_a_choice_are_listed_as_words(capsys: Streams) -> None:
+    with pytest.raises(SystemExit):
+        main(["export", "field.safetensors", "--to", "cheese", "-o", "out"])
+    err = " ".join(capsys.readouterr().err.replace("│", "").split())
+    assert "web, gltf, faust" in err
