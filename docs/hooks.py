@@ -21,12 +21,16 @@ import contextlib, io, json
 from avmsf.cli import VERBS, main
 found = {}
 for verb in VERBS:
+    words = ["dataset", "check"] if verb == "dataset" else [verb]
     with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit):
-        main([verb, "--help"])
+        main([*words, "--help"])
     found[verb] = [VERBS[verb], text.getvalue()]
 print(json.dumps(found))
 """
-"""Prints each verb's summary and help. In a process of its own, so that what verbs import does not slow mkdocs down."""
+"""Prints each verb's summary and help; that of `dataset` is its only part's.
+
+It runs in a process of its own, so that what verbs import does not slow mkdocs down.
+"""
 
 _RULE = re.compile(r" *[-─]{10,} *$")
 _generated: dict[str, str] = {}
@@ -107,10 +111,13 @@ def _command_page(verb: str, text: str) -> str:
         if indent <= 1 and (_RULE.match(following) or words.endswith(":")) and words.islower():
             page += ["", f"## {words.strip(':').capitalize()}", ""]
             described = False
-        elif 0 < indent <= 4 and (words.startswith("-") or re.match(r"[A-Z{\[]\S+(  |$)", words)):
+        elif 0 < indent <= 4 and (words.startswith("-") or re.match(r"[A-Z{\[]\S*[^.\s](  |$)", words)):
             name, _, description = words.partition("  ")
             page += ["", f"`{name}`", f":   {description.strip()}"]
             described = True
+        elif page[-1] == ":   ":
+            # The description of a long option begins on the line below.
+            page[-1] += words
         else:
             page.append(f"    {words}" if described and words else words)
     return "\n".join(page) + "\n"
