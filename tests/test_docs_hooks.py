@@ -30,7 +30,8 @@ def _hooks() -> ModuleType:
     pytest.importorskip("latex2mathml")
     pytest.importorskip("mkdocs")
     spec = spec_from_file_location("docs_hooks", HOOKS)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     hooks = module_from_spec(spec)
     spec.loader.exec_module(hooks)
     return hooks
