@@ -141,16 +141,19 @@ def _package_pages() -> list[Any]:
 
 
 def _names(package: Path) -> list[str]:
-    """Return the names that a package exports: those that its stub imports from modules, or its literal `__all__`."""
+    """Return the names that a package exports: those of its `__all__`, and those that its stub imports from modules."""
     stub = package.with_suffix(".pyi")
+    exported: list[str] = []
     for node in ast.parse(package.read_text()).body:
         literal = isinstance(node, ast.Assign) and isinstance(node.value, ast.List)
         if literal and ast.unparse(node.targets[0]) == "__all__":
-            return [name for name in ast.literal_eval(node.value) if not name.startswith("_")]
-    imports = (
-        [node for node in ast.parse(stub.read_text()).body if isinstance(node, ast.ImportFrom)] if stub.exists() else []
-    )
-    return sorted(each.name for node in imports if node.module for each in node.names if not each.name.startswith("_"))
+            exported = [each.value for each in node.value.elts if isinstance(each, ast.Constant)]
+            if len(exported) == len(node.value.elts):
+                return [name for name in exported if not name.startswith("_")]
+    nodes = ast.parse(stub.read_text()).body if stub.exists() else []
+    imports = [node for node in nodes if isinstance(node, ast.ImportFrom) and node.module]
+    named = {*exported, *(each.name for node in imports for each in node.names)}
+    return sorted(name for name in named if not name.startswith("_"))
 
 
 def _module(folder: Path) -> str:
