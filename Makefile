@@ -41,8 +41,10 @@ lint: .venv/developed
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# The documentation, into site/. A link or an anchor that leads nowhere is an error.
+# The documentation, into site/. A link or an anchor that leads nowhere is an error, and so is one in the notebook, which
+# is executed for its sounds and pictures.
 docs: .venv/developed
+	rm -rf .cache/mkdocs-jupyter
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 clean:

@@ -21,12 +21,16 @@ import contextlib, io, json
 from avmsf.cli import VERBS, main
 found = {}
 for verb in VERBS:
+    words = ["dataset", "check"] if verb == "dataset" else [verb]
     with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit):
-        main([verb, "--help"])
+        main([*words, "--help"])
     found[verb] = [VERBS[verb], text.getvalue()]
 print(json.dumps(found))
 """
-"""Prints each verb's summary and help. In a process of its own, so that what verbs import does not slow mkdocs down."""
+"""Prints each verb's summary and help; that of `dataset` is its only part's.
+
+It runs in a process of its own, so that what verbs import does not slow mkdocs down.
+"""
 
 _RULE = re.compile(r" *[-─]{10,} *$")
 _generated: dict[str, str] = {}
@@ -107,10 +111,13 @@ def _command_page(verb: str, text: str) -> str:
         if indent <= 1 and (_RULE.match(following) or words.endswith(":")) and words.islower():
             page += ["", f"## {words.strip(':').capitalize()}", ""]
             described = False
-        elif 0 < indent <= 4 and (words.startswith("-") or re.match(r"[A-Z{\[]\S+(  |$)", words)):
+        elif 0 < indent <= 4 and (words.startswith("-") or re.match(r"[A-Z{\[]\S*[^.\s](  |$)", words)):
             name, _, description = words.partition("  ")
             page += ["", f"`{name}`", f":   {description.strip()}"]
             described = True
+        elif page[-1] == ":   ":
+            # The description of a long option begins on the line below.
+            page[-1] += words
         else:
             page.append(f"    {words}" if described and words else words)
     return "\n".join(page) + "\n"
@@ -134,16 +141,19 @@ def _package_pages() -> list[Any]:
 
 
 def _names(package: Path) -> list[str]:
-    """Return the names that a package exports: those that its stub imports from modules, or its literal `__all__`."""
+    """Return the names that a package exports: those of its `__all__`, and those that its stub imports from modules."""
     stub = package.with_suffix(".pyi")
+    exported: list[str] = []
     for node in ast.parse(package.read_text()).body:
         literal = isinstance(node, ast.Assign) and isinstance(node.value, ast.List)
         if literal and ast.unparse(node.targets[0]) == "__all__":
-            return [name for name in ast.literal_eval(node.value) if not name.startswith("_")]
-    imports = (
-        [node for node in ast.parse(stub.read_text()).body if isinstance(node, ast.ImportFrom)] if stub.exists() else []
-    )
-    return sorted(each.name for node in imports if node.module for each in node.names if not each.name.startswith("_"))
+            exported = [each.value for each in node.value.elts if isinstance(each, ast.Constant)]
+            if len(exported) == len(node.value.elts):
+                return [name for name in exported if not name.startswith("_")]
+    nodes = ast.parse(stub.read_text()).body if stub.exists() else []
+    imports = [node for node in nodes if isinstance(node, ast.ImportFrom) and node.module]
+    named = {*exported, *(each.name for node in imports for each in node.names)}
+    return sorted(name for name in named if not name.startswith("_"))
 
 
 def _module(folder: Path) -> str:

@@ -38,7 +38,7 @@ def test_a_sheet_has_a_row_for_each_set_of_colors_and_a_column_for_each_side():
     )
     titles = [axes.get_title() for axes in figure.axes]
     assert titles == [
-        f"{name}, azimuth {azimuth}°, elevation 25°"
+        f"{name}\nazimuth {azimuth}°, elevation 25°"
         for name in ("color", "features", "5 clusters", "symmetries")
         for azimuth in (0, 90)
     ]

@@ -65,7 +65,7 @@ def draw_cloud(
             if symmetries is not None and name == "symmetries":
                 _draw_symmetries(axes, points, symmetries, view)
             name_axes(axes, view)
-            axes.set_title(f"{name}, {side_words(side)}")
+            axes.set_title(f"{name}\n{side_words(side)}")
     figure.suptitle(title)
     return figure
 
