@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf.bench.cases import Shots
-from avmsf.field.gains import elastic
+from avmsf.field.gains import elastic, mixture
 from avmsf.field.gains.elastic import PERTURBATIONS, PROFILE_PRIOR, REMAINDER_PRIOR, REMAINDERS, WIDTHS, Elastic
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.gains.model import MixtureGains
@@ -30,11 +30,14 @@ OBJECTS = (
 )
 """Kinds and materials; the seeds are 101 and so on."""
 COUNTS = (8, 4, 2, 1)
-VARIANTS = ("default", "mean gains rendered", "profiles equally probable", "both")
+VARIANTS = ("default", "mean gains rendered", "profiles equally probable", "scale unknown")
+
+_UNKNOWN = 1e-9
+"""Shape of a prior of the scale that says nothing."""
 
 
 def few(options: Options) -> Report:
-    """Errors by number of impacts; without the prior of the profiles, with the mean gains rendered, and with both."""
+    """Errors by number of impacts: with the mean gains rendered, without the profiles' prior, without the scale's."""
     rows: list[list[str | float]] = []
     found: dict[tuple[str, int], list[float]] = {}
     shares = []
@@ -76,8 +79,9 @@ def _errors(case: SplitCase, options: Options) -> tuple[list[float], Float64[Ten
     default = case.fit(estimator, quick=options.quick_look)
     with patch.object(elastic, "EQUAL_PRIOR", 1.0):
         equal = case.fit(estimator, quick=options.quick_look)
-    fields_of_variants = (default, with_means(default), equal, with_means(equal))
-    return [case.error(each) for each in fields_of_variants], _posterior(equal)
+    with patch.object(mixture, "SCALE_SHAPE", _UNKNOWN):
+        unscaled = case.fit(estimator, quick=options.quick_look)
+    return [case.error(each) for each in (default, with_means(default), equal, unscaled)], _posterior(equal)
 
 
 def _posterior(field: SoundField) -> Float64[Tensor, "profiles remainders"]:
