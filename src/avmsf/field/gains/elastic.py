@@ -41,7 +41,7 @@ REMAINDER_PRIOR = (0.96, 0.04, 7e-4, 1e-4)
 """Typical share of the modes of a body with each of `REMAINDERS`.
 
 Both are mean posterior probabilities over the modes of seven simulated objects with 8 impacts each
-(docs/decisions/gain-model.md)."""
+(docs/decisions/few-impacts.md)."""
 EQUAL_PRIOR = 0.2
 """Probability that a body is not typical, so that all profiles and remainders are equally probable."""
 REACH = 0.15
