@@ -211,7 +211,7 @@ def test_a_body_stays_coarse_where_a_finer_one_does_not_fit_into_the_memory(
 
 
 @pytest.mark.parametrize(
-    ("error", "reason"), [(MemoryError(), "freedoms=1500"), (SimulationError("badly shaped"), "badly shaped")]
+    ("error", "reason"), [(MemoryError(), "1500 (--body.dofs)"), (SimulationError("badly shaped"), "badly shaped")]
 )
 def test_a_body_stays_coarse_where_a_finer_one_fails(
     monkeypatch: pytest.MonkeyPatch, coarse: NominalBody, error: Exception, reason: str
@@ -241,7 +241,7 @@ def test_the_only_body_that_is_left_stays_in_use_where_it_cannot_be_made_finer(m
     monkeypatch.setattr(nominal, "TRIAL", 2000)
     found = nominal_bodies(sheet(), walls=[0.004, 0.012], count=4, freedoms=4000, tell=told.append)
     assert [(body.wall, body.fine) for body in found.bodies] == [(0.004, False)]
-    assert any(message.startswith("wall of 4 mm: ") and "freedoms=2000" in message for message in told)
+    assert any(message.startswith("wall of 4 mm: ") and "2000 (--body.dofs)" in message for message in told)
     assert list(found.refused) == [0.012]
 
 
@@ -263,7 +263,7 @@ def test_modes_that_do_not_fit_into_the_memory_after_all_are_refused(monkeypatch
     with raises(SimulationError, name="surface") as caught:
         nominal_bodies(sheet(), walls=[0.004], freedoms=3000)
     [reason] = caught.value.value
-    assert "freedoms=1500" in reason
+    assert "1500 (--body.dofs)" in reason
 
 
 def test_the_memory_is_asked_for_what_is_computed_and_for_nothing_that_is_kept(

@@ -17,7 +17,7 @@ from avmsf.capture.texturedmesh import TexturedMesh, read_textured_mesh
 from avmsf.capture.views.read import read_views
 from avmsf.cli import simulate
 from avmsf.cli.options import simulate as options
-from avmsf.errors import SimulationError
+from avmsf.errors import AvmsfError, SimulationError
 from avmsf.simulate.recipe import Imperfections, ObjectRecipe, key_of
 from avmsf.simulate.sim20 import sim20_recipe
 from avmsf.simulate.simulation import Simulation, simulate_object
@@ -405,8 +405,8 @@ def test_the_command_lists_and_knows_what_it_does_not_know(capsys: pytest.Captur
     with raises(SimulationError, name="sim-20", value="mug-ceramics") as caught:
         simulate.run(options.parse(["mug-ceramics", "--output", "nowhere"]))
     assert "mug-ceramic," in str(caught.value)
-    with raises(SimulationError, name="output"):
-        simulate.run(options.parse(["sim-20"]))
+    with raises(AvmsfError, name="output"):
+        options.parse(["sim-20"]).check_inputs()
 
 
 def test_what_is_asked_of_a_named_object_holds_though_it_is_the_usual() -> None:

@@ -98,16 +98,8 @@ def test_an_interrupted_edit_has_the_whole_curve(
 )
 def test_scores_need_a_prompt_and_previews(given: tuple[str, ...], tmp_path: Path) -> None:
     save(ceramic(), tmp_path / "plate.safetensors")
+    (tmp_path / "a.wav").write_bytes(b"")
+    words = [str(tmp_path / "plate.safetensors"), "--output", str(tmp_path / "new.safetensors"), "--clap", "x"]
+    options = parse([*words, *(str(tmp_path / each) if each == "a.wav" else each for each in given)])
     with raises(AvmsfError, name="--clap"):
-        run(
-            parse(
-                [
-                    str(tmp_path / "plate.safetensors"),
-                    "--output",
-                    str(tmp_path / "new.safetensors"),
-                    "--clap",
-                    "x",
-                    *given,
-                ]
-            )
-        )
+        options.check_inputs()

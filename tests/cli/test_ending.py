@@ -27,6 +27,7 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[], object]], int
             return 0
 
         monkeypatch.setattr(check, "run", stand_in)
+        monkeypatch.setattr(check.Options, "check_inputs", lambda options: None)
         return main(["check", "."])
 
     return run

@@ -38,6 +38,7 @@ def run_of(impacts: Impacts, folder: Path) -> CaseRun:
         bodies=partial(bodies, "a"),
         family=partial(bodies.family, "a"),
         material=None,
+        vertices=None,
         stranger=lambda: torch.zeros(impacts.sounds.shape[1]),
         listened=False,
     )

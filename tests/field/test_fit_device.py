@@ -15,6 +15,7 @@ from avmsf.field.recipes import Attention, GainRecipe, gain_case
 from avmsf.field.training import Targets, TrainingRun
 from avmsf.pipeline.record import with_record
 from avmsf.scene import features
+from plate_capture import fill_plate
 from plate_field import QUICK, plate_extraction, plate_features, plate_impacts
 from raising import raises
 
@@ -93,8 +94,9 @@ def fitted(device: str | None, recipe: GainRecipe | None = None):
 def test_a_device_that_is_not_there_is_refused(device: str, tmp_path, capsys) -> None:
     with raises(FitError, name="device", value=device):
         fitted(device)
+    capture = fill_plate(tmp_path / "plate")
     for verb in ("fit", "reconstruct"):
-        assert main([verb, str(tmp_path), "--device", device, "--output", str(tmp_path / "f.safetensors")]) == 2
+        assert main([verb, str(capture), "--device", device, "--output", str(tmp_path / "f.safetensors")]) == 2
         assert device in capsys.readouterr().err
 
 
