@@ -117,9 +117,9 @@ class BodyConfig:
     freedoms: int = field(default=40_000, metadata={"option": "dofs"})
     """Approximate degrees of freedom of the finite elements."""
     supports: Literal["auto", "free", "try"] = "auto"
-    """Supports at the object's lowest face or point, or along a lower edge (z is upwards). auto: tried if by leave-
-    one-out the free body predicts little better than none. free: it lay on foam or hung. try: always tried, which
-    takes 10 to 30 s more."""
+    """Supports at the object's lowest face or point, or along a lower edge (z is upwards). auto: tried if the free body
+    predicts little better than none by leave-one-out. free: it lay on foam or hung. try: always tried, which takes 10
+    to 30 s more."""
 
     def __post_init__(self) -> None:
         if self.wall is not None and not 0 <= self.wall < float("inf"):
