@@ -114,6 +114,14 @@ class ResultsFolder:
             )
         kept = known.pop("methods")
         for key in dict.fromkeys((*wanted, *known)):
+            if key == "source" and wanted.get(key) != known.get(key):
+                raise EvaluationError(
+                    f"{self.path}: expected results made by this version of avmsf, got those of another, whose code "
+                    "differs; choose another --output",
+                    file=self.path,
+                    name=key,
+                    value=known.get(key),
+                )
             if wanted.get(key) != known.get(key):
                 raise EvaluationError(
                     f"{self.path}: expected results with {key} = {_brief(wanted.get(key))}, got "

@@ -155,7 +155,8 @@ def in_folder(folder: Path) -> Iterator[None]:
     except CaptureError as error:
         if str(error).startswith(str(folder)):
             raise
-        file = folder if error.file is None else folder / error.file
+        named = folder if error.file is None else Path(error.file)
+        file = named if named == folder or folder in named.parents else folder / named
         place = f"{file.parent}/" if str(error).startswith(file.name) else f"{folder}: "
         raise type(error)(f"{place}{error}", **{**error.attributes, "file": file}) from error
 
