@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ import torch
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.surface import Surface
 from avmsf.errors import EvaluationError, LocationError, SimulationError
+from avmsf.evaluation import material_fit
 from avmsf.evaluation.diffsound import DiffSound, leveled
 from avmsf.evaluation.diffsound_locator import DiffSoundLocator
 from avmsf.evaluation.material_fit import (
@@ -245,3 +247,15 @@ def test_recordings_that_are_too_dull_are_refused():
     frequency, _ = true_modes()
     with pytest.raises(EvaluationError):
         DampingCurve.of(ModalBank(frequency, torch.full_like(frequency, 2000.0)))
+
+
+def test_a_search_starts_on_its_bounds():
+    """Whatever rounding makes of the bounds, a start on one of them is a place to search from."""
+
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(40):
+        low = torch.randn(3, dtype=torch.float64, generator=generator)
+        bounds = torch.stack([low, low + torch.rand(3, dtype=torch.float64, generator=generator)])
+        bowl = SimpleNamespace(bounds=bounds, loss=lambda point: float(point.square().sum()))
+        found = material_fit._Problem.searched(bowl, bounds[1], 1)
+        assert bool(((found >= bounds[0]) & (found <= bounds[1])).all())
