@@ -46,7 +46,7 @@ NOISE_SHARES = (0.003, 0.01, 0.03)
 evidence takes what it cannot predict for noise, and smooths through clean gains."""
 SCALE_SHAPE = 1.0
 """Shape a of the prior of s^2: its logarithm has a standard deviation of 1.3, so levels one of 5.6 dB. Chosen on
-simulated objects with 1 to 8 impacts (docs/decisions/few-impacts.md)."""
+simulated objects with 1 to 8 impacts, one of them of sim-20 (docs/decisions/few-impacts.md)."""
 _ROUNDS = 5
 """Of expectation maximization."""
 _PSEUDO_COUNT = 0.1
