@@ -124,9 +124,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def recorded_cast(folder: Path, *, words: bool, seed: int = 0, paper: tuple[str, Path] | None = None) -> Cast:
     """Return the objects of RealImpact that are there; `paper` names an encoder and a folder for what it makes.
 
-    Raises AvmsfError where the dataset cannot be read or holds too few.
+    With `paper` recordings start at their peaks, as in that preset. Raises AvmsfError where the dataset cannot be read
+    or holds too few.
     """
-    dataset = open_dataset(folder)
+    dataset = open_dataset(folder, time_zero=None if paper is None else PRESETS["paper"].time_zero)
     missing = sorted(set(REALIMPACT_26) - set(dataset.objects()))
     if len(REALIMPACT_26) - len(missing) < LEAST:
         raise EvaluationError(

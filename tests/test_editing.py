@@ -241,7 +241,13 @@ def leave_out_umap(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_protocol_of_recorded_objects_runs_without_words(tmp_path, monkeypatch):
     names = [*_named("ceramic")[:1], *_named("wood")[:7]]
     made = tuple(replace(struck(REALIMPACT_26[name]), name=name) for name in names)
-    monkeypatch.setattr(protocol, "open_dataset", lambda folder: Recorded(*names))
+    starts = []
+
+    def opened(folder, *, time_zero):
+        starts.append(time_zero)
+        return Recorded(*names)
+
+    monkeypatch.setattr(protocol, "open_dataset", opened)
     monkeypatch.setattr(protocol, "recorded_objects", lambda dataset, paper: made)
     monkeypatch.setattr(protocol, "RECORDED_TRANSITIONS", RECORDED_TRANSITIONS[:1])
     leave_out_umap(monkeypatch)
@@ -253,7 +259,9 @@ def test_the_protocol_of_recorded_objects_runs_without_words(tmp_path, monkeypat
     assert {each["method"] for each in record["scores"]} == {"before", "unconstrained", "searched", "hierarchical"}
     assert report.figures["realimpact.spectral_before"] > report.figures["realimpact.spectral_hierarchical"] > 0
     assert "94_GlassGoblet" in report.conventions[1]
-    monkeypatch.setattr(protocol, "open_dataset", lambda folder: Recorded(*names[:3]))
+    protocol.recorded_cast(tmp_path, words=False, paper=("descriptors", tmp_path))
+    assert starts == [None, "peak"]
+    monkeypatch.setattr(protocol, "open_dataset", lambda folder, *, time_zero: Recorded(*names[:3]))
     with raises(EvaluationError, name="plates", value=3):
         protocol.recorded_cast(tmp_path, words=False)
 
