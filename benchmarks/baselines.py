@@ -42,6 +42,7 @@ from avmsf.simulate.sim20 import sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from avmsf.simulate.simulationfolder import write_simulation
 from avmsf.tasks.locator import Locator
+from benchmarks.costs import method_costs
 from benchmarks.material import surface_features
 from benchmarks.paperrun import paper_runs
 from benchmarks.report import Options, Report, Table, tell
@@ -266,6 +267,13 @@ def _errors(part: str, records: _Records) -> tuple[Table, ...]:
     return (Table(f"{part}: means over objects", ("method", "L1", "relative STFT error"), rows),)
 
 
+def _costs(objects: _Objects) -> Report:
+    name = objects.few[0]
+    weights = (f"sonicgauss-small:{objects.weights.resolve()}",) if objects.weights.is_file() else ()
+    methods = METHODS[:1] if objects.quick else (*METHODS, *weights, "field", "field-auto")
+    return method_costs(objects.root([name]).resolve(), name, methods, objects.folder / "costs")
+
+
 def _locating(objects: _Objects) -> Report:
     rows: list[list[str | float]] = []
     for name in FEW[: objects.most]:
@@ -295,5 +303,6 @@ PARTS: dict[str, Callable[[_Objects], Report]] = {
     "sim20": _sim20,
     "shots": _shots,
     "locating": _locating,
+    "costs": _costs,
     "paper": lambda objects: paper_runs(objects.options, objects.folder),
 }
