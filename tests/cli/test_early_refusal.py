@@ -49,6 +49,17 @@ REFUSED = (
     "dataset check empty",
     "studio",
     "play field.safetensors",
+    "fit good -o f.wav",
+    "reconstruct good -o f.wav",
+    "edit field.safetensors -o new.wav --pitch 2",
+    "render field.safetensors --position 0 0 0 -o s.mp3",
+    "features good -o f.ply",
+    "modes good --plots modes.png",
+    "export field.safetensors --to wavs -o s.wav",
+    "locate field.safetensors field.safetensors",
+    "render good/001.wav --position 0 0 0 -o s",
+    "fit field.safetensors -o f.safetensors",
+    "info good/001.wav",
 )
 CODE = """
 import contextlib, io, json, sys

@@ -13,11 +13,12 @@ from avmsf.capture import Surface, read_surface
 from avmsf.capture.views.write import write_views
 from avmsf.cli import main
 from avmsf.cli.options.checks import OutputError
-from avmsf.cli.options.surface import kind_of
+from avmsf.cli.options.surface import parse
 from avmsf.errors import EvaluationError
 from avmsf.field.store import save
 from believing_field import bar_contacts, drawn_gains, elastic_field, positional_field, sound_field
 from plate_capture import PLATE, TINY, fill_plate
+from raising import raises
 from small_scene import SMALL_SPLAT, THICKNESS, slab, slab_views, write_surface_file
 
 Streams = pytest.CaptureFixture[str]
@@ -63,8 +64,8 @@ def test_a_reconstruction_leaves_its_surface_and_says_where(tmp_path: Path, caps
 
 
 def test_what_cannot_be_written_is_refused_first(tmp_path: Path, capsys: Streams) -> None:
-    with pytest.raises(OutputError):
-        kind_of(tmp_path / "surface.stl")
+    with raises(OutputError, name="suffix", value=".stl"):
+        parse([str(tmp_path), "-o", str(tmp_path / "surface.stl")]).check_inputs()
     assert main(["surface", str(tmp_path), "--output", str(tmp_path / "surface.obj")]) == 2
     assert "surface.obj" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

@@ -18,7 +18,7 @@ def read_header_text(path: Path, key: str, *, what: str, advice: str, raising: t
     if not path.exists():
         raise raising(f"{path}: expected {what}, got no such file; check the name, or {advice}", file=path)
     try:
-        metadata = _metadata(path)
+        metadata = read_metadata(path)
     except (OSError, ValueError) as error:
         raise unreadable(path, what=what, advice=advice, raising=raising) from error
     if key not in metadata:
@@ -38,7 +38,7 @@ def unreadable(path: Path, *, what: str, advice: str, raising: type[AvmsfError])
     return raising(f"{path}: expected {what}, got {found}; {helps}", file=path, value=found)
 
 
-def _metadata(path: Path) -> dict[str, str]:
+def read_metadata(path: Path) -> dict[str, str]:
     """Return the metadata of a safetensors file. Raises OSError or ValueError where there is none to read."""
     with path.open("rb") as file:
         start = file.read(8)

@@ -16,7 +16,7 @@ from avmsf.cli.render import METRES
 from avmsf.config import CACHE
 from avmsf.errors import ExportError
 from avmsf.export.faust import fitted, write_faust
-from avmsf.export.formats import FAUST_SUFFIXES, GLTF_SUFFIXES, PAGE_SUFFIXES, POINTS, UNIVERSAL_SUFFIXES, Format
+from avmsf.export.formats import POINTS
 from avmsf.export.gltf import write_gltf
 from avmsf.export.look import Look, read_look
 from avmsf.export.modaldemo import SCENE, is_demo, read_demo, write_demo
@@ -25,7 +25,7 @@ from avmsf.export.sampledfield import SampledField, spread_rows
 from avmsf.export.universal import write_universal
 from avmsf.export.wavgrid import Grid, Layer, write_grid
 from avmsf.export.webpage import write_webpage
-from avmsf.export.written import Written, expect_ending, expect_free, write_file
+from avmsf.export.written import Written, expect_free, write_file
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.pipeline.reconstruct import SURFACE
@@ -33,29 +33,9 @@ from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import read_splats
 from avmsf.tasks.edits import EDITS
 
-_FILES: dict[Format, tuple[str, ...]] = {"gltf": GLTF_SUFFIXES, "faust": FAUST_SUFFIXES, "uff": UNIVERSAL_SUFFIXES}
-"""Formats that are one file, and what its name may end in."""
-_FOLDERS: dict[Format, str] = {
-    "web": "a page as a folder, or as one file whose name ends in .html",
-    "avmsf-demo": "a folder in the layout of the paper's demo",
-    "wavs": "a folder with a wav file for each impact, a table and an SFZ instrument",
-}
-"""Formats that are folders, and what is written."""
-_ENDINGS = frozenset(
-    (
-        *(".aif", ".aiff", ".flac", ".mp3", ".ogg", ".wav"),
-        *(".csv", ".json", ".sfz", ".txt", ".safetensors"),
-        *(".obj", ".ply", ".stl"),
-        *(".gz", ".tar", ".zip"),
-        *(*GLTF_SUFFIXES, *FAUST_SUFFIXES, *UNIVERSAL_SUFFIXES, *PAGE_SUFFIXES),
-    )
-)
-"""Endings by which a name is that of a file: a folder's may have a dot too, as in bowl-1.2 or name.github.io."""
-
 
 def run(options: Options) -> int:
     """Read, write, and print the size and what is left out."""
-    expect_name(options)
     for sentence in unused_options(options):
         say(f"note: {sentence}")
     field = _read(options)
@@ -81,21 +61,6 @@ def run(options: Options) -> int:
     if options.field.is_file():
         next_command("avmsf studio", options.field)
     return 0
-
-
-def expect_name(options: Options) -> None:
-    """Raise `ExportError` for a file's name without an ending of this format, or with one where a folder is written."""
-    output, suffix = options.output, options.output.suffix.lower()
-    if options.to in _FILES:
-        expect_ending(output, _FILES[options.to])
-    elif suffix in _ENDINGS and not output.is_dir() and not (options.to == "web" and suffix in PAGE_SUFFIXES):
-        raise ExportError(
-            f"{output}: expected the name of a folder for --to {options.to} ({_FOLDERS[options.to]}), got one with "
-            f"{output.suffix}; use --output {output.with_suffix('')}",
-            file=output,
-            name="suffix",
-            value=output.suffix,
-        )
 
 
 def _read(options: Options) -> SoundField | SampledField:

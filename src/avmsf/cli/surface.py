@@ -8,7 +8,7 @@ from avmsf.capture.surface import Surface, find_surface, read_surface, write_sur
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.scenes import with_seed
-from avmsf.cli.options.surface import Options, kind_of
+from avmsf.cli.options.surface import Options
 from avmsf.cli.printing import next_command, print_result, say
 from avmsf.cli.scenes import opened_scene, stage_line
 from avmsf.config import SceneConfig
@@ -18,7 +18,6 @@ from avmsf.pipeline.reconstruct import keep_surface, object_shape
 
 def run(options: Options) -> int:
     """Make and write the surface; return 130 where Ctrl-C stopped it."""
-    kind = "ply" if options.output is None else kind_of(options.output)
     config = with_seed(SceneConfig(views=options.views, splat=options.splat), options.seed)
     try:
         with opened_scene(options, config, command="avmsf surface") as scene:
@@ -26,7 +25,9 @@ def run(options: Options) -> int:
             kept = keep_surface(scene.stages, *object_shape(given, scene))
             surface = read_surface(kept.path)
             if options.output is not None:
-                write_whole(options.output, lambda place: write_surface(surface, place, kind=kind), raising=OutputError)
+                write_whole(
+                    options.output, lambda place: write_surface(surface, place, kind=options.kind), raising=OutputError
+                )
     except KeyboardInterrupt:
         say("avmsf surface: interrupted; repeat the command to continue")
         return INTERRUPTED

@@ -7,7 +7,8 @@ import tyro
 
 from avmsf.capture.table import read_rows
 from avmsf.cli.options.checks import read_settings
-from avmsf.cli.options.common import CaptureFolder, Flag, Printing, SettingsFile, parse_options
+from avmsf.cli.options.common import Flag, Printing, parse_options
+from avmsf.cli.options.paths import CaptureFolder, SettingsFile
 
 
 @dataclass(frozen=True)

@@ -2,16 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from avmsf.cli.options.helptext import described_fields, one_column, paragraphs
-from avmsf.errors import AvmsfError
-from avmsf.field.header import read_record
+from avmsf.cli.options.paths import InputError, path_mark
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 """An option that is off unless it is given."""
@@ -19,40 +17,6 @@ Unit = Literal["m", "cm", "mm", "in", "ft"]
 _RENAMED = {"--at": "--position", "--picture": "--plots"}
 """Options of earlier versions, and what they are called now."""
 T = TypeVar("T")
-
-
-class InputError(AvmsfError):
-    """An option names a file or folder that does not exist."""
-
-
-@dataclass(frozen=True)
-class Existing:
-    """Marks a path that has to exist before a verb begins."""
-
-    what: str
-
-    def check(self, path: Path) -> None:
-        """Raise `InputError` where nothing is at the path."""
-        if not path.exists():
-            raise InputError.expected(self.what, got="no such file or folder", file=path, advice="check the name")
-
-
-@dataclass(frozen=True)
-class ExistingField(Existing):
-    """Marks the path of a field's file that this version has to be able to read."""
-
-    what: str = "a field file, as avmsf fit writes it"
-
-    def check(self, path: Path) -> None:
-        """Raise `InputError` where nothing is at the path, `FieldFileError` for a file that is no field."""
-        super().check(path)
-        read_record(path)
-
-
-FieldFile = Annotated[Path, tyro.conf.arg(metavar="FIELD.safetensors"), ExistingField()]
-CaptureFolder = Annotated[Path, tyro.conf.arg(metavar="CAPTURE"), Existing("a capture folder, with impacts.csv")]
-SettingsFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml"), Existing("a capture.toml")]
-OutputFolder = Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,15 +29,15 @@ class Common:
     """Print each step of the work as it begins."""
 
     def check_inputs(self) -> None:
-        """Raise `InputError` for the first input that does not exist, and for what a command's own checks find."""
+        """Raise for the first path that cannot be used, see `paths`, and for what a command's own checks find."""
         hints = get_type_hints(type(self), include_extras=True)
         for each in fields(self):
-            expected = _expected(hints[each.name])
+            mark = path_mark(hints[each.name])
             value = getattr(self, each.name)
-            if expected is None or value is None:
+            if mark is None or value is None:
                 continue
             for path in value if isinstance(value, tuple) else (value,):
-                expected.check(path)
+                mark.check(path)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,15 +64,6 @@ def parse_options(
             kind, prog=f"avmsf {verb}", args=words, description=paragraphs(description or kind.__doc__ or ""),
             registry=REGISTRY, **given,
         )  # fmt: skip
-
-
-def _expected(hint: Any) -> Existing | None:
-    """Return what a type's paths have to be; None where it has no such mark."""
-    for each in getattr(hint, "__metadata__", ()):
-        if isinstance(each, Existing):
-            return each
-    inner = get_args(hint)
-    return next((found for each in inner if (found := _expected(each)) is not None), None)
 
 
 def _optional(info: PrimitiveTypeInfo) -> Any:

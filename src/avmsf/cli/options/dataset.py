@@ -8,8 +8,9 @@ from typing import Annotated
 import tyro
 
 from avmsf.capture.datasets.signs import expect_signs
-from avmsf.cli.options.common import REGISTRY, Existing, Printing
+from avmsf.cli.options.common import REGISTRY, Printing
 from avmsf.cli.options.helptext import one_column
+from avmsf.cli.options.paths import Existing
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,9 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from avmsf.cli.options.checks import OutputError, expect_device, expect_writable
-from avmsf.cli.options.common import FieldFile, Printing, parse_options
+from avmsf.cli.options.common import Printing, parse_options
 from avmsf.cli.options.helptext import option_of
+from avmsf.cli.options.paths import NEW_TENSORS, FieldFile, NewFile, PlotsFolder
 from avmsf.errors import EditError
 from avmsf.simulate.material import material_named
 from avmsf.tasks.config import STABLE_AUDIO, DistillationConfig, GuidedEditConfig, expect_prompt
@@ -110,7 +111,7 @@ class GuideOptions:
     """Length that the model works at; by default all that it was trained for, and time grows in proportion."""
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda")] = None
     """Device of the model; by default the GPU if there is one."""
-    generated: Annotated[Path | None, tyro.conf.arg(metavar="FILE.wav")] = None
+    generated: Annotated[Path | None, tyro.conf.arg(metavar="FILE.wav"), NewFile((".wav",))] = None
     """Also write the sound that the model makes from the prompt without the field: the paper's baseline."""
     clap: Annotated[str | None, tyro.conf.arg(metavar="FOLDER|NAME")] = None
     """Also compute the CLAP score of the unedited field and of every preview with this network, a folder or a name on
@@ -178,7 +179,7 @@ class Options(Printing):
 
     field: tyro.conf.Positional[FieldFile]
     """Field file, as `avmsf fit` writes it."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="NEW.safetensors")]
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="NEW.safetensors"), NEW_TENSORS]
     """File to write the edited field to."""
     change: Annotated[tyro.conf.OmitArgPrefixes[MaterialOptions], tyro.conf.arg(name="material")] = dataclasses.field(
         default_factory=MaterialOptions
@@ -192,7 +193,7 @@ class Options(Printing):
         default_factory=GuideOptions
     )
     """Guided edits."""
-    plots: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    plots: PlotsFolder = None
     """Folder for modes.png, spectrograms.png, before.wav and after.wav; with --clap also clap.png, the score over the
     steps."""
     position: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
@@ -218,9 +219,6 @@ class Options(Printing):
                 "--decay, --brightness, --mode-db, --mode-pitch or --mode-decay, --prompt, --like or --like-material",
                 name="options",
             )
-        expect_writable(self.output)
-        if self.steering.generated is not None:
-            expect_writable(self.steering.generated)
         if self.output.exists() and self.field.exists() and self.output.samefile(self.field):
             raise OutputError(
                 f"{self.output}: expected another file than the field to edit; choose another --output",

@@ -10,7 +10,8 @@ import tyro
 from avmsf.bench.names import expect_method, expect_protocol
 from avmsf.capture.datasets.signs import expect_signs
 from avmsf.cli.options.checks import expect_device, expect_modes
-from avmsf.cli.options.common import Existing, Flag, OutputFolder, Printing, parse_options
+from avmsf.cli.options.common import Flag, Printing, parse_options
+from avmsf.cli.options.paths import Existing, OutputFolder
 from avmsf.config import BodyConfig, Geometry, LiftConfig, TimeZero
 from avmsf.errors import EvaluationError
 from avmsf.modal.config import ExtractionMethod

@@ -7,10 +7,19 @@ from typing import Annotated
 
 import tyro
 
-from avmsf.cli.options.common import Existing, Flag, Printing, Unit, parse_options
+from avmsf.cli.options.common import Flag, Printing, Unit, parse_options
 from avmsf.cli.options.helptext import option_of
+from avmsf.cli.options.paths import Existing, NewFile, NewFolder, OtherCapture, ShapeFile
 from avmsf.errors import ExportError
-from avmsf.export.formats import Axis, Format, Precision
+from avmsf.export.formats import (
+    FAUST_SUFFIXES,
+    GLTF_SUFFIXES,
+    PAGE_SUFFIXES,
+    UNIVERSAL_SUFFIXES,
+    Axis,
+    Format,
+    Precision,
+)
 from avmsf.field.header import read_record
 from avmsf.modal.config import PulseShape
 
@@ -23,6 +32,15 @@ _USED: dict[Format, tuple[str, ...]] = {
     "uff": ("functions",),
 }
 """Options that each format uses, in addition to those that all use."""
+_OUTPUTS: dict[Format, NewFile | NewFolder] = {
+    "web": NewFile(PAGE_SUFFIXES, or_folder=True),
+    "gltf": NewFile(GLTF_SUFFIXES),
+    "faust": NewFile(FAUST_SUFFIXES),
+    "avmsf-demo": NewFolder(),
+    "wavs": NewFolder(),
+    "uff": NewFile(UNIVERSAL_SUFFIXES),
+}
+"""What each format writes."""
 _OF_SOME = {"rate"}.union(*_USED.values())
 
 
@@ -37,18 +55,22 @@ class Options(Printing):
     """
 
     field: tyro.conf.Positional[
-        Annotated[Path, tyro.conf.arg(metavar="FIELD"), Existing("a field file, as avmsf fit writes it")]
+        Annotated[
+            Path,
+            tyro.conf.arg(metavar="FIELD"),
+            Existing("a sound field, as avmsf fit writes it", ("a sound field", "a folder")),
+        ]
     ]
     """Field file, as `avmsf fit` writes it; or a folder in the layout of the paper's demo."""
     to: Format
     """Format to write."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE|FOLDER")]
     """A folder, or a file for gltf (.glb), faust (.dsp or .lib), uff (.uff) or a page in one file (.html)."""
-    object: Annotated[Path | None, tyro.conf.arg(metavar="MESH|PLY"), Existing("a mesh or Gaussians")] = None
+    object: ShapeFile = None
     """Mesh, or Gaussians as a .ply, to show; by default the capture's surface, or else the field's points."""
     object_unit: Unit = "m"
     """Unit of the coordinates of the object's mesh."""
-    capture: Annotated[Path | None, tyro.conf.arg(metavar="CAPTURE"), Existing("a capture folder")] = None
+    capture: OtherCapture = None
     """Capture folder: its mesh is shown, or the surface made from its photographs, and a page offers its recordings
     next to the model's sounds."""
     points: int | None = None
@@ -81,6 +103,7 @@ class Options(Printing):
         super().check_inputs()
         if self.points is not None and self.points < 1:
             raise ExportError.expected("1 or more", self.points, name="--points")
+        _OUTPUTS[self.to].check(self.output)
         if not self.field.is_dir():
             read_record(self.field)
 

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import tyro
 
-from avmsf.cli.options.checks import expect_writable
 from avmsf.cli.options.common import parse_options
+from avmsf.cli.options.paths import NEW_TENSORS
 from avmsf.cli.options.presets import preset_of, with_defaults
 from avmsf.cli.options.scenes import SceneOptions
 from avmsf.config import PRESETS, LiftConfig, Preset, ViewsConfig
@@ -23,7 +23,7 @@ class Options(SceneOptions):
     --seed is the seed of all stages.
     """
 
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FEATURES.safetensors")] = None
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FEATURES.safetensors"), NEW_TENSORS] = None
     """Copy the features to this file."""
     views: ViewsConfig = field(default_factory=ViewsConfig)
     """How views are made."""
@@ -35,11 +35,6 @@ class Options(SceneOptions):
         default_factory=LiftConfig
     )
     """How features are made."""
-
-    def check_inputs(self) -> None:
-        """Raise the package's errors for options that cannot be used, before anything is loaded."""
-        super().check_inputs()
-        expect_writable(self.output)
 
 
 def parse(words: Sequence[str]) -> Options:

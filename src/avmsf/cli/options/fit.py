@@ -7,8 +7,9 @@ from typing import Annotated, Any
 
 import tyro
 
-from avmsf.cli.options.checks import expect_capture, expect_device, expect_modes, expect_writable
-from avmsf.cli.options.common import Existing, Printing, SettingsFile, parse_options
+from avmsf.cli.options.checks import expect_capture, expect_device, expect_modes
+from avmsf.cli.options.common import Printing, parse_options
+from avmsf.cli.options.paths import NEW_TENSORS, Existing, SettingsFile
 from avmsf.cli.options.presets import preset_of, preset_values, with_defaults
 from avmsf.config import BodyConfig, PipelineConfig, Preset, SceneConfig, TimeZero
 from avmsf.errors import EvaluationError, FitError
@@ -26,10 +27,14 @@ class Options(Printing):
     """
 
     capture: tyro.conf.Positional[
-        Annotated[Path, tyro.conf.arg(metavar="CAPTURE"), Existing("a capture folder, with impacts.csv")]
+        Annotated[
+            Path,
+            tyro.conf.arg(metavar="CAPTURE"),
+            Existing("a capture folder, with impacts.csv", ("a folder", "a mesh or Gaussians")),
+        ]
     ]
     """Folder with impacts.csv and the recordings that it names; with --material, a folder with a mesh, or a mesh."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FIELD.safetensors")]
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FIELD.safetensors"), NEW_TENSORS]
     """File to write the field to."""
     settings: SettingsFile = None
     """Use this capture.toml instead of the folder's own."""
@@ -44,7 +49,9 @@ class Options(Printing):
     start: int = 0
     """Row of impacts.csv, counted from 0, whose contact this choice starts from."""
     features: Annotated[
-        Path | None, tyro.conf.arg(metavar="FEATURES.safetensors"), Existing("features, as avmsf features writes them")
+        Path | None,
+        tyro.conf.arg(metavar="FEATURES.safetensors"),
+        Existing("features, as avmsf features writes them", ("features",)),
     ] = None
     """Features written by `avmsf features`, in the frame of the contacts; by default positions on the surface."""
     gain_model: GainModel = "auto"
@@ -82,7 +89,6 @@ class Options(Printing):
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
-        expect_writable(self.output)
         expect_device(self.device, raising=FitError)
         expect_modes(self.modes)
         expect_split(self.train_fraction, self.train_count)

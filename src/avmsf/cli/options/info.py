@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 import tyro
 
 from avmsf.cli.options.checks import expect_capture
-from avmsf.cli.options.common import Existing, Printing, SettingsFile, parse_options
+from avmsf.cli.options.common import Printing, parse_options
+from avmsf.cli.options.paths import Existing, OtherCapture, PlotsFolder, SettingsFile
 from avmsf.field.header import read_record
 from avmsf.scene.featureheader import holds_features
 
@@ -18,15 +19,19 @@ class Options(Printing):
     """Describe a field, Gaussians or features, and draw them with --plots."""
 
     file: tyro.conf.Positional[
-        Annotated[Path, tyro.conf.arg(metavar="FILE"), Existing("a field, Gaussians or features")]
+        Annotated[
+            Path,
+            tyro.conf.arg(metavar="FILE"),
+            Existing("a field, Gaussians or features", ("a sound field", "features", "a mesh or Gaussians")),
+        ]
     ]
     """A field (.safetensors, of `avmsf fit`), Gaussians (.ply, of `avmsf splat`) or features (.safetensors, of
     `avmsf features`)."""
-    capture: Annotated[Path | None, tyro.conf.arg(metavar="CAPTURE"), Existing("a capture folder")] = None
+    capture: OtherCapture = None
     """Field: compare it with a capture's recordings that it was not fitted to, or with all if there are none."""
     settings: SettingsFile = None
     """Field: use this capture.toml instead of the capture's own."""
-    plots: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    plots: PlotsFolder = None
     """Draw figures to this folder. Field: modes.png, gains.png; uncertainty.png and spectrum.png if the gains have a
     posterior; surface.png, with cross-sections, if they have a body; spectrograms.png with --capture. Gaussians:
     cloud.png and turntable.gif. Features: features.png and turntable.gif."""

@@ -7,10 +7,11 @@ from typing import Annotated
 
 import tyro
 
-from avmsf.cli.options.checks import OutputError, expect_writable
-from avmsf.cli.options.common import Existing, FieldFile, Flag, OutputFolder, Printing, SettingsFile, parse_options
+from avmsf.cli.options.checks import OutputError
+from avmsf.cli.options.common import Flag, Printing, parse_options
+from avmsf.cli.options.paths import Existing, FieldFile, OutputFolder, SettingsFile
 
-_Recording = Annotated[Path, Existing("a recording")]
+_Recording = Annotated[Path, Existing("a recording", ("a recording",))]
 
 
 @dataclass(frozen=True)
@@ -50,8 +51,6 @@ class Options(Printing):
             raise OutputError.expected(
                 "a probability between 0 and 1, such as 0.9", self.probability, name="--probability"
             )
-        if self.output is not None:
-            expect_writable(self.output / "impact.png")
 
 
 def parse(words: Sequence[str]) -> Options:

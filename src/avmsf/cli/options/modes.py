@@ -2,13 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
 import tyro
 
 from avmsf.cli.options.checks import expect_capture, expect_modes
-from avmsf.cli.options.common import CaptureFolder, Printing, SettingsFile, parse_options
+from avmsf.cli.options.common import Printing, parse_options
+from avmsf.cli.options.paths import CaptureFolder, PlotsFolder, SettingsFile
 from avmsf.cli.options.presets import preset_of, preset_values, with_defaults
 from avmsf.config import PipelineConfig, Preset, TimeZero
 from avmsf.modal.config import ExtractionMethod
@@ -31,7 +30,7 @@ class Options(Printing):
     """Defaults of all settings; paper: the published method, from the peak on."""
     settings: SettingsFile = None
     """Use this capture.toml instead of the folder's own."""
-    plots: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    plots: PlotsFolder = None
     """Draw the modes to modes.png in this folder."""
 
     def check_inputs(self) -> None:

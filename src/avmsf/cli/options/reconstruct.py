@@ -9,9 +9,10 @@ import tyro
 
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.table import read_strikes
-from avmsf.cli.options.checks import expect_modes, expect_writable
+from avmsf.cli.options.checks import expect_modes
 from avmsf.cli.options.common import parse_options
 from avmsf.cli.options.fit import expect_split, refuse_with_material
+from avmsf.cli.options.paths import NEW_TENSORS
 from avmsf.cli.options.presets import preset_of, preset_values, with_defaults
 from avmsf.cli.options.scenes import SceneOptions, with_seed
 from avmsf.config import (
@@ -37,7 +38,7 @@ class Options(SceneOptions):
     changed is computed again, and repeating an interrupted command continues it.
     """
 
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FIELD.safetensors")] = None
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FIELD.safetensors"), NEW_TENSORS] = None
     """Copy the field to this file."""
     material: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Compute an approximate field without recordings from shape and material; see `avmsf fit --help`."""
@@ -83,7 +84,6 @@ class Options(SceneOptions):
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
-        expect_writable(self.output)
         expect_modes(self.modes)
         expect_split(self.train_fraction, self.train_count)
         if self.material is not None:

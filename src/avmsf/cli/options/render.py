@@ -9,7 +9,8 @@ from typing import Annotated, Literal
 import tyro
 
 from avmsf.cli.options.checks import OutputError
-from avmsf.cli.options.common import Existing, FieldFile, Printing, Unit, parse_options
+from avmsf.cli.options.common import Printing, Unit, parse_options
+from avmsf.cli.options.paths import Existing, FieldFile, NewFile
 from avmsf.modal.config import PulseShape
 from avmsf.simulate.recipe import LONGEST
 
@@ -28,7 +29,9 @@ class Options(Printing):
 
     field: tyro.conf.Positional[FieldFile]
     """Field file, as `avmsf fit` writes it."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER|FILE.wav")]
+    output: Annotated[
+        Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER|FILE.wav"), NewFile((".wav",), or_folder=True)
+    ]
     """Folder for the sounds; for a single contact also a file that ends in .wav."""
     position: Annotated[Points, tyro.conf.arg(metavar="X Y Z")] = ()
     """A contact in the object's frame."""

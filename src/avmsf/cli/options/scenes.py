@@ -9,7 +9,8 @@ import tyro
 from avmsf.capture.filenames import expect_views
 from avmsf.capture.settings import CaptureSettings
 from avmsf.cli.options.checks import expect_device, read_settings
-from avmsf.cli.options.common import Existing, Printing, SettingsFile
+from avmsf.cli.options.common import Printing
+from avmsf.cli.options.paths import Existing, SettingsFile
 from avmsf.config import CACHE, SceneConfig
 from avmsf.errors import SceneError
 
@@ -18,7 +19,13 @@ from avmsf.errors import SceneError
 class SceneOptions(Printing):
     """The input, and the cache of the stages' outputs."""
 
-    folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="FOLDER"), Existing("a folder")]]
+    folder: tyro.conf.Positional[
+        Annotated[
+            Path,
+            tyro.conf.arg(metavar="FOLDER"),
+            Existing("a folder with photographs, a video or a mesh", ("a folder",)),
+        ]
+    ]
     """Folder with photographs (transforms.json, a COLMAP model, or only images/), a video, a mesh or Gaussians."""
     cache: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Cache the output of each stage here, by default in FOLDER/.avmsf."""

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import tyro
 
-from avmsf.cli.options.common import Flag, InputError, Printing, parse_options
+from avmsf.cli.options.common import Flag, Printing, parse_options
+from avmsf.cli.options.paths import InputError
 from avmsf.errors import SimulationError
 from avmsf.simulate.example import EXAMPLE
 from avmsf.simulate.recipe import ObjectRecipe

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import tyro
 
-from avmsf.cli.options.checks import expect_writable
 from avmsf.cli.options.common import parse_options
+from avmsf.cli.options.paths import NewFile
 from avmsf.cli.options.scenes import SceneOptions
 from avmsf.config import ViewsConfig
 from avmsf.scene.splatconfig import SplatConfig
@@ -22,7 +22,7 @@ class Options(SceneOptions):
     --seed is the seed of all stages.
     """
 
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="CLOUD.ply")] = None
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="CLOUD.ply"), NewFile((".ply",))] = None
     """Copy the Gaussians to this file."""
     views: ViewsConfig = field(default_factory=ViewsConfig)
     """How views are made."""
@@ -30,11 +30,6 @@ class Options(SceneOptions):
         default_factory=SplatConfig
     )
     """How Gaussians are fitted."""
-
-    def check_inputs(self) -> None:
-        """Raise the package's errors for options that cannot be used, before anything is loaded."""
-        super().check_inputs()
-        expect_writable(self.output)
 
 
 def parse(words: Sequence[str]) -> Options:

@@ -8,7 +8,8 @@ from typing import Annotated
 import tyro
 
 from avmsf.cli.options.checks import expect_modes
-from avmsf.cli.options.common import Existing, Flag, Printing, parse_options
+from avmsf.cli.options.common import Flag, Printing, parse_options
+from avmsf.cli.options.paths import Existing, ShapeFile
 from avmsf.config import Preset
 from avmsf.errors import StudioError
 
@@ -26,13 +27,16 @@ class Options(Printing):
         Annotated[
             Path | None,
             tyro.conf.arg(metavar="FIELD|FOLDER|MESH"),
-            Existing("a field, a capture folder, a folder of images or a mesh"),
+            Existing(
+                "a field, a capture folder, a folder of images or a mesh",
+                ("a sound field", "a folder", "a mesh or Gaussians"),
+            ),
         ]
     ] = None
     """A field file, a capture folder, a folder that shows the object, or a mesh. A mesh is copied to a folder of its
     name next to it, which becomes the capture; but surface.obj, .ply, .glb or .stl, and Gaussians called splats.ply or
     point_cloud.ply, open the folder that holds them as the capture. --capture names another folder for either."""
-    object: Annotated[Path | None, tyro.conf.arg(metavar="MESH|PLY"), Existing("a mesh or Gaussians")] = None
+    object: ShapeFile = None
     """Mesh, in meters, or Gaussians to show; by default what the capture folder holds."""
     capture: Annotated[Path | None, tyro.conf.arg(metavar="CAPTURE")] = None
     """Capture folder of a field, to show its recordings and record more; for a mesh, the folder to make."""

@@ -2,13 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
 import tyro
 
-from avmsf.cli.options.checks import expect_capture, expect_writable
-from avmsf.cli.options.common import Existing, FieldFile, Flag, OutputFolder, Printing, SettingsFile, parse_options
+from avmsf.cli.options.checks import expect_capture
+from avmsf.cli.options.common import Flag, Printing, parse_options
+from avmsf.cli.options.paths import FieldFile, OtherCapture, OutputFolder, SettingsFile
 from avmsf.errors import FitError
 
 TABLE, PICTURE = "suggested.csv", "suggested.png"
@@ -27,7 +26,7 @@ class Options(Printing):
     """Field file, as `avmsf fit` writes it."""
     count: int = 5
     """Number of contacts."""
-    candidates: Annotated[Path | None, tyro.conf.arg(metavar="CAPTURE"), Existing("a capture folder")] = None
+    candidates: OtherCapture = None
     """Suggest among the contacts of this capture. By default: all of the surface that a straight hammer of 10 mm
     reaches from outside, at most 45 degrees from perpendicular."""
     unseen: Flag = False
@@ -46,8 +45,6 @@ class Options(Printing):
             raise FitError("--unseen: expected it without --candidates, got both; leave one out", name="--unseen")
         if self.candidates is not None:
             expect_capture(self.candidates, self.settings)
-        if self.output is not None:
-            expect_writable(self.output / TABLE)
 
 
 def parse(words: Sequence[str]) -> Options:

@@ -8,11 +8,14 @@ from typing import Annotated, get_args
 import tyro
 
 from avmsf.capture.filenames import SurfaceKind
-from avmsf.cli.options.checks import OutputError, expect_writable
 from avmsf.cli.options.common import parse_options
+from avmsf.cli.options.paths import NewFile, PlotsFolder
 from avmsf.cli.options.scenes import SceneOptions
 from avmsf.config import ViewsConfig
 from avmsf.scene.splatconfig import SplatConfig
+
+_KINDS: tuple[SurfaceKind, ...] = get_args(SurfaceKind)
+_SUFFIXES = tuple(f".{kind}" for kind in _KINDS)
 
 
 @dataclass(frozen=True)
@@ -25,9 +28,9 @@ class Options(SceneOptions):
     if the cache does not have them.
     """
 
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="SURFACE.ply")] = None
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="SURFACE.ply"), NewFile(_SUFFIXES)] = None
     """Write the surface to this file, which ends in .ply, .obj or .glb; surface.ply in the cache is always written."""
-    plots: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    plots: PlotsFolder = None
     """Draw the surface and two cross-sections to surface.png in this folder."""
     seed: int | None = None
     """Seed of all stages; by default each stage's own."""
@@ -36,27 +39,10 @@ class Options(SceneOptions):
     splat: SplatConfig = field(default_factory=SplatConfig)
     """How Gaussians are fitted."""
 
-    def check_inputs(self) -> None:
-        """Raise the package's errors for options that cannot be used, before anything is loaded."""
-        super().check_inputs()
-        expect_writable(self.output)
-        if self.output is not None:
-            kind_of(self.output)
-
-
-def kind_of(path: Path) -> SurfaceKind:
-    """Return the format of a file by its suffix. Raises OutputError for another."""
-    kinds: tuple[SurfaceKind, ...] = get_args(SurfaceKind)
-    for kind in kinds:
-        if path.suffix.lower() == f".{kind}":
-            return kind
-    raise OutputError(
-        f"{path}: expected a name that ends in {', '.join(f'.{kind}' for kind in kinds)}, got "
-        f"{path.suffix or 'no suffix'}; rename it",
-        file=path,
-        name="suffix",
-        value=path.suffix,
-    )
+    @property
+    def kind(self) -> SurfaceKind:
+        """The format of the output, ply without one."""
+        return "ply" if self.output is None else _KINDS[_SUFFIXES.index(self.output.suffix.lower())]
 
 
 def parse(words: Sequence[str]) -> Options:

@@ -1,0 +1,153 @@
+"""What the paths of options have to be: marks on their types, checked before anything that computes is loaded.
+
+An input exists and is no file of another kind; an output can be written, and its ending is that of its format.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+import tyro
+
+from avmsf._utils.headers import read_metadata
+from avmsf.capture.filenames import PICTURE_SUFFIXES, VIDEO_SUFFIXES
+from avmsf.cli.options.checks import OutputError, expect_writable
+from avmsf.errors import AvmsfError
+from avmsf.field import header as field_header
+from avmsf.scene import featureheader
+
+FileKind = Literal[
+    "a sound field", "features", "a recording", "a mesh or Gaussians", "a picture", "a video", "a folder"
+]  # fmt: skip
+"""Kinds of inputs that are told apart."""
+_SOUND_SUFFIXES = (".wav", ".flac", ".ogg", ".aif", ".aiff", ".mp3")
+_SHAPE_SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl")
+FILE_SUFFIXES = frozenset(
+    (
+        *(*_SOUND_SUFFIXES, *_SHAPE_SUFFIXES, *PICTURE_SUFFIXES, *VIDEO_SUFFIXES),
+        *(".csv", ".json", ".sfz", ".txt", ".toml", ".safetensors", ".gif", ".html", ".htm"),
+        *(".gz", ".tar", ".zip", ".dsp", ".lib", ".uff", ".unv"),
+    )
+)
+"""Endings by which a name is that of a file: a folder's may have a dot too, as in bowl-1.2 or name.github.io."""
+
+
+class InputError(AvmsfError):
+    """An option names a file or folder that does not exist, or is of another kind."""
+
+
+@dataclass(frozen=True)
+class Existing:
+    """Marks a path that has to exist before a verb begins."""
+
+    what: str
+    kinds: tuple[FileKind, ...] = get_args(FileKind)
+    """What it may be; a file of no known kind is left to its reader."""
+
+    def check(self, path: Path) -> None:
+        """Raise `InputError` where nothing is at the path, or something of a kind that is known and no other use."""
+        if not path.exists():
+            raise InputError.expected(self.what, got="no such file or folder", file=path, advice="check the name")
+        found = kind_of(path)
+        if found is not None and found not in self.kinds:
+            raise InputError(f"{path}: expected {self.what}, got {found}; name another", file=path, value=found)
+
+
+@dataclass(frozen=True)
+class ExistingField(Existing):
+    """Marks the path of a field's file that this version has to be able to read."""
+
+    what: str = "a sound field, as avmsf fit writes it"
+    kinds: tuple[FileKind, ...] = ("a sound field",)
+
+    def check(self, path: Path) -> None:
+        """Raise `InputError` for no file or another kind, `FieldFileError` for a field that cannot be read."""
+        super().check(path)
+        field_header.read_record(path)
+
+
+@dataclass(frozen=True)
+class NewFile:
+    """Marks the path of a file to write."""
+
+    suffixes: tuple[str, ...]
+    """Endings of its format, in lower case."""
+    or_folder: bool = False
+    """Whether the path of a folder may be given instead."""
+
+    def check(self, path: Path) -> None:
+        """Raise `OutputError` for a path where no file can be written, and for the ending of another format."""
+        suffix = path.suffix.lower()
+        if self.or_folder and (path.is_dir() or suffix not in FILE_SUFFIXES):
+            return
+        expect_writable(path)
+        if suffix not in self.suffixes:
+            raise OutputError(
+                f"{path}: expected a name that ends in {' or '.join(self.suffixes)}{self.or_folder * ', or a folder'}, "
+                f"got {path.suffix or 'no ending'}; rename it",
+                file=path,
+                name="suffix",
+                value=path.suffix,
+            )
+
+
+@dataclass(frozen=True)
+class NewFolder:
+    """Marks the path of a folder to write to."""
+
+    def check(self, path: Path) -> None:
+        """Raise `OutputError` for a path where no folder can be made, and for a name with the ending of a file."""
+        if not path.is_dir() and path.suffix.lower() in FILE_SUFFIXES:
+            raise OutputError(
+                f"{path}: expected the name of a folder, got one with {path.suffix}; use {path.with_suffix('')}",
+                file=path,
+                name="suffix",
+                value=path.suffix,
+            )
+        expect_writable(path / "file")
+
+
+FieldFile = Annotated[Path, tyro.conf.arg(metavar="FIELD.safetensors"), ExistingField()]
+CaptureFolder = Annotated[
+    Path, tyro.conf.arg(metavar="CAPTURE"), Existing("a capture folder, with impacts.csv", ("a folder",))
+]
+OtherCapture = Annotated[Path | None, tyro.conf.arg(metavar="CAPTURE"), Existing("a capture folder", ("a folder",))]
+ShapeFile = Annotated[
+    Path | None, tyro.conf.arg(metavar="MESH|PLY"), Existing("a mesh or Gaussians", ("a mesh or Gaussians",))
+]
+SettingsFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml"), Existing("a capture.toml", ())]
+OutputFolder = Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER"), NewFolder()]
+PlotsFolder = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER"), NewFolder()]
+NEW_TENSORS = NewFile((".safetensors",))
+"""A field or features to write."""
+
+
+def path_mark(hint: Any) -> Existing | NewFile | NewFolder | None:
+    """Return what a type's paths have to be; None where it has no such mark."""
+    for each in getattr(hint, "__metadata__", ()):
+        if isinstance(each, Existing | NewFile | NewFolder):
+            return each
+    return next((found for each in get_args(hint) if (found := path_mark(each)) is not None), None)
+
+
+def kind_of(path: Path) -> FileKind | None:
+    """Return what is at a path, by its first bytes and its name; None for what is not known."""
+    if path.is_dir():
+        return "a folder"
+    suffix = path.suffix.lower()
+    by_name: tuple[tuple[tuple[str, ...], FileKind], ...] = (
+        (_SOUND_SUFFIXES, "a recording"),
+        (_SHAPE_SUFFIXES, "a mesh or Gaussians"),
+        (PICTURE_SUFFIXES, "a picture"),
+        (VIDEO_SUFFIXES, "a video"),
+    )
+    named = next((kind for suffixes, kind in by_name if suffix in suffixes), None)
+    if named is not None:
+        return named
+    try:
+        entries = read_metadata(path)
+    except (OSError, ValueError):
+        return None
+    if featureheader.KEY in entries:
+        return "features"
+    return "a sound field" if field_header.KEY in entries else None
