@@ -14,7 +14,7 @@ from avmsf.capture import Capture, Impacts
 from avmsf.capture.placement import surface_points
 from avmsf.config import PipelineConfig
 from avmsf.errors import FitError
-from avmsf.field.config import GainModel
+from avmsf.field.config import AUTO, GainModel
 from avmsf.field.fit import Progress, fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.estimator import estimator_for
@@ -60,7 +60,10 @@ def fit_capture(
         expect_on_object(capture.impacts, features.points)
     elif capture.surface is not None:
         expect_on_object(capture.impacts, surface_points(capture.surface))
-    points = _points_of(capture, config, log) if features is None else features
+    shapeless = capture.surface is None and features is None
+    if shapeless:
+        log(_no_shape(config))
+    points = _points_of(capture, config) if features is None else features
     if features is None and config.gain_model == "network":
         log("no visual features were given: the network reads positions alone")
     if len(train) < _FEW:
@@ -70,7 +73,7 @@ def fit_capture(
         config.gain_model,
         lambda: _bodies(capture, config, None if output is None else unfinished(output, "bodies"), log),
         symmetries=lambda: _symmetries(capture, config),
-        log=log,
+        log=None if shapeless else log,
     )
     log(f"finding the modes of {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
     if output is None:
@@ -159,13 +162,18 @@ def discard_unfinished(output: Path) -> None:
         discard(unfinished(output, ending))
 
 
-def _points_of(capture: Capture, config: PipelineConfig, log: Callable[[str], None]) -> FeatureField:
+def _no_shape(config: PipelineConfig) -> str:
+    """Return the note on a capture without a shape, which says also what its gain model has to do without."""
+    lacks = " and no elastic mode shapes" if config.gain_model == AUTO else ""
+    return (
+        f"the capture has no mesh: points that fill the bounding box of its contacts are used{lacks}. Add surface.obj; "
+        "from photographs, a video or Gaussians, avmsf reconstruct makes the shape"
+    )
+
+
+def _points_of(capture: Capture, config: PipelineConfig) -> FeatureField:
     """Return the object's points: of its surface where there is one, else those that fill the contacts' box."""
     if capture.surface is None:
-        log(
-            "expected a surface in the capture, got none: points that fill the bounding box of its contacts are used. "
-            "avmsf reconstruct uses photographs, a video or Gaussians"
-        )
         return FeatureField.from_contacts(capture.impacts.contacts)
     return FeatureField.from_mesh(capture.surface, seed=config.fit.seed)
 
