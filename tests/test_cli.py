@@ -426,7 +426,7 @@ def test_render_is_the_fields_own(field: Path, tmp_path: Path, capsys: Streams) 
 def test_a_contact_off_the_object_is_noted_with_its_distance(field: Path, tmp_path: Path, capsys: Streams) -> None:
     assert main(["render", str(field), *AT, "--position", "0.05", "0.06", "0.04", "--output", str(tmp_path)]) == 0
     noted = [line for line in capsys.readouterr().err.splitlines() if " off the object" in line]
-    assert [("002.wav" in line, "40 mm" in line) for line in noted] == [(True, True)]
+    assert [("--position 2 of 2" in line, "40 mm" in line) for line in noted] == [(True, True)]
 
 
 def test_render_takes_a_table_in_any_unit_and_a_length(field: Path, tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert main([*words, "--gain-model", "smooth", "--steps", "1"]) == 0
     (folder / "not-ours.safetensors").write_bytes(b"RIFF and so on")
     (folder / "no-z.csv").write_text("file,x,y\na.wav,0,0\n")
+    (folder / "far.csv").write_text("file,x,y,z\na.wav,0.1,0.05,0\n\nb.wav,50,60,0\n")
     (folder / "empty.csv").write_text("x,y,z\n")
     (folder / "words.csv").write_text("x,y,z\n0,0,0\n0.1,left,0\n")
     (folder / "short.csv").write_text("x,y,z\n0,0\n")
@@ -70,7 +71,15 @@ WRONG: dict[str, dict[str, Any]] = {
     f"render not-ours.safetensors {AT} --output s": {"file": "not-ours.safetensors"},
     "render field.safetensors --output s": {"name": "--position", "value": 0},
     f"{TABLE} no-z.csv {AT}": {"name": "--position", "value": 1},
-    "render field.safetensors --position 50 60 0 --output s": {"name": "001.wav", "row": 0, "value": [50.0, 60.0, 0.0]},
+    "render field.safetensors --position 50 60 0 --output s": {
+        "name": "--position",
+        "row": 0,
+        "value": [50.0, 60.0, 0.0],
+    },
+    f"render field.safetensors {AT} --position 50 60 0 --output s": {"name": "--position", "row": 1},
+    f"{TABLE} far.csv": {"file": "far.csv", "row": 4, "name": "b.wav", "value": [50.0, 60.0, 0.0]},
+    f"render field.safetensors {AT} --output s --direction 0 0 0": {"name": "--direction", "row": 0},
+    f"render field.safetensors {AT} --output s --direction nan 0 1": {"name": "--direction", "row": 0},
     "render field.safetensors --position nan 0 0 --output s": {"name": "--position", "row": 0},
     f"render field.safetensors {AT} {AT} --direction 0 0 1 -o s": {"name": "--direction", "value": 1},
     f"render field.safetensors {AT} {AT} --output two.wav": {"file": "two.wav", "value": 2},

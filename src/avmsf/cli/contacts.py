@@ -30,6 +30,17 @@ class Contacts:
     """Paths of wav files in the output folder."""
     directions: Float64[Tensor, "contacts 3"] | None = None
     """Of the impacts, zero where unknown; None if none is known."""
+    option: str = "--position"
+    """The option that gives them where there is no table."""
+    table: Path | None = None
+    lines: tuple[int, ...] = ()
+    """Line of the table of each."""
+
+    def label(self, row: int) -> str:
+        """Return where a user wrote a contact: the option, with its number if there are several, or file and row."""
+        if self.table is not None:
+            return f"{self.table}, row {self.lines[row]}"
+        return self.option if len(self.names) == 1 else f"{self.option} {row + 1} of {len(self.names)}"
 
 
 def contacts_at(
@@ -76,16 +87,24 @@ def read_contacts(path: Path, *, meters: float) -> Contacts:
         raise _cell_error(path, line, "file", "a name that no other row has", name)
     directions = torch.tensor(normals, dtype=torch.float64)
     known = directions if bool(directions.any()) else None
-    return Contacts(torch.tensor(places, dtype=torch.float64) * meters, tuple(names), known)
+    numbers = tuple(line for line, _ in lines[1:])
+    located = torch.tensor(places, dtype=torch.float64) * meters
+    return Contacts(located, tuple(names), known, table=path, lines=numbers)
 
 
-def refuse_far(contacts: Contacts, field: SoundField) -> None:
-    """Raise `OutputError` for a contact that is not on the object, see `expect_near`."""
+def refuse_far(contacts: Contacts, field: SoundField, *, advice: str = "") -> None:
+    """Raise `OutputError` for a contact that is not on the object, see `expect_near`; `advice` ends its message."""
     try:
         expect_near(contacts.places, field.gain_field.points)
     except PositionError as error:
-        name = contacts.names[error.row or 0]
-        raise OutputError(f"{name}: {error}, see --unit", **{**error.attributes, "name": name}) from error
+        row = error.row or 0
+        found = str(error).partition(": ")[2]
+        where = (
+            {"name": contacts.option, "row": row}
+            if contacts.table is None
+            else {"file": contacts.table, "name": contacts.names[row], "row": contacts.lines[row]}
+        )
+        raise OutputError(f"{contacts.label(row)}: {found}{advice}", **{**error.attributes, **where}) from error
 
 
 def _number(text: str, path: Path, line: int, column: str, separator: str) -> float:

@@ -118,7 +118,7 @@ def _true_contact(options: Options, field: SoundField) -> Float64[Tensor, " 3"] 
     if options.true_contact is None:
         return None
     place = torch.tensor(options.true_contact, dtype=torch.float64)
-    refuse_far(Contacts(place[None], ("--true-contact",)), field)
+    refuse_far(Contacts(place[None], ("true",), option="--true-contact"), field)
     return place
 
 

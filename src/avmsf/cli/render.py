@@ -31,9 +31,9 @@ def run(options: Options) -> int:
     contacts = _contacts(options)
     paths = _paths(options.output, contacts)
     field = load(options.field)
-    refuse_far(contacts, field)
+    refuse_far(contacts, field, advice=", see --unit")
     for row, distance in off_surface(contacts.places, field.gain_field.points):
-        say(f"note: the contact of {contacts.names[row]} is {1e3 * distance:.3g} mm off the object")
+        say(f"note: {contacts.label(row)} is {1e3 * distance:.3g} mm off the object")
     if options.force != 1 and not field.origin.per_newton:
         say(f"note: the forces are not known: {options.force:g} is relative to an average recorded impact")
     if round(field.sample_rate) != field.sample_rate:

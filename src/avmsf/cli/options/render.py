@@ -38,7 +38,7 @@ class Options(Printing):
     direction: Annotated[Points, tyro.conf.arg(metavar="X Y Z")] = ()
     """Direction of the impact at each --position, in the same order."""
     contact_table: Annotated[Path | None, tyro.conf.arg(metavar="TABLE.csv"), Existing("a table of contacts")] = None
-    """Table of contacts."""
+    """Table of contacts. In it, a direction that is empty or 0,0,0 is not known."""
     unit: Unit = "m"
     """Unit of the coordinates. A field itself is in meters, whatever unit its capture has."""
     force: float = 1.0
@@ -75,6 +75,12 @@ class Options(Printing):
         for row, place in enumerate(self.position):
             if not all(map(math.isfinite, place)):
                 raise OutputError.expected("finite coordinates", list(place), row=row, name="--position")
+        for row, way in enumerate(self.direction):
+            if not (any(way) and all(map(math.isfinite, way))):
+                advice = "leave out --direction for impacts perpendicular to the surface"
+                raise OutputError.expected(
+                    "a direction other than 0 0 0", list(way), row=row, name="--direction", advice=advice
+                )
         if not math.isfinite(self.level_db):
             raise OutputError.expected("a finite number", self.level_db, name="--level-db")
         if not 0 < self.force < math.inf:
