@@ -12,6 +12,7 @@ import soundfile
 from avmsf.capture import CaptureSettings, check, read_capture
 from avmsf.errors import CaptureError
 from capture_folder import HEADER, RATE, ROWS, fill, ring
+from raising import raises
 
 
 def test_a_good_folder_has_no_problem_and_true_figures(tmp_path: Path) -> None:
@@ -132,3 +133,16 @@ def test_measured_strikes_pass(shared: Path) -> None:
         assert report.problems == ()
         assert len(report.recordings) == 74
         assert [row.problems for row in report.recordings] == [()] * 74
+
+
+def test_a_missing_file_may_be_one_that_no_row_has(tmp_path: Path) -> None:
+    folder = fill(tmp_path, rows=("a.wav,0.1,0,0", "b.wav,0,0.2,0", "d.wav,0,0,0.3"))
+    with raises(CaptureError, file="d.wav", value="c.wav"):
+        read_capture(folder)
+    assert "c.wav" in check(folder).recordings[2].problems[0]
+    (folder / "c.wav").unlink()
+    with raises(CaptureError, file="d.wav", value=None):
+        read_capture(folder)
+    (problem,) = check(folder).recordings[2].problems
+    assert "a.wav" not in problem
+    assert "b.wav" not in problem

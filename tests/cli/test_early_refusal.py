@@ -21,6 +21,11 @@ REFUSED = (
     "fit good -o f.safetensors --train-fraction 0.5 --train-count 4",
     "fit good -o f.safetensors --modes 0",
     "fit good -o f.safetensors --material cheese",
+    "fit one -o f.safetensors",
+    "modes one",
+    "reconstruct one",
+    "fit torn -o f.safetensors",
+    "reconstruct torn",
     "check empty",
     "modes empty",
     "modes good --modes 0",
@@ -78,11 +83,12 @@ print(json.dumps(found))
 @pytest.fixture
 def place(tmp_path: Path) -> Path:
     (tmp_path / "empty").mkdir()
-    for name, cell in (("good", "0.1"), ("cells", "left")):
+    for name, cell in (("good", "0.1"), ("one", "0.1"), ("torn", "0.1"), ("cells", "left")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "impacts.csv").write_text(f"file,x,y,z\n001.wav,0,0,0\n002.wav,{cell},0,0\n")
-    for each in ("001.wav", "002.wav"):
-        (tmp_path / "good" / each).touch()
+    for each in ("good/001.wav", "good/002.wav", "torn/001.wav", "torn/002.wav", "one/001.wav", "one/02.wav"):
+        (tmp_path / each).touch()
+    (tmp_path / "torn" / "surface.ply").write_bytes(b"no mesh")
     (tmp_path / "wrong.safetensors").write_bytes(b"RIFF and so on")
     field = STORED.read_bytes()
     (tmp_path / "field.safetensors").write_bytes(field)

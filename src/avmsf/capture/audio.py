@@ -1,9 +1,7 @@
 """Sound files as they lie on disk: every channel, the file's own rate, nothing resampled or scaled."""
 
-import heapq
 import io
 from dataclasses import dataclass
-from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +10,7 @@ import torch
 from jaxtyping import Float, Float64, Shaped
 from torch import Tensor
 
+from avmsf.capture.filenames import missing_recording
 from avmsf.errors import CaptureError, RecordingLengthError
 
 LOWEST_RATE = 100.0
@@ -22,8 +21,6 @@ hold hours of silence."""
 MIN_PEAK, MAX_PEAK = 1e-15, 1e15
 """Largest magnitude that a recording may have, in its own unit. Full scale is 1 and raw counts of 32 bits reach 2e9.
 Between these the squares of `MAX_SAMPLES` samples and their sum are ordinary numbers in float32."""
-_MAX_NAMES_COMPARED = 1000
-"""File names among which a misspelt one is sought: a tenth of a second."""
 MAX_CHANNEL_DIFFERENCE = 0.01
 """Share of a channel, root mean square, that another channel times a constant may leave of it where both hold one
 sound: 40 dB down, less than the noise of a usable recording (`HIGHEST_NOISE_DB` in measure.py is 20)."""
@@ -140,12 +137,7 @@ def read_recording(path: Path, name: str | None = None, *, advice: str = "check 
     if path.is_dir():
         raise CaptureError(f"{name}: expected a sound file, got a folder; name a file in it", file=path)
     if missing:
-        near = _nearest_name(path)
-        if not path.parent.is_dir():
-            advice = f"the folder {path.parent} does not exist either; {advice}"
-        elif near is not None:
-            advice = f"did you mean {near}?"
-        raise CaptureError(f"{name}: expected a sound file, got none; {advice}", file=path, value=near)
+        raise missing_recording(path, name, advice=advice)
     return decode_recording(path, name)
 
 
@@ -271,14 +263,3 @@ def _refuse_long(file: soundfile.SoundFile, name: str) -> None:
             file=name,
             value=samples,
         )
-
-
-def _nearest_name(path: Path) -> str | None:
-    """Return the file with the most similar name to a path that does not exist, if any."""
-    if not path.parent.is_dir():
-        return None
-    # The first by name: the order of a folder differs from disk to disk.
-    listed = heapq.nsmallest(_MAX_NAMES_COMPARED, (other.name for other in path.parent.iterdir()))
-    names = {name.lower(): name for name in listed}
-    found = get_close_matches(path.name.lower(), names, n=1, cutoff=0.7)
-    return names[found[0]] if found else None

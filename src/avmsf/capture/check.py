@@ -1,7 +1,6 @@
 """Everything that is wrong with a capture folder, found without stopping at the first thing."""
 
-import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,7 +10,16 @@ from avmsf.capture.prepare import Prepared, margin_length
 from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.starts import stay_uncut
 from avmsf.capture.surface import find_surface
-from avmsf.capture.table import TABLE, Row, Strike, read_rows, refuse_repeated_files, understand
+from avmsf.capture.table import (
+    TABLE,
+    Row,
+    Strike,
+    is_missing,
+    missing_recording_of,
+    read_rows,
+    refuse_repeated_files,
+    understand,
+)
 from avmsf.capture.together import common_length, common_rate, judge_contacts, judge_levels, judge_surface
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError
@@ -59,9 +67,9 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
         return CaptureReport(False, (), (str(error),))
     problems = [str(each) for each in warned]
     reports, strikes, sounds = list[RecordingReport](), list[Strike](), list[_Sound]()
-    missing = list[str]()
+    missing, files = list[str](), [row.cells["file"].replace("\\", "/") for row in rows]
     for row in rows:
-        strike, prepared, report = _check_row(folder, row, settings=settings, missing=missing)
+        strike, prepared, report = _check_row(folder, row, settings=settings, missing=missing, files=files)
         reports.append(report)
         if strike is not None:
             strikes.append(strike)
@@ -94,16 +102,20 @@ def _wav_files(folder: Path) -> list[str]:
 
 
 def _check_row(
-    folder: Path, row: Row, *, settings: CaptureSettings, missing: list[str]
+    folder: Path, row: Row, *, settings: CaptureSettings, missing: list[str], files: Sequence[str]
 ) -> tuple[Strike | None, Prepared | None, RecordingReport]:
-    """Return one row parsed as far as possible, its sound, and its report; add its file to `missing` where it is."""
+    """Return one row parsed as far as possible, its sound, and its report; add its file to `missing` where it is.
+
+    `files` are those of all rows.
+    """
     strike = None
     try:
         strike = understand(row, settings)
-        if not os.path.exists(folder / strike.file):
+        if is_missing(folder / strike.file):
             missing.append(strike.file)
             if len(missing) > MAX_SUGGESTIONS:
                 raise CaptureError(f"{strike.file}: expected a sound file, got none", file=strike.file)
+            raise missing_recording_of(folder, strike.file, files)
         prepared, report = read_strike(folder, strike, settings=settings)
     except CaptureError as error:
         file = strike.file if strike is not None else row.cells["file"]

@@ -1,5 +1,8 @@
 """Names by which the files of a folder are recognized; importing this loads nothing that computes."""
 
+import heapq
+from collections.abc import Collection
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Literal
 
@@ -13,6 +16,8 @@ PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 SPLATS = ("splats.ply", "point_cloud.ply")
 """Names under which a folder may hold Gaussians that were made elsewhere."""
+_MAX_NAMES_COMPARED = 1000
+"""File names among which a misspelt one is sought: a tenth of a second."""
 _OF_VIEWS = frozenset(("transforms.json", "images", "sparse", "cameras.bin", "cameras.txt", *SURFACE_FILES, *SPLATS))
 
 
@@ -46,3 +51,27 @@ def no_views(folder: Path) -> SceneError:
         "(surface.obj, .ply, .glb, .stl) or Gaussians (splats.ply), got none",
         file=folder,
     )
+
+
+def missing_recording(path: Path, name: str, *, advice: str, used: Collection[Path] = ()) -> CaptureError:
+    """Return the error of a sound file that does not exist, with the file of the most similar name that is not `used`.
+
+    `advice` says what to do where there is none of a similar name.
+    """
+    near = _nearest_name(path, used)
+    if not path.parent.is_dir():
+        advice = f"the folder {path.parent} does not exist either; {advice}"
+    elif near is not None:
+        advice = f"did you mean {near}?"
+    return CaptureError(f"{name}: expected a sound file, got none; {advice}", file=path, value=near)
+
+
+def _nearest_name(path: Path, used: Collection[Path]) -> str | None:
+    """Return the unused file with the most similar name to a path that does not exist, if any."""
+    if not path.parent.is_dir():
+        return None
+    # The first by name: the order of a folder differs from disk to disk.
+    others = (other.name for other in path.parent.iterdir() if other not in used)
+    names = {name.lower(): name for name in heapq.nsmallest(_MAX_NAMES_COMPARED, others)}
+    found = get_close_matches(path.name.lower(), names, n=1, cutoff=0.7)
+    return names[found[0]] if found else None

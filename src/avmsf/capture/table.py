@@ -3,7 +3,6 @@
 import csv
 import io
 import math
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 
 from avmsf._utils.text_files import read_text
+from avmsf.capture.filenames import missing_recording
 from avmsf.capture.location import Location
 from avmsf.capture.settings import METRES, CaptureSettings
 from avmsf.capture.warning import CaptureWarning
@@ -188,9 +188,11 @@ def refuse_repeated_files(strikes: Sequence[Strike]) -> None:
 
 
 def _refuse_missing(folder: Path, strikes: Sequence[Strike]) -> None:
-    """Raise one `CaptureError` where several recordings are missing; for a single one its reader has more advice."""
-    missing = [strike.file for strike in strikes if not os.path.exists(folder / strike.file)]
-    if len(missing) > 1:
+    """Raise one `CaptureError` where recordings are missing; for a single one with the file that may be meant."""
+    missing = [strike.file for strike in strikes if is_missing(folder / strike.file)]
+    if len(missing) == 1:
+        raise missing_recording_of(folder, missing[0], [strike.file for strike in strikes])
+    if missing:
         shown = f"{', '.join(missing[:5])}{', …' * (len(missing) > 5)}"
         raise CaptureError(
             f"{folder / TABLE}: expected a file for each row, got none for {len(missing)} of {len(strikes)} "
@@ -199,6 +201,20 @@ def _refuse_missing(folder: Path, strikes: Sequence[Strike]) -> None:
             name="file",
             value=missing,
         )
+
+
+def is_missing(path: Path) -> bool:
+    """Return whether nothing is at a path; a name that no file can have is left to the reader of sound files."""
+    try:
+        return not path.exists()
+    except OSError:
+        return False
+
+
+def missing_recording_of(folder: Path, file: str, files: Sequence[str]) -> CaptureError:
+    """Return the error of a recording of a table that does not exist; `files` are those of all rows."""
+    advice = f"copy it there, or remove its row from {TABLE}"
+    return missing_recording(folder / file, file, advice=advice, used={folder / each for each in files})
 
 
 def fitting_units(written: float) -> str:

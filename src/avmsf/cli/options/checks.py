@@ -2,12 +2,17 @@
 
 from pathlib import Path
 
+from avmsf.capture.filenames import find_surface_file
 from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.table import read_strikes
-from avmsf.errors import AvmsfError, ExtractionError
+from avmsf.errors import AvmsfError, CaptureError, ExtractionError
 
 DEVICES = ("cpu", "cuda")
 """Kinds of devices that commands compute on."""
+
+
+_PLY_HEADER_BYTES = 1 << 16
+"""Bytes in which the header of a .ply ends: a hundred times those of a mesh with colors and normals."""
 
 
 class OutputError(AvmsfError):
@@ -46,5 +51,20 @@ def read_settings(folder: Path, settings: Path | None) -> CaptureSettings:
 
 
 def expect_capture(folder: Path, settings: Path | None) -> None:
-    """Raise `CaptureError` for a capture folder whose table or settings cannot be used."""
-    read_strikes(folder, read_settings(folder, settings))
+    """Raise `CaptureError` for a capture folder whose table, settings or surface cannot be used, see `expect_rows`."""
+    expect_rows(folder, read_settings(folder, settings))
+
+
+def expect_rows(folder: Path, settings: CaptureSettings) -> None:
+    """Raise `CaptureError` for a capture folder whose table cannot be used, or whose .ply has no such header."""
+    read_strikes(folder, settings)
+    surface = find_surface_file(folder, settings)
+    if surface is None or surface.suffix.lower() != ".ply" or not surface.is_file():
+        return
+    with surface.open("rb") as file:
+        start = file.read(_PLY_HEADER_BYTES)
+    if not start.startswith(b"ply") or b"end_header" not in start:
+        raise CaptureError.expected(
+            "a mesh or point cloud", start[:8], got="a file without the header of a .ply", file=surface,
+            advice="export it again",
+        )  # fmt: skip

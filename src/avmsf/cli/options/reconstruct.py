@@ -8,8 +8,7 @@ from typing import Annotated
 import tyro
 
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.table import read_strikes
-from avmsf.cli.options.checks import expect_modes
+from avmsf.cli.options.checks import expect_modes, expect_rows
 from avmsf.cli.options.common import parse_options
 from avmsf.cli.options.fit import expect_split, refuse_with_material
 from avmsf.cli.options.paths import NEW_TENSORS
@@ -93,7 +92,7 @@ class Options(SceneOptions):
     def expect_folder(self, settings: CaptureSettings) -> None:
         """Raise `CaptureError` for a table that cannot be used; only without recordings the folder needs views."""
         if self.material is None:
-            read_strikes(self.folder, settings)
+            expect_rows(self.folder, settings)
         else:
             super().expect_folder(settings)
 
