@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from benchmarks import editing, locating
-from benchmarks.recast import recast_report
+from benchmarks.changedmaterial import changed_material_report
 from benchmarks.report import Options, Report
 
 
@@ -26,7 +26,7 @@ def _locate(part: str) -> Callable[[Options], Report]:
 
 _RUNNERS: dict[str, Callable[[Options], Report]] = {
     **{part: _locate(part) for part in locating.PARTS},
-    "recast": recast_report,
+    "change-material": changed_material_report,
     "edit": _edit,
 }
 PARTS = tuple(_RUNNERS)

@@ -54,7 +54,7 @@ def test_pitch_moves_frequencies_and_decay_the_ring_times(name):
     )
     assert torch.equal(after.gains(PLACES), before.gains(PLACES))
     told = after.origin.report["edits"][-1]
-    assert (told["edit"], told["pitch"], told["decay"]) == ("retune", 1.2, factors.tolist())
+    assert (told["edit"], told["pitch"], told["decay"]) == ("adjust_modes", 1.2, factors.tolist())
 
 
 def test_brightness_is_decibels_an_octave_about_the_center():

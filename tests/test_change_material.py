@@ -103,7 +103,7 @@ def test_a_plate_of_another_material_and_size_is_the_one_in_closed_form(size):
 
 
 @pytest.mark.parametrize("size", [1.0, 0.6])
-def test_recasting_is_a_fresh_finite_element_solve(size):
+def test_changing_the_material_is_a_fresh_finite_element_solve(size):
     new = replace(OTHER, poisson=CERAMIC.poisson)
     generator = torch.Generator().manual_seed(1)
     places = torch.rand(6, 3, dtype=torch.float64, generator=generator) * torch.tensor([0.11, 0.07, 0.0])
@@ -235,7 +235,7 @@ def test_another_poissons_ratio_is_said_with_what_it_would_do_to_a_plate():
     )
 
 
-def test_a_recast_field_is_a_field_like_any_other(tmp_path):
+def test_a_field_of_another_material_is_a_field_like_any_other(tmp_path):
     found = change_material(plate_field(STEEL), STEEL, WOOD, size=0.5)
     save(found, tmp_path / "wood.safetensors")
     loaded = load(tmp_path / "wood.safetensors")

@@ -235,7 +235,7 @@ def test_towards_a_materials_sound(field: Path, capsys: Streams) -> None:
     wood = edited(field, "--like-material", "Wood", *quick, name="wood")
     assert "ceramic assumed" in capsys.readouterr().err
     (told,) = wood.origin.report[EDITS]
-    assert (told["edit"], told["reference"]) == ("steer", "wood")
+    assert (told["edit"], told["reference"]) == ("guided", "wood")
     ringing = wood.bank.damping / ceramic().bank.damping
     assert float(ringing.median()) > 3.0
     # What it is of is what it was made before, and what is made of it before is what the sound is led on from.
@@ -243,12 +243,12 @@ def test_towards_a_materials_sound(field: Path, capsys: Streams) -> None:
     heard = common.reference(samples=2400, sample_rate=RATE, seed=3).describe()
     words = ["--from", "glass", "--to-material", "wood", "--pitch", "1", "--like-material", "steel", "--seed", "3"]
     both = edited(field, *words, *quick, name="both")
-    assert [each["edit"] for each in both.origin.report[EDITS]] == ["recast", "steer"]
+    assert [each["edit"] for each in both.origin.report[EDITS]] == ["change_material", "guided"]
     assert {name: both.origin.report[EDITS][1][name] for name in heard} == heard
     assert main(["info", str(field.with_name("both.safetensors"))]) == 0
     out = capsys.readouterr().out
-    assert "edited     recast, from glass to wood, law displacement" in out
-    assert "edited     steer, towards 'steel', pitch " in out
+    assert "edited     change_material, from glass to wood, law displacement" in out
+    assert "edited     guided, towards 'steel', pitch " in out
     assert ", steps 2" in out
     assert "preview_every" not in out
 
@@ -260,8 +260,8 @@ def test_edits_are_shown_by_what_they_did(field: Path, capsys: Streams) -> None:
     lines = [line.strip() for line in capsys.readouterr().out.splitlines() if "edited" in line]
     law = "law displacement, modes overdamped: "
     assert lines == [
-        f"edited     recast, from ceramic to wood with alpha changed, size 2, {law}2",
-        "edited     retune, pitch 10, decay 1 to 4 by mode, gains_db 0 to 6 by mode, 1 muted, "
+        f"edited     change_material, from ceramic to wood with alpha changed, size 2, {law}2",
+        "edited     adjust_modes, pitch 10, decay 1 to 4 by mode, gains_db 0 to 6 by mode, 1 muted, "
         "modes beyond half the sample rate: 1",
     ]
 
@@ -383,7 +383,7 @@ def test_towards_words_by_a_saved_model_and_an_interrupted_edit_goes_on(
 
     assert edit_to("whole") == 0
     (told,) = json.loads(capsys.readouterr().out)["edits"]
-    assert (told["edit"], told["prompt"], told["model"]) == ("steer", "a wooden bowl is hit", "tiny-audio")
+    assert (told["edit"], told["prompt"], told["model"]) == ("guided", "a wooden bowl is hit", "tiny-audio")
     whole = load(field.with_name("whole.safetensors"))
     assert bool((whole.bank.frequency != FREQUENCY).all())
     shown = steering.SteerBar.show

@@ -190,7 +190,7 @@ def test_what_tells_models_apart_tells_guides_apart():
     assert guide(Known(room=3)).describe() == guide(Known(room=3)).describe() != guide(Known(room=4)).describe()
 
 
-def test_a_field_is_steered_to_what_the_model_wants():
+def test_a_field_is_edited_to_what_the_model_wants():
     wanted = sound_of(ringing_field(pitch=1.02, damping=2.0))
     before, seen = ringing_field(), []
     made = edit_towards(

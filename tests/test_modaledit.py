@@ -72,7 +72,7 @@ def test_nothing_changes_nothing():
 
 
 @pytest.mark.parametrize("pitch", [math.log(0.7), math.log(2.5)])
-def test_what_is_steered_on_is_what_the_edited_field_renders(pitch):
+def test_what_is_optimized_is_what_the_edited_field_renders(pitch):
     # At 2.5 times the pitch two modes lie above half the rate, and are silent in both.
     field, edit = made_field(), made_edit(pitch=pitch)
     contacts = made_fields.places(4, seed=6)
@@ -107,7 +107,7 @@ def test_an_edited_field_saves_loads_and_is_edited_again(tmp_path):
     assert torch.equal(again.render(contacts), direct.render(contacts))
     entries = again.origin.report["edits"]
     assert [each.get("prompt") for each in entries] == ["wood", None]
-    assert [each["edit"] for each in entries] == ["steer", "steer"]
+    assert [each["edit"] for each in entries] == ["guided", "guided"]
     assert entries[0]["pitch"] == pytest.approx(0.7)
     # As in an edit by hand: what rings a third as long.
     assert entries[0]["decay"] == pytest.approx(1 / 3)

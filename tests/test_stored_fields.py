@@ -1,5 +1,6 @@
 """Fields that earlier versions wrote are read, and sound as they did then."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,11 @@ from safetensors.torch import load_file
 
 from avmsf.field import SoundField
 from avmsf.field.header import FORMAT
+from avmsf.simulate.material import GLASS, WOOD
+from avmsf.tasks.edits import EDITS
+from avmsf.tasks.madeof import made_of
+from avmsf.tasks.material import change_material
+from avmsf.tasks.modes import adjust_modes
 from stored_fields import fields
 
 FILES = sorted((Path(__file__).parent / "data").glob("format-*/*.safetensors"))
@@ -31,3 +37,17 @@ def test_a_stored_alignment_is_read():
     alignment = SoundField.load(path).alignment
     assert alignment is not None
     assert len(alignment.names) == len(alignment.delays) == 8
+
+
+def test_edits_of_earlier_versions_have_the_present_names(tmp_path):
+    field = adjust_modes(change_material(fields()["mixture"], GLASS, WOOD), pitch=1.1)
+    entries = field.origin.report[EDITS]
+    old = [{**entry, "edit": kind} for entry, kind in zip(entries, ("recast", "retune"), strict=True)]
+    report = {**field.origin.report, EDITS: [*old, {"edit": "steer"}, {"edit": "recast", "to": entries[0]["to"]}]}
+    replace(field, origin=replace(field.origin, report=report)).save(tmp_path / "old.safetensors")
+    assert b"recast" in (tmp_path / "old.safetensors").read_bytes()
+    read = SoundField.load(tmp_path / "old.safetensors")
+    kinds = [entry["edit"] for entry in read.origin.report[EDITS]]
+    assert kinds == ["change_material", "adjust_modes", "guided", "change_material"]
+    assert read.origin.report[EDITS][:2] == entries
+    assert made_of(read, option="--from").material == WOOD

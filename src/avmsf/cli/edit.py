@@ -40,7 +40,7 @@ class Sliders(ModeOptions):
     """Every mode by hand."""
 
     def apply(self, field: SoundField, *, named: Float[Tensor, " modes"]) -> SoundField:
-        """Return the retuned field; modes are called by the frequencies `named`, Hz."""
+        """Return the adjusted field; modes are called by the frequencies `named`, Hz."""
         levels = torch.zeros(len(named), dtype=torch.float64)
         pitch, decay = torch.full_like(levels, self.pitch), torch.full_like(levels, self.decay)
         for frequency, level in self.mode_db:

@@ -44,6 +44,8 @@ _MAX = {"bank.frequency": 1e9, "bank.damping": 1e9, "residual.magnitude": MAX_PE
 """Largest values: hertz and 1/s beyond any solid's modes, and noise as loud as the loudest recording."""
 _KINDS: dict[str, type[GainField]] = {**FITTED, ScaledGains.kind: ScaledGains}
 """The gain fields that a file may hold, by what it calls them."""
+_RENAMED_EDITS = {"recast": "change_material", "retune": "adjust_modes", "steer": "guided"}
+"""Kinds of edits that earlier versions wrote, and what they are called now."""
 _SAVE_AGAIN = "fit and save the field again"
 
 
@@ -158,12 +160,24 @@ class _Header:
             trained_on=tuple(like(name, "", "origin.trained_on") for name in origin["trained_on"]),
             per_newton=like(origin["per_newton"], True, "origin.per_newton"),
             config=record_of(FitConfig(), record["config"], "config"),
-            report=like(origin["report"], {}, "origin.report"),
+            report=_with_present_names(like(origin["report"], {}, "origin.report")),
             settings=CaptureSettings.of(like(origin["settings"], {}, "origin.settings"), name="origin.settings"),
         )
         if (quality := read.report.get("quality")) is not None:
             FieldQuality.of(quality)
         return cls(rate, samples, kind, gains, read, skeleton)
+
+
+def _with_present_names(report: dict[str, Any]) -> dict[str, Any]:
+    """Return a report whose edits are called as this version calls them."""
+    if not isinstance(edits := report.get("edits"), list):
+        return report
+    return {**report, "edits": [_renamed(entry) for entry in edits]}
+
+
+def _renamed(entry: Any) -> Any:
+    kind = entry.get("edit") if isinstance(entry, dict) else None
+    return {**entry, "edit": _RENAMED_EDITS[kind]} if isinstance(kind, str) and kind in _RENAMED_EDITS else entry
 
 
 def _record(field: SoundField) -> dict[str, Any]:

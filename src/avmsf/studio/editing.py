@@ -131,12 +131,12 @@ class Sliders:
             new = old if self.material is None else material_named(self.material)
             edited = change_material(ground, old, new, size=self.size, law=LAWS[self.law])
         if (self.pitch, self.decay, self.brightness) != (1.0, 1.0, 0.0) or self.modes:
-            edited = self._retuned(edited)
+            edited = self._adjusted(edited)
         entries = edited.origin.report.get(EDITS, [])[len(ground.origin.report.get(EDITS, [])) :]
         return edited, words + remarks(entries, edited)
 
-    def _retuned(self, recasted: SoundField) -> SoundField:
-        count = len(recasted.bank)
+    def _adjusted(self, changed: SoundField) -> SoundField:
+        count = len(changed.bank)
         levels = torch.zeros(count, dtype=torch.float64)
         pitch, decay = torch.full_like(levels, self.pitch), torch.full_like(levels, self.decay)
         for row in self.modes:
@@ -145,7 +145,7 @@ class Sliders:
             levels[row.mode] += row.db
             pitch[row.mode] *= row.pitch
             decay[row.mode] *= row.decay
-        return adjust_modes(recasted, pitch=pitch, decay=decay, brightness_db=self.brightness, gains_db=levels)
+        return adjust_modes(changed, pitch=pitch, decay=decay, brightness_db=self.brightness, gains_db=levels)
 
 
 REST = Sliders()

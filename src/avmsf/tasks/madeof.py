@@ -11,7 +11,7 @@ from avmsf.tasks.materialguess import guess_materials
 
 _CLOSE = 1.2
 """Ratio of the errors up to which the second-best material is as likely."""
-_KEEPING = ("recast", "retune")
+_KEEPING = ("change_material", "adjust_modes")
 """Edits after which a field's material is known."""
 
 
@@ -29,7 +29,7 @@ def made_of(field: SoundField, *, option: str) -> MadeOf:
 
     `option` is the option for the material, named in messages. Raises `EditError` where no material fits.
     """
-    known = _recast_to(field.origin.report.get(EDITS, []))
+    known = _changed_to(field.origin.report.get(EDITS, []))
     if known is not None:
         return MadeOf(known, f"old material: {known.name}, from the last material edit")
     report = field.origin.report
@@ -53,13 +53,13 @@ def made_of(field: SoundField, *, option: str) -> MadeOf:
     )
 
 
-def _recast_to(edits: Sequence[object]) -> Material | None:
+def _changed_to(edits: Sequence[object]) -> Material | None:
     """Return the material of the last change of it, None where there is none or what followed may have changed it."""
     for entry in reversed(edits):
         kind = entry.get("edit") if isinstance(entry, dict) else None
         if kind not in _KEEPING:
             return None
-        if kind == "recast":
+        if kind == "change_material":
             assert isinstance(entry, dict)
             return Material(**entry["to"])
     return None

@@ -82,7 +82,7 @@ def change_material(
     mass = (new.density / old.density) * size**3
     scale = (before.frequency / bank.frequency) ** law.frequency / mass**law.mass
     entry: dict[str, Any] = {
-        "edit": "recast",
+        "edit": "change_material",
         "from": asdict(old),
         "to": asdict(new),
         "size": float(size),
@@ -98,7 +98,7 @@ def _name(origin: Origin, old: Material, new: Material) -> str:
     """Return the object's name with its new material in place of the one of an earlier edit."""
     if new.name == old.name:
         return origin.capture
-    earlier = [edit["to"]["name"] for edit in origin.report.get(EDITS, []) if edit["edit"] == "recast"]
+    earlier = [edit["to"]["name"] for edit in origin.report.get(EDITS, []) if edit["edit"] == "change_material"]
     base = origin.capture.removesuffix(f", {earlier[-1]}") if earlier else origin.capture
     return f"{base}, {new.name}" if base else new.name
 

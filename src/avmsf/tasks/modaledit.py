@@ -94,7 +94,7 @@ class ModalEdit:
             field,
             ModalBank(bank.frequency.detach(), bank.damping.detach()),
             self.scale.detach().exp(),
-            entry={"edit": "steer", "pitch": self.pitch_factor, "decay": self.decay_factor, **(told or {})},
+            entry={"edit": "guided", "pitch": self.pitch_factor, "decay": self.decay_factor, **(told or {})},
         )
 
 

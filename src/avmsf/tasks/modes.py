@@ -53,7 +53,7 @@ def adjust_modes(
         center = brightness_center(field, bank)
         levels = levels + brightness_db * torch.log2(bank.frequency / center)
     entry: dict[str, Any] = {
-        "edit": "retune",
+        "edit": "adjust_modes",
         "pitch": _told(factors["pitch"]),
         "decay": _told(factors["decay"]),
         "brightness_db": float(brightness_db),

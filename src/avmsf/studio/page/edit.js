@@ -46,13 +46,13 @@ export function editSheet(studio, load) {
       ...names.map((name) => element("option", { value: name }, name)),
     );
   // What the object is of counts where it shall be of another material or size, and changes nothing by itself.
-  const recasts = () => to.value !== "" || sliders.size.value !== sliders.size.rest;
-  const from = select("inferred", () => recasts() && onInput());
+  const changesMaterial = () => to.value !== "" || sliders.size.value !== sliders.size.rest;
+  const from = select("inferred", () => changesMaterial() && onInput());
   const to = select("unchanged", onInput);
   const remarks = element("div", { className: "group", "aria-live": "polite" });
   const busy = element("progress", { hidden: true, "aria-label": "Editing" });
   const asked = () => ({
-    material: recasts() && (from.value || to.value) ? { from: from.value || null, to: to.value || null } : null,
+    material: changesMaterial() && (from.value || to.value) ? { from: from.value || null, to: to.value || null } : null,
     ...Object.fromEntries(Object.entries(sliders).map(([name, slider]) => [name, slider.value])),
     modes: [...single].filter(([, values]) => !atRest(values)).map(([mode, values]) => ({ mode, ...values })),
   });

@@ -1,4 +1,4 @@
-"""Recasting against fresh finite-element solves of the same shape in the new material, and in another size."""
+"""Changed materials against fresh finite-element solves of the same shape in the new material, and in another size."""
 
 import json
 import math
@@ -31,14 +31,14 @@ from benchmarks.report import Options, Report, Table, tell
 PAIRS = ((CERAMIC, WOOD, 1.0), (GLASS, STEEL, 1.0), (WOOD, GLASS, 1.0), (IRON, PLASTIC, 0.5), (CERAMIC, CERAMIC, 2.0))
 """Old material, new material, and the new size over the old one."""
 CONVENTIONS = (
-    "recast.frequency_error: largest relative error of damped frequencies, recast.gain_error: of a mode's gains over "
-    "the largest of that mode (modes of one frequency, whose shapes are any mixture, summed), between a recast field "
+    "change_material.frequency_error: largest relative error of damped frequencies; gain_error: of a mode's gains over "
+    "the largest of that mode (modes of one frequency, whose shapes are any mixture, summed), between a changed field "
     "and a field from a new finite-element solve of the same tetrahedra in the new material and size, Poisson's ratio "
     "kept; ring_error: largest relative error of dampings. A ceramic bowl, a "
     "square of 120 mm and 4 mm thick bent onto a sphere of 100 mm; gains are the displacement of one place by a blow "
     "of a newton-second at each of 24, and are kept as float32.",
-    "recast.seconds: time of one recast; recast.solve_seconds: of one solve, which it saves. recast.megabytes: what "
-    "one recast adds to the peak of resident memory (VmHWM) of a process that has loaded the field, in units of 2^20.",
+    "change_material.seconds: time of one change; solve_seconds: of one solve, which it saves. megabytes: what "
+    "one change adds to the peak of resident memory (VmHWM) of a process that has loaded the field, in units of 2^20.",
 )
 
 
@@ -58,7 +58,7 @@ print(json.dumps((peak_gigabytes() - before) * 1e9 / 2**20))
 """
 
 
-def recast_report(options: Options) -> Report:
+def changed_material_report(options: Options) -> Report:
     """Return both errors over all pairs of materials, and what either way takes."""
     solid = bowl(6 if options.quick_look else 16)
     count = 12 if options.quick_look else 48
@@ -76,25 +76,27 @@ def recast_report(options: Options) -> Report:
         gain = float(((ours - truth).abs().amax(0) / truth.abs().amax(0)).max())
         scaled = "" if size == 1.0 else f", {size:g} times as large"
         rows.append([f"{old.name} to {new.name}{scaled}", frequency, damping, gain, seconds, solve_seconds])
-        tell(f"recast: {rows[-1][0]}: frequencies off by {frequency:.2g}, gains by {gain:.2g}")
+        tell(f"change_material: {rows[-1][0]}: frequencies off by {frequency:.2g}, gains by {gain:.2g}")
     columns = ("edit", "frequency_error", "ring_error", "gain_error", "seconds", "solve_seconds")
     # Errors at their worst, times in the mean.
     worst = {
-        f"recast.{name}": max(float(row[place]) for row in rows) for place, name in enumerate(columns) if 1 <= place < 4
+        f"change_material.{name}": max(float(row[place]) for row in rows)
+        for place, name in enumerate(columns)
+        if 1 <= place < 4
     }
     spent = {
-        f"recast.{name}": sum(float(row[place]) for row in rows) / len(rows)
+        f"change_material.{name}": sum(float(row[place]) for row in rows) / len(rows)
         for place, name in enumerate(columns)
         if place > 3
     }
-    spent["recast.megabytes"] = _megabytes(start)
-    title = f"recast: {count} modes of a bowl with {len(solid.cells)} tetrahedra"
+    spent["change_material.megabytes"] = _megabytes(start)
+    title = f"change_material: {count} modes of a bowl with {len(solid.cells)} tetrahedra"
     return Report(CONVENTIONS, (Table(title, columns, rows),), {**worst, **spent})
 
 
 def _megabytes(field: SoundField) -> float:
-    """Return what one recast adds to the peak of a fresh process's resident memory."""
-    with tempfile.TemporaryDirectory(prefix="recast-") as place:
+    """Return what one change adds to the peak of a fresh process's resident memory."""
+    with tempfile.TemporaryDirectory(prefix="material-") as place:
         path = Path(place) / "bowl.safetensors"
         save(field, path)
         command = [sys.executable, "-c", _CHILD, str(path)]
