@@ -1,5 +1,6 @@
 """`avmsf check`: what each recording of a capture is worth, and what is wrong."""
 
+import shlex
 import warnings
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -15,6 +16,7 @@ from avmsf.cli.alignment import AlignmentReport
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.check import Options
 from avmsf.cli.printing import console, decimals, next_command, print_json, say, table
+from avmsf.cli.visuals import visual_inputs
 from avmsf.errors import CaptureError, ExtractionError
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.extraction.finders import HighResolution
@@ -36,12 +38,15 @@ def run(options: Options) -> int:
     if proposals and options.write_settings:
         _write(options, proposals, screen)
     report = check(options.capture, settings)
+    visual = visual_inputs(options.capture, settings)
     doing("finding the modes that align the recordings")
     modes = _modes(options.capture, settings) if report.readable else None
     aligned = None if modes is None else AlignmentReport.of(*modes)
     if report.recordings:
         screen.print(_table(report, str(options.capture), aligned))
-    problems = problems_of(report)
+    if visual is not None:
+        screen.print(visual.sentence, soft_wrap=True)
+    problems = [*problems_of(report), *(() if visual is None else visual.problems)]
     for problem in problems[:MAX_PRINTED]:
         screen.print(problem, soft_wrap=True)
     if len(problems) > MAX_PRINTED:
@@ -55,6 +60,7 @@ def run(options: Options) -> int:
         print_json(
             {
                 **asdict(report),
+                "visual_inputs": None if visual is None else asdict(visual),
                 "proposals": [asdict(each) for each in proposals],
                 "alignment": None if aligned is None else asdict(aligned),
             }
@@ -72,7 +78,10 @@ def run(options: Options) -> int:
     if aligned is not None:
         wrong += bool(aligned.not_aligned) + bool(aligned.inverted)
     screen.print("no problem found" if not wrong else f"readable, with {counted(wrong, 'warning')}", soft_wrap=True)
-    next_command("avmsf modes", options.capture)
+    if visual is not None and visual.reconstructs:
+        next_command("avmsf reconstruct", options.capture, f"-o {shlex.quote(f'{options.capture}.safetensors')}")
+    else:
+        next_command("avmsf modes", options.capture)
     return 0
 
 

@@ -44,7 +44,7 @@ def read_views(
         raise CaptureError(
             f"expected the length of the cameras' unit in meters, got {meters}", name="meters", value=meters
         )
-    base, found = _find_shots(Path(folder))
+    base, found = find_shots(Path(folder))
     shots = sorted(found.shots, key=lambda shot: shot.name)
     _refuse_repeated(shots, found.origin)
     findings = Findings(list(found.remarks))
@@ -65,7 +65,7 @@ def read_views(
     return tuple(views)
 
 
-def _find_shots(folder: Path) -> tuple[Path, Shots]:
+def find_shots(folder: Path) -> tuple[Path, Shots]:
     """Return the folder that paths count from, and the shots of the camera file in it."""
     if folder.suffix.lower() == ".json" and not folder.is_dir():
         if not folder.is_file():

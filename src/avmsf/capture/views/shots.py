@@ -67,9 +67,14 @@ def refuse_many(count: int, where: Path) -> None:
 
 def mask_places(shot: Shot, folder: Path) -> list[Path]:
     """Return the paths where a shot's mask may be, the likeliest first."""
-    name = PurePosixPath(shot.name)
-    places = [folder / "masks" / name.with_suffix(".png"), folder / "masks" / f"{name}.png"]
+    places = mask_names(shot.name, folder)
     return places if shot.mask is None else [shot.mask, *places]
+
+
+def mask_names(name: str, folder: Path) -> list[Path]:
+    """Return the paths where the mask of the photograph of this name may be, the likeliest first."""
+    path = PurePosixPath(name)
+    return [folder / "masks" / path.with_suffix(".png"), folder / "masks" / f"{path}.png"]
 
 
 def listed(names: Sequence[str], *, most: int = 5) -> str:

@@ -1,0 +1,134 @@
+"""What shows the object in a capture folder: found by names and camera files, without reading pictures or shapes."""
+
+import importlib.util
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image
+
+from avmsf.capture.filenames import find_surface_file
+from avmsf.capture.settings import CaptureSettings, settings_of
+from avmsf.capture.views.read import find_shots
+from avmsf.capture.views.shots import listed, mask_names
+from avmsf.errors import CaptureError, SceneError
+from avmsf.pipeline.sources import find_source, find_splats, images_in
+from avmsf.wording import counted
+
+
+@dataclass(frozen=True)
+class VisualInputs:
+    """What a folder holds of an object's look, in plain values."""
+
+    photographs: int
+    cameras: str | None
+    """The file or folder with the cameras of the photographs; None where they have none."""
+    masks: int
+    """Photographs with a mask: a file of its own, or an alpha channel in all of them."""
+    video: str | None
+    mesh: str | None
+    gaussians: str | None
+    problems: tuple[str, ...]
+    """What is wrong with these, as far as names and camera files show it."""
+
+    @property
+    def reconstructs(self) -> bool:
+        """Whether `avmsf reconstruct` finds more of the object here than `avmsf fit`, which reads a mesh alone."""
+        return self.mesh is None and bool(self.photographs or self.video or self.gaussians)
+
+    @property
+    def sentence(self) -> str:
+        """The line on what shows the object."""
+        found = []
+        if self.photographs:
+            cameras = "without cameras" if self.cameras is None else f"with cameras ({self.cameras})"
+            some = self.masks < self.photographs
+            masks = "no masks" if not self.masks else f"masks of {self.masks}" if some else "masks"
+            found.append(f"{counted(self.photographs, 'photograph')} {cameras}, {masks}")
+        named = {"video": self.video, "mesh": self.mesh, "Gaussians": self.gaussians}
+        found += [f"{kind} {name}" for kind, name in named.items() if name is not None]
+        return f"the object is shown by: {'; '.join(found) or 'no photographs, video, mesh or Gaussians'}"
+
+
+def visual_inputs(folder: Path, settings: CaptureSettings | None) -> VisualInputs | None:
+    """Return what a folder holds of an object's look; None for a folder or settings that cannot be read."""
+    try:
+        settings = settings or settings_of(folder)
+        surface = find_surface_file(folder, settings)
+        if not folder.is_dir():
+            return None
+    except CaptureError:
+        return None
+    problems, kind, video = list[str](), None, None
+    try:
+        source = find_source(folder, settings)
+        if source is not None:
+            kind, video = source.kind, source.path.name if source.kind == "video" else None
+    except SceneError as error:
+        problems.append(str(error))
+    names, cameras, masks = _photographs(folder, kind, problems)
+    masked = _masked(folder, names, masks, problems)
+    if kind == "photographs" and importlib.util.find_spec("pycolmap") is None:
+        problems.append(
+            "the photographs have no cameras, and the package that finds them is missing: pip install 'avmsf[sfm]'"
+        )
+    splats = find_splats(folder)
+    return VisualInputs(
+        len(names),
+        cameras,
+        masked,
+        video,
+        None if surface is None or not surface.is_file() else surface.name,
+        None if splats is None else splats.name,
+        tuple(problems),
+    )
+
+
+def _photographs(
+    folder: Path, kind: str | None, problems: list[str]
+) -> tuple[dict[str, Path], str | None, dict[str, Path]]:
+    """Return the photographs by their names, what holds their cameras, and the masks that it names.
+
+    Pictures next to a mesh may be its textures: without a camera file they count where nothing else shows the object.
+    """
+    if kind == "cameras":
+        try:
+            _, found = find_shots(folder)
+        except CaptureError as error:
+            problems.append(str(error))
+            return {}, None, {}
+        missing = [shot.name for shot in found.shots if not shot.image.is_file()]
+        if missing:
+            lacks = counted(len(missing), "missing photograph")
+            problems.append(f"{found.origin.name}: {lacks}, {listed(missing)}; copy them there")
+        present = {shot.name: shot.image for shot in found.shots if shot.image.is_file()}
+        origin = "COLMAP's" if found.origin == folder else found.origin.relative_to(folder).as_posix()
+        return present, origin, {shot.name: shot.mask for shot in found.shots if shot.mask is not None}
+    images = folder / "images"
+    if images.is_dir():
+        return {path.relative_to(images).as_posix(): path for path in images_in(images, deep=True)}, None, {}
+    alone = images_in(folder, deep=False) if kind == "photographs" else []
+    return {path.name: path for path in alone}, None, {}
+
+
+def _masked(folder: Path, names: dict[str, Path], masks: dict[str, Path], problems: list[str]) -> int:
+    """Return how many photographs have a mask, and add to `problems` the masks that belong to none."""
+    places = {name: [*mask_names(name, folder), *([masks[name]] if name in masks else [])] for name in names}
+    known = {path for each in places.values() for path in each}
+    strange = [path for path in images_in(folder / "masks", deep=True) if path not in known]
+    if strange:
+        shown = listed([path.relative_to(folder).as_posix() for path in strange])
+        problems.append(
+            f"{counted(len(strange), 'mask')} without a photograph of that name: {shown}; a mask is masks/NAME.png"
+        )
+    masked = sum(any(path.is_file() for path in each) for each in places.values())
+    return len(names) if not masked and _have_alpha(list(names.values())) else masked
+
+
+def _have_alpha(photographs: Sequence[Path]) -> bool:
+    """Return whether the first photograph has an alpha channel, by its header."""
+    try:
+        with Image.open(photographs[0]) as picture:
+            return "A" in picture.getbands()
+    except (IndexError, OSError, Image.DecompressionBombError):
+        return False

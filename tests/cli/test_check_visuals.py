@@ -1,0 +1,97 @@
+"""`avmsf check` says what shows the object, what is wrong with it, and which command uses it."""
+
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from avmsf.capture import CaptureSettings
+from avmsf.cli import main
+from avmsf.cli.visuals import VisualInputs, visual_inputs
+from capture_folder import fill
+from small_scene import write_surface_file
+from views_folder import frames, ring, write_image, write_transforms
+
+Streams = pytest.CaptureFixture[str]
+
+
+def found(folder: Path) -> VisualInputs:
+    visual = visual_inputs(folder, CaptureSettings())
+    assert visual is not None
+    return visual
+
+
+def test_photographs_with_cameras_and_masks(tmp_path: Path) -> None:
+    write_transforms(tmp_path, frames(ring(4)))
+    assert found(tmp_path) == VisualInputs(4, "transforms.json", 0, None, None, None, ())
+    for name in "abcd":
+        write_image(tmp_path / "masks" / f"{name}.png")
+    assert found(tmp_path).masks == 4
+    assert found(tmp_path).problems == ()
+
+
+def test_masks_and_camera_files_that_name_no_photograph(tmp_path: Path) -> None:
+    write_transforms(tmp_path, frames(ring(4)))
+    write_image(tmp_path / "masks" / "e.png")
+    (tmp_path / "images" / "b.png").unlink()
+    visual = found(tmp_path)
+    missing, mask = visual.problems
+    assert "b.png" in missing
+    assert "masks/e.png" in mask
+    assert (visual.photographs, visual.masks) == (3, 0)
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_photographs_alone_need_structure_from_motion(
+    tmp_path: Path, installed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in "abc":
+        write_image(tmp_path / "images" / f"{name}.jpg")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object() if installed else None)
+    visual = found(tmp_path)
+    assert (visual.photographs, visual.cameras, visual.masks) == (3, None, 0)
+    assert len(visual.problems) == (not installed)
+
+
+def test_a_mesh_video_and_gaussians_are_named(tmp_path: Path) -> None:
+    (tmp_path / "splats.ply").touch()
+    (tmp_path / "turn.mp4").touch()
+    assert found(tmp_path) == VisualInputs(0, None, 0, "turn.mp4", None, "splats.ply", ())
+    assert found(tmp_path).reconstructs
+    write_surface_file(tmp_path)
+    # Pictures next to a mesh may be its textures.
+    assert found(tmp_path).mesh is not None
+    assert found(tmp_path).photographs == 0
+    assert not found(tmp_path).reconstructs
+
+
+def test_what_cannot_be_used_is_a_problem(tmp_path: Path) -> None:
+    (tmp_path / "one.mp4").touch()
+    (tmp_path / "two.mp4").touch()
+    assert len(found(tmp_path).problems) == 1
+    (tmp_path / "transforms.json").write_text("{}")
+    assert "transforms.json" in found(tmp_path).problems[0]
+
+
+@pytest.mark.parametrize("pictured", [True, False])
+def test_the_report_has_them_and_leads_to_the_command_that_uses_them(
+    tmp_path: Path, capsys: Streams, pictured: bool
+) -> None:
+    folder = fill(tmp_path / "cup")
+    if pictured:
+        write_transforms(folder, frames(ring(4)))
+        write_image(folder / "masks" / "e.png")
+    assert main(["check", str(folder)]) == 0
+    out, err = capsys.readouterr()
+    (line,) = [line for line in out.splitlines() if line.startswith("the object is shown by: ")]
+    assert ("4 photographs" in line) == pictured
+    following = f"avmsf reconstruct {folder} -o {folder}.safetensors" if pictured else f"avmsf modes {folder}"
+    assert err.splitlines()[-1] == f"next: {following}"
+    # The mask without a photograph counts as a warning.
+    assert out.splitlines()[-1] == ("readable, with 1 warning" if pictured else "no problem found")
+    assert main(["check", str(folder), "--json"]) == 0
+    report: dict[str, Any] = json.loads(capsys.readouterr().out)
+    assert report["visual_inputs"]["photographs"] == 4 * pictured
+    assert len(report["visual_inputs"]["problems"]) == pictured
