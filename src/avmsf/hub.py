@@ -2,7 +2,7 @@
 
 from pathlib import Path
 from typing import Any
-from urllib.error import HTTPError
+from urllib.error import HTTPError, URLError
 from urllib.request import Request, urlopen
 
 from avmsf._utils.text_files import read_json
@@ -34,6 +34,15 @@ def expect_answer(name: str, file: str) -> None:
         refusal.close()
         if refusal.code >= 500:
             raise
+
+
+def why_not(error: Exception) -> str:
+    """Return in plain words why a model could not be downloaded."""
+    if isinstance(error, HTTPError):
+        return f"the server answered with code {error.code}"
+    if isinstance(error, URLError | ConnectionError | TimeoutError):
+        return "the server cannot be reached"
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)[:200].rstrip(".")
 
 
 def read_settings(path: Path, *, raising: type[AvmsfError]) -> dict[str, Any]:

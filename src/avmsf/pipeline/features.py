@@ -53,8 +53,7 @@ def choose_encoder(config: LiftConfig, *, tell: Callable[[str], None], device: s
     try:
         return DinoEncoder.load(DINO, longest=config.longest, device=place)
     except SceneError as error:
-        reason = str(error).partition(";")[0]
-        tell(f"encoder: the built-in descriptors, since {DINO} is not available ({reason})")
+        tell(f"encoder: the built-in descriptors are used in place of DINOv2 ({error})")
         return ImageDescriptors()
 
 

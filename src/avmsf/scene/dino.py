@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from avmsf.errors import SceneError
-from avmsf.hub import HUB_SECONDS, expect_answer, read_settings
+from avmsf.hub import HUB_SECONDS, expect_answer, read_settings, why_not
 from avmsf.scene.encode import unit_image
 
 MODELS: Final = tuple(
@@ -137,7 +137,7 @@ def _from_hub(name: str) -> Path:
         paths = [hf_hub_download(name, file, etag_timeout=HUB_SECONDS) for file in wanted]
     except Exception as error:  # the hub's client raises whatever the network beneath it does
         raise SceneError(
-            f"{name}: expected a cached or downloadable model, got {type(error).__name__}: {error}; save {_CONFIG}, "
+            f"{name}: expected its weights, got none: they could not be downloaded ({why_not(error)}); save {_CONFIG}, "
             f"{_WEIGHTS} and {_PREPROCESSOR} from https://huggingface.co/{name}/tree/main in one FOLDER and use "
             "--encoder FOLDER, or use --encoder descriptors, which needs no download",
             name="encoder",

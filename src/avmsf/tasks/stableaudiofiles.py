@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from avmsf.errors import EditError
-from avmsf.hub import expect_answer, is_hub_name, read_settings
+from avmsf.hub import expect_answer, is_hub_name, read_settings, why_not
 from avmsf.tasks.config import STABLE_AUDIO
 
 """The model that the paper edits with, by its name on the hub."""
@@ -100,8 +100,8 @@ def _from_hub(kind: Any, name: str) -> Path:
         return Path(kind.download(name))
     except Exception as error:  # the hub's client raises whatever the network beneath it does
         raise EditError(
-            f"{name}: the model is not in the cache, and its download failed ({type(error).__name__}: "
-            f"{_first_line(error)}); accept the license at https://huggingface.co/{name}, create a token at "
+            f"{name}: the model is not in the cache, and its download failed ({why_not(error)}); "
+            f"accept the license at https://huggingface.co/{name}, create a token at "
             "https://huggingface.co/settings/tokens and run hf auth login; or, on a computer with a network, run "
             f"hf download {name} --local-dir FOLDER --exclude 'model.*', copy FOLDER here and give its path",
             name="source",
@@ -172,10 +172,6 @@ def _expect_weights(folder: Path, network: nn.Module) -> None:
             name="weights",
             value=tuple(missing),
         )
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [""])[0][:200].rstrip(".")
 
 
 def _pipeline_class() -> Any:
