@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import shlex
 import warnings
 from pathlib import Path
 
@@ -178,6 +179,20 @@ def test_other_formats_say_their_size(to: str, name: str, field_file: Path, tmp_
     assert f"{to}, {size / 1e6:.3g} MB, one file" in capsys.readouterr().out
     # Its own is written again.
     assert main(words) == 0
+
+
+def test_a_sample_set_names_its_instrument(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
+    output = tmp_path / "samples"
+    words = ["export", str(field_file), "--to", "wavs", "--output", str(output), "--points", "2", "--seconds", "0.05"]
+    assert main([*words, "--json"]) == 0
+    out, err = capsys.readouterr()
+    instrument = output / "instrument.sfz"
+    assert json.loads(out)["instrument"] == str(instrument)
+    assert str(instrument) in err
+    # One force is one velocity layer; the command that makes several can be run as it is.
+    following = shlex.split(err.splitlines()[-1].removeprefix("next: avmsf "))
+    assert main([*following, "--points", "2", "--seconds", "0.05"]) == 0
+    assert instrument.read_text().count("<region>") == 6
 
 
 def test_a_page_is_a_folder_or_one_file(field_file: Path, tmp_path: Path, capsys: Streams) -> None:

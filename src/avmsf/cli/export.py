@@ -1,8 +1,10 @@
 """`avmsf export`: a field in the formats of other tools."""
 
+import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -23,7 +25,7 @@ from avmsf.export.modaldemo import SCENE, is_demo, read_demo, write_demo
 from avmsf.export.objectfile import holds_gaussians, read_object
 from avmsf.export.sampledfield import SampledField, spread_rows
 from avmsf.export.universal import write_universal
-from avmsf.export.wavgrid import Grid, Layer, write_grid
+from avmsf.export.wavgrid import INSTRUMENT, Grid, Layer, write_grid
 from avmsf.export.webpage import write_webpage
 from avmsf.export.written import Written, expect_free, write_file
 from avmsf.field.soundfield import SoundField
@@ -49,7 +51,7 @@ def run(options: Options) -> int:
     largest = max(written.sizes, key=lambda path: written.sizes[path])
     files = f"{len(written.sizes)} files, the largest {largest.name}" if len(written.sizes) > 1 else "one file"
     text = f"wrote {options.output}: {options.to}, {written.size / 1e6:.3g} MB, {files}"
-    values = {
+    values: dict[str, Any] = {
         "output": str(options.output),
         "format": options.to,
         "bytes": written.size,
@@ -57,8 +59,15 @@ def run(options: Options) -> int:
         "files": {str(path): size for path, size in written.sizes.items()},
         "notes": list(written.remarks),
     }
+    if options.to == "wavs":
+        instrument = options.output / INSTRUMENT
+        text += f"; any SFZ player opens {instrument}"
+        values["instrument"] = str(instrument)
     print_result(text, values, json=options.json)
-    if options.field.is_file():
+    if options.to == "wavs" and len(options.forces) == 1:
+        layered = f"--to wavs --output {shlex.quote(str(options.output))} --forces 0.3 1 3"
+        next_command("avmsf export", options.field, layered)
+    elif options.field.is_file():
         next_command("avmsf studio", options.field)
     return 0
 
