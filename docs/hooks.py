@@ -108,7 +108,7 @@ def _command_page(verb: str, text: str) -> str:
         indent = len(line) - len(line.lstrip())
         if _RULE.match(line):
             continue
-        if indent <= 1 and (_RULE.match(following) or words.endswith(":")) and words.islower():
+        if indent <= 1 and words and (_RULE.match(following) or (words.endswith(":") and words.islower())):
             page += ["", f"## {words.strip(':').capitalize()}", ""]
             described = False
         elif 0 < indent <= 4 and (words.startswith("-") or re.match(r"[A-Z{\[]\S*[^.\s](  |$)", words)):

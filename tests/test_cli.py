@@ -84,7 +84,7 @@ def test_a_verbs_help_starts_with_the_sentence_that_the_list_has(verb: str, caps
     with pytest.raises(SystemExit) as ended:
         main([verb, "--help"])
     assert ended.value.code == 0
-    told = " ".join(capsys.readouterr().out.split())
+    told = " ".join(capsys.readouterr().out.replace("│", "").split())
     assert f"usage: avmsf {verb}" in told
     # The list ends the sentence where a verb's own help may go on after a colon.
     assert VERBS[verb].rstrip(".") in told

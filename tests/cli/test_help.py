@@ -22,6 +22,8 @@ def test_help_fills_the_terminal_and_states_only_defaults_that_say_something(
     assert left.value.code == 0
     page = capsys.readouterr().out
     assert max(map(len, page.splitlines())) <= COLUMNS
+    assert not re.search(r"╭─ [\w -]+ options", page)
+    assert {len(line) for line in page.splitlines() if line[:1] in "╭╰│" and line} <= {COLUMNS}
     assert not re.search(r"\(default: (None|False|True)?\)|\[[A-Z]+ \[|\bINT\b|\bFLOAT\b|\bWhether\b", page)
 
 

@@ -24,8 +24,12 @@ from tyro.constructors import StructConstructorSpec, StructFieldSpec, StructType
 
 _WIDEST = 129
 """Columns of help: in wider ones tyro sets its boxes side by side."""
-_BOX = re.compile("[│╭╰]")
-"""Lines that tyro has filled."""
+_BOX = re.compile(r"[│╭╰]|^ [\w-]+ options *$")
+"""Lines that tyro has filled, and titles where the output cannot have boxes."""
+_TITLE = re.compile(r"(?<=[ m])([A-Za-z][\w-]*)((?:\x1b\[[\d;]*m)*) options(?=.*╮| *$)")
+"""The title that tyro gives to a group of options; on a terminal, its words have colors."""
+_TITLES = {"splat": "Gaussians", "lift": "features", "body": "bodies", "guided-edit": "guided edits"}
+"""What groups of options set, where it is not what their prefix says."""
 _NAMES: dict[object, str] = {int: "N", float: "NUMBER", str: "TEXT", Path: "FILE"}
 
 
@@ -38,8 +42,8 @@ class _Page(io.StringIO):
 
     @property
     def encoding(self) -> str:  # type: ignore[override]
-        """How its text is encoded, which decides what boxes are drawn with."""
-        return self.stream.encoding
+        """How its text is encoded, which decides what boxes are drawn with: tyro knows utf-8 in lower case alone."""
+        return (self.stream.encoding or "").lower()
 
     def isatty(self) -> bool:
         """Return whether it goes to a terminal."""
@@ -65,7 +69,17 @@ def one_column() -> Iterator[None]:
         if before is not None:
             os.environ["COLUMNS"] = before
         for line in re.sub(r"\n{3,}", "\n\n", page.getvalue()).splitlines():
-            print(line if _BOX.search(line) else textwrap.fill(line, width))
+            print(_with_title(line.rstrip()) if _BOX.search(line) else textwrap.fill(line, width))
+
+
+def _with_title(line: str) -> str:
+    """Return a line of a box, in which the title of a group of options is the noun for what they set."""
+    found = _TITLE.search(line)
+    if found is None:
+        return line
+    title = _TITLES.get(found[1], found[1].replace("-", " "))
+    filled = "─" * (len(f"{found[1]} options") - len(title))
+    return line.replace(found[0], title + found[2], 1).replace("╮", f"{filled}╮")
 
 
 def described_fields(info: StructTypeInfo) -> StructConstructorSpec | None:
