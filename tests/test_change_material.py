@@ -203,7 +203,7 @@ def test_modes_without_a_tone_are_mute_and_named_and_stay_where_they_are():
     assert torch.equal(gains_of(found, CONTACTS).abs().amax((0, 1)) == 0, dead)
     told = found.origin.report["edits"][-1]
     assert told["overdamped_hertz"] == field.bank.frequency[dead].tolist()
-    assert f"{int(dead.sum())} of {len(dead)} modes are overdamped" in told["remarks"][0]
+    assert f"{int(dead.sum())} of {len(dead)} modes overdamped" in told["remarks"][0]
     assert bool(torch.isfinite(found.render(CONTACTS)).all())
     back = change_material(found, lossy, GLASS)
     for name in ("frequency", "damping"):

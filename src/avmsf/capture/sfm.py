@@ -25,6 +25,7 @@ from avmsf.capture.views.pictures import Picture, PictureSizeError, read_mask, r
 from avmsf.capture.warning import Remark
 from avmsf.errors import CaptureError
 from avmsf.files import unwritable
+from avmsf.wording import counted
 
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 WORKER = Path(__file__).with_name("sfm_worker.py")
@@ -321,7 +322,7 @@ def _refuse_few(models: Sequence[dict[str, Any]], everything: Sequence[str], *, 
 def _remarks(models: Sequence[dict[str, Any]], lost: Sequence[str], missing: Sequence[str]) -> list[Remark]:
     remarks = []
     if lost:
-        message = f"{len(lost)} images cannot be read and are not used: {_some(lost)}"
+        message = f"{counted(len(lost), 'image')} not used, as they cannot be read: {_some(lost)}"
         remarks.append(Remark(message, name="unreadable images", value=lost))
     # Groups overlap: an image may belong to several that could not be joined.
     kept = set(models[0]["names"])
@@ -337,7 +338,7 @@ def _remarks(models: Sequence[dict[str, Any]], lost: Sequence[str], missing: Seq
     apart = {name for names in others for name in names}
     unseen = [name for name in missing if name not in apart and name not in lost]
     if unseen:
-        message = f"{len(unseen)} images got no camera: {_some(unseen)}"
+        message = f"no camera was found for {counted(len(unseen), 'image')}: {_some(unseen)}"
         remarks.append(Remark(message, name="cameras", value=unseen))
     return remarks
 

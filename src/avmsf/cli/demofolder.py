@@ -9,6 +9,7 @@ from avmsf._utils.locks import write_lock
 from avmsf._utils.text_files import read_json
 from avmsf.cli.options.checks import OutputError
 from avmsf.files import way_out
+from avmsf.wording import counted
 
 FORMAT = "avmsf demo 1"
 """Format of the folder in `demo.json`."""
@@ -91,8 +92,8 @@ def _expect_own(folder: Path) -> None:
     if foreign:
         shown = ", ".join(foreign[:_SHOWN]) + (", ..." if len(foreign) > _SHOWN else "")
         raise OutputError(
-            f"{folder}: expected an empty folder or an earlier demo, got {len(foreign)} files that no demo wrote "
-            f"({shown}); choose another folder, or move them away",
+            f"{folder}: expected an empty folder or an earlier demo, got {counted(len(foreign), 'file')} that no demo "
+            f"wrote ({shown}); choose another folder, or move them away",
             file=folder,
             value=foreign,
         )

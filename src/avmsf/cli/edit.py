@@ -26,6 +26,7 @@ from avmsf.field.store import load, save
 from avmsf.plotting.edits import draw_clap_curves
 from avmsf.tasks.edits import EDITS, remarks, silenced
 from avmsf.tasks.modes import adjust_modes
+from avmsf.wording import counted
 
 _LISTED = 20
 """Modes in the table, those of most energy."""
@@ -223,6 +224,8 @@ def _table(before: HeardModes, after: HeardModes) -> Table:
         ]
         for row in (rows[place] for place in listed)
     ]
-    title = f"{len(rows)} modes" if len(rows) <= _LISTED else f"the {_LISTED} modes of most energy among {len(rows)}"
+    title = (
+        counted(len(rows), "mode") if len(rows) <= _LISTED else f"the {_LISTED} modes of most energy among {len(rows)}"
+    )
     columns = ["before (Hz)", "after (Hz)", "T60 before (s)", "T60 after (s)", "level change (dB)"]
     return table(f"{title}, before and after", columns, cells, words=0)

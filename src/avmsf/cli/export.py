@@ -34,6 +34,7 @@ from avmsf.pipeline.reconstruct import SURFACE
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import read_splats
 from avmsf.tasks.edits import EDITS
+from avmsf.wording import counted
 
 
 def run(options: Options) -> int:
@@ -93,7 +94,7 @@ def _sampled(field: SoundField | SampledField, options: Options) -> SampledField
     else:
         sampled, held = field if len(field) <= most else field.take(field.spread(most)), len(field)
     if len(sampled) < held and options.points is None:
-        say(f"note: {len(sampled)} of the field's {held} contacts are written; --points sets the number")
+        say(f"note: written: {len(sampled)} of the field's {counted(held, 'contact')}; --points sets the number")
     return sampled
 
 

@@ -183,7 +183,7 @@ def summary(fitted: SoundField, contacts: int) -> str:
             "leave-one-out)"
         )
     return (
-        f"field of {fitted.origin.capture}: {len(fitted.bank)} modes from {counted(contacts, 'recording')}, gains by "
-        f"{gains}, {report.get('damping', 'shared')} damping{reason}, "
-        f"{report.get('steps', fitted.origin.config.steps)} steps end to end"
+        f"field of {fitted.origin.capture}: {counted(len(fitted.bank), 'mode')} from "
+        f"{counted(contacts, 'recording')}, gains by {gains}, {report.get('damping', 'shared')} damping{reason}, "
+        f"{counted(report.get('steps', fitted.origin.config.steps), 'step')} end to end"
     )

@@ -31,6 +31,7 @@ from avmsf.field.uncertainty import has_posterior, relative_gain_std, spectrum_b
 from avmsf.pipeline.record import RECORD
 from avmsf.scene.featureheader import holds_features
 from avmsf.scene.points import farthest_points
+from avmsf.wording import counted
 
 _DRAWN_POINTS = 4000
 _DRAWN_CONTACTS = 4
@@ -56,7 +57,7 @@ def run(options: Options) -> int:
     values = describe(field)
     screen = console(errors=options.json)
     screen.print(_words(values, quality_words(field, options.file)), soft_wrap=True)
-    screen.print(mode_table(f"{len(rows)} modes, levels on average over the object", rows))
+    screen.print(mode_table(f"{counted(len(rows), 'mode')}, levels on average over the object", rows))
     recorded = None
     if options.capture is not None:
         settings = None if options.settings is None else CaptureSettings.read(options.settings)
@@ -64,7 +65,7 @@ def run(options: Options) -> int:
         recorded, what = _held_out(read_capture(options.capture, settings).impacts, field)
         recorded = field.aligned(recorded)
         scores = {"field": evaluate(Fitted(field, recorded.sounds.shape[1]), recorded)}
-        screen.print(score_table(f"{len(recorded)} contacts, {what}; lower is better", scores))
+        screen.print(score_table(f"{counted(len(recorded), 'contact')}, {what}; lower is better", scores))
         values |= {"compared_with": {"recordings": list(recorded.names), "which": what, "scores": score_values(scores)}}
     if options.plots is not None:
         doing("drawing the figures")
@@ -132,7 +133,7 @@ def draw_field(
     """Write the figures of a field, with some of the recordings `recorded` next to its sounds."""
     name = field.origin.capture or "field"
     pictures = {
-        "modes": draw_modes(field.bank, level, title=f"{len(field.bank)} modes of {name}"),
+        "modes": draw_modes(field.bank, level, title=f"{counted(len(field.bank), 'mode')} of {name}"),
         "gains": draw_gains(points, gains, field.bank.frequency, title=f"gains of the strongest modes of {name}"),
     }
     if recorded is not None:
@@ -181,9 +182,8 @@ def _gains_words(gains: dict[str, Any]) -> str:
         return f"attention network on features: {gains['encoder']}"
     if gains.get("inner", gains["kind"]) == BodyGains.kind:
         return "computed without recordings: mode shapes of a body, each times its level"
-    return (
-        f"Gaussian process over {', '.join(dict.fromkeys(gains['families']))} kernels, by {gains['contacts']} contacts"
-    )
+    families = ", ".join(dict.fromkeys(gains["families"]))
+    return f"Gaussian process over {families} kernels, by {counted(gains['contacts'], 'contact')}"
 
 
 def _words(values: dict[str, Any], quality: list[str]) -> str:
@@ -198,7 +198,7 @@ def _words(values: dict[str, Any], quality: list[str]) -> str:
         f"  noise      {values['residual_rms']:.2g} (root mean square of the residual)",
         f"  object     {values['points']} points, {extent} m",
         f"  gains      {_gains_words(values['gain_field'])}",
-        f"  fitted to  {len(values['trained_on'])} recordings",
+        f"  fitted to  {counted(len(values['trained_on']), 'recording')}",
     ]
     lines += [] if "guess" in report else _pipeline_lines(values["pipeline"])
     lines += [f"  quality    {words}" for words in quality]
@@ -229,7 +229,9 @@ def _pipeline_lines(pipeline: dict[str, Any]) -> list[str]:
         )
     learned = f"{fit['clusters']} clusters, {fit['warmup_steps']} steps of warm-up, "
     network = pipeline.get("gain_model") == NETWORK
-    lines.append(f"  fit        {learned if network else ''}{fit['steps']} steps end to end, seed {fit['seed']}")
+    lines.append(
+        f"  fit        {learned if network else ''}{counted(fit['steps'], 'step')} end to end, seed {fit['seed']}"
+    )
     return lines
 
 

@@ -22,6 +22,7 @@ from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import read_splats
 from avmsf.scene.start import ZEROTH
 from avmsf.scene.symmetry import Symmetries
+from avmsf.wording import counted
 
 _UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
@@ -32,7 +33,7 @@ def describe_cloud(options: Options) -> dict[str, Any]:
     extent = (cloud.centers.amax(0) - cloud.centers.amin(0)).tolist()
     screen = console(errors=options.json)
     sides = " x ".join(f"{side:.3g}" for side in extent)
-    screen.print(f"{options.file}: {len(cloud)} Gaussians, {sides} m", soft_wrap=True)
+    screen.print(f"{options.file}: {counted(len(cloud), 'Gaussian')}, {sides} m", soft_wrap=True)
     if options.plots is not None:
         _draw_cloud(cloud, options, options.plots)
     return {"kind": "gaussians", "file": str(options.file), "count": len(cloud), "extent_meters": extent}
@@ -54,7 +55,7 @@ def describe_features(options: Options) -> dict[str, Any]:
 
 def _draw_cloud(cloud: GaussianCloud, options: Options, folder: Path) -> None:
     colors = plain_colors(cloud)
-    title = f"{options.file.name}: {len(cloud)} Gaussians"
+    title = f"{options.file.name}: {counted(len(cloud), 'Gaussian')}"
     _write(draw_cloud(cloud.centers, {"color": colors}, title=title, up=_UP[options.up]), folder / "cloud.png")
     _turn(cloud.centers, colors, options.up, folder)
 

@@ -34,18 +34,20 @@ def run(options: Options) -> int:
     quality = measure_quality(extraction.aligned(impacts).sounds, extraction, sample_rate=impacts.sample_rate)
     every = list(zip(rows, quality_rows(quality), quality.is_mode.tolist(), strict=True))
     modes, supporting = ([(row, how) for row, how, is_mode in every if is_mode is part] for part in (True, False))
-    title = f"{len(modes)} modes of {capture.name}, {len(impacts)} recordings"
+    title = f"{counted(len(modes), 'mode')} of {capture.name}, {counted(len(impacts), 'recording')}"
     screen = console(errors=options.json)
     screen.print(quality_table(title, modes))
     if supporting:
-        screen.print(quality_table(f"{len(supporting)} supporting poles: in the model, but not modes", supporting))
+        screen.print(
+            quality_table(f"{counted(len(supporting), 'supporting pole')}: in the model, but not modes", supporting)
+        )
     screen.print(_EXPLANATION)
     aligned = AlignmentReport.of(extraction, impacts)
     for sentence in [] if aligned is None else aligned.sentences():
         screen.print(sentence, soft_wrap=True)
     if options.plots is not None:
         picture = options.plots / "modes.png"
-        drawn = f"{len(rows)} poles of {capture.name}, {len(modes)} of them modes"
+        drawn = f"{counted(len(rows), 'pole')} of {capture.name}, of them {counted(len(modes), 'mode')}"
         save_picture(draw_modes(extraction.bank, level, title=drawn), picture)
         say(f"wrote {picture}")
     if options.json:

@@ -14,6 +14,7 @@ from avmsf.field.fit import Progress as FitProgress
 from avmsf.pipeline.scene import Listener
 from avmsf.scene.lift import LiftProgress
 from avmsf.scene.splat import SplatProgress
+from avmsf.wording import counted
 
 REFINEMENT = "refinement"
 """Name of the stage that the steps of a fit are."""
@@ -77,7 +78,7 @@ class OverallBar:
     def fitting(self, progress: FitProgress) -> None:
         """Take note of a step of the refinement, which follows the solution for the gains."""
         if self._stage != REFINEMENT and REFINEMENT in self.stages:
-            self.tell(f"{REFINEMENT}: {progress.steps} steps")
+            self.tell(f"{REFINEMENT}: {counted(progress.steps, 'step')}")
         doing(f"fit: step {progress.step} of {progress.steps}")
         self._advance(progress.step / progress.steps)
 

@@ -8,6 +8,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from avmsf.cli.heartbeat import doing, verbosity
 from avmsf.cli.printing import console, figure, say
 from avmsf.field.fit import Progress as FitProgress
+from avmsf.wording import counted
 
 
 class FitBar:
@@ -50,6 +51,6 @@ class FitBar:
         if self.live:
             self.bar.update(self.task, completed=step, loss=figure(progress.loss))
         elif step == steps:
-            say(f"{stage}: {steps} steps, loss {figure(progress.loss)}")
+            say(f"{stage}: {counted(steps, 'step')}, loss {figure(progress.loss)}")
         else:
             doing(f"{stage}: step {step} of {steps}, loss {figure(progress.loss)}")

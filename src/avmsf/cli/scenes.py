@@ -12,6 +12,7 @@ from avmsf.config import SceneConfig
 from avmsf.pipeline.scene import SceneStages
 from avmsf.pipeline.stages import Kept, StageFolder
 from avmsf.scene.symmetry import Symmetries
+from avmsf.wording import counted
 
 
 @contextmanager
@@ -44,7 +45,9 @@ def features_words(report: Mapping[str, Any]) -> str:
         f"consistency of the views {100 * report['agreement']:.0f} % of the features' variance"
     ]
     if report.get("dropped"):
-        lines.append(f"removed: {report['dropped']} Gaussians inside the object or behind its surface in the views")
+        lines.append(
+            f"removed: {counted(report['dropped'], 'Gaussian')} inside the object or behind its surface in the views"
+        )
     if "symmetries" in report:
         lines.append(Symmetries.from_dict(report["symmetries"]).summary())
     if "orbit_spread" in report:

@@ -8,6 +8,7 @@ from avmsf.cli.scenes import opened_scene, stage_line
 from avmsf.config import SceneConfig
 from avmsf.files import copy_whole
 from avmsf.scene.ply import read_splats
+from avmsf.wording import counted
 
 
 def run(options: Options) -> int:
@@ -22,7 +23,7 @@ def run(options: Options) -> int:
     except KeyboardInterrupt:
         say("avmsf splat: interrupted; repeat the command to continue")
         return INTERRUPTED
-    lines = [f"{gaussians} Gaussians", *(stage_line(name, kept) for name, kept in scene.made().items())]
+    lines = [counted(gaussians, "Gaussian"), *(stage_line(name, kept) for name, kept in scene.made().items())]
     if options.output is not None:
         lines.append(f"wrote {options.output}")
     path = options.output or cloud.path

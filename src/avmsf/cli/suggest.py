@@ -18,6 +18,7 @@ from avmsf.cli.writing import write_text
 from avmsf.field.store import load
 from avmsf.field.suggest import Suggestions, suggest
 from avmsf.field.uncertainty import relative_gain_std, unedited_mixture
+from avmsf.wording import counted
 
 _DRAWN_POINTS = 4000
 
@@ -85,7 +86,9 @@ def _print_table(found: Suggestions, rows: Sequence[dict[str, Any]], screen: Con
         soft_wrap=True,
     )
     if found.unreachable:
-        screen.print(f"left out: {found.unreachable} positions that no hammer reaches from outside", soft_wrap=True)
+        screen.print(
+            f"left out: {counted(found.unreachable, 'position')} that no hammer reaches from outside", soft_wrap=True
+        )
 
 
 def _rows(found: Suggestions, names: Sequence[str] | None) -> list[dict[str, Any]]:

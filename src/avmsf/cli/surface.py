@@ -14,6 +14,7 @@ from avmsf.cli.scenes import opened_scene, stage_line
 from avmsf.config import SceneConfig
 from avmsf.files import write_whole
 from avmsf.pipeline.reconstruct import keep_surface, object_shape
+from avmsf.wording import counted
 
 
 def run(options: Options) -> int:
@@ -47,6 +48,6 @@ def surface_words(surface: Surface) -> str:
     """Return a message on a surface's size, and on whether it is closed."""
     mesh = trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=True)
     extent = " x ".join(f"{1000 * side:.3g}" for side in mesh.extents)
-    words = f"{len(surface.faces)} triangles, {extent} mm, area {1e4 * mesh.area:.3g} cm2"
+    words = f"{counted(len(surface.faces), 'triangle')}, {extent} mm, area {1e4 * mesh.area:.3g} cm2"
     closed = f"closed, volume {1e6 * mesh.volume:.3g} cm3" if mesh.is_watertight else "not closed"
     return f"{words}, {closed}"

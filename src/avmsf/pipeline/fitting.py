@@ -80,7 +80,7 @@ def fit_capture(
         modes = extract_modes(train, finder_of(config))
     else:
         modes = extract_once(train, finder_of(config), unfinished(output, "modes"))
-    log(f"fitting a field of {len(modes.bank)} modes")
+    log(f"fitting a field of {counted(len(modes.bank), 'mode')}")
     try:
         fitted = fit(
             train,

@@ -139,7 +139,7 @@ def _reconstruct(
         gains = estimator_for(
             config.gain_model, bodies, symmetries=shape.symmetries, features=shape.features, log=listener.tell
         )
-        listener.tell(f"fit: a field of {len(modes.bank)} modes")
+        listener.tell(f"fit: a field of {counted(len(modes.bank), 'mode')}")
         fitted = fit(
             train,
             shape.features if config.gain_model == Visual.kind else shape.points,

@@ -28,6 +28,7 @@ from avmsf.scene.ply import read_splats, write_splats
 from avmsf.scene.rasterizer import choose_rasterizer
 from avmsf.scene.splat import SplatProgress, splat
 from avmsf.scene.start import StartPoints
+from avmsf.wording import counted
 
 CLOUD, FEATURES = "cloud.ply", "features.safetensors"
 """What the stages call their outputs."""
@@ -106,7 +107,7 @@ class SceneStages:
         start = self._start(views)
 
         def make(path: Path) -> None:
-            self.listener.tell(f"splat: {self.config.splat.steps} steps on {len(views)} views")
+            self.listener.tell(f"splat: {counted(self.config.splat.steps, 'step')} on {len(views)} views")
             cloud = splat(
                 views,
                 self.config.splat,
@@ -176,7 +177,7 @@ class SceneStages:
         if found is None:
             raise SceneError(
                 f"{where}: expected masks, or points of structure from motion, to initialize Gaussians, got "
-                f"{len(bare)} views without a mask ({bare[0]}, ...); give masks, or let them be computed",
+                f"{counted(len(bare), 'view')} without a mask ({bare[0]}, ...); give masks, or let them be computed",
                 file=where,
                 name="masks",
                 value=bare,

@@ -13,6 +13,7 @@ from avmsf.field.scaledgains import ScaledGains
 from avmsf.field.soundfield import SoundField
 from avmsf.field.uncertainty import scale_of
 from avmsf.modal.bank import ModalBank
+from avmsf.wording import counted
 
 EDITS = "edits"
 """Key of a field's report that lists its edits, in order."""
@@ -69,8 +70,9 @@ def remarks(entries: Sequence[Mapping[str, Any]], field: SoundField) -> list[str
     silent = field.bank.frequency[silenced(field)].tolist()
     if silent:
         words.append(
-            f"{len(silent)} of {len(field.bank)} modes, from {min(silent):.4g} Hz to {max(silent):.4g} Hz, are silent "
-            f"because they are not below half the sample rate of {field.sample_rate:g} Hz; lower them to restore them"
+            f"{len(silent)} of {counted(len(field.bank), 'mode')}, from {min(silent):.4g} Hz to {max(silent):.4g} Hz, "
+            f"{'is' if len(silent) == 1 else 'are'} silent because not below half the sample rate of "
+            f"{field.sample_rate:g} Hz; lower the pitch to restore them"
         )
     if not bool((field.audible & ~muted(field)).any()):
         words.append("no mode is audible, only residual noise; edit less")

@@ -20,6 +20,7 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.starts import latest_start
 from avmsf.errors import ArrayError, AvmsfError, CaptureError, LocationError
 from avmsf.field.soundfield import SoundField
+from avmsf.wording import counted
 
 Sound = str | Path | Recording | ArrayLike
 """The path of a sound file, a recording, or samples alone: [samples]."""
@@ -215,7 +216,7 @@ def at_field_rate(
     note = f"{recording.name} was resampled from {own:g} Hz to the field's {rate:g} Hz"
     left_out = int((frequency < 0.5 * rate).sum()) - held
     if left_out:
-        note += f"; {left_out} of the object's {len(frequency)} modes, above {highest:.4g} Hz, were left out"
+        note += f"; {left_out} of the object's {counted(len(frequency), 'mode')}, above {highest:.4g} Hz, left out"
     return torch.from_numpy(resampled.astype(np.float32)), highest, [note]
 
 

@@ -20,6 +20,7 @@ from avmsf.field.soundfield import Origin, SoundField
 from avmsf.modal.bank import ModalBank
 from avmsf.simulate.material import Material, material_named
 from avmsf.tasks.edits import EDITS, edited, muted
+from avmsf.wording import counted
 
 
 @dataclass(frozen=True)
@@ -131,8 +132,8 @@ def _remarks(old: Material, new: Material, bank: ModalBank, dead: Bool[Tensor, "
         )
     if bool(dead.any()):
         remarks.append(
-            f"{int(dead.sum())} of {len(bank)} modes are overdamped by alpha {new.alpha:g} 1/s and beta {new.beta:g} s "
-            "and stay silent: " + ", ".join(f"{each:.4g} Hz" for each in bank.frequency[dead].tolist())
+            f"{int(dead.sum())} of {counted(len(bank), 'mode')} overdamped by alpha {new.alpha:g} 1/s and beta "
+            f"{new.beta:g} s, and silent: " + ", ".join(f"{each:.4g} Hz" for each in bank.frequency[dead].tolist())
         )
     return remarks
 

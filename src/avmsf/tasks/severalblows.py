@@ -34,6 +34,7 @@ from avmsf.tasks.hearing import (
 from avmsf.tasks.locate import judged
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.posterior import Force
+from avmsf.wording import counted
 
 _BEFORE = 0.005
 """Seconds before a blow that are left out of what rang before it: it may begin a little earlier than it is found."""
@@ -98,7 +99,7 @@ def locate_blows(
     if not refused:
         return found
     times = ", ".join(f"{seconds:.3f}" for seconds, _ in refused)
-    left_out = f"{whole.name}: {len(refused)} impacts, at {times} s, could not be located: {refused[0][1]}"
+    left_out = f"{whole.name}: {counted(len(refused), 'impact')}, at {times} s, could not be located: {refused[0][1]}"
     return [(seconds, replace(each, notes=(*each.notes, left_out))) for seconds, each in found]
 
 

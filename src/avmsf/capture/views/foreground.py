@@ -16,6 +16,7 @@ from avmsf.capture.views.hull import carve, silhouette
 from avmsf.capture.views.shots import listed
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError
+from avmsf.wording import counted
 
 FEWEST = 3
 # Parts of a first mask smaller than this against its largest are taken for spots in the background.
@@ -219,6 +220,6 @@ def _masked(views: Sequence[View], masks: Sequence[np.ndarray]) -> tuple[View, .
             empty.append(view.name)
     _refuse_few([view.name for view in found], len(views))
     if empty:
-        message = f"{len(empty)} views without an object are not used: {listed(empty)}"
+        message = f"{counted(len(empty), 'view')} not used, without an object: {listed(empty)}"
         warnings.warn(CaptureWarning(message, name="object", value=empty), stacklevel=3)
     return tuple(found)

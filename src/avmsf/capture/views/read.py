@@ -14,6 +14,7 @@ from avmsf.capture.views.single import Findings, read_view
 from avmsf.capture.views.transforms import read_transforms
 from avmsf.capture.warning import Remark
 from avmsf.errors import CaptureError
+from avmsf.wording import counted
 
 FEWEST = 3
 
@@ -50,7 +51,7 @@ def read_views(
     findings = Findings(list(found.remarks))
     unused = without_camera(shots, base)
     if unused:
-        message = f"{len(unused)} images without a camera are not used: {listed(unused)}"
+        message = f"{counted(len(unused), 'image')} not used, without a camera: {listed(unused)}"
         findings.remarks.append(Remark(message, name="cameras", value=unused))
     views = []
     for done, shot in enumerate(shots, start=1):

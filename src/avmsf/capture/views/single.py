@@ -11,6 +11,7 @@ from avmsf.capture.views.pictures import Picture, PictureSizeError, read_mask, r
 from avmsf.capture.views.shots import Shot, listed, mask_places
 from avmsf.capture.warning import Remark
 from avmsf.errors import CaptureError
+from avmsf.wording import counted
 
 
 @dataclass
@@ -28,16 +29,16 @@ class Findings:
     def summary(self) -> list[Remark]:
         """Return one remark for each kind of finding; its name is the kind, its value the images."""
         kinds = (
-            ("missing images", "images are missing or corrupt and are not used", self.lost),
-            ("empty masks", "images have a mask without an object and are not used", self.empty),
-            ("image sizes", "images have another size than their cameras, whose intrinsics were scaled", self.resized),
-            ("orientations", "images were rotated by their orientation tag to fit their cameras", self.turned),
-            ("missing masks", "masks are missing or corrupt; their images are used without", self.unmasked),
-            ("mask sizes", "masks have another size than their images and were scaled", self.stretched),
+            ("missing images", "image", "missing or corrupt, not used", self.lost),
+            ("empty masks", "image", "with an empty mask, not used", self.empty),
+            ("image sizes", "image", "of another size than the camera, whose intrinsics were scaled", self.resized),
+            ("orientations", "image", "rotated by the orientation tag to fit the camera", self.turned),
+            ("missing masks", "mask", "missing or corrupt; the images are used without", self.unmasked),
+            ("mask sizes", "mask", "scaled from another size to that of the image", self.stretched),
         )
         return self.remarks + [
-            Remark(f"{len(images)} {message}: {listed(images)}", name=name, value=images)
-            for name, message, images in kinds
+            Remark(f"{counted(len(images), thing)} {message}: {listed(images)}", name=name, value=images)
+            for name, thing, message, images in kinds
             if images
         ]
 
