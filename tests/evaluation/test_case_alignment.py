@@ -6,12 +6,15 @@ from pathlib import Path
 import pytest
 import torch
 
+from avmsf.bench.baselines import NearestStrike
 from avmsf.bench.caserun import CaseRun
 from avmsf.bench.cases import Case
+from avmsf.bench.fieldmethods import FieldMethod
 from avmsf.bench.judging import Judging
 from avmsf.bench.methods import method_named
 from avmsf.bench.plan import Evaluation
 from avmsf.bench.protocols import PROTOCOLS
+from avmsf.bench.task import Task
 from avmsf.capture.datasets import CaptureCollection
 from avmsf.capture.impacts import Impacts
 from delayed_plate import ALIGNED, delays, distance, strikes, without_delays
@@ -21,7 +24,7 @@ COUNT, TRAIN = 16, 12
 METHODS = ("nearest", "knn3", "knn-gains")
 
 
-def run_of(impacts: Impacts, folder: Path) -> CaseRun:
+def run_of(impacts: Impacts, folder: Path, own_starts: Impacts | None = None) -> CaseRun:
     methods = tuple(map(method_named, METHODS))
     judging = Judging(level="raw", cdpam=False)
     looks, bodies = PlateLooks(), NoBodies()
@@ -41,6 +44,7 @@ def run_of(impacts: Impacts, folder: Path) -> CaseRun:
         vertices=None,
         stranger=lambda: torch.zeros(impacts.sounds.shape[1]),
         listened=False,
+        own_starts=own_starts,
     )
 
 
@@ -48,12 +52,31 @@ def test_errors_of_baselines_do_not_depend_on_delays(tmp_path: Path) -> None:
     starts = delays(COUNT)
     run = run_of(strikes(COUNT, starts=starts), tmp_path / "delayed")
     found = [run.outcome(method) for method in run.evaluation.methods]
-    same = without_delays(run.impacts, run._modes(), starts)
+    same = without_delays(run.impacts, run.scored.modes(), starts)
     other = run_of(same, tmp_path / "exact")
     expected = [other.outcome(method) for method in run.evaluation.methods]
-    assert distance(run.train.sounds, other.train.sounds) < ALIGNED
-    assert distance(run.test.sounds, other.test.sounds) < ALIGNED
+    assert distance(run.scored.train.sounds, other.scored.train.sounds) < ALIGNED
+    assert distance(run.scored.test.sounds, other.scored.test.sounds) < ALIGNED
     for one, other_one in zip(found, expected, strict=True):
         assert one.failure is None
         for metric in ("relative_stft", "l1", "envelope"):
             assert one.values[metric] == pytest.approx(other_one.values[metric], rel=2 * ALIGNED), (one.method, metric)
+
+
+def test_fields_are_fitted_to_own_starts_and_all_are_scored_from_the_peaks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = strikes(COUNT, starts=delays(COUNT))
+    peaks = own.delayed(own.sounds.abs().argmax(1).double())
+    run, fitted = run_of(peaks, tmp_path, own), []
+
+    def fit(method: FieldMethod, task: Task) -> NearestStrike:
+        fitted.append(task.train.sounds)
+        return NearestStrike(task.train)
+
+    monkeypatch.setattr(FieldMethod, "fit", fit)
+    ours, published, nearest = (run.outcome(method_named(name)) for name in ("field-smooth", "paper", "nearest"))
+    assert ours.failure is None
+    assert torch.equal(fitted[0], run.own.modes().aligned(own.take(range(TRAIN))).sounds)
+    assert torch.equal(fitted[1], peaks.take(range(TRAIN)).sounds)
+    assert published.values["relative_stft"] == nearest.values["relative_stft"] != ours.values["relative_stft"]

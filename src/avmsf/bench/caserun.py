@@ -1,4 +1,4 @@
-"""One case of one object: every method learns from the same blows and is judged by the same others."""
+"""One case of one object: every method is fitted to the same impacts and scored on the same others."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -28,6 +28,7 @@ from avmsf.errors import AvmsfError, EvaluationError, ExtractionError
 from avmsf.fem.family import BodyFamily
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.modal.extraction.extract import Extraction, extract_once
+from avmsf.modal.extraction.finders import ModeFinder
 from avmsf.scene.features import FeatureField
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.simulate.truth import Truth
@@ -36,6 +37,31 @@ LISTENED = 3
 """Test contacts of an experiment whose sounds are kept to be listened to."""
 _RECORDED = "recorded"
 """What the recordings' own files are called beside the methods'."""
+
+
+class _Recordings:
+    """A case's recordings from one kind of start, aligned when first asked for, and their modes, kept in a file."""
+
+    def __init__(self, impacts: Impacts, case: Case, finder: ModeFinder, path: Path) -> None:
+        self.train, self.test = impacts.take(case.train), impacts.take(case.test)
+        self._finder, self._path = finder, path
+        self._found: Extraction | None = None
+
+    def modes(self) -> Extraction:
+        if self._found is None:
+            self._found = extract_once(self.train, self._finder, self._path)
+        return self._found
+
+    def align(self) -> None:
+        """Give all recordings the starts that the training ones have in common; without modes they keep their own."""
+        if self.train.before is None:
+            return
+        try:
+            modes = self.modes()
+        except ExtractionError:
+            self.train, self.test = (replace(each, before=None, after=None) for each in (self.train, self.test))
+        else:
+            self.train, self.test = modes.aligned(self.train), modes.aligned(self.test)
 
 
 class CaseRun:
@@ -58,29 +84,41 @@ class CaseRun:
         stranger: Callable[[], Float[Tensor, " samples"]],
         vertices: Float[Tensor, "vertices 3"] | None,
         listened: bool,
+        own_starts: Impacts | None = None,
     ) -> None:
-        """Prepare a case of an object; `place` is its own path beneath the results' folder."""
+        """Prepare a case of an object; `place` is its own path beneath the results' folder.
+
+        All methods are scored on `impacts`. Where these start at their peaks, `own_starts` are the same recordings with
+        the dataset's own starts, for fields that are not of the paper's configuration: from its peak a recording's
+        modes have phases of its own, which hide the signs of the gains.
+        """
         self.evaluation, self.identifier, self.case, self.impacts = evaluation, identifier, case, impacts
-        self.train, self.test = impacts.take(case.train), impacts.take(case.test)
-        self.truth = None if truth is None else truth_at(truth, self.test.names)
+        modes, finder = folder / "modes", evaluation.finder
+        self.scored = self.own = _Recordings(impacts, case, finder, modes / f"{place}.safetensors")
+        if own_starts is not None:
+            self.own = _Recordings(own_starts, case, finder, modes / f"{place} own starts.safetensors")
+        self.truth = None if truth is None else truth_at(truth, self.scored.test.names)
         self.folder, self.place, self.look, self.stranger = folder, place, look, stranger
         self.bodies, self.family, self.material, self.vertices = bodies, family, material, vertices
         self.listened = spread(len(case.test), LISTENED) if listened else []
         self.shared = 0.0
-        self.found: Extraction | None = None
 
     def outcome(self, method: Method) -> Outcome:
         """Return what a method comes to; whatever it raises, but for an interruption, is its failure."""
         begun, shared = time.perf_counter(), self.shared
+        settings = configured(method)
+        recordings = self.scored if settings is None or settings.published else self.own
         try:
-            self._align()
-            renderer = method.fit(self._task())
+            for each in (self.scored, recordings):
+                with self._sharing():
+                    each.align()
+            renderer = method.fit(self._task(recordings))
             fit_seconds = time.perf_counter() - begun - (self.shared - shared)
             begun = time.perf_counter()
             with torch.no_grad():
-                sounds = renderer.render(self.test.contacts, directions=self.test.directions)
+                sounds = renderer.render(recordings.test.contacts, directions=recordings.test.directions)
             render_seconds = time.perf_counter() - begun
-            judgement, maps = self._judgement(method, renderer, sounds)
+            judgement, maps = self._judgement(method, recordings, renderer, sounds)
         except AvmsfError as error:
             return Outcome(self.case.key, method.name, failure=one_line(error))
         except Exception as error:  # A fault in one method must not cost the others their hours.
@@ -99,37 +137,43 @@ class CaseRun:
 
     def described(self, known: CaseRecord) -> CaseRecord:
         """Return the case's record with the recordings' files, and with what modes and features have taken so far."""
-        sounds = known.sounds or self._keep_sounds(_RECORDED, self.test.sounds)
+        sounds = known.sounds or self._keep_sounds(_RECORDED, self.scored.test.sounds)
         seconds, self.shared = known.shared_seconds + self.shared, 0.0
         return replace(known, sounds=sounds, shared_seconds=round(seconds, 4))
 
     def _judgement(
-        self, method: Method, renderer: Renderer, sounds: Float[Tensor, "contacts samples"]
+        self, method: Method, recordings: _Recordings, renderer: Renderer, sounds: Float[Tensor, "contacts samples"]
     ) -> tuple[Judgement, dict[str, str]]:
         """Return the metrics, and the files of contacts' maps by the names of their recordings."""
         if not self.evaluation.protocol.locating:
             loudest = float(self.impacts.sounds.abs().max())
-            return self.evaluation.judging.judge(renderer, sounds, self.test, self.truth, loudest=loudest), {}
+            return self.evaluation.judging.judge(renderer, sounds, self.scored.test, self.truth, loudest=loudest), {}
         points, settings = self._shared(self.look)("positions").points, configured(method)
         published = settings is not None and settings.published
         found = located(
-            renderer, self.train, self.test, points, vertices=self.vertices, published=published, kept=self.listened
+            renderer,
+            recordings.train,
+            recordings.test,
+            points,
+            vertices=self.vertices,
+            published=published,
+            kept=self.listened,
         )
         maps = {}
         for row, each in found.maps.items():
             file = f"maps/{self.place}/{row:03d} {_file_word(method.name)}.safetensors"
-            write_map(self.folder / file, each, truth=self.test.contacts[row])
-            maps[self.test.names[row]] = file
+            write_map(self.folder / file, each, truth=recordings.test.contacts[row])
+            maps[recordings.test.names[row]] = file
         return Judgement(dict(found.errors), {}), maps
 
-    def _task(self) -> Task:
+    def _task(self, recordings: _Recordings) -> Task:
         return Task(
             name=self.identifier,
-            train=self.train,
+            train=recordings.train,
             contacts=self.impacts.contacts,
             names=self.impacts.names,
             seed=self.evaluation.seed,
-            modes=self._modes,
+            modes=self._shared(recordings.modes),
             features=self._shared(self.look),
             bodies=self._shared(self.bodies),
             stranger=self._shared(self.stranger),
@@ -138,24 +182,6 @@ class CaseRun:
             gaussians=self._gaussians,
             device=self.evaluation.device,
         )
-
-    def _modes(self) -> Extraction:
-        with self._sharing():
-            if self.found is None:
-                path = self.folder / "modes" / f"{self.place}.safetensors"
-                self.found = extract_once(self.train, self.evaluation.finder, path)
-            return self.found
-
-    def _align(self) -> None:
-        """Give all recordings the starts that the training ones have in common; without modes they keep their own."""
-        if self.train.before is None:
-            return
-        try:
-            modes = self._modes()
-        except ExtractionError:
-            self.train, self.test = (replace(each, before=None, after=None) for each in (self.train, self.test))
-        else:
-            self.train, self.test = modes.aligned(self.train), modes.aligned(self.test)
 
     def _shared(self, make: Callable[Given, Result]) -> Callable[Given, Result]:
         def made(*given: Given.args, **named: Given.kwargs) -> Result:
@@ -187,9 +213,11 @@ class CaseRun:
         word = _file_word(name)
         for row in self.listened:
             file = f"sounds/{self.place}/{row:03d} {word}.flac"
-            gain = listening_gain(self.test.sounds[row])
-            keep_sound(self.folder / file, sounds[row], sample_rate=self.test.sample_rate, gain=gain)
-            kept[self.test.names[row]] = file
+            test = self.scored.test
+            keep_sound(
+                self.folder / file, sounds[row], sample_rate=test.sample_rate, gain=listening_gain(test.sounds[row])
+            )
+            kept[test.names[row]] = file
         return kept
 
 

@@ -74,7 +74,10 @@ class Evaluation:
     encoder: str | None = None
     """Encoder that `auto` in the settings stands for; None where the settings name it, or no method reads features."""
     time_zero: str | None = None
-    """Start of the dataset's sounds, `onset` or `peak`, for all methods; None for the dataset's own."""
+    """Start of the dataset's sounds, `onset` or `peak`, on which all methods are scored; None for the dataset's own."""
+    own_starts: Dataset | None = None
+    """The same dataset with its own starts, for fields that are not of the paper's configuration; None where all
+    methods are fitted to the sounds that they are scored on."""
 
     def begin(self, results: ResultsFolder) -> None:
         """Take a folder for this evaluation's results.

@@ -35,6 +35,7 @@ def run_object(
         try:
             capture = evaluation.dataset.capture(identifier)
             impacts, surface = capture.impacts, capture.surface
+            own = None if evaluation.own_starts is None else evaluation.own_starts.capture(identifier).impacts
             # From its peak, a recording's modes have phases of its own, which the truth of all does not have.
             truth = None if evaluation.time_zero == "peak" else truth_of(evaluation.dataset, identifier)
             digest = digest_of(impacts, truth)
@@ -72,6 +73,7 @@ def run_object(
                     stranger=stranger,
                     vertices=None if surface is None or not len(surface.faces) else surface.vertices,
                     listened=firsts[case.label] == case.key,
+                    own_starts=own,
                 ),
                 record,
                 results,

@@ -54,11 +54,14 @@ def run(options: Options) -> int:
     contacts, table_of_names = (
         None if path is None else path.resolve() for path in (options.contact_data, options.table)
     )
-    dataset = open_dataset(options.data.resolve(), contacts=contacts, table=table_of_names, time_zero=options.time_zero)
+    opened = partial(open_dataset, options.data.resolve(), contacts=contacts, table=table_of_names)
+    dataset = opened(time_zero=options.time_zero)
     title = title_of(dataset, options.data)
     objects = choose_objects(dataset, protocol, words_of(options.objects))
     folder = (options.output or Path("evaluation") / title / protocol.name).resolve()
     evaluation = evaluation_of(options, dataset, title, protocol, methods, folder)
+    if options.time_zero == "peak":
+        evaluation = replace(evaluation, own_starts=opened())
     _note_start(methods, options.time_zero)
     results, groups = ResultsFolder(folder), members(dataset)
     work = f"{counted(len(objects), 'object')}, {counted(len(methods), 'method')}"
