@@ -152,7 +152,12 @@ def test_ctrl_c_keeps_what_is_there(
     assert capsys.readouterr().err.splitlines()[-1].startswith("avmsf evaluate: interrupted")
     kept = json.loads((tmp_path / "results" / "objects" / "a.json").read_text())
     assert [each["method"] for each in kept["outcomes"]] == ["knn3"]
+    summary = json.loads((tmp_path / "results" / "summary.json").read_text())
+    assert list(summary["methods"]) == ["knn3"]
+    assert summary["missing"] == {"a": ["nearest", "white-noise"], "b": ["knn3", "nearest", "white-noise"]}
+    assert "a (nearest, white-noise), b." in (tmp_path / "results" / "report.md").read_text().splitlines()[2]
     assert run(parse(words)) == 0
+    assert json.loads((tmp_path / "results" / "summary.json").read_text())["missing"] == {}
 
 
 def test_a_known_wall_is_handed_on(plates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

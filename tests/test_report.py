@@ -22,7 +22,7 @@ from avmsf.bench.published import PUBLISHED, published_ratios
 from avmsf.bench.report import write_page, write_summary
 from avmsf.bench.reporttables import WARNING, Grid, Section, figure, sections
 from avmsf.bench.results import CaseRecord, ObjectRecord, Outcome, ResultsFolder, natural
-from avmsf.bench.summary import Mean, object_figures, summarize
+from avmsf.bench.summary import Mean, missing_of, object_figures, summarize
 from avmsf.bench.titles import TITLES
 from avmsf.errors import EvaluationError
 from plate_set import fill_plates
@@ -64,6 +64,16 @@ def test_means_are_over_contacts_then_over_objects() -> None:
     assert summary["standard_errors"]["paper"]["l1"] == pytest.approx(7.5)
     assert summary["counts"] == {"knn3": 3, "paper": 2}
     assert summary["failures"] == [{"object": "10", "case": "farthest", "method": "paper", "failure": "no modes"}]
+
+
+def test_a_failure_is_not_missing_but_a_method_or_an_object_that_has_not_run_is() -> None:
+    broken = ObjectRecord("3", failure="no recordings")
+    methods = ["knn3", "paper"]
+    assert missing_of((*THREE, broken), dict.fromkeys(("1", "10", "3"), methods)) == {}
+    assert missing_of(THREE, {"1": ["knn3", "field"], "7": methods}) == {"1": ["field"], "7": methods}
+    # One case of two.
+    cases = (*THREE[0].cases, CaseRecord("other", "other", ("t",), ("u",)))
+    assert missing_of((replace(THREE[0], cases=cases),), {"1": methods}) == {"1": methods}
 
 
 def test_differences_and_ratios_are_paired() -> None:

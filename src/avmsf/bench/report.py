@@ -1,6 +1,6 @@
 """The files of a results folder: summary, times, tables, and page."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from avmsf.bench.page import heard_contacts, page
 from avmsf.bench.pictures import save_picture
 from avmsf.bench.reporttables import Section, sections
 from avmsf.bench.results import ObjectRecord, ResultsFolder, write_json
-from avmsf.bench.summary import summarize, times_of
+from avmsf.bench.summary import missing_of, summarize, times_of
 from avmsf.errors import EvaluationError
 from avmsf.files import write_whole
 from avmsf.plotting.spectrograms import draw_method_spectrograms
@@ -27,13 +27,22 @@ _RECORDED = "recorded"
 """Title of the first column."""
 
 
-def write_summary(results: ResultsFolder, *, subsets: Mapping[str, frozenset[str]]) -> dict[str, Any]:
-    """Write `summary.json`, `times.json` and `report.md` of the folder's results, and return the summary."""
+def write_summary(
+    results: ResultsFolder,
+    *,
+    subsets: Mapping[str, frozenset[str]],
+    wanted: Mapping[str, Sequence[str]] | None = None,
+) -> dict[str, Any]:
+    """Write `summary.json`, `times.json` and `report.md` of the folder's results, and return the summary.
+
+    `wanted` are the methods of each object that the evaluation is of; those without results yet are named as missing.
+    """
     records, identity = results.records(), results.identity()
-    summary = summarize(records, identity, subsets=subsets)
+    missing = missing_of(records, wanted or {})
+    summary = summarize(records, identity, subsets=subsets, missing=missing)
     write_json(results.path / SUMMARY, summary)
     write_json(results.path / TIMES, times_of(records))
-    _write_text(results.path / TABLES, markdown(sections(records, identity, subsets=subsets)))
+    _write_text(results.path / TABLES, markdown(sections(records, identity, subsets=subsets, missing=missing)))
     return summary
 
 

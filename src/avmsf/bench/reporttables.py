@@ -1,7 +1,7 @@
 """The content of a report, as titles, paragraphs and tables, for Markdown and HTML."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +21,7 @@ from avmsf.bench.summary import (
     times_of,
 )
 from avmsf.bench.titles import TITLES, kind_of
+from avmsf.wording import counted
 
 HEADINGS = {
     "l1": "L1",
@@ -65,16 +66,20 @@ class Section:
 
 
 def sections(
-    records: Sequence[ObjectRecord], identity: Mapping[str, Any], *, subsets: Mapping[str, frozenset[str]]
+    records: Sequence[ObjectRecord],
+    identity: Mapping[str, Any],
+    *,
+    subsets: Mapping[str, frozenset[str]],
+    missing: Mapping[str, Sequence[str]] | None = None,
 ) -> list[Section]:
-    """Return all parts of the report on these results."""
+    """Return all parts of the report on these results, and which are missing: methods by object."""
     protocol, dataset = str(identity["protocol"]), str(identity["dataset"])
     order = list(identity["methods"])
     labels = labels_of(records)
     tables = {label: _ordered(figures_of(records, label), order) for label in labels}
     main = tables[labels[0]] if labels else {}
     shown = _metrics(main, protocol)
-    parts = [_opening(records, identity, labels)]
+    parts = [_opening(records, identity, labels, missing or {})]
     if main:
         parts.append(_main_table(main, shown, protocol, dataset, labels))
         if any(BASELINE in methods for methods in main.values()):
@@ -101,7 +106,12 @@ def figure(value: float | None, digits: int = 3) -> str:
     return f"{value:.{max(0, digits - 1 - math.floor(math.log10(abs(value))))}f}"
 
 
-def _opening(records: Sequence[ObjectRecord], identity: Mapping[str, Any], labels: Sequence[str]) -> Section:
+def _opening(
+    records: Sequence[ObjectRecord],
+    identity: Mapping[str, Any],
+    labels: Sequence[str],
+    missing: Mapping[str, Sequence[str]],
+) -> Section:
     protocol = PROTOCOLS.get(str(identity["protocol"]))
     about = f"{protocol.summary} " if protocol else ""
     trained = [len(case.train) for record in records for case in record.cases if case.label in labels[:1]]
@@ -109,6 +119,7 @@ def _opening(records: Sequence[ObjectRecord], identity: Mapping[str, Any], label
     return Section(
         f"{identity['protocol']} on {identity['dataset']}",
         (
+            *([_incomplete(missing, {record.identifier for record in records})] if missing else []),
             f"{about}Objects: {len(records)}; training recordings of each: {_span(trained)}; "
             f"test recordings in total: {tested}"
             f"{f' ({labels[0]})' if len(labels) > 1 else ''}; avmsf {identity['version']}, seed {identity['seed']}.",
@@ -123,6 +134,13 @@ def _opening(records: Sequence[ObjectRecord], identity: Mapping[str, Any], label
             f"Settings: metrics {identity['metrics']}; modes {identity['modes']}.",
         ),
     )
+
+
+def _incomplete(missing: Mapping[str, Sequence[str]], begun: Collection[str]) -> str:
+    """Return the sentence on results that are not computed yet: methods are named only of objects that are begun."""
+    listed = ", ".join(f"{name} ({', '.join(methods)})" if name in begun else name for name, methods in missing.items())
+    objects = counted(len(missing), "object")
+    return f"Incomplete: results of {objects} are missing: {listed}. Run the same command again to compute them."
 
 
 def _span(counts: Sequence[int]) -> str:

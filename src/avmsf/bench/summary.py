@@ -109,12 +109,16 @@ def ratios_of_means(table: Table) -> dict[str, dict[str, float]]:
 
 
 def summarize(
-    records: Sequence[ObjectRecord], identity: Mapping[str, Any], *, subsets: Mapping[str, frozenset[str]] | None = None
+    records: Sequence[ObjectRecord],
+    identity: Mapping[str, Any],
+    *,
+    subsets: Mapping[str, frozenset[str]] | None = None,
+    missing: Mapping[str, Sequence[str]] | None = None,
 ) -> dict[str, Any]:
     """Return all figures as plain values, of which the same records always give the same.
 
     `methods`, `standard_errors`, `ratio_to_knn3` and the like are of the main experiment, `cases` of each; `subsets`
-    names groups of objects whose means are told apart.
+    names groups of objects whose means are told apart; `missing` are the results that are yet to be computed.
     """
     labels = labels_of(records)
     tables = {label: figures_of(records, label) for label in labels}
@@ -145,7 +149,25 @@ def summarize(
             if table
         },
         "failures": failures_of(records),
+        "missing": {name: list(methods) for name, methods in (missing or {}).items()},
     }
+
+
+def missing_of(records: Iterable[ObjectRecord], wanted: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
+    """Return, of the wanted methods of each object, those without an outcome in all of its cases.
+
+    A failure is an outcome. Objects that lack nothing are left out.
+    """
+    known = {record.identifier: record for record in records}
+    missing = {}
+    for name, methods in wanted.items():
+        record = known.get(name)
+        if record is None:
+            missing[name] = list(methods)
+        elif record.failure is None:
+            found = {(each.case, each.method) for each in record.outcomes}
+            missing[name] = [each for each in methods if any((case.key, each) not in found for case in record.cases)]
+    return {name: methods for name, methods in missing.items() if methods}
 
 
 def failures_of(records: Iterable[ObjectRecord]) -> list[dict[str, str | None]]:

@@ -20,7 +20,7 @@ from avmsf.bench.plan import Evaluation
 from avmsf.bench.protocols import LEARNING_CURVE, EvaluationProtocol, protocol_named
 from avmsf.bench.report import PAGE, SUMMARY, TABLES, write_figures, write_page, write_summary
 from avmsf.bench.reporttables import Section
-from avmsf.bench.results import ResultsFolder, write_json
+from avmsf.bench.results import IDENTITY, ResultsFolder, write_json
 from avmsf.bench.subsets import choose_objects, members
 from avmsf.bench.task import Look, Looking, Method
 from avmsf.capture.datasets import CaptureCollection, open_dataset
@@ -66,12 +66,17 @@ def run(options: Options) -> int:
     results, groups = ResultsFolder(folder), members(dataset)
     work = f"{counted(len(objects), 'object')}, {counted(len(methods), 'method')}"
     say(f"{protocol.name} on {title}: {work}, results in {folder}")
+    names = tuple(method.name for method in methods)
+    write = partial(write_summary, results, subsets=groups, wanted=dict.fromkeys(objects, names))
     try:
-        run_shown(evaluation, objects, results, workers, after_each=partial(write_summary, results, subsets=groups))
-        summary = write_summary(results, subsets=groups)
+        run_shown(evaluation, objects, results, workers, after_each=write)
+        summary = write()
         parts = write_page(results, subsets=groups)
         figures = write_figures(results) if options.figures else []
     except KeyboardInterrupt:
+        if (folder / IDENTITY).exists():
+            missing = counted(len(write()["missing"]), "object")
+            say(f"wrote {SUMMARY} and {TABLES} in {folder}, without all results of {missing}")
         say(f"avmsf evaluate: interrupted; run the same command again to continue from {folder}")
         return INTERRUPTED
     if not summary["methods"]:
