@@ -164,7 +164,7 @@ def _jitter_with(options: Options, cache: Path) -> Report:
     plate = STRUCK.strikes(20 if options.quick_look else 40, seconds=1.0)
     # The plate's files: silence before the impact, which begins at their last sample.
     silence = torch.zeros(len(plate), 2 * margin_length(plate.sample_rate))
-    body = BodyConfig(freedoms=3000) if options.quick_look else BodyConfig()
+    body = BodyConfig(dofs=3000) if options.quick_look else BodyConfig()
     mug = MixtureEstimator(bodies=candidate_bodies(capture.surface, body, impacts=capture.impacts, cache=cache))
     cases: dict[str, tuple[Impacts, FeatureField, GainRecipe]] = {
         "mug": (_wide(EXAMPLE_FOLDER, truth.starts), surface_features(capture), mug),

@@ -85,7 +85,7 @@ def measure_editing(
         for transition in SIMULATED_TRANSITIONS
         for seed in range(seeds)
     ]
-    methods = towards_reference({"steps": steps, "contacts": CONTACTS})
+    methods = towards_reference({"steps": steps, "contacts_per_step": CONTACTS})
     scores = judge(tasks, methods, spaces, progress=_tell_score)
     if record is not None:
         write_scores(scores, spaces, record)

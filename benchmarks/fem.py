@@ -34,15 +34,15 @@ def measure_fem(options: Options) -> Report:
     for sides in rings:
         taken = _in_a_process(sides)
         error = float(np.abs(np.array(taken["frequency"]) / reference - 1)[:20].max())
-        rows.append([f"{sides} x {sides}", taken["freedoms"], taken["seconds"], taken["megabytes"], error])
-        tell(f"fem: {taken['freedoms']} degrees of freedom in {taken['seconds']:.1f} s")
+        rows.append([f"{sides} x {sides}", taken["dofs"], taken["seconds"], taken["megabytes"], error])
+        tell(f"fem: {taken['dofs']} degrees of freedom in {taken['seconds']:.1f} s")
     chosen = next((row for row in rows if float(row[1]) >= 40_000), rows[-1])
     figures = {
         "fem.beam_error": beam_error(),
         "fem.plate_error": plate_error(),
         "fem.seconds": float(chosen[2]),
         "fem.megabytes": float(chosen[3]),
-        "fem.freedoms": float(chosen[1]),
+        "fem.dofs": float(chosen[1]),
     }
     conventions = (
         "fem.beam_error: largest relative error of the three lowest bending frequencies of a free steel bar, 400 x 12 "
@@ -53,7 +53,7 @@ def measure_fem(options: Options) -> Report:
         f"{os.cpu_count()} processors; megabytes: its peak memory above what it had before.",
         f"error: largest of the 20 lowest frequencies against {fine} x {fine} boxes.",
     )
-    columns = ("boxes in the wall", "freedoms", "seconds", "megabytes", "error")
+    columns = ("boxes in the wall", "degrees of freedom", "seconds", "megabytes", "error")
     return Report(conventions, (Table("64 modes of a bowl", columns, rows),), figures)
 
 
@@ -126,7 +126,7 @@ def _measure_bowl(sides: int) -> dict[str, Any]:
     return {
         "seconds": time.perf_counter() - begun,
         "megabytes": 1e3 * (peak_gigabytes() - before),
-        "freedoms": 3 * len(SecondOrder.of(solid).nodes),
+        "dofs": 3 * len(SecondOrder.of(solid).nodes),
         "frequency": modes.frequency.tolist(),
     }
 

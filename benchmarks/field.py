@@ -72,8 +72,8 @@ Figures = dict[str, float]
 
 def filled_estimator(surface: Surface, options: Options) -> MixtureEstimator:
     """Return the gain models' estimator for an object with this surface: a filled body, coarse for a quick look."""
-    shapes, freedoms = (12, 20_000) if options.quick_look else (60, 40_000)
-    bodies = nominal_bodies(surface, walls=[None], count=shapes, freedoms=freedoms)
+    shapes, dofs = (12, 20_000) if options.quick_look else (60, 40_000)
+    bodies = nominal_bodies(surface, walls=[None], count=shapes, dofs=dofs)
     return MixtureEstimator(bodies=CandidateBodies(bodies))
 
 

@@ -183,7 +183,7 @@ def _simulated(name: str, options: LocatingOptions) -> tuple[Capture, Truth]:
 
 
 def _estimator(surface: Surface, wall: float | None, name: str, options: LocatingOptions) -> MixtureEstimator:
-    config = BodyConfig(wall=wall, shapes=12, freedoms=3000) if options.quick_look else BodyConfig(wall=wall)
+    config = BodyConfig(wall=wall, shapes=12, dofs=3000) if options.quick_look else BodyConfig(wall=wall)
     assert options.cache is not None
     tell(f"locate.{name}: elastic bodies")
     return MixtureEstimator(bodies=candidate_bodies(surface, config, cache=options.cache / name))

@@ -66,7 +66,7 @@ def _cost(options: Options) -> Report:
     figures: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / COSTED
-        recipe = replace(sim20_recipe(COSTED), size=COSTED_SIZE, modes=COSTED_MODES)
+        recipe = replace(sim20_recipe(COSTED), size=COSTED_SIZE, elastic_modes=COSTED_MODES)
         made = simulate_object(recipe, name=COSTED)
         train, _ = split(made.capture.impacts, fraction=0.2)
         write_capture(replace(made.capture, impacts=train), folder)
@@ -79,29 +79,29 @@ def _cost(options: Options) -> Report:
                     f"physics{name}.gigabytes{kept}": taken["gigabytes"],
                 }
                 words = f"{'filled' if name else 'wall unknown'}, {'kept shapes' if kept else 'nothing kept'}"
-                values = [taken[each] for each in ("bodies", "fit", "seconds", "gigabytes", "modes", "freedoms")]
+                values = [taken[each] for each in ("bodies", "fit", "seconds", "gigabytes", "modes", "dofs")]
                 rows.append([words, *values])
                 tell(f"physics.cost: {words}: {taken['seconds']:.0f} s")
         figures["physics.render_ms"] = taken["render_ms"]
     title = f"{COSTED}, 8 recordings; a sound is rendered in {taken['render_ms']:.1f} ms"
-    columns = ("", "s for bodies", "s for modes and fit", "s", "GB", "modes", "freedoms asked")
+    columns = ("", "s for bodies", "s for modes and fit", "s", "GB", "modes", "degrees of freedom asked")
     return Report(tables=(Table(title, columns, rows),), figures=figures)
 
 
 def _in_a_process(folder: Path, cache: Path, wall: str, options: Options) -> dict[str, Any]:
     """Return what `_fitted` prints in a fresh process, whose memory and caches are its own."""
-    freedoms = "3000" if options.quick_look else "40000"
-    command = [sys.executable, "-m", "benchmarks.physics", str(folder), str(cache), wall, freedoms]
+    dofs = "3000" if options.quick_look else "40000"
+    command = [sys.executable, "-m", "benchmarks.physics", str(folder), str(cache), wall, dofs]
     ended = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
     return json.loads(ended.stdout.splitlines()[-1])
 
 
-def _fitted(folder: Path, cache: Path, wall: str, freedoms: int) -> dict[str, float]:
+def _fitted(folder: Path, cache: Path, wall: str, dofs: int) -> dict[str, float]:
     """Return how long a fit takes, beside the reading of the capture, and what it takes it with."""
     capture = read_capture(folder)
     assert capture.surface is not None
     begun = time.perf_counter()
-    config = BodyConfig(wall=None if wall == "unknown" else float(wall), freedoms=freedoms)
+    config = BodyConfig(wall=None if wall == "unknown" else float(wall), dofs=dofs)
     bodies = candidate_bodies(capture.surface, config, impacts=capture.impacts, cache=cache)
     solved = time.perf_counter()
     modes = extract_modes(capture.impacts)
@@ -118,7 +118,7 @@ def _fitted(folder: Path, cache: Path, wall: str, freedoms: int) -> dict[str, fl
         "render_ms": 1e3 * (time.perf_counter() - warm),
         "gigabytes": peak_gigabytes(),
         "modes": float(len(modes.bank)),
-        "freedoms": float(freedoms),
+        "dofs": float(dofs),
     }
 
 
@@ -129,7 +129,7 @@ def _coverage(options: Options) -> Report:
         made = simulate_object(sim20_recipe(name), name=name)
         assert made.capture.surface is not None
         train, test = split(made.capture.impacts, fraction=0.2)
-        config = BodyConfig(freedoms=3000) if options.quick_look else BodyConfig()
+        config = BodyConfig(dofs=3000) if options.quick_look else BodyConfig()
         with tempfile.TemporaryDirectory() as cache:
             estimator = MixtureEstimator(bodies=candidate_bodies(made.capture.surface, config, cache=Path(cache)))
             steps = FitConfig(steps=2) if options.quick_look else FitConfig()
@@ -152,11 +152,11 @@ def _frequencies(options: Options) -> Report:
     """Compare the lowest frequencies of nominal bodies, made of what the mesh encloses, with the true ones."""
     rows: list[list[str | float]] = []
     for name, recipe in list(SIM20.items())[: 1 if options.quick_look else None]:
-        true = make_body(replace(recipe, modes=COMPARED), cache=None, tell=lambda words: None)
-        freedoms = 3000 if options.quick_look else 40_000
+        true = make_body(replace(recipe, elastic_modes=COMPARED), cache=None, tell=lambda words: None)
+        dofs = 3000 if options.quick_look else 40_000
         heard: list[str] = []
         begun = _processor_seconds()
-        made = nominal_bodies(true.surface, walls=[None], count=COMPARED, freedoms=freedoms, tell=heard.append)
+        made = nominal_bodies(true.surface, walls=[None], count=COMPARED, dofs=dofs, tell=heard.append)
         taken, material = _processor_seconds() - begun, material_named(recipe.material)
         speed = (material.young / material.density * NOMINAL.density / NOMINAL.young) ** 0.5
         error = made.bodies[0].elastic.frequency * speed / true.elastic.frequency - 1.0

@@ -88,7 +88,7 @@ def split_case(train: Impacts, test: Impacts, capture: Capture, bodies: Candidat
 
 
 def bodies_of(surface: Surface | ObjectShape, options: Options) -> CandidateBodies:
-    config = BodyConfig(shapes=12, freedoms=3000) if options.quick_look else BodyConfig()
+    config = BodyConfig(shapes=12, dofs=3000) if options.quick_look else BodyConfig()
     return candidate_bodies(surface, config, tell=tell)
 
 

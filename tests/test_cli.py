@@ -492,7 +492,7 @@ def test_show_says_and_draws(field: Path, capture: Path, tmp_path: Path, capsys:
     assert main(["info", str(field)]) == 0
     out = capsys.readouterr().out
     assert "field of plate" in out
-    assert (told["pipeline"]["method"], told["pipeline"]["fit"]["seed"]) == ("high-resolution", 0)
+    assert (told["pipeline"]["extraction"], told["pipeline"]["fit"]["seed"]) == ("high-resolution", 0)
     assert "extraction high-resolution" in out
 
 

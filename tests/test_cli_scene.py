@@ -70,7 +70,7 @@ def test_pictures_and_blows_become_a_field_on_gaussians(kept: Path) -> None:
     assert "descriptors" in features.encoder
     assert "dino" not in features.encoder
     made = describe(field)["pipeline"]
-    assert (made["method"], made["gain_model"]) == ("high-resolution", "network")
+    assert (made["extraction"], made["gain_model"]) == ("high-resolution", "network")
     assert made["encoder"] in features.encoder
     assert (made["scene"]["splat"]["steps"], made["scene"]["lift"]["encoder"]) == (60, "descriptors")
     assert made["fit"] == asdict(field.origin.config)

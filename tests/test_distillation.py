@@ -196,7 +196,7 @@ def test_a_field_is_edited_to_what_the_model_wants():
     made = edit_towards(
         before,
         guide(Known(wanted), guidance=0.9),
-        config=GuidedEditConfig(steps=40, contacts=2, preview_every=0, fft_sizes=(2048, 512)),
+        config=GuidedEditConfig(steps=40, contacts_per_step=2, preview_every=0, fft_sizes=(2048, 512)),
         progress=seen.append,
     )
     assert seen[-1].pitch == pytest.approx(1.02, abs=0.01)

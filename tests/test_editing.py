@@ -65,7 +65,7 @@ from benchmarks import editingprotocol as protocol
 from raising import raises, warns
 
 RATE = 16000.0
-QUICK = {"steps": 3, "contacts": 2, "fft_sizes": (512, 128)}
+QUICK = {"steps": 3, "contacts_per_step": 2, "fft_sizes": (512, 128)}
 
 
 @cache

@@ -17,7 +17,7 @@ from avmsf.tasks.reference import Reference
 from raising import raises
 from ringing_field import RATE, SameGains, ringing_field, sound_of
 
-QUICK = GuidedEditConfig(steps=12, contacts=2, preview_every=5, seconds=0.25, fft_sizes=(2048, 512))
+QUICK = GuidedEditConfig(steps=12, contacts_per_step=2, preview_every=5, seconds=0.25, fft_sizes=(2048, 512))
 
 
 @dataclass
@@ -106,7 +106,7 @@ def test_level_is_no_part_of_the_edit():
 
 def test_modes_beyond_the_count_follow_the_common_factors_alone():
     field = ringing_field()
-    made = edit_towards(field, towards(pitch=1.01), config=replace(QUICK, modes=2))
+    made = edit_towards(field, towards(pitch=1.01), config=replace(QUICK, free_modes=2))
     entry = made.origin.report["edits"][-1]
     ratio = made.bank.frequency / field.bank.frequency / entry["pitch"]
     alone = (ratio - 1).abs() > 1e-9
@@ -244,7 +244,7 @@ def test_a_silent_field_is_refused():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("steps", 0), ("modes", 0), ("seconds", -1.0), ("fft_sizes", (1023,)), ("seed", 2**70), ("seconds", 0.04)],
+    [("steps", 0), ("free_modes", 0), ("seconds", -1.0), ("fft_sizes", (1023,)), ("seed", 2**70), ("seconds", 0.04)],
 )
 def test_settings_that_cannot_be_meant(name, value):
     with raises(EditError, name=name, value=value):

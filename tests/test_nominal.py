@@ -36,7 +36,7 @@ def ball(radius: float = 0.05) -> Surface:
 
 
 def test_a_sheet_with_a_wall_vibrates_as_the_plate_it_is():
-    bodies = nominal_bodies(sheet(), walls=[0.004], count=12, freedoms=6000).bodies
+    bodies = nominal_bodies(sheet(), walls=[0.004], count=12, dofs=6000).bodies
     assert [body.name for body in bodies] == ["wall of 4 mm"]
     assert bodies[0].fine
     found, plate = bodies[0].elastic, elastic_modes(block((0.24, 0.17, 0.004), (12, 9, 1)), NOMINAL, count=12)
@@ -51,7 +51,7 @@ def test_a_sheet_with_a_wall_vibrates_as_the_plate_it_is():
 def test_walls_of_a_sheet_are_tried_coarsely_and_the_chosen_one_made_fine(monkeypatch: pytest.MonkeyPatch):
     told: list[str] = []
     monkeypatch.setattr(nominal, "TRIAL", 1500)
-    found = nominal_bodies(sheet(), count=6, freedoms=4000, tell=told.append)
+    found = nominal_bodies(sheet(), count=6, dofs=4000, tell=told.append)
     assert [body.wall for body in found.bodies] == pytest.approx(
         [part * math.hypot(0.24, 0.17) for part in nominal.WALLS]
     )
@@ -59,7 +59,7 @@ def test_walls_of_a_sheet_are_tried_coarsely_and_the_chosen_one_made_fine(monkey
     assert any("42 open edges" in message for message in told)
     assert "42 open edges" in found.refused[None]
     body = found.bodies[1]
-    fine = refined(sheet(), body, freedoms=4000)
+    fine = refined(sheet(), body, dofs=4000)
     assert fine.fine
     assert fine.wall == body.wall
     assert refined(sheet(), fine) is fine
@@ -71,24 +71,24 @@ def test_walls_of_a_sheet_are_tried_coarsely_and_the_chosen_one_made_fine(monkey
 def test_what_a_ball_encloses_vibrates_as_lambs_sphere_does_and_is_kept(tmp_path: Path):
     told: list[str] = []
     inwards = Surface(ball().vertices, ball().faces.flip(1))
-    found = nominal_bodies(inwards, walls=[None], count=20, freedoms=10000, cache=tmp_path, tell=told.append).bodies[0]
+    found = nominal_bodies(inwards, walls=[None], count=20, dofs=10000, cache=tmp_path, tell=told.append).bodies[0]
     assert any(f"{len(inwards.faces)} of {len(inwards.faces)} triangles" in message for message in told)
     # Lamb: the torsional oscillation of degree 2, whose wave number times radius is 2.501, belongs to five modes.
     shear = math.sqrt(NOMINAL.young / (2 * (1 + NOMINAL.poisson)) / NOMINAL.density)
     # Fillings differ from run to run, and their frequencies by 2 % at this size.
     assert found.elastic.frequency[:5].numpy() == pytest.approx(2.501 * shear / (2 * math.pi * 0.05), rel=0.04)
     kept = sorted(tmp_path.iterdir())
-    again = nominal_bodies(inwards, walls=[None], count=20, freedoms=10000, cache=tmp_path).bodies[0]
+    again = nominal_bodies(inwards, walls=[None], count=20, dofs=10000, cache=tmp_path).bodies[0]
     assert torch.equal(again.elastic.shapes, found.elastic.shapes)
     assert sorted(tmp_path.iterdir()) == kept
     moved = Surface(inwards.vertices + 0.001, inwards.faces)
-    nominal_bodies(moved, walls=[None], count=20, freedoms=10000, cache=tmp_path)
+    nominal_bodies(moved, walls=[None], count=20, dofs=10000, cache=tmp_path)
     assert len(sorted(tmp_path.iterdir())) == 2
 
 
 def test_a_damaged_kept_file_is_made_again(tmp_path: Path):
     def made(told: list[str]) -> torch.Tensor:
-        bodies = nominal_bodies(sheet(), walls=[0.004], count=4, freedoms=2000, cache=tmp_path, tell=told.append)
+        bodies = nominal_bodies(sheet(), walls=[0.004], count=4, dofs=2000, cache=tmp_path, tell=told.append)
         return bodies.bodies[0].elastic.shapes
 
     first = made([])
@@ -105,7 +105,7 @@ def test_a_damaged_kept_file_is_made_again(tmp_path: Path):
 def test_both_sides_of_a_wall_are_filled_and_given_no_wall():
     outer, inner = trimesh.creation.icosphere(3, radius=0.06), trimesh.creation.icosphere(3, radius=0.054)
     inner.invert()
-    found = nominal_bodies(surface_of(trimesh.util.concatenate([outer, inner])), count=8, freedoms=8000)
+    found = nominal_bodies(surface_of(trimesh.util.concatenate([outer, inner])), count=8, dofs=8000)
     assert [body.wall for body in found.bodies] == [None]
     # A hollow ball, not a massive one.
     mass = NOMINAL.density * 4 / 3 * math.pi * (0.06**3 - 0.054**3)
@@ -117,9 +117,7 @@ def test_both_sides_of_a_wall_are_filled_and_given_no_wall():
 
 def test_boxes_that_overlap_are_one_body():
     one, other = trimesh.creation.box((0.3, 0.05, 0.02)), trimesh.creation.box((0.05, 0.2, 0.015))
-    found = nominal_bodies(
-        surface_of(trimesh.util.concatenate([one, other])), walls=[None, 0.001], count=6, freedoms=6000
-    )
+    found = nominal_bodies(surface_of(trimesh.util.concatenate([one, other])), walls=[None, 0.001], count=6, dofs=6000)
     assert [body.name for body in found.bodies] == ["filled"]
     volume = 0.3 * 0.05 * 0.02 + (0.2 - 0.05) * 0.05 * 0.015
     assert found.bodies[0].elastic.mass == pytest.approx(NOMINAL.density * volume, rel=0.05)
@@ -129,7 +127,7 @@ def test_boxes_that_overlap_are_one_body():
 @pytest.mark.slow
 def test_the_aircraft_is_filled(shared: Path):
     surface = read_surface(shared / "aircraft_response/surface.obj")
-    found = nominal_bodies(surface, count=6, freedoms=12_000)
+    found = nominal_bodies(surface, count=6, dofs=12_000)
     assert [body.name for body in found.bodies] == ["filled"]
     # Its wings bend first, far below all else: as metal plates of 8 mm over 1.5 m do.
     assert 10 < float(found.bodies[0].elastic.frequency[0]) < 20
@@ -140,7 +138,7 @@ def test_parts_that_do_not_touch_are_refused_with_all_reasons():
     other.apply_translation((0.3, 0.0, 0.0))
     apart = surface_of(trimesh.util.concatenate([one, other]))
     with raises(SimulationError, name="surface") as caught:
-        nominal_bodies(apart, walls=[None, 0.001], count=6, freedoms=3000)
+        nominal_bodies(apart, walls=[None, 0.001], count=6, dofs=3000)
     filled, walled = caught.value.value
     for name, reason in (("filled", filled), ("wall of 1 mm", walled)):
         assert reason.startswith(f"{name}: ")
@@ -170,18 +168,18 @@ def test_points_alone_have_no_body():
 def test_a_mesh_too_large_for_the_memory_is_refused_with_the_size_that_fits(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 2 * 377e6)
     with raises(SimulationError, name="surface") as caught:
-        nominal_bodies(sheet(), walls=[0.004], freedoms=80_000)
+        nominal_bodies(sheet(), walls=[0.004], dofs=80_000)
     [reason] = caught.value.value
     assert all(number in reason for number in ("80000", "1.6 GB", "40000"))
     monkeypatch.setattr(nominalsolid, "_free_memory", lambda: None)
-    assert nominal_bodies(sheet(), walls=[0.004], count=4, freedoms=2000).bodies
+    assert nominal_bodies(sheet(), walls=[0.004], count=4, dofs=2000).bodies
 
 
 @pytest.mark.parametrize(
     ("settings", "row", "value"),
     [
         ({"count": 0}, None, 0),
-        ({"freedoms": 10}, None, 10),
+        ({"dofs": 10}, None, 10),
         ({"walls": []}, None, []),
         ({"walls": [None, -0.001]}, 1, -0.001),
         ({"walls": [math.nan]}, 0, math.nan),
@@ -195,7 +193,7 @@ def test_settings_that_make_no_sense_are_named(settings: dict, row: int | None, 
 
 @pytest.fixture(scope="module")
 def coarse() -> NominalBody:
-    elastic = nominal_bodies(sheet(), walls=[0.004], count=4, freedoms=2000).bodies[0].elastic
+    elastic = nominal_bodies(sheet(), walls=[0.004], count=4, dofs=2000).bodies[0].elastic
     return NominalBody(0.004, elastic, fine=False)
 
 
@@ -204,10 +202,10 @@ def test_a_body_stays_coarse_where_a_finer_one_does_not_fit_into_the_memory(
 ):
     monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 1e9)
     told: list[str] = []
-    assert refined(sheet(), coarse, freedoms=400_000, tell=told.append) is coarse
+    assert refined(sheet(), coarse, dofs=400_000, tell=told.append) is coarse
     assert told[-1].startswith("wall of 4 mm: ")
     assert "400000" in told[-1]
-    assert refined(sheet(), coarse, freedoms=400_000) is coarse
+    assert refined(sheet(), coarse, dofs=400_000) is coarse
 
 
 @pytest.mark.parametrize(
@@ -221,7 +219,7 @@ def test_a_body_stays_coarse_where_a_finer_one_fails(
 
     monkeypatch.setattr(nominal, "elastic_modes", fail)
     told: list[str] = []
-    assert refined(sheet(), coarse, freedoms=3000, tell=told.append) is coarse
+    assert refined(sheet(), coarse, dofs=3000, tell=told.append) is coarse
     assert told[-1].startswith("wall of 4 mm: ")
     assert reason in told[-1]
 
@@ -231,7 +229,7 @@ def test_the_only_body_that_is_left_stays_in_use_where_it_cannot_be_made_finer(m
     made, told = nominal.elastic_modes, []
 
     def fail(solid: object, *material: object, count: int, **kept: object) -> object:
-        if nominal.freedoms_of(solid) > 3000:  # type: ignore[arg-type]
+        if nominal.count_dofs(solid) > 3000:  # type: ignore[arg-type]
             raise MemoryError
         if abs(solid.volumes.sum() - 0.24 * 0.17 * 0.004) > 1e-5:  # type: ignore[attr-defined]
             raise SimulationError("of no use")
@@ -239,7 +237,7 @@ def test_the_only_body_that_is_left_stays_in_use_where_it_cannot_be_made_finer(m
 
     monkeypatch.setattr(nominal, "elastic_modes", fail)
     monkeypatch.setattr(nominal, "TRIAL", 2000)
-    found = nominal_bodies(sheet(), walls=[0.004, 0.012], count=4, freedoms=4000, tell=told.append)
+    found = nominal_bodies(sheet(), walls=[0.004, 0.012], count=4, dofs=4000, tell=told.append)
     assert [(body.wall, body.fine) for body in found.bodies] == [(0.004, False)]
     assert any(message.startswith("wall of 4 mm: ") and "2000 (--body.dofs)" in message for message in told)
     assert list(found.refused) == [0.012]
@@ -251,7 +249,7 @@ def test_walls_whose_names_are_alike_are_refused_each():
     [reason] = caught.value.value
     assert reason.startswith("wall of 2e+02 mm, wall of 2e+02 mm: ")
     assert "0.2001" not in str(caught.value)
-    found = nominal_bodies(sheet(), walls=[0.2, 0.2001, 0.004], count=4, freedoms=2000)
+    found = nominal_bodies(sheet(), walls=[0.2, 0.2001, 0.004], count=4, dofs=2000)
     assert list(found.refused) == [0.2, 0.2001]
 
 
@@ -261,7 +259,7 @@ def test_modes_that_do_not_fit_into_the_memory_after_all_are_refused(monkeypatch
 
     monkeypatch.setattr(nominal, "elastic_modes", fail)
     with raises(SimulationError, name="surface") as caught:
-        nominal_bodies(sheet(), walls=[0.004], freedoms=3000)
+        nominal_bodies(sheet(), walls=[0.004], dofs=3000)
     [reason] = caught.value.value
     assert "1500 (--body.dofs)" in reason
 
@@ -269,7 +267,7 @@ def test_modes_that_do_not_fit_into_the_memory_after_all_are_refused(monkeypatch
 def test_the_memory_is_asked_for_what_is_computed_and_for_nothing_that_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    walls, settings = [0.004, 0.006], {"count": 4, "freedoms": 80_000, "cache": tmp_path}
+    walls, settings = [0.004, 0.006], {"count": 4, "dofs": 80_000, "cache": tmp_path}
     monkeypatch.setattr(nominal, "TRIAL", 2000)
     # Enough for the few degrees of freedom that two bodies are compared with.
     monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 377e6)
@@ -290,5 +288,5 @@ def test_what_helps_depends_on_who_stated_the_wall(walls: list[float] | None, ad
     one = sheet()
     apart = Surface(torch.cat([one.vertices, one.vertices + 1]), torch.cat([one.faces, one.faces + len(one.vertices)]))
     with raises(SimulationError, name="surface") as caught:
-        nominal_bodies(apart if walls is None else sheet(), walls=walls, freedoms=1000)
+        nominal_bodies(apart if walls is None else sheet(), walls=walls, dofs=1000)
     assert f"or {advice}" in str(caught.value)

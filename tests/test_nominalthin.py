@@ -40,7 +40,7 @@ def test_a_dense_mesh_vibrates_as_a_coarse_one_of_the_same_shape(
     monkeypatch.setattr(nominalthin, "MOST", 6000)
     told: list[str] = []
     found, known = (
-        nominal_bodies(surface_of(skin), walls=[0.002], count=4, freedoms=8000, tell=told.append).bodies[0].elastic
+        nominal_bodies(surface_of(skin), walls=[0.002], count=4, dofs=8000, tell=told.append).bodies[0].elastic
         for skin in (dense, coarse)
     )
     assert f"{len(dense.faces)} triangles" in told[0]

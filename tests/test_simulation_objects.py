@@ -48,7 +48,7 @@ def recipe(tmp_path_factory: pytest.TempPathFactory) -> ObjectRecipe:
     """Return a coarse tile of a few hundred tetrahedra, briefly recorded."""
     mesh = sheet(tmp_path_factory.mktemp("mesh") / "tile.ply")
     return ObjectRecipe(
-        mesh=mesh, thickness=0.006, detail=0.15, modes=12, contacts=12, seconds=0.4, sample_rate=32000, views=3,
+        mesh=mesh, thickness=0.006, detail=0.15, elastic_modes=12, impacts=12, seconds=0.4, sample_rate=32000, views=3,
         view_size=48,
     )  # fmt: skip
 
@@ -193,7 +193,7 @@ def test_elastic_modes_are_kept_by_all_that_decides_them(
     recipe: ObjectRecipe, cache: Path, simulation: Simulation
 ) -> None:
     told: list[str] = []
-    again = simulate_object(replace(recipe, noise_db=-20.0, contacts=5), cache=cache, progress=told.append)
+    again = simulate_object(replace(recipe, noise_db=-20.0, impacts=5), cache=cache, progress=told.append)
     assert told == ["sounds"]
     assert torch.equal(again.truth.frequency, simulation.truth.frequency)
     # A damaged file is no reason to stop.
@@ -328,7 +328,7 @@ def test_a_set_killed_half_way_goes_on_and_refuses_to_mix(
     ("name", "value"),
     [
         ("material", "unobtainium"),
-        ("contacts", 1),
+        ("impacts", 1),
         ("thickness", -0.003),
         ("views", 10),
         ("noise_db", math.inf),
@@ -412,6 +412,6 @@ def test_the_command_lists_and_knows_what_it_does_not_know(capsys: pytest.Captur
 def test_what_is_asked_of_a_named_object_holds_though_it_is_the_usual() -> None:
     # The example has 16 contacts at 44,100 Hz where a recipe usually has 40 at 48,000.
     recipe = options.parse(["example", "--impacts", "40"]).recipe
-    assert (recipe.contacts, recipe.sample_rate, recipe.kind) == (40, 44100, "mug")
+    assert (recipe.impacts, recipe.sample_rate, recipe.kind) == (40, 44100, "mug")
     recipe = options.parse(["mug-plastic", "--material", "ceramic"]).recipe
     assert recipe == replace(sim20_recipe("mug-plastic"), material="ceramic")

@@ -152,13 +152,13 @@ def test_gradient_reaches_the_modes_and_leaves_the_weights(model):
     (sounds - targets).square().sum().backward()
     for name, value in vars(edit).items():
         assert float(value.grad.abs().max()) > 0, name
-    made = edit_towards(field, guide, config=GuidedEditConfig(steps=3, contacts=2, preview_every=0))
+    made = edit_towards(field, guide, config=GuidedEditConfig(steps=3, contacts_per_step=2, preview_every=0))
     for before, after in ((field.bank.frequency, made.bank.frequency), (field.bank.damping, made.bank.damping)):
         assert bool((before != after).all())
     assert bool((made.gain_field.scale != 1).all())
     now = {**model.pipeline.transformer.state_dict(), **model.pipeline.vae.state_dict()}
     assert all(torch.equal(now[name], each) for name, each in weights.items())
-    again = edit_towards(field, guide, config=GuidedEditConfig(steps=3, contacts=2, preview_every=0))
+    again = edit_towards(field, guide, config=GuidedEditConfig(steps=3, contacts_per_step=2, preview_every=0))
     assert torch.equal(again.bank.frequency, made.bank.frequency)
 
 
@@ -170,7 +170,7 @@ def test_what_the_decoder_says_is_the_target(model, monkeypatch):
     guide = DecoderDistillation(model, "duller", sample_rate=RATE, config=DistillationConfig(denoising=2))
     reference = Reference.of(model.decode(clean, samples=1600).mean(dim=1), sample_rate=RATE)
     field, still = ringing_field(seconds=0.2), replace(HIERARCHICAL, searches=False)
-    config = GuidedEditConfig(steps=8, contacts=2, preview_every=0)
+    config = GuidedEditConfig(steps=8, contacts_per_step=2, preview_every=0)
     seen: list[GuidedEditProgress] = []
     by_words = edit_towards(field, guide, config=config, parameters=still, progress=seen.append)
     by_sound = edit_towards(field, reference, config=config, parameters=still)

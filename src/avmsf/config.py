@@ -63,7 +63,7 @@ class LiftConfig:
     `descriptors` (built in, no download), or `auto`: DINOv2 base if it is available, else the built-in ones."""
     longest: int = 518
     """Pixels of the longer side of DINOv2's input images."""
-    background: Literal["inpainted", "kept"] = field(default="inpainted", metadata={"option": "encoder_background"})
+    encoder_background: Literal["inpainted", "kept"] = "inpainted"
     """Encoder input outside an object's mask: colors of the object continued, or the image unchanged (paper)."""
     weighting: Literal["plain", "visibility"] = "visibility"
     """Average over the views that see a point: weighted by visibility, or plain (paper)."""
@@ -82,7 +82,7 @@ class LiftConfig:
     """Point spacings within which the nearest point is a symmetric counterpart; 0 takes it at any distance (paper)."""
     positions: bool = True
     """Begin the features with the points' positions relative to the object's size."""
-    size: float = field(default=0.3, metadata={"option": "feature_size"})
+    feature_size: float = 0.3
     """Root mean square length of the features after positions, which are about .5 long; without them it is 1."""
     onto: Literal["mesh", "gaussians"] = "mesh"
     """Points of the features for a folder with a mesh only: on its surface, or Gaussians fitted to images of it."""
@@ -99,8 +99,8 @@ class LiftConfig:
             raise _scene_error("missing", self.missing, "0 to 0.45")
         if not 0 <= self.reach < math.inf:
             raise _scene_error("reach", self.reach, "a number of point spacings, or 0 for any distance")
-        if not 0 < self.size < math.inf:
-            raise _scene_error("size", self.size, "more than 0")
+        if not 0 < self.feature_size < math.inf:
+            raise _scene_error("feature_size", self.feature_size, "more than 0")
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class BodyConfig:
     decide."""
     shapes: int = 80
     """Number of the lowest elastic mode shapes for the gains and for updating stiffness and density."""
-    freedoms: int = field(default=40_000, metadata={"option": "dofs"})
+    dofs: int = 40_000
     """Approximate degrees of freedom of the finite elements."""
     supports: Literal["auto", "free", "try"] = "auto"
     """Supports at the object's lowest face or point, or along a lower edge (z is upwards). auto: tried if the free body
@@ -156,7 +156,7 @@ class PipelineConfig:
     """How views, Gaussians and features are made."""
     fit: FitConfig = field(default_factory=FitConfig)
     """How the field is fitted."""
-    method: ExtractionMethod = "high-resolution"
+    extraction: ExtractionMethod = "high-resolution"
     """How modes are found."""
     modes: int = 128
     """Modes to use at most."""
@@ -167,8 +167,8 @@ class PipelineConfig:
     Gaussians differ; cached stages are used for either device."""
 
     def __post_init__(self) -> None:
-        """Raise FitError for the name of no gain model or method, and for no modes."""
-        for name, known in (("gain_model", GainModel), ("method", ExtractionMethod)):
+        """Raise FitError for the name of no gain model or extraction method, and for no modes."""
+        for name, known in (("gain_model", GainModel), ("extraction", ExtractionMethod)):
             value = getattr(self, name)
             if value not in get_args(known):
                 raise FitError.expected(f"one of {', '.join(get_args(known))}", value, name=name)
@@ -189,7 +189,7 @@ PRESETS: Mapping[Preset, PipelineConfig] = {
         scene=SceneConfig(
             lift=LiftConfig(
                 encoder=DINO,
-                background="kept",
+                encoder_background="kept",
                 weighting="plain",
                 components=0,
                 reach=0.0,
@@ -198,7 +198,7 @@ PRESETS: Mapping[Preset, PipelineConfig] = {
             )
         ),
         fit=PAPER,
-        method="short-time",
+        extraction="short-time",
         time_zero="peak",
     ),
 }

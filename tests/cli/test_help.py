@@ -1,12 +1,16 @@
 """What `--help` prints of every verb, and hints for names of earlier versions."""
 
 import re
+from collections.abc import Callable
 
 import pytest
 
 from avmsf.cli import RENAMED, VERBS, main
 from avmsf.cli.options.edit import parse as parse_edit
+from avmsf.cli.options.features import parse as parse_features
 from avmsf.cli.options.simulate import parse as parse_simulate
+from avmsf.errors import AvmsfError
+from raising import raises
 
 Streams = pytest.CaptureFixture[str]
 COLUMNS = 80
@@ -27,13 +31,28 @@ def test_help_fills_the_terminal_and_states_only_defaults_that_say_something(
     assert not re.search(r"\(default: (None|False|True)?\)|\[[A-Z]+ \[|\bINT\b|\bFLOAT\b|\bWhether\b", page)
 
 
-def test_an_option_may_have_another_name_than_its_setting() -> None:
-    words = ["field", "-o", "new", "--free-modes", "3", "--contacts-per-step", "2", "--to-material", "wood"]
-    edit = parse_edit([*words, "--scale", "2"])
-    assert (edit.steering.config.modes, edit.steering.config.contacts) == (3, 2)
+def test_an_option_may_have_another_name_than_its_attribute() -> None:
+    edit = parse_edit(["field", "-o", "new", "--to-material", "wood", "--scale", "2"])
     assert (edit.change.material, edit.change.size) == ("wood", 2.0)
-    recipe = parse_simulate(["--elastic-modes", "5", "--impacts", "4"]).recipe
-    assert (recipe.modes, recipe.contacts) == (5, 4)
+
+
+@pytest.mark.parametrize(
+    ("parse", "words", "option", "value"),
+    [
+        (parse_features, "mug", "--feature-size", 0.0),
+        (parse_features, "mug", "--splat.wrong-masks", 2.0),
+        (parse_edit, "field -o new", "--free-modes", 0),
+        (parse_edit, "field -o new", "--contacts-per-step", 0),
+        (parse_simulate, "", "--elastic-modes", 0),
+        (parse_simulate, "", "--impacts", 1),
+    ],
+)
+def test_an_error_names_a_setting_as_its_option(
+    parse: Callable[[list[str]], object], words: str, option: str, value: float
+) -> None:
+    name = option.removeprefix("--").rpartition(".")[2].replace("-", "_")
+    with raises(AvmsfError, name=name, value=value):
+        parse([*words.split(), option, str(value)])
 
 
 @pytest.mark.parametrize("word", RENAMED)

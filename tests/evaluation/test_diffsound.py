@@ -145,7 +145,7 @@ def test_it_recovers_the_thickness_of_a_wall_that_lies_between_those_computed():
     rows = torch.arange(63).reshape(9, 7)
     a, b, c, d = (each.flatten() for each in (rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:]))
     walls = body_family(
-        Surface(points, torch.cat([torch.stack([a, b, c], 1), torch.stack([a, c, d], 1)])), count=8, freedoms=2000
+        Surface(points, torch.cat([torch.stack([a, b, c], 1), torch.stack([a, c, d], 1)])), count=8, dofs=2000
     )
     thickness = 1.2 * walls.thickness[1]
     frequency = walls.at(thickness).modes(replace(GLASS, young=1.3 * GLASS.young, poisson=POISSON)).frequency

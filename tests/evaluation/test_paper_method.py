@@ -56,7 +56,7 @@ def test_a_method_may_find_modes_in_its_own_way() -> None:
         bodies=shared,
         stranger=shared,
     )
-    pipeline = replace(NETWORK, method="short-time", fit=replace(QUICK, steps=1, correction_rate=0.0))
+    pipeline = replace(NETWORK, extraction="short-time", fit=replace(QUICK, steps=1, correction_rate=0.0))
     field = FieldMethod("quick", pipeline, "paper", published=True).fit(task)
     expected = ShortTime().find(impacts.sounds, impacts.sample_rate)
     assert torch.allclose(field.bank.frequency, expected.frequency)

@@ -82,7 +82,7 @@ def sheet() -> Surface:
 
 @cache
 def walls() -> BodyFamily:
-    return body_family(sheet(), count=6, freedoms=3000)
+    return body_family(sheet(), count=6, dofs=3000)
 
 
 def test_an_open_sheet_has_walls_whose_frequencies_between_thicknesses_are_those_of_direct_solves():
@@ -106,7 +106,7 @@ def test_a_family_is_exact_at_a_thickness_that_it_includes():
 
 def test_thin_walls_bend_in_proportion_to_their_thickness():
     flat = Surface(sheet().vertices * torch.tensor([1.0, 1.0, 0.0]), sheet().faces)
-    family = body_family(flat, count=4, freedoms=3000)
+    family = body_family(flat, count=4, dofs=3000)
     ratio = torch.tensor(0.3, dtype=torch.float64)
     first, second = (each.squares(ratio).sqrt() for each in family.bodies[:2])
     thicker = family.thickness[1] / family.thickness[0]

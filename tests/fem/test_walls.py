@@ -13,7 +13,7 @@ from avmsf.simulate.elastic import ElasticModes, elastic_modes
 from avmsf.simulate.material import STEEL
 from avmsf.simulate.nominal import NOMINAL, nominal_bodies
 from avmsf.simulate.nominalcheck import checked
-from avmsf.simulate.nominalsolid import filled_solid, freedoms_of
+from avmsf.simulate.nominalsolid import count_dofs, filled_solid
 from avmsf.simulate.shapes import make_shape
 from avmsf.simulate.skin import Skin
 
@@ -82,7 +82,7 @@ def test_prisms_fill_a_wall_of_uneven_thickness():
     assert wall.thickness == pytest.approx(shape.thickness, rel=0.1)
     solid = wall.solid(wall.length(12_000))
     assert solid.volume == pytest.approx(skin.volume, rel=0.02)
-    assert freedoms_of(solid) == pytest.approx(12_000, rel=0.35)
+    assert count_dofs(solid) == pytest.approx(12_000, rel=0.35)
 
 
 def test_prisms_of_a_thick_block_have_several_layers():
@@ -112,29 +112,29 @@ def test_lumps_and_walls_with_handles_are_not_filled_by_prisms(kind: str):
 
 def test_a_plate_of_twelve_triangles_has_leissas_frequencies():
     side, thickness = 0.2, 0.002
-    body = nominal_bodies(box(side, side, thickness), walls=[None], count=3, freedoms=12_000).bodies[0]
+    body = nominal_bodies(box(side, side, thickness), walls=[None], count=3, dofs=12_000).bodies[0]
     rigidity = NOMINAL.young * thickness**3 / (12 * (1 - NOMINAL.poisson**2))
     found = 2 * math.pi * body.elastic.frequency * side**2 * math.sqrt(NOMINAL.density * thickness / rigidity)
     assert found.tolist() == pytest.approx([13.489, 19.789, 24.432], rel=0.01)
 
 
 def test_a_body_of_too_coarse_elements_is_made_finer_and_its_error_told(monkeypatch: pytest.MonkeyPatch):
-    def modes(freedoms: int, error: float) -> ElasticModes:
+    def modes(dofs: int, error: float) -> ElasticModes:
         """Frequencies whose error falls with the third power of the edges' length."""
-        frequency = 100.0 * (1.0 + error * (40_000 / freedoms) ** 1.5) * torch.arange(1, 9, dtype=torch.float64)
-        nodes, none = torch.zeros(freedoms, 3, dtype=torch.float64), torch.zeros(0, 6, dtype=torch.int64)
-        return ElasticModes(frequency, nodes, none, torch.zeros(freedoms, 8, 3, dtype=torch.float64), NOMINAL, 1.0)
+        frequency = 100.0 * (1.0 + error * (40_000 / dofs) ** 1.5) * torch.arange(1, 9, dtype=torch.float64)
+        nodes, none = torch.zeros(dofs, 3, dtype=torch.float64), torch.zeros(0, 6, dtype=torch.int64)
+        return ElasticModes(frequency, nodes, none, torch.zeros(dofs, 8, 3, dtype=torch.float64), NOMINAL, 1.0)
 
     def made(error: float) -> tuple[list[int], list[str]]:
         asked: list[int] = []
         heard: list[str] = []
 
-        def found(maker: object, wall: float | None, freedoms: int, **others: object) -> ElasticModes:
-            asked.append(freedoms)
-            return modes(freedoms, error)
+        def found(maker: object, wall: float | None, dofs: int, **others: object) -> ElasticModes:
+            asked.append(dofs)
+            return modes(dofs, error)
 
         monkeypatch.setattr("avmsf.simulate.nominal._Maker._modes", found)
-        nominal_bodies(box(0.1, 0.1, 0.1), walls=[None], count=8, freedoms=40_000, tell=heard.append)
+        nominal_bodies(box(0.1, 0.1, 0.1), walls=[None], count=8, dofs=40_000, tell=heard.append)
         return asked, heard
 
     assert max(made(0.03)[0]) == 40_000

@@ -1,7 +1,7 @@
 """Presets: what `paper` selects, that it is complete, and that the options of the commands start from it."""
 
 import re
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import pytest
@@ -16,8 +16,9 @@ from avmsf.config import PRESETS, BodyConfig, LiftConfig, PipelineConfig, SceneC
 from avmsf.errors import FitError
 from avmsf.field.config import FitConfig
 from avmsf.field.soundfield import SoundField
+from avmsf.field.store import load
 from avmsf.modal.extraction.finders import ShortTime
-from avmsf.pipeline.record import capture_settings_of, finder_of
+from avmsf.pipeline.record import capture_settings_of, finder_of, recorded, with_record
 from avmsf.scene.splatconfig import SplatConfig
 from plate_field import plate_impacts
 from raising import raises
@@ -45,7 +46,7 @@ def test_the_paper_preset_deviates_nowhere_that_there_is_a_switch_for() -> None:
     assert (paper.fit.phase, paper.fit.residual_noise) == ("sine", "gaussian")
     assert paper.fit.bands > 0
     lift = paper.scene.lift
-    assert (lift.onto, lift.weighting, lift.background) == ("gaussians", "plain", "kept")
+    assert (lift.onto, lift.weighting, lift.encoder_background) == ("gaussians", "plain", "kept")
     assert (lift.components, lift.positions, lift.reach) == (0, False, 0.0)
     # Refused where it cannot be had, which `auto` is not.
     assert lift.encoder == "facebook/dinov2-base"
@@ -68,7 +69,7 @@ def test_features_and_modes_start_from_the_preset_too() -> None:
         paper.scene.lift, components=3
     )
     modes = parse_modes(["mug", "--preset", "paper", "--modes", "5"]).pipeline
-    assert (modes.method, modes.time_zero, modes.modes) == (paper.method, paper.time_zero, 5)
+    assert (modes.extraction, modes.time_zero, modes.modes) == (paper.extraction, paper.time_zero, 5)
     assert parse_features(["mug"]).config == PRESETS["default"].scene.lift
     assert parse_modes(["mug"]).pipeline == PRESETS["default"]
     # `splat` needs no preset.
@@ -112,3 +113,22 @@ def test_a_preset_that_there_is_not_is_refused() -> None:
 def test_a_capture_with_another_start_of_sounds_than_the_presets_is_refused() -> None:
     with raises(FitError, name="time_zero", value="onset"):
         SoundField.fit(Capture("plate", plate_impacts()), config=PRESETS["paper"], progress=False)
+
+
+def test_settings_in_earlier_files_have_the_names_of_today() -> None:
+    field = load(Path(__file__).parents[1] / "data" / "format-8" / "mixture.safetensors")
+    assert recorded(field) == {}
+    scene = {"splat": {"dissent": 0.1, "background": "found"}, "lift": {"background": "kept", "size": 0.3}}
+    report = {"pipeline": {"method": "short-time", "body": {"freedoms": 5000}, "scene": scene}}
+    earlier = replace(field, origin=replace(field.origin, report=report))
+    assert recorded(earlier) == {
+        "extraction": "short-time",
+        "body": {"dofs": 5000},
+        "scene": {
+            "splat": {"wrong_masks": 0.1, "background": "found"},
+            "lift": {"encoder_background": "kept", "feature_size": 0.3},
+        },
+    }
+    config = PRESETS["paper"]
+    now = recorded(with_record(field, config, {"scene": asdict(config.scene)}))
+    assert {**now, "fit": asdict(config.fit)} == {**asdict(config), "encoder": None}

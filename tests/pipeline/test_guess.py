@@ -27,7 +27,7 @@ from avmsf.tasks.madeof import made_of
 from raising import raises
 
 LENGTH, WIDTH, HEIGHT = 0.3, 0.02, 0.012
-QUICK = BodyConfig(freedoms=6000)
+QUICK = BodyConfig(dofs=6000)
 
 
 def box(*sides: float, cuts: tuple[int, int, int] = (15, 2, 1)) -> Surface:

@@ -44,7 +44,7 @@ class Cup:
 
 
 def test_walls_cover_the_range_and_thicker_ones_are_stiffer() -> None:
-    filled, *walls = nominal_bodies(Cup(), count=6, freedoms=4000).bodies
+    filled, *walls = nominal_bodies(Cup(), count=6, dofs=4000).bodies
     assert filled.wall is None
     assert [body.wall for body in walls] == pytest.approx([0.006 * 3 ** (step / 4) for step in range(5)])
     lowest = [float(body.elastic.frequency[0]) for body in walls]
@@ -55,20 +55,20 @@ def test_walls_cover_the_range_and_thicker_ones_are_stiffer() -> None:
 
 
 def test_walls_that_cannot_be_had_are_left_out() -> None:
-    found = nominal_bodies(Cup(most=0.01), count=6, freedoms=4000)
+    found = nominal_bodies(Cup(most=0.01), count=6, dofs=4000)
     assert [body.wall is None or body.wall <= 0.01 for body in found.bodies] == [True] * len(found.bodies)
     assert {wall for wall in found.refused if wall is not None and wall > 0.01} == set(found.refused)
-    assert with_wall(Cup(most=0.01), 0.011, count=6, freedoms=4000) is None
+    assert with_wall(Cup(most=0.01), 0.011, count=6, dofs=4000) is None
 
 
 def test_the_thickness_is_searched_for_unless_it_is_known_or_there_is_no_cavity() -> None:
-    config = BodyConfig(shapes=6, freedoms=4000)
+    config = BodyConfig(shapes=6, dofs=4000)
     searched = candidate_bodies(Cup(), config)
     assert searched.thicken is not None
     body = searched.thicken(0.007)
     assert body is not None
     assert body.wall == 0.007
-    known = candidate_bodies(Cup(), BodyConfig(wall=0.005, shapes=6, freedoms=4000))
+    known = candidate_bodies(Cup(), BodyConfig(wall=0.005, shapes=6, dofs=4000))
     assert (known.thicken, [each.wall for each in known.bodies.bodies]) == (None, [0.005])
     solid = candidate_bodies(Cup(thickness_range=None), config)
     assert (solid.thicken, [each.wall for each in solid.bodies.bodies]) == (None, [None])
@@ -79,7 +79,7 @@ def test_bodies_of_a_shape_are_read_again_and_those_of_another_shape_are_not(tmp
 
     def frequency(shape: Cup) -> torch.Tensor:
         said.clear()
-        made = nominal_bodies(shape, walls=[0.009], count=6, freedoms=2000, cache=tmp_path, tell=said.append)
+        made = nominal_bodies(shape, walls=[0.009], count=6, dofs=2000, cache=tmp_path, tell=said.append)
         return made.bodies[0].elastic.frequency
 
     def computed() -> int:

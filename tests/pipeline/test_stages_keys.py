@@ -116,7 +116,7 @@ def test_a_field_does_not_depend_on_free_memory_and_is_made_again_once_there_are
             capture,
             capture.impacts,
             PipelineConfig(
-                body=BodyConfig(wall=0.004, shapes=8, freedoms=1000),
+                body=BodyConfig(wall=0.004, shapes=8, dofs=1000),
                 fit=FitConfig(steps=2, fft_sizes=(1024, 256)),
                 modes=6,
             ),

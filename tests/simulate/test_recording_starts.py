@@ -29,7 +29,7 @@ POLES = torch.tensor([-40.0 + 2j * math.pi * 523.0, -90.0 + 2j * math.pi * 3217.
 @pytest.fixture(scope="module")
 def recipe() -> ObjectRecipe:
     """Return a plate with few modes, briefly recorded."""
-    return ObjectRecipe(kind="plate", modes=8, contacts=6, seconds=0.2, sample_rate=32000, views=0)
+    return ObjectRecipe(kind="plate", elastic_modes=8, impacts=6, seconds=0.2, sample_rate=32000, views=0)
 
 
 @pytest.fixture(scope="module")
@@ -177,7 +177,7 @@ def test_contact_times_follow_the_speed_by_hertzs_law(pulse: str, power: float, 
 
 
 def test_the_defaults_vary_force_and_contact_time_as_impacts_by_hand_do(recipe: ObjectRecipe, cache: Path) -> None:
-    made = simulate_object(replace(recipe, contacts=80, noise_db=None), cache=cache)
+    made = simulate_object(replace(recipe, impacts=80, noise_db=None), cache=cache)
     forces = made.capture.impacts.forces
     assert forces is not None
     # Of the aircraft's 74 impacts by hand: .37; eighty numbers have it to 8 %.

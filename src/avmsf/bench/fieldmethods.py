@@ -46,7 +46,7 @@ class FieldMethod:
         """Return the modes of a task's training recordings."""
         if not self.published:
             return task.modes()
-        finder = finder_named(self.pipeline.method, self.pipeline.modes)
+        finder = finder_named(self.pipeline.extraction, self.pipeline.modes)
         return extract_sounds(task.train.sounds, sample_rate=task.train.sample_rate, method=finder)
 
     def fitted(

@@ -28,7 +28,7 @@ from avmsf.field.scaledgains import ScaledGains
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.field.uncertainty import has_posterior, relative_gain_std, spectrum_band, training_contacts
-from avmsf.pipeline.record import RECORD
+from avmsf.pipeline.record import RECORD, recorded
 from avmsf.scene.featureheader import holds_features
 from avmsf.scene.points import farthest_points
 from avmsf.wording import counted
@@ -111,7 +111,7 @@ def describe(field: SoundField) -> dict[str, Any]:
         "residual_rms": noise,
         "per_newton": field.origin.per_newton,
         "trained_on": list(field.origin.trained_on),
-        "pipeline": {**field.origin.report.get(RECORD, {}), "fit": asdict(field.origin.config)},
+        "pipeline": {**recorded(field), "fit": asdict(field.origin.config)},
         "report": {name: value for name, value in field.origin.report.items() if name != RECORD},
     }
 
@@ -218,8 +218,8 @@ def _pipeline_lines(pipeline: dict[str, Any]) -> list[str]:
     """Return lines on the stages that made the field, if its file names them."""
     fit, scene = pipeline["fit"], pipeline.get("scene")
     lines = []
-    if "method" in pipeline:
-        lines.append(f"  extraction {pipeline['method']}, {pipeline['modes']} modes at most")
+    if "extraction" in pipeline:
+        lines.append(f"  extraction {pipeline['extraction']}, {pipeline['modes']} modes at most")
         lines.append(f"  gain model {pipeline['gain_model']}")
     if scene is not None:
         lift, count = scene["lift"], scene["views"]["count"]

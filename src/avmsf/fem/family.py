@@ -18,9 +18,9 @@ from avmsf.simulate.nominalcheck import CheckedSurface, checked
 from avmsf.simulate.nominalsolid import TRIANGLES, filled_solid, wall_solids
 from avmsf.simulate.solid import Solid
 
-FREEDOMS = WALL_TRIAL
+DOFS = WALL_TRIAL
 """Degrees of freedom of each wall, about: prisms along walls of a pot and a tube are 1 % too stiff in frequency."""
-FILLED_FREEDOMS = 40_000
+FILLED_DOFS = 40_000
 """Of a filled body, about: tetrahedra lock where they fill thin parts."""
 _HOLES = 0.01
 """Part of a closed surface that lids over holes make up, below which the holes are defects of a scan. The mouth of a
@@ -94,13 +94,13 @@ def body_family(
     surface: Surface | Shape,
     *,
     count: int,
-    freedoms: int = FREEDOMS,
-    filled: int = FILLED_FREEDOMS,
+    dofs: int = DOFS,
+    filled: int = FILLED_DOFS,
     tell: Callable[[str], None] | None = None,
 ) -> BodyFamily:
     """Return the bodies of a surface, with their lowest `count` modes.
 
-    Walls have about `freedoms` degrees of freedom, a filled body `filled`.
+    Walls have about `dofs` degrees of freedom, a filled body `filled`.
 
     A closed mesh that shows both sides of one wall has walls of `_SCALES` times its thickness behind its larger side;
     another closed mesh is filled. An open mesh has walls of `WALLS` times its size. A shape from photographs has walls
@@ -110,38 +110,38 @@ def body_family(
     """
     told = tell or (lambda words: None)
     if not isinstance(surface, Surface):
-        return _of_shape(surface, count, freedoms, filled, told)
+        return _of_shape(surface, count, dofs, filled, told)
     found = checked(surface, tell=told)
     if found.lids > _HOLES:
-        make = wall_solids(found, freedoms)
+        make = wall_solids(found, dofs)
         thicknesses = [part * found.skin.size for part in WALLS if part * found.skin.size < found.width]
         return _of_walls(make, thicknesses, count, told)
     wall = wall_of(found.skin)
-    scaled = None if wall is None else _scaled(wall, freedoms)
+    scaled = None if wall is None else _scaled(wall, dofs)
     if wall is None or scaled is None:
         return _filled(found, count, filled, told)
     mean = wall.thickness
     return _of_walls(lambda thickness: scaled(thickness / mean), [mean * scale for scale in _SCALES], count, told)
 
 
-def _of_shape(shape: Shape, count: int, freedoms: int, filled: int, tell: Callable[[str], None]) -> BodyFamily:
+def _of_shape(shape: Shape, count: int, dofs: int, filled: int, tell: Callable[[str], None]) -> BodyFamily:
     between = shape.thickness_range
     if between is None:
         return _filled(checked(shape.as_seen(), tell=tell), count, filled, tell)
 
     def make(thickness: float) -> Solid:
         try:
-            surface = shape.shell(thickness, faces=round(0.5 * TRIANGLES * freedoms))
+            surface = shape.shell(thickness, faces=round(0.5 * TRIANGLES * dofs))
         except SceneError as error:
             raise SimulationError(str(error), **error.attributes) from error
-        return filled_solid(checked(surface, tell=tell), freedoms, wall=thickness)
+        return filled_solid(checked(surface, tell=tell), dofs, wall=thickness)
 
     return _of_walls(make, np.geomspace(*between, _THICKNESSES).tolist(), count, tell)
 
 
-def _filled(found: CheckedSurface, count: int, freedoms: int, tell: Callable[[str], None]) -> BodyFamily:
+def _filled(found: CheckedSurface, count: int, dofs: int, tell: Callable[[str], None]) -> BodyFamily:
     tell("tetrahedra: solid body")
-    return BodyFamily((isotropic_modes(filled_solid(found, freedoms), count=count),), ())
+    return BodyFamily((isotropic_modes(filled_solid(found, dofs), count=count),), ())
 
 
 def _of_walls(
@@ -164,9 +164,9 @@ def _of_walls(
     return BodyFamily(tuple(made.values()), tuple(made), make)
 
 
-def _scaled(wall: Wall, freedoms: int) -> Callable[[float], Solid] | None:
+def _scaled(wall: Wall, dofs: int) -> Callable[[float], Solid] | None:
     """Return what makes a wall of a factor times its thickness; None where prisms do not fill the mesh."""
-    length = wall.length(freedoms)
+    length = wall.length(dofs)
     for tried in (length, _FINER * length):
         try:
             return wall.solids(tried)

@@ -69,12 +69,12 @@ class Wall:
         """Diagonal of the box around the mesh, meters."""
         return self.skin.size
 
-    def length(self, freedoms: int) -> float:
+    def length(self, dofs: int) -> float:
         """Return the sides' length along the wall, meters, of prisms with about so many degrees of freedom."""
 
         # Each vertex of the sheet has 4 nodes on each of 2 layers + 1 levels, and two triangles.
         def needed(layers: int) -> float:
-            return math.sqrt(_TRIANGLE * 12.0 * (2 * layers + 1) * float(self.sheet.areas.sum()) / freedoms)
+            return math.sqrt(_TRIANGLE * 12.0 * (2 * layers + 1) * float(self.sheet.areas.sum()) / dofs)
 
         layers = next(
             layers for layers in range(1, _MOST) if layers == _MOST - 1 or self._layers(needed(layers)) <= layers

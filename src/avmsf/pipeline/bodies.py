@@ -21,7 +21,7 @@ class FinerBodies:
     """Makes bodies of a surface finer, each once."""
 
     surface: Surface | Shape
-    freedoms: int
+    dofs: int
     """Degrees of freedom to come near to."""
     cache: Path | None
     """Folder that keeps elastic modes by content."""
@@ -34,12 +34,12 @@ class FinerBodies:
         """Return the body with finer elements, or as it is where that fails: it was good enough to choose by."""
         key = body.wall, body.support
         if key not in self.made:
-            self.made[key] = refined(self.surface, body, freedoms=self.freedoms, cache=self.cache, tell=self.tell)
+            self.made[key] = refined(self.surface, body, dofs=self.dofs, cache=self.cache, tell=self.tell)
         return self.made[key]
 
     def digest(self) -> str:
         """Return what tells these bodies from those of other settings."""
-        return f"{self.freedoms}"
+        return f"{self.dofs}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class HeldBodies:
     """Holds bodies of a surface at what may have supported them, each once."""
 
     surface: Surface | Shape
-    freedoms: int
+    dofs: int
     """Degrees of freedom at most."""
     cache: Path | None
     """Folder that keeps elastic modes by content."""
@@ -59,14 +59,12 @@ class HeldBodies:
     def __call__(self, body: NominalBody) -> tuple[NominalBody, ...]:
         """Return the free body, and with each support that it may have."""
         if body.wall not in self.made:
-            self.made[body.wall] = supported(
-                self.surface, body, freedoms=self.freedoms, cache=self.cache, tell=self.tell
-            )
+            self.made[body.wall] = supported(self.surface, body, dofs=self.dofs, cache=self.cache, tell=self.tell)
         return self.made[body.wall]
 
     def digest(self) -> str:
         """Return what tells these bodies from those of other settings."""
-        return f"{self.freedoms}"
+        return f"{self.dofs}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +74,7 @@ class ThickerBodies:
     surface: Surface | Shape
     count: int
     """Elastic modes."""
-    freedoms: int
+    dofs: int
     """Degrees of freedom at most."""
     cache: Path | None
     """Folder that keeps elastic modes by content."""
@@ -89,13 +87,13 @@ class ThickerBodies:
         """Return the body with a wall of this thickness, meters; None where that fails."""
         if wall not in self.made:
             self.made[wall] = with_wall(
-                self.surface, wall, count=self.count, freedoms=self.freedoms, cache=self.cache, tell=self.tell
+                self.surface, wall, count=self.count, dofs=self.dofs, cache=self.cache, tell=self.tell
             )
         return self.made[wall]
 
     def digest(self) -> str:
         """Return what tells these bodies from those of other settings."""
-        return f"{self.freedoms}"
+        return f"{self.dofs}"
 
 
 def candidate_bodies(
@@ -116,8 +114,8 @@ def candidate_bodies(
         seen = surface if isinstance(surface, Surface) else surface.as_seen()
         expect_placed(impacts.contacts, surface_points(seen), names=impacts.names)
     walls = None if config.wall is None else [config.wall or None]
-    bodies = nominal_bodies(surface, walls=walls, count=config.shapes, freedoms=config.freedoms, cache=cache, tell=tell)
-    made = surface, config.freedoms, cache, tell or (lambda words: None)
+    bodies = nominal_bodies(surface, walls=walls, count=config.shapes, dofs=config.dofs, cache=cache, tell=tell)
+    made = surface, config.dofs, cache, tell or (lambda words: None)
     several = config.wall is None and sum(body.wall is not None for body in bodies.bodies) > 1
     thicken = ThickerBodies(surface, config.shapes, *made[1:]) if several else None
     hold = None if config.supports == "free" else HeldBodies(*made)

@@ -82,7 +82,7 @@ def lift_to_cloud(
         encoder,
         rasterizer=rasterizer,
         weighting=weighting,
-        inpainted=config.background == "inpainted",
+        inpainted=config.encoder_background == "inpainted",
         progress=progress,
     )
     return supported(lifted, views)
@@ -107,7 +107,7 @@ def lift_to_surface(
         encoder,
         depth_map=depth_map,
         weighting=weighting,
-        inpainted=config.background == "inpainted",
+        inpainted=config.encoder_background == "inpainted",
         progress=progress,
     )
 
@@ -118,7 +118,7 @@ def finish_features(lifted: Lifted, config: LiftConfig) -> MadeFeatures:
     if config.components:
         features = reduce(features, config.components)
     # Before pooling, which is meant to shrink what is noise.
-    features = resize(features, config.size if config.positions else 1.0)
+    features = resize(features, config.feature_size if config.positions else 1.0)
     report: dict[str, Any] = {
         "encoder": lifted.features.encoder,
         "points": len(features.points),

@@ -157,7 +157,7 @@ def _body(
         )
     try:
         found = nominal_bodies(
-            surface, walls=[config.wall or None], count=count, freedoms=config.freedoms, material=material, cache=cache,
+            surface, walls=[config.wall or None], count=count, dofs=config.dofs, material=material, cache=cache,
             tell=tell,
         )  # fmt: skip
     except SimulationError as error:

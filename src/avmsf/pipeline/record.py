@@ -12,10 +12,18 @@ from avmsf.modal.extraction.finders import ModeFinder, finder_named
 RECORD = "pipeline"
 """What a field's report calls the configuration that made it."""
 
+_RENAMED = {
+    RECORD: {"method": "extraction"},
+    "body": {"freedoms": "dofs"},
+    "splat": {"dissent": "wrong_masks"},
+    "lift": {"background": "encoder_background", "size": "feature_size"},
+}
+"""Settings in files of earlier versions, and their names now, by the record that holds them."""
+
 
 def finder_of(config: PipelineConfig) -> ModeFinder:
     """Return what finds the modes."""
-    return finder_named(config.method, config.modes)
+    return finder_named(config.extraction, config.modes)
 
 
 def capture_settings_of(config: PipelineConfig, settings: CaptureSettings) -> CaptureSettings:
@@ -35,3 +43,16 @@ def with_record(made: SoundField, config: PipelineConfig, features: Mapping[str,
     values["encoder"] = features.get("encoder")
     report = {**made.origin.report, RECORD: values}
     return replace(made, origin=replace(made.origin, report=report))
+
+
+def recorded(field: SoundField) -> dict[str, Any]:
+    """Return the configuration in a field's report, by the names that settings have now; empty where there is none."""
+    return _renamed(field.origin.report.get(RECORD, {}), RECORD)
+
+
+def _renamed(values: Mapping[str, Any], owner: str) -> dict[str, Any]:
+    names = _RENAMED.get(owner, {})
+    return {
+        names.get(name, name): _renamed(value, name) if isinstance(value, Mapping) else value
+        for name, value in values.items()
+    }

@@ -137,7 +137,7 @@ class _Keeper:
 
 
 def _hull_points(views: Sequence[View], config: SplatConfig) -> StartPoints:
-    hull = visual_hull(views, points=config.start_points, dissent=config.dissent)
+    hull = visual_hull(views, points=config.start_points, dissent=config.wrong_masks)
     colors = photographed_colors(hull.points, views, spacing=hull.spacing)
     return StartPoints(hull.points, colors, hull.normals)
 

@@ -33,7 +33,7 @@ _RATES = (
     "start_scale",
     "start_flatness",
 )
-_PARTS = ("coarse_until", "degree_every", "densify_from", "densify_until", "least_opacity", "dissent")
+_PARTS = ("coarse_until", "degree_every", "densify_from", "densify_until", "least_opacity", "wrong_masks")
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class SplatConfig:
     """Opacity below which a Gaussian is removed."""
     reset_every: int = 0
     """Steps between resets of all opacities to twice `least_opacity`; 0 never resets them."""
-    dissent: float = field(default=0.05, metadata={"option": "wrong_masks"})
+    wrong_masks: float = 0.05
     """Fraction of the views whose masks may be wrong."""
     seed: int = 0
     """Seed of the order of the views, backgrounds and splits."""

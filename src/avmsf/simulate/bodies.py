@@ -109,7 +109,7 @@ def _elastic(recipe: ObjectRecipe, solid: Solid, legs: Float64[Tensor, "legs 3"]
     return elastic_modes(
         solid,
         material,
-        count=recipe.modes,
+        count=recipe.elastic_modes,
         stiffness_factor=stiffness,
         density_factor=density,
         springs=[(leg, strength) for leg in legs] if strength > 0.0 else None,

@@ -35,7 +35,7 @@ class Vibrations:
 
     squares: Float64[np.ndarray, " modes"]
     """Squared angular frequencies, 1/s2."""
-    shapes: Float64[np.ndarray, "freedoms modes"]
+    shapes: Float64[np.ndarray, "dofs modes"]
     """Mass-normalized displacements, 1 / sqrt(kg)."""
 
 
@@ -60,7 +60,7 @@ def rigid_motions(nodes: Float64[np.ndarray, "nodes 3"], mass: scipy.sparse.csr_
 def lowest_vibrations(
     stiffness: scipy.sparse.sparray,
     mass: scipy.sparse.csr_array,
-    rigid: Float64[np.ndarray, "freedoms 6"],
+    rigid: Float64[np.ndarray, "dofs 6"],
     *,
     count: int,
     shift: float,
@@ -72,14 +72,14 @@ def lowest_vibrations(
     angular frequency. `supported` bodies are held by springs, others are free. Raises SimulationError where the body
     has fewer vibrations, or cells of such bad form that none are found.
     """
-    freedoms = stiffness.shape[0]
+    dofs = stiffness.shape[0]
     wanted = count + (_RIGID if supported else 0)
-    if wanted + 2 * _RIGID > freedoms:
+    if wanted + 2 * _RIGID > dofs:
         raise SimulationError(
-            f"expected {wanted // 3 + 5} nodes or more for {count} modes, got {freedoms // 3}; ask for fewer modes or "
+            f"expected {wanted // 3 + 5} nodes or more for {count} modes, got {dofs // 3}; ask for fewer modes or "
             "a finer detail",
             name="nodes",
-            value=freedoms // 3,
+            value=dofs // 3,
         )
     heavy = scipy.sparse.kron(mass, scipy.sparse.eye_array(3), format="csc")
     try:
@@ -114,11 +114,11 @@ def _largest_responses(
     Each step adds the response to the last block of motions, made orthogonal to all before. In the basis that grows so
     the response is a band of blocks, whose eigenvectors end in how far each mode still is from its true shape.
     """
-    freedoms = 3 * mass.shape[0]
-    longest = min(freedoms, _LONGEST * (wanted + _BLOCK))
-    basis = np.empty((freedoms, longest + _BLOCK), order="F")
+    dofs = 3 * mass.shape[0]
+    longest = min(dofs, _LONGEST * (wanted + _BLOCK))
+    basis = np.empty((dofs, longest + _BLOCK), order="F")
     band = np.zeros((longest + _BLOCK, longest + _BLOCK))
-    drawn = np.random.default_rng(0).standard_normal((freedoms, min(_BLOCK, freedoms)))
+    drawn = np.random.default_rng(0).standard_normal((dofs, min(_BLOCK, dofs)))
     block, _ = _orthonormal(respond(drawn), mass, basis[:, :0])
     begin, end = 0, block.shape[1]
     basis[:, :end] = block
@@ -169,6 +169,6 @@ def _times(mass: scipy.sparse.csr_array, vectors: np.ndarray) -> np.ndarray:
     return (mass @ spread).reshape(vectors.shape)
 
 
-def _signs(shapes: Float64[np.ndarray, "freedoms modes"]) -> Float64[np.ndarray, " modes"]:
+def _signs(shapes: Float64[np.ndarray, "dofs modes"]) -> Float64[np.ndarray, " modes"]:
     """Return the sign that makes the largest component of each shape positive."""
     return np.sign(shapes[np.abs(shapes).argmax(axis=0), np.arange(shapes.shape[1])])

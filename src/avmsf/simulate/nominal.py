@@ -25,7 +25,7 @@ from avmsf.simulate.elasticstore import modes_once
 from avmsf.simulate.elements import SecondOrder
 from avmsf.simulate.material import Material
 from avmsf.simulate.nominalcheck import CheckedSurface, checked
-from avmsf.simulate.nominalsolid import FEWEST, TRIANGLES, expect_memory, filled_solid, freedoms_of, wall_solids
+from avmsf.simulate.nominalsolid import FEWEST, TRIANGLES, count_dofs, expect_memory, filled_solid, wall_solids
 from avmsf.simulate.recipe import key_of
 from avmsf.simulate.solid import Solid
 
@@ -113,7 +113,7 @@ def nominal_bodies(
     *,
     walls: Sequence[float | None] | None = None,
     count: int = 80,
-    freedoms: int = 40_000,
+    dofs: int = 40_000,
     material: Material = NOMINAL,
     cache: Path | None = None,
     tell: Callable[[str], None] | None = None,
@@ -122,7 +122,7 @@ def nominal_bodies(
 
     `walls` states what to try: thicknesses in meters, None for what the surface encloses. By itself it tries that,
     and walls of `WALLS` times the surface's size where the surface is a sheet or holds much more than the wall would;
-    of a `Shape`, walls all over its range of thickness. Where one body is left, it has about `freedoms` degrees of
+    of a `Shape`, walls all over its range of thickness. Where one body is left, it has about `dofs` degrees of
     freedom, at most a fifth more; of several each has at most `TRIAL`, or `WALL_TRIAL`, enough to choose by, and
     `refined` makes the chosen one fine. Dense, noisy and inverted surfaces are mended, and `tell` hears of it; the wall
     of an open one lies behind its triangles, whichever way they face. Modes are kept by content in the folder `cache`,
@@ -133,7 +133,7 @@ def nominal_bodies(
     """
     told = tell or (lambda words: None)
     maker = _Maker(surface, count, cache, told, material)
-    _expect_settings(count, freedoms, walls)
+    _expect_settings(count, dofs, walls)
     guessed = walls is None
     wanted: list[float | None] = maker.guesses() if walls is None else list(dict.fromkeys(walls))
     refused: dict[float | None, str] = {}
@@ -144,7 +144,7 @@ def nominal_bodies(
             likely.append(wall)
         except SimulationError as error:
             refused[wall] = str(error)
-    bodies = maker.bodies(likely, freedoms, refused)
+    bodies = maker.bodies(likely, dofs, refused)
     reasons = _grouped(refused)
     for reason in reasons:
         told(f"candidate model left out: {reason}")
@@ -157,7 +157,7 @@ def nominal_bodies(
             value=reasons,
         )
     if len(bodies) == 1 and not bodies[0].fine:
-        bodies = [refined(surface, bodies[0], freedoms=freedoms, cache=cache, tell=tell)]
+        bodies = [refined(surface, bodies[0], dofs=dofs, cache=cache, tell=tell)]
     return NominalBodies(tuple(bodies), MappingProxyType(refused))
 
 
@@ -166,7 +166,7 @@ def with_wall(
     wall: float,
     *,
     count: int = 80,
-    freedoms: int = 40_000,
+    dofs: int = 40_000,
     cache: Path | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> NominalBody | None:
@@ -176,7 +176,7 @@ def with_wall(
     """
     told = tell or (lambda words: None)
     try:
-        return _Maker(surface, count, cache, told).body(wall, freedoms, fine=False)
+        return _Maker(surface, count, cache, told).body(wall, dofs, fine=False)
     except SimulationError as error:
         told(f"candidate model left out: {body_name(wall)}: {error}")
         return None
@@ -186,11 +186,11 @@ def refined(
     surface: Surface | Shape,
     body: NominalBody,
     *,
-    freedoms: int = 40_000,
+    dofs: int = 40_000,
     cache: Path | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> NominalBody:
-    """Return a body of `nominal_bodies` computed with about `freedoms` degrees of freedom; a fine one as it is.
+    """Return a body of `nominal_bodies` computed with about `dofs` degrees of freedom; a fine one as it is.
 
     Where that fails, for want of memory or because it cannot be filled so finely, the coarser one is returned, which
     was good enough to choose by, and `tell` hears of it. Raises SimulationError for settings that cannot be meant.
@@ -198,12 +198,12 @@ def refined(
     if body.fine:
         return body
     told = tell or (lambda words: None)
-    _expect_settings(len(body.elastic), freedoms, [body.wall])
+    _expect_settings(len(body.elastic), dofs, [body.wall])
     try:
         maker = _Maker(surface, len(body.elastic), cache, told, body.elastic.material)
         if body.support is None:
-            return maker.body(body.wall, freedoms, fine=True)
-        modes = maker.held(body.wall, freedoms, maker.solid(body.wall, freedoms), body.support, perturbed=True)
+            return maker.body(body.wall, dofs, fine=True)
+        modes = maker.held(body.wall, dofs, maker.solid(body.wall, dofs), body.support, perturbed=True)
         return replace(body, elastic=modes, fine=True)
     except SimulationError as error:
         told(f"{body.name}: using the coarse mesh: {error}")
@@ -214,7 +214,7 @@ def supported(
     surface: Surface | Shape,
     body: NominalBody,
     *,
-    freedoms: int = 40_000,
+    dofs: int = 40_000,
     cache: Path | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> tuple[NominalBody, ...]:
@@ -226,14 +226,14 @@ def supported(
     """
     told = tell or (lambda words: None)
     trial = TRIAL if isinstance(surface, Surface) else WALL_TRIAL
-    few = min(freedoms, trial)
+    few = min(dofs, trial)
     maker, bodies = _Maker(surface, len(body.elastic), cache, told, body.elastic.material), []
     try:
         solid = maker.solid(body.wall, few)
         for support in (None, *supports_of(SecondOrder.of(solid))):
             try:
-                modes = maker.held(body.wall, few, solid, support, perturbed=freedoms <= trial)
-                bodies.append(NominalBody(body.wall, modes, freedoms <= trial, support))
+                modes = maker.held(body.wall, few, solid, support, perturbed=dofs <= trial)
+                bodies.append(NominalBody(body.wall, modes, dofs <= trial, support))
             except SimulationError as error:
                 if support is None:
                     raise
@@ -290,10 +290,10 @@ class _Maker:
         elif guessed and self._shape is None:
             self.checked.expect_hollow(wall)
 
-    def body(self, wall: float | None, freedoms: int, *, fine: bool) -> NominalBody:
+    def body(self, wall: float | None, dofs: int, *, fine: bool) -> NominalBody:
         """Return one body with so many degrees of freedom, or with at most `TRIAL` where it need not be fine."""
         trial = TRIAL if self._shape is None else WALL_TRIAL
-        if not fine and freedoms > trial:
+        if not fine and dofs > trial:
             try:
                 return NominalBody(wall, self._modes(wall, trial, perturbed=False), fine=False)
             except SimulationError as error:
@@ -301,17 +301,15 @@ class _Maker:
                 if self._shape is not None:
                     raise
                 self._tell(f"retrying with more tetrahedra ({error})")
-        return NominalBody(wall, self._converged(wall, freedoms))
+        return NominalBody(wall, self._converged(wall, dofs))
 
-    def bodies(
-        self, walls: Sequence[float | None], freedoms: int, refused: dict[float | None, str]
-    ) -> list[NominalBody]:
+    def bodies(self, walls: Sequence[float | None], dofs: int, refused: dict[float | None, str]) -> list[NominalBody]:
         """Return the bodies with these walls, fine if it is one; `refused` gets the reason of those that fail."""
         bodies = []
         # Most of the time goes to factorizations, which release the interpreter's lock and keep a processor busy each.
         # The limit on BLAS is the whole process's: set by each thread for itself, it would not be taken back in order.
         with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(lane_count()) as pool:
-            pending = {wall: pool.submit(self.body, wall, freedoms, fine=len(walls) == 1) for wall in walls}
+            pending = {wall: pool.submit(self.body, wall, dofs, fine=len(walls) == 1) for wall in walls}
             try:
                 for wall, body in pending.items():
                     try:
@@ -322,11 +320,11 @@ class _Maker:
                 pool.shutdown(cancel_futures=True)
         return bodies
 
-    def _converged(self, wall: float | None, freedoms: int) -> ElasticModes:
+    def _converged(self, wall: float | None, dofs: int) -> ElasticModes:
         """Return modes of one body, of twice as many degrees of freedom where their frequencies still change much."""
-        modes = self._modes(wall, freedoms, perturbed=True)
+        modes = self._modes(wall, dofs, perturbed=True)
         # The thickness of a shape's wall is found with such elements, and makes up for their stiffness.
-        if freedoms <= TRIAL or (self._shape is not None and wall is not None):
+        if dofs <= TRIAL or (self._shape is not None and wall is not None):
             return modes
         try:
             error = _frequency_error(self._modes(wall, TRIAL, perturbed=False), modes)
@@ -335,68 +333,66 @@ class _Maker:
             return modes
         if error > LARGEST_ERROR:
             try:
-                finer = self._modes(wall, 2 * freedoms, perturbed=True)
+                finer = self._modes(wall, 2 * dofs, perturbed=True)
                 modes, error = finer, _frequency_error(modes, finer)
             except SimulationError as failure:
                 self._tell(f"{body_name(wall)}: no finer mesh ({failure})")
         if error > LARGEST_ERROR:
             self._tell(
                 f"{body_name(wall)}: mesh too coarse, relative error of the lowest frequencies about {error:.0%}; "
-                f"allow {4 * freedoms} degrees of freedom (--body.dofs)"
+                f"allow {4 * dofs} degrees of freedom (--body.dofs)"
             )
         return modes
 
     def held(
-        self, wall: float | None, freedoms: int, solid: Solid, support: Support | None, *, perturbed: bool
+        self, wall: float | None, dofs: int, solid: Solid, support: Support | None, *, perturbed: bool
     ) -> ElasticModes:
         """Return the modes of tetrahedra that are held, or free without a support, read from where they are kept."""
         fixed = None if support is None else support.nodes(SecondOrder.of(solid))
-        kept = self._kept(wall, freedoms, support, perturbed=perturbed)
-        return modes_once(kept, lambda: self._solved(solid, freedoms, fixed, perturbed=perturbed), tell=self._tell)
+        kept = self._kept(wall, dofs, support, perturbed=perturbed)
+        return modes_once(kept, lambda: self._solved(solid, dofs, fixed, perturbed=perturbed), tell=self._tell)
 
-    def _modes(self, wall: float | None, freedoms: int, *, perturbed: bool) -> ElasticModes:
+    def _modes(self, wall: float | None, dofs: int, *, perturbed: bool) -> ElasticModes:
         """Return the modes of one free body, read from where they are kept."""
-        kept = self._kept(wall, freedoms, perturbed=perturbed)
-        return modes_once(kept, lambda: self._computed(wall, freedoms, perturbed=perturbed), tell=self._tell)
+        kept = self._kept(wall, dofs, perturbed=perturbed)
+        return modes_once(kept, lambda: self._computed(wall, dofs, perturbed=perturbed), tell=self._tell)
 
-    def _computed(self, wall: float | None, freedoms: int, *, perturbed: bool) -> ElasticModes:
-        return self._solved(self.solid(wall, freedoms), freedoms, None, perturbed=perturbed)
+    def _computed(self, wall: float | None, dofs: int, *, perturbed: bool) -> ElasticModes:
+        return self._solved(self.solid(wall, dofs), dofs, None, perturbed=perturbed)
 
     def _solved(
-        self, solid: Solid, freedoms: int, fixed: Int[np.ndarray, " fixed"] | None, *, perturbed: bool
+        self, solid: Solid, dofs: int, fixed: Int[np.ndarray, " fixed"] | None, *, perturbed: bool
     ) -> ElasticModes:
-        size = freedoms_of(solid)
+        size = count_dofs(solid)
         self._tell(f"{self._count} elastic modes of {size} degrees of freedom")
         try:
             return elastic_modes(solid, self._material, count=self._count, fixed=fixed, perturbed=perturbed)
         except MemoryError as error:
             raise SimulationError(
                 f"expected enough memory for {size} degrees of freedom, got too little; use "
-                f"{max(freedoms // 2, FEWEST)} (--body.dofs), or close other programs",
-                name="freedoms",
+                f"{max(dofs // 2, FEWEST)} (--body.dofs), or close other programs",
+                name="dofs",
                 value=size,
             ) from error
 
-    def solid(self, wall: float | None, freedoms: int) -> Solid:
+    def solid(self, wall: float | None, dofs: int) -> Solid:
         """Return tetrahedra with about so many degrees of freedom."""
-        expect_memory(freedoms)
+        expect_memory(dofs)
         self._tell(f"tetrahedra: {body_name(wall)}")
         if wall is None:
-            return filled_solid(self.checked, freedoms)
+            return filled_solid(self.checked, dofs)
         if self._shape is not None:
             try:
-                surface = self._shape.shell(wall, faces=round(0.5 * TRIANGLES * freedoms))
+                surface = self._shape.shell(wall, faces=round(0.5 * TRIANGLES * dofs))
             except SceneError as error:
                 raise SimulationError(str(error), **error.attributes) from error
-            return filled_solid(checked(surface, tell=self._tell), freedoms, wall=wall)
+            return filled_solid(checked(surface, tell=self._tell), dofs, wall=wall)
         with self._lock:
-            if freedoms not in self._walls:
-                self._walls[freedoms] = wall_solids(self.checked, freedoms)
-        return self._walls[freedoms](wall)
+            if dofs not in self._walls:
+                self._walls[dofs] = wall_solids(self.checked, dofs)
+        return self._walls[dofs](wall)
 
-    def _kept(
-        self, wall: float | None, freedoms: int, support: Support | None = None, *, perturbed: bool
-    ) -> Path | None:
+    def _kept(self, wall: float | None, dofs: int, support: Support | None = None, *, perturbed: bool) -> Path | None:
         if self._cache is None:
             return None
         values = {
@@ -406,7 +402,7 @@ class _Maker:
             "surface": self._digest,
             "wall": wall,
             "count": self._count,
-            "freedoms": freedoms,
+            "dofs": dofs,
             "perturbed": perturbed,
             "material": asdict(self._material),
             "support": None if support is None else asdict(support),
@@ -437,11 +433,11 @@ def _frequency_error(coarse: ElasticModes, fine: ElasticModes) -> float:
     return change / max((len(fine.nodes) / len(coarse.nodes)) ** 1.5 - 1.0, 1.0)
 
 
-def _expect_settings(count: int, freedoms: int, walls: Sequence[float | None] | None) -> None:
+def _expect_settings(count: int, dofs: int, walls: Sequence[float | None] | None) -> None:
     if count < 1:
         raise SimulationError(f"count: expected 1 mode or more, got {count}", name="count", value=count)
-    if freedoms < FEWEST:
-        raise SimulationError(f"freedoms: expected {FEWEST} or more, got {freedoms}", name="freedoms", value=freedoms)
+    if dofs < FEWEST:
+        raise SimulationError(f"dofs: expected {FEWEST} or more, got {dofs}", name="dofs", value=dofs)
     if walls is not None and not len(walls):
         raise SimulationError(
             "walls: expected thicknesses in meters, or None for a solid object, got an empty list",

@@ -20,11 +20,11 @@ ROUGH = 20.0
 _FINE = 0.06
 """Mean edge over the body's size from which on a mesh is too coarse to tell noise from form: a box turns by 60."""
 _PROBES = 8
-"""Random vectors that estimate the number of freedoms left; they do so within a per cent for thousands of vertices."""
+"""Random vectors that estimate the number of degrees of freedom left, within a per cent for thousands of vertices."""
 _WEAKEST, _STRONGEST = -3.0, 5.0
 """Decimal logarithms of the strengths to choose from."""
 _KEPT = 0.8
-"""Part of the vertices' freedoms that a mesh without noise would keep."""
+"""Part of the vertices' degrees of freedom that a mesh without noise would keep."""
 
 
 def roughness(skin: Skin) -> float:

@@ -42,27 +42,27 @@ _CAUTION = 2.0
 """Factor on that, for lumps take more than the walls it was measured on."""
 
 
-def expect_memory(freedoms: int) -> None:
+def expect_memory(dofs: int) -> None:
     """Raise SimulationError where the modes of a mesh with so many degrees of freedom do not fit into memory."""
     free = _free_memory()
     peak, measured, power = _PEAK
-    needed = _CAUTION * peak * (freedoms / measured) ** power
+    needed = _CAUTION * peak * (dofs / measured) ** power
     if free is not None and needed > free:
         fitting = int(measured * (free / (_CAUTION * peak)) ** (1.0 / power)) // 1000 * 1000
         raise SimulationError(
-            f"expected about {needed / 1e9:.2g} GB of free memory for {freedoms} degrees of freedom, got "
+            f"expected about {needed / 1e9:.2g} GB of free memory for {dofs} degrees of freedom, got "
             f"{free / 1e9:.2g} GB; use {max(fitting, FEWEST)} (--body.dofs), or close other programs",
             name="memory",
             value=free,
         )
 
 
-def freedoms_of(solid: Solid) -> int:
+def count_dofs(solid: Solid) -> int:
     """Return the number of displacements at the nodes of second-order elements."""
     return 3 * len(SecondOrder.of(solid).nodes)
 
 
-def filled_solid(checked: CheckedSurface, freedoms: int, *, wall: float | None = None) -> Solid:
+def filled_solid(checked: CheckedSurface, dofs: int, *, wall: float | None = None) -> Solid:
     """Return what a surface encloses as tetrahedra with about so many degrees of freedom.
 
     A mesh that shows both sides of a wall, which may be `wall` meters thick everywhere, is filled by prisms, one that
@@ -73,32 +73,30 @@ def filled_solid(checked: CheckedSurface, freedoms: int, *, wall: float | None =
     sides = wall_of(checked.skin, wall)
     if sides is not None:
         with contextlib.suppress(SimulationError):
-            # Freedoms may be few for prisms along a wall that bends tightly; tetrahedra need not follow it.
-            return _near(
-                lambda detail: sides.solid(detail * sides.size), freedoms, first=sides.length(freedoms) / sides.size
-            )
-    first = _filling_detail(checked, freedoms)
+            # Degrees of freedom may be few for prisms along a wall that bends tightly; tetrahedra need not follow it.
+            return _near(lambda detail: sides.solid(detail * sides.size), dofs, first=sides.length(dofs) / sides.size)
+    first = _filling_detail(checked, dofs)
 
     def filled(detail: float) -> Solid:
         # Quadrics keep the volume. Edges taken out one by one made the wall of a mug 5 % thinner.
-        count = round(TRIANGLES * freedoms * (first / detail) ** 2)
+        count = round(TRIANGLES * dofs * (first / detail) ** 2)
         return fill(_surface(simplified(checked.skin, count)), detail=detail)
 
-    return _near(filled, freedoms, first=first)
+    return _near(filled, dofs, first=first)
 
 
-def wall_solids(checked: CheckedSurface, freedoms: int) -> Callable[[float], Solid]:
+def wall_solids(checked: CheckedSurface, dofs: int) -> Callable[[float], Solid]:
     """Return what makes a wall of a thickness, meters, with about so many degrees of freedom inwards of a surface.
 
     The skin is remeshed once for all thicknesses. Raises SimulationError for several parts and for triangles that
     face different ways; what it returns does as `shell` does.
     """
     sheet = checked.sheet()
-    length = 1.2 * math.sqrt(_SHELL * float(sheet.areas.sum()) / freedoms)
+    length = 1.2 * math.sqrt(_SHELL * float(sheet.areas.sum()) / dofs)
     skin = sheet
     for _ in range(_TRIES):
         skin = sheet.remeshed(length)
-        part = _SHELL * len(skin.points) / freedoms
+        part = _SHELL * len(skin.points) / dofs
         if _UNDER <= part <= 1.0:
             break
         length *= math.sqrt(part / 0.85)
@@ -108,12 +106,12 @@ def wall_solids(checked: CheckedSurface, freedoms: int) -> Callable[[float], Sol
         def made(detail: float) -> Solid:
             return shell(surface, thickness=thickness, detail=detail)
 
-        return _near(made, freedoms, first=length / skin.size)
+        return _near(made, dofs, first=length / skin.size)
 
     return walled
 
 
-def _near(make: Callable[[float], Solid], freedoms: int, *, first: float) -> Solid:
+def _near(make: Callable[[float], Solid], dofs: int, *, first: float) -> Solid:
     """Return the solid of the detail, `first` at first, whose degrees of freedom come nearest to those wanted.
 
     Raises SimulationError where all of them are over by more than `_OVER`, and what `make` raises of the last detail
@@ -121,7 +119,7 @@ def _near(make: Callable[[float], Solid], freedoms: int, *, first: float) -> Sol
     """
     tried: dict[float, int] = {}
     best: tuple[int, Solid] | None = None
-    for detail in _details(tried, freedoms, first):
+    for detail in _details(tried, dofs, first):
         try:
             solid = make(detail)
         except SimulationError:
@@ -130,39 +128,39 @@ def _near(make: Callable[[float], Solid], freedoms: int, *, first: float) -> Sol
                 break
             detail *= _FINER
             solid = make(detail)
-        tried[detail] = freedoms_of(solid)
-        if tried[detail] <= _OVER * freedoms and (best is None or tried[detail] > best[0]):
+        tried[detail] = count_dofs(solid)
+        if tried[detail] <= _OVER * dofs and (best is None or tried[detail] > best[0]):
             best = tried[detail], solid
     if best is None:
         least = min(tried.values())
         raise SimulationError(
-            f"expected a mesh of {freedoms} degrees of freedom, got {least} at least; allow these (--body.dofs), or "
+            f"expected a mesh of {dofs} degrees of freedom, got {least} at least; allow these (--body.dofs), or "
             "simplify the mesh",
-            name="freedoms",
+            name="dofs",
             value=least,
         )
     return best[1]
 
 
-def _details(tried: dict[float, int], freedoms: int, first: float) -> Iterator[float]:
+def _details(tried: dict[float, int], dofs: int, first: float) -> Iterator[float]:
     """Yield details until one of those tried is near the wanted number, each by the power that the last two show."""
     detail, power = min(max(first, _DETAILS[0]), _DETAILS[1]), 1.5
     for _ in range(_TRIES):
         yield detail
         last, found = list(tried.items())[-1]
-        if _UNDER * freedoms <= found <= _OVER * freedoms:
+        if _UNDER * dofs <= found <= _OVER * dofs:
             return
         if len(tried) > 1:
             before, other = list(tried.items())[-2]
             if other != found:
                 power = min(max(-math.log(found / other) / math.log(last / before), 0.8), 3.0)
-        change = (found / (0.95 * freedoms)) ** (1.0 / power)
+        change = (found / (0.95 * dofs)) ** (1.0 / power)
         detail = min(max(last * min(max(change, 1.0 / _STEP), _STEP), _DETAILS[0]), _DETAILS[1])
         if detail in tried:
             return
 
 
-def _filling_detail(checked: CheckedSurface, freedoms: int) -> float:
+def _filling_detail(checked: CheckedSurface, dofs: int) -> float:
     """Return a first guess of the detail that fills a surface with so many degrees of freedom."""
     skin = checked.skin
     held = checked.mean_thickness or 0.0
@@ -172,7 +170,7 @@ def _filling_detail(checked: CheckedSurface, freedoms: int) -> float:
     lengths = np.geomspace(_DETAILS[0], _DETAILS[1], 200) * skin.size
     relative = np.maximum(held / lengths, 1e-3)
     needed = area / lengths**2 * 16.4 * relative**-0.68 + volume / lengths**3 * 38.0 * np.minimum(1.0, relative / 3.0)
-    return float(lengths[np.argmax(needed <= freedoms)] / skin.size) if (needed <= freedoms).any() else _DETAILS[1]
+    return float(lengths[np.argmax(needed <= dofs)] / skin.size) if (needed <= dofs).any() else _DETAILS[1]
 
 
 def _surface(skin: Skin) -> Surface:

@@ -136,11 +136,11 @@ class ObjectRecipe:
     """Longest side of the bounding box, meters; by default that of the random shape or of the mesh."""
     up: Literal["x", "y", "z"] = "z"
     """Upward axis: the hammer comes from above or from the side."""
-    modes: int = field(default=64, metadata={"option": "elastic_modes"})
+    elastic_modes: int = 64
     """Number of elastic modes to compute, the lowest; those above 45 % of the sample rate are left out."""
     detail: float = 0.04
     """Edge length of the tetrahedra in a mesh, over its diagonal. Shapes have tetrahedra of their own."""
-    contacts: int = field(default=40, metadata={"option": "impacts"})
+    impacts: int = 40
     """Number of impacts."""
     sample_rate: int = 48000
     """Sample rate, Hz."""
@@ -162,8 +162,8 @@ class ObjectRecipe:
     def __post_init__(self) -> None:
         material_named(self.material)
         for name, least, most in (
-            ("contacts", 2, 100_000),
-            ("modes", 1, 1000),
+            ("impacts", 2, 100_000),
+            ("elastic_modes", 1, 1000),
             ("sample_rate", 1000, 1_000_000),
             ("seconds", 0.02, 60.0),
             ("view_size", 16, 8192),
@@ -195,7 +195,7 @@ class ObjectRecipe:
         names = ("version", "kind", "mesh", "thickness", "material", "seed", "size", "up")
         kept = {"source": source_digest(), **{name: values[name] for name in names}}
         imperfect = {name: values["imperfections"][name] for name in ("thickness", "stiffness", "density", "support")}
-        return {**kept, "modes": self.modes, "detail": self.detail, "imperfections": imperfect}
+        return {**kept, "modes": self.elastic_modes, "detail": self.detail, "imperfections": imperfect}
 
 
 def key_of(values: dict[str, Any]) -> str:

@@ -67,7 +67,7 @@ def simulate_object(
     tell("sounds")
     sounding = sounding_body(recipe, body)
     strikes = draw_strikes(
-        body.surface, recipe.contacts, up=up_of(recipe), imperfections=recipe.imperfections, seed=recipe.seed
+        body.surface, recipe.impacts, up=up_of(recipe), imperfections=recipe.imperfections, seed=recipe.seed
     )
     recordings, forces, truth = record(recipe, sounding, strikes)
     seen = body.surface if recipe.surface else None

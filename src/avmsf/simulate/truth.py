@@ -30,6 +30,8 @@ TRUTH = "truth.safetensors"
 _KEY = "avmsf_truth"
 _MODES, _TABLES = ("frequency", "damping"), ("gains", "quadrature")
 _OPTIONAL = ("contacts", "starts")
+_RENAMED = {"modes": "elastic_modes", "contacts": "impacts"}
+"""Settings of recipes in files of earlier versions, and their names now."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +110,8 @@ def read_truth(path: str | Path) -> Truth:
     words, tensors = _read(path)
     record = _understand(words, path)
     _expect_tensors(tensors, len(record["names"]), path)
-    return Truth(names=tuple(record["names"]), recipe=record["recipe"], **tensors)
+    recipe = {_RENAMED.get(name, name): value for name, value in record["recipe"].items()}
+    return Truth(names=tuple(record["names"]), recipe=recipe, **tensors)
 
 
 def _read(path: Path) -> tuple[str, dict[str, Tensor]]:

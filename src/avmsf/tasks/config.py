@@ -1,7 +1,7 @@
 """Settings of guided edits: importing this imports nothing that computes."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 from avmsf.errors import EditError
@@ -17,9 +17,9 @@ class GuidedEditConfig:
 
     steps: int = 300
     """Steps; Audio-SDS reports about 1,000."""
-    contacts: int = field(default=10, metadata={"option": "contacts_per_step"})
+    contacts_per_step: int = 10
     """Contacts of each step, drawn again from the whole surface."""
-    modes: int = field(default=128, metadata={"option": "free_modes"})
+    free_modes: int = 128
     """Number of modes, the loudest, with own factors; the others follow the common factors."""
     seconds: float | None = None
     """Duration of each sound that is compared; by default that of the field's sounds."""
@@ -32,7 +32,13 @@ class GuidedEditConfig:
 
     def __post_init__(self) -> None:
         """Raise `EditError` for values out of range."""
-        for name, least in (("steps", 1), ("contacts", 1), ("modes", 1), ("preview_every", 0), ("seed", 0)):
+        for name, least in (
+            ("steps", 1),
+            ("contacts_per_step", 1),
+            ("free_modes", 1),
+            ("preview_every", 0),
+            ("seed", 0),
+        ):
             if getattr(self, name) < least:
                 raise _unfit(self, name, f"{least} or more")
         if self.seed > _LARGEST_SEED:

@@ -146,7 +146,7 @@ class _Steering:
         )
         searching = state is None and parameters.searches
         start = guide.start(self.probes) if searching else ModalEdit.none(self.probes.bank)
-        self.variables = EditVariables(start, self.probes.loudest(config.modes), parameters)
+        self.variables = EditVariables(start, self.probes.loudest(config.free_modes), parameters)
         if state is not None:
             self.variables.resume(state["variables"])
             self.step, self.spoilt = state["step"], state["spoilt"]
@@ -176,7 +176,7 @@ class _Steering:
         """Take one step and return the loss before it."""
         # All chance of a step hangs on its number, so that an edit goes on as if it had never been interrupted.
         generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
-        rows = torch.randperm(len(self.places), generator=generator)[: self.config.contacts]
+        rows = torch.randperm(len(self.places), generator=generator)[: self.config.contacts_per_step]
         struck = self._struck(self.places[rows])
         before = level(struck.sounds(ModalEdit.none(struck.bank)), sample_rate=struck.sample_rate)
         sounds = struck.sounds(self.variables.edit())

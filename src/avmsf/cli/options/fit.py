@@ -101,7 +101,7 @@ class Options(Printing):
 
 def parse(words: Sequence[str]) -> Options:
     """Return the options that the words spell, with the preset's settings as defaults."""
-    values = preset_values(preset_of(words), method="extraction", fit="config")
+    values = preset_values(preset_of(words), fit="config")
     # Views and features are made beforehand.
     del values["scene"]
     return parse_options(with_defaults(Options, values), "fit", words, description=Options.__doc__)

@@ -107,8 +107,8 @@ def _spec(info: StructTypeInfo, each: "Field[Any]", hint: Any) -> StructFieldSpe
 
 
 def option_of(each: "Field[Any]") -> str:
-    """Return the option of a field without a prefix; its metadata may state another name than the field's."""
-    return f"--{each.metadata.get('option', each.name).replace('_', '-')}"
+    """Return the option of a field without a prefix."""
+    return f"--{each.name.replace('_', '-')}"
 
 
 def _with_names(each: "Field[Any]", hint: Any) -> Any:
@@ -119,7 +119,6 @@ def _with_names(each: "Field[Any]", hint: Any) -> Any:
     repeated, flag = tyro.conf.UseAppendAction in marks, tyro.conf.FlagCreatePairsOff in marks
     shown: Callable[[str], str] | None = _on_or_off if kind is bool and not flag else _default
     own = tyro.conf.arg(
-        name=each.metadata.get("option"),
         metavar=each.metadata.get("metavar") or (None if kind is bool else _metavar(kind)),
         help_behavior_hint=None if repeated else shown,
     )

@@ -42,11 +42,11 @@ class Options(Printing):
     @property
     def pipeline(self) -> PipelineConfig:
         """The settings that modes depend on, with the defaults of all others."""
-        return PipelineConfig(method=self.extraction, modes=self.modes, time_zero=self.time_zero)
+        return PipelineConfig(extraction=self.extraction, modes=self.modes, time_zero=self.time_zero)
 
 
 def parse(words: Sequence[str]) -> Options:
     """Return the options that the words spell, with the preset's settings as defaults."""
-    values = preset_values(preset_of(words), method="extraction")
+    values = preset_values(preset_of(words))
     own = {name: values[name] for name in ("extraction", "modes", "time_zero", "preset")}
     return parse_options(with_defaults(Options, own), "modes", words, description=Options.__doc__)

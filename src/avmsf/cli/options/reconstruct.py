@@ -99,7 +99,7 @@ class Options(SceneOptions):
 
 def parse(words: Sequence[str]) -> Options:
     """Return the options that the words spell, with the preset's settings as defaults."""
-    values = preset_values(preset_of(words), method="extraction")
+    values = preset_values(preset_of(words))
     scene = values.pop("scene")
     values |= {each.name: getattr(scene, each.name) for each in fields(scene)}
     return parse_options(with_defaults(Options, values), "reconstruct", words, description=Options.__doc__)

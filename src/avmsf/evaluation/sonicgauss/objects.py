@@ -55,7 +55,7 @@ def training_recipes(count: int, *, seed: int = 0, contacts: int = 32) -> tuple[
         materials = [material for material in MATERIALS if (kind, material) not in taken]
         material = materials[generator.integers(len(materials))]
         start = FIRST_SEED + number + 10_000 * seed
-        recipes.append(ObjectRecipe(kind=kind, material=material, seed=start, contacts=contacts, views=0))
+        recipes.append(ObjectRecipe(kind=kind, material=material, seed=start, impacts=contacts, views=0))
     return tuple(recipes)
 
 
