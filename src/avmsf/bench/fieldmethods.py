@@ -61,18 +61,10 @@ class FieldMethod:
 
 
 @dataclass(frozen=True)
-class UninformedField:
-    """A field without modal initialization (the paper's row "w/o init"): no extracted modes and no warm-up.
-
-    It starts from `random_modes`, with as many modes and bands of noise as the extraction has, and is trained end to
-    end for as many steps as the method takes in all. Corrections have `correction_rate`, for here they are no
-    corrections: frequencies, dampings and noise have to find where they belong.
-    """
+class FieldVariant:
+    """A field that is fitted in another way than its method says, and has the method's name and features."""
 
     method: FieldMethod
-    """The method whose steps are all taken end to end."""
-    correction_rate: float = 0.03
-    """Adam's step for frequencies (in widths of their modes) and for the logarithms of dampings."""
 
     @property
     def name(self) -> str:
@@ -83,6 +75,19 @@ class UninformedField:
     def look(self) -> Look:
         """What is read of the object's points."""
         return self.method.look
+
+
+@dataclass(frozen=True)
+class UninformedField(FieldVariant):
+    """A field without modal initialization (the paper's row "w/o init"): no extracted modes and no warm-up.
+
+    It starts from `random_modes`, with as many modes and bands of noise as the extraction has, and is trained end to
+    end for as many steps as the method takes in all. Corrections have `correction_rate`, for here they are no
+    corrections: frequencies, dampings and noise have to find where they belong.
+    """
+
+    correction_rate: float = 0.03
+    """Adam's step for frequencies (in widths of their modes) and for the logarithms of dampings."""
 
     def fit(self, task: Task) -> SoundField:
         """Fit the field. Raises AvmsfError where features or field cannot be made, or no mode can be counted."""
@@ -101,5 +106,5 @@ class UninformedField:
 
 def configured(method: Method) -> FieldMethod | None:
     """Return the configuration that a method fits, or starts from; None for methods without one."""
-    found = getattr(method, "method", method)
+    found = method.method if isinstance(method, FieldVariant) else method
     return found if isinstance(found, FieldMethod) else None

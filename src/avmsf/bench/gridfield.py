@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
-from avmsf.bench.fieldmethods import FieldMethod
-from avmsf.bench.task import Look, Task
+from avmsf.bench.fieldmethods import FieldVariant
+from avmsf.bench.task import Task
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.places import rows_by_place
 from avmsf.field.config import FitConfig
@@ -45,28 +45,16 @@ QUICK_GRID = Grid((8, 16, 32), (3e-3, 1e-3), (150,), (1.0,))
 
 
 @dataclass(frozen=True)
-class GridField:
+class GridField(FieldVariant):
     """A field whose settings are chosen from a grid on validation contacts, a part of the training contacts alone.
 
     The quarter of the training places that farthest-point sampling takes last is held out; every candidate is fitted
     to the others and judged there by ENV (paper, supplement), the mean over contacts of the root mean square difference
     of envelopes. The best is fitted to all training contacts; of equals the first. With fewer than six places nothing
-    is held out, and the base settings are taken. Modes are those of all training contacts.
+    is held out, and the method's own settings are taken. Modes are those of all training contacts.
     """
 
-    method: FieldMethod
-    """The method whose settings are chosen where the grid names them, and taken where nothing can be validated."""
     grid: Grid
-
-    @property
-    def name(self) -> str:
-        """What tables call it."""
-        return self.method.name
-
-    @property
-    def look(self) -> Look:
-        """What is read of the object's points."""
-        return self.method.look
 
     def fit(self, task: Task) -> SoundField:
         """Choose and fit the field, whose report has what was chosen. Raises as FieldMethod."""
