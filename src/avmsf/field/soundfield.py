@@ -130,7 +130,7 @@ class SoundField:
     Positions, directions and forces are lists, numpy arrays or tensors. Methods raise ArrayError for other shapes and
     for values that are not finite, and PositionError for a position that lies farther from the object than this is
     large; for one nearer but off the object they give a PositionWarning. Directions of any length count as unit
-    vectors; one of length zero goes straight into the surface.
+    vectors. One of length zero is unknown, and the impact then goes straight into the surface.
     """
 
     bank: ModalBank
@@ -313,11 +313,12 @@ class SoundField:
     ) -> Float[Tensor, "contacts samples"]:
         """Return the sound of an impact at each position (object frame, meters), [contacts, 3].
 
-        `directions`, unit vectors, [contacts, 3], are those of the impacts; without them they go straight into the
-        surface. `forces`, one for all or one for each, are in newtons where the recordings were divided by theirs, else
-        relative to an average one of them; without them they are 1. Of `samples` samples, or as long as the training
-        sounds. The noise is the same at every contact and in every call, so that a contact's sound depends on nothing
-        else. Modes that are not `audible` are silent.
+        `directions`, unit vectors, [contacts, 3], are those of the impacts. One of [0, 0, 0] is unknown, as in tables
+        of contacts: the impact goes straight into the surface, as all do without `directions`. `forces`, one for all or
+        one for each, are in newtons where the recordings were divided by theirs, else relative to an average one of
+        them; without them they are 1. Of `samples` samples, or as long as the training sounds. The noise is the same at
+        every contact and in every call, so that a contact's sound depends on nothing else. Modes that are not `audible`
+        are silent.
 
         `pulse` is what a softer hammer adds to the recorded impacts' own pulses; it has the same impulse, however long
         it is, and leaves the noise as it is. The noise grows with the force as the modes do, which is a simplification:
