@@ -194,8 +194,8 @@ class Options(Printing):
     )
     """Guided edits."""
     plots: PlotsFolder = None
-    """Folder for modes.png, spectrograms.png, before.wav and after.wav; with --clap also clap.png, the score over the
-    steps."""
+    """Write modes.png, spectrograms.png, before.wav and after.wav to this folder; with --clap also clap.png, the score
+    over the steps."""
     position: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
     """Contact of these sounds in meters, on the object as it was; by default where it is loudest."""
 

@@ -91,8 +91,9 @@ class Options(Printing):
     table: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), Existing("a table of objects")] = None
     """The published table of ObjectFolder Real's names and materials."""
     figures: Flag = False
-    """Also draw figures/OBJECT.png: spectrograms of the recording and of all methods, 20 Hz to 20 kHz, first second;
-    with localize also each field's heat maps of three recordings, with the true contact marked."""
+    """Also draw figures/OBJECT.png in the folder of results: spectrograms of the recording and of all methods, 20 Hz to
+    20 kHz, first second; with localize also each field's heat maps of three recordings, with the true contact
+    marked."""
 
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""

@@ -32,7 +32,7 @@ class Options(Printing):
     settings: SettingsFile = None
     """Field: use this capture.toml instead of the capture's own."""
     plots: PlotsFolder = None
-    """Draw figures to this folder. Field: modes.png, gains.png; uncertainty.png and spectrum.png if the gains have a
+    """Write figures to this folder. Field: modes.png, gains.png; uncertainty.png and spectrum.png if the gains have a
     posterior; surface.png, with cross-sections, if they have a body; spectrograms.png with --capture. Gaussians:
     cloud.png and turntable.gif. Features: features.png and turntable.gif."""
     cloud: Annotated[Path | None, tyro.conf.arg(metavar="CLOUD.ply"), Existing("Gaussians, as a .ply file")] = None
