@@ -24,8 +24,7 @@ NETWORK = PipelineConfig(gain_model="network")
 class FieldMethod:
     """A field fitted as a configuration of the pipeline says.
 
-    Seed and device are the evaluation's, and so is the start of sounds, since all methods of one evaluation are scored
-    on the same recordings.
+    Seed and device are the evaluation's, and the sounds start as in the task's recordings.
     """
 
     name: str

@@ -82,8 +82,9 @@ class Options(Printing):
     modes: int = 128
     """Maximum number of the modes that methods share."""
     time_zero: TimeZero | None = None
-    """Start of the sounds, for all methods: onset, or peak (paper); by default that of the dataset or of each
-    capture.toml. From peaks, methods are not compared with the ground truth of simulated objects."""
+    """Start of the sounds on which all methods are scored: onset, or peak (paper); by default that of the dataset or of
+    each capture.toml. With peak, the methods `field...` are fitted to the recordings from the dataset's own starts,
+    and no method is compared with the ground truth of simulated objects."""
     contact_data: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER"), Existing("ObjectFolder Real's contacts")] = (
         None
     )
