@@ -64,6 +64,7 @@ class FieldVariant:
     """A field that is fitted in another way than its method says, and has the method's name and features."""
 
     method: FieldMethod
+    """What it differs from."""
 
     @property
     def name(self) -> str:

@@ -75,8 +75,9 @@ def run(options: Options) -> int:
         figures = write_figures(results) if options.figures else []
     except KeyboardInterrupt:
         if (folder / IDENTITY).exists():
-            missing = counted(len(write()["missing"]), "object")
-            say(f"wrote {SUMMARY} and {TABLES} in {folder}, without all results of {missing}")
+            missing = write()["missing"]
+            lacking = f", without all results of {counted(len(missing), 'object')}" if missing else ""
+            say(f"wrote {SUMMARY} and {TABLES} in {folder}{lacking}")
         say(f"avmsf evaluate: interrupted; run the same command again to continue from {folder}")
         return INTERRUPTED
     if not summary["methods"]:
