@@ -1,6 +1,7 @@
 """Sliders: pitch, decay, brightness and levels, alone, together and undone."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,7 +10,12 @@ from avmsf.errors import EditError
 from avmsf.field.scaledgains import ScaledGains
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import load, save
+from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
+from avmsf.simulate.material import CERAMIC, WOOD
+from avmsf.tasks.madeof import made_of
+from avmsf.tasks.material import change_material, rayleigh_damping
+from avmsf.tasks.materialguess import guess_materials
 from avmsf.tasks.modes import adjust_modes, brightness_center
 from made_fields import BANK, FIELDS, places
 from raising import raises
@@ -126,3 +132,16 @@ def test_values_that_cannot_be_are_refused():
             adjust_modes(field(), brightness_db=value)
     with raises(EditError, name="gain factor", row=0, value=math.inf):
         adjust_modes(field(), gains_db=1e5)
+
+
+def test_adjusted_modes_keep_the_material():
+    """An octave lower, ceramic's dampings would be those of another material."""
+    frequency = torch.tensor([1600.0, 2500.0, 4100.0, 6000.0, 9000.0], dtype=torch.float64)
+    damping = rayleigh_damping(2.0 * math.pi * frequency, CERAMIC)
+    ceramic = replace(field(), bank=ModalBank(frequency, damping), sample_rate=48000.0)
+    assert made_of(ceramic, option="--from").material == CERAMIC
+    lower = adjust_modes(adjust_modes(ceramic, pitch=0.25), decay=torch.linspace(0.1, 0.5, 5), brightness_db=3.0)
+    assert guess_materials(lower.bank)[0].material != CERAMIC
+    assert made_of(lower, option="--from").material == CERAMIC
+    wooden = change_material(lower, CERAMIC, WOOD)
+    assert made_of(adjust_modes(wooden, pitch=2.0), option="--from").material == WOOD

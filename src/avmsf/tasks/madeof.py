@@ -1,18 +1,23 @@
-"""The material of a field before an edit: that of its last material edit, or the one nearest to its dampings."""
+"""The material of a field before an edit: that of its last material edit, or the one nearest to its dampings.
 
-from collections.abc import Sequence
+Adjusted modes do not change the material: its dampings are compared at the frequencies before the adjustments.
+"""
+
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
+
+import torch
 
 from avmsf.errors import EditError
 from avmsf.field.soundfield import SoundField
+from avmsf.modal.bank import ModalBank
 from avmsf.simulate.material import Material
 from avmsf.tasks.edits import EDITS
 from avmsf.tasks.materialguess import guess_materials
 
 _CLOSE = 1.2
 """Ratio of the errors up to which the second-best material is as likely."""
-_KEEPING = ("change_material", "adjust_modes")
-"""Edits after which a field's material is known."""
 
 
 @dataclass(frozen=True)
@@ -29,14 +34,15 @@ def made_of(field: SoundField, *, option: str) -> MadeOf:
 
     `option` is the option for the material, named in messages. Raises `EditError` where no material fits.
     """
-    known = _changed_to(field.origin.report.get(EDITS, []))
-    if known is not None:
-        return MadeOf(known, f"old material: {known.name}, from the last material edit")
     report = field.origin.report
-    if "guess" in report and not report.get(EDITS):
+    bank, last = _before_adjustments(field.bank, report.get(EDITS, []))
+    if last is not None and last["edit"] == "change_material":
+        known = Material(**last["to"])
+        return MadeOf(known, f"old material: {known.name}, from the last material edit")
+    if "guess" in report and last is None:
         guessed = Material(**report["material"])
         return MadeOf(guessed, f"old material: {guessed.name}, for which the field was guessed")
-    best, second, *_ = guess_materials(field.bank)
+    best, second, *_ = guess_materials(bank)
     if not best.fits:
         raise EditError(
             f"expected {option}, got none, and no material has the dampings of the modes: the nearest, "
@@ -53,13 +59,13 @@ def made_of(field: SoundField, *, option: str) -> MadeOf:
     )
 
 
-def _changed_to(edits: Sequence[object]) -> Material | None:
-    """Return the material of the last change of it, None where there is none or what followed may have changed it."""
+def _before_adjustments(
+    bank: ModalBank, edits: Sequence[Mapping[str, Any]]
+) -> tuple[ModalBank, Mapping[str, Any] | None]:
+    """Return the modes before the last adjustments of pitch and decay, and the edit before these, if there is one."""
     for entry in reversed(edits):
-        kind = entry.get("edit") if isinstance(entry, dict) else None
-        if kind not in _KEEPING:
-            return None
-        if kind == "change_material":
-            assert isinstance(entry, dict)
-            return Material(**entry["to"])
-    return None
+        if entry["edit"] != "adjust_modes":
+            return bank, entry
+        pitch, decay = (torch.tensor(entry[name], dtype=torch.float64) for name in ("pitch", "decay"))
+        bank = ModalBank(bank.frequency / pitch, bank.damping * decay)
+    return bank, None
