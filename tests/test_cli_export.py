@@ -171,6 +171,18 @@ def test_wavs_have_the_layers_asked_for(field_file: Path, tmp_path: Path) -> Non
     assert soundfile.info(tmp_path / "w" / rows[0]["file"]).frames == 400
 
 
+def test_wavs_without_noise_are_the_modes(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
+    words = ["export", str(field_file), "--to", "wavs", "--output", str(tmp_path / "w"), "--points", "1", "--no-noise"]
+    assert main(words) == 0
+    assert "--no-noise" not in capsys.readouterr().err
+    sampled = SampledField.of(load(field_file), limit=1)
+    modes = sampled.render(torch.tensor([0]), noise=False)[0]
+    assert not torch.equal(modes, sampled.render(torch.tensor([0]))[0])
+    sound, _ = soundfile.read(tmp_path / "w" / "sounds" / "001-1.wav")
+    scale = json.loads((tmp_path / "w" / "manifest.json").read_text())["scale"]
+    np.testing.assert_allclose(sound, scale * modes.numpy(), atol=1e-6)
+
+
 @pytest.mark.parametrize(("to", "name"), [("faust", "a.dsp"), ("faust", "a.lib"), ("uff", "a.uff")])
 def test_other_formats_say_their_size(to: str, name: str, field_file: Path, tmp_path: Path, capsys: Streams) -> None:
     words = ["export", str(field_file), "--to", to, "--output", str(tmp_path / name), "--points", "5"]

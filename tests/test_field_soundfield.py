@@ -63,6 +63,15 @@ def test_the_noise_is_the_same_at_every_contact_and_in_every_call():
     assert torch.equal(sound_field.render(CONTACTS), sound_field.render(CONTACTS))
 
 
+def test_without_noise_a_sound_is_its_modes():
+    sound_field = field()
+    silent = replace(sound_field, residual=replace(sound_field.residual, magnitude=torch.zeros(33)))
+    assert torch.equal(sound_field.render(CONTACTS, noise=False), silent.render(CONTACTS))
+    recordings = torch.ones(len(sound_field.origin.trained_on), 2400)
+    recorded = replace(sound_field, residual=replace(sound_field.residual, recordings=recordings))
+    assert torch.equal(recorded.render(CONTACTS, noise=False), silent.render(CONTACTS))
+
+
 def with_noise(kind: str) -> SoundField:
     origin = field().origin
     return replace(field(), origin=replace(origin, config=replace(origin.config, residual_noise=kind)))

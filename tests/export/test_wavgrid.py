@@ -123,6 +123,15 @@ def test_lengths_are_as_asked(tmp_path):
     assert soundfile.info(tmp_path / "long" / "sounds" / "001-1.wav").frames == 4000
 
 
+def test_without_noise_the_modes_are_written(tmp_path):
+    field = table(noisy=True)
+    write_grid(field, tmp_path / "grid", Grid(2, LAYERS, noise=False))
+    write_grid(replace(field, noise=torch.zeros(SAMPLES)), tmp_path / "silent", Grid(2, LAYERS))
+    for row in rows(tmp_path / "grid"):
+        found, expected = (soundfile.read(tmp_path / each / row["file"])[0] for each in ("grid", "silent"))
+        assert np.array_equal(found, expected)
+
+
 def test_more_contacts_than_points_are_all_points(tmp_path):
     write_grid(table(), tmp_path / "grid", Grid(50))
     assert len(rows(tmp_path / "grid")) == len(table())

@@ -223,7 +223,8 @@ def _wavs(field: SoundField | SampledField, options: Options) -> Written:
         )
     layers = tuple(Layer(force, each, options.pulse) for force, each in zip(forces, times, strict=True))
     sampled = _sampled(field, options)
-    return write_grid(sampled, options.output, Grid(len(sampled), layers, options.seconds), force=options.overwrite)
+    grid = Grid(len(sampled), layers, options.seconds, noise=not options.no_noise)
+    return write_grid(sampled, options.output, grid, force=options.overwrite)
 
 
 def _uff(field: SoundField | SampledField, options: Options) -> Written:

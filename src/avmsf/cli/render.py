@@ -40,7 +40,7 @@ def run(options: Options) -> int:
         say(f"note: the wav files have {round(field.sample_rate)} Hz for {field.sample_rate:g} Hz")
     doing("rendering")
     pulse = _pulse(options)
-    rendered = partial(render_sounds, field, force=options.force, seconds=options.seconds)
+    rendered = partial(render_sounds, field, force=options.force, seconds=options.seconds, noise=not options.no_noise)
     sounds = rendered(contacts.places, contacts.directions, pulse=pulse)
     if pulse is not None and options.normalize == "none" and options.level_db == 0:
         loudest = int(sounds.abs().amax(1).argmax())
@@ -92,13 +92,14 @@ def render_sounds(
     force: float,
     seconds: float | None,
     pulse: ForcePulse | None = None,
+    noise: bool = True,
 ) -> Float[Tensor, "contacts samples"]:
     """Render impacts of `force` for `seconds`; raises `OutputError` for a time of less than a sample."""
     samples = None if seconds is None else _samples(seconds, field)
     with warnings.catch_warnings():
         # The notes have said it, with the names of the sounds.
         warnings.simplefilter("ignore", PositionWarning)
-        return field.render(places, directions=directions, forces=force, samples=samples, pulse=pulse)
+        return field.render(places, directions=directions, forces=force, samples=samples, pulse=pulse, noise=noise)
 
 
 def _samples(seconds: float, field: SoundField) -> int:

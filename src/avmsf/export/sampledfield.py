@@ -154,13 +154,15 @@ class SampledField:
         force: float = 1.0,
         samples: int | None = None,
         pulse: ForcePulse | None = None,
+        noise: bool = True,
     ) -> Float32[Tensor, "contacts samples"]:
         """Return what `SoundField.render` does for blows at the points of some rows.
 
-        Of `samples` samples, or as long as the training sounds, behind whose end there is no noise.
+        Of `samples` samples, or as long as the training sounds, behind whose end there is no noise. With
+        `noise=False` the sounds are the modes alone.
         """
         length = self.samples if samples is None else samples
-        noise = torch.nn.functional.pad(self.noise, (0, max(0, length - self.samples)))[:length]
+        added = torch.nn.functional.pad(self.noise, (0, max(0, length - self.samples)))[:length]
         parts = []
         for chosen in torch.split(rows, _RENDERED):
             modes = synthesize(
@@ -172,7 +174,8 @@ class SampledField:
                 quadrature=self.cosine[chosen],
             )
             parts.append(modes if pulse is None else pulse.soften(modes, sample_rate=self.sample_rate))
-        return force * (torch.cat(parts) + noise)
+        sounds = torch.cat(parts)
+        return force * (sounds + added if noise else sounds)
 
 
 def spread_rows(points: Float[Tensor, "points 3"], count: int) -> Int[Tensor, " chosen"]:

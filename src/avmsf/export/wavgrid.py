@@ -51,6 +51,8 @@ class Grid:
     """Length of the sounds; that of the training sounds where it is not given."""
     level_db: float = -1.0
     """Peak of the loudest sound, dB relative to full scale; all sounds have one scale."""
+    noise: bool = True
+    """Whether the sounds have the residual noise in addition to the modes."""
 
 
 def write_grid(field: SampledField, folder: str | Path, grid: Grid | None = None, *, force: bool = False) -> Written:
@@ -68,9 +70,10 @@ def write_grid(field: SampledField, folder: str | Path, grid: Grid | None = None
         )
     rows = field.spread(grid.contacts)
     samples = field.samples if grid.seconds is None else max(1, round(grid.seconds * rate))
+    pulses = [ForcePulse(layer.contact_time, layer.shape) for layer in grid.layers]
     sounds = [
-        field.render(rows, force=layer.force, samples=samples, pulse=ForcePulse(layer.contact_time, layer.shape))
-        for layer in grid.layers
+        field.render(rows, force=layer.force, samples=samples, pulse=pulse, noise=grid.noise)
+        for layer, pulse in zip(grid.layers, pulses, strict=True)
     ]
     peak = max(float(each.abs().max()) for each in sounds)
     scale = 10 ** (grid.level_db / 20) / peak if peak > 0 else 1.0

@@ -310,6 +310,7 @@ class SoundField:
         *,
         samples: int | None = None,
         pulse: ForcePulse | None = None,
+        noise: bool = True,
     ) -> Float[Tensor, "contacts samples"]:
         """Return the sound of an impact at each position (object frame, meters), [contacts, 3].
 
@@ -322,17 +323,18 @@ class SoundField:
 
         `pulse` is what a softer hammer adds to the recorded impacts' own pulses; it has the same impulse, however long
         it is, and leaves the noise as it is. The noise grows with the force as the modes do, which is a simplification:
-        recorded background noise does not depend on the force of an impact.
+        recorded background noise does not depend on the force of an impact. `noise=False` renders the modes alone.
         """
         contacts, ways = self._impacts(positions, directions)
         length = self.samples if samples is None else as_count(samples, "samples")
-        noise = None if self.residual.recordings is not None else self.noise(length)
+        recorded = noise and self.residual.recordings is not None
+        added = self.noise(length) if noise and not recorded else torch.zeros(length)
         parts = [torch.zeros(0, length)]
         for rows in torch.split(torch.arange(len(contacts)), _BATCH):
             way = None if ways is None else ways[rows]
             modes = self.modal_sounds(self.known(contacts[rows], directions=way), length)
             sounds = modes if pulse is None else pulse.soften(modes, sample_rate=self.sample_rate)
-            parts.append(sounds + (self._recorded(contacts[rows], way, length) if noise is None else noise))
+            parts.append(sounds + (self._recorded(contacts[rows], way, length) if recorded else added))
         sounds = torch.cat(parts)
         if forces is None:
             return sounds

@@ -28,7 +28,7 @@ _USED: dict[Format, tuple[str, ...]] = {
     "gltf": ("object", "object_unit", "capture", "up"),
     "faust": ("no_noise",),
     "avmsf-demo": ("object", "variant", "precision"),
-    "wavs": ("forces", "contact_times", "pulse", "seconds"),
+    "wavs": ("forces", "contact_times", "pulse", "seconds", "no_noise"),
     "uff": ("functions",),
 }
 """Options that each format uses, in addition to those that all use."""
@@ -88,7 +88,7 @@ class Options(Printing):
     up: Axis = "z"
     """gltf: axis of the object's frame that points up."""
     no_noise: Flag = False
-    """faust: write the modes without the residual noise."""
+    """faust, wavs: write the modes without the residual noise."""
     functions: int = 16
     """uff: number of points whose frequency response functions are written in addition to the mode shapes."""
     variant: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from avmsf.cli.options.checks import OutputError
-from avmsf.cli.options.common import Printing, Unit, parse_options
+from avmsf.cli.options.common import Flag, Printing, Unit, parse_options
 from avmsf.cli.options.paths import Existing, FieldFile, NewFile
 from avmsf.modal.config import PulseShape
 from avmsf.simulate.recipe import LONGEST
@@ -48,6 +48,8 @@ class Options(Printing):
     """Contact time of a softer hammer, in seconds, with the same impulse: 0.002 for felt. 0: as recorded."""
     pulse: PulseShape = "half-sine"
     """Force over the contact time. half-sine: a linear contact. hertz: a Hertzian contact of two round bodies."""
+    no_noise: Flag = False
+    """Write the modes without the residual noise."""
     seconds: float | None = None
     """Length of the sounds; by default that of the training sounds."""
     normalize: Literal["none", "peak"] = "none"
