@@ -1,4 +1,4 @@
-"""`avmsf render`: with and without noise."""
+"""`avmsf render`: noise, and what it says of a table."""
 
 import json
 from pathlib import Path
@@ -9,6 +9,7 @@ import soundfile
 import torch
 
 from avmsf.cli import main
+from avmsf.cli.contacts import read_contacts
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import save
 from avmsf.modal.residual import Residual
@@ -46,3 +47,12 @@ def test_without_noise_the_modes_are_rendered(path: Path, capsys: Streams, words
     # The sounds are float32, of peaks near 1.
     assert np.abs(noisy - modes - sounding().noise().numpy()).max() < 1e-6
     assert words or np.array_equal(modes, sounding().render(PLACE, noise=False)[0].numpy())
+
+
+def test_columns_that_are_not_used_are_named(path: Path, tmp_path: Path, capsys: Streams) -> None:
+    table = tmp_path / "places.csv"
+    table.write_text("File,x,y,z,nz,Hammer,force_newtons\na,0.05,0.03,0.002,1,felt,2\nb,0.02,0.03,0.002,1,felt,2\n")
+    assert read_contacts(table, meters=1.0).unused == ("hammer", "force_newtons")
+    assert main(["render", str(path), "--contact-table", str(table), "--output", str(tmp_path / "out")]) == 0
+    noted = [line for line in capsys.readouterr().err.splitlines() if str(table) in line]
+    assert [line.endswith("hammer, force_newtons") for line in noted] == [True]

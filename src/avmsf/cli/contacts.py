@@ -35,6 +35,8 @@ class Contacts:
     table: Path | None = None
     lines: tuple[int, ...] = ()
     """Line of the table of each."""
+    unused: tuple[str, ...] = ()
+    """Columns of the table that say nothing of a contact."""
 
     def label(self, row: int) -> str:
         """Return where a user wrote a contact: the option, with its number if there are several, or file and row."""
@@ -60,8 +62,8 @@ def contacts_at(
 def read_contacts(path: Path, *, meters: float) -> Contacts:
     """Read a table with the columns x, y, z and perhaps file, nx, ny and nz, such as a capture's impacts.csv.
 
-    Other columns are ignored. Sounds are named by the column `file`, else by number. Raises `CaptureError` with the
-    line at fault as `row`.
+    Other columns are listed as `unused`. Sounds are named by the column `file`, else by number. Raises `CaptureError`
+    with the line at fault as `row`, counted from 1 with the header, as in all tables.
     """
     lines, separator = read_cells(path)
     header = [name.lower() for name in lines[0][1]] if lines else []
@@ -89,7 +91,8 @@ def read_contacts(path: Path, *, meters: float) -> Contacts:
     known = directions if bool(directions.any()) else None
     numbers = tuple(line for line, _ in lines[1:])
     located = torch.tensor(places, dtype=torch.float64) * meters
-    return Contacts(located, tuple(names), known, table=path, lines=numbers)
+    unused = tuple(name or "(no name)" for name in header if name not in ("file", *_COLUMNS, *_NORMALS))
+    return Contacts(located, tuple(names), known, table=path, lines=numbers, unused=unused)
 
 
 def refuse_far(contacts: Contacts, field: SoundField, *, advice: str = "") -> None:

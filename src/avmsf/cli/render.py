@@ -70,7 +70,10 @@ def _contacts(options: Options) -> Contacts:
     """Return the contacts of the options or of their table."""
     meters = METRES[options.unit]
     if options.contact_table is not None:
-        return read_contacts(options.contact_table, meters=meters)
+        contacts = read_contacts(options.contact_table, meters=meters)
+        if contacts.unused:
+            say(f"note: {contacts.table}: columns that are not used: {', '.join(contacts.unused)}")
+        return contacts
     return contacts_at(options.position, meters=meters, directions=options.direction)
 
 
