@@ -1,4 +1,4 @@
-"""`avmsf render`: noise, and what it says of a table."""
+"""`avmsf render`: noise, the level of what is written, and what it says of a table."""
 
 import json
 from pathlib import Path
@@ -47,6 +47,23 @@ def test_without_noise_the_modes_are_rendered(path: Path, capsys: Streams, words
     # The sounds are float32, of peaks near 1.
     assert np.abs(noisy - modes - sounding().noise().numpy()).max() < 1e-6
     assert words or np.array_equal(modes, sounding().render(PLACE, noise=False)[0].numpy())
+
+
+@pytest.mark.parametrize("level", [-30.0, -10.0, 20.0])
+def test_the_peak_of_what_is_written_is_said(path: Path, capsys: Streams, level: float) -> None:
+    loudest = 20 * np.log10(float(sounding().render(PLACE).abs().max()))
+    sound, told, notes = rendered(path, capsys, "--level-db", str(level - loudest))
+    assert told["peak_dbfs"] == pytest.approx(level, abs=1e-3)
+    assert np.abs(sound).max() == pytest.approx(10 ** (level / 20), rel=1e-4)
+    # Quiet ones and those that clip are noted, once.
+    advised = [note for note in notes if "--normalize peak" in note]
+    assert len(advised) == (0 if level == -10 else 1)
+
+
+def test_a_quiet_level_that_is_normalized_is_not_noted(path: Path, capsys: Streams) -> None:
+    _, told, notes = rendered(path, capsys, "--normalize", "peak", "--level-db", "-30")
+    assert told["peak_dbfs"] == pytest.approx(-30, abs=1e-3)
+    assert not any("--normalize" in note for note in notes)
 
 
 def test_columns_that_are_not_used_are_named(path: Path, tmp_path: Path, capsys: Streams) -> None:

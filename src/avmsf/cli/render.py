@@ -23,6 +23,8 @@ from avmsf.modal.pulse import ForcePulse
 
 _MUCH_SOFTER = 20.0
 """Decibels below the recorded impact from which a softer hammer's sound is noted."""
+_QUIET_DBFS = -20.0
+"""Peak in decibels of full scale below which sounds are noted as quiet."""
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254, "ft": 0.3048}
 
 
@@ -42,26 +44,28 @@ def run(options: Options) -> int:
     pulse = _pulse(options)
     rendered = partial(render_sounds, field, force=options.force, seconds=options.seconds, noise=not options.no_noise)
     sounds = rendered(contacts.places, contacts.directions, pulse=pulse)
+    softer = 0.0
     if pulse is not None and options.normalize == "none" and options.level_db == 0:
         loudest = int(sounds.abs().amax(1).argmax())
         place = contacts.places[loudest : loudest + 1]
         way = None if contacts.directions is None else contacts.directions[loudest : loudest + 1]
         hard = rendered(place, way)
-        _say_softer(hard[0], sounds[loudest], pulse.contact_time)
+        softer = _softer(hard[0], sounds[loudest])
     sounds = sounds * Level(options.normalize, options.level_db).factor(sounds, coding=options.coding)
     peak = float(sounds.abs().max())
-    if options.coding == "float32" and peak > 1:
-        say(
-            f"note: the loudest sound peaks at {20 * math.log10(peak):+.1f} dB over full scale and will clip; add "
-            "--normalize peak, or lower --level-db"
-        )
+    peak_dbfs = 20 * math.log10(peak) if peak > 0 else -math.inf
+    _say_level(peak_dbfs, softer, options)
     for path, sound in zip(paths, sounds, strict=True):
         write_sound(path, sound, sample_rate=field.sample_rate, coding=options.coding)
     wrote = paths[0] if len(paths) == 1 else f"{len(paths)} sounds to {options.output}"
     seconds = sounds.shape[1] / field.sample_rate
-    text = f"wrote {wrote}: {seconds:.3g} s at {field.sample_rate:g} Hz, {options.coding}"
-    values = {"files": list(map(str, paths)), "sample_rate": field.sample_rate, "seconds": seconds, "peak": peak}
-    print_result(text, values, json=options.json)
+    text = (
+        f"wrote {wrote}: {seconds:.3g} s at {field.sample_rate:g} Hz, {options.coding}, "
+        # The sum makes 0.0 of -0.0.
+        f"peak {round(peak_dbfs, 1) + 0.0:.1f} dBFS"
+    )
+    values = {"files": list(map(str, paths)), "sample_rate": field.sample_rate, "seconds": seconds}
+    print_result(text, {**values, "peak": peak, "peak_dbfs": peak_dbfs}, json=options.json)
     next_command("avmsf export", options.field, "--to web -o page")
     return 0
 
@@ -77,14 +81,26 @@ def _contacts(options: Options) -> Contacts:
     return contacts_at(options.position, meters=meters, directions=options.direction)
 
 
-def _say_softer(hard: Float[Tensor, " samples"], soft: Float[Tensor, " samples"], contact_time: float) -> None:
-    """Print by how many decibels a softer hammer lowers the recorded impact's peak, where these are many."""
+def _softer(hard: Float[Tensor, " samples"], soft: Float[Tensor, " samples"]) -> float:
+    """Return by how many decibels a softer hammer lowers the recorded impact's peak; 0 where that is not known."""
     loud, faint = (float(each.abs().max()) for each in (hard, soft))
-    if faint > 0 and (softer := 20 * math.log10(loud / faint)) > _MUCH_SOFTER:
+    return 20 * math.log10(loud / faint) if loud > 0 and faint > 0 else 0.0
+
+
+def _say_level(peak_dbfs: float, softer: float, options: Options) -> None:
+    """Print that the loudest sound clips, or that it is quiet, and why where it is the softer hammer."""
+    if options.coding == "float32" and peak_dbfs > 0:
         say(
-            f"note: a contact time of {1e3 * contact_time:.3g} ms lowers the peak by {softer:.0f} dB; add --normalize "
-            "peak or --level-db, or a shorter --contact-time"
+            f"note: the loudest sound peaks at {peak_dbfs:+.1f} dB over full scale and will clip; add --normalize "
+            "peak, or lower --level-db"
         )
+    elif softer > _MUCH_SOFTER:
+        say(
+            f"note: a contact time of {1e3 * options.contact_time:.3g} ms lowers the peak by {softer:.0f} dB; add "
+            "--normalize peak or --level-db, or a shorter --contact-time"
+        )
+    elif options.normalize == "none" and -math.inf < peak_dbfs < _QUIET_DBFS:
+        say(f"note: the loudest sound peaks at {peak_dbfs:.1f} dBFS, which is quiet; add --normalize peak")
 
 
 def render_sounds(
