@@ -26,6 +26,7 @@ from avmsf.field.store import load, save
 from avmsf.modal.residual import Residual
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import read_splats, write_splats
+from avmsf.tasks.material import change_material
 from avmsf.tasks.modes import adjust_modes
 from capture_folder import fill
 from made_fields import BANK, SIDES, positional
@@ -335,3 +336,44 @@ def test_an_edited_field_is_not_paired_with_recordings(field_file: Path, tmp_pat
         noted = any("field is edited" in line for line in capsys.readouterr().err.splitlines())
         pairs.append((len(manifest["strikes"]), noted))
     assert pairs == [(3, False), (0, True)]
+
+
+def enlarged(field_file: Path, folder: Path) -> Path:
+    """Return a file of the field edited twice, to three times its size."""
+    field = load(field_file)
+    for size in (2.0, 1.5):
+        field = change_material(field, "glass", "glass", size=size)
+    save(field, folder / "large.safetensors")
+    return folder / "large.safetensors"
+
+
+@pytest.mark.parametrize("to", ["gltf", "web"])
+def test_a_captures_mesh_is_as_large_as_the_edited_field(
+    to: str, field_file: Path, tmp_path: Path, capsys: Streams
+) -> None:
+    fill(tmp_path / "capture", rows=["a.wav,0,0,0"], settings='surface_unit = "cm"\n')
+    trimesh.creation.box([100 * side for side in SIDES]).export(tmp_path / "capture" / "surface.ply")
+    output = tmp_path / ("a.glb" if to == "gltf" else "page")
+    words = ["--to", to, "--output", str(output), "--capture", str(tmp_path / "capture")]
+    assert main(["export", str(enlarged(field_file, tmp_path)), *words]) == 0
+    shown = trimesh.load(output if to == "gltf" else output / "object.glb", process=False).dump()[0]
+    assert sorted(shown.extents) == pytest.approx(sorted(3.0 * side for side in SIDES), rel=1e-5)
+    assert str(tmp_path / "capture" / "surface.ply") in capsys.readouterr().err
+
+
+def test_a_captures_gaussians_are_refused_for_a_field_of_another_size(field_file: Path, tmp_path: Path) -> None:
+    fill(tmp_path / "capture", rows=["a.wav,0,0,0"], settings='surface = "splats.ply"\n')
+    gaussians(tmp_path / "capture" / "splats.ply")
+    words = ["--to", "web", "--output", str(tmp_path / "page"), "--capture", str(tmp_path / "capture")]
+    error = refused([str(enlarged(field_file, tmp_path)), *words])
+    assert (error.file, error.name, error.value) == (tmp_path / "capture" / "splats.ply", "--capture", 3.0)
+
+
+def test_a_given_object_is_not_scaled_with_a_note(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
+    trimesh.creation.box([3.0 * side for side in SIDES]).export(tmp_path / "large.stl")
+    words = ["--to", "gltf", "--output", str(tmp_path / "a.glb"), "--object", str(tmp_path / "large.stl")]
+    assert main(["export", str(enlarged(field_file, tmp_path)), *words]) == 0
+    shown = trimesh.load(tmp_path / "a.glb", process=False).dump()[0]
+    assert sorted(shown.extents) == pytest.approx(sorted(3.0 * side for side in SIDES), rel=1e-5)
+    (note,) = [line for line in capsys.readouterr().err.splitlines() if "3 times" in line]
+    assert str(tmp_path / "large.stl") in note

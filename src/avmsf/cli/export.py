@@ -33,6 +33,7 @@ from avmsf.field.store import load
 from avmsf.pipeline.reconstruct import SURFACE
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import read_splats
+from avmsf.studio.sampling import length_of
 from avmsf.tasks.edits import EDITS
 from avmsf.wording import counted
 
@@ -98,10 +99,43 @@ def _sampled(field: SoundField | SampledField, options: Options) -> SampledField
     return sampled
 
 
-def _object(options: Options) -> tuple[Path | None, float]:
-    """Return the file that shows the object, and what its coordinates count in meters; print where there is none."""
+def _object(field: SoundField | SampledField, options: Options) -> tuple[Path | None, float]:
+    """Return the file that shows the object, and what its coordinates count in meters; print where there is none.
+
+    A capture shows the object as it was recorded: of a field edited to another size its mesh is scaled alike. Raises
+    `ExportError` for a capture's Gaussians then.
+    """
     if options.object is not None:
+        _note_size(field, options.object)
         return options.object, METRES[options.object_unit]
+    path, meters = _captured(options)
+    length = _length(field)
+    if length == 1.0 or path is None:
+        return path, meters
+    if path.suffix.lower() == ".ply" and path.is_file() and holds_gaussians(path):
+        raise ExportError(
+            f"{path}: expected a mesh for a field edited to {length:g} times its size, got Gaussians, which are not "
+            "scaled; name a mesh of that size by --object, or leave --capture out",
+            file=path,
+            name="--capture",
+            value=length,
+        )
+    say(f"note: {path} is shown {length:g} times as large, as the field was edited")
+    return path, meters * length
+
+
+def _length(field: SoundField | SampledField) -> float:
+    """Return lengths on the field's object over those on the object that was recorded."""
+    return length_of(field) if isinstance(field, SoundField) else 1.0
+
+
+def _note_size(field: SoundField | SampledField, path: Path) -> None:
+    if _length(field) != 1.0:
+        say(f"note: the field was edited to {_length(field):g} times its size; {path} is not scaled and has to have it")
+
+
+def _captured(options: Options) -> tuple[Path | None, float]:
+    """Return the file that shows a capture's object, and what its coordinates count in meters."""
     if options.capture is None:
         say("note: only the field's points are shown; --object or --capture adds the surface")
         return None, 1.0
@@ -133,7 +167,7 @@ def _gaussians(path: Path | None, meters: float, field: SampledField) -> Gaussia
 
 
 def _web(field: SoundField | SampledField, options: Options) -> Written:
-    source, meters = _object(options)
+    source, meters = _object(field, options)
     return write_webpage(
         field,
         options.output,
@@ -155,7 +189,7 @@ def _recordings(field: SoundField | SampledField, capture: Path | None) -> Impac
 
 def _gltf(field: SoundField | SampledField, options: Options) -> Written:
     sampled = _sampled(field, options)
-    source, meters = _object(options)
+    source, meters = _object(field, options)
     cloud = _gaussians(source, meters, sampled)
     if cloud is not None and source is not None:
         beside, content = options.output.with_suffix(".gaussians.ply"), source.read_bytes()
@@ -185,6 +219,8 @@ def _demo(field: SoundField | SampledField, options: Options) -> Written:
     most = options.points or POINTS["avmsf-demo"]
     sampled = _sampled(field, options)
     cloud = _gaussians(source, 1.0, sampled)
+    if source is not None:
+        _note_size(field, source)
     if cloud is None and source is not None:
         raise ExportError(
             f"{source}: expected a .ply of Gaussians for the demo, got another file; name one, or leave --object out "
