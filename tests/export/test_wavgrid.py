@@ -37,6 +37,7 @@ def test_every_row_is_its_blow(tmp_path):
         place = torch.tensor([[float(row[axis]) for axis in "xyz"]])
         point = field.nearest(place)
         assert float((field.points[point] - place).abs().max()) < 1e-6
+        assert int(row["contact"]) == int(point)
         assert [float(row[axis]) for axis in ("nx", "ny", "nz")] == pytest.approx(field.normals[point][0].tolist())
         pulse = ForcePulse(float(row["contact_time"]))
         truths.append(field.render(point, force=float(row["force"]), pulse=pulse)[0].numpy())
@@ -98,6 +99,27 @@ def test_the_level_rises_with_the_velocity_without_steps_between_layers(tmp_path
         assert (np.diff(level) >= -1e-6 * level[-1]).all()
         # Half a decibel, where it takes the velocity's square 9.5 dB to fall from 3 to 1.
         assert (20 * np.log10(level[42:] / level[41:-1]) < 0.5).all()
+
+
+@pytest.mark.parametrize(
+    ("layers", "order"),
+    [
+        ((Layer(2.0), Layer(1.0), Layer(0.5)), [2, 1, 0]),
+        ((Layer(1.0), Layer(1.0, 0.002), Layer(1.0, 0.0005)), [1, 2, 0]),
+        (LAYERS, [0, 1, 2]),
+    ],
+)
+def test_layers_go_from_soft_to_loud_whatever_their_order(tmp_path, layers, order):
+    written = write_grid(table(), tmp_path / "grid", Grid(2, layers))
+    found = rows(tmp_path / "grid")
+    assert [(float(row["force"]), float(row["contact_time"])) for row in found[:3]] == [
+        (layers[number].force, layers[number].contact_time) for number in order
+    ]
+    levels_db = [float(row["peak_db"]) for row in found]
+    assert levels_db[:3] == sorted(levels_db[:3])
+    for region in played(tmp_path / "grid"):
+        assert float(region[f"amp_velcurve_{region['hivel']}"]) == pytest.approx(1.0, rel=1e-5)
+    assert len(written.remarks) == 1 + (order != [0, 1, 2])
 
 
 def test_a_layers_hardest_velocity_plays_it_as_it_is(tmp_path):

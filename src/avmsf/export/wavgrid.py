@@ -21,7 +21,7 @@ from avmsf.modal.pulse import ForcePulse
 TABLE, INSTRUMENT, SOUNDS = "strikes.csv", "instrument.sfz", "sounds"
 _WHERE = ("x", "y", "z", "nx", "ny", "nz")
 _HOW = ("force", "contact_time", "midi_note", "velocity_low", "velocity_high")
-COLUMNS = ("file", *_WHERE, *_HOW, "seconds", "peak_db", "row")
+COLUMNS = ("file", *_WHERE, *_HOW, "seconds", "peak_db", "contact")
 HIGHEST_NOTE = 127
 LOWEST_NOTE = 36
 """MIDI note of the first contact: C2, where drum maps begin."""
@@ -46,7 +46,7 @@ class Grid:
     contacts: int = 16
     """How many contacts, as far apart as possible, one MIDI note each."""
     layers: tuple[Layer, ...] = (Layer(),)
-    """From soft to hard; each contact has one impact of each."""
+    """Each contact has one impact of each; they are sorted by their level."""
     seconds: float | None = None
     """Length of the sounds; that of the training sounds where it is not given."""
     level_db: float = -1.0
@@ -75,15 +75,16 @@ def write_grid(field: SampledField, folder: str | Path, grid: Grid | None = None
         field.render(rows, force=layer.force, samples=samples, pulse=pulse, noise=grid.noise)
         for layer, pulse in zip(grid.layers, pulses, strict=True)
     ]
+    layers, sounds = _soft_to_loud(grid.layers, sounds)
     peak = max(float(each.abs().max()) for each in sounds)
     scale = 10 ** (grid.level_db / 20) / peak if peak > 0 else 1.0
     # From 1 on: a note of velocity 0 is the end of one. No range is empty, as there are no more layers than velocities.
-    edges = np.linspace(1, HIGHEST_NOTE + 1, len(grid.layers) + 1).round().astype(int)
+    edges = np.linspace(1, HIGHEST_NOTE + 1, len(layers) + 1).round().astype(int)
     amplitudes = np.stack([each.double().square().mean(1).sqrt().numpy() for each in sounds])
     records, curves = [], []
     for place, row in enumerate(rows.tolist()):
         curves += _curves(amplitudes[:, place], edges)
-        for number, layer in enumerate(grid.layers):
+        for number, layer in enumerate(layers):
             sound = scale * sounds[number][place]
             where = [f"{value:.9g}" for value in (*field.points[row].tolist(), *field.normals[row].tolist())]
             range_ = (int(edges[number]), int(edges[number + 1]) - 1)
@@ -102,9 +103,22 @@ def write_grid(field: SampledField, folder: str | Path, grid: Grid | None = None
         (place / INSTRUMENT).write_text(_instrument(field.name, [record for _, record in records], curves))
 
     manifest = {"name": field.name, "sampleRate": rate, "scale": scale, "perNewton": field.per_newton}
-    manifest["pulses"] = [layer.shape for layer in grid.layers]
+    manifest["pulses"] = [layer.shape for layer in layers]
     sizes = write_folder(Path(folder), fill, manifest, force=force)
-    return Written(sizes, (f"all sounds are scaled by {scale:.4g}, so that the loudest reaches {grid.level_db:g} dB",))
+    remarks = [f"all sounds are scaled by {scale:.4g}, so that the loudest reaches {grid.level_db:g} dB"]
+    if layers != grid.layers:
+        named = ", ".join(f"{layer.force:g} ({layer.contact_time:g} s)" for layer in layers)
+        remarks.append(f"layers are sorted from soft to loud: force (contact time) {named}")
+    return Written(sizes, tuple(remarks))
+
+
+def _soft_to_loud(
+    layers: tuple[Layer, ...], sounds: list[Float32[Tensor, "contacts samples"]]
+) -> tuple[tuple[Layer, ...], list[Float32[Tensor, "contacts samples"]]]:
+    """Return the layers and their sounds sorted by their energy at all contacts; equal ones stay in order."""
+    energies = [float(each.double().square().sum()) for each in sounds]
+    order = sorted(range(len(layers)), key=energies.__getitem__)
+    return tuple(layers[number] for number in order), [sounds[number] for number in order]
 
 
 def _expect(grid: Grid) -> None:

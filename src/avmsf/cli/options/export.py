@@ -78,7 +78,8 @@ class Options(Printing):
     overwrite: Flag = False
     """Replace files that no export wrote. Files of other names are not changed."""
     forces: tuple[float, ...] = (1.0,)
-    """wavs: forces of the layers, from soft to hard, in newtons if the field knows forces, otherwise relative."""
+    """wavs: forces of the layers, in newtons if the field knows forces, otherwise relative; written from soft to
+    loud."""
     contact_times: tuple[float, ...] = (0.0,)
     """wavs: contact time of each layer's hammer in seconds; one for all, or one per force."""
     seconds: float | None = None
