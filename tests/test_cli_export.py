@@ -184,14 +184,31 @@ def test_wavs_without_noise_are_the_modes(field_file: Path, tmp_path: Path, caps
     np.testing.assert_allclose(sound, scale * modes.numpy(), atol=1e-6)
 
 
-@pytest.mark.parametrize(("to", "name"), [("faust", "a.dsp"), ("faust", "a.lib"), ("uff", "a.uff")])
-def test_other_formats_say_their_size(to: str, name: str, field_file: Path, tmp_path: Path, capsys: Streams) -> None:
+@pytest.mark.parametrize("name", ["a.dsp", "a.lib", "a.uff"])
+def test_other_formats_say_their_size(name: str, field_file: Path, tmp_path: Path, capsys: Streams) -> None:
+    to = "uff" if name == "a.uff" else "faust"
     words = ["export", str(field_file), "--to", to, "--output", str(tmp_path / name), "--points", "5"]
     assert main(words) == 0
-    size = (tmp_path / name).stat().st_size
-    assert f"{to}, {size / 1e6:.3g} MB, one file" in capsys.readouterr().out
+    size = sum(path.stat().st_size for path in tmp_path.iterdir())
+    assert f"{to}, {size / 1e6:.3g} MB, " in capsys.readouterr().out
     # Its own is written again.
     assert main(words) == 0
+
+
+def test_contacts_of_faust_and_of_wavs_have_the_same_numbers(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
+    words = ["export", str(field_file), "--points", "7", "--to"]
+    assert main([*words, "faust", "--output", str(tmp_path / "a.dsp"), "--json"]) == 0
+    contacts = tmp_path / "a.contacts.csv"
+    out, err = capsys.readouterr()
+    assert json.loads(out)["contacts"] == str(contacts)
+    assert str(contacts) in err
+    assert main([*words, "wavs", "--output", str(tmp_path / "w"), "--seconds", "0.01"]) == 0
+    tables = []
+    for path in (contacts, tmp_path / "w" / "strikes.csv"):
+        with path.open(newline="") as file:
+            tables.append({row["contact"]: [row[axis] for axis in "xyz"] for row in csv.DictReader(file)})
+    assert len(tables[0]) == 7
+    assert tables[0] == tables[1]
 
 
 def test_a_sample_set_names_its_instrument(field_file: Path, tmp_path: Path, capsys: Streams) -> None:

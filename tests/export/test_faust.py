@@ -1,5 +1,6 @@
 """The Faust program is compiled by Faust and a C compiler, and sounds as the field."""
 
+import csv
 import re
 import shutil
 import subprocess
@@ -10,7 +11,7 @@ import pytest
 import torch
 
 from avmsf.errors import ExportError
-from avmsf.export.faust import faust_library, write_faust
+from avmsf.export.faust import contacts_path, faust_library, write_faust
 from avmsf.export.sampledfield import SampledField
 from avmsf.modal.pulse import ForcePulse
 from made_tables import POINTS, RATE, SAMPLES, apart, table
@@ -127,3 +128,25 @@ def test_too_many_numbers_and_other_endings_are_refused(tmp_path):
         write_faust(table(points=40_000), tmp_path / "thing.dsp")
     with raises(ExportError, file="thing.cpp", name="suffix", value=".cpp"):
         write_faust(table(), tmp_path / "thing.cpp")
+
+
+def test_the_table_has_each_contacts_place(tmp_path):
+    field = table()
+    path = tmp_path / "thing.dsp"
+    written = write_faust(field, path)
+    place = contacts_path(path)
+    assert set(written.sizes) == {path, place}
+    with place.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["contact"]) for row in rows] == list(range(POINTS))
+    assert torch.equal(torch.tensor([[float(row[axis]) for axis in "xyz"] for row in rows]), field.points)
+    # Its own is replaced, also by one of other contacts; another's is not, and then the program is not written either.
+    write_faust(field.take(torch.tensor([3, 1])), path)
+    assert len(place.read_text().splitlines()) == 3
+    path.unlink()
+    place.write_text("contact,who\n")
+    with raises(ExportError, file=place, name="--overwrite"):
+        write_faust(field, path)
+    assert not path.exists()
+    write_faust(field, path, force=True)
+    assert len(place.read_text().splitlines()) == 1 + POINTS

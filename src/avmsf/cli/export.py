@@ -17,7 +17,7 @@ from avmsf.cli.printing import figure, next_command, print_result, say
 from avmsf.cli.render import METRES
 from avmsf.config import CACHE
 from avmsf.errors import ExportError
-from avmsf.export.faust import fitted, write_faust
+from avmsf.export.faust import contacts_path, fitted, write_faust
 from avmsf.export.formats import POINTS
 from avmsf.export.gltf import write_gltf
 from avmsf.export.look import Look, read_look
@@ -65,6 +65,10 @@ def run(options: Options) -> int:
         instrument = options.output / INSTRUMENT
         text += f"; any SFZ player opens {instrument}"
         values["instrument"] = str(instrument)
+    elif options.to == "faust":
+        contacts = contacts_path(options.output)
+        text += f"; {contacts} has the coordinates of each contact"
+        values["contacts"] = str(contacts)
     print_result(text, values, json=options.json)
     if options.to == "wavs" and len(options.forces) == 1:
         layered = f"--to wavs --output {shlex.quote(str(options.output))} --forces 0.3 1 3"

@@ -14,7 +14,7 @@ from torch import Tensor
 from avmsf.errors import ExportError
 from avmsf.export.formats import FAUST_SUFFIXES
 from avmsf.export.sampledfield import SampledField
-from avmsf.export.written import Written, expect_ending, generator, write_file
+from avmsf.export.written import Written, expect_ending, expect_free, generator, write_file
 
 _FEWEST = 16
 """Points below which the noise is left out for more of them."""
@@ -25,10 +25,11 @@ MOST_NUMBERS = 150_000
 
 
 def write_faust(field: SampledField, path: str | Path, *, noise: bool = True, force: bool = False) -> Written:
-    """Write a `.dsp` with controls, or a `.lib` without them, by the path's ending.
+    """Write a `.dsp` with controls, or a `.lib` without them, by the path's ending, and a table of the contacts.
 
-    Without `noise` only the modes sound. Raises `ExportError` for another ending, and for more numbers than Faust
-    compiles in reasonable time.
+    The table is `contacts_path(path)`: the coordinates of each `contact`, object frame, meters. Without `noise` only
+    the modes sound. Raises `ExportError` for another ending, and for more numbers than Faust compiles in reasonable
+    time.
     """
     path = Path(path)
     expect_ending(path, FAUST_SUFFIXES)
@@ -43,7 +44,22 @@ def write_faust(field: SampledField, path: str | Path, *, noise: bool = True, fo
         remarks.append("the noise restarts with every impact")
     elif field.noise.any():
         remarks.append("the residual noise is left out")
-    return Written(write_file(path, text.encode(), force=force), tuple(remarks))
+    table, contacts = contacts_path(path), _contacts(field).encode()
+    expect_free(table, contacts, force=force)
+    sizes = write_file(path, text.encode(), force=force) | write_file(table, contacts, force=force)
+    return Written(sizes, tuple(remarks))
+
+
+def contacts_path(path: Path) -> Path:
+    """Return the name of the table of contacts of a program: thing.contacts.csv for thing.dsp."""
+    return path.with_suffix(".contacts.csv")
+
+
+def _contacts(field: SampledField) -> str:
+    rows = (
+        ",".join([str(row), *(f"{value:.9g}" for value in point)]) for row, point in enumerate(field.points.tolist())
+    )
+    return "\n".join(["contact,x,y,z", *rows, ""])
 
 
 def fitted(field: SampledField, *, noise: bool = True) -> tuple[SampledField, bool]:

@@ -19,6 +19,7 @@ _READ = 4096
 _MADE_HERE = re.compile(
     rb"""
       ^//\ .*\ as\ exported\ by\ avmsf\ \d    # Faust
+    | \Acontact,x,y,z\r?\n0,             # contacts of Faust
     | "asset":\{[^{}]*"generator":"avmsf\ \d   # glTF
     | ^\ *151\ *\r?\n(.*\r?\n){5}avmsf\ \d           # universal, in its header
     | ^<!--\ avmsf\ \d[^\ ]*\ -->$            # a page
