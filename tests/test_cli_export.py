@@ -52,6 +52,7 @@ def test_a_mesh_goes_into_the_glb(field_file: Path, tmp_path: Path, capsys: Stre
     assert f"wrote {tmp_path / 'a.glb'}: gltf, " in out
     assert "every mode starts as a sine" in err
     assert "% of its loudest sample" in err
+    assert " dB on average" in err
     shown = trimesh.load(tmp_path / "a.glb", process=False).dump()[0]
     assert shown.extents == pytest.approx([SIDES[1], SIDES[0], SIDES[2]], rel=1e-5)
 

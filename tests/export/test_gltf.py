@@ -2,6 +2,7 @@
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.errors import CaptureError, ExportError
 from avmsf.export.gltf import write_gltf
 from avmsf.export.look import Look, read_look
+from avmsf.export.onephase import deviation
 from made_tables import MODES, POINTS, apart, summed, table
 from raising import raises
 
@@ -116,6 +118,25 @@ def test_what_the_draft_cannot_hold_is_said_and_lies_in_extras(tmp_path):
     size *= 2 * np.pi * model["frequencies"][:, None]
     expected = np.hypot(arrays[extras["sine"]], arrays[extras["cosine"]]).reshape(MODES, POINTS)
     np.testing.assert_allclose(size, expected, rtol=1e-5)
+
+
+def test_phases_alone_change_the_waveform_and_hardly_the_spectrum(tmp_path):
+    # Modes far apart in frequency: a window of 40 ms tells them from one another.
+    field = replace(table(phased=True), frequency=torch.tensor([412.3, 1077.7, 2081.25, 3300.1], dtype=torch.float64))
+    turned = replace(field, sine=0.1 * field.cosine, cosine=field.cosine)
+    written = write_gltf(turned, tmp_path / "thing.glb")
+    assert written.error > 0.7
+    assert 0.0 < written.spectrum_error_db < 0.7
+    # A table without phases is written as it is.
+    assert write_gltf(table(), tmp_path / "plain.glb").spectrum_error_db < 1e-4
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_level_that_is_missed_is_told_in_decibels(factor):
+    field = table()
+    found = deviation(field, sine=factor * field.sine, cosine=None, damping=field.damping)
+    assert found.waveform == pytest.approx(abs(factor - 1.0), rel=1e-3)
+    assert found.spectrum_db == pytest.approx(6.02, abs=0.1)
 
 
 def test_viewers_show_the_mesh_or_the_points(tmp_path):

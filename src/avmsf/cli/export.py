@@ -48,7 +48,8 @@ def run(options: Options) -> int:
         say(f"note: {remark}")
     if written.error:
         say(
-            f"note: waveforms differ from the field's by up to {figure(100 * written.error, 2)} % of its loudest sample"
+            f"note: waveforms differ from the field's by up to {figure(100 * written.error, 2)} % of its loudest "
+            f"sample, magnitude spectra by {figure(written.spectrum_error_db, 2)} dB on average"
         )
     largest = max(written.sizes, key=lambda path: written.sizes[path])
     files = f"{len(written.sizes)} files, the largest {largest.name}" if len(written.sizes) > 1 else "one file"
@@ -58,6 +59,7 @@ def run(options: Options) -> int:
         "format": options.to,
         "bytes": written.size,
         "error": written.error,
+        "spectrum_error_db": written.spectrum_error_db,
         "files": {str(path): size for path, size in written.sizes.items()},
         "notes": list(written.remarks),
     }

@@ -56,7 +56,7 @@ def write_gltf(
     content = _glb(_document(sampled, look or Look.of_points(sampled), up, order, gains, damping))
     sizes = write_file(path, content, force=force)
     error = deviation(sampled, sine=gains, cosine=None, damping=damping)
-    return Written(sizes, _remarks(sampled), error)
+    return Written(sizes, _remarks(sampled), error.waveform, error.spectrum_db)
 
 
 @dataclass

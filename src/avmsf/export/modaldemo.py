@@ -105,7 +105,7 @@ def write_demo(
     sizes = write_folder(folder, fill, {**manifest, "variants": sorted([variant, *kept])}, force=force)
     written = torch.from_numpy(gains.astype(np.float32))
     error = deviation(field, sine=None, cosine=written, damping=field.damping)
-    return Written(sizes, tuple(_remarks(field, kept, others)), error)
+    return Written(sizes, tuple(_remarks(field, kept, others)), error.waveform, error.spectrum_db)
 
 
 def _gains(field: SampledField, precision: Precision) -> Float[np.ndarray, "points modes"]:

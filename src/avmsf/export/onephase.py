@@ -1,15 +1,33 @@
 """One signed amplitude a mode, for formats in which all modes start alike."""
 
+import math
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Float32, Float64, Int
 from torch import Tensor
 
 from avmsf.export.sampledfield import SampledField
 from avmsf.modal.phase import common_phase
+from avmsf.modal.spectra import magnitude_stft
 from avmsf.modal.synthesis import synthesize
 
 _JUDGED = 8
 """Points at which an export is compared with the field."""
+_WINDOW = 0.04
+"""Seconds in which levels are compared: about as finely as one hears."""
+_FLOOR = 1e-3
+"""Magnitude, over the largest, below which nothing is compared: 60 dB."""
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """How far an export's sounds are from the field's, at a few points."""
+
+    waveform: float
+    """Largest difference of samples, over the loudest sample."""
+    spectrum_db: float
+    """Mean difference of short-time magnitude spectra, dB, weighted by the field's energy."""
 
 
 def signed_amplitudes(field: SampledField) -> Float32[Tensor, "points modes"]:
@@ -40,8 +58,8 @@ def deviation(
     sine: Float32[Tensor, "points modes"] | None,
     cosine: Float32[Tensor, "points modes"] | None,
     damping: Float64[Tensor, "*points modes"],
-) -> float:
-    """Return by how much these modes without noise miss the field at most, over its loudest sample, at a few points."""
+) -> Deviation:
+    """Return by how much these modes without noise miss the field at a few points."""
     rows = field.spread(_JUDGED)
     zero = torch.zeros(len(rows), len(field.frequency))
     heard = synthesize(
@@ -52,7 +70,8 @@ def deviation(
         sample_rate=field.sample_rate,
         quadrature=zero if cosine is None else cosine[rows],
     )
-    return _relative(heard, field.render(rows))
+    true = field.render(rows)
+    return Deviation(_relative(heard, true), _apart_db(heard, true, field.sample_rate))
 
 
 def importance(field: SampledField, damping: Float64[Tensor, " modes"]) -> Int[Tensor, " modes"]:
@@ -64,3 +83,15 @@ def importance(field: SampledField, damping: Float64[Tensor, " modes"]) -> Int[T
 def _relative(heard: Tensor, true: Tensor) -> float:
     peak = float(true.abs().max())
     return float((heard - true).abs().max()) / peak if peak > 0 else 0.0
+
+
+def _apart_db(
+    heard: Float32[Tensor, "contacts samples"], true: Float32[Tensor, "contacts samples"], sample_rate: float
+) -> float:
+    size = max(4, 2 ** round(math.log2(_WINDOW * sample_rate)))
+    found, expected = (magnitude_stft(each, fft_size=size, hop=size // 4) for each in (heard, true))
+    floor, energy = _FLOOR * float(expected.max()), expected.square()
+    if floor == 0:
+        return 0.0
+    apart = 20.0 * torch.log10((found + floor) / (expected + floor)).abs()
+    return float((energy * apart).sum() / energy.sum())
