@@ -234,7 +234,32 @@ def test_a_page_is_a_folder_or_one_file(field_file: Path, tmp_path: Path, capsys
     assert (manifest["points"], manifest["modes"]) == (30, len(BANK))
     assert (tmp_path / "page" / "index.html").is_file()
     assert b"<html" in (tmp_path / "page.html").read_bytes()
-    assert "page: web, " in capsys.readouterr().out
+    out, err = capsys.readouterr()
+    assert "page: web, " in out
+    (*_, served, opened) = [line for line in err.splitlines() if line.startswith("next: ")]
+    assert f"http.server --directory {tmp_path / 'page'}" in served
+    assert str(tmp_path / "page.html") in opened
+
+
+@pytest.mark.parametrize(
+    ("to", "name", "named"),
+    [
+        ("gltf", "a.glb", "a.glb"),
+        ("faust", "a.dsp", "a.dsp"),
+        ("faust", "a.lib", "a.lib"),
+        ("wavs", "samples", "samples/instrument.sfz"),
+        ("uff", "a.uff", "a.uff"),
+        ("avmsf-demo", "demo", "demo"),
+    ],
+)
+def test_what_follows_names_what_was_written(
+    to: str, name: str, named: str, field_file: Path, tmp_path: Path, capsys: Streams
+) -> None:
+    words = ["export", str(field_file), "--to", to, "--output", str(tmp_path / name), "--points", "3"]
+    assert main([*words, *(["--forces", "1", "2", "--seconds", "0.01"] if to == "wavs" else [])]) == 0
+    (following,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("next: ")]
+    assert named in following
+    assert "avmsf" not in following.replace(str(tmp_path), "")
 
 
 def export(words: list[str]) -> None:

@@ -18,7 +18,7 @@ from avmsf.cli.render import METRES
 from avmsf.config import CACHE
 from avmsf.errors import ExportError
 from avmsf.export.faust import contacts_path, fitted, write_faust
-from avmsf.export.formats import POINTS
+from avmsf.export.formats import PAGE_SUFFIXES, POINTS
 from avmsf.export.gltf import write_gltf
 from avmsf.export.look import Look, read_look
 from avmsf.export.modaldemo import SCENE, is_demo, read_demo, write_demo
@@ -64,20 +64,40 @@ def run(options: Options) -> int:
         "notes": list(written.remarks),
     }
     if options.to == "wavs":
-        instrument = options.output / INSTRUMENT
-        text += f"; any SFZ player opens {instrument}"
-        values["instrument"] = str(instrument)
+        values["instrument"] = str(options.output / INSTRUMENT)
     elif options.to == "faust":
         contacts = contacts_path(options.output)
         text += f"; {contacts} has the coordinates of each contact"
         values["contacts"] = str(contacts)
     print_result(text, values, json=options.json)
+    say(f"next: {_following(options)}")
     if options.to == "wavs" and len(options.forces) == 1:
         layered = f"--to wavs --output {shlex.quote(str(options.output))} --forces 0.3 1 3"
         next_command("avmsf export", options.field, layered)
-    elif options.field.is_file():
-        next_command("avmsf studio", options.field)
     return 0
+
+
+def _following(options: Options) -> str:
+    """Return what to do with the files of a format."""
+    output = shlex.quote(str(options.output))
+    match options.to:
+        case "web" if options.output.suffix.lower() in PAGE_SUFFIXES:
+            return f"open {output} in a browser"
+        case "web":
+            return f"python -m http.server --directory {output}, then open http://localhost:8000 in a browser"
+        case "gltf":
+            return f"open {output} in a glTF viewer"
+        case "faust" if options.output.suffix.lower() == ".lib":
+            call = "strike(contact, force, contactTime, gate)"
+            return f'in a Faust program beside it: library("{options.output.name}").{call}'
+        case "faust":
+            return f"open {output} in the Faust IDE (https://faustide.grame.fr), or compile it: faust2jack {output}"
+        case "wavs":
+            return f"load {shlex.quote(str(options.output / INSTRUMENT))} in a sampler that reads SFZ"
+        case "uff":
+            return f"open {output} in a program for modal analysis"
+        case _:
+            return f"open {output} in the paper's web demo"
 
 
 def _read(options: Options) -> SoundField | SampledField:
