@@ -43,6 +43,18 @@ def test_masks_and_camera_files_that_name_no_photograph(tmp_path: Path) -> None:
     assert (visual.photographs, visual.masks) == (3, 0)
 
 
+def test_masks_that_some_photographs_lack_are_a_problem(tmp_path: Path) -> None:
+    write_transforms(tmp_path, frames(ring(4)))
+    for name in "acd":
+        write_image(tmp_path / "masks" / f"{name}.png")
+    (problem,) = found(tmp_path).problems
+    assert "b.png" in problem
+    named = [{**frame, "mask_path": f"cut/{name}.png"} for name, frame in zip("abcd", frames(ring(4)), strict=True)]
+    write_transforms(tmp_path / "named", named)
+    (problem,) = found(tmp_path / "named").problems
+    assert problem.startswith("4 photographs")
+
+
 @pytest.mark.parametrize("installed", [True, False])
 def test_photographs_alone_need_structure_from_motion(
     tmp_path: Path, installed: bool, monkeypatch: pytest.MonkeyPatch
@@ -89,6 +101,9 @@ def test_the_report_has_them_and_leads_to_the_command_that_uses_them(
     assert ("4 photographs" in line) == pictured
     following = f"avmsf reconstruct {folder} -o {folder}.safetensors" if pictured else f"avmsf modes {folder}"
     assert err.splitlines()[-1] == f"next: {following}"
+    assert main(["modes", str(folder)]) == 0
+    following = "reconstruct" if pictured else "fit"
+    assert capsys.readouterr().err.splitlines()[-1].startswith(f"next: avmsf {following} ")
     # The mask without a photograph counts as a warning.
     assert out.splitlines()[-1] == ("readable, with 1 warning" if pictured else "no problem found")
     assert main(["check", str(folder), "--json"]) == 0

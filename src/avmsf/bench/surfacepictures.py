@@ -2,26 +2,30 @@
 
 import numpy as np
 import trimesh
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from avmsf.bench.sides import ALL_SIDES, name_axes, view_from
 from avmsf.capture.surface import Surface
 from avmsf.errors import EvaluationError
-from avmsf.plotting.style import FIRST, styled
+from avmsf.plotting.style import FIRST, SERIES, styled
 
 _LIGHT = np.array([-0.4, 0.5, 0.77])
 """Direction to the light in the picture's frame: right, up, towards the eye; of unit length."""
 _MILLIMETERS = 1000.0
+_NEAR = 0.1
+"""Distance from a cut up to which contacts are drawn on it, over the diagonal of the surface's box."""
 
 
 @styled
-def draw_surface(surface: Surface, *, title: str) -> Figure:
+def draw_surface(surface: Surface, *, title: str, contacts: Float[Tensor, "contacts 3"] | None = None) -> Figure:
     """Draw a surface of triangles (object frame, meters), and its cuts through the middle of its box, in millimeters.
 
-    One cut is along x and z, one along y and z: walls and cavities of what stands upright show in both. Raises
-    EvaluationError for a surface without triangles.
+    One cut is along x and z, one along y and z: walls and cavities of what stands upright show in both. `contacts` are
+    dots, on a cut those within a tenth of the diagonal of it. Raises EvaluationError for a surface without triangles.
     """
     if not len(surface.faces):
         raise EvaluationError(
@@ -34,6 +38,8 @@ def draw_surface(surface: Surface, *, title: str) -> Figure:
     middle = mesh.bounds.mean(axis=0)
     for axes, across in zip(cuts, (0, 1), strict=True):
         _cut(axes, mesh, middle, across=across)
+    if contacts is not None:
+        _mark(whole, cuts, mesh, _MILLIMETERS * contacts.double().numpy())
     figure.suptitle(title)
     return figure
 
@@ -66,3 +72,14 @@ def _cut(axes: Axes, mesh: trimesh.Trimesh, middle: np.ndarray, *, across: int) 
     axes.set_xlabel(f"{'xy'[across]} (mm)")
     axes.set_ylabel("z (mm)")
     axes.grid()
+
+
+def _mark(whole: Axes, cuts: list[Axes], mesh: trimesh.Trimesh, contacts: np.ndarray) -> None:
+    """Draw contacts, millimeters: all in the view, and in each cut those near its plane."""
+    middle, diagonal = mesh.bounds.mean(axis=0), float(np.linalg.norm(mesh.extents))
+    seen = contacts @ view_from(ALL_SIDES[0]).T
+    whole.plot(seen[:, 0], seen[:, 1], "o", color=SERIES[1], markersize=4, label="contacts")
+    whole.legend(loc="upper right")
+    for axes, across in zip(cuts, (0, 1), strict=True):
+        near = contacts[np.abs(contacts[:, 1 - across] - middle[1 - across]) < _NEAR * diagonal]
+        axes.plot(near[:, across], near[:, 2], "o", color=SERIES[1], markersize=4)

@@ -75,7 +75,10 @@ def run(options: Options) -> int:
         say(f"not trained on: {shown}")
     print_fitted(screen, fitted, train, test, scores, options.output)
     screen.print(f"wrote {options.output}", soft_wrap=True)
-    next_command("avmsf render", options.output, "--position X Y Z -o impact.wav")
+    if test is None:
+        next_command("avmsf render", options.output, "--position X Y Z -o impact.wav")
+    else:
+        next_command("avmsf fit", options.capture, "-o field.safetensors  # with all recordings")
     if options.json:
         print_json(
             {

@@ -10,6 +10,7 @@ from avmsf.cli.modetable import ModeRow, QualityRow, amplitudes, levels, mode_ro
 from avmsf.cli.options.checks import read_settings
 from avmsf.cli.options.modes import Options
 from avmsf.cli.printing import console, decimals, figure, next_command, print_json, say, table
+from avmsf.cli.visuals import visual_inputs
 from avmsf.modal.extraction.extract import extract_modes
 from avmsf.modal.extraction.quality import measure_quality
 from avmsf.pipeline.record import capture_settings_of, finder_of
@@ -63,7 +64,9 @@ def run(options: Options) -> int:
                 "supporting_poles": [asdict(row) | asdict(how) for row, how in supporting],
             }
         )
-    next_command("avmsf fit", options.capture, "-o field.safetensors")
+    visual = visual_inputs(options.capture, capture.settings)
+    verb = "reconstruct" if visual is not None and visual.reconstructs else "fit"
+    next_command(f"avmsf {verb}", options.capture, "-o field.safetensors")
     return 0
 
 

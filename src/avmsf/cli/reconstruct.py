@@ -67,7 +67,10 @@ def run(options: Options) -> int:
     screen.print(f"the field is {made.field}", soft_wrap=True)
     if options.output is not None:
         screen.print(f"wrote {options.output}", soft_wrap=True)
-    next_command("avmsf render", options.output or made.field, "--position X Y Z -o impact.wav")
+    if test is None:
+        next_command("avmsf render", options.output or made.field, "--position X Y Z -o impact.wav")
+    else:
+        next_command("avmsf reconstruct", options.folder, "-o field.safetensors  # with all recordings")
     if options.json:
         print_json(
             {

@@ -18,6 +18,7 @@ from avmsf.cli.writing import write_text
 from avmsf.field.store import load
 from avmsf.field.suggest import Suggestions, suggest
 from avmsf.field.uncertainty import relative_gain_std, unedited_mixture
+from avmsf.pipeline.record import RECORD
 from avmsf.wording import counted
 
 _DRAWN_POINTS = 4000
@@ -61,7 +62,9 @@ def run(options: Options) -> int:
         save_picture(picture, paths[PICTURE])
         for path in paths.values():
             say(f"wrote {path}")
-    next_command(f"avmsf fit CAPTURE -o {shlex.quote(str(options.field))}")
+    # `fit` would make a field of a shape from photographs without that shape.
+    verb = "fit" if field.origin.report.get(RECORD, {}).get("scene") is None else "reconstruct"
+    next_command(f"avmsf {verb} CAPTURE -o {shlex.quote(str(options.field))}")
     if options.json:
         print_json(
             {

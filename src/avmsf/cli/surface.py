@@ -1,10 +1,17 @@
 """`avmsf surface`: a folder's mesh, photographs or video in, the object's surface out."""
 
+from pathlib import Path
+
+import torch
 import trimesh
+from jaxtyping import Float64
+from torch import Tensor
 
 from avmsf.bench.pictures import save_picture
 from avmsf.bench.surfacepictures import draw_surface
+from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.surface import Surface, find_surface, read_surface, write_surface
+from avmsf.capture.table import TABLE, in_folder, read_rows, understand
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.scenes import with_seed
@@ -36,12 +43,23 @@ def run(options: Options) -> int:
     lines += [stage_line(name, made) for name, made in {**scene.made(), "surface": kept}.items()]
     picture = None if options.plots is None else options.plots / "surface.png"
     if picture is not None:
-        save_picture(draw_surface(surface, title=f"{options.folder.resolve().name}: surface"), picture)
+        title = f"{options.folder.resolve().name}: surface"
+        contacts = _contacts(options.folder, scene.settings)
+        save_picture(draw_surface(surface, title=title, contacts=contacts), picture)
     lines += [f"wrote {path}" for path in (options.output, picture) if path is not None]
     values = {"surface": str(options.output or kept.path), "triangles": len(surface.faces)}
     print_result("\n".join(lines), values, json=options.json)
     next_command("avmsf reconstruct", options.folder, "-o field.safetensors")
     return 0
+
+
+def _contacts(folder: Path, settings: CaptureSettings) -> Float64[Tensor, "contacts 3"] | None:
+    """Return the contacts of the folder's table, meters; None without a table. Raises CaptureError for a bad one."""
+    if not (folder / TABLE).is_file():
+        return None
+    with in_folder(folder):
+        contacts = [understand(row, settings).contact for row in read_rows(folder)[0]]
+    return torch.tensor(contacts, dtype=torch.float64)
 
 
 def surface_words(surface: Surface) -> str:

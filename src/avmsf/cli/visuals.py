@@ -112,7 +112,7 @@ def _photographs(
 
 
 def _masked(folder: Path, names: dict[str, Path], masks: dict[str, Path], problems: list[str]) -> int:
-    """Return how many photographs have a mask, and add to `problems` the masks that belong to none."""
+    """Return how many photographs have a mask; add to `problems` masks of no photograph, and masks that are missing."""
     places = {name: [*mask_names(name, folder), *([masks[name]] if name in masks else [])] for name in names}
     known = {path for each in places.values() for path in each}
     strange = [path for path in images_in(folder / "masks", deep=True) if path not in known]
@@ -121,8 +121,13 @@ def _masked(folder: Path, names: dict[str, Path], masks: dict[str, Path], proble
         problems.append(
             f"{counted(len(strange), 'mask')} without a photograph of that name: {shown}; a mask is masks/NAME.png"
         )
-    masked = sum(any(path.is_file() for path in each) for each in places.values())
-    return len(names) if not masked and _have_alpha(list(names.values())) else masked
+    bare = [name for name, each in places.items() if not any(path.is_file() for path in each)]
+    masked = len(names) - len(bare)
+    if not masked and _have_alpha(list(names.values())):
+        return len(names)
+    if bare and (masked or masks):
+        problems.append(f"{counted(len(bare), 'photograph')} without a mask: {listed(bare)}; add masks/NAME.png")
+    return masked
 
 
 def _have_alpha(photographs: Sequence[Path]) -> bool:
