@@ -43,7 +43,7 @@ def adjust_modes(
     """
     factors = {name: _values(field, value, name) for name, value in (("pitch", pitch), ("decay", decay))}
     for name, values in factors.items():
-        _expect(torch.isfinite(values) & (values > 0), name, values, "factors above 0, such as 1.5")
+        _expect(torch.isfinite(values) & (values > 0), name, values, "factors above 0, such as 0.5 for half the value")
     levels = _values(field, gains_db, "gains_db")
     _expect(levels < math.inf, "gains_db", levels, "decibels, or -inf for silence")
     if not math.isfinite(brightness_db):
@@ -95,7 +95,8 @@ def _expect(fine: Bool[Tensor, " modes"], name: str, values: Float64[Tensor, " m
     if not bool(fine.all()):
         row = int(torch.nonzero(~fine)[0])
         value = float(values[row])
-        raise EditError(f"{name}, mode {row}: expected {wanted}, got {value:g}", row=row, name=name, value=value)
+        where = name if bool((values == value).all()) else f"{name}, mode {row}"
+        raise EditError(f"{where}: expected {wanted}, got {value:g}", row=row, name=name, value=value)
 
 
 def _told(values: Float64[Tensor, " modes"]) -> float | list[float | None] | None:
