@@ -8,6 +8,9 @@ from typing import Any
 import pytest
 
 from avmsf.capture import CaptureSettings
+from avmsf.capture.filenames import pictures_in
+from avmsf.capture.views.read import find_shots
+from avmsf.capture.views.shots import without_camera
 from avmsf.cli import main
 from avmsf.cli.visuals import VisualInputs, visual_inputs
 from capture_folder import fill
@@ -53,6 +56,15 @@ def test_masks_that_some_photographs_lack_are_a_problem(tmp_path: Path) -> None:
     write_transforms(tmp_path / "named", named)
     (problem,) = found(tmp_path / "named").problems
     assert problem.startswith("4 photographs")
+
+
+def test_images_of_a_cache_are_no_photographs(tmp_path: Path) -> None:
+    """`avmsf surface FOLDER/images`, of the wrong folder, leaves its cache there."""
+    write_transforms(tmp_path, frames(ring(4)))
+    write_image(tmp_path / "images" / ".avmsf" / "motion" / "view_000.png")
+    assert pictures_in(tmp_path / "images", deep=True) == [tmp_path / "images" / f"{name}.png" for name in "abcd"]
+    _, shots = find_shots(tmp_path)
+    assert without_camera(shots.shots, tmp_path) == []
 
 
 @pytest.mark.parametrize("installed", [True, False])

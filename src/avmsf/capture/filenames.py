@@ -75,3 +75,18 @@ def _nearest_name(path: Path, used: Collection[Path]) -> str | None:
     names = {name.lower(): name for name in heapq.nsmallest(_MAX_NAMES_COMPARED, others)}
     found = get_close_matches(path.name.lower(), names, n=1, cutoff=0.7)
     return names[found[0]] if found else None
+
+
+def pictures_in(folder: Path, *, deep: bool) -> list[Path]:
+    """Return the image files in a folder, sorted, and `deep` in those beneath it; none where there is no folder.
+
+    Hidden folders are left out: a cache in `.avmsf` holds images of its own.
+    """
+    found = folder.rglob("*") if deep else folder.glob("*")
+    return sorted(
+        path
+        for path in found
+        if path.suffix.lower() in PICTURE_SUFFIXES
+        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+        and path.is_file()
+    )

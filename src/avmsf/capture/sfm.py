@@ -20,7 +20,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from avmsf.capture.filenames import PICTURE_SUFFIXES
+from avmsf.capture.filenames import PICTURE_SUFFIXES, pictures_in
 from avmsf.capture.views.pictures import Picture, PictureSizeError, read_mask, read_picture
 from avmsf.capture.warning import Remark
 from avmsf.errors import CaptureError
@@ -154,7 +154,7 @@ def _stage_images(images: Path, begun: Path, *, shared_camera: bool) -> tuple[di
     Returns the images' names there with their true ones, and the names of those that cannot be read. Raises
     CaptureError for too few images, and for images of different sizes from one camera.
     """
-    found = sorted(path for path in images.rglob("*") if path.suffix.lower() in PICTURE_SUFFIXES and path.is_file())
+    found = pictures_in(images, deep=True)
     names, lost, sizes = {}, [], {}
     for path in found:
         name = path.relative_to(images).as_posix()

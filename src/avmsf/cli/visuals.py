@@ -7,12 +7,12 @@ from pathlib import Path
 
 from PIL import Image
 
-from avmsf.capture.filenames import find_surface_file
+from avmsf.capture.filenames import find_surface_file, pictures_in
 from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.views.read import find_shots
 from avmsf.capture.views.shots import listed, mask_names
 from avmsf.errors import CaptureError, SceneError
-from avmsf.pipeline.sources import find_source, find_splats, images_in
+from avmsf.pipeline.sources import find_source, find_splats
 from avmsf.wording import counted
 
 
@@ -106,8 +106,8 @@ def _photographs(
         return present, origin, {shot.name: shot.mask for shot in found.shots if shot.mask is not None}
     images = folder / "images"
     if images.is_dir():
-        return {path.relative_to(images).as_posix(): path for path in images_in(images, deep=True)}, None, {}
-    alone = images_in(folder, deep=False) if kind == "photographs" else []
+        return {path.relative_to(images).as_posix(): path for path in pictures_in(images, deep=True)}, None, {}
+    alone = pictures_in(folder, deep=False) if kind == "photographs" else []
     return {path.name: path for path in alone}, None, {}
 
 
@@ -115,7 +115,7 @@ def _masked(folder: Path, names: dict[str, Path], masks: dict[str, Path], proble
     """Return how many photographs have a mask; add to `problems` masks of no photograph, and masks that are missing."""
     places = {name: [*mask_names(name, folder), *([masks[name]] if name in masks else [])] for name in names}
     known = {path for each in places.values() for path in each}
-    strange = [path for path in images_in(folder / "masks", deep=True) if path not in known]
+    strange = [path for path in pictures_in(folder / "masks", deep=True) if path not in known]
     if strange:
         shown = listed([path.relative_to(folder).as_posix() for path in strange])
         problems.append(

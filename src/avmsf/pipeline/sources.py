@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 
 from avmsf.capture.cameras import View
-from avmsf.capture.filenames import PICTURE_SUFFIXES, SPLATS, VIDEO_SUFFIXES, find_surface_file
+from avmsf.capture.filenames import SPLATS, VIDEO_SUFFIXES, find_surface_file, pictures_in
 from avmsf.capture.meshviews import orbit_cameras, render_views
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.sfm import FEWEST, estimate_cameras
@@ -57,14 +57,14 @@ def find_source(folder: Path, settings: CaptureSettings, *, prefer: Literal["bes
     transforms = folder / "transforms.json"
     model = None if transforms.is_file() else find_model(folder)
     photographs = folder / "images" if (folder / "images").is_dir() else folder
-    images, masks = images_in(photographs, deep=photographs != folder), images_in(folder / "masks", deep=True)
+    images, masks = pictures_in(photographs, deep=photographs != folder), pictures_in(folder / "masks", deep=True)
     surface = find_surface_file(folder, settings)
     shaped = surface is not None and surface.is_file()
     if (model is not None or transforms.is_file()) and not (prefer == "mesh" and shaped):
         named = [transforms] if model is None else sorted(each for each in model.iterdir() if each.is_file())
         return Source("cameras", (*named, *images, *masks, *sorted(folder.glob("*.ply"))), folder, folder)
     if surface is not None and shaped:
-        beside = (*images_in(surface.parent, deep=False), *sorted(surface.parent.glob("*.mtl")))
+        beside = (*pictures_in(surface.parent, deep=False), *sorted(surface.parent.glob("*.mtl")))
         return Source("mesh", (surface, *beside), surface, folder)
     if len(images) >= FEWEST or (images and photographs != folder):
         if len(images) < FEWEST:
@@ -170,9 +170,3 @@ def _keep_motion(source: Source, stages: StageFolder, config: ViewsConfig, *, te
         estimate_cameras(path / "images", path, timeout=60 * config.minutes, seed=config.seed)
 
     return stages.keep("motion", recipe, make)
-
-
-def images_in(folder: Path, *, deep: bool) -> list[Path]:
-    """Return the image files in a folder, sorted, and `deep` in those beneath it; none where there is no folder."""
-    paths = folder.rglob("*") if deep else folder.glob("*")
-    return sorted(path for path in paths if path.suffix.lower() in PICTURE_SUFFIXES and path.is_file())

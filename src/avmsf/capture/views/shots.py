@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.capture.filenames import PICTURE_SUFFIXES
+from avmsf.capture.filenames import pictures_in
 from avmsf.capture.views.lenses import Lens
 from avmsf.capture.warning import Remark
 from avmsf.errors import CaptureError
@@ -47,10 +47,11 @@ def without_camera(shots: Sequence[Shot], folder: Path) -> list[str]:
     known = {path.resolve() for shot in shots for path in (shot.image, shot.mask) if path is not None}
     images = folder / "images"
     if images.is_dir():
-        candidates = set(images.rglob("*"))
+        candidates = set(pictures_in(images, deep=True))
     else:
-        candidates = {path for parent in {shot.image.parent for shot in shots} for path in parent.glob("*")}
-    strangers = [path for path in candidates if path.suffix.lower() in PICTURE_SUFFIXES and path.resolve() not in known]
+        folders = {shot.image.parent for shot in shots}
+        candidates = {path for parent in folders for path in pictures_in(parent, deep=False)}
+    strangers = [path for path in candidates if path.resolve() not in known]
     return sorted(path.relative_to(images).as_posix() if images.is_dir() else path.name for path in strangers)
 
 
