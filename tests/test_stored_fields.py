@@ -7,6 +7,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from avmsf.errors import FieldFileError
 from avmsf.field import SoundField
 from avmsf.field.header import FORMAT
 from avmsf.simulate.material import GLASS, WOOD
@@ -14,6 +15,7 @@ from avmsf.tasks.edits import EDITS
 from avmsf.tasks.madeof import made_of
 from avmsf.tasks.material import change_material
 from avmsf.tasks.modes import adjust_modes
+from raising import raises
 from stored_fields import fields
 
 FILES = sorted((Path(__file__).parent / "data").glob("format-*/*.safetensors"))
@@ -51,3 +53,23 @@ def test_edits_of_earlier_versions_have_the_present_names(tmp_path):
     assert kinds == ["change_material", "adjust_modes", "guided", "change_material"]
     assert read.origin.report[EDITS][:2] == entries
     assert made_of(read, option="--from").material == WOOD
+
+
+@pytest.mark.parametrize(
+    ("entry", "name"),
+    [
+        ("x", "origin.report.edits.0"),
+        ({"a": 1}, "origin.report.edits.0.edit"),
+        ({"edit": "change_material"}, "origin.report.edits.0.to"),
+        ({"edit": "recast", "to": {"name": "wood"}}, "origin.report.edits.0.to.density"),
+        ({"edit": "adjust_modes", "decay": 1.0}, "origin.report.edits.0.pitch"),
+        ({"edit": "adjust_modes", "pitch": 0.0, "decay": 1.0}, "origin.report.edits.0.pitch"),
+        ({"edit": "adjust_modes", "pitch": [1.0], "decay": 1.0}, "origin.report.edits.0.pitch"),
+    ],
+)
+def test_what_is_no_edit_is_refused(entry, name, tmp_path):
+    field = fields()["mixture"]
+    report = {**field.origin.report, EDITS: [entry]}
+    with raises(FieldFileError, name=name):
+        replace(field, origin=replace(field.origin, report=report)).save(tmp_path / "field.safetensors")
+        SoundField.load(tmp_path / "field.safetensors")

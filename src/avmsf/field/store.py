@@ -46,6 +46,8 @@ _KINDS: dict[str, type[GainField]] = {**FITTED, ScaledGains.kind: ScaledGains}
 """The gain fields that a file may hold, by what it calls them."""
 _RENAMED_EDITS = {"recast": "change_material", "retune": "adjust_modes", "steer": "guided"}
 """Kinds of edits that earlier versions wrote, and what they are called now."""
+_MATERIAL = {"name": "", **dict.fromkeys(("density", "young", "poisson", "alpha", "beta"), 1.0)}
+"""What the entry of a material has, by example."""
 _SAVE_AGAIN = "fit and save the field again"
 
 
@@ -160,7 +162,7 @@ class _Header:
             trained_on=tuple(like(name, "", "origin.trained_on") for name in origin["trained_on"]),
             per_newton=like(origin["per_newton"], True, "origin.per_newton"),
             config=record_of(FitConfig(), record["config"], "config"),
-            report=_with_present_names(like(origin["report"], {}, "origin.report")),
+            report=_checked_edits(like(origin["report"], {}, "origin.report"), modes),
             settings=CaptureSettings.of(like(origin["settings"], {}, "origin.settings"), name="origin.settings"),
         )
         if (quality := read.report.get("quality")) is not None:
@@ -168,16 +170,28 @@ class _Header:
         return cls(rate, samples, kind, gains, read, skeleton)
 
 
-def _with_present_names(report: dict[str, Any]) -> dict[str, Any]:
-    """Return a report whose edits are called as this version calls them."""
-    if not isinstance(edits := report.get("edits"), list):
-        return report
-    return {**report, "edits": [_renamed(entry) for entry in edits]}
+def _checked_edits(report: dict[str, Any], modes: int) -> dict[str, Any]:
+    """Return a report whose edits are called as this version calls them. Raises RecordError for what is no edit."""
+    edits = like(report.get("edits", []), [], "origin.report.edits")
+    found = [_edit_of(entry, f"origin.report.edits.{row}", modes) for row, entry in enumerate(edits)]
+    return {**report, "edits": found} if found else report
 
 
-def _renamed(entry: Any) -> Any:
-    kind = entry.get("edit") if isinstance(entry, dict) else None
-    return {**entry, "edit": _RENAMED_EDITS[kind]} if isinstance(kind, str) and kind in _RENAMED_EDITS else entry
+def _edit_of(entry: Any, name: str, modes: int) -> dict[str, Any]:
+    known: dict[str, Any] = like(entry, {}, name)
+    written = like(known.get("edit"), "", f"{name}.edit")
+    kind = _RENAMED_EDITS.get(written, written)
+    if kind == "change_material":
+        material = like(known.get("to"), {}, f"{name}.to")
+        for key, example in _MATERIAL.items():
+            like(material.get(key), example, f"{name}.to.{key}")
+    if kind == "adjust_modes":
+        for key in ("pitch", "decay"):
+            factors = known.get(key)
+            for factor in factors if isinstance(factors, list) and len(factors) == modes else [factors]:
+                if not 0.0 < like(factor, 1.0, f"{name}.{key}") < math.inf:
+                    raise RecordError.expected("a number above 0", factor, name=f"{name}.{key}")
+    return {**known, "edit": kind}
 
 
 def _record(field: SoundField) -> dict[str, Any]:
