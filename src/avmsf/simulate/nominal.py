@@ -450,11 +450,9 @@ def _expect_settings(count: int, dofs: int, walls: Sequence[float | None] | None
 
 
 def _grouped(refused: Mapping[float | None, str]) -> list[str]:
-    """Return each reason once, after the names of all that it holds for, which have the walls that were got."""
+    """Return each reason once, after the names of all that it holds for."""
     names: dict[str, list[str]] = {}
     for wall, reason in refused.items():
-        if wall is not None:
-            reason = reason.replace(f", got {1000 * wall:.2g} mm;", ";")
         names.setdefault(reason, []).append(body_name(wall))
     shown = {reason: f"{each[0]} to {each[-1]}" if len(each) > 2 else ", ".join(each) for reason, each in names.items()}
     return [f"{each}: {reason}" for reason, each in shown.items()]
