@@ -98,16 +98,15 @@ def read_contacts(path: Path, *, meters: float) -> Contacts:
 def refuse_far(contacts: Contacts, field: SoundField, *, advice: str = "") -> None:
     """Raise `OutputError` for a contact that is not on the object, see `expect_near`; `advice` ends its message."""
     try:
-        expect_near(contacts.places, field.gain_field.points)
+        expect_near(contacts.places, field.gain_field.points, contacts.label)
     except PositionError as error:
         row = error.row or 0
-        found = str(error).partition(": ")[2]
         where = (
             {"name": contacts.option, "row": row}
             if contacts.table is None
             else {"file": contacts.table, "name": contacts.names[row], "row": contacts.lines[row]}
         )
-        raise OutputError(f"{contacts.label(row)}: {found}{advice}", **{**error.attributes, **where}) from error
+        raise OutputError(f"{error}{advice}", **{**error.attributes, **where}) from error
 
 
 def _number(text: str, path: Path, line: int, column: str, separator: str) -> float:

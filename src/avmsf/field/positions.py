@@ -1,5 +1,7 @@
 """Whether positions lie on an object, by the points that its field knows."""
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float, Float64
 from scipy.spatial import cKDTree
@@ -12,10 +14,14 @@ _FEW = 16
 """Positions up to which all distances take less time than a tree of the points."""
 
 
-def expect_near(positions: Float[Tensor, "contacts 3"], points: Float[Tensor, "points 3"]) -> None:
+def expect_near(
+    positions: Float[Tensor, "contacts 3"],
+    points: Float[Tensor, "points 3"],
+    label: Callable[[int], str] = "positions, row {}".format,
+) -> None:
     """Raise PositionError for a position farther outside the box of an object's points than the object is large.
 
-    Such a position counts another unit, or is in another frame.
+    Such a position counts another unit, or is in another frame. `label` says where a row's position was given.
     """
     places, known = positions.double(), points.detach().cpu().double()
     low, high = known.amin(0), known.amax(0)
@@ -27,7 +33,7 @@ def expect_near(positions: Float[Tensor, "contacts 3"], points: Float[Tensor, "p
         found = places[row].tolist()
         where = ", ".join(f"{value:.4g}" for value in found)
         raise PositionError(
-            f"positions, row {row}: expected positions on the object, in meters, got ({where}), "
+            f"{label(row)}: expected positions on the object, in meters, got ({where}), "
             f"{float(outside[row]):.3g} m outside an object {size:.3g} m across; check the unit and the frame",
             name="positions",
             row=row,
