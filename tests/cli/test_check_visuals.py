@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
 from avmsf.capture import CaptureSettings
 from avmsf.capture.filenames import pictures_in
@@ -67,6 +68,15 @@ def test_images_of_a_cache_are_no_photographs(tmp_path: Path) -> None:
     assert without_camera(shots.shots, tmp_path) == []
 
 
+def test_an_alpha_channel_is_the_mask_of_its_photograph_alone(tmp_path: Path) -> None:
+    write_transforms(tmp_path, frames(ring(4)))
+    Image.new("RGBA", (8, 8)).save(tmp_path / "images" / "a.png")
+    assert found(tmp_path).masks == 1
+    (problem,) = found(tmp_path).problems
+    assert "b.png" in problem
+    assert "a.png" not in problem
+
+
 @pytest.mark.parametrize("installed", [True, False])
 def test_photographs_alone_need_structure_from_motion(
     tmp_path: Path, installed: bool, monkeypatch: pytest.MonkeyPatch
@@ -111,7 +121,7 @@ def test_the_report_has_them_and_leads_to_the_command_that_uses_them(
     out, err = capsys.readouterr()
     (line,) = [line for line in out.splitlines() if line.startswith("the object is shown by: ")]
     assert ("4 photographs" in line) == pictured
-    following = f"avmsf reconstruct {folder} -o {folder}.safetensors" if pictured else f"avmsf modes {folder}"
+    following = f"avmsf reconstruct {folder} -o field.safetensors" if pictured else f"avmsf modes {folder}"
     assert err.splitlines()[-1] == f"next: {following}"
     assert main(["modes", str(folder)]) == 0
     following = "reconstruct" if pictured else "fit"

@@ -1,6 +1,5 @@
 """`avmsf check`: what each recording of a capture is worth, and what is wrong."""
 
-import shlex
 import warnings
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -79,7 +78,7 @@ def run(options: Options) -> int:
         wrong += bool(aligned.not_aligned) + bool(aligned.inverted)
     screen.print("no problem found" if not wrong else f"readable, with {counted(wrong, 'warning')}", soft_wrap=True)
     if visual is not None and visual.reconstructs:
-        next_command("avmsf reconstruct", options.capture, f"-o {shlex.quote(f'{options.capture}.safetensors')}")
+        next_command("avmsf reconstruct", options.capture, "-o field.safetensors")
     else:
         next_command("avmsf modes", options.capture)
     return 0

@@ -1,7 +1,6 @@
 """What shows the object in a capture folder: found by names and camera files, without reading pictures or shapes."""
 
 import importlib.util
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,7 +23,7 @@ class VisualInputs:
     cameras: str | None
     """The file or folder with the cameras of the photographs; None where they have none."""
     masks: int
-    """Photographs with a mask: a file of its own, or an alpha channel in all of them."""
+    """Photographs with a mask: a file of its own, or an alpha channel."""
     video: str | None
     mesh: str | None
     gaussians: str | None
@@ -121,19 +120,20 @@ def _masked(folder: Path, names: dict[str, Path], masks: dict[str, Path], proble
         problems.append(
             f"{counted(len(strange), 'mask')} without a photograph of that name: {shown}; a mask is masks/NAME.png"
         )
-    bare = [name for name, each in places.items() if not any(path.is_file() for path in each)]
-    masked = len(names) - len(bare)
-    if not masked and _have_alpha(list(names.values())):
-        return len(names)
-    if bare and (masked or masks):
+    bare = [
+        name
+        for name, each in places.items()
+        if not any(path.is_file() for path in each) and not _has_alpha(names[name])
+    ]
+    if bare and (masks or len(bare) < len(names)):
         problems.append(f"{counted(len(bare), 'photograph')} without a mask: {listed(bare)}; add masks/NAME.png")
-    return masked
+    return len(names) - len(bare)
 
 
-def _have_alpha(photographs: Sequence[Path]) -> bool:
-    """Return whether the first photograph has an alpha channel, by its header."""
+def _has_alpha(photograph: Path) -> bool:
+    """Return whether a photograph has an alpha channel, by its header."""
     try:
-        with Image.open(photographs[0]) as picture:
+        with Image.open(photograph) as picture:
             return "A" in picture.getbands()
-    except (IndexError, OSError, Image.DecompressionBombError):
+    except (OSError, Image.DecompressionBombError):
         return False
