@@ -75,10 +75,7 @@ def run(options: Options) -> int:
         say(f"not trained on: {shown}")
     print_fitted(screen, fitted, train, test, scores, options.output)
     screen.print(f"wrote {options.output}", soft_wrap=True)
-    if test is None:
-        next_command("avmsf render", options.output, "--position X Y Z -o impact.wav")
-    else:
-        next_command("avmsf fit", options.capture, "-o field.safetensors  # with all recordings")
+    next_after_fit(options.output, trial=test is not None)
     if options.json:
         print_json(
             {
@@ -133,6 +130,14 @@ def _run_guess(options: Options, material: str, settings: CaptureSettings) -> in
     save(guessed, options.output)
     show_guess(guessed, options.output, json=options.json)
     return 0
+
+
+def next_after_fit(output: Path, *, trial: bool) -> None:
+    """Print what is useful after a fit: after a `trial` on a part of the recordings, a fit to all of them."""
+    if trial:
+        say("next: the same command without --train-fraction and --train-count, to fit to all recordings")
+    else:
+        next_command("avmsf render", output, "--position X Y Z -o impact.wav")
 
 
 def show_guess(guessed: SoundField, output: Path, *, json: bool) -> None:

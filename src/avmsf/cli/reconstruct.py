@@ -6,11 +6,11 @@ from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
-from avmsf.cli.fit import fitted_values, part_contacts, print_fitted, show_guess
+from avmsf.cli.fit import fitted_values, next_after_fit, part_contacts, print_fitted, show_guess
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.checks import read_settings
 from avmsf.cli.options.reconstruct import Options
-from avmsf.cli.printing import console, figure, next_command, print_json, say, table
+from avmsf.cli.printing import console, figure, print_json, say, table
 from avmsf.cli.progress import FitBar
 from avmsf.cli.scenebar import SceneBar
 from avmsf.cli.scenes import features_words
@@ -67,10 +67,7 @@ def run(options: Options) -> int:
     screen.print(f"the field is {made.field}", soft_wrap=True)
     if options.output is not None:
         screen.print(f"wrote {options.output}", soft_wrap=True)
-    if test is None:
-        next_command("avmsf render", options.output or made.field, "--position X Y Z -o impact.wav")
-    else:
-        next_command("avmsf reconstruct", options.folder, "-o field.safetensors  # with all recordings")
+    next_after_fit(options.output or made.field, trial=test is not None)
     if options.json:
         print_json(
             {
