@@ -11,13 +11,14 @@ import torch
 
 from avmsf.errors import EditError, FieldFileError, SimulationError, StudioError
 from avmsf.export.sampledfield import SampledField
+from avmsf.field.scaledgains import length_of
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.files import way_out
 from avmsf.simulate.material import CERAMIC, WOOD
 from avmsf.studio.editing import REST, Sliders
 from avmsf.studio.refusal import RefusedError
-from avmsf.studio.sampling import length_of, resample, sample
+from avmsf.studio.sampling import resample, sample
 from avmsf.studio.session import Revision, Session, file_name
 from avmsf.tasks.material import change_material
 from avmsf.tasks.modes import adjust_modes
@@ -270,7 +271,7 @@ def test_the_table_of_an_edited_field_is_the_one_made_anew(kind: str) -> None:
     # The highest mode goes beyond half the sample rate, and the next one down is mute.
     words = {"size": 0.7, "material": {"from": "ceramic", "to": "ceramic"}, "decay": 0.5, "brightness": 2.0}
     after, _ = Sliders.read({**words, "pitch": 1.3, "modes": [{"mode": 3, "db": None}]}).apply(before)
-    assert length_of(after) == 0.7
+    assert length_of(after.gain_field) == 0.7
     found = resample(sampled, before, after)
     assert found is not None
     expected = SampledField.of(after, before.gain_field.points.double() * 0.7, normals)

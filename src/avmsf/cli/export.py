@@ -28,12 +28,12 @@ from avmsf.export.universal import write_universal
 from avmsf.export.wavgrid import INSTRUMENT, Grid, Layer, write_grid
 from avmsf.export.webpage import write_webpage
 from avmsf.export.written import Written, expect_free, write_file
+from avmsf.field.scaledgains import length_of
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.pipeline.reconstruct import SURFACE
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import read_splats
-from avmsf.studio.sampling import length_of
 from avmsf.tasks.edits import EDITS
 from avmsf.wording import counted
 
@@ -152,7 +152,7 @@ def _object(field: SoundField | SampledField, options: Options) -> tuple[Path | 
 
 def _length(field: SoundField | SampledField) -> float:
     """Return lengths on the field's object over those on the object that was recorded."""
-    return length_of(field) if isinstance(field, SoundField) else 1.0
+    return length_of(field.gain_field) if isinstance(field, SoundField) else 1.0
 
 
 def _note_size(field: SoundField | SampledField, path: Path) -> None:

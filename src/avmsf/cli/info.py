@@ -24,7 +24,7 @@ from avmsf.field.attention import AttentionGains
 from avmsf.field.config import NETWORK
 from avmsf.field.gains.body import BodyGains
 from avmsf.field.gains.model import MixtureGains
-from avmsf.field.scaledgains import ScaledGains
+from avmsf.field.scaledgains import fitted_gains, length_of
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.field.uncertainty import has_posterior, relative_gain_std, spectrum_band, training_contacts
@@ -151,11 +151,10 @@ def draw_field(
         pictures["spectrum"] = draw_band(
             spectrum_band(field, points[0]), title=f"{name}: one impact, with its uncertainty"
         )
-    scaled = field.gain_field if isinstance(field.gain_field, ScaledGains) else None
-    gained, length = (field.gain_field, 1.0) if scaled is None else (scaled.field, scaled.length)
+    gained = fitted_gains(field.gain_field)
     body = gained.body if isinstance(gained, MixtureGains | BodyGains) else None
     if body is not None:
-        surface = Surface(length * body.nodes.float(), body.triangles[:, :3])
+        surface = Surface(length_of(field.gain_field) * body.nodes.float(), body.triangles[:, :3])
         pictures["surface"] = draw_surface(surface, title=f"the body of {name}")
     for stem, picture in pictures.items():
         path = folder / f"{stem}.png"

@@ -112,6 +112,11 @@ def fitted_gains(gains: GainField) -> GainField:
     return gains.field if isinstance(gains, ScaledGains) else gains
 
 
+def length_of(gains: GainField) -> float:
+    """Return lengths on the object of edited gains over those on the object that they were fitted to."""
+    return gains.length if isinstance(gains, ScaledGains) else 1.0
+
+
 def _inner(record: Mapping[str, Any]) -> str:
     kind: str = like(record["fitted_kind"], "", "fitted_kind")
     if kind not in FITTED:

@@ -21,7 +21,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.gainfield import GainField, Gains
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.positions import expect_near, off_surface
-from avmsf.field.scaledgains import ScaledGains, fitted_gains
+from avmsf.field.scaledgains import fitted_gains, length_of
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.alignment import Alignment
 from avmsf.modal.pulse import ForcePulse
@@ -371,8 +371,7 @@ class SoundField:
         gains, recordings = fitted_gains(self.gain_field), self.residual.recordings
         assert isinstance(gains, MixtureGains)
         assert recordings is not None
-        length = self.gain_field.length if isinstance(self.gain_field, ScaledGains) else 1.0
-        rows, signs = gains.nearest(gains.sites(contacts.double() / length, directions))
+        rows, signs = gains.nearest(gains.sites(contacts.double() / length_of(self.gain_field), directions))
         found = (recordings[rows] * signs[..., None]).mean(1).float()[:, :samples]
         return torch.nn.functional.pad(found, (0, samples - found.shape[1]))
 

@@ -7,20 +7,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.export.sampledfield import SampledField
-from avmsf.field.scaledgains import ScaledGains, fitted_gains
+from avmsf.field.scaledgains import fitted_gains, length_of
 from avmsf.field.soundfield import SoundField
 from avmsf.field.uncertainty import scale_of
 
 
-def length_of(field: SoundField) -> float:
-    """Return lengths on a field's object over those on the object that it was fitted to, which the page shows."""
-    gains = field.gain_field
-    return gains.length if isinstance(gains, ScaledGains) else 1.0
-
-
 def sample(field: SoundField, points: Float[Tensor, "points 3"], normals: Float[Tensor, "points 3"]) -> SampledField:
     """Return the table of a field at points of the object that it was fitted to, meters."""
-    sampled = SampledField.of(field, points.double() * length_of(field), normals)
+    sampled = SampledField.of(field, points.double() * length_of(field.gain_field), normals)
     return replace(sampled, points=points)
 
 

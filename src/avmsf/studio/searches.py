@@ -7,10 +7,10 @@ from collections import defaultdict
 
 from avmsf._utils.text import printable
 from avmsf.errors import AvmsfError
+from avmsf.field.scaledgains import length_of
 from avmsf.studio.capturing import StrikeBook
 from avmsf.studio.locating import Finder, Likeness
 from avmsf.studio.refusal import FORESEEN_ERRORS
-from avmsf.studio.sampling import length_of
 from avmsf.studio.session import Revision, Session
 from avmsf.studio.showing import Showcase
 from avmsf.studio.threads import Threads
@@ -32,10 +32,13 @@ class Searches:
         """Return what locates blows on a revision; its tables are made when they are first asked for."""
         if self._finder is None or self._finder[0] != revision.number:
             field = revision.expect_field()
-            points = self.showcase.current.sampled.points.double() * length_of(field)
+            points = self.showcase.current.sampled.points.double() * length_of(field.gain_field)
             settings = None if self.book is None else self.book.settings
             likeness = self._likenesses[revision.opening]
-            self._finder = (revision.number, Finder(field, points.float(), length_of(field), likeness, settings))
+            self._finder = (
+                revision.number,
+                Finder(field, points.float(), length_of(field.gain_field), likeness, settings),
+            )
         return self._finder[1]
 
     def prepare_ahead(self) -> None:

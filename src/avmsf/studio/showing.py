@@ -24,12 +24,13 @@ from avmsf.export.bundle import write_bundle
 from avmsf.export.formats import MOST_POINTS
 from avmsf.export.normals import outward_normals
 from avmsf.export.sampledfield import SampledField
+from avmsf.field.scaledgains import length_of
 from avmsf.field.soundfield import SoundField
 from avmsf.scene.features import FeatureField
 from avmsf.scene.ply import read_splats
 from avmsf.studio.capturing import StrikeBook
 from avmsf.studio.opening import Opened, find_object, find_reconstructed, is_gaussians
-from avmsf.studio.sampling import length_of, resample, sample
+from avmsf.studio.sampling import resample, sample
 from avmsf.studio.session import Revision
 
 _CLICKED = 8_000
@@ -123,7 +124,7 @@ class Showcase:
         own = field.gain_field.points
         if len(own):
             sampled = SampledField.of(field, _thinned(own, MOST_POINTS))
-            return replace(sampled, points=(sampled.points.double() / length_of(field)).float())
+            return replace(sampled, points=(sampled.points.double() / length_of(field.gain_field)).float())
         points, normals = self._clickable()
         return sample(field, points, normals)
 
