@@ -21,13 +21,15 @@ class Options(Printing):
     not read. The exit code is 0 if at least one object can be read, and 2 otherwise.
     """
 
-    dataset: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATASET"), Existing("a dataset's folder")]]
+    dataset: tyro.conf.Positional[
+        Annotated[Path, tyro.conf.arg(metavar="DATASET"), Existing("a dataset's folder", ("a folder",))]
+    ]
     """Folder of the dataset."""
-    contact_data: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER"), Existing("ObjectFolder Real's contacts")] = (
-        None
-    )
+    contact_data: Annotated[
+        Path | None, tyro.conf.arg(metavar="FOLDER"), Existing("ObjectFolder Real's contacts", ("a folder",))
+    ] = None
     """ObjectFolder Real's contacts: a folder of arrays, or one of SonicGauss's lists."""
-    table: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), Existing("a table of objects")] = None
+    table: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), Existing("a table of objects", ())] = None
     """A CSV or JSON list id, name, material of ObjectFolder Real's objects, numbered as published."""
 
     def check_inputs(self) -> None:

@@ -30,7 +30,9 @@ class Options(Printing):
     """The experiment: farthest, leave-one-out, closest, shots, learning-curve, views, ablation, non-symmetric, localize
     or grid."""
     data: tyro.conf.Positional[
-        Annotated[Path, tyro.conf.arg(metavar="DATA"), Existing("a dataset, capture folders or one capture")]
+        Annotated[
+            Path, tyro.conf.arg(metavar="DATA"), Existing("a dataset, capture folders or one capture", ("a folder",))
+        ]
     ]
     """Folder of a dataset, of capture folders, or of one capture."""
     methods: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
@@ -85,11 +87,11 @@ class Options(Printing):
     """Start of the sounds on which all methods are scored: onset, or peak (paper); by default that of the dataset or of
     each capture.toml. With peak, the methods `field...` are fitted to the recordings from the dataset's own starts,
     and no method is compared with the ground truth of simulated objects."""
-    contact_data: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER"), Existing("ObjectFolder Real's contacts")] = (
-        None
-    )
+    contact_data: Annotated[
+        Path | None, tyro.conf.arg(metavar="FOLDER"), Existing("ObjectFolder Real's contacts", ("a folder",))
+    ] = None
     """ObjectFolder Real's contacts, for its raw form."""
-    table: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), Existing("a table of objects")] = None
+    table: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), Existing("a table of objects", ())] = None
     """The published table of ObjectFolder Real's names and materials."""
     figures: Flag = False
     """Also draw figures/OBJECT.png in the folder of results: spectrograms of the recording and of all methods, 20 Hz to

@@ -35,7 +35,9 @@ class Options(Printing):
     """Write figures to this folder. Field: modes.png, gains.png; uncertainty.png and spectrum.png if the gains have a
     posterior; surface.png, with cross-sections, if they have a body; spectrograms.png with --capture. Gaussians:
     cloud.png and turntable.gif. Features: features.png and turntable.gif."""
-    cloud: Annotated[Path | None, tyro.conf.arg(metavar="CLOUD.ply"), Existing("Gaussians, as a .ply file")] = None
+    cloud: Annotated[
+        Path | None, tyro.conf.arg(metavar="CLOUD.ply"), Existing("Gaussians, as a .ply file", ("a mesh or Gaussians",))
+    ] = None
     """Features: also draw the colors of the Gaussians that the features lie on."""
     regions: int = 64
     """Features: number of regions to draw."""

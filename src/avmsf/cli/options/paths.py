@@ -41,7 +41,7 @@ class Existing:
     """Marks a path that has to exist before a verb begins."""
 
     what: str
-    kinds: tuple[FileKind, ...] = get_args(FileKind)
+    kinds: tuple[FileKind, ...]
     """What it may be; a file of no known kind is left to its reader."""
 
     def check(self, path: Path) -> None:

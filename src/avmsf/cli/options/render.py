@@ -37,7 +37,9 @@ class Options(Printing):
     """A contact in the object's frame."""
     direction: Annotated[Points, tyro.conf.arg(metavar="X Y Z")] = ()
     """Direction of the impact at each --position, in the same order."""
-    contact_table: Annotated[Path | None, tyro.conf.arg(metavar="TABLE.csv"), Existing("a table of contacts")] = None
+    contact_table: Annotated[Path | None, tyro.conf.arg(metavar="TABLE.csv"), Existing("a table of contacts", ())] = (
+        None
+    )
     """Table of contacts. In it, a direction that is empty or 0,0,0 is not known."""
     unit: Unit = "m"
     """Unit of the coordinates. A field itself is in meters, whatever unit its capture has."""
