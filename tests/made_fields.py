@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import torch
 
@@ -15,7 +16,10 @@ from avmsf.field.gains.family import KernelFamily, Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
+from avmsf.field.soundfield import Origin, SoundField
+from avmsf.field.store import save
 from avmsf.modal.bank import ModalBank
+from avmsf.modal.residual import Residual
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.elastic import ElasticModes
 from made_modes import sliding_plate
@@ -125,3 +129,15 @@ FIELDS: dict[str, Callable[[], GainField]] = {
     "body": cache(body),
 }
 """All there are, by what tests call them; the same object at every call."""
+
+
+def sounding(gains: GainField) -> SoundField:
+    """Return a field of the plate's modes with noise, a quarter of a second long."""
+    phase = torch.zeros(len(BANK), dtype=torch.float64)
+    return SoundField(BANK, gains, phase, Residual(torch.full((9,), 0.01)), 8000.0, 2000, Origin("plate"))
+
+
+def saved(gains: GainField, folder: Path) -> Path:
+    """Write the field of these gains, and return its path."""
+    save(sounding(gains), folder / "plate.safetensors")
+    return folder / "plate.safetensors"

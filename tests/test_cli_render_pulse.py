@@ -8,32 +8,23 @@ import soundfile
 import torch
 
 from avmsf.cli import main
-from avmsf.field.soundfield import Origin, SoundField
-from avmsf.field.store import save
 from avmsf.modal.pulse import ForcePulse
-from avmsf.modal.residual import Residual
-from made_fields import BANK, positional
+from made_fields import positional, saved, sounding
 
 PLACE = torch.tensor([[0.05, 0.03, 0.002]], dtype=torch.float64)
 AT = ("--position", "0.05", "0.03", "0.002")
 
 
-def sounding() -> SoundField:
-    phase = torch.zeros(len(BANK), dtype=torch.float64)
-    return SoundField(BANK, positional(), phase, Residual(torch.full((9,), 0.01)), 8000.0, 2000, Origin("plate"))
-
-
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    save(sounding(), tmp_path / "plate.safetensors")
-    return tmp_path / "plate.safetensors"
+    return saved(positional(), tmp_path)
 
 
 @pytest.mark.parametrize(("words", "shape"), [((), "half-sine"), (("--pulse", "hertz"), "hertz")])
 def test_render_softens_the_modes(path: Path, tmp_path: Path, words, shape) -> None:
     sound_path = tmp_path / "soft.wav"
     assert main(["render", str(path), *AT, "--output", str(sound_path), "--contact-time", "2e-3", *words]) == 0
-    expected = sounding().render(PLACE, pulse=ForcePulse(2e-3, shape))
+    expected = sounding(positional()).render(PLACE, pulse=ForcePulse(2e-3, shape))
     assert np.array_equal(soundfile.read(sound_path, dtype="float32")[0], expected[0].numpy())
 
 
@@ -64,13 +55,13 @@ def test_no_more_is_said_of_a_little_softer_blow_and_of_a_level_that_was_chosen(
 def test_without_a_contact_time_a_blow_is_as_recorded(path: Path, tmp_path: Path) -> None:
     assert main(["render", str(path), *AT, "--output", str(tmp_path / "hard.wav")]) == 0
     assert np.array_equal(
-        soundfile.read(tmp_path / "hard.wav", dtype="float32")[0], sounding().render(PLACE)[0].numpy()
+        soundfile.read(tmp_path / "hard.wav", dtype="float32")[0], sounding(positional()).render(PLACE)[0].numpy()
     )
 
 
 def test_the_noise_knows_no_hammer() -> None:
     """Modes alone are softened, so that what a pulse changes is their convolution with it."""
-    sound_field, pulse = sounding(), ForcePulse(2e-3)
+    sound_field, pulse = sounding(positional()), ForcePulse(2e-3)
     noise = sound_field.noise()
     hard, soft = (sound_field.render(PLACE, forces=3.0, pulse=each) for each in (None, pulse))
     expected = 3.0 * (pulse.soften(hard / 3.0 - noise, sample_rate=8000.0) + noise)

@@ -8,24 +8,15 @@ import soundfile
 import torch
 
 from avmsf.cli import main
-from avmsf.field.soundfield import Origin, SoundField
-from avmsf.field.store import save
-from avmsf.modal.residual import Residual
-from made_fields import BANK, directional
+from made_fields import directional, saved, sounding
 
 PLACES = torch.tensor([[0.05, 0.03, 0.002], [0.05, 0.03, 0.002], [-0.04, 0.01, 0.002]], dtype=torch.float64)
 DIRECTIONS = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
 
 
-def sounding() -> SoundField:
-    phase = torch.zeros(len(BANK), dtype=torch.float64)
-    return SoundField(BANK, directional(), phase, Residual(torch.full((9,), 0.01)), 8000.0, 2000, Origin("plate"))
-
-
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    save(sounding(), tmp_path / "plate.safetensors")
-    return tmp_path / "plate.safetensors"
+    return saved(directional(), tmp_path)
 
 
 def test_directions_of_a_table_are_rendered(path: Path, tmp_path: Path) -> None:
@@ -36,7 +27,7 @@ def test_directions_of_a_table_are_rendered(path: Path, tmp_path: Path) -> None:
     (tmp_path / "impacts.csv").write_text("\n".join(["file,x,y,z,nx,ny,nz", *rows]) + "\n")
     table = ("--contact-table", str(tmp_path / "impacts.csv"))
     assert main(["render", str(path), *table, "--output", str(tmp_path / "all")]) == 0
-    expected = sounding().render(PLACES, directions=DIRECTIONS)
+    expected = sounding(directional()).render(PLACES, directions=DIRECTIONS)
     for number, sound in enumerate(expected):
         found = soundfile.read(tmp_path / "all" / f"{number}.wav", dtype="float32")[0]
         assert np.array_equal(found, sound.numpy())
@@ -46,7 +37,7 @@ def test_directions_of_a_table_are_rendered(path: Path, tmp_path: Path) -> None:
 def test_the_direction_of_a_contact_is_rendered(path: Path, tmp_path: Path) -> None:
     words = ["--position", "0.05", "0.03", "0.002", "--direction", "0", "0", "1", "--output", str(tmp_path / "up.wav")]
     assert main(["render", str(path), *words]) == 0
-    expected = sounding().render(PLACES[1:2], directions=DIRECTIONS[1:2])[0]
+    expected = sounding(directional()).render(PLACES[1:2], directions=DIRECTIONS[1:2])[0]
     assert np.array_equal(soundfile.read(tmp_path / "up.wav", dtype="float32")[0], expected.numpy())
 
 

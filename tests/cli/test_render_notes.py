@@ -10,25 +10,16 @@ import torch
 
 from avmsf.cli import main
 from avmsf.cli.contacts import read_contacts
-from avmsf.field.soundfield import Origin, SoundField
-from avmsf.field.store import save
-from avmsf.modal.residual import Residual
-from made_fields import BANK, positional
+from made_fields import positional, saved, sounding
 
 AT = ("--position", "0.05", "0.03", "0.002")
 PLACE = torch.tensor([[0.05, 0.03, 0.002]], dtype=torch.float64)
 Streams = pytest.CaptureFixture[str]
 
 
-def sounding() -> SoundField:
-    phase = torch.zeros(len(BANK), dtype=torch.float64)
-    return SoundField(BANK, positional(), phase, Residual(torch.full((9,), 0.01)), 8000.0, 2000, Origin("plate"))
-
-
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    save(sounding(), tmp_path / "plate.safetensors")
-    return tmp_path / "plate.safetensors"
+    return saved(positional(), tmp_path)
 
 
 def rendered(path: Path, capsys: Streams, *words: str) -> tuple[np.ndarray, dict, list[str]]:
@@ -45,13 +36,13 @@ def rendered(path: Path, capsys: Streams, *words: str) -> tuple[np.ndarray, dict
 def test_without_noise_the_modes_are_rendered(path: Path, capsys: Streams, words: tuple[str, ...]) -> None:
     noisy, modes = (rendered(path, capsys, *words, *more)[0] for more in ((), ("--no-noise",)))
     # The sounds are float32, of peaks near 1.
-    assert np.abs(noisy - modes - sounding().noise().numpy()).max() < 1e-6
-    assert words or np.array_equal(modes, sounding().render(PLACE, noise=False)[0].numpy())
+    assert np.abs(noisy - modes - sounding(positional()).noise().numpy()).max() < 1e-6
+    assert words or np.array_equal(modes, sounding(positional()).render(PLACE, noise=False)[0].numpy())
 
 
 @pytest.mark.parametrize("level", [-30.0, -10.0, 20.0])
 def test_the_peak_of_what_is_written_is_said(path: Path, capsys: Streams, level: float) -> None:
-    loudest = 20 * np.log10(float(sounding().render(PLACE).abs().max()))
+    loudest = 20 * np.log10(float(sounding(positional()).render(PLACE).abs().max()))
     sound, told, notes = rendered(path, capsys, "--level-db", str(level - loudest))
     assert told["peak_dbfs"] == pytest.approx(level, abs=1e-3)
     assert np.abs(sound).max() == pytest.approx(10 ** (level / 20), rel=1e-4)
