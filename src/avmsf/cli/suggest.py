@@ -18,7 +18,7 @@ from avmsf.cli.writing import write_text
 from avmsf.field.store import load
 from avmsf.field.suggest import Suggestions, suggest
 from avmsf.field.uncertainty import relative_gain_std, unedited_mixture
-from avmsf.pipeline.record import RECORD
+from avmsf.pipeline.record import recorded
 from avmsf.wording import counted
 
 _DRAWN_POINTS = 4000
@@ -63,7 +63,7 @@ def run(options: Options) -> int:
         for path in paths.values():
             say(f"wrote {path}")
     # `fit` would make a field of a shape from photographs without that shape.
-    verb = "fit" if field.origin.report.get(RECORD, {}).get("scene") is None else "reconstruct"
+    verb = "fit" if recorded(field).get("scene") is None else "reconstruct"
     next_command(f"avmsf {verb} CAPTURE -o {shlex.quote(str(options.field))}")
     if options.json:
         print_json(

@@ -39,8 +39,8 @@ class Written:
     """What the format cannot hold, a sentence each."""
     error: float = 0.0
     """Largest difference between the file's sound and `SampledField.render`, over the loudest sample."""
-    spectrum_error_db: float = 0.0
-    """Mean difference of their short-time magnitude spectra, dB, weighted by the field's energy."""
+    spectrum_error_db: float | None = None
+    """Mean difference of their short-time magnitude spectra, dB, weighted by the field's energy; None: not measured."""
 
     @property
     def size(self) -> int:

@@ -14,7 +14,6 @@ from avmsf.errors import EditError
 from avmsf.hub import expect_answer, is_hub_name, read_settings, why_not
 from avmsf.tasks.config import STABLE_AUDIO
 
-"""The model that the paper edits with, by its name on the hub."""
 _CLASS, _INDEX = "StableAudioPipeline", "model_index.json"
 _NETWORKS: Final = ("vae", "text_encoder", "projection_model", "transformer")
 _PARTS: Final = (*_NETWORKS, "tokenizer", "scheduler")
