@@ -2,6 +2,7 @@
 
 import math
 import re
+import sys
 from collections.abc import Callable
 
 import numpy as np
@@ -283,6 +284,13 @@ def apart(surface: Surface) -> Surface:
 def test_filling_that_takes_too_long_says_so():
     with raises(SimulationError, name="timeout", value=0.01):
         fill(ball(subdivisions=1), timeout=0.01)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="its seed cannot be fixed elsewhere")
+def test_the_same_mesh_has_the_same_tetrahedra():
+    first, second = (fill(ball(subdivisions=2), detail=0.2) for _ in range(2))
+    assert torch.equal(first.points, second.points)
+    assert torch.equal(first.cells, second.cells)
 
 
 def test_a_crash_of_pytetwild_is_reported(monkeypatch, tmp_path):

@@ -1,8 +1,9 @@
 """Any mesh or scan as tetrahedra, by pytetwild, which heeds neither holes nor self-intersections.
 
-pytetwild inserts the triangles in an order that it draws afresh each time and that no seed reaches, so that two runs
-differ in their tetrahedra, and the frequencies of the body in their last digits; keep the solid to keep its sounds. It
-runs in a process of its own, for it may crash, and never ends on some meshes.
+pytetwild inserts the triangles in an order that it draws afresh each time. Its seed is fixed from outside, so the same
+mesh has the same tetrahedra in each run; on macOS and Windows that cannot be done, and two runs differ in their
+tetrahedra and somewhat in the body's frequencies: keep the solid to keep its sounds. It runs in a process of its own,
+for it may crash, and never ends on some meshes.
 """
 
 import importlib.util
