@@ -56,16 +56,7 @@ def fit_capture(
     config = PipelineConfig() if config is None else config
     train = capture.impacts if train is None else train
     _expect_start(capture, config)
-    if features is not None:
-        expect_on_object(capture.impacts, features.points)
-    elif capture.surface is not None:
-        expect_on_object(capture.impacts, surface_points(capture.surface))
-    shapeless = capture.surface is None and features is None
-    if shapeless:
-        log(_no_shape(config))
-    points = _points_of(capture, config) if features is None else features
-    if features is None and config.gain_model == "network":
-        log("no visual features were given: the network reads positions alone")
+    points = _points_of(capture, config, features, log)
     if len(train) < _FEW:
         log(f"expected {_FEW} recordings or more to predict gains between contacts well, got {len(train)}")
     # Before the modes: what is wrong with the object's shape shows in less time than they take.
@@ -73,7 +64,7 @@ def fit_capture(
         config.gain_model,
         lambda: _bodies(capture, config, None if output is None else unfinished(output, "bodies"), log),
         symmetries=lambda: _symmetries(capture, config),
-        log=None if shapeless else log,
+        log=None if capture.surface is None and features is None else log,
     )
     log(f"finding the modes of {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
     if output is None:
@@ -171,10 +162,19 @@ def _no_shape(config: PipelineConfig) -> str:
     )
 
 
-def _points_of(capture: Capture, config: PipelineConfig) -> FeatureField:
-    """Return the object's points: of its surface where there is one, else those that fill the contacts' box."""
+def _points_of(
+    capture: Capture, config: PipelineConfig, features: FeatureField | None, log: Callable[[str], None]
+) -> FeatureField:
+    """Return the object's points: the described ones, else of its surface, else those that fill the contacts' box."""
+    if features is not None:
+        expect_on_object(capture.impacts, features.points)
+        return features
+    if config.gain_model == "network":
+        log("no visual features were given: the network reads positions alone")
     if capture.surface is None:
+        log(_no_shape(config))
         return FeatureField.from_contacts(capture.impacts.contacts)
+    expect_on_object(capture.impacts, surface_points(capture.surface))
     return FeatureField.from_mesh(capture.surface, seed=config.fit.seed)
 
 
