@@ -129,7 +129,7 @@ class ObjectShape:
     def shell(self, thickness: float, *, faces: int = FACES) -> Surface:
         """Return the body whose walls around its cavities are `thickness` meters thick, measured from outside.
 
-        Whatever lies deeper below the outer side is empty where it is connected with a cavity; parts that are hardly
+        Space deeper below the outer side is empty where it is connected with a cavity; parts that are hardly
         thicker than a wall on both sides, like handles, stay solid. Raises SceneError where there is no cavity, and for
         a thickness that is not positive or leaves nothing of the cavity.
         """

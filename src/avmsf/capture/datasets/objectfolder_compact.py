@@ -86,7 +86,7 @@ class ObjectFolderCompact:
         )
 
     def look(self, identifier: str) -> Look | None:
-        """Return the object's mesh, where the meshes of ObjectFolder Real were unpacked here or beside."""
+        """Return the object's mesh, if the meshes of ObjectFolder Real were unpacked in this folder or next to it."""
         self._expect(identifier)
         return find_mesh(self.folder, identifier)
 

@@ -48,7 +48,7 @@ class Shape:
     name: str
     """Kind and seed, such as "mug-3"."""
     surface: Surface
-    """Closed triangles, counter-clockwise from outside, meters: the solid's skin, its triangles cut finer."""
+    """Closed triangles, counter-clockwise from outside, meters: the solid's surface, with its triangles subdivided."""
     colors: Float[Tensor, "points 3"]
     """Red, green, blue at each vertex of the surface as displayed (sRGB), 0 to 1."""
     thickness: float
