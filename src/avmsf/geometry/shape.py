@@ -220,7 +220,7 @@ class ObjectShape:
         return closed_surface(smooth, grid, faces)
 
     def describe(self) -> str:
-        """Say what is known of the shape: its cavities, what no view saw, and masks that were left out."""
+        """Return sentences on the shape: its cavities, what no view saw, and masks that were left out."""
         count = int(self.hollow.max())
         cavities = f"{count or 'no'} {'cavities' if count > 1 else 'cavity'}"
         parts = [f"{cavities}{', supposed behind faces that no outline touches' if self.supposed and count else ''}"]

@@ -85,7 +85,7 @@ class Symmetries:
     tolerance: float
     """Errors up to this were accepted, in point spacings."""
     rejected: float
-    """The least error of what was not accepted, in point spacings; infinite where nothing else came near."""
+    """The least error of a rejected candidate, in point spacings; infinite if there was none."""
 
     def __bool__(self) -> bool:
         return bool(self.rotations or self.mirrors)

@@ -59,16 +59,16 @@ def find_symmetries(
     up to 3 spacings. So `tolerance` lets the whole surface be off by that many spacings, or a part of
     (tolerance / 3)^2 of it, 1.6 % at the usual .38, have no counterpart at all.
 
-    **Holes.** Moved points that find no surface are gathered into pieces. A piece fills a hole, and speaks neither
-    for nor against, where it continues the surface: at least 45 % of its border lies beyond an open edge, within
-    the plane that the surface has there. Otherwise it is a part that the object has on one side only, like a mug's
-    handle, and counts. The part `missing` may fall into holes, of an object of which 30 % are lost 43 %; the
-    tolerance shrinks by what does. A cloud that covers its object needs far less, and a lower value gives
+    **Holes.** Moved points without a surface near them are grouped into connected pieces. A piece is in a hole, and is
+    not counted, if it continues the surface: at least 45 % of its border lies beyond an open edge, within the plane
+    that the surface has there. Otherwise it is a part that the object has on one side only, like a mug's handle, and
+    is counted. At most the part `missing` may be in holes (43 % of an object of which 30 % are lost); the tolerance
+    decreases by the part that is. A cloud that covers its object needs far less, and a lower value gives
     fewer false symmetries: where walls are no thicker than a few spacings, their rims resemble the edges of holes.
-    Compositions of two symmetries may have twice the error. A hole that a turn or two planes carry onto itself
-    is no damage but an opening of the shape, like a cup's, and what would fill it is no symmetry; neither is what
-    fills holes and contradicts what does not. So if a cut takes just what made an object asymmetric, it is found
-    symmetric, and a symmetry whose every counterpart was cut away goes unnoticed.
+    Compositions of two symmetries may have twice the error. A hole that is symmetric itself, under a rotation or two
+    planes, is an opening of the shape, like a cup's, and a motion that would fill it is not a symmetry. Nor is one that
+    fills holes and contradicts a symmetry that does not. So an object whose only asymmetric part was cut off is found
+    symmetric, and a symmetry whose every counterpart was cut off is not found.
 
     Orders 2 to 12 are distinguished; an axis is continuous if every angle holds and no order holds better than the
     angles between its turns. Planes that contain a continuous axis and half turns across it follow from it and are not

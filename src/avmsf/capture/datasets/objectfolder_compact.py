@@ -115,7 +115,7 @@ class ObjectFolderCompact:
         return float(value)
 
     def check(self) -> DatasetReport:
-        """Say what is there and what is missing, from names and headers alone."""
+        """Report which files are there and which are missing, from names and headers alone."""
         reports = []
         for identifier in self.objects():
             contacts, problems, lost = self._examine(identifier)

@@ -115,7 +115,7 @@ class RealImpact:
         return Look(folder, CaptureSettings(surface=MESH)) if (folder / MESH).is_file() else None
 
     def check(self) -> DatasetReport:
-        """Say what is there and what is missing, from names and headers alone."""
+        """Report which files are there and which are missing, from names and headers alone."""
         reports = tuple(self._report(identifier) for identifier in self.objects())
         absent = [name for name in REALIMPACT_NAMES if name not in self.objects()]
         missing = []
