@@ -63,6 +63,11 @@ def test_the_docs_give_every_setting_of_a_capture_and_its_default(tmp_path: Path
 
 
 @pytest.mark.parametrize("page", LINKED, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_no_text_directly_below_a_table_becomes_a_row(page: Path) -> None:
+    assert re.findall(r"^\|.*\n(?![|\n]).+", page.read_text(), re.MULTILINE) == []
+
+
+@pytest.mark.parametrize("page", LINKED, ids=lambda page: str(page.relative_to(REPOSITORY)))
 def test_every_link_of_the_docs_leads_to_a_file_and_a_heading(page: Path) -> None:
     for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
         if "://" in link:

@@ -16,7 +16,9 @@ from small_scene import slab_views
 REPOSITORY = Path(__file__).resolve().parents[1]
 DOCS = REPOSITORY / "docs"
 PAGES = (*sorted((DOCS / "tutorials").glob("*.md")), REPOSITORY / "README.md", DOCS / "getting-started.md")
-"""Tutorials first: what they have run is not repeated for README and getting started."""
+"""Tutorials first: what they have run in the same folder is not repeated for README and getting started."""
+PHOTOGRAPHS = "**With photographs**"
+"""Where README turns from a capture with a mesh to one with photographs."""
 FEW_STEPS = ("--splat.steps", "60", "--splat.start-points", "800")
 FEW_VIEWS = ("--views.rendered", "48", "--views.count", "18")
 SMALL = {
@@ -57,9 +59,19 @@ def photographed(workshop: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return folder
 
 
-def steps(page: Path) -> list[tuple[str, str]]:
-    """Return the page's commands and Python blocks in their order, each as its kind and its text."""
-    found = re.findall(r"^    (avmsf [^\n]+)$|^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+def parts(page: Path) -> dict[str, str]:
+    """Return the page's text by the folder in which it is to run."""
+    text = page.read_text()
+    if page.stem == "README":
+        mesh, mark, photographs = text.partition(PHOTOGRAPHS)
+        # README's Python, in the second part, would fit bodies of many thicknesses, for minutes, if it had a mesh.
+        return {"workshop": mesh, "photographed": mark + photographs}
+    return {"photographed" if page.stem == "photographs" else "workshop": text}
+
+
+def steps(text: str) -> list[tuple[str, str]]:
+    """Return a page's commands and Python blocks in their order, each as its kind and its text."""
+    found = re.findall(r"^    (avmsf [^\n]+)$|^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     return [("command", re.split(r"\s+#", command)[0]) if command else ("python", block) for command, block in found]
 
 
@@ -70,25 +82,28 @@ def run(command: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def done() -> set[str]:
-    """Return the commands that have run on an earlier page."""
+def done() -> set[tuple[str, str]]:
+    """Return the folders and the steps that have run in them on an earlier page."""
     return set()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_every_step_of_a_page_runs(
-    page: Path, done: set[str], request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    page: Path,
+    done: set[tuple[str, str]],
+    request: pytest.FixtureRequest,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    # README's Python would fit with bodies of many thicknesses, for minutes, if the folder had a mesh.
-    folder = "photographed" if page.stem in ("photographs", "README") else "workshop"
-    shutil.copytree(request.getfixturevalue(folder), tmp_path, dirs_exist_ok=True)
-    monkeypatch.chdir(tmp_path)
-    for kind, text in steps(page):
-        if text.startswith(LONG) or text in done:
-            continue
-        done.add(text)
-        if kind == "command":
-            run(text)
-        else:
-            exec(compile(text, page.name, "exec"), {})
+    for folder, text in parts(page).items():
+        assert steps(text)
+        monkeypatch.chdir(shutil.copytree(request.getfixturevalue(folder), tmp_path / folder))
+        for kind, step in steps(text):
+            if step.startswith(LONG) or (folder, step) in done:
+                continue
+            done.add((folder, step))
+            if kind == "command":
+                run(step)
+            else:
+                exec(compile(step, page.name, "exec"), {})

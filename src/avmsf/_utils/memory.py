@@ -1,7 +1,7 @@
 """Which errors mean that there is not enough memory: libraries do not all raise MemoryError."""
 
 NO_MEMORY = "expected more free memory; close other programs, or use less data, fewer modes or smaller images"
-"""What to tell a user then."""
+"""The end of the message of such an error."""
 
 
 def lacks_memory(error: BaseException) -> bool:

@@ -41,7 +41,7 @@ class Recording:
     sample_rate: float
     """The file's own rate, Hz."""
     subtype: str
-    """How a sample is coded, in libsndfile's words: PCM_16, PCM_U8, FLOAT and so on."""
+    """libsndfile's name of the sample format: PCM_16, PCM_U8, FLOAT and so on."""
 
     @property
     def frames(self) -> int:
@@ -66,11 +66,12 @@ class Recording:
         return self.channels[number - 1]
 
     def response_channel(self, number: int | None = None, *, force_channel: int | None = None) -> int:
-        """Return the number of the channel that holds the object's sound: the given one, or the only one it can be.
+        """Return the number of the channel that holds the object's sound: the given one, or the only possible one.
 
-        Without a number that is a file's one channel, the one that is left beside the force, or, where all hold one
-        sound up to a constant factor, rounding and dither, the first of them that is not faint: the same channel in all
-        files of a recorder, for another might have the opposite sign. `CaptureError` where the choice is open.
+        Without a number it is the only channel, or the only one besides the force. If all channels hold one sound up to
+        a constant factor, rounding and dither, it is the first one with a sufficient level: the same channel in all
+        files of a recorder, because another one might have the opposite sign. Raises `CaptureError` if several
+        channels are possible.
         """
         if number is not None:
             return number

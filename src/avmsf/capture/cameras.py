@@ -54,7 +54,7 @@ class Camera:
     ) -> "Camera":
         """Return a camera at `position` that sees `target` in the middle of its image, with `up` upwards in it.
 
-        Raises CaptureError where position and target are equal, or `up` is parallel to the line of sight.
+        Raises CaptureError where position and target are equal, or `up` is parallel to the viewing direction.
         """
         position, target, up = position.double(), target.double(), up.double()
         forward = target - position
@@ -97,7 +97,7 @@ class Camera:
         return inside[:, :2] / ahead[:, None] * scale + inside.new_tensor(self.principal), depth
 
     def rays(self) -> Float[Tensor, "height width 3"]:
-        """Return the unit direction, in the object frame, in which each pixel's center looks; float64."""
+        """Return the unit viewing direction of each pixel's center in the object frame; float64."""
         across = (torch.arange(self.width, dtype=torch.float64) + 0.5 - self.principal[0]) / self.focal[0]
         down = (torch.arange(self.height, dtype=torch.float64) + 0.5 - self.principal[1]) / self.focal[1]
         directions = torch.ones(self.height, self.width, 3, dtype=torch.float64)
@@ -129,7 +129,7 @@ class View:
     """Red, green, blue as displayed (sRGB)."""
     camera: Camera
     mask: UInt8[Tensor, "height width"] | None = None
-    """How much of each pixel the object covers, 255 for all of it; None where nobody knows."""
+    """How much of each pixel the object covers, 255 for all of it; None if unknown."""
 
     def __post_init__(self) -> None:
         found = tuple(self.image.shape[:2])

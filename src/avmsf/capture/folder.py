@@ -75,7 +75,7 @@ def read_capture(folder: str | Path, settings: CaptureSettings | None = None) ->
     rate of all others (see `CaptureSettings`); nothing is resampled. With `align`, the samples on either side of the
     sounds are included for their alignment with one another (`Impacts.before`, `after`), and recordings that all start
     with the impact are not cut (`start_with_impact`). The order is that of `impacts.csv`. Raises `CaptureError` at the
-    first input that cannot be used, and warns with `CaptureWarning` of what can be used but looks wrong; `check` lists
+    first input that cannot be used, and warns with `CaptureWarning` of what is usable but probably wrong; `check` lists
     everything.
     """
     folder = Path(folder)
@@ -128,8 +128,8 @@ def write_capture(capture: Capture, folder: str | Path, *, onsets_within: float 
     """Write a folder that `read_capture` reads back to the same values, bit for bit.
 
     Sounds become float32 wav files under the recordings' names where these are wav paths inside a folder, else under
-    numbers. Everything is written beside the folder first and then renamed into place, so that a folder of this name
-    is whole or absent. With `onsets_within` the sounds are whole recordings that start before their impacts: reading
+    numbers. Everything is written to a temporary folder first and then renamed into place: a folder of this name is
+    complete or absent. With `onsets_within` the sounds are whole recordings that start before their impacts: reading
     then finds the onsets, and keeps this many seconds from each on; without it they are final, and are not aligned when
     they are read. Raises `CaptureError` where the folder exists and
     is not empty, or cannot be written.

@@ -98,7 +98,7 @@ class Impacts:
         )
 
     def digest(self) -> str:
-        """Return a digest of all that can be learnt from the recordings."""
+        """Return a digest of the recordings and of their names, contacts, directions and forces."""
         digest = hashlib.sha256(json.dumps([self.names, self.sample_rate]).encode())
         for tensor in (self.contacts, self.sounds, self.directions, self.forces, self.before, self.after):
             digest.update(b"none" if tensor is None else tensor.contiguous().numpy().tobytes())
@@ -119,7 +119,7 @@ class Impacts:
         )
 
     def delayed(self, delays: Float64[Tensor, " contacts"]) -> "Impacts":
-        """Return the recordings cut anew, each starting `delays` samples later in its file (earlier where negative).
+        """Return the recordings cut again, each starting `delays` samples later in its file (earlier where negative).
 
         Between samples by a windowed sinc. What a file does not hold is zero. The result is final: its `before` and
         `after` are None. Raises ArrayError for delays that are not finite.

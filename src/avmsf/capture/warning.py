@@ -1,4 +1,4 @@
-"""The one warning of this package: the capture can be read, but something in it looks wrong."""
+"""The one warning of this package: the capture can be read, but something in it is probably wrong."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +8,7 @@ from avmsf.errors import AvmsfWarning
 
 
 class CaptureWarning(AvmsfWarning):
-    """A capture was read, but a recording or a contact in it looks wrong; the message names it and says what to do."""
+    """A capture was read, but a recording or a contact in it is probably wrong; the message says what to do."""
 
 
 @dataclass(frozen=True)

@@ -166,7 +166,7 @@ class SoundField:
     def quality(self) -> FieldQuality | None:
         """How well its contacts are predicted from one another.
 
-        None for few places, for the attention network, and for an edited field, which nobody recorded.
+        None for few places, for the attention network, and for an edited field, which has no recordings.
         """
         found = None if self.origin.report.get("edits") else self.origin.report.get("quality")
         return FieldQuality.of(found) if isinstance(found, dict) else None

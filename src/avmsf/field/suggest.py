@@ -31,7 +31,7 @@ _SAME = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Suggestions:
-    """Where to strike next, in this order, and what that is expected to bring.
+    """Suggested contacts of the next impacts, in this order, with the expected error after each.
 
     Errors are relative: the square root of the expected squared error of the gains, as energy, over the energy that is
     expected on the mean over the surface. 0 is certainty, 1 as wrong as silence.
@@ -42,22 +42,22 @@ class Suggestions:
     contacts: Float64[Tensor, "contacts 3"]
     """Object frame, meters."""
     directions: Float64[Tensor, "contacts 3"] | None
-    """Unit vectors along which to strike: as given, or the nearest to straight into the field's body that a hammer can
-    take; without a body that of the nearest recording; None where the field knows nothing of directions."""
+    """Unit vectors of the impacts' directions: as given, or the nearest to straight into the field's body that a hammer
+    can take; without a body that of the nearest recording; None if the field does not depend on directions."""
     rows: Int[Tensor, " contacts"]
     """Which of the candidates they are."""
     before: float
-    """Expected error of the whole field with what has been struck."""
+    """Expected error of the whole field with the present recordings."""
     after: tuple[float, ...]
     """Expected error of the whole field after each of the contacts and those before it."""
     points: Float64[Tensor, "points 3"]
     """Points spread evenly over the surface, meters."""
     map_before: Float64[Tensor, " points"]
-    """Expected error at these with what has been struck."""
+    """Expected error at these with the present recordings."""
     map_after: Float64[Tensor, " points"]
     """Expected error at these after all the contacts."""
     unreachable: int = 0
-    """How many of `points` were no candidates because a hammer cannot strike them from outside."""
+    """How many of `points` were no candidates because a hammer cannot reach them from outside."""
 
 
 def suggest(

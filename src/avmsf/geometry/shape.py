@@ -129,7 +129,7 @@ class ObjectShape:
     def shell(self, thickness: float, *, faces: int = FACES) -> Surface:
         """Return the body whose walls around its cavities are `thickness` meters thick, measured from outside.
 
-        Whatever lies deeper below the outer side is empty where it is connected with a cavity; parts that are hardly
+        Space deeper below the outer side is empty where it is connected with a cavity; parts that are hardly
         thicker than a wall on both sides, like handles, stay solid. Raises SceneError where there is no cavity, and for
         a thickness that is not positive or leaves nothing of the cavity.
         """
@@ -220,7 +220,7 @@ class ObjectShape:
         return closed_surface(smooth, grid, faces)
 
     def describe(self) -> str:
-        """Say what is known of the shape: its cavities, what no view saw, and masks that were left out."""
+        """Return sentences on the shape: its cavities, what no view saw, and masks that were left out."""
         count = int(self.hollow.max())
         cavities = f"{count or 'no'} {'cavities' if count > 1 else 'cavity'}"
         parts = [f"{cavities}{', supposed behind faces that no outline touches' if self.supposed and count else ''}"]

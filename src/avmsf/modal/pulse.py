@@ -47,7 +47,7 @@ class ForcePulse:
     def soften(
         self, sounds: Float[Tensor, "contacts samples"], *, sample_rate: float
     ) -> Float[Tensor, "contacts samples"]:
-        """Return what is heard of this blow where a blow of one sample gives `sounds`: their causal convolution.
+        """Return the sounds of this pulse, given those of a pulse of one sample: their causal convolution.
 
         As long as `sounds`, of their dtype; made in float64.
         """

@@ -35,8 +35,8 @@ class Residual:
     """Standard deviation of the white noise that each band is cut from (bins evenly spaced from 0 Hz to half the
     sample rate), so that all ones is white noise of unit variance. Not negative."""
     recordings: Float[Tensor, "contacts samples"] | None = None
-    """What the recordings of the training contacts have beside their modes, where their mean over the nearest ones
-    predicts a contact left out better than noise does; None where noise does."""
+    """The training recordings without their modes, if their mean over the nearest ones predicts a contact left out
+    better than noise does; else None."""
 
 
 def shape_noise(

@@ -104,7 +104,7 @@ def candidate_bodies(
     cache: Path | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> CandidateBodies:
-    """Return the bodies that may lie behind a surface; their mode shapes are kept by content in `cache`.
+    """Return the bodies that a surface may enclose; their mode shapes are cached by content in `cache`.
 
     Raises SimulationError where no body can be computed, and FitError, before any is, where the contacts of the
     `impacts` that they are meant for do not lie on the surface.

@@ -45,11 +45,11 @@ def fit_capture(
 ) -> tuple[SoundField, Extraction]:
     """Fit a field to all recordings of a capture, or to those of `train`; return it and the modes that it started from.
 
-    The contacts of all recordings say where the object is. `features` describe the object's points, and
-    `features_report` how they were made; without them they are positions on the mesh, or in the box of the contacts
-    where there is no mesh. With the path of an `output`, files next to it keep the modes, the elastic modes and the
-    state of the training: after an interruption the same call goes on from them. Who has saved the field discards them
-    (`discard_unfinished`).
+    The contacts of all recordings give the object's position. `features` describe the object's points, and
+    `features_report` how they were made; by default they are positions on the mesh, or in the box of the contacts
+    if there is no mesh. With the path of an `output`, files next to it hold the modes, the elastic modes and the
+    state of the training: after an interruption the same call continues from them. Discard them once the field is
+    saved (`discard_unfinished`).
 
     Raises as the stages do: CaptureError, ExtractionError, FitError, SimulationError, FieldFileError.
     """

@@ -55,7 +55,7 @@ def guess_field(
     `surface` is in meters. It is filled, unless `body.wall` states the thickness of a wall. At most `modes` modes are
     kept, those that sound below half of `sample_rate`, Hz. Sounds are in pascals per newton of peak force of a small
     steel hammer (`Hammer`), at a distance of 1 m (`radiated_pressure`). There is no residual noise. Elastic modes are
-    kept in the folder `cache`, and `tell` hears what is done.
+    cached in the folder `cache`; `tell` receives messages on the progress.
 
     Raises SimulationError for an unknown material, a surface without a body and a body that makes no sound, and
     FitError for a surface in another unit and a wall whose thickness has to be stated.

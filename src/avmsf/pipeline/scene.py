@@ -40,10 +40,10 @@ def _say_nothing(words: str) -> None:
 
 @dataclass(frozen=True)
 class Listener:
-    """Who is told how far the work is."""
+    """Callbacks that receive the progress of the stages."""
 
     tell: Callable[[str], None] = _say_nothing
-    """Hears a sentence as each stage begins."""
+    """Receives a sentence as each stage begins."""
     splatting: Callable[[SplatProgress], None] | None = None
     lifting: Callable[[LiftProgress], None] | None = None
 

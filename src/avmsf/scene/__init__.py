@@ -1,4 +1,4 @@
-"""What an object looks like: 3D Gaussians, image features in 3D, and symmetries."""
+"""Appearance and shape of an object: 3D Gaussians, image features in 3D, and symmetries."""
 
 import lazy_loader
 

@@ -32,7 +32,7 @@ _FAINT = np.float32(0.01)
 
 @dataclass(frozen=True)
 class ImageDescriptors:
-    """Hand-made descriptors of an image's neighborhoods. They are no DINO features and do not say so.
+    """Hand-made descriptors of an image's neighborhoods, which are not DINO features.
 
     Color and spread of color in CIE Lab, orientation histograms' Fourier coefficients 0 to 4, principal curvatures
     of the brightness: 39 features with the default scales.

@@ -49,9 +49,9 @@ class FeatureField:
     ) -> "FeatureField":
         """Return `count` points drawn evenly from a surface's triangles, with their positions as features.
 
-        `normal_scale` adds their normals, of this length beside positions of about unit size. Thin walls have two sides
-        that sound alike and opposite normals, between which a contact's nearest point flips, so that normals mislead
-        there: they are left out unless asked for. A surface of points alone keeps its points, which have no normals.
+        `normal_scale` adds their normals, of this length, to positions of about unit size. The two sides of a thin wall
+        sound the same and have opposite normals, and a contact's nearest point may be on either side. So normals are
+        left out by default. A surface of points alone keeps its points, which have no normals.
         """
         if len(surface.faces) == 0:
             return cls.from_points(surface.vertices)

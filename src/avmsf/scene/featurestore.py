@@ -26,8 +26,8 @@ FORMAT = 1
 def save_features(features: FeatureField, path: str | Path, *, report: dict[str, Any] | None = None) -> None:
     """Write features to one file, which `load_features` reads back to the last bit.
 
-    `report` is what else its owner wants to keep, as JSON holds it. A file that is there stays whole until the new one
-    is. Raises SceneError where the file cannot be written, or could not be read back.
+    `report` is saved with them as JSON. An existing file is replaced only when the new one is
+    complete. Raises SceneError where the file cannot be written, or could not be read back.
     """
     path = Path(path)
     tensors = {

@@ -63,7 +63,7 @@ def write_splats(cloud: GaussianCloud, path: str | Path) -> None:
 
 
 def read_splats(path: str | Path) -> GaussianCloud:
-    """Read Gaussians from a 3DGS `.ply`, text or binary of either byte order, whatever else its vertices hold.
+    """Read Gaussians from a 3DGS `.ply`, text or binary of either byte order; other properties are ignored.
 
     Raises `SceneError`, which describes the file, for one that is missing, no .ply, a mesh, a point cloud, compressed
     or truncated, or holds numbers that are not finite.

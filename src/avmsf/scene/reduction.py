@@ -56,8 +56,8 @@ def resize(features: FeatureField, size: float) -> FeatureField:
 def with_positions(features: FeatureField) -> FeatureField:
     """Return the features with the points' positions before them, as `FeatureField.from_points` has them.
 
-    Color alone does not tell a bowl's left from its right; a gain field may need to. Positions are 1 long at most,
-    and root mean square about .5: `resize` keeps features from drowning them.
+    Color alone does not distinguish a bowl's left from its right; a gain field may need to. Positions have a norm of 1
+    at most and a root mean square of about .5; `resize` gives features a comparable size.
     """
     positions = FeatureField.from_points(features.points).features
     joined = torch.cat([positions, features.features.float()], dim=1)

@@ -37,13 +37,13 @@ def refine(
 ) -> FeatureField:
     """Return the same points with features that agree between symmetric places.
 
-    In every round, for each rotation the mean over its orbit of the feature of the point nearest to the turned place
+    In every round, for each rotation the mean over its orbit of the feature of the point nearest to the rotated point
     (the point itself included), and then for each mirror plane the mean of a point's own feature and that of the point
     nearest to its image. An orbit has the turns of the rotation's order, or `angles` even ones about a continuous axis.
 
-    A turned place without a point within `reach` point spacings, in a hole of the cloud, is left out of the mean, lest
-    features of another part be mixed in; `reach` 0 takes the nearest point however far it is (paper). Without
-    symmetries the features come back as they are. `tell` hears of each symmetry whose counterparts are found. Raises
+    A rotated point without a point of the cloud within `reach` spacings, in a hole of it, is left out of the mean, so
+    that features of another part are not mixed in; `reach` 0 takes the nearest point however far it is (paper). Without
+    symmetries the features come back as they are. `tell` receives a message for each symmetry. Raises
     SceneError for fewer than one iteration or angle.
     """
     if iterations < 1 or angles < 1:

@@ -64,11 +64,11 @@ def splat(
     """Fit Gaussians to views and return those that lie on the object.
 
     They start at the points of `start`, or on the visual hull of the views' masks. Without a `device` or `rasterizer`
-    they are fitted on a CUDA device where there is one and gsplat beside it, else on the CPU; they come back on the
+    they are fitted on a CUDA device if there is one and gsplat is installed, else on the CPU; they are returned on the
     CPU. There the same views, config and start give the same Gaussians on the same machine.
 
-    With `checkpoint`, the state is kept there while it runs, on interruption and at the end, and a splatting of the
-    same arguments goes on from it to the same result; delete the file once the Gaussians are written. Raises
+    With `checkpoint`, the state is saved there while it runs, on interruption and at the end, and a call with the
+    same arguments continues from it to the same result; delete the file once the Gaussians are written. Raises
     `SceneError` for views or settings that nothing can be made of, and for a checkpoint that is not of these.
     """
     config = SplatConfig() if config is None else config

@@ -76,22 +76,22 @@ class MirrorSymmetry:
 
 @dataclass(frozen=True, eq=False)
 class Symmetries:
-    """The symmetries found on one cloud, best first, and what they were judged by."""
+    """The symmetries found on one cloud, best first, and the thresholds of the test."""
 
     rotations: tuple[RotationalSymmetry, ...]
     mirrors: tuple[MirrorSymmetry, ...]
     spacing: float
-    """Distance between neighboring points of the cloud that was judged, meters: the unit of the errors."""
+    """Distance between neighboring points of the cloud, meters: the unit of the errors."""
     tolerance: float
     """Errors up to this were accepted, in point spacings."""
     rejected: float
-    """The least error of what was not accepted, in point spacings; infinite where nothing else came near."""
+    """The least error of a rejected candidate, in point spacings; infinite if there was none."""
 
     def __bool__(self) -> bool:
         return bool(self.rotations or self.mirrors)
 
     def summary(self) -> str:
-        """Say in plain words what was found and how sure that is."""
+        """Return sentences on the symmetries found, their errors, and how clear these are."""
         found: list[RotationalSymmetry | MirrorSymmetry] = [*self.rotations, *self.mirrors]
         against = (
             f"the best of what was not accepted, for its error or for holes, has an error of {self.rejected:.2f}"

@@ -50,9 +50,8 @@ def find_symmetries(
     """Return the rotations and mirror planes that carry a cloud of an object's surface onto itself.
 
     The cloud may be noisy, cover the object unevenly, lie in any pose, and lack parts. At most `limit` points are
-    looked at, drawn so that dense parts lose most. Candidates come from the principal axes, from pairs of points about
-    which the surface is alike, and from what follows from symmetries already found; each is moved to where it fits
-    best.
+    used, drawn so that dense parts lose most. Candidates come from the principal axes, from pairs of points with
+    similar surfaces around them, and from compositions of symmetries already found; each is refined to its best fit.
 
     **The tolerance.** One half of the points is moved onto the surface that the other half samples. The error is the
     root mean square of their distances from it, without what the distances are when nothing is moved (noise), in
@@ -60,21 +59,21 @@ def find_symmetries(
     up to 3 spacings. So `tolerance` lets the whole surface be off by that many spacings, or a part of
     (tolerance / 3)^2 of it, 1.6 % at the usual .38, have no counterpart at all.
 
-    **Holes.** Moved points that find no surface are gathered into pieces. A piece fills a hole, and speaks neither
-    for nor against, where it continues the surface: at least 45 % of its border lies beyond an open edge, within
-    the plane that the surface has there. Otherwise it is a part that the object has on one side only, like a mug's
-    handle, and counts. The part `missing` may fall into holes, of an object of which 30 % are lost 43 %; the
-    tolerance shrinks by what does. A cloud that covers its object needs far less, and has then less to be fooled
-    by: where walls are no thicker than a few spacings, their rims look like the edges of holes. What follows from
-    two symmetries one after the other may have twice the error. A hole that a turn or two planes carry onto itself
-    is no damage but an opening of the shape, like a cup's, and what would fill it is no symmetry; neither is what
-    fills holes and contradicts what does not. So if a cut takes just what made an object asymmetric, it is found
-    symmetric, and a symmetry whose every counterpart was cut away goes unnoticed.
+    **Holes.** Moved points without a surface near them are grouped into connected pieces. A piece is in a hole, and is
+    not counted, if it continues the surface: at least 45 % of its border lies beyond an open edge, within the plane
+    that the surface has there. Otherwise it is a part that the object has on one side only, like a mug's handle, and
+    is counted. At most the part `missing` may be in holes (43 % of an object of which 30 % are lost); the tolerance
+    decreases by the part that is. A cloud that covers its object needs far less, and a lower value gives
+    fewer false symmetries: where walls are no thicker than a few spacings, their rims resemble the edges of holes.
+    Compositions of two symmetries may have twice the error. A hole that is symmetric itself, under a rotation or two
+    planes, is an opening of the shape, like a cup's, and a motion that would fill it is not a symmetry. Nor is one that
+    fills holes and contradicts a symmetry that does not. So an object whose only asymmetric part was cut off is found
+    symmetric, and a symmetry whose every counterpart was cut off is not found.
 
-    Orders 2 to 12 are told apart; an axis is continuous if every angle holds and no order holds better than the angles
-    between its turns. Planes that contain a continuous axis and half turns across it follow from it and are not listed;
-    of a ball, two of its axes are. Raises SceneError for points that are too few (240), not finite, or on one line, and
-    for a tolerance that is not positive.
+    Orders 2 to 12 are distinguished; an axis is continuous if every angle holds and no order holds better than the
+    angles between its turns. Planes that contain a continuous axis and half turns across it follow from it and are not
+    listed; of a ball, two of its axes are. Raises SceneError for points that are too few (240), not finite, or on one
+    line, and for a tolerance that is not positive.
     """
     if not tolerance > 0.0:
         raise SceneError(f"tolerance: expected a number above 0, got {tolerance:g}", name="tolerance", value=tolerance)

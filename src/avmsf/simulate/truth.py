@@ -55,7 +55,7 @@ class Truth:
     recipe: dict[str, Any] = field(default_factory=dict)
     """All settings that the object was made with, as plain values."""
     contacts: Float64[Tensor, "contacts 3"] | None = None
-    """Where the blows fell, meters, which is not quite where the table of impacts has them; None if that is exact."""
+    """True contacts, meters; the table of impacts has them with errors. None if the table is exact."""
     starts: Float64[Tensor, " contacts"] | None = None
     """Sample of its file, counted from 0 and between samples too, at which t = 0 of each recording lies: sample n of
     recording i is at t = (n - starts[i]) / sample_rate. None where all files start with the impact's sound."""

@@ -54,13 +54,13 @@ def locate_blows(
     force: Force | None = None,
     locator: Locator | None = None,
 ) -> list[tuple[float, ContactMap]]:
-    """Return when each blow of a recording begins, seconds, and where it fell, in order.
+    """Return the onset, seconds, and the contact of each impact in a recording, in order.
 
-    Bare samples are at `sample_rate` Hz, or at the field's rate; `settings` as for `hear`; `force`, of every blow, as
-    for `Locator.locate`; `locator` saves making the field's anew. What rang before a blow is fitted by the object's
-    modes, carried on as they decay, and subtracted. Blows that are none on this object are left out, which a note says,
-    and blows closer than 30 ms are not told apart. Raises LocationError as `hear`, where the settings ask for the pulse
-    that the recording holds to be divided out, and where no blow can be located.
+    Bare samples are at `sample_rate` Hz, or at the field's rate; `settings` as for `hear`; `force`, of every impact, as
+    for `Locator.locate`; `locator` is one made of the field before. The sound of earlier impacts is fitted by the
+    object's modes, extrapolated with their decay, and subtracted. Impacts on other objects are left out, with a note,
+    and impacts closer than 30 ms are not separated. Raises LocationError as `hear`, where the settings ask for
+    deconvolution by the recording's own pulse, and where no impact can be located.
     """
     recording = read_if_path(recording)
     whole = as_recording(recording, field, sample_rate=sample_rate)

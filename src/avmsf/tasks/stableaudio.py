@@ -35,7 +35,7 @@ class Conditioning:
 
 
 class StableAudio:
-    """A `StableAudioPipeline` as an `AudioDiffusion`: its autoencoder, words, and denoiser; all frozen."""
+    """A `StableAudioPipeline` as an `AudioDiffusion`: its autoencoder, text encoder and denoiser; all frozen."""
 
     def __init__(self, pipeline: Any, *, name: str, seconds: float | None = None) -> None:
         """Wrap a pipeline on whatever device it is.
@@ -65,7 +65,7 @@ class StableAudio:
     ) -> "StableAudio":
         """Load a pipeline of the hub by name, or a folder that holds one.
 
-        On CUDA and in bfloat16 where there is a GPU, else on the CPU in float32, unless told. Raises `EditError` where
+        On CUDA and in bfloat16 where there is a GPU, else on the CPU in float32, by default. Raises `EditError` where
         diffusers is missing, where the model is neither here nor to be downloaded (its licence has to be accepted
         first), for a folder that holds another model or a part of one, and for a device that is not there or whose
         memory does not hold the model.
@@ -148,7 +148,7 @@ class StableAudio:
         return decoded[:, :, :samples]
 
     def embed(self, prompt: str, negative: str | None, *, seconds: float) -> Conditioning:
-        """Return the words of a sound that starts at once and lasts `seconds`."""
+        """Return the embedding of a prompt, for a sound that starts at 0 and lasts `seconds`."""
         pipeline, device = self.pipeline, self.device
         with torch.no_grad():
             words = pipeline.encode_prompt(prompt, device, negative is not None, negative)
@@ -206,7 +206,7 @@ class StableAudio:
         steps: int = 100,
         guidance: float = 7.0,
     ) -> Float[Tensor, " samples"]:
-        """Return a sound made from words alone, mono at the model's rate, by the pipeline's own sampler.
+        """Return a sound generated from a prompt alone, mono at the model's rate, by the pipeline's own sampler.
 
         Without a `seed` it is that of the seed 0.
 

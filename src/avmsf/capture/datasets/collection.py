@@ -46,7 +46,7 @@ class CaptureCollection:
             return ObjectFacts(identifier, identifier)
 
     def capture(self, identifier: str) -> Capture:
-        """Read one capture as `read_capture` does. Raises DatasetError for an unknown one and for what that refuses."""
+        """Read one capture by `read_capture`. Raises DatasetError for an unknown or unreadable one."""
         folder = self._expect(identifier)
         try:
             return read_capture(folder, settings_of(folder).starting(self._time_zero))

@@ -15,7 +15,7 @@ class ObjectFacts:
     identifier: str
     """Its identifier in the dataset: a number, or a folder's name."""
     name: str
-    """As words, or the identifier."""
+    """A name in plain English, or the identifier."""
     material: str | None = None
     """In lower case, such as `ceramic`; None where it is unknown."""
     inferred: bool = False

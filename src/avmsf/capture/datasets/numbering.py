@@ -40,8 +40,8 @@ def in_order(names: Iterable[str]) -> tuple[str, ...]:
 def shared_objects() -> tuple[int, ...]:
     """Return the numbers that are in both ObjectFolder Real and RealImpact.
 
-    The two number objects alike and share many of them physically, so that one who learns from one dataset and tests
-    on the other has to leave these out of one of them. That is every object of RealImpact.
+    Both datasets have the same numbers, and many of their objects are the same physical ones. To train on one dataset
+    and test on the other, leave these out of one of them. They are all of RealImpact's objects.
     """
     return tuple(sorted(number for number in map(number_of, REALIMPACT_NAMES) if number is not None))
 

@@ -86,7 +86,7 @@ class ObjectFolderCompact:
         )
 
     def look(self, identifier: str) -> Look | None:
-        """Return the object's mesh, where the meshes of ObjectFolder Real were unpacked here or beside."""
+        """Return the object's mesh, if the meshes of ObjectFolder Real were unpacked in this folder or next to it."""
         self._expect(identifier)
         return find_mesh(self.folder, identifier)
 
@@ -115,7 +115,7 @@ class ObjectFolderCompact:
         return float(value)
 
     def check(self) -> DatasetReport:
-        """Say what is there and what is missing, from names and headers alone."""
+        """Report which files are there and which are missing, from names and headers alone."""
         reports = []
         for identifier in self.objects():
             contacts, problems, lost = self._examine(identifier)

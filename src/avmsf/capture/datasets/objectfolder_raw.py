@@ -103,7 +103,7 @@ class ObjectFolderRaw:
         return find_mesh(self.folder, identifier)
 
     def check(self) -> DatasetReport:
-        """Say what is there and what is missing, from names and headers alone."""
+        """Report which files are there and which are missing, from names and headers alone."""
         reports = []
         for identifier in self.objects():
             strikes, problems = self._examine(identifier)

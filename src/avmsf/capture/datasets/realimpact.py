@@ -55,8 +55,8 @@ class RealImpact:
     """RealImpact, unpacked: `<number>_<name>/preprocessed/deconvolved_0db.npy` and so on.
 
     The published sounds are divided by the hammer's spectrum already, and their first sample is the force's onset: they
-    are taken as they are, or with `time_zero` "peak" from their peaks, as in the paper, and cut to 3 s. All blows of an
-    object are heard by one microphone (`closest_rows`). Of the sounds, 2.8 GB an object, only the rows needed are read.
+    are taken as they are, or with `time_zero` "peak" from their peaks, as in the paper, and cut to 3 s. All impacts on
+    an object are of one microphone (`closest_rows`). Of the sounds, 2.8 GB per object, only the rows needed are read.
     """
 
     name = "RealImpact"
@@ -77,8 +77,10 @@ class RealImpact:
         return ObjectFacts(identifier, in_words(identifier), material, inferred=material is not None)
 
     def capture(self, identifier: str) -> Capture:
-        """Read one object's blows, in the order of the files. Raises DatasetError for an unknown object, and for files
-        that are missing, cut short or of another form."""
+        """Read one object's impacts, in the order of the files.
+
+        Raises DatasetError for an unknown object, and for files that are missing, cut short or of another form.
+        """
         self._expect(identifier)
         origin = f"{self.name}, {identifier}"
         surface = self._mesh(identifier)
@@ -113,7 +115,7 @@ class RealImpact:
         return Look(folder, CaptureSettings(surface=MESH)) if (folder / MESH).is_file() else None
 
     def check(self) -> DatasetReport:
-        """Say what is there and what is missing, from names and headers alone."""
+        """Report which files are there and which are missing, from names and headers alone."""
         reports = tuple(self._report(identifier) for identifier in self.objects())
         absent = [name for name in REALIMPACT_NAMES if name not in self.objects()]
         missing = []

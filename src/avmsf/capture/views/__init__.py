@@ -1,4 +1,4 @@
-"""Photographs with cameras: read from folders, made straight, and the object told from a plain background."""
+"""Photographs with cameras: read from folders, undistorted, with masks of the object on a plain background."""
 
 from avmsf.capture.views.foreground import background_color, find_foreground
 from avmsf.capture.views.read import read_views

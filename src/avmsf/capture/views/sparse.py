@@ -19,7 +19,7 @@ def read_sparse_points(
 ) -> tuple[Float[Tensor, "points 3"], UInt8[Tensor, "points 3"]] | None:
     """Return the points that structure from motion found and their colors; None where there are none.
 
-    Meters, float64. They lie in the frame of `read_views`' cameras: the COLMAP model's own points, or beside a
+    Meters, float64. They lie in the frame of `read_views`' cameras: the COLMAP model's own points, or with a
     `transforms.json` the file that it names as `ply_file_path`. Raises CaptureError where such a file cannot be read.
     """
     folder = Path(folder)

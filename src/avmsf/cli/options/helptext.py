@@ -1,6 +1,7 @@
 """How help shows options: sentences that fill the lines, plain names of values, defaults only where they say something.
 
-tyro reads a dataclass by these rules in place of its own.
+tyro reads a dataclass by these rules in place of its own. Its help is printed with other titles of groups, in one
+column of boxes and with filled paragraphs. tyro (1.0.17) has no option or theme for these: `one_column` edits the text.
 """
 
 import ast

@@ -37,7 +37,7 @@ _ALIGNMENT = "alignment."
 
 @dataclass(frozen=True, eq=False)
 class Extraction:
-    """Modes shared by all recordings, their gains in each, and the noise beneath them."""
+    """Modes shared by all recordings, their gains in each, and the residual noise."""
 
     __repr__ = short_repr
 
@@ -46,7 +46,7 @@ class Extraction:
     """Signed amplitude of exp(-d t) sin(2 pi f t) in each recording, in the recordings' own unit."""
     residual: Residual
     quadrature: Float[Tensor, "contacts modes"]
-    """Amplitude of exp(-d t) cos(2 pi f t) beside it: what of the mode does not start as a sine at the onset."""
+    """Amplitude of exp(-d t) cos(2 pi f t) in each recording: the part of the mode that does not start as a sine."""
     alignment: Alignment | None = None
     """How the recordings were aligned first; None where they were taken as they are."""
 

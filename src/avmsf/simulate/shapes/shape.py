@@ -21,7 +21,7 @@ def _no_planes() -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Symmetry:
-    """Turns about one axis and mirror planes that carry a shape onto itself; what follows from them is not listed."""
+    """Rotations about one axis and mirror planes that are symmetries of a shape; compositions are not listed."""
 
     words: str
     """For people, such as "one mirror plane"."""
@@ -37,7 +37,7 @@ class Symmetry:
 
     @property
     def none(self) -> bool:
-        """Whether nothing but standing still carries the shape onto itself."""
+        """Whether the shape has no symmetry but the identity."""
         return self.axis is None and not len(self.mirrors)
 
 
@@ -48,7 +48,7 @@ class Shape:
     name: str
     """Kind and seed, such as "mug-3"."""
     surface: Surface
-    """Closed triangles, counter-clockwise from outside, meters: the solid's skin, its triangles cut finer."""
+    """Closed triangles, counter-clockwise from outside, meters: the solid's surface, with its triangles subdivided."""
     colors: Float[Tensor, "points 3"]
     """Red, green, blue at each vertex of the surface as displayed (sRGB), 0 to 1."""
     thickness: float
