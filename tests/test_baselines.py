@@ -14,7 +14,7 @@ from avmsf.bench.baselines import MeanGains, MeanWaveform, NearestStrike, WhiteN
 from avmsf.bench.conventions import OBJECTFOLDER
 from avmsf.bench.evaluation import Scores, evaluate, score, split
 from avmsf.bench.metrics import relative_stft_error
-from avmsf.bench.renderer import Renderer
+from avmsf.bench.renderer import Renderer, expect_renderer
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
 from avmsf.modal.bank import ModalBank
@@ -206,6 +206,48 @@ def test_who_knows_the_answer_scores_zero_and_the_rest_in_order():
     assert set(chosen.values) == {"relative_stft", "spectrogram", "envelope"}
     rendered = NearestStrike(train).render(test.contacts)
     assert torch.equal(chosen.values["relative_stft"], relative_stft_error(rendered, test.sounds, fft_sizes=sizes))
+
+
+class Silent:
+    """Renders silence, with what it has in place of a sample rate."""
+
+    def __init__(self, sample_rate):
+        self.sample_rate = sample_rate
+
+    def render(self, contacts, directions=None):
+        return torch.zeros(len(contacts), 4410)
+
+
+class WithoutRate:
+    def render(self, contacts, *, directions=None):
+        return torch.zeros(len(contacts), 4410)
+
+
+class WithoutDirections(Silent):
+    def render(self, contacts):
+        return torch.zeros(len(contacts), 4410)
+
+
+@pytest.mark.parametrize(
+    "made",
+    [WithoutRate(), WithoutDirections(22050.0), Silent("22 kHz"), object(), Silent],
+    ids=["no rate", "no directions", "rate in words", "nothing", "class"],
+)
+def test_what_is_no_renderer_is_refused(made):
+    kind = made if isinstance(made, type) else type(made)
+    with raises(EvaluationError, name="renderer", value=kind.__name__):
+        expect_renderer(made)
+
+
+def test_training_recordings_are_for_what_makes_a_renderer():
+    train, test = split(plate_impacts(4))
+    assert evaluate(lambda heard: Silent(heard.sample_rate), test, train=train).mean()["relative_stft"] == 1.0
+    with raises(EvaluationError, name="renderer", value="Silent"):
+        evaluate(Silent(22050.0), test, train=train)
+    with raises(EvaluationError, name="renderer", value="WithoutDirections"):
+        evaluate(WithoutDirections(22050.0), test)
+    with raises(EvaluationError, name="renderer", value="int"):
+        evaluate(lambda heard: 3, test, train=train)
 
 
 def test_scores_have_means_and_standard_errors():

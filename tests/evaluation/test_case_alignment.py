@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import Tensor
 
+from avmsf.bench import align_split, evaluate
 from avmsf.bench.baselines import NearestStrike
 from avmsf.bench.caserun import CaseRun
 from avmsf.bench.cases import Case
@@ -61,6 +63,31 @@ def test_errors_of_baselines_do_not_depend_on_delays(tmp_path: Path) -> None:
         assert one.failure is None
         for metric in ("relative_stft", "l1", "envelope"):
             assert one.values[metric] == pytest.approx(other_one.values[metric], rel=2 * ALIGNED), (one.method, metric)
+
+
+class NearestThree:
+    """The built-in knn3 as somebody else would write it."""
+
+    def __init__(self, train: Impacts) -> None:
+        self.train, self.sample_rate = train, train.sample_rate
+
+    def render(self, contacts: Tensor, *, directions: Tensor | None = None) -> Tensor:
+        nearest = torch.cdist(contacts, self.train.contacts).argsort(1)[:, :3]
+        return self.train.sounds[nearest].mean(1)
+
+
+def test_an_own_method_in_python_gets_the_score_of_the_same_built_in_one(tmp_path: Path) -> None:
+    run = run_of(strikes(COUNT, starts=delays(COUNT)), tmp_path)
+    train, test = run.scored.train, run.scored.test
+    built_in = run.outcome(method_named("knn3"))
+    own = evaluate(NearestThree, test, train=train)
+    aligned = align_split(train, test)
+    by_hand = evaluate(NearestThree(aligned[0]), aligned[1])
+    for metric, values in own.values.items():
+        assert values.tolist() == pytest.approx(built_in.values[metric], rel=1e-6), metric
+        assert by_hand.values[metric].tolist() == pytest.approx(values.tolist(), rel=1e-6), metric
+    # What this is for: recordings as they are give another score.
+    assert evaluate(NearestThree(train), test).mean()["relative_stft"] > 1.02 * own.mean()["relative_stft"]
 
 
 def test_fields_are_fitted_to_own_starts_and_all_are_scored_from_the_peaks(

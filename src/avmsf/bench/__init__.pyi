@@ -1,4 +1,5 @@
 from .evaluation import Scores as Scores
+from .evaluation import align_split as align_split
 from .evaluation import evaluate as evaluate
 from .evaluation import score as score
 from .evaluation import split as split

@@ -13,6 +13,7 @@ from torch import Tensor
 from avmsf._utils.caching import Given, Result
 from avmsf.bench.cases import Case
 from avmsf.bench.contactmaps import write_map
+from avmsf.bench.evaluation import align_split
 from avmsf.bench.fieldmethods import configured
 from avmsf.bench.judging import Judgement, spread
 from avmsf.bench.knowntruth import truth_at
@@ -20,11 +21,11 @@ from avmsf.bench.listening import keep_sound, listening_gain
 from avmsf.bench.locatingmethods import located
 from avmsf.bench.methods import report_of
 from avmsf.bench.plan import Evaluation
-from avmsf.bench.renderer import Renderer
+from avmsf.bench.renderer import Renderer, expect_renderer
 from avmsf.bench.results import CaseRecord, Outcome, one_line
 from avmsf.bench.task import Look, Method, Task
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import AvmsfError, EvaluationError, ExtractionError
+from avmsf.errors import AvmsfError, EvaluationError
 from avmsf.fem.family import BodyFamily
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.modal.extraction.extract import Extraction, extract_once
@@ -53,15 +54,8 @@ class _Recordings:
         return self._found
 
     def align(self) -> None:
-        """Give all recordings the starts that the training ones have in common; without modes they keep their own."""
-        if self.train.before is None:
-            return
-        try:
-            modes = self.modes()
-        except ExtractionError:
-            self.train, self.test = (replace(each, before=None, after=None) for each in (self.train, self.test))
-        else:
-            self.train, self.test = modes.aligned(self.train), modes.aligned(self.test)
+        """Give all recordings the starts that the training ones have in common."""
+        self.train, self.test = align_split(self.train, self.test, modes=self.modes)
 
 
 class CaseRun:
@@ -112,7 +106,7 @@ class CaseRun:
             for each in (self.scored, recordings):
                 with self._sharing():
                     each.align()
-            renderer = method.fit(self._task(recordings))
+            renderer = expect_renderer(method.fit(self._task(recordings)))
             fit_seconds = time.perf_counter() - begun - (self.shared - shared)
             begun = time.perf_counter()
             with torch.no_grad():

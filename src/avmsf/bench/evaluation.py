@@ -2,8 +2,9 @@
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 
@@ -11,11 +12,12 @@ from avmsf._utils.arrays import ArrayLike, as_floats
 from avmsf.bench.cases import Places
 from avmsf.bench.conventions import PAPER, Convention
 from avmsf.bench.metrics import PerContact, default_fft_sizes, relative_stft_error, validate
-from avmsf.bench.renderer import Renderer
+from avmsf.bench.renderer import Renderer, expect_renderer
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import EvaluationError, PositionWarning
+from avmsf.errors import EvaluationError, ExtractionError, PositionWarning
 from avmsf.field.soundfield import SoundField
+from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.scene.points import farthest_points
 from avmsf.wording import counted
 
@@ -70,28 +72,50 @@ def split(
     return impacts.take(case.train), impacts.take(case.test)
 
 
+def align_split(
+    train: Impacts, test: Impacts, *, modes: Callable[[], Extraction] | None = None
+) -> tuple[Impacts, Impacts]:
+    """Return both with the starts that the training recordings have in common; without modes they keep their own.
+
+    `avmsf evaluate` does this before it fits and scores methods. `modes` finds the modes of `train`, by default with
+    the settings of `extract_modes`.
+    """
+    if train.before is None:
+        return train, test
+    try:
+        found = extract_modes(train) if modes is None else modes()
+    except ExtractionError:
+        return replace(train, before=None, after=None), replace(test, before=None, after=None)
+    return found.aligned(train), found.aligned(test)
+
+
 def evaluate(
-    renderer: Renderer,
+    renderer: Renderer | Callable[[Impacts], Renderer],
     test: Capture | Impacts,
     *,
+    train: Capture | Impacts | None = None,
     convention: Convention = PAPER,
     fft_sizes: Sequence[int] | None = None,
 ) -> Scores:
     """Score the sounds that `renderer` renders at the contacts of recordings against these recordings.
 
-    For a SoundField, recordings that are not aligned yet are aligned as its fit aligned those it was fitted to. Raises
-    as `score`, and for a renderer at another sample rate.
+    With the training recordings as `train`, `renderer` is a class or function that makes one from them. It gets them,
+    and is scored on `test`, as the methods of `avmsf evaluate` are: aligned with one another (`align_split`). Without
+    them, recordings are taken as they are; for a SoundField, those that are not aligned yet are aligned as its fit
+    aligned those it was fitted to. Raises as `score`, and EvaluationError for what is no renderer, and for one at
+    another sample rate.
     """
-    impacts = test.impacts if isinstance(test, Capture) else test
-    if not isinstance(impacts, Impacts):
+    impacts = _impacts_of(test, "test")
+    if train is not None:
+        make = _expect_maker(renderer)
+        heard, impacts = align_split(_impacts_of(train, "train"), impacts)
+        renderer = make(heard)
+    made = expect_renderer(renderer)
+    if isinstance(made, SoundField):
+        impacts = made.aligned(impacts)
+    if made.sample_rate != impacts.sample_rate:
         raise EvaluationError(
-            f"test: expected a Capture or Impacts, got {type(test).__name__}", name="test", value=type(test).__name__
-        )
-    if isinstance(renderer, SoundField):
-        impacts = renderer.aligned(impacts)
-    if renderer.sample_rate != impacts.sample_rate:
-        raise EvaluationError(
-            f"expected recordings at the field's {renderer.sample_rate:g} Hz, got {impacts.sample_rate:g} Hz; resample "
+            f"expected recordings at the field's {made.sample_rate:g} Hz, got {impacts.sample_rate:g} Hz; resample "
             "them, or fit a field to recordings of their rate",
             name="sample_rate",
             value=impacts.sample_rate,
@@ -99,8 +123,32 @@ def evaluate(
     with torch.no_grad(), warnings.catch_warnings():
         # Reading the capture has warned of contacts off the object.
         warnings.simplefilter("ignore", PositionWarning)
-        sounds = renderer.render(impacts.contacts, directions=impacts.directions)
+        sounds = made.render(impacts.contacts, directions=impacts.directions)
     return score(sounds, impacts, convention=convention, fft_sizes=fft_sizes)
+
+
+def _impacts_of(recordings: Capture | Impacts, name: str) -> Impacts:
+    impacts = recordings.impacts if isinstance(recordings, Capture) else recordings
+    if not isinstance(impacts, Impacts):
+        raise EvaluationError(
+            f"{name}: expected a Capture or Impacts, got {type(impacts).__name__}",
+            name=name,
+            value=type(impacts).__name__,
+        )
+    return impacts
+
+
+def _expect_maker(given: Any) -> Callable[[Impacts], Renderer]:
+    if not callable(given) or (isinstance(given, Renderer) and not isinstance(given, type)):
+        raise EvaluationError.expected(
+            "a class or function that makes a renderer of the training recordings",
+            type(given).__name__,
+            got=f"an object of {type(given).__name__}",
+            name="renderer",
+            advice="leave out `train`, or give the class",
+        )
+    make: Callable[[Impacts], Renderer] = given
+    return make
 
 
 def score(
