@@ -1,6 +1,7 @@
 """Running an evaluation: kept as it goes, gone on with, never mixed, and the same however it is run."""
 
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -133,6 +134,32 @@ def test_a_failing_method_stops_no_other_and_is_tried_again(plates: Path, tmp_pa
     summary = summed(tmp_path)
     assert summary["failures"] == []
     assert set(summary["methods"]) == {"knn3", "counting"}
+
+
+def test_changed_wavs_are_scored_again_and_no_others(plates: Path, tmp_path: Path) -> None:
+    results, sounds = ResultsFolder(tmp_path / "results"), tmp_path / "sounds"
+    for name in ("a", "b"):
+        shutil.copytree(plates / name, sounds / name)
+    tested = {name: split(read_capture(plates / name).impacts)[1].names for name in ("a", "b")}
+    changing, missing = sounds / "a" / tested["a"][0], sounds / "b" / tested["b"][0]
+    content = missing.read_bytes()
+    missing.unlink()
+    evaluation = planned(plates, f"recorded:{sounds}")
+    run_objects(evaluation, ("a", "b"), results)
+    (failure,) = summed(results.path)["failures"]
+    assert failure["object"] == "b"
+    first = results.read("a")
+    missing.write_bytes(content)
+    run_objects(evaluation, ("a", "b"), results)
+    assert summed(results.path)["failures"] == []
+    assert results.read("a") == first
+    shutil.copy(sounds / "a" / tested["a"][1], changing)
+    run_objects(evaluation, ("a", "b"), results)
+    changed = results.read("a")
+    assert first is not None
+    assert changed is not None
+    errors = [sum(each.outcomes[0].values["relative_stft"]) for each in (first, changed)]
+    assert errors[0] < 1e-3 < errors[1]
 
 
 def test_an_interruption_keeps_all_before_it(plates: Path, tmp_path: Path) -> None:

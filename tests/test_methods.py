@@ -450,11 +450,15 @@ def test_others_sounds_that_do_not_fit_are_refused_by_name(tmp_path):
         RecordedMethod(tmp_path).fit(replace(task, names=task.names[:3]))
 
 
-def test_a_recorded_method_is_known_by_what_is_in_its_files(tmp_path: Path) -> None:
-    path = tmp_path / "bowl" / "001.wav"
-    path.parent.mkdir()
-    path.write_bytes(b"one")
-    before = repr(RecordedMethod(tmp_path))
-    assert repr(RecordedMethod(tmp_path)) == before
-    path.write_bytes(b"two")
-    assert repr(RecordedMethod(tmp_path)) != before
+def test_a_digest_is_of_the_wavs_of_one_object(tmp_path: Path) -> None:
+    method = RecordedMethod(tmp_path)
+    paths = [tmp_path / name / "001.wav" for name in ("bowl", "mug")]
+    for path in paths:
+        path.parent.mkdir()
+        path.write_bytes(b"one")
+    before, identity = method.digest("bowl"), repr(method)
+    paths[1].write_bytes(b"two")
+    assert method.digest("bowl") == before
+    paths[0].write_bytes(b"two")
+    assert method.digest("bowl") != before
+    assert repr(method) == identity

@@ -55,14 +55,14 @@ class RecordedMethod:
         """`recorded:` and the folder."""
         return f"{RECORDED}{self.folder}"
 
-    def __repr__(self) -> str:
-        # What is in the files decides the figures, and a results folder must not keep those of other files.
-        digest = hashlib.sha256()
-        for path in sorted(self.folder.rglob("*")):
+    def digest(self, name: str) -> str:
+        """Return a digest of an object's wavs, which decide its figures."""
+        digest, folder = hashlib.sha256(), self.folder / name
+        for path in sorted(folder.rglob("*")):
             if path.suffix.lower() == ".wav" and path.is_file():
-                digest.update(f"{path.relative_to(self.folder).as_posix()}\0{path.stat().st_size}\0".encode())
+                digest.update(f"{path.relative_to(folder).as_posix()}\0{path.stat().st_size}\0".encode())
                 digest.update(path.read_bytes())
-        return f"RecordedMethod({str(self.folder)!r}, wavs {digest.hexdigest()[:16]})"
+        return digest.hexdigest()
 
     def fit(self, task: Task) -> Recorded:
         """Find the object's folder. Raises EvaluationError where there is none."""

@@ -41,6 +41,8 @@ class Outcome:
     """Files of located contacts' maps, likewise."""
     failure: str | None = None
     """Reason for missing values, in one line."""
+    digest: str = ""
+    """Of the files that a method's sounds are read from (`FromFiles`); empty for all other methods."""
 
 
 @dataclass(frozen=True)
@@ -78,9 +80,10 @@ class ObjectRecord:
     failure: str | None = None
     """Why the object could not be evaluated at all."""
 
-    def done(self, case: str, method: str) -> bool:
-        """Whether this method has values in this case; failures are retried."""
-        return any(each.case == case and each.method == method and each.failure is None for each in self.outcomes)
+    def done(self, case: str, method: str, digest: str = "") -> bool:
+        """Whether this method has values in this case, of files with this digest; failures are retried."""
+        wanted = (case, method, digest, None)
+        return any((each.case, each.method, each.digest, each.failure) == wanted for each in self.outcomes)
 
     def adding(self, outcome: Outcome) -> "ObjectRecord":
         """Return the record with this outcome in place of an earlier one of its case and method."""

@@ -16,6 +16,7 @@ from avmsf.bench.knowntruth import truth_at, truth_from_first_sample, truth_of
 from avmsf.bench.otherobjects import draw_stranger
 from avmsf.bench.plan import Evaluation
 from avmsf.bench.results import CaseRecord, ObjectRecord, ResultsFolder, one_line
+from avmsf.bench.task import FromFiles
 from avmsf.capture.datasets.dataset import ObjectFacts
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import AvmsfError, EvaluationError
@@ -141,11 +142,12 @@ def _run_case(
     """Run the methods that have no figures in a case, and return the object's record with them."""
     key = run.case.key
     for method in run.evaluation.methods:
-        if record.done(key, method.name):
+        digest = method.digest(run.identifier) if isinstance(method, FromFiles) else ""
+        if record.done(key, method.name, digest):
             continue
         if tell is not None:
             tell(f"{key}, {method.name}")
-        outcome = run.outcome(method)
+        outcome = replace(run.outcome(method), digest=digest)
         cases = tuple(run.described(case) if case.key == key else case for case in record.cases)
         record = replace(record, cases=cases).adding(outcome)
         results.write(record)

@@ -90,3 +90,12 @@ class Looking(Protocol):
     def look(self) -> Look:
         """Which ones it reads."""
         ...
+
+
+@runtime_checkable
+class FromFiles(Protocol):
+    """A method whose sounds were made elsewhere and may change from one run to the next."""
+
+    def digest(self, name: str) -> str:
+        """Return what tells an object's files apart from others: its results count only for these."""
+        ...
