@@ -66,6 +66,29 @@ def test_means_are_over_contacts_then_over_objects() -> None:
     assert summary["failures"] == [{"object": "10", "case": "farthest", "method": "paper", "failure": "no modes"}]
 
 
+def best_of(records: tuple[ObjectRecord, ...], title: str, **settings: frozenset[str]) -> tuple[list[str], Section]:
+    """Return the methods that a table marks as best, and its section."""
+    (part,) = [each for each in sections(records, IDENTITY, subsets=settings) if each.title == title]
+    assert part.grid is not None
+    return [part.grid.rows[row][0] for row, _ in sorted(part.grid.best)], part
+
+
+def test_the_best_is_marked_among_methods_that_have_all_objects() -> None:
+    easy = record("1", {"knn3": (2.0, 2.0), "nearest": (3.0, 3.0), "paper": (1.0, 1.0)})
+    hard = record("2", {"knn3": (9.0, 9.0), "nearest": (8.0, 8.0), "paper": "no modes"})
+    for title, parts in (("All methods", {}), ("Objects: part", {"part": frozenset("12")})):
+        best, part = best_of((easy, hard, record("3", {"knn3": (1.0, 1.0), "nearest": (1.5, 1.5)})), title, **parts)
+        # Of three objects 4 and 4.17, of two 5.5 and 5.5: of equal ones the first.
+        assert best == ["knn3"]
+        assert "paper" in part.remarks[0]
+    best, part = best_of((easy,), "All methods")
+    assert best == ["paper"]
+    assert not any(words.startswith("Not of all") for words in part.remarks)
+    # Where every method lacks an object there is no mean to compare.
+    best, _ = best_of((easy, record("2", {"nearest": (8.0, 8.0)}), record("3", {"knn3": (1.0, 1.0)})), "All methods")
+    assert best == []
+
+
 def test_a_failure_is_not_missing_but_a_method_or_an_object_that_has_not_run_is() -> None:
     broken = ObjectRecord("3", failure="no recordings")
     methods = ["knn3", "paper"]

@@ -155,7 +155,7 @@ def _main_table(main: Table, shown: Sequence[str], protocol: str, dataset: str, 
         (method, *(_mean(figures.get(metric)) for metric in shown), _count(figures))
         for method, figures in found.items()
     ]
-    best = _best(found, shown)
+    best = _best(main, shown)
     paper = published(protocol, dataset)
     if paper is not None:
         rows += [
@@ -170,7 +170,7 @@ def _main_table(main: Table, shown: Sequence[str], protocol: str, dataset: str, 
     )
     grid = Grid(("method", *_headings(shown), "objects"), tuple(rows), best)
     titles = "; ".join(f"{method}: {TITLES[kind_of(method)]}" for method in found if kind_of(method) in TITLES)
-    remarks = (remark, f"{titles}.") if titles else (remark,)
+    remarks = (*_of_fewer(main), remark, *([f"{titles}."] if titles else []))
     return Section("All methods" + (f": {labels[0]}" if len(labels) > 1 else ""), (), grid, remarks)
 
 
@@ -216,7 +216,9 @@ def _subset_table(name: str, chosen: Table, shown: Sequence[str]) -> Section:
     found = means(chosen)
     rows = tuple((method, *(_mean(found[method].get(metric)) for metric in shown)) for method in found)
     words = f"{len(chosen)} objects: {', '.join(chosen)}."
-    return Section(f"Objects: {name}", (words,), Grid(("method", *_headings(shown)), rows, _best(found, shown)))
+    return Section(
+        f"Objects: {name}", (words,), Grid(("method", *_headings(shown)), rows, _best(chosen, shown)), _of_fewer(chosen)
+    )
 
 
 def _case_table(metric: str, tables: Mapping[str, Table], protocol: str, dataset: str) -> Section:
@@ -342,12 +344,29 @@ def _count(figures: Mapping[str, Mean]) -> str:
     return str(max((each.objects for each in figures.values()), default=0))
 
 
-def _best(found: Mapping[str, Mapping[str, Mean]], shown: Sequence[str]) -> frozenset[tuple[int, int]]:
-    best = set()
-    methods = list(found)
+def _best(table: Table, shown: Sequence[str]) -> frozenset[tuple[int, int]]:
+    """Return the best cells of each metric's column, among the methods that have it of all objects that have it."""
+    found, best = means(table), set()
     for column, metric in enumerate(shown, 1):
-        values = {row: found[method][metric].mean for row, method in enumerate(methods) if metric in found[method]}
-        if values:
+        total = sum(any(metric in values for values in figures.values()) for figures in table.values())
+        complete = {
+            row: figures[metric].mean
+            for row, figures in enumerate(found.values())
+            if metric in figures and figures[metric].objects == total
+        }
+        if complete:
             pick = max if metric in RISING else min
-            best.add((pick(values, key=lambda row: values[row]), column))
+            best.add((pick(complete, key=lambda row: complete[row]), column))
     return frozenset(best)
+
+
+def _of_fewer(table: Table) -> tuple[str, ...]:
+    """Return the sentence on methods without results of some objects; nothing where there are none."""
+    methods = dict.fromkeys(method for figures in table.values() for method in figures)
+    fewer = [method for method in methods if any(method not in figures for figures in table.values())]
+    if not fewer:
+        return ()
+    return (
+        f"Not of all {len(table)} objects: {', '.join(fewer)}. Their means are of other objects than those of the "
+        "other rows, and are never marked as best; ratios and paired differences are of the same objects.",
+    )
