@@ -14,6 +14,7 @@ from avmsf.cli.options.evaluate import parse
 from avmsf.errors import AvmsfError, EvaluationError, FitError
 from avmsf.modal.extraction.finders import ShortTime
 from avmsf.pipeline.objectbodies import ObjectBodies
+from avmsf.simulate.sim20 import ABLATED
 from plate_set import fill_plates
 from raising import raises
 
@@ -65,6 +66,35 @@ WRONG = {
     "farthest plates --cdpam-contacts -1": ("cdpam_contacts", -1),
     "non-symmetric plates": ("subset", "non-symmetric"),
 }
+
+
+@pytest.mark.parametrize("protocol", ["shots", "learning-curve"])
+def test_files_are_of_one_set_of_training_recordings(protocol: str, plates: Path, tmp_path: Path) -> None:
+    method = f"recorded:{plates}"
+    options = parse([protocol, str(plates), "--methods", f"knn3,{method}", "--output", str(tmp_path / "results")])
+    with raises(EvaluationError, name="method", value=method):
+        options.check_inputs()
+    parse(["closest", str(plates), "--methods", method]).check_inputs()
+
+
+def test_what_is_taken_without_being_asked_for_is_printed(
+    tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*given: object, **settings: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("avmsf.cli.evaluate.run_objects", stop)
+    chosen, others = ABLATED[:2], ("spare", "extra")
+    plates = fill_plates(tmp_path / "plates", (*chosen, *others), count=2, truth=True)
+    words = ["closest", str(plates), "--no-cdpam", "--methods", f"recorded:{plates}", "--quiet"]
+    words += ["--output", str(tmp_path / "results")]
+    assert run(parse([*words, "--time-zero", "peak"])) == 130
+    objects, start = [line for line in capsys.readouterr().err.splitlines() if line.startswith("note:")]
+    assert all(name in objects for name in (*chosen, "--objects"))
+    assert not any(name in objects for name in others)
+    assert f"recorded:{plates}" in start
+    assert run(parse([*words, "--objects", others[0]])) == 130
+    assert "note:" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("words", WRONG)

@@ -50,6 +50,8 @@ METHOD_NAMES = (
 """All methods but those that take a path, in the order of tables."""
 PUBLISHED, SMALL, RECORDED = "sonicgauss:", "sonicgauss-small:", "recorded:"
 """How the names of methods that take a path begin."""
+_SEVERAL_SETS = ("shots", "learning-curve")
+"""Protocols that test a recording after training on several sets of others."""
 
 
 def expect_protocol(name: str) -> None:
@@ -70,6 +72,17 @@ def expect_method(name: str) -> None:
             f"{name!r}{_guess(name, METHOD_NAMES)}",
             name="method",
             value=name,
+        )
+
+
+def expect_suited(method: str, protocol: str) -> None:
+    """Raise `EvaluationError` for a method whose sounds cannot be those of the protocol's training recordings."""
+    if method.startswith(RECORDED) and protocol in _SEVERAL_SETS:
+        raise EvaluationError(
+            f"{method}: expected a protocol that tests each recording once, got {protocol}, which trains on several "
+            "sets of recordings, and the folder holds the sounds of one; choose farthest, closest or leave-one-out",
+            name="method",
+            value=method,
         )
 
 

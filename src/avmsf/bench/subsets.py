@@ -12,6 +12,11 @@ from avmsf.simulate import sim20
 
 ABLATED, NOT_SYMMETRIC = "ablation", "non-symmetric"
 """The groups' names."""
+SUBSETS: Mapping[str, str] = {
+    ABLATED: "those of the paper's ablations or the simulated ones in their place",
+    NOT_SYMMETRIC: "those without rotational symmetry",
+}
+"""What the objects of each group have in common."""
 _NUMBERS: Mapping[str, Sequence[str]] = {ABLATED: ABLATION, NOT_SYMMETRIC: NON_SYMMETRIC}
 
 _SIMULATED: Mapping[str, Sequence[str]] = {ABLATED: sim20.ABLATED, NOT_SYMMETRIC: sim20.NON_SYMMETRIC}

@@ -13,7 +13,7 @@ from avmsf.bench.cases import Growing
 from avmsf.bench.fieldmethods import configured
 from avmsf.bench.judging import Judging
 from avmsf.bench.learningcurve import curves, draw_learning_curve
-from avmsf.bench.methods import method_named
+from avmsf.bench.methods import RecordedMethod, method_named
 from avmsf.bench.parallel import RunProgress, Workers, run_objects
 from avmsf.bench.pictures import save_picture
 from avmsf.bench.plan import Evaluation
@@ -21,7 +21,7 @@ from avmsf.bench.protocols import LEARNING_CURVE, EvaluationProtocol, protocol_n
 from avmsf.bench.report import PAGE, SUMMARY, TABLES, write_figures, write_page, write_summary
 from avmsf.bench.reporttables import Section
 from avmsf.bench.results import IDENTITY, ResultsFolder, write_json
-from avmsf.bench.subsets import choose_objects, members
+from avmsf.bench.subsets import SUBSETS, choose_objects, members
 from avmsf.bench.task import Look, Looking, Method
 from avmsf.capture.datasets import CaptureCollection, open_dataset
 from avmsf.capture.datasets.dataset import Dataset
@@ -58,6 +58,8 @@ def run(options: Options) -> int:
     dataset = opened(time_zero=options.time_zero)
     title = title_of(dataset, options.data)
     objects = choose_objects(dataset, protocol, words_of(options.objects))
+    if not options.objects:
+        _note_subset(dataset, protocol, objects)
     folder = (options.output or Path("evaluation") / title / protocol.name).resolve()
     evaluation = evaluation_of(options, dataset, title, protocol, methods, folder)
     if options.time_zero == "peak":
@@ -177,9 +179,24 @@ def evaluation_of(
     )
 
 
+def _note_subset(dataset: Dataset, protocol: EvaluationProtocol, objects: Sequence[str]) -> None:
+    """Print which objects a protocol takes of a dataset, where it does not take all."""
+    total = len(dataset.objects())
+    if protocol.subset is not None and len(objects) < total:
+        say(
+            f"note: {protocol.name} takes {len(objects)} of {total} objects, {SUBSETS[protocol.subset]}: "
+            f"{', '.join(objects)}; --objects NAME,NAME takes others"
+        )
+
+
 def _note_start(methods: Sequence[Method], time_zero: TimeZero | None) -> None:
-    """Print which methods are configured for another start of sounds than the evaluation has."""
+    """Print which methods are configured for, or may have, another start of sounds than the evaluation has."""
     for method in methods:
+        if isinstance(method, RecordedMethod) and time_zero == "peak":
+            say(
+                f"note: the files of {method.name} are taken as they are; with --time-zero peak each has to start at "
+                "its largest sample, as the recordings do"
+            )
         settings = configured(method)
         wanted = None if settings is None else settings.pipeline.time_zero
         if wanted not in (None, time_zero):

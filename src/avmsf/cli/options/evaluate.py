@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from avmsf.bench.names import expect_method, expect_protocol
+from avmsf.bench.names import expect_method, expect_protocol, expect_suited
 from avmsf.capture.datasets.signs import expect_signs
 from avmsf.cli.options.checks import expect_device, expect_modes
 from avmsf.cli.options.common import Flag, Printing, parse_options
@@ -104,6 +104,7 @@ class Options(Printing):
         expect_protocol(self.protocol)
         for name in words_of(self.methods):
             expect_method(name)
+            expect_suited(name, self.protocol)
         expect_device(self.device, raising=EvaluationError)
         expect_modes(self.modes)
         expect_signs(self.data)
