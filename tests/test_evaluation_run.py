@@ -25,7 +25,7 @@ from avmsf.bench.plan import Evaluation
 from avmsf.bench.protocols import PROTOCOLS
 from avmsf.bench.renderer import Renderer
 from avmsf.bench.report import write_summary
-from avmsf.bench.results import ResultsFolder
+from avmsf.bench.results import ENCODER, ResultsFolder
 from avmsf.bench.task import Method, Task
 from avmsf.capture import read_capture
 from avmsf.capture.datasets import CaptureCollection
@@ -258,6 +258,18 @@ def test_a_folder_of_other_things_and_damaged_results_are_refused(plates: Path, 
         (tmp_path / "results" / "objects" / "a.json").write_text(content)
         with raises(EvaluationError, file="objects/a.json"):
             results.records()
+
+
+def test_another_encoder_is_named_by_its_option(tmp_path: Path) -> None:
+    results = ResultsFolder(tmp_path)
+    results.begin({"protocol": "farthest"}, {"field": f"Field(width=3){ENCODER}descriptors"})
+    with raises(EvaluationError, name="field") as caught:
+        results.begin({"protocol": "farthest"}, {"field": f"Field(width=3){ENCODER}facebook/dinov2-base"})
+    assert "--lift.encoder descriptors" in str(caught.value)
+    assert "width" not in str(caught.value)
+    with raises(EvaluationError, name="field") as caught:
+        results.begin({"protocol": "farthest"}, {"field": f"Field(width=4){ENCODER}descriptors"})
+    assert "width" not in str(caught.value)
 
 
 def test_a_hidden_part_that_a_kill_left_is_no_other_thing(tmp_path: Path) -> None:

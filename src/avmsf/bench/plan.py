@@ -8,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 from avmsf._utils.caching import source_digest
 from avmsf.bench.judging import Judging
 from avmsf.bench.protocols import EvaluationProtocol
-from avmsf.bench.results import ResultsFolder
+from avmsf.bench.results import ENCODER, ResultsFolder
 from avmsf.bench.task import Look, Looking, Method
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.fem.family import BodyFamily
@@ -79,6 +79,9 @@ class Evaluation:
     """The same dataset with its own starts, for fields that are not of the paper's configuration; None where all
     methods are fitted to the sounds that they are scored on."""
 
+    options: Mapping[str, str] = field(default_factory=dict)
+    """What a command line spelled of all this, by option, for messages."""
+
     def begin(self, results: ResultsFolder) -> None:
         """Take a folder for this evaluation's results.
 
@@ -98,9 +101,9 @@ class Evaluation:
             "modes": repr(self.finder),
             "settings": dict(self.settings),
         }
-        results.begin(identity, {method.name: self._described(method) for method in self.methods})
+        results.begin(identity, {method.name: self._described(method) for method in self.methods}, self.options)
 
     def _described(self, method: Method) -> str:
         """Return what tells a method apart from another of its name. Methods that read no features share any folder."""
         read = self.encoder is not None and isinstance(method, Looking)
-        return f"{method!r}, encoder {self.encoder}" if read else repr(method)
+        return f"{method!r}{ENCODER}{self.encoder}" if read else repr(method)

@@ -14,6 +14,10 @@ from avmsf.files import write_whole
 
 IDENTITY, OBJECTS = "protocol.json", "objects"
 """The file that identifies the evaluation, and the folder of the objects' files."""
+ENCODER = ", encoder "
+"""What comes between a method's description and the encoder of the features that it reads."""
+_OPTIONS = "options"
+"""Key of the command line's options in the file: they explain the identity and are no part of it."""
 _MAX_BYTES = 64 << 20
 """Largest file of results that is read: three million values, as of 100 contacts by 10 metrics in 3000 cases."""
 
@@ -97,11 +101,14 @@ class ResultsFolder:
 
     path: Path
 
-    def begin(self, identity: Mapping[str, Any], methods: Mapping[str, str]) -> None:
+    def begin(
+        self, identity: Mapping[str, Any], methods: Mapping[str, str], options: Mapping[str, str] | None = None
+    ) -> None:
         """Use the folder for results of this identity, or continue with those that it holds.
 
         `identity` holds plain values that determine the results; `methods` describes each method. Methods may be added
-        later. Raises EvaluationError where the folder's results are of another identity, or a method has changed.
+        later. `options` are those of a command line, as it spelled them, for messages. Raises EvaluationError where the
+        folder's results are of another identity, or a method has changed.
         """
         wanted = json.loads(json.dumps(dict(identity)))
         place = self.path / IDENTITY
@@ -115,34 +122,37 @@ class ResultsFolder:
                 name="output",
                 advice="choose a new --output",
             )
-        kept = known.pop("methods")
+        kept, typed = known.pop("methods"), known.pop(_OPTIONS, {})
         for key in dict.fromkeys((*wanted, *known)):
-            if key == "source" and wanted.get(key) != known.get(key):
-                raise EvaluationError(
-                    f"{self.path}: expected results made by this version of avmsf, got those of another, whose code "
-                    "differs; choose another --output",
-                    file=self.path,
-                    name=key,
-                    value=known.get(key),
-                )
             if wanted.get(key) != known.get(key):
-                raise EvaluationError(
-                    f"{self.path}: expected results with {key} = {_brief(wanted.get(key))}, got "
-                    f"{_brief(known.get(key))}; choose another --output",
-                    file=self.path,
-                    name=key,
-                    value=known.get(key),
-                )
+                raise self._of_another(key, wanted, known, *_different(options or {}, typed))
         for name in methods:
             if name in kept and kept[name] != methods[name]:
-                raise EvaluationError(
-                    f"{self.path}: expected results of the method {name} = {_brief(methods[name])}, got "
-                    f"{_brief(kept[name])}; choose another --output",
-                    file=self.path,
-                    name=name,
-                    value=kept[name],
-                )
-        write_json(place, {**wanted, "methods": {**kept, **methods}})
+                raise self._of_another_method(name, methods[name], kept[name])
+        given = {_OPTIONS: dict(options)} if options else {}
+        write_json(place, {**wanted, **given, "methods": {**kept, **methods}})
+
+    def _of_another(
+        self, key: str, wanted: Mapping[str, Any], known: Mapping[str, Any], asked: str, found: str
+    ) -> EvaluationError:
+        """Return the error for results of another identity; `asked` and `found` are the options that differ."""
+        if key == "source":
+            message = "made by this version of avmsf, got those of another, whose code differs; choose another --output"
+        elif asked and key not in ("version", "protocol", "dataset"):
+            message = f"made {asked}, got those made {found}; give the same options, or choose another --output"
+        else:
+            message = f"of {key} {_brief(wanted.get(key))}, got {_brief(known.get(key))}; choose another --output"
+        text = f"{self.path}: expected results {message}"
+        return EvaluationError(text, file=self.path, name=key, value=known.get(key))
+
+    def _of_another_method(self, name: str, wanted: str, known: str) -> EvaluationError:
+        parts = [each.partition(ENCODER) for each in (wanted, known)]
+        if parts[0][0] == parts[1][0]:
+            asked, found = (f"--lift.encoder {each[2]}" for each in parts)
+        else:
+            asked, found = "these settings and weights", "others"
+        text = f"{self.path}: expected results of {name} made with {asked}, got those made with {found}"
+        return EvaluationError(f"{text}; choose another --output", file=self.path, name=name, value=known)
 
     def identity(self) -> dict[str, Any]:
         """Return the evaluation that the folder holds, with its methods. Raises EvaluationError where there is none."""
@@ -225,6 +235,18 @@ def _finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_finite(each) for each in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _different(asked: Mapping[str, str], found: Mapping[str, str]) -> tuple[str, str]:
+    """Return the options that differ between two command lines, as each spelled them; nothing where one is unknown."""
+    names = [name for name in dict.fromkeys((*asked, *found)) if asked.get(name) != found.get(name)]
+    if not (asked and found and names):
+        return "", ""
+    both = [
+        ", ".join(f"with {each[name]}" if name in each else f"without {name}" for name in names)
+        for each in (asked, found)
+    ]
+    return both[0], both[1]
 
 
 def _brief(value: object) -> str:

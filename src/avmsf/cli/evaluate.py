@@ -27,7 +27,7 @@ from avmsf.capture.datasets import CaptureCollection, open_dataset
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.objectbar import ObjectBar
-from avmsf.cli.options.evaluate import Options, words_of
+from avmsf.cli.options.evaluate import Options, deciding, words_of
 from avmsf.cli.printing import console, decimals, print_json, say, table
 from avmsf.config import AUTO, PRESETS, LiftConfig, SceneConfig, TimeZero, ViewsConfig
 from avmsf.errors import EvaluationError
@@ -176,6 +176,7 @@ def evaluation_of(
         device,
         None if lift == options.lift else lift.encoder,
         options.time_zero,
+        options=deciding(options),
     )
 
 

@@ -1,15 +1,18 @@
 """What the options of all verbs have in common: how they are parsed, shown and checked."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, fields, is_dataclass
 from types import NoneType, UnionType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from avmsf.cli.options.helptext import described_fields, one_column, paragraphs
 from avmsf.cli.options.paths import InputError, path_mark
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 """An option that is off unless it is given."""
@@ -64,6 +67,29 @@ def parse_options(
             kind, prog=f"avmsf {verb}", args=words, description=paragraphs(description or kind.__doc__ or ""),
             registry=REGISTRY, **given,
         )  # fmt: skip
+
+
+def spelled(options: object, *, without: Collection[str] = (), prefix: str = "") -> dict[str, str]:
+    """Return how the command line spells options, by their names; those that nothing was given for are left out.
+
+    `without` are the fields that do not count.
+    """
+    words: dict[str, str] = {}
+    for each in fields(cast("DataclassInstance", options)):
+        if each.name in without:
+            continue
+        value, name = getattr(options, each.name), prefix + each.name.replace("_", "-")
+        if is_dataclass(value):
+            words |= spelled(value, prefix=f"{name}.")
+        elif isinstance(value, bool):
+            # A flag has no form for off; a setting within a group has one.
+            off = f"--{prefix}no-{name.removeprefix(prefix)}" if prefix else None
+            words |= {f"--{name}": f"--{name}"} if value else {f"--{name}": off} if off else {}
+        elif value is not None and value != ():
+            several = value if isinstance(value, tuple) else (value,)
+            text = " ".join(f"{each:g}" if isinstance(each, float) else str(each) for each in several)
+            words[f"--{name}"] = f"--{name} {text}"
+    return words
 
 
 def _optional(info: PrimitiveTypeInfo) -> Any:

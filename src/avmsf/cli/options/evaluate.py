@@ -10,7 +10,7 @@ import tyro
 from avmsf.bench.names import expect_method, expect_protocol, expect_suited
 from avmsf.capture.datasets.signs import expect_signs
 from avmsf.cli.options.checks import expect_device, expect_modes
-from avmsf.cli.options.common import Flag, Printing, parse_options
+from avmsf.cli.options.common import Flag, Printing, parse_options, spelled
 from avmsf.cli.options.paths import Existing, OutputFolder
 from avmsf.config import BodyConfig, Geometry, LiftConfig, TimeZero
 from avmsf.errors import EvaluationError
@@ -108,6 +108,18 @@ class Options(Printing):
         expect_device(self.device, raising=EvaluationError)
         expect_modes(self.modes)
         expect_signs(self.data)
+
+
+_NO_MATTER = (
+    *("protocol", "data", "methods", "objects", "output", "cache", "metric", "workers", "ray", "device"),
+    *("contact_data", "table", "figures", "json", "quiet", "verbose"),
+)
+"""Options that do not decide a result, or that a folder of results has as something else than an option."""
+
+
+def deciding(options: Options) -> dict[str, str]:
+    """Return the options that decide results as the command line spells them, by name."""
+    return spelled(options, without=_NO_MATTER)
 
 
 def parse(words: Sequence[str]) -> Options:
