@@ -5,6 +5,7 @@ import math
 import shutil
 import sys
 from pathlib import Path
+from urllib.error import URLError
 
 import numpy as np
 import pytest
@@ -225,6 +226,19 @@ def test_a_model_that_is_neither_here_nor_there_says_how_to_get_it(tmp_path, mon
     with raises(EvaluationError, name="source", value="laion/clap-htsat-unfused") as caught:
         Clap.load()
     assert "hf download laion/clap-htsat-unfused --local-dir FOLDER" in str(caught.value)
+
+
+def test_a_failed_download_is_one_sentence_without_the_clients_exception(tmp_path, monkeypatch):
+    from huggingface_hub import constants
+
+    def refused(*_):
+        raise URLError(ConnectionRefusedError(111, "Connection refused"))
+
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
+    monkeypatch.setattr("avmsf.bench.clapweights.expect_answer", refused)
+    with raises(EvaluationError, name="source", value="laion/clap-htsat-unfused") as caught:
+        Clap.load()
+    assert not any(word in str(caught.value) for word in ("URLError", "urlopen", "Errno", "\n"))
 
 
 def test_a_missing_package_is_named_with_its_remedy(saved, monkeypatch):

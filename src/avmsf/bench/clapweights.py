@@ -7,7 +7,7 @@ from typing import Any, Final
 from torch import nn
 
 from avmsf.errors import EvaluationError
-from avmsf.hub import HUB_SECONDS, expect_answer, is_hub_name, read_settings
+from avmsf.hub import HUB_SECONDS, expect_answer, is_hub_name, read_settings, why_not
 
 MODELS: Final = ("laion/clap-htsat-unfused", "laion/clap-htsat-fused", "laion/larger_clap_general")
 """Names under which the hub has networks that fit."""
@@ -122,7 +122,7 @@ def _from_hub(name: str) -> Path:
         raise FileNotFoundError(f"no {' and no '.join(_WEIGHTS)}")
     except Exception as error:  # the hub's client raises whatever the network beneath it does
         raise EvaluationError(
-            f"{name}: the model is not in the cache, and its download failed ({type(error).__name__}: {error}); "
+            f"{name}: expected its weights, got none: they could not be downloaded ({why_not(error)}); "
             f"{_how_to_download(name)}",
             name="source",
             value=name,
