@@ -108,8 +108,8 @@ def _print_failures(failures: Sequence[Mapping[str, Any]], screen: Console) -> N
     for each in failures[:_SHOWN]:
         screen.print(f"failed: {each['object']}, {each['method'] or 'all'}: {each['failure']}", soft_wrap=True)
     if failures:
-        count = len(failures)
-        screen.print(f"{count} failures, listed in {TABLES}; run the command again to retry them", soft_wrap=True)
+        failed = counted(len(failures), "failure")
+        screen.print(f"{failed}, listed in {TABLES}; run the command again to retry", soft_wrap=True)
 
 
 def _draw_curves(
