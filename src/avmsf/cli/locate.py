@@ -156,7 +156,7 @@ def _words(values: dict[str, Any]) -> str:
         error, share = 1000 * values["error"], 100 * values["rmed_posterior"]
         lines.append(f"  {error:.1f} mm from the true contact ({share:.1f} % of the diagonal)")
     if values["multimodal"]:
-        lines.append("  ambiguous: several positions have similar probabilities")
+        lines.append("  ambiguous: there are other possible positions")
     lines += [f"  {other['message']}" for other in values["equivalent_points"]]
     return "\n".join([*lines, *(f"  note: {note}" for note in values["notes"])])
 
