@@ -274,8 +274,11 @@ def test_another_plate_is_refused_with_the_number(length):
         assert locator.locate(sound).mismatch_ratio > 1.5 * STRANGE
         found = locate(true_field(), sound, locator=locator)
         assert f"a mismatch ratio of {found.mismatch_ratio:.2f}" in found.refusal
-        with raises(LocationError, name="position", value=found.mismatch_ratio):
-            _ = found.position
+        for name in ("position", "most_probable"):
+            with raises(LocationError, name=name, value=found.mismatch_ratio):
+                getattr(found, name)
+        assert bool(found.probability.isnan().all())
+        assert bool(found.distance.isfinite().all())
 
 
 @pytest.mark.parametrize("noise_db", [-40.0, 0.0])

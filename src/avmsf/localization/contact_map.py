@@ -127,7 +127,8 @@ class ContactMap:
     """The paper's cosine distance between recorded and predicted gains, for an impact of either polarity: 0 where they
     agree up to a factor, 1 where they are orthogonal."""
     probability: Float64[Tensor, " points"]
-    """That the contact is on the part of the surface that a point represents; sums to one."""
+    """That the contact is on the part of the surface that a point represents; sums to one. NaN where the recording was
+    rejected."""
     explained_energy: float
     """Fraction of the sound's energy, without its noise, that an impact at the point of greatest likelihood explains,
     0 to 1."""
@@ -145,6 +146,10 @@ class ContactMap:
     refusal: str | None = None
     """Why the recording was rejected, as that of another object; None if it was located."""
 
+    def rejected(self, reason: str) -> "ContactMap":
+        """Return the map without a position and with NaN for every probability, and the reason as its `refusal`."""
+        return replace(self, probability=torch.full_like(self.probability, math.nan), refusal=reason)
+
     @property
     def best(self) -> int:
         """Index of the point of least cosine distance, the paper's answer, which has no uncertainty; see `position`."""
@@ -161,6 +166,7 @@ class ContactMap:
     @property
     def most_probable(self) -> int:
         """Index of the most probable point."""
+        self._expect_located("most_probable")
         return int(torch.argmax(self.probability))
 
     @property

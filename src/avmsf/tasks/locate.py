@@ -77,14 +77,14 @@ def judged(found: ContactMap) -> ContactMap:
             f"expected a mismatch ratio of at most {DOUBTFUL:g}, as of this object's impacts, got a mismatch ratio of "
             f"{ratio:.2f}: another object, no impact, or noise ({share}); record it again, or choose another field"
         )
-        return replace(found, refusal=refusal)
+        return found.rejected(refusal)
     if found.evidence <= 0.0:
         refusal = (
             f"expected gains that the field predicts better than noise, got a log Bayes factor of {found.evidence:.1f}"
             f": another object, or too few recordings near the contact ({share}); record it again, or fit to more "
             "recordings"
         )
-        return replace(found, refusal=refusal)
+        return found.rejected(refusal)
     if ratio > DOUBTFUL:
         note = f"the sound may be of another object, or hold other sounds: a mismatch ratio of {ratio:.2f} ({share})"
     elif found.explained_energy < UNLIKE:
