@@ -210,6 +210,29 @@ def test_a_force_that_cannot_be_is_refused(value):
     assert caught.value.value is value
 
 
+@pytest.mark.parametrize("given", [2.0, 2, torch.tensor([2.0]), [2.0]], ids=repr)
+def test_a_force_may_be_a_number(given):
+    sound = struck(1, seed=3).sounds[0]
+    found = locate(true_field(), sound, force=given, locator=locator_of())
+    prior = locate(true_field(), sound, force=Force(2.0), locator=locator_of())
+    assert torch.equal(found.probability, prior.probability)
+
+
+@pytest.mark.parametrize(("given", "value"), [([1.0, 2.0], [2]), ([[1.0], [2.0, 3.0]], "list")])
+def test_forces_that_are_no_number_are_refused(given, value):
+    with raises(LocationError, name="force", value=value):
+        locate(true_field(), struck(1, seed=3).sounds[0], force=given, locator=locator_of())
+
+
+def test_a_force_that_the_level_contradicts_is_noted():
+    sound = struck(1, seed=3).sounds[0]
+    force = abs(locator_of().locate(sound).force)
+    assert locator_of().locate(sound, force=1.5 * force).notes == ()
+    for factor in (0.05, 20.0):
+        (note,) = locator_of().locate(sound, force=factor * force).notes
+        assert f"{factor * force:.3g}" in note
+
+
 def test_the_region_grows_with_the_noise():
     locator = locator_of()
     sizes = [

@@ -30,6 +30,10 @@ _UNIT = 1e-3
 """How far a direction's length may be from one."""
 _KEPT_LENGTHS = 8
 """Lengths of sounds whose equations are kept."""
+_LIKELY = -3.0
+"""Tempered log likelihood, relative to the largest, from which on a position is likely: 5 % of its probability."""
+_FORCE_DEVIATIONS = 4.0
+"""Standard deviations of a known force's prior beyond which a note says that the sound contradicts it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,16 +97,23 @@ class Locator:
         )
 
     def locate(
-        self, sound: Float[Tensor, " samples"], *, highest: float | None = None, force: Force | None = None
+        self,
+        sound: Float[Tensor, " samples"],
+        *,
+        highest: float | None = None,
+        force: Force | float | int | ArrayLike | None = None,
     ) -> ContactMap:
         """Return how well a blow at each point explains a sound that starts at its onset, at the field's rate.
 
         20 ms and more; what is longer than the training sounds is not heard. Modes above `highest` Hz are left out,
-        for a recording that does not hold them. `force`, where it is known, is in newtons for a field that was fitted
-        to sounds per newton, else relative to an average blow of its training. Fields whose dampings vary with the
+        for a recording that does not hold them. `force`, where it is known, is the peak force of the impact: in newtons
+        for a field that was fitted to sounds per newton (`Origin.per_newton`), and 1 for a sound that was divided by
+        its force already; for another field, relative to an average impact of its training. A note says where the
+        sound is too loud or too faint for that force at every likely position. Fields whose dampings vary with the
         contact are heard through their mean dampings, and their gains corrected for that. Raises LocationError for
         sounds that are too short, silent or not finite, and where the modes explain no more than they would of noise.
         """
+        known = None if force is None else Force.of(force)
         heard = sound.detach().cpu()[: self.field.samples]
         self._expect_sound(heard)
         length = self._length(len(heard), float("inf") if highest is None else highest)
@@ -112,9 +123,10 @@ class Locator:
         amplitudes = replace(amplitudes, energy=max(amplitudes.energy, amplitudes.fitted, float(detuned.max())))
         values, noise = length.separate(amplitudes)
         _expect_more_than_noise(values, noise)
-        found = judge(length.foretold, values, noise, force=length.scaled(force))
+        scaled = length.scaled(known)
+        found = judge(length.foretold, values, noise, force=scaled)
         # How hard the blow was does not say whether it was one on this object.
-        free = found if force is None else judge(length.foretold, values, noise)
+        free = found if scaled is None else judge(length.foretold, values, noise)
         row = int(torch.argmax(found.log_likelihood))
         explained = length.explained(amplitudes, found, row)
         trust = found.trust(explained, heed=self.heed)
@@ -130,6 +142,7 @@ class Locator:
             amplitudes.part(float(detuned.mean())),
             float(found.force[row]) / length.unit,
             evidence=free.evidence(self.areas),
+            notes=() if scaled is None else _force_notes(scaled, free, trust, length.unit),
         )
 
     def prepare(self, *samples: int) -> None:
@@ -270,6 +283,20 @@ def _mixed(
     usual = power.mean(0)
     usual = usual.clamp_min(1e-8 * float(usual.max()))
     return Foretold(gains, power, variance, usual, shares.T @ extractor.bank.frequency)
+
+
+def _force_notes(force: Force, free: Judgement, trust: float, unit: float) -> tuple[str, ...]:
+    """Return a note where no likely position has about that force; `free` is what the sound says without it."""
+    likely = trust * (free.log_likelihood - free.log_likelihood.max()) > _LIKELY
+    forces = free.force[likely].abs()
+    level = 20.0 * (forces / force.expected).log10().abs()
+    if float(level.min()) <= _FORCE_DEVIATIONS * force.spread_db:
+        return ()
+    fitting, given = float(forces[level.argmin()]) / unit, force.expected / unit
+    return (
+        f"expected a force of about {fitting:.2g} by the sound's level, got {given:.3g}; the force of a recording that "
+        "was divided by its force is 1",
+    )
 
 
 def _expect_more_than_noise(values: Complex128[Tensor, " modes"], noise: Float64[Tensor, " modes"]) -> None:

@@ -11,6 +11,7 @@ from jaxtyping import Float64
 from scipy.fft import irfft, next_fast_len, rfft
 from torch import Tensor
 
+from avmsf._utils.arrays import ArrayLike
 from avmsf.capture.audio import Recording, refuse_silence
 from avmsf.capture.onset import find_onset
 from avmsf.capture.prepare import remove_rumble, shortest_allowed
@@ -51,7 +52,7 @@ def locate_blows(
     *,
     sample_rate: float | int | None = None,
     settings: CaptureSettings | None = None,
-    force: Force | None = None,
+    force: Force | float | int | ArrayLike | None = None,
     locator: Locator | None = None,
 ) -> list[tuple[float, ContactMap]]:
     """Return the onset, seconds, and the contact of each impact in a recording, in order.
@@ -62,6 +63,7 @@ def locate_blows(
     and impacts closer than 30 ms are not separated. Raises LocationError as `hear`, where the settings ask for
     deconvolution by the recording's own pulse, and where no impact can be located.
     """
+    known = None if force is None else Force.of(force)
     recording = read_if_path(recording)
     whole = as_recording(recording, field, sample_rate=sample_rate)
     chosen = settings_for(whole, own_settings(recording, field) if settings is None else settings)
@@ -89,7 +91,7 @@ def locate_blows(
             own = own - still_ringing(field, resampled, starts[number - 1], start, len(own), highest=highest)
         seconds = onset / whole.sample_rate
         try:
-            located = _accepted(judged(finder.locate(own.float(), highest=highest, force=force)), whole.name, seconds)
+            located = _accepted(judged(finder.locate(own.float(), highest=highest, force=known)), whole.name, seconds)
         except LocationError as error:
             refused.append((seconds, error))
             continue

@@ -30,8 +30,9 @@ class Options(Printing):
     several: Flag = False
     """The recordings hold several impacts each; locate every one of them."""
     force: float | None = None
-    """Peak force of every impact in newtons: it distinguishes contacts that differ only in loudness. For a field whose
-    recordings were not divided by their forces: relative to an average recorded impact."""
+    """Peak force of every impact in newtons: it distinguishes contacts that differ only in loudness. 1 for recordings
+    that were divided by their forces already. For a field whose recordings were not divided by their forces: relative
+    to an average recorded impact."""
     probability: float = 0.9
     """Probability that the contact lies within the region that is reported."""
     true_contact: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
