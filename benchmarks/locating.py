@@ -301,7 +301,7 @@ def _strangers(options: LocatingOptions) -> Report:
 
 def _refusal(field: SoundField, locator: Locator, sound: torch.Tensor) -> str | None:
     try:
-        return locate(field, sound, locator=locator).refusal
+        return locate(field, sound, locator=locator, progress=False).refusal
     except LocationError as error:
         return str(error)
 

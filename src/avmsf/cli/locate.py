@@ -110,7 +110,8 @@ def _blows(
     """Return the onsets of a recording's impacts, seconds, where there may be several, and their contacts."""
     if several:
         return [*locate_blows(known.field, recording, settings=settings, force=force, locator=known.locator)]
-    return [(None, locate(known.field, recording, settings=settings, force=force, locator=known.locator))]
+    found = locate(known.field, recording, settings=settings, force=force, locator=known.locator, progress=False)
+    return [(None, found)]
 
 
 def _true_contact(options: Options, field: SoundField) -> Float64[Tensor, " 3"] | None:

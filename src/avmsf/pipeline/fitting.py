@@ -1,6 +1,7 @@
 """From a capture to a field in one call: what `avmsf fit` and `SoundField.fit` do."""
 
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from rich.console import Console
 from rich.progress import Progress as Bar
 
 from avmsf._utils.caching import discard
+from avmsf._utils.progress import is_live, repeated
 from avmsf.capture import Capture, Impacts
 from avmsf.capture.placement import surface_points
 from avmsf.config import PipelineConfig
@@ -130,13 +132,20 @@ def fit_with_progress(
         config = replace(config, device=device)
     if not progress:
         return fit_capture(capture, config, features=features)[0]
-    with Bar(console=Console(stderr=True), transient=True) as bar:
+    console, doing = Console(stderr=True), ["fitting"]
+    live = is_live(console)
+    with (
+        Bar(console=console, transient=True, disable=not live) as bar,
+        nullcontext() if live else repeated(lambda: doing[0]),
+    ):
         task = bar.add_task("fitting", total=None)
 
         def say(message: str) -> None:
-            bar.console.print(message, markup=False, highlight=False, soft_wrap=True)
+            doing[0] = message
+            console.print(message, markup=False, highlight=False, soft_wrap=True)
 
         def show(step: Progress) -> None:
+            doing[0] = f"{step.stage}: step {step.step} of {step.steps}"
             bar.update(task, description=step.stage, completed=step.step, total=step.steps)
 
         return fit_capture(capture, config, features=features, log=say, progress=show)[0]

@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import lru_cache
 
 from avmsf._utils.arrays import ArrayLike
+from avmsf._utils.progress import working
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
 from avmsf.field.soundfield import SoundField
@@ -32,6 +33,7 @@ def locate(
     directions: ArrayLike | None = None,
     force: Force | float | int | ArrayLike | None = None,
     locator: Locator | None = None,
+    progress: bool = True,
 ) -> ContactMap:
     """Return where on the object a recorded impact was (paper, section Contact Localization, and a posterior).
 
@@ -40,7 +42,7 @@ def locate(
     fitted to (see `hear`), `points` and `directions` as for `Locator.of`. `force` is the peak force of the impact, a
     number or `Force`, see `Locator.locate`; a note says where the recording's own force channel differs. `locator` is
     one made of the field before, with points of its own. That of the last field and its own points is cached, so that
-    of several recordings only the first waits for it. The sound of another object has a `refusal` in place of a
+    of several recordings only the first waits for it. With `progress`, the standard error says that it works. The sound of another object has a `refusal` in place of a
     position, see `judged`. Raises LocationError as `hear` and `Locator.locate`, and for a locator of another field or
     given with points.
     """
@@ -52,11 +54,12 @@ def locate(
             value=what,
         )
     known = None if force is None else Force.of(force)
-    heard = hear(recording, field, sample_rate=sample_rate, settings=settings)
-    if locator is None and points is None and directions is None:
-        locator = _locator_of(field)
-    finder = Locator.of(field, points=points, directions=directions) if locator is None else locator
-    found = finder.locate(heard.sound, highest=heard.highest, force=known)
+    with working("locating the impact; the first of a field takes seconds to minutes", shown=progress):
+        heard = hear(recording, field, sample_rate=sample_rate, settings=settings)
+        if locator is None and points is None and directions is None:
+            locator = _locator_of(field)
+        finder = Locator.of(field, points=points, directions=directions) if locator is None else locator
+        found = finder.locate(heard.sound, highest=heard.highest, force=known)
     measured = _measured_force_notes(heard, field, known)
     return judged(replace(found, notes=(*heard.notes, *measured, *found.notes)))
 
