@@ -361,6 +361,16 @@ def test_fit_says_why_elastic_mode_shapes_took_no_part(tmp_path: Path, capsys: S
     assert "elastic mode" not in capsys.readouterr().err
 
 
+def test_a_stated_wall_that_the_object_cannot_have_ends_the_fit(tmp_path: Path, capsys: Streams) -> None:
+    folder, output = fill_plate(tmp_path / "plate"), tmp_path / "plate.safetensors"
+    for words in (["fit", str(folder)], ["fit", str(folder / "surface.ply"), "--material", "glass"]):
+        assert main([*words, "--output", str(output), "--body.wall", "3", *TINY]) == 2
+        error = capsys.readouterr().err
+        assert "--body.wall" in error
+        assert "finding the modes" not in error
+    assert not output.exists()
+
+
 @pytest.mark.parametrize("wrong", ["no mesh, seen before the modes", "a rate that diverges, seen after them"])
 def test_a_refused_fit_leaves_nothing_behind(tmp_path: Path, capsys: Streams, wrong: str) -> None:
     early = wrong.endswith("before the modes")

@@ -152,7 +152,7 @@ def test_a_wall_thicker_than_the_object_is_refused():
     with raises(SimulationError, name="surface") as caught:
         nominal_bodies(sheet(), walls=[0.2])
     [reason] = caught.value.value
-    assert reason.startswith("wall of 2e+02 mm: ")
+    assert reason.startswith("wall of 200 mm: ")
     assert "170 mm" in reason
     assert "200 mm" in reason
     with raises(SimulationError, name="surface") as caught:
@@ -250,7 +250,7 @@ def test_walls_whose_names_are_alike_are_refused_each():
     with raises(SimulationError, name="surface") as caught:
         nominal_bodies(sheet(), walls=[0.2, 0.2001])
     [reason] = caught.value.value
-    assert reason.startswith("wall of 2e+02 mm, wall of 2e+02 mm: ")
+    assert reason.startswith("wall of 200 mm, wall of 200 mm: ")
     assert "0.2001" not in str(caught.value)
     found = nominal_bodies(sheet(), walls=[0.2, 0.2001, 0.004], count=4, dofs=2000)
     assert list(found.refused) == [0.2, 0.2001]

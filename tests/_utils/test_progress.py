@@ -1,4 +1,4 @@
-"""Progress in a file or a pipe: lines that repeat while work runs, and nothing for short work or where none is wanted."""
+"""Progress in a file or a pipe: lines that repeat, and none for short work or where none is wanted."""
 
 import io
 import sys

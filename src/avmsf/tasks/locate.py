@@ -42,9 +42,9 @@ def locate(
     fitted to (see `hear`), `points` and `directions` as for `Locator.of`. `force` is the peak force of the impact, a
     number or `Force`, see `Locator.locate`; a note says where the recording's own force channel differs. `locator` is
     one made of the field before, with points of its own. That of the last field and its own points is cached, so that
-    of several recordings only the first waits for it. With `progress`, the standard error says that it works. The sound of another object has a `refusal` in place of a
-    position, see `judged`. Raises LocationError as `hear` and `Locator.locate`, and for a locator of another field or
-    given with points.
+    of several recordings only the first waits for it. With `progress`, the standard error says that it works. The sound
+    of another object has a `refusal` in place of a position, see `judged`. Raises LocationError as `hear` and
+    `Locator.locate`, and for a locator of another field or given with points.
     """
     if locator is not None and (locator.field is not field or points is not None or directions is not None):
         what = "points or directions" if locator.field is field else "another field"
