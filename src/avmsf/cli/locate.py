@@ -16,7 +16,7 @@ from avmsf.capture import CaptureSettings
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.cli.contacts import Contacts, refuse_far
 from avmsf.cli.heartbeat import doing
-from avmsf.cli.options.locate import Options
+from avmsf.cli.options.locate import RECORDING, Options
 from avmsf.cli.printing import console, figure, next_command, print_json, say
 from avmsf.errors import AvmsfError, LocationError
 from avmsf.field.soundfield import SoundField
@@ -49,6 +49,7 @@ def run(options: Options) -> int:
         if found:
             doing(f"locating the impact of {path}")
         try:
+            RECORDING.check(path)
             answers = _answers(known, read_recording(path), path, settings, force, options)
         except AvmsfError as error:
             if len(options.recordings) == 1:
