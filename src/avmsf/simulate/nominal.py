@@ -378,7 +378,7 @@ class _Maker:
     def solid(self, wall: float | None, dofs: int) -> Solid:
         """Return tetrahedra with about so many degrees of freedom."""
         expect_memory(dofs)
-        self._tell(f"tetrahedra: {body_name(wall)}")
+        self._tell(f"dividing the {body_name(wall)} into tetrahedra")
         if wall is None:
             return filled_solid(self.checked, dofs)
         if self._shape is not None:
@@ -459,8 +459,8 @@ def _grouped(refused: Mapping[float | None, str]) -> list[str]:
 
 
 def body_name(wall: float | None) -> str:
-    """Return what a body of this wall, meters, is called, with two digits."""
-    return "filled" if wall is None else f"wall of {_millimeters(wall, 2)}"
+    """Return what a body of this wall, meters, is called, with two digits; None is all that the surface encloses."""
+    return "enclosed volume" if wall is None else f"wall of {_millimeters(wall, 2)}"
 
 
 def _millimeters(meters: float, digits: int) -> str:
