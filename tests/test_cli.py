@@ -90,6 +90,16 @@ def test_a_verbs_help_starts_with_the_sentence_that_the_list_has(verb: str, caps
     assert VERBS[verb].rstrip(".") in told
 
 
+def test_common_options_may_stand_before_the_verb(capture: Path, capsys: Streams) -> None:
+    results = []
+    for words in (["check", str(capture), "--json", "--quiet"], ["--json", "--quiet", "check", str(capture)]):
+        assert main(words) == 0
+        results.append(capsys.readouterr())
+    assert results[0] == results[1]
+    assert json.loads(results[0].out)
+    assert main(["--quiet"]) == 2
+
+
 def test_what_is_no_verb_ends_with_2_on_the_standard_error(capsys: Streams) -> None:
     for words in (["fit"], ["fit", "capture", "--output", "x", "--steps", "many"]):
         with pytest.raises(SystemExit) as ended:
