@@ -108,7 +108,7 @@ def test_a_second_blow_is_said_and_not_heard(locator):
     both = torch.cat([impacts.sounds[0][:5400], impacts.sounds[1]])
     found = locate(true_field(), recorded(both), locator=locator)
     assert "at 0.100 s and at 0.4" in found.notes[0]
-    assert "locate_blows" in found.notes[0]
+    assert "locate_impacts" in found.notes[0]
     assert missed(found, found.most_probable, impacts.contacts[0]) < 0.03
 
 

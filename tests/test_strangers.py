@@ -6,7 +6,7 @@ import torch
 from avmsf.tasks.amplitudes import Extractor
 from avmsf.tasks.listening import Listener
 from avmsf.tasks.locate import DOUBTFUL, STRANGE, locate
-from avmsf.tasks.severalblows import locate_blows
+from avmsf.tasks.multi_impact import locate_impacts
 from damped_plates import RATE, damped_blows, damped_field, damped_locator
 
 FOREIGN = [("wood", "wood", 0.2), ("wood", "wood", 0.33), ("plastic", "wood", 0.2), ("plastic", "plastic", 0.2)]
@@ -43,7 +43,7 @@ def test_of_several_blows_the_strangers_are_left_out(material, other, length):
     own = damped_blows(material, heard_by=material)[0]
     foreign = damped_blows(other, length=length, heard_by=material)[1]
     both = torch.cat([recorded(own), recorded(foreign)])
-    found = locate_blows(damped_field(material), both, locator=damped_locator(material))
+    found = locate_impacts(damped_field(material), both, locator=damped_locator(material))
     assert [round(seconds, 2) for seconds, _ in found] == [0.1]
 
 

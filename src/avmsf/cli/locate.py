@@ -25,8 +25,8 @@ from avmsf.localization.contact_map import ContactMap, not_located, symmetries_o
 from avmsf.scene.symmetry import Symmetries
 from avmsf.tasks.locate import locate
 from avmsf.tasks.locator import Locator
+from avmsf.tasks.multi_impact import locate_impacts
 from avmsf.tasks.posterior import Force
-from avmsf.tasks.severalblows import locate_blows
 
 UNLOCATED = 2
 """The exit code where a recording could not be located."""
@@ -96,21 +96,21 @@ def _answers(
 ) -> list[tuple[dict[str, Any], ContactMap | None]]:
     """Return the values for each impact of a recording, and its map; None for one that could not be located."""
     try:
-        blows = _blows(known, recording, settings, force, several=options.several)
+        impacts = _impacts(known, recording, settings, force, several=options.several)
     except LocationError as error:
         return [({"recording": str(path), "seconds": None, **not_located(str(error))}, None)]
     return [
         (_describe(str(path), seconds, contact, known, options.probability), None if contact.refusal else contact)
-        for seconds, contact in blows
+        for seconds, contact in impacts
     ]
 
 
-def _blows(
+def _impacts(
     known: _Known, recording: Recording, settings: CaptureSettings | None, force: Force | None, *, several: bool
 ) -> list[tuple[float | None, ContactMap]]:
     """Return the onsets of a recording's impacts, seconds, where there may be several, and their contacts."""
     if several:
-        return [*locate_blows(known.field, recording, settings=settings, force=force, locator=known.locator)]
+        return [*locate_impacts(known.field, recording, settings=settings, force=force, locator=known.locator)]
     found = locate(known.field, recording, settings=settings, force=force, locator=known.locator, progress=False)
     return [(None, found)]
 

@@ -8,7 +8,7 @@ from .locator import Locator as Locator
 from .material import change_material as change_material
 from .materialstatistics import MaterialStatistics as MaterialStatistics
 from .modes import adjust_modes as adjust_modes
+from .multi_impact import locate_impacts as locate_impacts
 from .posterior import Force as Force
 from .reference import Reference as Reference
-from .severalblows import locate_blows as locate_blows
 from .stableaudio import StableAudio as StableAudio

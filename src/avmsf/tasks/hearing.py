@@ -84,7 +84,7 @@ def hear(
         rate = whole.sample_rate
         notes.append(
             f"{whole.name}: expected one impact, got more, at {prepared.onset / rate:.3f} s and at {second / rate:.3f} "
-            "s: only the first was located; --several (in Python locate_blows) locates all"
+            "s: only the first was located; --several (in Python locate_impacts) locates all"
         )
         sound = sound[: max(second - begin, shortest_allowed(rate))]
     at_rate, highest, remark = at_field_rate(sound, whole, field, speed=chosen.playback_speed)
