@@ -2,7 +2,6 @@ from .config import DistillationConfig as DistillationConfig
 from .config import GuidedEditConfig as GuidedEditConfig
 from .distillation import DecoderDistillation as DecoderDistillation
 from .guided import edit_towards as edit_towards
-from .listening import Listener as Listener
 from .locate import locate as locate
 from .locator import Locator as Locator
 from .material import change_material as change_material
@@ -12,3 +11,5 @@ from .multi_impact import locate_impacts as locate_impacts
 from .posterior import Force as Force
 from .reference import Reference as Reference
 from .stableaudio import StableAudio as StableAudio
+from .streaming import LocatedImpact as LocatedImpact
+from .streaming import StreamingLocalizer as StreamingLocalizer
