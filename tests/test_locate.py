@@ -382,7 +382,7 @@ def test_fields_that_were_edited_and_know_no_contacts_are_located_on_too():
     impacts = struck(2, seed=44)
     for field in (true_field(), adjust_modes(true_field(), pitch=1.1)):
         assert contacts_of(field) is None
-        assert Locator.of(field).slack is None
+        assert Locator.of(field).smoothing is None
     higher = adjust_modes(replace(true_field(), origin=Origin(trained_on=("a", "b"))), pitch=1.1)
     assert contacts_of(higher) == 2
     sound = higher.render(impacts.contacts[:1])[0]
