@@ -147,7 +147,9 @@ class Locator:
             amplitudes.part(float(detuned.mean())),
             float(found.force[row]) / length.unit,
             evidence=free.evidence(self.areas),
-            notes=() if scaled is None else _force_notes(scaled, free, exponent, length.unit),
+            notes=()
+            if scaled is None
+            else _force_notes(scaled, free, exponent, length.unit, per_newton=self.field.origin.per_newton),
         )
 
     def prepare(self, *samples: int) -> None:
@@ -290,7 +292,7 @@ def _decorrelated(
     return PredictedGains(gains, power, variance, usual, shares.T @ extractor.bank.frequency)
 
 
-def _force_notes(force: Force, free: Judgement, exponent: float, unit: float) -> tuple[str, ...]:
+def _force_notes(force: Force, free: Judgement, exponent: float, unit: float, *, per_newton: bool) -> tuple[str, ...]:
     """Return a note where no likely position has about that force; `free` is what the sound says without it."""
     likely = exponent * (free.log_likelihood - free.log_likelihood.max()) > _LIKELY
     forces = free.force[likely].abs()
@@ -298,10 +300,12 @@ def _force_notes(force: Force, free: Judgement, exponent: float, unit: float) ->
     if float(level.min()) <= _FORCE_DEVIATIONS * force.spread_db:
         return ()
     fitting, given = float(forces[level.argmin()]) / unit, force.expected / unit
-    return (
-        f"expected a force of about {fitting:.2g} by the sound's level, got {given:.3g}; the force of a recording that "
-        "was divided by its force is 1",
+    meaning = (
+        "that of a recording which was divided by its force is 1"
+        if per_newton
+        else "for this field, whose recordings were not divided by their forces, 1 is that of an average one"
     )
+    return (f"expected a force of about {fitting:.2g} by the sound's level, got {given:.3g}; {meaning}",)
 
 
 def _expect_more_than_noise(values: Complex128[Tensor, " modes"], noise: Float64[Tensor, " modes"]) -> None:
