@@ -39,9 +39,9 @@ from avmsf.simulate.shapes.shape import Symmetry
 from avmsf.simulate.sim20 import NON_SYMMETRIC, SIM20, sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from avmsf.simulate.truth import Truth, read_truth
-from avmsf.tasks.listening import Blow, Listener
 from avmsf.tasks.locate import locate
 from avmsf.tasks.locator import Locator
+from avmsf.tasks.streaming import LocatedImpact, StreamingLocalizer
 from benchmarks.look import slab
 from benchmarks.material import STRUCK, capture_in_place, shared_data, surface_features
 from benchmarks.report import Options, Report, Table, show, tell
@@ -301,7 +301,7 @@ def _strangers(options: LocatingOptions) -> Report:
 
 def _refusal(field: SoundField, locator: Locator, sound: torch.Tensor) -> str | None:
     try:
-        return locate(field, sound, locator=locator).refusal
+        return locate(field, sound, locator=locator, progress=False).refusal
     except LocationError as error:
         return str(error)
 
@@ -357,15 +357,15 @@ def _stream(options: LocatingOptions) -> Report:
         gains=_estimator(slab(STRUCK.plate), 0.0, "plate", options),
     )
     begun = time.process_time()
-    listener = Listener(Locator.of(field))
+    listener = StreamingLocalizer(Locator.of(field))
     prepared = time.process_time() - begun
     stream, begins = streamed(test, STREAM_BLOWS)
-    blows: list[Blow] = []
+    blows: list[LocatedImpact] = []
     unloaded: list[float] = []
     computed = 0.0
     for number, block in enumerate(torch.split(stream, STREAM_BLOCK), start=1):
         begun = time.process_time()
-        answers = listener.hear(block)
+        answers = listener.process(block)
         taken = time.process_time() - begun
         computed += taken
         blows += answers

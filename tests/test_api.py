@@ -203,6 +203,15 @@ def test_a_recording_is_located_by_its_path_or_its_samples(tmp_path):
     assert all(float((place - expected).norm()) < 0.03 for place in places)  # meters
 
 
+@pytest.mark.parametrize("progress", [True, False])
+def test_long_work_says_what_it_does_in_a_pipe_too(monkeypatch, capsys, progress):
+    monkeypatch.setattr("avmsf._utils.progress.REPEAT_SECONDS", 1e-3)
+    avmsf.locate(field(), capture().impacts.sounds[3], points=field().gain_field.points, progress=progress)
+    assert ("locating" in capsys.readouterr().err) == progress
+    SoundField.fit(capture(), config=PipelineConfig(modes=2, fit=FitConfig(steps=2)), progress=progress)
+    assert (" ... 0 s" in capsys.readouterr().err) == progress
+
+
 def test_evaluation_aligns_recordings_as_the_fit_did(tmp_path):
     late = 40
     sounds = torch.nn.functional.pad(plate_impacts().sounds, (late, late))

@@ -90,6 +90,16 @@ def test_a_verbs_help_starts_with_the_sentence_that_the_list_has(verb: str, caps
     assert VERBS[verb].rstrip(".") in told
 
 
+def test_common_options_may_stand_before_the_verb(capture: Path, capsys: Streams) -> None:
+    results = []
+    for words in (["check", str(capture), "--json", "--quiet"], ["--json", "--quiet", "check", str(capture)]):
+        assert main(words) == 0
+        results.append(capsys.readouterr())
+    assert results[0] == results[1]
+    assert json.loads(results[0].out)
+    assert main(["--quiet"]) == 2
+
+
 def test_what_is_no_verb_ends_with_2_on_the_standard_error(capsys: Streams) -> None:
     for words in (["fit"], ["fit", "capture", "--output", "x", "--steps", "many"]):
         with pytest.raises(SystemExit) as ended:
@@ -359,6 +369,16 @@ def test_fit_says_why_elastic_mode_shapes_took_no_part(tmp_path: Path, capsys: S
     # Told to do without them, it does not look for any.
     assert main(["fit", str(folder), "--output", str(fields / "one.safetensors"), "--gain-model", "smooth", *TINY]) == 0
     assert "elastic mode" not in capsys.readouterr().err
+
+
+def test_a_stated_wall_that_the_object_cannot_have_ends_the_fit(tmp_path: Path, capsys: Streams) -> None:
+    folder, output = fill_plate(tmp_path / "plate"), tmp_path / "plate.safetensors"
+    for words in (["fit", str(folder)], ["fit", str(folder / "surface.ply"), "--material", "glass"]):
+        assert main([*words, "--output", str(output), "--body.wall", "3", *TINY]) == 2
+        error = capsys.readouterr().err
+        assert "--body.wall" in error
+        assert "finding the modes" not in error
+    assert not output.exists()
 
 
 @pytest.mark.parametrize("wrong", ["no mesh, seen before the modes", "a rate that diverges, seen after them"])

@@ -187,15 +187,16 @@ def test_recordings_without_a_blow_on_the_object_have_no_place(place: Place, tmp
 
 def test_one_bad_recording_does_not_cost_the_others(place: Place, capsys: Streams) -> None:
     silent, unreadable = str(place.folder / "quiet.wav"), place.folder / "text.wav"
+    missing = [str(place.folder / "missing.wav"), str(place.folder)]
     soundfile.write(silent, np.zeros(SAMPLES), RATE)
     unreadable.write_text("no sound")
     hit = place.wav("beside.wav", place.blow(STRUCK))
-    assert run(parse([place.field, silent, str(unreadable), hit, "--json"])) == 2
+    assert main(["locate", place.field, silent, str(unreadable), *missing, hit, "--json"]) == 2
     out, err = capsys.readouterr()
     printed = json.loads(out)
     assert [blow["recording"] for blow in printed["impacts"]] == [silent, hit]
     assert [blow["status"] for blow in printed["impacts"]] == ["not located", "located"]
-    assert [each["recording"] for each in printed["failures"]] == [str(unreadable)]
+    assert [each["recording"] for each in printed["failures"]] == [str(unreadable), *missing]
     assert "text.wav" in err
 
 

@@ -14,7 +14,7 @@ from avmsf.field.soundfield import Origin, SoundField
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
 from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts
-from avmsf.tasks.heed import heed_of
+from avmsf.tasks.heed import calibrate_tempering
 from avmsf.tasks.locator import Locator
 
 PLATE = Plate()
@@ -41,16 +41,16 @@ def plate_field(taps: int, *, copies: int = 1, again: int = 1) -> SoundField:
 
 def test_modes_that_err_alike_tell_no_more_than_one_of_them() -> None:
     # Ten times as many modes tell nothing new; what is thought beforehand keeps the factor from a whole tenth.
-    assert heed_of(plate_field(40, copies=10)) < 0.3 * heed_of(plate_field(40))
+    assert calibrate_tempering(plate_field(40, copies=10)) < 0.3 * calibrate_tempering(plate_field(40))
 
 
 def test_levels_and_edits_change_nothing() -> None:
     field = plate_field(20)
     gains = field.gain_field
     louder = replace(field, gain_field=gains.with_values(1000.0 * gains.values))
-    assert heed_of(louder) == heed_of(field)
+    assert calibrate_tempering(louder) == calibrate_tempering(field)
     edited = replace(field, gain_field=ScaledGains(gains, torch.full((len(field.bank),), 0.1).double(), 2.0))
-    assert heed_of(edited) == heed_of(field)
+    assert calibrate_tempering(edited) == calibrate_tempering(field)
 
 
 def test_modes_that_an_edit_muted_have_no_say() -> None:
@@ -58,19 +58,19 @@ def test_modes_that_an_edit_muted_have_no_say() -> None:
     scale = torch.zeros(len(whole.bank), dtype=torch.float64)
     scale[: len(scale) // 10] = 3.0
     muted = replace(whole, gain_field=ScaledGains(whole.gain_field, scale))
-    assert heed_of(muted) == pytest.approx(heed_of(plate_field(40)), rel=0.2)
+    assert calibrate_tempering(muted) == pytest.approx(calibrate_tempering(plate_field(40)), rel=0.2)
 
 
 def test_fields_with_too_few_strikes_are_trusted_as_fields_are_on_the_whole() -> None:
     few = plate_field(20)
     only = few.gain_field.without(torch.arange(20) >= 2)
-    assert heed_of(replace(few, gain_field=only)) == 1.0
-    assert heed_of(plate_field(1, again=20)) == 1.0
+    assert calibrate_tempering(replace(few, gain_field=only)) == 1.0
+    assert calibrate_tempering(plate_field(1, again=20)) == 1.0
 
 
 def test_a_strike_in_the_same_place_as_another_is_left_out_with_it() -> None:
     # Predicted from itself, an impact would be found to a hair's breadth.
-    assert heed_of(plate_field(12, again=2)) == pytest.approx(heed_of(plate_field(12)), rel=0.3)
+    assert calibrate_tempering(plate_field(12, again=2)) == pytest.approx(calibrate_tempering(plate_field(12)), rel=0.3)
 
 
 def test_regions_are_the_wider_the_less_a_mode_counts() -> None:
@@ -78,6 +78,6 @@ def test_regions_are_the_wider_the_less_a_mode_counts() -> None:
     sound, sizes = field.render(field.gain_field.points[200:201])[0], []
     for heed in (1.0, 0.1, 0.01):
         locator = Locator.of(field)
-        vars(locator)["_heed"] = heed
+        vars(locator)["_tempering_factor"] = heed
         sizes.append(int(locator.locate(sound).region().sum()))
     assert sizes[0] < sizes[1] < sizes[2]

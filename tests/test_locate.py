@@ -210,6 +210,29 @@ def test_a_force_that_cannot_be_is_refused(value):
     assert caught.value.value is value
 
 
+@pytest.mark.parametrize("given", [2.0, 2, torch.tensor([2.0]), [2.0]], ids=repr)
+def test_a_force_may_be_a_number(given):
+    sound = struck(1, seed=3).sounds[0]
+    found = locate(true_field(), sound, force=given, locator=locator_of())
+    prior = locate(true_field(), sound, force=Force(2.0), locator=locator_of())
+    assert torch.equal(found.probability, prior.probability)
+
+
+@pytest.mark.parametrize(("given", "value"), [([1.0, 2.0], [2]), ([[1.0], [2.0, 3.0]], "list")])
+def test_forces_that_are_no_number_are_refused(given, value):
+    with raises(LocationError, name="force", value=value):
+        locate(true_field(), struck(1, seed=3).sounds[0], force=given, locator=locator_of())
+
+
+def test_a_force_that_the_level_contradicts_is_noted():
+    sound = struck(1, seed=3).sounds[0]
+    force = abs(locator_of().locate(sound).force)
+    assert locator_of().locate(sound, force=1.5 * force).notes == ()
+    for factor in (0.05, 20.0):
+        (note,) = locator_of().locate(sound, force=factor * force).notes
+        assert f"{factor * force:.3g}" in note
+
+
 def test_the_region_grows_with_the_noise():
     locator = locator_of()
     sizes = [
@@ -274,8 +297,11 @@ def test_another_plate_is_refused_with_the_number(length):
         assert locator.locate(sound).mismatch_ratio > 1.5 * STRANGE
         found = locate(true_field(), sound, locator=locator)
         assert f"a mismatch ratio of {found.mismatch_ratio:.2f}" in found.refusal
-        with raises(LocationError, name="position", value=found.mismatch_ratio):
-            _ = found.position
+        for name in ("position", "most_probable"):
+            with raises(LocationError, name=name, value=found.mismatch_ratio):
+                getattr(found, name)
+        assert bool(found.probability.isnan().all())
+        assert bool(found.distance.isfinite().all())
 
 
 @pytest.mark.parametrize("noise_db", [-40.0, 0.0])
@@ -356,7 +382,7 @@ def test_fields_that_were_edited_and_know_no_contacts_are_located_on_too():
     impacts = struck(2, seed=44)
     for field in (true_field(), adjust_modes(true_field(), pitch=1.1)):
         assert contacts_of(field) is None
-        assert Locator.of(field).slack is None
+        assert Locator.of(field).smoothing is None
     higher = adjust_modes(replace(true_field(), origin=Origin(trained_on=("a", "b"))), pitch=1.1)
     assert contacts_of(higher) == 2
     sound = higher.render(impacts.contacts[:1])[0]

@@ -74,6 +74,19 @@ def test_how_hard_a_blow_was_is_heard_where_its_push_was_recorded():
         for force in (0.02, 0.4)
     )
     assert float(hard.sound.norm() / soft.sound.norm()) == pytest.approx(20.0, rel=1e-3)
+    assert (soft.newtons, hard.newtons) == (pytest.approx(0.02, rel=0.05), pytest.approx(0.4, rel=0.05))
+
+
+def test_a_force_that_the_force_channel_contradicts_is_noted(locator):
+    sound = recorded(struck(1, seed=25).sounds[0]).channels[0]
+    push = np.zeros_like(sound)
+    push[1796:1805] = 8.0 * np.sin(np.pi * np.arange(1, 10) / 10)
+    both = Recording("hit.wav", np.stack([push, sound]), RATE, "FLOAT")
+    field = replace(true_field(), origin=replace(true_field().origin, per_newton=True))
+    settings, finder = CaptureSettings(force_channel=1, response_channel=2), replace(locator, field=field)
+    for force, noted in ((8.0, False), (12.0, True)):
+        notes = locate(field, both, settings=settings, force=force, locator=finder).notes
+        assert any("force channel" in note for note in notes) == noted
 
 
 def test_a_rate_that_holds_no_mode_is_refused():
@@ -95,7 +108,7 @@ def test_a_second_blow_is_said_and_not_heard(locator):
     both = torch.cat([impacts.sounds[0][:5400], impacts.sounds[1]])
     found = locate(true_field(), recorded(both), locator=locator)
     assert "at 0.100 s and at 0.4" in found.notes[0]
-    assert "locate_blows" in found.notes[0]
+    assert "locate_impacts" in found.notes[0]
     assert missed(found, found.most_probable, impacts.contacts[0]) < 0.03
 
 

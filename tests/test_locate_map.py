@@ -53,20 +53,50 @@ def test_the_credible_radius_and_the_standard_deviation_are_those_about_the_most
         found.credible_radius(0.0)
 
 
-def test_peaks_are_places_apart_of_comparable_probability():
+def test_peaks_are_positions_apart_that_hold_some_probability():
     chances = [0.0] * 30
     chances[3], chances[4], chances[5] = 0.2, 0.2, 0.1
     chances[20], chances[21] = 0.25, 0.2
     chances[28] = 0.05
     found = made(chances)
-    first, second = found.peaks(0.95)
+    first, second = found.peaks(0.94)
     assert (first.row, second.row) == (3, 20)
     assert first.probability == pytest.approx(0.5)
     assert second.probability == pytest.approx(0.45)
     assert second.points.nonzero().flatten().tolist() == [20, 21]
     assert found.multimodal
-    assert len(found.peaks(0.99, comparable=0.05)) == 3
+    assert len(found.peaks(0.99, least=0.04)) == 3
+    assert len(found.peaks(0.99, least=0.06)) == 2
     assert not made([0.1, 0.8, 0.1]).multimodal
+
+
+def test_small_peaks_make_a_map_multimodal():
+    chances = [0.0] * 40
+    for row, chance in ((0, 0.64), (8, 0.1), (16, 0.1), (24, 0.1), (32, 0.03), (39, 0.03)):
+        chances[row] = chance
+    found = made(chances)
+    assert found.multimodal
+    assert [round(each.probability, 2) for each in found.equivalent_points()] == [0.1, 0.1, 0.1]
+    assert len(found.equivalent_points(level=0.99)) == 3
+
+
+def test_other_positions_include_a_broader_peak_and_not_the_answer():
+    chances = [0.0] * 30
+    chances[20] = 0.15
+    chances[0:8] = [0.07] * 8
+    chances[26] = 0.29
+    found = made(chances)
+    broad, narrow = found.equivalent_points(level=0.999)
+    assert found.position.tolist() == pytest.approx([0.26, 0.0, 0.0])
+    assert (broad.probability, narrow.probability) == (pytest.approx(0.56), pytest.approx(0.15))
+    positions = [each["position"][0] for each in found.describe(level=0.999)["equivalent_points"]]
+    assert positions == [pytest.approx(0.0, abs=0.08), pytest.approx(0.2)]
+
+
+def test_a_map_that_is_printed_shows_its_notes():
+    found = replace(made([0.1, 0.8, 0.1]), notes=("explains 4 %",))
+    assert "explains 4 %" in repr(found)
+    assert "explains 4 %" in repr(replace(found, refusal="another object"))
 
 
 def test_a_symmetric_plate_is_ambiguous_and_each_counterpart_is_named():

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from avmsf.tasks.amplitudes import Extractor
-from avmsf.tasks.listening import Listener
 from avmsf.tasks.locate import DOUBTFUL, STRANGE, locate
-from avmsf.tasks.severalblows import locate_blows
+from avmsf.tasks.multi_impact import locate_impacts
+from avmsf.tasks.streaming import StreamingLocalizer
 from damped_plates import RATE, damped_blows, damped_field, damped_locator
 
 FOREIGN = [("wood", "wood", 0.2), ("wood", "wood", 0.33), ("plastic", "wood", 0.2), ("plastic", "plastic", 0.2)]
@@ -43,25 +43,28 @@ def test_of_several_blows_the_strangers_are_left_out(material, other, length):
     own = damped_blows(material, heard_by=material)[0]
     foreign = damped_blows(other, length=length, heard_by=material)[1]
     both = torch.cat([recorded(own), recorded(foreign)])
-    found = locate_blows(damped_field(material), both, locator=damped_locator(material))
+    found = locate_impacts(damped_field(material), both, locator=damped_locator(material))
     assert [round(seconds, 2) for seconds, _ in found] == [0.1]
 
 
 @pytest.mark.parametrize(("material", "other", "length"), FOREIGN)
 def test_a_stream_refuses_strangers_or_doubts_them(material, other, length):
-    listener, foreign = Listener(damped_locator(material)), damped_blows(other, length=length, heard_by=material)[:4]
-    blows = [blow for sound in foreign for blow in listener.hear(recorded(sound))]
-    assert listener.ears.strangers + len(blows) == len(foreign)
+    listener, foreign = (
+        StreamingLocalizer(damped_locator(material)),
+        damped_blows(other, length=length, heard_by=material)[:4],
+    )
+    blows = [blow for sound in foreign for blow in listener.process(recorded(sound))]
+    assert listener.state.rejected + len(blows) == len(foreign)
     # In 40 ms broad modes are told apart less than in all of a sound.
     assert len(blows) <= 1
     assert all("mismatch ratio" in note for blow in blows for note in blow.map.notes)
-    assert "mismatch ratio" in listener.ears.refusal
+    assert "mismatch ratio" in listener.state.refusal
 
 
 @pytest.mark.parametrize("material", ["wood", "plastic"])
 def test_a_stream_answers_its_own_blows(material):
-    listener, own = Listener(damped_locator(material)), damped_blows(material, heard_by=material)[:4]
-    blows = [blow for sound in own for blow in listener.hear(recorded(sound))]
+    listener, own = StreamingLocalizer(damped_locator(material)), damped_blows(material, heard_by=material)[:4]
+    blows = [blow for sound in own for blow in listener.process(recorded(sound))]
     assert [blow.map.notes for blow in blows] == [()] * 4
 
 

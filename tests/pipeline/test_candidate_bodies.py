@@ -9,7 +9,8 @@ import torch
 
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.surface import Surface
-from avmsf.errors import FitError
+from avmsf.config import BodyConfig, PipelineConfig
+from avmsf.errors import FitError, SimulationError
 from avmsf.fem.supports import Support
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
@@ -21,7 +22,7 @@ from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesize_phased
-from avmsf.pipeline.bodies import candidate_bodies
+from avmsf.pipeline.bodies import candidate_bodies, stated_bodies
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.nominal import NominalBodies, NominalBody
 from made_dome import STIFFER, WALLS, bodies, dome, points, truth
@@ -170,9 +171,8 @@ def test_estimators_of_other_bodies_or_elements_have_other_digests() -> None:
 
 def test_reasons_against_other_bodies_are_reported() -> None:
     known = CandidateBodies(NominalBodies(bodies()[1:2], {None: "the mesh is open"}))
-    assert MixtureEstimator(bodies=known).start(case(), "shared").report["unavailable"] == {
-        "filled": "the mesh is open"
-    }
+    report = MixtureEstimator(bodies=known).start(case(), "shared").report
+    assert report["unavailable"] == {"enclosed volume": "the mesh is open"}
 
 
 @pytest.mark.parametrize("directions", [None, torch.zeros(12, 3)], ids=["no directions", "directions of length zero"])
@@ -232,6 +232,28 @@ def test_bodies_take_part_despite_rough_surfaces_thick_glue_and_a_wrong_row(coun
     above[-1] += 0.5 * size
     for body, each in ((rough, contacts), (bodies()[1], above)):
         assert estimator(body).start(case(count, contacts=each), "shared").report["bodies"]
+
+
+@pytest.mark.parametrize(
+    ("config", "name", "value"),
+    [(BodyConfig(wall=3.0), "wall", 3.0), (BodyConfig(wall=0.0), "wall", 0.0), (BodyConfig(dofs=5), "dofs", 5)],
+    ids=repr,
+)
+def test_stated_settings_that_leave_no_body_are_refused(config: BodyConfig, name: str, value: float) -> None:
+    def make() -> CandidateBodies:
+        return candidate_bodies(dome(), config)
+
+    for model in ("auto", "elastic"):
+        with raises(SimulationError, name=name, value=value):
+            stated_bodies(PipelineConfig(gain_model=model, body=config), make)
+    stated_bodies(PipelineConfig(gain_model="smooth", body=config), make)
+
+
+def test_what_no_setting_is_the_reason_of_is_no_error() -> None:
+    def fail() -> CandidateBodies:
+        raise SimulationError("3.1 GB are free")
+
+    stated_bodies(PipelineConfig(body=BodyConfig(wall=0.004)), fail)
 
 
 def test_contacts_elsewhere_are_refused_before_any_body_is_computed() -> None:

@@ -20,7 +20,7 @@ def test_threads_share_what_is_cached(monkeypatch: pytest.MonkeyPatch) -> None:
     locator = Locator.of(plate_field("elastic"))
     made: Counter[Any] = Counter()
     together = threading.Barrier(THREADS)
-    of, heed_of = _Length.of, module.heed_of
+    of, calibrate = _Length.of, module.calibrate_tempering
 
     def slow_length(locator: Locator, samples: int, highest: float) -> _Length:
         made[samples] += 1
@@ -30,10 +30,10 @@ def test_threads_share_what_is_cached(monkeypatch: pytest.MonkeyPatch) -> None:
     def slow_heed(field: Any) -> float:
         made["heed"] += 1
         time.sleep(0.02)
-        return heed_of(field)
+        return calibrate(field)
 
     monkeypatch.setattr(module._Length, "of", staticmethod(slow_length))
-    monkeypatch.setattr(module, "heed_of", slow_heed)
+    monkeypatch.setattr(module, "calibrate_tempering", slow_heed)
 
     def prepare(_: int) -> None:
         together.wait(20)

@@ -48,7 +48,7 @@ from avmsf.studio.studio import StudioConfig
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.material import change_material
 from avmsf.tasks.modes import adjust_modes
-from avmsf.tasks.severalblows import locate_blows
+from avmsf.tasks.multi_impact import locate_impacts
 from capture_folder import fill, ring
 from opened_plate import RATE, blow, open_plate, plate_field, wav
 from plate_capture import fill_plate
@@ -109,7 +109,7 @@ def test_a_recorded_blow_is_located_as_the_task_does(plate: Served) -> None:
         answer = plate.ask("POST", "locate", wav(sound.numpy()))
         assert answer.status == 200
         [found] = answer.words["impacts"]
-        [(seconds, expected)] = locate_blows(field, sound, locator=Locator.of(field, points=points))
+        [(seconds, expected)] = locate_impacts(field, sound, locator=Locator.of(field, points=points))
         assert (found["row"], found["seconds"]) == (expected.most_probable, seconds)
         assert np.array_equal(unpacked(found["probability"]), expected.probability.float())
         assert np.array_equal(unpacked(found["distance"]), expected.distance.float())
@@ -268,7 +268,7 @@ def test_only_the_current_revision_is_prepared_and_symmetries_once(
     finder = plate.studio.searches.finder_of(plate.studio.session.current)
     _ = finder.symmetries
     assert len(searched) == 1
-    assert {"locator", "_heed"} <= vars(finder).keys() | vars(finder.locator).keys()
+    assert {"locator", "_tempering_factor"} <= vars(finder).keys() | vars(finder.locator).keys()
 
 
 @pytest.mark.slow

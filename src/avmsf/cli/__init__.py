@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from difflib import get_close_matches
 from importlib import import_module
+from itertools import takewhile
 from types import FrameType
 from typing import TextIO
 
@@ -61,6 +62,8 @@ TERMINATED = 143
 """The exit code that shells give a command ended by SIGTERM."""
 _WAITING = frozenset({"studio"})
 """Verbs that wait for their user most of the time."""
+_COMMON = frozenset({"--quiet", "--verbose", "--json"})
+"""Options that may also stand before the verb."""
 _WIDEST = 120
 """Columns of the list of verbs, at most."""
 _AGAIN = 0.05
@@ -72,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Raises SystemExit, as command lines do, for a verb's help (0) and for options that cannot be understood (2).
     """
-    words = list(sys.argv[1:] if arguments is None else arguments)
+    words = _verb_first(sys.argv[1:] if arguments is None else arguments)
     if words[:1] == ["--version"]:
         print(avmsf.__version__)
         return 0
@@ -180,6 +183,13 @@ def _compilation_announced() -> AbstractContextManager[None]:
     return announced
 
 
+def _verb_first(words: Sequence[str]) -> list[str]:
+    """Return the words with options of all verbs that stand before the verb behind it."""
+    before = list(takewhile(_COMMON.__contains__, words))
+    verb, rest = words[len(before) : len(before) + 1], words[len(before) + 1 :]
+    return [*verb, *before, *rest]
+
+
 def _explain(words: list[str]) -> int:
     """Print the list of verbs and return 0, or print that there is no such verb and return 2."""
     if words and words[0] not in ("-h", "--help"):
@@ -193,7 +203,8 @@ def _explain(words: list[str]) -> int:
     rows = {**VERBS, "--help": "Print this list.", "--version": "Print the version."}
     print("usage: avmsf COMMAND [OPTIONS]\n")
     print("The sound of an impact anywhere on an object, from a few recordings.")
-    print("`avmsf COMMAND --help` explains a command; `avmsf demo` runs a complete example.\n")
+    print("`avmsf COMMAND --help` explains a command; `avmsf demo` runs a complete example.")
+    print("--quiet, --verbose and --json may stand before or after the command.\n")
     separator = "\n" + " " * indent
     for name, sentence in rows.items():
         lines = textwrap.wrap(sentence, max(30, width - indent))

@@ -16,7 +16,7 @@ from avmsf.capture import CaptureSettings
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.cli.contacts import Contacts, refuse_far
 from avmsf.cli.heartbeat import doing
-from avmsf.cli.options.locate import Options
+from avmsf.cli.options.locate import RECORDING, Options
 from avmsf.cli.printing import console, figure, next_command, print_json, say
 from avmsf.errors import AvmsfError, LocationError
 from avmsf.field.soundfield import SoundField
@@ -25,8 +25,8 @@ from avmsf.localization.contact_map import ContactMap, not_located, symmetries_o
 from avmsf.scene.symmetry import Symmetries
 from avmsf.tasks.locate import locate
 from avmsf.tasks.locator import Locator
+from avmsf.tasks.multi_impact import locate_impacts
 from avmsf.tasks.posterior import Force
-from avmsf.tasks.severalblows import locate_blows
 
 UNLOCATED = 2
 """The exit code where a recording could not be located."""
@@ -49,6 +49,7 @@ def run(options: Options) -> int:
         if found:
             doing(f"locating the impact of {path}")
         try:
+            RECORDING.check(path)
             answers = _answers(known, read_recording(path), path, settings, force, options)
         except AvmsfError as error:
             if len(options.recordings) == 1:
@@ -95,22 +96,23 @@ def _answers(
 ) -> list[tuple[dict[str, Any], ContactMap | None]]:
     """Return the values for each impact of a recording, and its map; None for one that could not be located."""
     try:
-        blows = _blows(known, recording, settings, force, several=options.several)
+        impacts = _impacts(known, recording, settings, force, several=options.several)
     except LocationError as error:
         return [({"recording": str(path), "seconds": None, **not_located(str(error))}, None)]
     return [
         (_describe(str(path), seconds, contact, known, options.probability), None if contact.refusal else contact)
-        for seconds, contact in blows
+        for seconds, contact in impacts
     ]
 
 
-def _blows(
+def _impacts(
     known: _Known, recording: Recording, settings: CaptureSettings | None, force: Force | None, *, several: bool
 ) -> list[tuple[float | None, ContactMap]]:
     """Return the onsets of a recording's impacts, seconds, where there may be several, and their contacts."""
     if several:
-        return [*locate_blows(known.field, recording, settings=settings, force=force, locator=known.locator)]
-    return [(None, locate(known.field, recording, settings=settings, force=force, locator=known.locator))]
+        return [*locate_impacts(known.field, recording, settings=settings, force=force, locator=known.locator)]
+    found = locate(known.field, recording, settings=settings, force=force, locator=known.locator, progress=False)
+    return [(None, found)]
 
 
 def _true_contact(options: Options, field: SoundField) -> Float64[Tensor, " 3"] | None:
@@ -156,7 +158,7 @@ def _words(values: dict[str, Any]) -> str:
         error, share = 1000 * values["error"], 100 * values["rmed_posterior"]
         lines.append(f"  {error:.1f} mm from the true contact ({share:.1f} % of the diagonal)")
     if values["multimodal"]:
-        lines.append("  ambiguous: several positions have similar probabilities")
+        lines.append("  ambiguous: there are other possible positions")
     lines += [f"  {other['message']}" for other in values["equivalent_points"]]
     return "\n".join([*lines, *(f"  note: {note}" for note in values["notes"])])
 

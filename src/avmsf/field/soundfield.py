@@ -263,8 +263,7 @@ class SoundField:
         """
         from avmsf.tasks.locate import locate
 
-        with working("locating the impact; the first takes seconds to minutes", shown=progress):
-            return locate(self, recording, sample_rate=sample_rate)
+        return locate(self, recording, sample_rate=sample_rate, progress=progress)
 
     def aligned(self, impacts: Impacts) -> Impacts:
         """Return recordings of the object with the starts that the field's sounds have."""

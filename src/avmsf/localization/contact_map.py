@@ -19,11 +19,12 @@ from avmsf.errors import AvmsfError, LocationError
 from avmsf.field.soundfield import SoundField
 from avmsf.scene.symmetry import MirrorSymmetry, RotationalSymmetry, Symmetries
 from avmsf.scene.symmetrysearch import find_symmetries
+from avmsf.wording import counted
 
 LEVEL = 0.9
 """Probability of a credible region by default."""
-COMPARABLE = 0.25
-"""Fraction of the first peak's probability from which on another peak is reported."""
+MIN_PEAK_PROBABILITY = 0.05
+"""Probability from which on another peak is reported: half of what lies outside a region of 90 %."""
 LOCATED, NOT_LOCATED = "located", "not located"
 """Status of a recording."""
 _LEAST_RESIDUAL = 0.01
@@ -56,7 +57,7 @@ class Peak:
 
 @dataclass(frozen=True, eq=False)
 class EquivalentPoint:
-    """A position about as probable as the most probable one, and the symmetry that maps one to the other."""
+    """Another possible position, and the symmetry that maps the most probable one to it."""
 
     position: Float32[Tensor, " 3"]
     """Object frame, meters."""
@@ -111,13 +112,14 @@ class ContactMap:
     """
 
     def __repr__(self) -> str:
+        notes = f"\nnote: {'; '.join(self.notes)}" if self.notes else ""
         if self.refusal is not None:
-            return f"ContactMap({len(self.points)} points, no position: {self.refusal})"
-        _, *others = self.peaks()
+            return f"ContactMap({len(self.points)} points, no position: {self.refusal}){notes}"
         where = ", ".join(f"{value + 0.0:.3f}" for value in self.position.tolist())
-        more = f", {len(others)} more positions as probable" if others else ""
+        others = len(self._other_peaks(LEVEL))
+        more = f", {counted(others, 'other possible position')}" if others else ""
         radius = f"{LEVEL:.0%} within {1e3 * self.credible_radius():.2g} mm"
-        return f"ContactMap({len(self.points)} points, most probable ({where}) m, {radius}{more})"
+        return f"ContactMap({len(self.points)} points, most probable ({where}) m, {radius}{more}){notes}"
 
     points: Float32[Tensor, "points 3"]
     """Object frame, meters."""
@@ -125,7 +127,8 @@ class ContactMap:
     """The paper's cosine distance between recorded and predicted gains, for an impact of either polarity: 0 where they
     agree up to a factor, 1 where they are orthogonal."""
     probability: Float64[Tensor, " points"]
-    """That the contact is on the part of the surface that a point represents; sums to one."""
+    """That the contact is on the part of the surface that a point represents; sums to one. NaN where the recording was
+    rejected."""
     explained_energy: float
     """Fraction of the sound's energy, without its noise, that an impact at the point of greatest likelihood explains,
     0 to 1."""
@@ -143,6 +146,10 @@ class ContactMap:
     refusal: str | None = None
     """Why the recording was rejected, as that of another object; None if it was located."""
 
+    def rejected(self, reason: str) -> "ContactMap":
+        """Return the map without a position and with NaN for every probability, and the reason as its `refusal`."""
+        return replace(self, probability=torch.full_like(self.probability, math.nan), refusal=reason)
+
     @property
     def best(self) -> int:
         """Index of the point of least cosine distance, the paper's answer, which has no uncertainty; see `position`."""
@@ -159,6 +166,7 @@ class ContactMap:
     @property
     def most_probable(self) -> int:
         """Index of the most probable point."""
+        self._expect_located("most_probable")
         return int(torch.argmax(self.probability))
 
     @property
@@ -206,11 +214,11 @@ class ContactMap:
         spacing = float(np.median(cKDTree(positions).query(positions, k=2)[0][:, 1]))
         return max(_LINK_SPACINGS * spacing, _LINK_FRACTION * diagonal)
 
-    def peaks(self, level: float = LEVEL, *, comparable: float = COMPARABLE) -> tuple[Peak, ...]:
-        """Return the peaks of comparable probability in the credible region, the most probable first.
+    def peaks(self, level: float = LEVEL, *, least: float = MIN_PEAK_PROBABILITY) -> tuple[Peak, ...]:
+        """Return the peaks of the credible region that hold a probability of `least` or more, the largest first.
 
-        A peak is a set of the region's points that are linked by steps of at most `linking_length`. Comparable are
-        peaks with at least that fraction of the first one's probability.
+        A peak is a set of the region's points that are linked by steps of at most `linking_length`. The one that
+        contains `position`, the most probable point, is always among them; a larger peak may be broader and lower.
         """
         rows = torch.nonzero(self.region(level)).flatten()
         positions = self.points[rows].double().numpy()
@@ -225,28 +233,31 @@ class ContactMap:
             members[own] = True
             found.append(Peak(row, self.points[row], float(self.probability[own].sum()), members))
         found.sort(key=lambda peak: (-peak.probability, peak.row))
-        return tuple(peak for peak in found if peak.probability >= comparable * found[0].probability)
+        return tuple(peak for peak in found if peak.probability >= least or peak.points[self.most_probable])
+
+    def _other_peaks(self, level: float) -> tuple[Peak, ...]:
+        """Return the peaks that do not contain the most probable point."""
+        return tuple(peak for peak in self.peaks(level) if not peak.points[self.most_probable])
 
     @property
     def multimodal(self) -> bool:
-        """Whether the posterior has several peaks of comparable probability."""
+        """Whether the contact may be at several positions apart: more than one of the `peaks` of the 90 % region."""
         return len(self.peaks()) > 1
 
     def equivalent_points(
         self, symmetries: Symmetries | None = None, level: float = LEVEL
     ) -> tuple[EquivalentPoint, ...]:
-        """Return the other positions that are about as probable, each with the symmetry that explains it.
+        """Return the other possible positions, those of all `peaks` without `position`, the largest peak first.
 
-        That symmetry is named which maps the first position nearest to the other, if nearer than twice
-        `linking_length`. Empty for a posterior of one peak.
+        Each has the symmetry that maps `position` nearest to it, if nearer than twice `linking_length`. Empty for a
+        posterior of one peak.
         """
-        first, *others = self.peaks(level)
         tolerance = 2.0 * self.linking_length
         return tuple(
             EquivalentPoint.of(
-                first.position, each.position, symmetries, probability=each.probability, tolerance=tolerance
+                self.position, each.position, symmetries, probability=each.probability, tolerance=tolerance
             )
-            for each in others
+            for each in self._other_peaks(level)
         )
 
     def describe(self, symmetries: Symmetries | None = None, level: float = LEVEL) -> dict[str, Any]:

@@ -7,12 +7,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from avmsf._utils.caching import once
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.placement import expect_placed, surface_points
 from avmsf.capture.surface import Surface
-from avmsf.config import BodyConfig
+from avmsf.config import BodyConfig, PipelineConfig
+from avmsf.errors import AvmsfError, SimulationError
 from avmsf.fem.supports import Support
+from avmsf.field.config import AUTO
 from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.field.gains.elastic import Elastic
 from avmsf.simulate.nominal import NominalBody, Shape, nominal_bodies, refined, supported, with_wall
 
 
@@ -106,21 +110,55 @@ def candidate_bodies(
 ) -> CandidateBodies:
     """Return the bodies that a surface may enclose; their mode shapes are cached by content in `cache`.
 
-    Raises SimulationError where no body can be computed, and FitError, before any is, where the contacts of the
-    `impacts` that they are meant for do not lie on the surface.
+    Raises SimulationError where no body can be computed, with the name `wall` where `config` states one, and FitError,
+    before any is, where the contacts of the `impacts` that they are meant for do not lie on the surface.
     """
     config = BodyConfig() if config is None else config
     if impacts is not None:
         seen = surface if isinstance(surface, Surface) else surface.as_seen()
         expect_placed(impacts.contacts, surface_points(seen), names=impacts.names)
     walls = None if config.wall is None else [config.wall or None]
-    bodies = nominal_bodies(surface, walls=walls, count=config.shapes, dofs=config.dofs, cache=cache, tell=tell)
+    try:
+        bodies = nominal_bodies(surface, walls=walls, count=config.shapes, dofs=config.dofs, cache=cache, tell=tell)
+    except SimulationError as error:
+        if config.wall is None or error.name != "surface":
+            raise
+        raise wall_error(surface, config.wall, error) from error
     made = surface, config.dofs, cache, tell or (lambda words: None)
     several = config.wall is None and sum(body.wall is not None for body in bodies.bodies) > 1
     thicken = ThickerBodies(surface, config.shapes, *made[1:]) if several else None
     hold = None if config.supports == "free" else HeldBodies(*made)
     refine = None if len(bodies.bodies) == 1 and hold is None else FinerBodies(*made)
     return CandidateBodies(bodies, refine, hold, config.supports == "try", thicken)
+
+
+def wall_error(surface: Surface | Shape, wall: float, error: SimulationError) -> SimulationError:
+    """Return the error for a stated wall, meters, of which no body can be computed, with the reasons."""
+    seen = surface if isinstance(surface, Surface) else surface.as_seen()
+    extent = float((seen.vertices.amax(0) - seen.vertices.amin(0)).max())
+    reasons = "; ".join(error.value) if isinstance(error.value, list) else str(error)
+    return SimulationError(
+        f"--body.wall: expected a wall thickness in meters that an object of {extent:.3g} m can have, got {wall:g} m "
+        f"({reasons}); give it in meters, as 0.003 for 3 mm, or leave it out",
+        name="wall",
+        value=wall,
+    )
+
+
+def stated_bodies(config: PipelineConfig, bodies: Callable[[], CandidateBodies]) -> Callable[[], CandidateBodies]:
+    """Return `bodies`, computed once, for a gain model that uses them.
+
+    Raises SimulationError, where their settings are not the defaults, for those that leave no body: a wall or degrees
+    of freedom that cannot be. Other failures are left to the gain model: "auto" does without bodies.
+    """
+    found = once(bodies)
+    if config.body != BodyConfig() and config.gain_model in (AUTO, Elastic.kind):
+        try:
+            found()
+        except AvmsfError as error:
+            if error.name in ("wall", "dofs"):
+                raise
+    return found
 
 
 def roughened(surface: Surface, part: float, *, seed: int) -> Surface:

@@ -1,6 +1,7 @@
 """From a capture to a field in one call: what `avmsf fit` and `SoundField.fit` do."""
 
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from rich.console import Console
 from rich.progress import Progress as Bar
 
 from avmsf._utils.caching import discard
+from avmsf._utils.progress import is_live, repeated
 from avmsf.capture import Capture, Impacts
 from avmsf.capture.placement import surface_points
 from avmsf.config import PipelineConfig
@@ -20,7 +22,7 @@ from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.estimator import estimator_for
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.extract import Extraction, extract_modes, extract_once
-from avmsf.pipeline.bodies import candidate_bodies
+from avmsf.pipeline.bodies import candidate_bodies, stated_bodies
 from avmsf.pipeline.reconstruct import expect_on_object
 from avmsf.pipeline.record import finder_of, with_record
 from avmsf.scene.features import FeatureField
@@ -60,17 +62,16 @@ def fit_capture(
     if len(train) < _FEW:
         log(f"expected {_FEW} recordings or more to predict gains between contacts well, got {len(train)}")
     # Before the modes: what is wrong with the object's shape shows in less time than they take.
+    cache = None if output is None else unfinished(output, "bodies")
     gains = estimator_for(
         config.gain_model,
-        lambda: _bodies(capture, config, None if output is None else unfinished(output, "bodies"), log),
+        stated_bodies(config, lambda: _bodies(capture, config, cache, log)),
         symmetries=lambda: _symmetries(capture, config),
         log=None if capture.surface is None and features is None else log,
     )
     log(f"finding the modes of {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
-    if output is None:
-        modes = extract_modes(train, finder_of(config))
-    else:
-        modes = extract_once(train, finder_of(config), unfinished(output, "modes"))
+    kept = None if output is None else unfinished(output, "modes")
+    modes = extract_modes(train, finder_of(config)) if kept is None else extract_once(train, finder_of(config), kept)
     log(f"fitting a field of {counted(len(modes.bank), 'mode')}")
     try:
         fitted = fit(
@@ -86,8 +87,8 @@ def fit_capture(
             device=config.device,
         )
     except FitError:
-        if output is not None:
-            discard(unfinished(output, "modes"))
+        if kept is not None:
+            discard(kept)
         raise
     return with_record(fitted, config, features_report or {}), modes
 
@@ -130,13 +131,20 @@ def fit_with_progress(
         config = replace(config, device=device)
     if not progress:
         return fit_capture(capture, config, features=features)[0]
-    with Bar(console=Console(stderr=True), transient=True) as bar:
+    console, doing = Console(stderr=True), ["fitting"]
+    live = is_live(console)
+    with (
+        Bar(console=console, transient=True, disable=not live) as bar,
+        nullcontext() if live else repeated(lambda: doing[0]),
+    ):
         task = bar.add_task("fitting", total=None)
 
         def say(message: str) -> None:
-            bar.console.print(message, markup=False, highlight=False, soft_wrap=True)
+            doing[0] = message
+            console.print(message, markup=False, highlight=False, soft_wrap=True)
 
         def show(step: Progress) -> None:
+            doing[0] = f"{step.stage}: step {step.step} of {step.steps}"
             bar.update(task, description=step.stage, completed=step.step, total=step.steps)
 
         return fit_capture(capture, config, features=features, log=say, progress=show)[0]

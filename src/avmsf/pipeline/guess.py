@@ -21,6 +21,7 @@ from avmsf.field.gains.body import BodyGains
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
+from avmsf.pipeline.bodies import wall_error
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.hammer import contact_times, pulse_spectrum
@@ -161,6 +162,8 @@ def _body(
             tell=tell,
         )  # fmt: skip
     except SimulationError as error:
+        if config.wall and error.name == "surface":
+            raise wall_error(surface, config.wall, error) from error
         if config.wall:
             raise
         raise SimulationError(

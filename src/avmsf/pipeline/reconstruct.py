@@ -32,7 +32,7 @@ from avmsf.files import write_whole
 from avmsf.geometry import ObjectShape
 from avmsf.geometry.closest import ClosestPoints
 from avmsf.modal.extraction.extract import Extraction, extract_once
-from avmsf.pipeline.bodies import candidate_bodies
+from avmsf.pipeline.bodies import candidate_bodies, stated_bodies
 from avmsf.pipeline.guess import expect_no_recordings, guess_field
 from avmsf.pipeline.record import finder_of, with_record
 from avmsf.pipeline.scene import Listener, SceneStages
@@ -127,7 +127,6 @@ def _reconstruct(
     listener.tell(f"modes: {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
     found = stages.keep(MODES, heard, lambda path: extract_once(train, method, path, needed=True))
     modes = extract_once(train, method, found.path)
-    basis = {**heard, "features": shape.digest, "fit": asdict(config.fit)}
 
     @once
     def bodies() -> CandidateBodies:
@@ -137,8 +136,9 @@ def _reconstruct(
 
     def make(path: Path) -> None:
         gains = estimator_for(
-            config.gain_model, bodies, symmetries=shape.symmetries, features=shape.features, log=listener.tell
-        )
+            config.gain_model, stated_bodies(config, bodies), symmetries=shape.symmetries, features=shape.features,
+            log=listener.tell,
+        )  # fmt: skip
         listener.tell(f"fit: a field of {counted(len(modes.bank), 'mode')}")
         fitted = fit(
             train,
@@ -164,13 +164,13 @@ def _reconstruct(
             return True
         return False
 
-    recipe = {**basis, "modes": found.digest, "gain_model": config.gain_model, "name": capture.name}
+    recipe = {**heard, "features": shape.digest, "fit": asdict(config.fit), "modes": found.digest}
+    recipe |= {"gain_model": config.gain_model, "name": capture.name}
     recipe |= {"body": asdict(config.body), "settings": asdict(capture.settings), "surface": shape.surface_digest}
     kept = stages.keep(FIELD, recipe, make, usable=is_final)
     made = {**shape.made, "modes": found, "fit": kept}
     times = tuple(StageTime(name, each.seconds, each.fresh) for name, each in made.items())
-    path = shape.made["surface"].path if "surface" in shape.made else None
-    return Reconstruction(kept.path, times, shape.report, modes, path)
+    return Reconstruction(kept.path, times, shape.report, modes, made["surface"].path if "surface" in made else None)
 
 
 def reconstruct_guess(

@@ -55,7 +55,7 @@ def make_body(recipe: ObjectRecipe, *, cache: Path | None, tell: Tell) -> Body:
     kept = None if cache is None else cache / f"modes-{key_of(recipe.elastic_values())}.safetensors"
 
     def compute() -> ElasticModes:
-        tell("tetrahedra")
+        tell("dividing the body into tetrahedra")
         solid = _uneven(recipe, make_solid())
         tell(f"elastic modes of {len(solid.cells)} tetrahedra")
         return _elastic(recipe, solid, legs)

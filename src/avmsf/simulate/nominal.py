@@ -282,8 +282,8 @@ class _Maker:
             self.checked.expect_filling()
         elif wall >= self.checked.width:
             raise SimulationError(
-                f"expected a wall thinner than the object's width of {1000 * self.checked.width:.3g} mm, got "
-                f"{1000 * wall:.3g} mm; give the wall thickness in meters",
+                f"expected a wall thinner than the object's width of {_millimeters(self.checked.width, 3)}, got "
+                f"{_millimeters(wall, 3)}; give a thinner wall",
                 name="wall",
                 value=wall,
             )
@@ -378,7 +378,7 @@ class _Maker:
     def solid(self, wall: float | None, dofs: int) -> Solid:
         """Return tetrahedra with about so many degrees of freedom."""
         expect_memory(dofs)
-        self._tell(f"tetrahedra: {body_name(wall)}")
+        self._tell(f"dividing the {body_name(wall)} into tetrahedra")
         if wall is None:
             return filled_solid(self.checked, dofs)
         if self._shape is not None:
@@ -459,5 +459,10 @@ def _grouped(refused: Mapping[float | None, str]) -> list[str]:
 
 
 def body_name(wall: float | None) -> str:
-    """Return what a body of this wall, meters, is called, with two digits."""
-    return "filled" if wall is None else f"wall of {1000 * wall:.2g} mm"
+    """Return what a body of this wall, meters, is called, with two digits; None is all that the surface encloses."""
+    return "enclosed volume" if wall is None else f"wall of {_millimeters(wall, 2)}"
+
+
+def _millimeters(meters: float, digits: int) -> str:
+    """Return a length with so many significant digits and no exponent."""
+    return f"{float(f'{1000 * meters:.{digits}g}'):g} mm"

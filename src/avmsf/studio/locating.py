@@ -1,4 +1,4 @@
-"""Where a recorded blow fell, for the page: the tables are made ahead of time, a recording is answered at once."""
+"""Where a recorded impact was, for the page: the tables are made ahead of time, a recording is answered at once."""
 
 import base64
 import dataclasses
@@ -20,7 +20,7 @@ from avmsf.localization.contact_map import LEVEL, ContactMap, enlarged, symmetri
 from avmsf.scene.symmetry import Symmetries
 from avmsf.studio.refusal import RefusedError
 from avmsf.tasks.locator import Locator
-from avmsf.tasks.severalblows import locate_blows
+from avmsf.tasks.multi_impact import locate_impacts
 
 
 class Likeness:
@@ -41,7 +41,7 @@ class Likeness:
 
 @dataclass(frozen=True, eq=False)
 class Finder:
-    """What is needed to locate blows on one revision of a field; made when it is first asked for."""
+    """What is needed to locate impacts on one revision of a field; made when it is first asked for."""
 
     field: SoundField
     points: Float[Tensor, "points 3"]
@@ -71,13 +71,13 @@ class Finder:
             _ = self.symmetries
 
     def locate(self, recording: Recording) -> list[dict[str, Any]]:
-        """Return the blows of a recording, each with a value for every point of the page.
+        """Return the impacts of a recording, each with a value for every point of the page.
 
-        Lengths are those of the page's picture, meters. Raises LocationError as `locate_blows`.
+        Lengths are those of the page's picture, meters. Raises LocationError as `locate_impacts`.
         """
         self.prepare()
-        blows = locate_blows(self.field, recording, settings=self.settings, locator=self.locator)
-        return [self._described(seconds, contact) for seconds, contact in blows]
+        impacts = locate_impacts(self.field, recording, settings=self.settings, locator=self.locator)
+        return [self._described(seconds, contact) for seconds, contact in impacts]
 
     def _described(self, seconds: float, contact: ContactMap) -> dict[str, Any]:
         values = contact.describe(self.symmetries, LEVEL)

@@ -19,7 +19,7 @@ DETUNINGS = (0.9, 0.95, 1.05, 1.1)
 
 
 @dataclass(frozen=True, eq=False)
-class OutOfTune:
+class DetunedModes:
     """A bank's modes at each of `DETUNINGS`, for sounds of one length."""
 
     poles: tuple[Complex128[Tensor, " _modes"], ...]
@@ -28,7 +28,7 @@ class OutOfTune:
     """As `Extractor.inverse`."""
 
     @classmethod
-    def of(cls, bank: ModalBank, *, sample_rate: float, samples: int, highest: float) -> "OutOfTune":
+    def of(cls, bank: ModalBank, *, sample_rate: float, samples: int, highest: float) -> "DetunedModes":
         """Return it for sounds at `sample_rate` Hz, of the modes that stay below `highest` Hz.
 
         A detuning that leaves no mode below is left out; those downwards leave all that are below in tune.

@@ -39,7 +39,7 @@ def widened(field: SoundField) -> float:
     return float(torch.nanquantile(errors.flatten(), _LEVEL)) / NormalDist().inv_cdf(0.5 + _LEVEL / 2.0)
 
 
-def foretell(
+def predict(
     sound_field: SoundField, points: Float[Tensor, "points 3"], directions: Float[Tensor, "points 3"] | None
 ) -> tuple[Complex64[Tensor, "points modes"], Float32[Tensor, "points modes"] | None]:
     """Return gains, amplitudes of sines and of cosines as imaginary part, and the factors on dampings."""

@@ -42,6 +42,8 @@ class Heard:
     """Frequency in Hz up to which the recording holds the sound; None where that is half the field's rate."""
     notes: tuple[str, ...]
     """Messages for the user."""
+    newtons: float | None = None
+    """Peak force by the recording's force channel; None without one."""
 
 
 def hear(
@@ -82,11 +84,12 @@ def hear(
         rate = whole.sample_rate
         notes.append(
             f"{whole.name}: expected one impact, got more, at {prepared.onset / rate:.3f} s and at {second / rate:.3f} "
-            "s: only the first was located; --several (in Python locate_blows) locates all"
+            "s: only the first was located; --several (in Python locate_impacts) locates all"
         )
         sound = sound[: max(second - begin, shortest_allowed(rate))]
     at_rate, highest, remark = at_field_rate(sound, whole, field, speed=chosen.playback_speed)
-    return Heard(at_rate, prepared.onset, highest, (*notes, *remark))
+    newtons = None if prepared.pulse is None else abs(prepared.pulse.height * chosen.force_scale)
+    return Heard(at_rate, prepared.onset, highest, (*notes, *remark), newtons)
 
 
 def read_if_path(recording: Sound) -> Recording | ArrayLike:

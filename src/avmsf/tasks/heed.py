@@ -2,7 +2,7 @@
 
 How far the errors of modes hang together depends on what is wrong with a field: a body that is nearly the object's errs
 in all modes at once, splines between few contacts err in each mode by itself. No constant serves both. But every field
-that knows its doubt can foretell each of its own strikes from the others, and their places are known: so much is made
+that knows its doubt can predict each of its own strikes from the others, and their places are known: so much is made
 of the likelihood that these places are as probable as they can be (the logarithmic score, which is best for the
 probabilities that are true).
 """
@@ -19,8 +19,8 @@ from avmsf.field.gains.model import MixtureGains
 from avmsf.field.soundfield import SoundField
 from avmsf.field.uncertainty import fitted_mixture, scale_of
 from avmsf.scene.points import farthest_points
-from avmsf.tasks.foretelling import foretell, judges_itself, patches, unknown, widened
-from avmsf.tasks.posterior import Foretold, judge
+from avmsf.tasks.foretelling import judges_itself, patches, predict, unknown, widened
+from avmsf.tasks.posterior import PredictedGains, judge
 from avmsf.tasks.slack import areas_of, contacts_of, spread_by
 
 _STRIKES = 12
@@ -36,7 +36,7 @@ _NOISE = 1e-10
 """Variance of the measured gains' own errors over the strongest one's square: they are taken as they are."""
 
 
-def heed_of(field: SoundField) -> float:
+def calibrate_tempering(field: SoundField) -> float:
     """Return the factor on `posterior.INDEPENDENT` that a field's own strikes bear out best, .01 to 4.
 
     1 where the field has too few strikes to tell, or does not know how sure it is.
@@ -52,7 +52,7 @@ def heed_of(field: SoundField) -> float:
     rows = torch.unique(torch.cat([spread, near]))
     truths = torch.searchsorted(rows, near)
     places, factor = gains.points[rows], widened(fitted)
-    about = patches(gains.points, foretell(fitted, gains.points, None)[0])[rows]
+    about = patches(gains.points, predict(fitted, gains.points, None)[0])[rows]
     prior = areas_of(places).clamp_min(1e-300).log() if len(places) > 2 else torch.zeros(len(places)).double()
     slack = spread_by(places, contacts=contacts_of(fitted))
     # A locator does not hear the others either.
@@ -71,7 +71,9 @@ def heed_of(field: SoundField) -> float:
         found = judge(known, heard, torch.full(heard.shape, _NOISE * loudest**2, dtype=torch.float64))
         row = int(found.log_likelihood.argmax())
         explained = _explained(known.gains[row].to(heard), heard, 1.0 / (4.0 * field.bank.damping[kept].double()))
-        trusts = torch.tensor([found.trust(explained, heed=heed) for heed in _TRIED.tolist()], dtype=torch.float64)
+        trusts = torch.tensor(
+            [found.tempering(explained, factor=tried) for tried in _TRIED.tolist()], dtype=torch.float64
+        )
         score += _log_score(trusts[:, None] * found.log_likelihood + prior, truth, slack)
     return float(_TRIED[int(score.argmax())])
 
@@ -96,14 +98,14 @@ def _foretold(
     kept: Int64[Tensor, " kept"],
     *,
     factor: float,
-) -> Foretold:
+) -> PredictedGains:
     """Return what a field foretells of some modes at places whose gains vary by `about` around them."""
-    gains = foretell(field, places, None)[0][:, kept]
+    gains = predict(field, places, None)[0][:, kept]
     power = gains.abs().square()
     usual = power.mean(0)
     usual = usual.clamp_min(max(1e-8 * float(usual.max()), torch.finfo(torch.float32).tiny))
     variance = (unknown(field, places, None, factor=factor) + about)[:, kept]
-    return Foretold(gains, power, variance, usual, field.bank.frequency[kept].double())
+    return PredictedGains(gains, power, variance, usual, field.bank.frequency[kept].double())
 
 
 def _explained(foretold: Tensor, heard: Tensor, weights: Float64[Tensor, " modes"]) -> float:

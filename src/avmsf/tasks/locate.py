@@ -4,11 +4,12 @@ from dataclasses import replace
 from functools import lru_cache
 
 from avmsf._utils.arrays import ArrayLike
+from avmsf._utils.progress import working
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
 from avmsf.field.soundfield import SoundField
 from avmsf.localization.contact_map import ContactMap
-from avmsf.tasks.hearing import Sound, hear
+from avmsf.tasks.hearing import Heard, Sound, hear
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.posterior import Force
 
@@ -18,6 +19,8 @@ DOUBTFUL = 0.3
 """The same, above which a note says that it may be."""
 UNLIKE = 0.1
 """Part of a sound's energy that an impact at the most probable position explains, below which a note is given."""
+SAME_FORCE = 1.41
+"""Factor between a known force and the recorded one from which on a note is given: 3 dB, as `Force` is uncertain."""
 
 
 def locate(
@@ -28,18 +31,20 @@ def locate(
     settings: CaptureSettings | None = None,
     points: ArrayLike | None = None,
     directions: ArrayLike | None = None,
-    force: Force | None = None,
+    force: Force | float | int | ArrayLike | None = None,
     locator: Locator | None = None,
+    progress: bool = True,
 ) -> ContactMap:
     """Return where on the object a recorded impact was (paper, section Contact Localization, and a posterior).
 
     `recording` is the path of a sound file, a Recording, or the samples of one channel. Bare samples are at
     `sample_rate` Hz, or at the field's rate. `settings` take the place of those of the capture that the field was
-    fitted to (see `hear`), `points` and `directions` as for `Locator.of`, `force` as for `Locator.locate`; `locator` is
+    fitted to (see `hear`), `points` and `directions` as for `Locator.of`. `force` is the peak force of the impact, a
+    number or `Force`, see `Locator.locate`; a note says where the recording's own force channel differs. `locator` is
     one made of the field before, with points of its own. That of the last field and its own points is cached, so that
-    of several recordings only the first waits for it. The sound of another object has a `refusal` in place of a
-    position, see `judged`. Raises LocationError as `hear` and `Locator.locate`, and for a locator of another field or
-    given with points.
+    of several recordings only the first waits for it. With `progress`, the standard error says that it works. The sound
+    of another object has a `refusal` in place of a position, see `judged`. Raises LocationError as `hear` and
+    `Locator.locate`, and for a locator of another field or given with points.
     """
     if locator is not None and (locator.field is not field or points is not None or directions is not None):
         what = "points or directions" if locator.field is field else "another field"
@@ -48,12 +53,26 @@ def locate(
             name="locator",
             value=what,
         )
-    heard = hear(recording, field, sample_rate=sample_rate, settings=settings)
-    if locator is None and points is None and directions is None:
-        locator = _locator_of(field)
-    finder = Locator.of(field, points=points, directions=directions) if locator is None else locator
-    found = finder.locate(heard.sound, highest=heard.highest, force=force)
-    return judged(replace(found, notes=(*heard.notes, *found.notes)))
+    known = None if force is None else Force.of(force)
+    with working("locating the impact; the first of a field takes seconds to minutes", shown=progress):
+        heard = hear(recording, field, sample_rate=sample_rate, settings=settings)
+        if locator is None and points is None and directions is None:
+            locator = _locator_of(field)
+        finder = Locator.of(field, points=points, directions=directions) if locator is None else locator
+        found = finder.locate(heard.sound, highest=heard.highest, force=known)
+    measured = _measured_force_notes(heard, field, known)
+    return judged(replace(found, notes=(*heard.notes, *measured, *found.notes)))
+
+
+def _measured_force_notes(heard: Heard, field: SoundField, force: Force | None) -> tuple[str, ...]:
+    """Return a note where a known force, in newtons, is not the one in the recording's force channel."""
+    if force is None or not heard.newtons or not field.origin.per_newton:
+        return ()
+    if 1.0 / SAME_FORCE < force.expected / heard.newtons < SAME_FORCE:
+        return ()
+    return (
+        f"expected a force of {heard.newtons:.3g} N as in the recording's force channel, got {force.expected:.3g} N",
+    )
 
 
 @lru_cache(maxsize=1)
@@ -77,14 +96,14 @@ def judged(found: ContactMap) -> ContactMap:
             f"expected a mismatch ratio of at most {DOUBTFUL:g}, as of this object's impacts, got a mismatch ratio of "
             f"{ratio:.2f}: another object, no impact, or noise ({share}); record it again, or choose another field"
         )
-        return replace(found, refusal=refusal)
+        return found.rejected(refusal)
     if found.evidence <= 0.0:
         refusal = (
             f"expected gains that the field predicts better than noise, got a log Bayes factor of {found.evidence:.1f}"
             f": another object, or too few recordings near the contact ({share}); record it again, or fit to more "
             "recordings"
         )
-        return replace(found, refusal=refusal)
+        return found.rejected(refusal)
     if ratio > DOUBTFUL:
         note = f"the sound may be of another object, or hold other sounds: a mismatch ratio of {ratio:.2f} ({share})"
     elif found.explained_energy < UNLIKE:

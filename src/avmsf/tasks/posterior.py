@@ -1,18 +1,17 @@
-"""How likely a blow at each of many points is to have made a sound, whose modes' amplitudes are known in part.
+"""The likelihood of an impact at each of many points, given the modal amplitudes of its sound with their errors.
 
-A blow at x of unknown force and polarity s, noticed a little late or early, makes the amplitudes
+An impact at x of unknown force and polarity s, with an error t of its onset, has the amplitudes
 
     c = s a(x) exp(i w t) + e,     E |e|^2 = n + s^2 (v(x) + r^2 b(x)),
 
-one complex number a mode: a(x) is what the field foretells, t the shift of the onset, n the noise of the extraction,
-v(x) what the field itself does not know, and r how wrong fields and blows are beyond that, as part of b(x), the mean of
-the gains' squares at x and over the whole surface. The force has no scale (p(s) = 1 / |s|) unless it is known, and is
-integrated over; t is taken where it fits best; r is unknown as well: every value in `MISFITS` and `BETWEEN` has its
-say as loud as the sound supports it. So a field that foretells the sound to a hair's breadth gives a sharp answer, and
-a rough one a broad answer. What is wrong in one mode is wrong in others too, and modes whose errors hang together tell
-less than their number: where it is the field that errs, the log likelihood counts for a part of itself, and for the
-less the less of the sound the field explains at its best (`INDEPENDENT`). How fast modes die away is no evidence, even
-of a field whose dampings vary with the contact: these only correct the gains that its sounds seem to have.
+one complex number a mode: a(x) are the predicted gains, n is the variance of the extraction's noise, v(x) the field's
+posterior variance, and r the relative error of fields and impacts beyond that, of b(x), the mean of the gains' squares
+at x and over the surface. The force is integrated over, with the scale-free prior p(s) = 1 / |s| unless it is known; t
+is its maximum-likelihood value; r is averaged over `MISFITS` and `BETWEEN`, weighted by their likelihood. An accurate
+field thus has a narrow posterior, and an inaccurate one a broad posterior. Errors of a field are correlated between
+modes, so the likelihood is tempered where the field's errors dominate: its logarithm is multiplied by an exponent below
+1, which is smaller the less of the sound's energy the field explains (`INDEPENDENT`). Dampings are no evidence, even of
+a field whose dampings vary with the contact: these only correct the gains.
 """
 
 import math
@@ -22,46 +21,46 @@ import torch
 from jaxtyping import Complex64, Complex128, Float32, Float64, Int64
 from torch import Tensor
 
-from avmsf.errors import LocationError
+from avmsf._utils.arrays import ArrayLike, as_floats
+from avmsf.errors import ArrayError, LocationError
 from avmsf.localization.cosine_distance import delays_of
 
 MISFITS = (0.8, 0.15, 0.03)
-"""How wrong gains may be, relative: what every point is tried with."""
+"""Relative errors r of the gains for which the likelihood of every point is computed."""
 BETWEEN = (1.6, 0.35, 0.07, 0.015)
-"""More of them, for the points that have a part in the answer."""
+"""More of them, for the likely points."""
 INDEPENDENT = (0.25, 0.4)
-"""What a mode tells where fields err, over what it would tell if every mode erred for itself: of a field that explains
-nothing of a sound even at its best point, and of one that explains all of it. Chosen on plates, with splines and with
-physics, where the 90 % region then held nine blows in ten; elsewhere it held as few as four. So where a field has
-strikes of its own they have the last word (`avmsf.tasks.heed`)."""
+"""Exponent of the tempered likelihood where a field's errors dominate: of a field that explains nothing of a sound even
+at its best point, and of one that explains all of it. Chosen on plates, where the 90 % region then held nine impacts in
+ten; elsewhere it held as few as four. So a field's own contacts calibrate it (`avmsf.tasks.heed`)."""
 SHIFT_DEVIATION = 2e-4
 """Standard deviation of that, seconds."""
 _COARSE, _FINE = 0.9, 0.3
-"""Radians that the sound's typical frequency turns by between two shifts that are tried, at all points and at those
-looked at closely."""
+"""Step between the tried shifts of the onset, as phase of the sound's typical frequency in radians: at all points, and
+at the preselected ones."""
 _CLOSELY = 2000
-"""Points that are looked at closely: those whose gains look most alike."""
+"""Preselected points, whose gains match best; the likelihood is computed for these."""
 _NEGLIGIBLE = 40.0
-"""A point this far below the best in log likelihood has no part in the answer."""
+"""Log likelihood below the largest from which on a point is negligible."""
 _LEVEL_STEP, _LEVEL_LIMIT = 0.1, 28.0
 """Logarithms of the levels that noise is tried at: step, and limit either way. Amplitudes are in units of the largest;
 their errors' variances are at least 1e-10, those expected of modes at least 1e-8 of the largest."""
 _TINY = torch.finfo(torch.float32).tiny
 _BATCH = 512
-"""Points judged at once: few enough that what they need stays in a processor's cache."""
+"""Points computed at once: few enough that their arrays stay in a processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)
-class Foretold:
-    """What blows at points are foretold to sound like."""
+class PredictedGains:
+    """Predicted gains of impacts at points."""
 
     gains: Complex64[Tensor, "points modes"]
     power: Float32[Tensor, "points modes"]
     """Squares of the gains' magnitudes."""
     variance: Float32[Tensor, "points modes"]
-    """v(x): what the field does not know of the gains."""
+    """v(x): the field's posterior variance of the gains."""
     usual: Float32[Tensor, " modes"]
-    """The gains' squares on the mean over the surface, nowhere zero."""
+    """Mean of the gains' squares over the surface, nowhere zero."""
     frequency: Float64[Tensor, " modes"]
     """Hz."""
 
@@ -75,6 +74,25 @@ class Force:
     spread_db: float = 3.0
     """Standard deviation, dB."""
 
+    @classmethod
+    def of(cls, given: "Force | float | int | ArrayLike") -> "Force":
+        """Return the prior of a force that is given as a number, or as an array of one; a prior as it is.
+
+        Raises LocationError for other values.
+        """
+        if isinstance(given, Force):
+            return given
+        try:
+            values = as_floats(given, "force")
+        except ArrayError as error:
+            raise LocationError(str(error), **error.attributes) from error
+        if values.numel() != 1:
+            shape = list(values.shape)
+            raise LocationError.expected(
+                "one peak force", shape, got=f"an array {shape}", name="force", advice="locate each recording by itself"
+            )
+        return cls(values.item())
+
     def __post_init__(self) -> None:
         for name, value in (("expected", self.expected), ("spread_db", self.spread_db)):
             if not (math.isfinite(value) and value > 0.0):
@@ -87,49 +105,49 @@ class Force:
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """What a sound says of every point."""
+    """The likelihood of every point, given a sound."""
 
     log_likelihood: Float64[Tensor, " points"]
-    """Up to a constant, as if every mode erred for itself."""
+    """Up to a constant, with errors that are independent between modes."""
     force: Float64[Tensor, " points"]
-    """The force that fits best, with its sign; 0 at points that were not looked at closely."""
+    """The force of greatest likelihood, with its sign; 0 at points that were not preselected."""
     shift: Float64[Tensor, " points"]
-    """Seconds by which the sound is best taken to begin after the blow."""
+    """The shift of the onset of greatest likelihood, seconds from the impact to the sound's first sample."""
     noisy: float
-    """Which part of the errors is noise, 0 to 1."""
+    """Fraction of the errors' variance that is noise, 0 to 1."""
     random: float
-    """Log likelihood, with the same constant, of noise in place of a blow; see `_Trial.random`."""
+    """Log likelihood, with the same constant, of noise in place of an impact; see `_Trial.random`."""
 
     def evidence(self, areas: Float64[Tensor, " points"]) -> float:
-        """Return the log Bayes factor of a blow at some point, as probable as its area, against noise."""
+        """Return the log Bayes factor of an impact at some point, with a prior by area, against noise."""
         prior = areas.log() - areas.sum().log()
         return float(torch.logsumexp(self.log_likelihood + prior, 0)) - self.random
 
-    def trust(self, explained: float, *, heed: float = 1.0) -> float:
-        """Return what the log likelihood counts for, where the likeliest point explains that part of the sound.
+    def tempering(self, explained: float, *, factor: float = 1.0) -> float:
+        """Return the exponent of the tempered likelihood, where the likeliest point explains that part of the sound.
 
-        `heed` is a factor on `INDEPENDENT` for one field, as `avmsf.tasks.heed` measures it.
+        `factor` on `INDEPENDENT` is that of one field, as `avmsf.tasks.heed` measures it.
         """
         least, most = INDEPENDENT
-        together = min(1.0, heed * (least + (most - least) * explained))
+        together = min(1.0, factor * (least + (most - least) * explained))
         # Noise errs in every mode by itself. Not the arithmetic mean: where modes of a field that errs tell a twentieth
         # of their number, a tenth of noise would make that a seventh.
         return together ** (1.0 - self.noisy)
 
 
 def judge(
-    foretold: Foretold,
+    predicted: PredictedGains,
     amplitudes: Complex128[Tensor, " modes"],
     noise: Float64[Tensor, " modes"],
     *,
     force: Force | None = None,
 ) -> Judgement:
-    """Return what amplitudes, with the variances of their errors, say of each point."""
+    """Return the likelihood of each point, given amplitudes and the variances of their errors."""
     # In units in which the strongest is one, so that float32 holds all squares.
     unit = float(amplitudes.abs().max())
     values, errors = amplitudes / unit, (noise / unit**2).float()
     strength = None if force is None else replace(force, expected=force.expected / unit)
-    trial = _Trial.of(foretold, values, errors, strength)
+    trial = _Trial.of(predicted, values, errors, strength)
     rows = trial.alike(_CLOSELY)
     found = trial.judge(rows, MISFITS)
     near = torch.nonzero(found[0] > found[0].max() - _NEGLIGIBLE).flatten()
@@ -138,7 +156,7 @@ def judge(
     found[1][near[better]] = finer[1][better]
     found[0][near] = torch.logaddexp(found[0][near], finer[0])
     # The others are no likelier than the least likely of those.
-    count, logs = len(foretold.gains), found[0].double()
+    count, logs = len(predicted.gains), found[0].double()
     evidence = torch.full((count,), float(logs.min()), dtype=torch.float64)
     forces, shifts = torch.zeros(count, dtype=torch.float64), torch.zeros(count, dtype=torch.float64)
     evidence[rows], forces[rows], shifts[rows] = logs, unit * found[1].double(), found[2]
@@ -147,7 +165,7 @@ def judge(
 
 @dataclass(frozen=True, eq=False)
 class _Strengths:
-    """How strong the sound is, and what makes a blow of force one as strong, summed over modes in one measure."""
+    """Weighted sums over modes of the sound's energy, and of that of an impact of force one."""
 
     sound: Float32[Tensor, ""]
     power: Float32[Tensor, " points"]
@@ -156,15 +174,17 @@ class _Strengths:
 
     @classmethod
     def of(
-        cls, foretold: Foretold, values: Complex128[Tensor, " modes"], noise: Float32[Tensor, " modes"]
+        cls, predicted: PredictedGains, values: Complex128[Tensor, " modes"], noise: Float32[Tensor, " modes"]
     ) -> "_Strengths":
         surplus = (values.abs().square().float() - noise).clamp_min(0.0)
-        level = (surplus.sum() / foretold.usual.sum()).clamp_min(1e-12)
-        weights = 1.0 / (noise + level * foretold.usual)
-        return cls(weights @ surplus, foretold.power @ weights, foretold.variance @ weights, weights @ foretold.usual)
+        level = (surplus.sum() / predicted.usual.sum()).clamp_min(1e-12)
+        weights = 1.0 / (noise + level * predicted.usual)
+        return cls(
+            weights @ surplus, predicted.power @ weights, predicted.variance @ weights, weights @ predicted.usual
+        )
 
     def forces(self, rows: Int64[Tensor, " rows"], misfit: float) -> Float32[Tensor, " rows"]:
-        """Return the squares of the forces at which blows with their errors are as strong as the sound."""
+        """Return the squares of the forces at which impacts, with their errors, have the sound's energy."""
         part = 0.5 * misfit**2
         own = (1.0 + part) * self.power[rows] + self.variance[rows] + part * self.usual
         return (self.sound / own.clamp_min(_TINY)).clamp(1e-24, 1e24)
@@ -172,9 +192,9 @@ class _Strengths:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """One sound's amplitudes, in units in which the strongest is one, against what is foretold."""
+    """One sound's amplitudes, in units in which the strongest is one, and the predicted gains."""
 
-    foretold: Foretold
+    predicted: PredictedGains
     values: Complex128[Tensor, " modes"]
     noise: Float32[Tensor, " modes"]
     weights: Float32[Tensor, " modes"]
@@ -182,23 +202,23 @@ class _Trial:
     strengths: _Strengths
     force: Force | None
     noisy: float
-    """Which part of the errors is noise."""
+    """Fraction of the errors' variance that is noise."""
 
     @classmethod
     def of(
         cls,
-        foretold: Foretold,
+        predicted: PredictedGains,
         values: Complex128[Tensor, " modes"],
         noise: Float32[Tensor, " modes"],
         force: Force | None,
     ) -> "_Trial":
         """Return the trial of amplitudes of which the greatest has magnitude one."""
-        usual, unknown = foretold.usual, foretold.variance.mean(0)
+        usual, unknown = predicted.usual, predicted.variance.mean(0)
         level = (values.abs().square().float() - noise).clamp_min(0.0).sum() / (usual + unknown).sum()
         error = level.clamp_min(1e-12) * (unknown + MISFITS[1] ** 2 * usual)
         weights = 1.0 / (noise + error)
         noisy = float((weights * noise).mean())
-        return cls(foretold, values, noise, weights, _Strengths.of(foretold, values, noise), force, noisy)
+        return cls(predicted, values, noise, weights, _Strengths.of(predicted, values, noise), force, noisy)
 
     def random(self) -> float:
         """Return the log likelihood of noise, of any level, with the constant of `judge`.
@@ -208,7 +228,7 @@ class _Trial:
         surface. Its level has no scale, p(level) = 1 / level, as the force has none.
         """
         levels = torch.arange(-_LEVEL_LIMIT, _LEVEL_LIMIT, _LEVEL_STEP, dtype=torch.float64).exp()[:, None]
-        noise, usual = self.noise.double(), (self.foretold.usual + self.foretold.variance.mean(0)).double()
+        noise, usual = self.noise.double(), (self.predicted.usual + self.predicted.variance.mean(0)).double()
         variance = torch.cat([levels * noise, noise + levels * usual / usual.mean()])
         logs = -(variance.log() + self.values.abs().square() / variance).sum(1)
         # The likelihood of a point is a sum over misfits, and leaves a factor of the integral over the force out.
@@ -217,16 +237,16 @@ class _Trial:
 
     def alike(self, count: int) -> Int64[Tensor, " rows"]:
         """Return the rows, ascending, of the points whose gains match the amplitudes best, whatever the force."""
-        if len(self.foretold.gains) <= count:
-            return torch.arange(len(self.foretold.gains))
+        if len(self.predicted.gains) <= count:
+            return torch.arange(len(self.predicted.gains))
         _, turned = self._turned(_COARSE)
-        match = (torch.view_as_real(self.foretold.gains).flatten(1) @ self._weighted(turned)).abs().amax(1)
-        size = (self.foretold.power @ self.weights).clamp_min(_TINY).sqrt()
+        match = (torch.view_as_real(self.predicted.gains).flatten(1) @ self._weighted(turned)).abs().amax(1)
+        size = (self.predicted.power @ self.weights).clamp_min(_TINY).sqrt()
         return torch.sort(torch.topk(match / size, count).indices).values
 
     def _turned(self, step: float) -> tuple[Float64[Tensor, " shifts"], Complex64[Tensor, "shifts modes"]]:
         """Return the shifts of `delays_of` for what is heard, and the amplitudes turned back by each."""
-        frequency = self.foretold.frequency
+        frequency = self.predicted.frequency
         heard = self.weights.double() * self.values.abs().square()
         shifts = delays_of(heard, frequency, step=step)
         back = torch.polar(torch.ones((), dtype=torch.float64), -2.0 * math.pi * shifts[:, None] * frequency)
@@ -244,15 +264,15 @@ class _Trial:
         weighted, heard = self._weighted(turned), turned[0].abs().square()
         evidence, forces, shifts = [], [], []
         for part in torch.split(rows, _BATCH):
-            gains, power = self.foretold.gains[part], self.foretold.power[part]
+            gains, power = self.predicted.gains[part], self.predicted.power[part]
             match = torch.view_as_real(gains).flatten(1) @ weighted
             gained = match.square() / (power @ self.weights).clamp_min(_TINY)[:, None]
             chosen = torch.argmax(gained + prior.float(), dim=1)
             both = torch.view_as_real(gains) * torch.view_as_real(turned[chosen])
-            cross, variance = both[..., 0] + both[..., 1], self.foretold.variance[part]
+            cross, variance = both[..., 0] + both[..., 1], self.predicted.variance[part]
             tried = []
             for misfit in misfits:
-                error = torch.add(variance, power + self.foretold.usual, alpha=0.5 * misfit**2)
+                error = torch.add(variance, power + self.predicted.usual, alpha=0.5 * misfit**2)
                 tried.append(self._weigh(cross, heard, power, error, self.strengths.forces(part, misfit)))
             found, strength = (torch.stack(each) for each in zip(*tried, strict=True))
             evidence.append(torch.logsumexp(found, 0) + prior[chosen].float())

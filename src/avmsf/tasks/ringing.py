@@ -1,4 +1,4 @@
-"""What rings of an object whose modes are known: followed from sample to sample, and fitted to what is heard."""
+"""The free decay of an object whose modes are known: propagated from sample to sample, and fitted to a stream."""
 
 from dataclasses import dataclass
 
@@ -49,7 +49,7 @@ class Ringing:
         powers = poles ** torch.arange(window)[:, None]
         return cls(poles, powers, poles**hop, scale, vectors, values.clamp_min(0.0))
 
-    def hear(self, amplitudes: Complex128[Tensor, " modes"], length: int) -> Float64[Tensor, " samples"]:
+    def render(self, amplitudes: Complex128[Tensor, " modes"], length: int) -> Float64[Tensor, " samples"]:
         """Return so many samples of what rings with amplitudes."""
         if length <= len(self.window):
             return (self.window[:length] @ amplitudes).imag

@@ -10,8 +10,9 @@ import tyro
 from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.common import Flag, Printing, parse_options
 from avmsf.cli.options.paths import Existing, FieldFile, OutputFolder, SettingsFile
+from avmsf.errors import AvmsfError
 
-_Recording = Annotated[Path, Existing("a recording", ("a recording",))]
+RECORDING = Existing("a recording", ("a recording",))
 
 
 @dataclass(frozen=True)
@@ -23,15 +24,16 @@ class Options(Printing):
 
     field: tyro.conf.Positional[FieldFile]
     """Field file, as `avmsf fit` writes it."""
-    recordings: tyro.conf.Positional[Annotated[tuple[_Recording, ...], tyro.conf.arg(metavar="RECORDING.wav ...")]]
+    recordings: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RECORDING.wav ...")]]
     """Recordings of impacts on the same object: wav, flac or another format that libsndfile reads."""
     settings: SettingsFile = None
     """Read the recordings by this capture.toml; by default like the recordings of the fit."""
     several: Flag = False
     """The recordings hold several impacts each; locate every one of them."""
     force: float | None = None
-    """Peak force of every impact in newtons: it distinguishes contacts that differ only in loudness. For a field whose
-    recordings were not divided by their forces: relative to an average recorded impact."""
+    """Peak force of every impact in newtons: it distinguishes contacts that differ only in loudness. 1 for recordings
+    that were divided by their forces already. For a field whose recordings were not divided by their forces: relative
+    to an average recorded impact."""
     probability: float = 0.9
     """Probability that the contact lies within the region that is reported."""
     true_contact: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
@@ -47,6 +49,15 @@ class Options(Printing):
             raise OutputError(
                 "expected one recording or more after the field, such as HIT.wav", name="recordings", value=0
             )
+        # One that is missing does not keep the others from being located.
+        failures = []
+        for path in self.recordings:
+            try:
+                RECORDING.check(path)
+            except AvmsfError as error:
+                failures.append(error)
+        if len(failures) == len(self.recordings):
+            raise failures[0]
         if not 0.0 < self.probability < 1.0:
             raise OutputError.expected(
                 "a probability between 0 and 1, such as 0.9", self.probability, name="--probability"

@@ -9,7 +9,7 @@ from avmsf.capture.audio import Recording
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
 from avmsf.tasks.locator import Locator
-from avmsf.tasks.severalblows import find_blows, locate_blows, still_ringing
+from avmsf.tasks.multi_impact import detect_onsets, locate_impacts, predict_ringing
 from raising import raises
 from test_locate import PLATE, RATE, locator_of, missed, struck, true_field
 
@@ -20,7 +20,7 @@ def locator() -> Locator:
 
 
 def overlapping(starts: list[float], strengths: list[float], *, seed: int):
-    """Return blows that ring into one another, and where they fell."""
+    """Return impacts that ring into one another, and where they fell."""
     impacts = struck(len(starts), seed=seed)
     sound = torch.zeros(round(RATE * (starts[-1] + 0.4)) + 10)
     for start, strength, own in zip(starts, strengths, impacts.sounds, strict=True):
@@ -31,73 +31,73 @@ def overlapping(starts: list[float], strengths: list[float], *, seed: int):
 
 
 @pytest.mark.parametrize("strengths", [[1.0, 0.8, 1.2], [0.3, 1.0, -0.7]])
-def test_every_blow_is_found_where_and_when_it_fell(strengths, locator):
+def test_every_impact_is_found_where_and_when_it_fell(strengths, locator):
     starts = [0.1, 0.25, 0.36]
     sound, contacts = overlapping(starts, strengths, seed=31)
-    found = locate_blows(true_field(), sound, locator=locator)
+    found = locate_impacts(true_field(), sound, locator=locator)
     assert [round(seconds, 3) for seconds, _ in found] == pytest.approx(starts, abs=2e-3)
     for (_, each), contact in zip(found, contacts, strict=True):
         assert missed(each, each.most_probable, contact) < 0.05
         assert each.explained_energy > 0.85
 
 
-def test_what_rings_on_is_carried_over_a_blow():
+def test_what_rings_on_is_carried_over_a_impact():
     sound, _ = overlapping([0.05, 0.2], [1.0, 1.0], seed=32)
     alone, _ = overlapping([0.05, 0.2], [1.0, 0.0], seed=32)
     start = round(0.2 * RATE)
-    carried = still_ringing(true_field(), sound, round(0.05 * RATE), start, 3000, highest=None)
+    carried = predict_ringing(true_field(), sound, round(0.05 * RATE), start, 3000, highest=None)
     true = alone[start : start + 3000].double()
     assert float((carried - true).norm() / true.norm()) < 0.1
 
 
-def test_one_blow_is_one(locator):
+def test_one_impact_is_one(locator):
     sound, _ = overlapping([0.1], [1.0], seed=33)
-    assert len(locate_blows(true_field(), sound, locator=locator)) == 1
+    assert len(locate_impacts(true_field(), sound, locator=locator)) == 1
 
 
-def test_a_faint_blow_before_a_loud_one_is_found():
+def test_a_faint_impact_before_a_loud_one_is_found():
     sound, _ = overlapping([0.1, 0.5], [0.2, 1.0], seed=34)
-    onsets = find_blows(sound.double().numpy(), sample_rate=RATE)
+    onsets = detect_onsets(sound.double().numpy(), sample_rate=RATE)
     assert [onset / RATE for onset in onsets] == pytest.approx([0.1, 0.5], abs=2e-3)
 
 
-def test_noise_holds_no_blows(locator):
+def test_noise_holds_no_impacts(locator):
     noise = torch.from_numpy(np.random.default_rng(0).standard_normal(18000))
     with raises(LocationError, name="noise"):
-        locate_blows(true_field(), noise, locator=locator)
+        locate_impacts(true_field(), noise, locator=locator)
 
 
-def test_blows_on_another_object_are_left_out_and_refused_where_there_are_no_others(locator):
+def test_impacts_on_another_object_are_left_out_and_refused_where_there_are_no_others(locator):
     sound, _ = overlapping([0.1, 0.5], [1.0, 1.0], seed=35)
     other = struck(1, seed=6, plate=replace(PLATE, length=0.4, width=0.31)).sounds[0]
     begin = round(0.5 * RATE)
     mixed = sound.clone()
     mixed[begin:] = 0.0
     mixed[begin : begin + len(other)] = (other / other.abs().max())[: len(mixed) - begin]
-    ((seconds, found),) = locate_blows(true_field(), mixed, locator=locator)
+    ((seconds, found),) = locate_impacts(true_field(), mixed, locator=locator)
     assert round(seconds, 2) == 0.1
     assert re.search(r"the recording: 1 .*, at 0\.5\d\d s, .* a mismatch ratio of", found.notes[-1])
     with raises(LocationError, name="impact", value=pytest.approx(3000 / RATE, abs=0.01)):
-        locate_blows(true_field(), torch.cat([torch.zeros(3000), mixed[begin:]]).numpy(), locator=locator)
+        locate_impacts(true_field(), torch.cat([torch.zeros(3000), mixed[begin:]]).numpy(), locator=locator)
 
 
 def test_a_channel_that_is_silent_is_refused_as_such(locator):
     sound, _ = overlapping([0.1], [1.0], seed=33)
     two = Recording("two.wav", np.stack([np.zeros(len(sound)), sound.double().numpy()]), RATE, "FLOAT")
     with raises(LocationError, file="two.wav", value=0.0):
-        locate_blows(true_field(), two, settings=CaptureSettings(response_channel=1), locator=locator)
+        locate_impacts(true_field(), two, settings=CaptureSettings(response_channel=1), locator=locator)
 
 
-def test_settings_count_as_for_one_blow(locator):
+def test_settings_count_as_for_one_impact(locator):
     sound, contacts = overlapping([0.1, 0.3], [1.0, 0.8], seed=36)
     settings = CaptureSettings(response_channel=2, force_channel=1, normalize="deconvolve")
     # Mono, as a telephone records it: the capture's channels are not asked for, and there is no pulse to divide out.
     mono = Recording("session.wav", sound.double().numpy()[None], RATE, "FLOAT")
-    found = locate_blows(true_field(), mono, settings=settings, locator=locator)
+    found = locate_impacts(true_field(), mono, settings=settings, locator=locator)
     for (_, each), contact in zip(found, contacts, strict=True):
         assert missed(each, each.most_probable, contact) < 0.05
     both = Recording("session.wav", np.stack([0.1 * mono.channels[0][::-1], mono.channels[0]]), RATE, "FLOAT")
     with raises(LocationError, file="session.wav", name="normalize", value="deconvolve"):
-        locate_blows(true_field(), both, settings=settings, locator=locator)
+        locate_impacts(true_field(), both, settings=settings, locator=locator)
     plain = replace(settings, normalize="auto")
-    assert len(locate_blows(true_field(), both, settings=plain, locator=locator)) == 2
+    assert len(locate_impacts(true_field(), both, settings=plain, locator=locator)) == 2

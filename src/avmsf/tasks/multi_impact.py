@@ -1,4 +1,4 @@
-"""Several blows in one recording: each is located by what it brought, without what still rings of those before."""
+"""Several impacts in one recording: each is located without the decaying sound of those before."""
 
 import math
 from dataclasses import replace
@@ -11,6 +11,7 @@ from jaxtyping import Float64
 from scipy.fft import irfft, next_fast_len, rfft
 from torch import Tensor
 
+from avmsf._utils.arrays import ArrayLike
 from avmsf.capture.audio import Recording, refuse_silence
 from avmsf.capture.onset import find_onset
 from avmsf.capture.prepare import remove_rumble, shortest_allowed
@@ -36,32 +37,34 @@ from avmsf.tasks.locator import Locator
 from avmsf.tasks.posterior import Force
 from avmsf.wording import counted
 
-_BEFORE = 0.005
-"""Seconds before a blow that are left out of what rang before it: it may begin a little earlier than it is found."""
-_LISTENED = 0.15
-"""Seconds before a blow that say what still rings: what is heard longer ago is farther from what it has become."""
-_ORDER_SECONDS = 0.006
-"""How much of the past foretells the next sample."""
-_SUDDEN, _FAINTEST = 4.0, 0.1
+_GUARD_SECONDS = 0.005
+"""Before an impact, left out of the fit of earlier impacts: it may begin a little earlier than its detected onset."""
+_FIT_SECONDS = 0.15
+"""Before an impact, to which the sound of earlier ones is fitted: longer ago it differs more from what it is then."""
+_PREDICTION_SECONDS = 0.006
+"""Length of the past from which linear prediction takes the next sample."""
+_ONSET_RATIO, _MIN_RELATIVE_LEVEL = 4.0, 0.1
+"""Level of the prediction residual at an onset, at least: over that before it, and over its largest."""
 
 
-def locate_blows(
+def locate_impacts(
     field: SoundField,
     recording: Sound,
     *,
     sample_rate: float | int | None = None,
     settings: CaptureSettings | None = None,
-    force: Force | None = None,
+    force: Force | float | int | ArrayLike | None = None,
     locator: Locator | None = None,
 ) -> list[tuple[float, ContactMap]]:
-    """Return the onset, seconds, and the contact of each impact in a recording, in order.
+    """Return the onset of each impact in a recording, seconds, and its map, in order.
 
     Bare samples are at `sample_rate` Hz, or at the field's rate; `settings` as for `hear`; `force`, of every impact, as
-    for `Locator.locate`; `locator` is one made of the field before. The sound of earlier impacts is fitted by the
-    object's modes, extrapolated with their decay, and subtracted. Impacts on other objects are left out, with a note,
-    and impacts closer than 30 ms are not separated. Raises LocationError as `hear`, where the settings ask for
-    deconvolution by the recording's own pulse, and where no impact can be located.
+    for `Locator.locate`; `locator` is one made of the field before. The decaying sound of earlier impacts is fitted by
+    the object's modes just before an impact, extrapolated and subtracted. Impacts on other objects are left out, which
+    a note says, and impacts closer than 30 ms count as one. Raises LocationError as `hear`, for settings with
+    `normalize = "deconvolve"` where the recording has a force channel, and where no impact can be located.
     """
+    known = None if force is None else Force.of(force)
     recording = read_if_path(recording)
     whole = as_recording(recording, field, sample_rate=sample_rate)
     chosen = settings_for(whole, own_settings(recording, field) if settings is None else settings)
@@ -75,7 +78,7 @@ def locate_blows(
         )
     notes = describe(whole, chosen)
     sound = _without_rumble(whole, chosen)
-    onsets = find_blows(sound, sample_rate=whole.sample_rate)
+    onsets = detect_onsets(sound, sample_rate=whole.sample_rate)
     resampled, highest, remark = at_field_rate(sound, whole, field, speed=chosen.playback_speed)
     finder = Locator.of(field) if locator is None else locator
     ratio = len(resampled) / len(sound)
@@ -86,10 +89,10 @@ def locate_blows(
         end = starts[number + 1] if number + 1 < len(starts) else len(resampled)
         own = resampled[start : min(end, start + field.samples)].double()
         if number:
-            own = own - still_ringing(field, resampled, starts[number - 1], start, len(own), highest=highest)
+            own = own - predict_ringing(field, resampled, starts[number - 1], start, len(own), highest=highest)
         seconds = onset / whole.sample_rate
         try:
-            located = _accepted(judged(finder.locate(own.float(), highest=highest, force=force)), whole.name, seconds)
+            located = _accepted(judged(finder.locate(own.float(), highest=highest, force=known)), whole.name, seconds)
         except LocationError as error:
             refused.append((seconds, error))
             continue
@@ -122,27 +125,27 @@ def _without_rumble(recording: Recording, settings: CaptureSettings) -> Float64[
         raise location_error(error) from error
 
 
-def find_blows(sound: Float64[np.ndarray, " frames"], *, sample_rate: float) -> list[int]:
-    """Return the samples at which blows begin, in order, at least 30 ms apart; where none is sudden, the likeliest.
+def detect_onsets(sound: Float64[np.ndarray, " frames"], *, sample_rate: float) -> list[int]:
+    """Return the onsets of impacts, samples, in order, at least 30 ms apart; where none is sudden, the most likely one.
 
-    What rings on follows from its own past, a blow does not. So the sound is foretold linearly from the samples before
-    (the same weights throughout, by its autocorrelation), and a blow is where that fails suddenly: where the error's
-    root mean square over 2 ms is `_SUDDEN` times that of the 25 ms before, and at least `_FAINTEST` of the greatest.
+    Free decay follows from its own past, an impact does not. So the sound is predicted linearly from the samples before
+    (one set of weights, by its autocorrelation). An onset is where the residual's root mean square over 2 ms is
+    `_ONSET_RATIO` times that of the 25 ms before, and at least `_MIN_RELATIVE_LEVEL` of the largest.
     """
-    error = _unforetold(sound, round(_ORDER_SECONDS * sample_rate))
+    error = _prediction_residual(sound, round(_PREDICTION_SECONDS * sample_rate))
     short, past, apart = (max(4, round(seconds * sample_rate)) for seconds in (0.002, 0.025, 0.03))
     power = np.concatenate([[0.0], np.cumsum(error**2)])
     level = np.sqrt((power[short:] - power[:-short]) / short)
-    floor = _FAINTEST * level.max()
+    floor = _MIN_RELATIVE_LEVEL * level.max()
     onsets: list[int] = []
     place = 0
     while place < len(level):
-        # The blow's own beginning is no past.
+        # The beginning of the impact itself is not its past.
         begin, end = max(0, place - past), max(0, place - short)
         if onsets:
             begin = max(begin, min(onsets[-1] + 2 * short, end - short))
         before = math.sqrt(max(power[end] - power[begin], 0.0) / (end - begin)) if end - begin >= short else 0.0
-        if level[place] < floor or level[place] < _SUDDEN * before:
+        if level[place] < floor or level[place] < _ONSET_RATIO * before:
             place += 1
             continue
         window = np.abs(error[place : place + 2 * short])
@@ -153,25 +156,25 @@ def find_blows(sound: Float64[np.ndarray, " frames"], *, sample_rate: float) -> 
     return kept or [find_onset(sound, sample_rate=sample_rate)]
 
 
-def _unforetold(sound: Float64[np.ndarray, " frames"], order: int) -> Float64[np.ndarray, " frames"]:
-    """Return what of each sample does not follow from the `order` samples before it."""
+def _prediction_residual(sound: Float64[np.ndarray, " frames"], order: int) -> Float64[np.ndarray, " frames"]:
+    """Return the residual of each sample's linear prediction from the `order` samples before it."""
     order = max(8, min(order, len(sound) // 8))
     size = next_fast_len(len(sound) + order + 1, real=True)
     correlation = irfft(np.abs(rfft(sound, size)) ** 2, size)[: order + 1]
     # As if there were noise 70 dB down: without any, the weights follow rounding.
     correlation[0] *= 1.0 + 1e-7
     weights = scipy.linalg.solve_toeplitz(correlation[:-1], correlation[1:])
-    foretold = scipy.signal.fftconvolve(sound, weights)[: len(sound) - 1]
-    return sound - np.concatenate([[0.0], foretold])
+    predicted = scipy.signal.fftconvolve(sound, weights)[: len(sound) - 1]
+    return sound - np.concatenate([[0.0], predicted])
 
 
-def still_ringing(
+def predict_ringing(
     field: SoundField, sound: Tensor, last: int, start: int, samples: int, *, highest: float | None
 ) -> Float64[Tensor, " samples"]:
-    """Return what of the blow that began at sample `last` is heard from sample `start` on, by the object's modes."""
+    """Return the sound from sample `start` on of the impact that began at sample `last`, by the object's modes."""
     rate = field.sample_rate
-    stop = start - min(round(_BEFORE * rate), (start - last) // 4)
-    begin = max(last, stop - round(_LISTENED * rate))
+    stop = start - min(round(_GUARD_SECONDS * rate), (start - last) // 4)
+    begin = max(last, stop - round(_FIT_SECONDS * rate))
     heard = torch.nonzero(field.bank.frequency < min(0.5 * rate, highest or 0.5 * rate)).flatten()
     bank = ModalBank(field.bank.frequency[heard], field.bank.damping[heard])
     extractor = Extractor.of(bank, sample_rate=rate, samples=stop - begin)

@@ -1,4 +1,4 @@
-"""Blows in a stream: found where and when they fell, whatever rings, and whatever blocks the stream comes in."""
+"""Impacts in a stream: located at their times, whatever still sounds, and whatever blocks the stream comes in."""
 
 import math
 from dataclasses import fields, replace
@@ -14,10 +14,10 @@ from avmsf.errors import LocationError
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesize
-from avmsf.tasks.listening import WINDOW, Blow, Listener
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.modes import adjust_modes
 from avmsf.tasks.ringing import Ringing
+from avmsf.tasks.streaming import WINDOW_SECONDS, LocatedImpact, StreamingLocalizer
 from made_fields import BANK, positional
 from raising import raises
 
@@ -48,23 +48,23 @@ def stream(*, noise: float = 1e-3) -> Tensor:
     return total + level * torch.randn(len(total), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
 
-def heard(listener: Listener, sound: Tensor, block: int = 100) -> list[Blow]:
-    return [blow for part in torch.split(sound, block) for blow in listener.hear(part)]
+def heard(listener: StreamingLocalizer, sound: Tensor, block: int = 100) -> list[LocatedImpact]:
+    return [blow for part in torch.split(sound, block) for blow in listener.process(part)]
 
 
-def spot(blow: Blow) -> int:
+def spot(blow: LocatedImpact) -> int:
     return blow.map.most_probable
 
 
 def test_nothing_is_left_to_compute_for_the_first_blow() -> None:
     fresh = Locator.of(locator().field)
-    listener = Listener(fresh, later=0.2)
-    assert "_heed" in vars(fresh)
+    listener = StreamingLocalizer(fresh, later=0.2)
+    assert "_tempering_factor" in vars(fresh)
     assert {length for length, _ in fresh.lengths} == {listener.window, listener.later}
 
 
 def test_every_blow_is_found_while_earlier_ones_ring() -> None:
-    blows = heard(Listener(locator(), sample_rate=RATE), stream())
+    blows = heard(StreamingLocalizer(locator(), sample_rate=RATE), stream())
     assert [spot(blow) for blow in blows] == list(STRUCK)
     # The first swing of a sine stands out of the noise within two samples.
     assert [round(blow.seconds * RATE) for blow in blows] == pytest.approx(BEGINS, abs=2)
@@ -74,17 +74,17 @@ def test_every_blow_is_found_while_earlier_ones_ring() -> None:
 
 
 def test_forces_come_out_with_their_signs() -> None:
-    blows = heard(Listener(locator()), stream())
+    blows = heard(StreamingLocalizer(locator()), stream())
     assert [blow.map.force for blow in blows] == pytest.approx(FORCES, rel=0.05)
 
 
 def test_blocks_do_not_matter() -> None:
-    whole = Listener(locator()).hear(stream())
+    whole = StreamingLocalizer(locator()).process(stream())
     generator = torch.Generator().manual_seed(1)
-    lengths, ragged = torch.randint(0, 300, (200,), generator=generator).tolist(), Listener(locator())
+    lengths, ragged = torch.randint(0, 300, (200,), generator=generator).tolist(), StreamingLocalizer(locator())
     blows, begin = [], 0
     for length in [*lengths, len(stream())]:
-        blows += ragged.hear(stream()[begin : begin + length])
+        blows += ragged.process(stream()[begin : begin + length])
         begin += length
     assert [blow.seconds for blow in blows] == [blow.seconds for blow in whole]
     for one, other in zip(blows, whole, strict=True):
@@ -92,48 +92,50 @@ def test_blocks_do_not_matter() -> None:
 
 
 def test_the_answer_waits_for_its_window_and_little_more() -> None:
-    for blow in heard(Listener(locator()), stream(), block=80):
-        assert blow.heard == pytest.approx(WINDOW)
+    for blow in heard(StreamingLocalizer(locator()), stream(), block=80):
+        assert blow.used_seconds == pytest.approx(WINDOW_SECONDS)
         # The stream's part of the latency: window, two hops of 2.5 ms and a block of 10 ms. The rest is computing.
-        assert blow.latency >= WINDOW
-    tardy = Listener(locator()).hear(stream())
+        assert blow.latency >= WINDOW_SECONDS
+    tardy = StreamingLocalizer(locator()).process(stream())
     assert tardy[0].latency > (len(stream()) - BEGINS[0]) / RATE
 
 
 def test_a_later_answer_rests_on_more() -> None:
-    blows = heard(Listener(locator(), later=0.12), stream(noise=3e-3))
+    blows = heard(StreamingLocalizer(locator(), later=0.12), stream(noise=3e-3))
     first = [blow for blow in blows if not blow.final]
     final = [blow for blow in blows if blow.final]
     assert [spot(blow) for blow in final] == list(STRUCK)
     assert [blow.seconds for blow in final] == [blow.seconds for blow in first]
     # The second blow was cut short by the third, 106 ms later; the others had their time.
-    assert [blow.heard for blow in final] == pytest.approx([0.12, 0.104, 0.12, 0.12, 0.12], abs=0.006)
+    assert [blow.used_seconds for blow in final] == pytest.approx([0.12, 0.104, 0.12, 0.12, 0.12], abs=0.006)
 
 
 def test_nothing_grows_with_time() -> None:
-    listener = Listener(locator(), later=0.2)
+    listener = StreamingLocalizer(locator(), later=0.2)
     sizes = []
     for _ in range(3):
         heard(listener, stream())
-        parts = [getattr(listener.ears, each.name) for each in fields(listener.ears)]
-        sizes.append([part.numel() for part in parts if isinstance(part, Tensor) and part is not listener.ears.rest])
+        parts = [getattr(listener.state, each.name) for each in fields(listener.state)]
+        sizes.append(
+            [part.numel() for part in parts if isinstance(part, Tensor) and part is not listener.state.waiting]
+        )
     assert sizes[0] == sizes[1] == sizes[2]
-    assert len(listener.ears.rest) < listener.hop
-    assert listener.ears.clock + len(listener.ears.rest) == 3 * len(stream())
+    assert len(listener.state.waiting) < listener.hop
+    assert listener.state.clock + len(listener.state.waiting) == 3 * len(stream())
 
 
 def test_an_offset_and_rumble_are_not_heard() -> None:
     times = torch.arange(len(stream()), dtype=torch.float64) / RATE
     loudest = float(stream().abs().max())
     disturbed = stream() + 0.5 * loudest + 0.2 * loudest * torch.sin(2 * torch.pi * 1.5 * times)
-    blows = heard(Listener(locator()), disturbed)
+    blows = heard(StreamingLocalizer(locator()), disturbed)
     # The filter starts with the stream, and its own start is a jump; it is over before the first blow.
     found = [spot(blow) for blow in blows if blow.seconds > 0.1]
     assert found == list(STRUCK)
 
 
 def test_the_rumble_filter_hardly_changes_the_lowest_mode() -> None:
-    listener = Listener(locator())
+    listener = StreamingLocalizer(locator())
     _, response = sosfreqz(listener.filter, worN=BANK.frequency.min().item(), fs=RATE)
     # A second-order Butterworth filter at frequency f turns by sqrt(2) c / f and loses (c / f)^4 / 2, c its cut-off.
     assert np.angle(response) == pytest.approx(math.sqrt(2) * 0.05, rel=0.01)
@@ -141,20 +143,20 @@ def test_the_rumble_filter_hardly_changes_the_lowest_mode() -> None:
 
 
 def test_noise_alone_is_no_blow() -> None:
-    listener = Listener(locator())
+    listener = StreamingLocalizer(locator())
     noise = torch.randn(16000, generator=torch.Generator().manual_seed(2))
     assert heard(listener, noise) == []
-    assert listener.ears.strangers == 0
+    assert listener.state.rejected == 0
 
 
 def test_what_does_not_belong_to_the_object_is_counted_and_the_next_blow_found() -> None:
-    listener = Listener(locator())
+    listener = StreamingLocalizer(locator())
     burst = torch.zeros(800, dtype=torch.float64)
     burst[200:480] = torch.randn(280, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     first = heard(listener, 1e-4 * torch.randn(800, dtype=torch.float64, generator=torch.Generator().manual_seed(4)))
     foreign = heard(listener, 10 * burst)
     assert first == []
-    assert listener.ears.strangers + len(foreign) == 1
+    assert listener.state.rejected + len(foreign) == 1
     assert all(blow.map.explained_energy < 0.3 for blow in foreign)
     assert [spot(blow) for blow in heard(listener, stream())] == list(STRUCK)
 
@@ -171,8 +173,8 @@ def test_ringing_is_followed_and_fitted_exactly() -> None:
         sample_rate=RATE,
         quadrature=amplitudes.imag[None],
     )[0]
-    assert torch.allclose(modes.hear(amplitudes, 1200), sound, atol=1e-9)
-    assert torch.allclose(modes.hear(modes.after(amplitudes, 300), 900), sound[300:], atol=1e-9)
+    assert torch.allclose(modes.render(amplitudes, 1200), sound, atol=1e-9)
+    assert torch.allclose(modes.render(modes.after(amplitudes, 300), 900), sound[300:], atol=1e-9)
     assert torch.allclose(modes.fit(sound[:480], 0.0), amplitudes, atol=1e-6)
     # Noise alone, as loud as it is said to be, is no ringing.
     assert not modes.fit(1e-3 * sound[:480], 1.0).abs().any()
@@ -182,8 +184,8 @@ def test_modes_that_an_edit_made_silent_are_not_followed() -> None:
     high = adjust_modes(locator().field, pitch=2.5)
     audible = int(high.audible.sum())
     assert 0 < audible < len(BANK)
-    listener = Listener(Locator.of(high))
-    assert len(listener.ears.ringing) == audible
+    listener = StreamingLocalizer(Locator.of(high))
+    assert len(listener.state.ringing) == audible
     sound = torch.cat([torch.zeros(800), high.render(locator().points[:1])[0]]).double()
     noise = 1e-4 * torch.randn(len(sound), generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     (blow,) = heard(listener, sound + noise)
@@ -192,26 +194,29 @@ def test_modes_that_an_edit_made_silent_are_not_followed() -> None:
 
 def test_nothing_is_heard_for_longer_than_the_fields_own_sounds() -> None:
     short = replace(locator().field, samples=800)
-    listener = Listener(Locator.of(short), window=0.05, later=3.0)
+    listener = StreamingLocalizer(Locator.of(short), window=0.05, later=3.0)
     assert (listener.window, listener.later) == (400, 800)
-    assert Listener(Locator.of(short), window=0.2, later=0.3).later is None
-    assert {blow.heard for blow in heard(listener, stream())} <= {0.05, *(each / RATE for each in range(400, 801))}
+    assert StreamingLocalizer(Locator.of(short), window=0.2, later=0.3).later is None
+    assert {blow.used_seconds for blow in heard(listener, stream())} <= {
+        0.05,
+        *(each / RATE for each in range(400, 801)),
+    }
 
 
 def test_streams_that_cannot_be_listened_to_are_refused() -> None:
     with raises(LocationError, name="sample_rate", value=44100.0):
-        Listener(locator(), sample_rate=44100.0)
+        StreamingLocalizer(locator(), sample_rate=44100.0)
     with raises(LocationError, name="window", value=0.0):
-        Listener(locator(), window=0.0)
+        StreamingLocalizer(locator(), window=0.0)
     with raises(LocationError, name="window", value=0.01):
-        Listener(locator(), window=0.01)
+        StreamingLocalizer(locator(), window=0.01)
     with raises(LocationError, name="field", value=0):
-        Listener(replace(locator(), field=adjust_modes(locator().field, pitch=1000.0)))
+        StreamingLocalizer(replace(locator(), field=adjust_modes(locator().field, pitch=1000.0)))
     with raises(LocationError, name="later", value=0.05):
-        Listener(locator(), window=0.06, later=0.05)
-    with raises(LocationError, name="rumble", value=4000.0):
-        Listener(locator(), rumble=4000.0)
-    listener = Listener(locator())
+        StreamingLocalizer(locator(), window=0.06, later=0.05)
+    with raises(LocationError, name="highpass", value=4000.0):
+        StreamingLocalizer(locator(), highpass=4000.0)
+    listener = StreamingLocalizer(locator())
     with raises(LocationError, name="block"):
-        listener.hear(torch.tensor([0.0, float("nan")]))
-    assert listener.ears.clock + len(listener.ears.rest) == 0
+        listener.process(torch.tensor([0.0, float("nan")]))
+    assert listener.state.clock + len(listener.state.waiting) == 0
