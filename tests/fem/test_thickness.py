@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import pytest
 
 from avmsf.fem.thickness import search_thickness
@@ -35,6 +36,16 @@ def test_the_posterior_of_a_normal_evidence_is_normal_with_the_variance_of_shape
     assert math.log(thickness.high / thickness.low) == pytest.approx(2 * 1.645 * both, rel=0.15)
     assert all(body.wall is not None for body in found)
     assert min(abs(math.log(body.wall / true)) for body in found if body.wall) < 0.04
+
+
+def test_a_maximum_between_distant_walls_is_found() -> None:
+    # As of a dish from photographs: gently up to 4.2 mm, then steeply down.
+    steps = np.log([0.000625, 0.0014, 0.00306, 0.0036, 0.0042, 0.005, 0.006, 0.0068, 0.015])
+    table = [-81.0, -60.0, -9.0, -4.0, 0.0, -6.0, -49.0, -73.0, -240.0]
+    skewed = partial(evidence, of=lambda log: float(np.interp(log, steps, table)), filled=-148.0)
+    grid = (0.000625, 0.001383, 0.003061, 0.006775, 0.014997)
+    found, _ = search_thickness([walled(each) for each in (None, *grid)], skewed, walled)
+    assert found[0].wall == pytest.approx(0.0042, rel=0.08)
 
 
 def test_thicker_walls_than_the_views_allow_are_not_tried() -> None:
