@@ -11,6 +11,7 @@ import pytest
 from avmsf.bench.methods import METHODS
 from avmsf.bench.names import METHOD_NAMES, PROTOCOL_NAMES
 from avmsf.bench.protocols import PROTOCOLS
+from avmsf.scene.plyheader import NEEDED
 
 STORED = Path(__file__).parents[1] / "data" / "format-8" / "mixture.safetensors"
 REFUSED = (
@@ -65,6 +66,8 @@ REFUSED = (
     "render good/001.wav --position 0 0 0 -o s",
     "fit field.safetensors -o f.safetensors",
     "info good/001.wav",
+    "info cut.ply",
+    "info torn/surface.ply",
 )
 CODE = """
 import contextlib, io, json, sys
@@ -89,6 +92,13 @@ def place(tmp_path: Path) -> Path:
     for each in ("good/001.wav", "good/002.wav", "torn/001.wav", "torn/002.wav", "one/001.wav", "one/02.wav"):
         (tmp_path / each).touch()
     (tmp_path / "torn" / "surface.ply").write_bytes(b"no mesh")
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "element vertex 2",
+        *(f"property float {name}" for name in NEEDED),
+    ]
+    (tmp_path / "cut.ply").write_bytes("\n".join([*lines, "end_header", ""]).encode() + bytes(4 * len(NEEDED) + 1))
     (tmp_path / "wrong.safetensors").write_bytes(b"RIFF and so on")
     field = STORED.read_bytes()
     (tmp_path / "field.safetensors").write_bytes(field)

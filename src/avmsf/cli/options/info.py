@@ -12,6 +12,7 @@ from avmsf.cli.options.common import Printing, parse_options
 from avmsf.cli.options.paths import Existing, OtherCapture, PlotsFolder, SettingsFile
 from avmsf.field.header import read_record
 from avmsf.scene.featureheader import holds_features
+from avmsf.scene.plyheader import expect_splats
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,9 @@ class Options(Printing):
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
         suffix = self.file.suffix.lower()
+        for cloud in (self.file if suffix == ".ply" else None, self.cloud):
+            if cloud is not None:
+                expect_splats(cloud)
         if suffix != ".ply" and not (suffix == ".safetensors" and holds_features(self.file)):
             read_record(self.file)
             if self.capture is not None:
