@@ -5,6 +5,7 @@ from pathlib import Path
 
 import torch
 
+from avmsf.cli.fit import summary
 from avmsf.cli.options import suggest
 from avmsf.cli.scores import quality_words
 from avmsf.field.soundfield import Origin, SoundField
@@ -37,3 +38,12 @@ def test_without_a_contact_no_command_is_named() -> None:
 def test_an_edited_or_unjudged_field_gets_no_words() -> None:
     assert quality_words(field_with({}), Path("f")) == []
     assert quality_words(field_with({"quality": FOUND, "edits": [{"edit": "x"}]}), Path("f")) == []
+
+
+def test_the_summary_gives_the_ratio_of_stiffness_to_density() -> None:
+    # Frequencies of one shape scale with the square root of the ratio: half of aluminum's is a quarter of it.
+    body = {"body": "solid", "wall_thickness": None, "frequency_factor": 0.5}
+    credibility = {"credible": True, "with_body": 2.5, "without_body": 0.75}
+    words = summary(field_with({"gain_model": "mixture", "bodies": [body], "credibility": credibility}), 9)
+    assert "0.25 times" in words
+    assert "by 1.8 per mode" in words

@@ -187,8 +187,8 @@ def summary(fitted: SoundField, contacts: int) -> str:
         gained = credibility["with_body"] - credibility["without_body"]
         gains += (
             f" (most probable body: {best['body']}{interval and ', 90 % interval of the wall ' + interval}, "
-            f"frequencies {best['frequency_factor']:.2f} times those of aluminum; adds {gained:.1f} nats per mode by "
-            "leave-one-out)"
+            f"with {best['frequency_factor'] ** 2:.2f} times the stiffness-to-density ratio of aluminum; it raises the "
+            f"log likelihood of the gains at left-out contacts by {gained:.1f} per mode)"
         )
     return (
         f"field of {fitted.origin.capture}: {counted(len(fitted.bank), 'mode')} from "

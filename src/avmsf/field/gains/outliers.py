@@ -213,7 +213,7 @@ class Outlier:
 
     def describe(self, names: Sequence[str], contacts: Float[Tensor, "contacts 3"]) -> str:
         """Return a message on it, from the names and positions (meters) of all training contacts."""
-        ratios = f"log predictive ratio {self.ratio:.2g} nats, there {self.place_ratio:.2g}; plausible above 0"
+        ratios = f"log likelihood ratio per mode {self.ratio:.2g}, there {self.place_ratio:.2g}; plausible above 0"
         if self.distance == 0.0 and self.reversed:
             return f"{names[self.row]} fits its contact if its direction or its polarity is reversed ({ratios})"
         if self.distance == 0.0:
