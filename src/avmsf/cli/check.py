@@ -51,7 +51,8 @@ def run(options: Options) -> int:
     if len(problems) > MAX_PRINTED:
         screen.print(f"and {len(problems) - MAX_PRINTED} more; --json prints all", soft_wrap=True)
     if options.write_settings and not proposals:
-        screen.print("no settings to propose: nothing was written", soft_wrap=True)
+        left = "; settings that the messages above name are yours to choose" if problems else ""
+        screen.print(f"the recordings alone determine no further setting: nothing was written{left}", soft_wrap=True)
     if not options.write_settings:
         for each in proposals:
             screen.print(f"proposed: {each.line} (--write-settings writes it). {each.reason}", soft_wrap=True)
@@ -122,7 +123,8 @@ def _table(report: CaptureReport, title: str, aligned: AlignmentReport | None) -
     delays = {} if aligned is None else aligned.delays
     left = [] if aligned is None else aligned.not_aligned
     doubtful = [] if aligned is None else [*left, *aligned.inverted]
-    columns = ["recording", "state", "length s", "rate Hz", "peak dB", "noise dB", "clipped", "onset s", "2nd impact s"]
+    levels = ["peak dBFS", "noise dB re peak"]
+    columns = ["recording", "state", "length s", "rate Hz", *levels, "clipped", "onset s", "2nd impact s"]
     rows = [
         (
             row.file,

@@ -15,7 +15,8 @@ from avmsf.cli.options.paths import CaptureFolder, SettingsFile
 class Options(Printing):
     """Check the recordings of a capture: levels, noise, clipping, onsets, second impacts and alignment.
 
-    Prints one row per recording and the problems below. The delay, in samples, aligns a recording with the others. The
+    Prints one row per recording and the problems below. The peak is relative to full scale, the noise (root mean
+    square) to the recording's own peak. The delay, in samples, aligns a recording with the others. The
     exit code is 0 if the capture can be read, with or without warnings, and 2 if it cannot.
     """
 
