@@ -3,7 +3,10 @@
 import base64
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
+
+import pytest
 
 from avmsf.errors import ExportError
 from avmsf.export.bundle import make_bundle
@@ -12,7 +15,7 @@ from raising import raises
 from struck_table import struck_table
 
 PAGE = {
-    "index.html": b"""<head><link rel="stylesheet" href="page/style.css">
+    "index.html": b"""<head><title>studio</title><link rel="stylesheet" href="page/style.css">
 <script type="importmap">{"imports": {"three": "https://host/three.js"}}</script>
 <script type="module" src="page/main.js"></script></head>""",
     "page/style.css": b"p { color: red }",
@@ -51,9 +54,16 @@ def test_one_file_holds_all_that_lay_beside_the_page() -> None:
 
 
 def test_a_page_without_its_import_map_is_told() -> None:
-    torn = {**PAGE, "index.html": b"<p>"}
+    torn = {**PAGE, "index.html": b"<title></title><p>"}
     with raises(ExportError, file="index.html", name="import map", value=0):
         single_file(make_bundle(struck_table(shared=True)), torn)
+
+
+@pytest.mark.parametrize("output", ["page", "page.html"])
+def test_the_title_is_the_name_of_the_object(tmp_path: Path, output: str) -> None:
+    write_webpage(replace(struck_table(shared=True), name="Tom & <Ann>"), tmp_path / output)
+    html = (tmp_path / output / "index.html" if output == "page" else tmp_path / output).read_text()
+    assert re.findall(r"<title>(.*?)</title>", html) == ["Tom &amp; &lt;Ann&gt;"]
 
 
 def test_both_forms_are_written_whole_and_kept_from_others(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import base64
 import json
 import re
 from collections.abc import Mapping
+from html import escape
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from avmsf.field.soundfield import SoundField
 
 IMPORT_MAP = re.compile(r'(<script type="importmap"[^>]*>)(.*?)(</script>)', re.DOTALL)
 """Where the page says from where three and spark come."""
+_TITLE = re.compile(r"<title>[^<]*</title>")
 _STYLE = re.compile(r'<link\b[^>]*\bhref="(?:\./)?page/(\w+\.css)"[^>]*>')
 _START = re.compile(r'<script type="module" src="(?:\./)?page/(\w+\.js)"[^>]*></script>')
 _IMPORTED = re.compile(r"""(\bfrom\s*|\bimport\s*\(\s*|\bimport\s+)(["'])\./(\w+\.js)\2""")
@@ -68,7 +70,7 @@ def write_webpage(
     if output.suffix.lower() in PAGE_SUFFIXES:
         return Written(write_file(output, single_file(bundle).encode(), force=force), bundle.remarks)
     content = {**page_files(), **bundle.files}
-    html = content["index.html"].decode()
+    html = _titled(content["index.html"].decode(), bundle)
     content["index.html"] = with_policy(html, directives_of(html)).encode()
     sizes = write_folder(output, lambda place: write_files(content, place), dict(bundle.manifest), force=force)
     return Written(sizes, bundle.remarks)
@@ -85,7 +87,7 @@ def page_files() -> dict[str, bytes]:
 def single_file(bundle: Bundle, page: Mapping[str, bytes] | None = None) -> str:
     """Return the page with a bundle, styles and modules inside it. `page` is that of `page_files` unless given."""
     page = page_files() if page is None else page
-    html = page["index.html"].decode()
+    html = _titled(page["index.html"].decode(), bundle)
     modules = {name.removeprefix("page/"): each.decode() for name, each in page.items() if name.endswith(".js")}
     imports = {f"avmsf/{name}": _data_url(_bare(source)) for name, source in modules.items()}
     html = _once(IMPORT_MAP, html, lambda found: found[1] + _with_imports(found[2], imports) + found[3], "import map")
@@ -100,6 +102,12 @@ def single_file(bundle: Bundle, page: Mapping[str, bytes] | None = None) -> str:
     html = html.replace("<!doctype html>\n", f"<!doctype html>\n<!-- {generator()} -->\n", 1)
     html = _once(_START, html, lambda found: begin.replace("{name}", found[1]), "script that starts the page")
     return with_policy(html, directives_of(html, single=True))
+
+
+def _titled(html: str, bundle: Bundle) -> str:
+    """Return the page with the object's name as its title, which is shown until the page's script runs."""
+    title = f"<title>{escape(bundle.manifest['name'] or 'Sound field')}</title>"
+    return _once(_TITLE, html, lambda found: title, "title")
 
 
 def _bare(source: str) -> str:

@@ -45,7 +45,7 @@ function showTitle(studio) {
   studio.on("bundle", () => {
     const { name, modes, points, sampleRate } = studio.bundle.manifest;
     at("name").textContent = name;
-    document.title = `${name} · avmsf studio`;
+    document.title = studio.live ? `${name} · avmsf studio` : name;
     const facts = [
       modes ? `${modes} modes` : null,
       points ? `${points.toLocaleString("en")} contacts` : null,
