@@ -1,6 +1,7 @@
 """From pictures, a mesh or Gaussians to a field on the command line: what is made, kept, made anew and refused."""
 
 import json
+import re
 import shutil
 from dataclasses import asdict
 from functools import partial
@@ -54,6 +55,11 @@ def kept(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return cache
 
 
+def counts(messages: str) -> list[tuple[str, str, str, str]]:
+    """Return the number, total, name and mark of each stage that was counted."""
+    return re.findall(r"^(\d+) of (\d+): (\w+)( \(cached\))?$", messages, re.MULTILINE)
+
+
 def made_now(streams: Streams) -> dict[str, bool]:
     values = json.loads(streams.readouterr().out)
     return {each["stage"]: each["fresh"] for each in values["stages"]}
@@ -90,7 +96,10 @@ def test_the_same_command_makes_nothing_anew_and_another_setting_only_what_follo
     kept_all = dict.fromkeys(("views", "cloud", "features", "modes", "fit"), False)
     assert made_now(capsys) == kept_all
     assert main([*words, "--fit.seed", "5"]) == 0
-    assert made_now(capsys) == kept_all | {"fit": True}
+    found, messages = capsys.readouterr()
+    assert {each["stage"]: each["fresh"] for each in json.loads(found)["stages"]} == kept_all | {"fit": True}
+    cached = [(str(row), "5", name, " (cached)") for row, name in enumerate(("views", "cloud", "features", "modes"), 1)]
+    assert counts(messages) == [*cached, ("5", "5", "field", "")]
     assert main([*words, "--lift.components", "4"]) == 0
     assert made_now(capsys) == kept_all | {"features": True, "fit": True}
 
@@ -213,7 +222,7 @@ def test_a_surface_of_points_is_the_object_without_any_look(tmp_path: Path, caps
         folder / "surface.ply",
     )
     assert main(["reconstruct", str(folder), *FIT, *MODES]) == 0
-    capsys.readouterr()
+    assert counts(capsys.readouterr().err) == [("1", "2", "modes", ""), ("2", "2", "field", "")]
     assert len(load(folder / ".avmsf" / "field.safetensors").gain_field.points) == 500
 
 

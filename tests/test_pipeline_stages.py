@@ -36,6 +36,15 @@ def test_another_recipe_runs_again(tmp_path: Path, recipe: dict) -> None:
     assert make.runs == 2
 
 
+def test_outputs_that_were_announced_are_counted_when_their_turn_comes(tmp_path: Path) -> None:
+    make, folder, told = Maker(), StageFolder(tmp_path), list[str]()
+    folder.keep("modes.safetensors", {}, make)
+    folder.count(("modes.safetensors", "field.safetensors"), told.append)
+    for name in ("modes.safetensors", "other", "field.safetensors"):
+        folder.keep(name, {}, make)
+    assert told == ["1 of 2: modes (cached)", "2 of 2: field"]
+
+
 def test_tuples_are_the_lists_that_they_are_read_back_as(tmp_path: Path) -> None:
     make, folder = Maker(), StageFolder(tmp_path)
     folder.keep("cloud.ply", {"sizes": (1, 2)}, make)

@@ -43,7 +43,7 @@ class SceneBar:
     @property
     def listener(self) -> Listener:
         """Who hears of the stages."""
-        return Listener(say, self.splatting, self.lifting)
+        return Listener(say, self.splatting, self.lifting, counting=say)
 
     def stop(self) -> None:
         """Leave the screen to another bar."""

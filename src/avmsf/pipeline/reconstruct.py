@@ -204,6 +204,7 @@ def reconstruct_guess(
                     file=folder,
                     value=scene.source.kind,
                 )
+        stages.count((*(() if scene is None else scene.outputs[:-1]), FIELD), listener.counting)
         shape, digest = object_shape(mesh, scene)
 
         def make(path: Path) -> None:
@@ -275,7 +276,10 @@ def _shape(
 ) -> _Shape:
     scene = SceneStages(folder, stages, config.scene, settings=settings, listener=listener, device=config.device)
     bare = capture.surface is not None and not len(capture.surface.faces)
-    if not scene or (bare and scene.source is not None and scene.source.kind == "mesh"):
+    shows = bool(scene) and not (bare and scene.source is not None and scene.source.kind == "mesh")
+    shaped = config.gain_model != NETWORK and (shows or (capture.surface is not None and not bare))
+    stages.count((*(scene.outputs if shows else ()), *((SURFACE,) if shaped else ()), MODES, FIELD), listener.counting)
+    if not shows:
         if capture.surface is None:
             listener.tell(
                 f"{folder}: expected views or a mesh, got none: points that fill the bounding box of the contacts are "

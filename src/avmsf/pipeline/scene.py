@@ -30,7 +30,7 @@ from avmsf.scene.splat import SplatProgress, splat
 from avmsf.scene.start import StartPoints
 from avmsf.wording import counted
 
-CLOUD, FEATURES = "cloud.ply", "features.safetensors"
+VIEWS, CLOUD, FEATURES = "views", "cloud.ply", "features.safetensors"
 """What the stages call their outputs."""
 
 
@@ -46,6 +46,8 @@ class Listener:
     """Receives a sentence as each stage begins."""
     splatting: Callable[[SplatProgress], None] | None = None
     lifting: Callable[[LiftProgress], None] | None = None
+    counting: Callable[[str], None] = _say_nothing
+    """Hears the number and name of each stage of a reconstruction, see `StageFolder.count`."""
 
 
 class SceneStages:
@@ -89,6 +91,19 @@ class SceneStages:
         if not self:
             self._source()
 
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """The outputs on the way to features, in order, the features last."""
+        if self.source is None:
+            return CLOUD, VIEWS, self.name
+        motion = ("motion",) if self.source.kind in ("photographs", "video") else ()
+        return (*motion, VIEWS, *(() if self._on_mesh else (CLOUD,)), self.name)
+
+    @property
+    def _on_mesh(self) -> bool:
+        """Whether features lie on the mesh, so that no Gaussians are needed."""
+        return self.splats is None and self._source().kind == "mesh" and self.config.lift.onto == "mesh"
+
     @cached_property
     def views(self) -> Kept:
         """The folder of views."""
@@ -126,7 +141,7 @@ class SceneStages:
     def features(self) -> Kept:
         """The file of features, on the Gaussians or on points of the mesh."""
         encoder = choose_encoder(self.config.lift, tell=self.listener.tell, device=self.device)
-        on_mesh = self.splats is None and self._source().kind == "mesh" and self.config.lift.onto == "mesh"
+        on_mesh = self._on_mesh
         recipe = {
             "views": self.views.digest,
             "cloud": None if on_mesh else self.cloud.digest,
@@ -223,7 +238,7 @@ class SceneStages:
             replace_views(views_of_cloud(cloud, rasterizer, size=self.config.views.rendered), path)
 
         recipe = {"cloud": self.cloud.digest, "rendered": self.config.views.rendered}
-        return self.stages.keep("views", recipe, make)
+        return self.stages.keep(VIEWS, recipe, make)
 
 
 def scaled(cloud: GaussianCloud, factor: float) -> GaussianCloud:

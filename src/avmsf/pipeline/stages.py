@@ -3,7 +3,7 @@
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,6 +43,13 @@ class StageFolder:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self._counted: Sequence[str] = ()
+        self._number = 0
+        self._log: Callable[[str], None] = lambda message: None
+
+    def count(self, names: Sequence[str], log: Callable[[str], None]) -> None:
+        """From now on log the number of each of these outputs when its turn comes, such as "2 of 5: modes (cached)"."""
+        self._counted, self._number, self._log = names, 0, log
 
     def lock(self, command: str, *, wait: float = WAIT) -> AbstractContextManager[None]:
         """Return a context in which no other process or thread makes or replaces a stage here.
@@ -84,7 +91,12 @@ class StageFolder:
             current = same and path.exists() and digest_of(path) == known.get("digest")
             if not same:
                 self.checkpoint(name).unlink(missing_ok=True)
-        if current and (usable is None or usable(path)):
+        fresh = not current or (usable is not None and not usable(path))
+        if name in self._counted:
+            self._number += 1
+            cached = "" if fresh else " (cached)"
+            self._log(f"{self._number} of {len(self._counted)}: {Path(name).stem}{cached}")
+        if not fresh:
             return Kept(path, known["digest"], float(known["seconds"]), fresh=False)
         _write(record, {"recipe": wanted, "digest": None, "seconds": 0.0})
         begun = time.monotonic()
