@@ -21,13 +21,16 @@ from avmsf.errors import AvmsfError
 from avmsf.export.modaldemo import read_demo
 from avmsf.export.sampledfield import SampledField
 from avmsf.field.config import FitConfig
+from avmsf.field.gains.body import BodyGains
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import load, save
+from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import read_splats, write_splats
 from avmsf.tasks.material import change_material
 from avmsf.tasks.modes import adjust_modes
+from believing_field import ELASTIC, bar, bar_points
 from capture_folder import fill
 from made_fields import BANK, SIDES, positional
 
@@ -355,6 +358,28 @@ def test_the_surface_made_from_photographs_is_shown(to: str, place: str, field_f
     assert main(["export", str(field), *words]) == 0
     shown = trimesh.load(output if to == "gltf" else output / "object.glb", process=False).dump()[0]
     assert len(shown.faces) == 12
+
+
+@pytest.mark.parametrize("to", ["gltf", "web"])
+def test_the_body_of_the_gains_is_shown_before_a_reconstruction(to: str, tmp_path: Path) -> None:
+    # Points on a closed lid above the body, as a reconstruction from outside has it.
+    points = torch.cat([bar_points(), bar_points() + torch.tensor([0.0, 0.0, 0.05])]).float()
+    bank = ModalBank(ELASTIC, torch.ones(6, dtype=torch.float64))
+    noise = Residual(torch.full((9,), 1e-3))
+    field = SoundField(
+        bank, BodyGains(points, bar()), torch.zeros(6, dtype=torch.float64), noise, RATE, SAMPLES, Origin()
+    )
+    save(field, tmp_path / "bar.safetensors")
+    fill(tmp_path / "capture", rows=["a.wav,0,0,0"])
+    (tmp_path / "capture" / ".avmsf").mkdir()
+    trimesh.creation.box(SIDES).export(tmp_path / "capture" / ".avmsf" / "surface.ply")
+    output = tmp_path / ("a.glb" if to == "gltf" else "page")
+    words = ["--to", to, "--output", str(output), "--capture", str(tmp_path / "capture")]
+    assert main(["export", str(tmp_path / "bar.safetensors"), *words]) == 0
+    shown = trimesh.load(output if to == "gltf" else output / "object.glb", process=False).dump()[0]
+    assert len(shown.faces) == len(bar().triangles)
+    if to == "web":
+        assert json.loads((output / "manifest.json").read_text())["points"] == len(bar_points())
 
 
 @pytest.mark.parametrize("captured", [True, False])

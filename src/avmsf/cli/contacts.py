@@ -9,10 +9,13 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from avmsf.capture.settings import METRES
 from avmsf.capture.table import read_cells
 from avmsf.cli.options.checks import OutputError
+from avmsf.cli.options.common import Unit
+from avmsf.cli.printing import say
 from avmsf.errors import CaptureError, PositionError
-from avmsf.field.positions import expect_near
+from avmsf.field.positions import expect_near, off_surface
 from avmsf.field.soundfield import SoundField
 
 _COLUMNS = ("x", "y", "z")
@@ -43,6 +46,22 @@ class Contacts:
         if self.table is not None:
             return f"{self.table}, row {self.lines[row]}"
         return self.option if len(self.names) == 1 else f"{self.option} {row + 1} of {len(self.names)}"
+
+
+def given_contacts(
+    places: Sequence[tuple[float, float, float]],
+    table: Path | None,
+    *,
+    unit: Unit,
+    directions: Sequence[tuple[float, float, float]] = (),
+) -> Contacts:
+    """Return the contacts of --position and --direction, or those of a table, whose unused columns are noted."""
+    if table is None:
+        return contacts_at(places, meters=METRES[unit], directions=directions)
+    contacts = read_contacts(table, meters=METRES[unit])
+    if contacts.unused:
+        say(f"note: {table}: columns that are not used: {', '.join(contacts.unused)}")
+    return contacts
 
 
 def contacts_at(
@@ -107,6 +126,13 @@ def refuse_far(contacts: Contacts, field: SoundField, *, advice: str = "") -> No
             else {"file": contacts.table, "name": contacts.names[row], "row": contacts.lines[row]}
         )
         raise OutputError(f"{error}{advice}", **{**error.attributes, **where}) from error
+
+
+def note_off(contacts: Contacts, field: SoundField) -> None:
+    """Print a note for each contact that is not on the object's surface, with its distance, see `off_surface`."""
+    for row, distance in off_surface(contacts.places, field.gain_field):
+        where = f"{1e3 * distance:.3g} mm off the object's surface"
+        say(f"note: {contacts.label(row)} is {where}; the gains there are extrapolated")
 
 
 def _number(text: str, path: Path, line: int, column: str, separator: str) -> float:

@@ -25,6 +25,7 @@ from avmsf.cli.writing import Level, write_sound, write_text
 from avmsf.config import CACHE, DESCRIPTORS, LiftConfig, PipelineConfig, SceneConfig
 from avmsf.export.webpage import write_webpage
 from avmsf.field.config import FitConfig
+from avmsf.field.scaledgains import surface_of
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.pipeline.reconstruct import reconstruct
@@ -101,7 +102,8 @@ def _go_all_the_way(
     field = load(folder / FIELD)
     scores = compare(field, train, test, made.modes)
     heard = test.take(farthest_points(test.contacts, min(_HEARD, len(test))).tolist())
-    write_webpage(field, folder / PAGE, object=folder / GAUSSIANS, surface=made.surface, strikes=test)
+    surface = surface_of(field.gain_field) or made.surface
+    write_webpage(field, folder / PAGE, object=folder / GAUSSIANS, surface=surface, strikes=test)
     if made.surface is not None:
         shutil.move(made.surface, folder / SHAPE)
     shutil.rmtree(folder / CACHE)

@@ -11,10 +11,10 @@ import torch
 from avmsf.capture.filenames import find_surface_file
 from avmsf.capture.folder import read_capture
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.settings import settings_of
+from avmsf.capture.settings import METRES, settings_of
+from avmsf.capture.surface import Surface
 from avmsf.cli.options.export import Options, unused_options
 from avmsf.cli.printing import figure, next_command, print_result, say
-from avmsf.cli.render import METRES
 from avmsf.config import CACHE
 from avmsf.errors import ExportError
 from avmsf.export.faust import contacts_path, fitted, write_faust
@@ -28,7 +28,8 @@ from avmsf.export.universal import write_universal
 from avmsf.export.wavgrid import INSTRUMENT, Grid, Layer, write_grid
 from avmsf.export.webpage import write_webpage
 from avmsf.export.written import Written, expect_free, write_file
-from avmsf.field.scaledgains import length_of
+from avmsf.field.positions import points_on_object
+from avmsf.field.scaledgains import length_of, surface_of
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.pipeline.reconstruct import SURFACE
@@ -117,7 +118,8 @@ def _read(options: Options) -> SoundField | SampledField:
 def _sampled(field: SoundField | SampledField, options: Options) -> SampledField:
     most = options.points or POINTS[options.to]
     if isinstance(field, SoundField):
-        sampled, held = SampledField.of(field, limit=most), len(field.gain_field.points)
+        points = points_on_object(field.gain_field)
+        sampled, held = SampledField.of(field, points, limit=most), len(points)
     else:
         sampled, held = field if len(field) <= most else field.take(field.spread(most)), len(field)
     if len(sampled) < held and options.points is None:
@@ -125,16 +127,23 @@ def _sampled(field: SoundField | SampledField, options: Options) -> SampledField
     return sampled
 
 
-def _object(field: SoundField | SampledField, options: Options) -> tuple[Path | None, float]:
-    """Return the file that shows the object, and what its coordinates count in meters; print where there is none.
+def _object(field: SoundField | SampledField, options: Options) -> tuple[Path | Surface | None, float]:
+    """Return what shows the object, and what its coordinates count in meters; print where there is nothing.
 
-    A capture shows the object as it was recorded: of a field edited to another size its mesh is scaled alike. Raises
-    `ExportError` for a capture's Gaussians then.
+    A capture's own mesh is shown, otherwise the surface of the body that the field's gains are computed on, otherwise
+    what was reconstructed from photographs, whose cavities may be closed. A capture shows the object as it was
+    recorded: of a field edited to another size its mesh is scaled alike. Raises `ExportError` for a capture's Gaussians
+    then.
     """
     if options.object is not None:
         _note_size(field, options.object)
         return options.object, METRES[options.object_unit]
     path, meters = _captured(options)
+    if path is None:
+        body = surface_of(field.gain_field) if isinstance(field, SoundField) else None
+        if body is not None:
+            return body, 1.0
+        path, meters = _reconstructed(options), 1.0
     length = _length(field)
     if length == 1.0 or path is None:
         return path, meters
@@ -161,32 +170,32 @@ def _note_size(field: SoundField | SampledField, path: Path) -> None:
 
 
 def _captured(options: Options) -> tuple[Path | None, float]:
-    """Return the file that shows a capture's object, and what its coordinates count in meters."""
+    """Return the capture's own mesh or Gaussians, and what its coordinates count in meters."""
     if options.capture is None:
-        say("note: only the field's points are shown; --object or --capture adds the surface")
         return None, 1.0
     settings = settings_of(options.capture)
-    given = find_surface_file(options.capture, settings)
-    if given is not None:
-        return given, settings.surface_meters
-    made = _reconstructed(options.field, options.capture)
+    return find_surface_file(options.capture, settings), settings.surface_meters
+
+
+def _reconstructed(options: Options) -> Path | None:
+    """Return the surface, in meters, that `reconstruct` left in a cache or `demo` next to the field; print if none."""
+    field, capture = options.field, options.capture
+    if capture is None:
+        say("note: only the field's points are shown; --object or --capture adds the surface")
+        return None
+    caches = [capture / CACHE / SURFACE, *([field.parent / SURFACE] if field.parent.name == CACHE else [])]
+    made = next((each for each in [field.with_name(f"{field.stem}-{SURFACE}"), *caches] if each.is_file()), None)
     if made is None:
         say(
-            f"note: {options.capture} has no surface: only the field's points are shown; make one by avmsf surface "
-            f"{options.capture}, or give --object"
+            f"note: {capture} has no surface: only the field's points are shown; make one by avmsf surface {capture}, "
+            "or give --object"
         )
-    return made, 1.0
+    return made
 
 
-def _reconstructed(field: Path, capture: Path) -> Path | None:
-    """Return the surface, in meters, that `reconstruct` left in a cache or `demo` next to the field."""
-    caches = [capture / CACHE / SURFACE, *([field.parent / SURFACE] if field.parent.name == CACHE else [])]
-    return next((each for each in [field.with_name(f"{field.stem}-{SURFACE}"), *caches] if each.is_file()), None)
-
-
-def _gaussians(path: Path | None, meters: float, field: SampledField) -> GaussianCloud | None:
+def _gaussians(path: Path | Surface | None, meters: float, field: SampledField) -> GaussianCloud | None:
     """Return the file's Gaussians, which are in meters; None for a mesh, whose coordinates count `meters`."""
-    if path is None or path.suffix.lower() != ".ply" or (path.is_file() and not holds_gaussians(path)):
+    if not isinstance(path, Path) or path.suffix.lower() != ".ply" or (path.is_file() and not holds_gaussians(path)):
         return None
     read_object(path, field.points, meters=meters)
     return read_splats(path)
@@ -217,7 +226,7 @@ def _gltf(field: SoundField | SampledField, options: Options) -> Written:
     sampled = _sampled(field, options)
     source, meters = _object(field, options)
     cloud = _gaussians(source, meters, sampled)
-    if cloud is not None and source is not None:
+    if cloud is not None and isinstance(source, Path):
         beside, content = options.output.with_suffix(".gaussians.ply"), source.read_bytes()
         expect_free(beside, content, force=options.overwrite)
         seen = Look.of_gaussians(cloud, sampled)

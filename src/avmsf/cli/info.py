@@ -12,7 +12,7 @@ from avmsf.bench.doubtpictures import draw_band, draw_doubt
 from avmsf.bench.evaluation import evaluate
 from avmsf.bench.pictures import draw_gains, draw_modes, draw_spectrograms, save_picture
 from avmsf.bench.surfacepictures import draw_surface
-from avmsf.capture import CaptureSettings, Impacts, Surface, read_capture
+from avmsf.capture import CaptureSettings, Impacts, read_capture
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.infoclouds import describe_cloud, describe_features
 from avmsf.cli.modes import mode_table
@@ -23,8 +23,7 @@ from avmsf.cli.scores import quality_words, score_table, score_values
 from avmsf.field.attention import AttentionGains
 from avmsf.field.config import NETWORK
 from avmsf.field.gains.body import BodyGains
-from avmsf.field.gains.model import MixtureGains
-from avmsf.field.scaledgains import fitted_gains, length_of
+from avmsf.field.scaledgains import surface_of
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.field.uncertainty import has_posterior, relative_gain_std, spectrum_band, training_contacts
@@ -151,10 +150,8 @@ def draw_field(
         pictures["spectrum"] = draw_band(
             spectrum_band(field, points[0]), title=f"{name}: one impact, with its uncertainty"
         )
-    gained = fitted_gains(field.gain_field)
-    body = gained.body if isinstance(gained, MixtureGains | BodyGains) else None
-    if body is not None:
-        surface = Surface(length_of(field.gain_field) * body.nodes.float(), body.triangles[:, :3])
+    surface = surface_of(field.gain_field)
+    if surface is not None:
         pictures["surface"] = draw_surface(surface, title=f"the body of {name}")
     for stem, picture in pictures.items():
         path = folder / f"{stem}.png"

@@ -9,14 +9,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.capture.audio import MAX_SAMPLES
-from avmsf.cli.contacts import Contacts, contacts_at, read_contacts, refuse_far
+from avmsf.cli.contacts import Contacts, given_contacts, note_off, refuse_far
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.checks import OutputError, expect_writable
 from avmsf.cli.options.render import Options
 from avmsf.cli.printing import next_command, print_result, say
 from avmsf.cli.writing import Level, write_sound
 from avmsf.errors import PositionWarning
-from avmsf.field.positions import off_surface
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.modal.pulse import ForcePulse
@@ -25,17 +24,15 @@ _MUCH_SOFTER = 20.0
 """Decibels below the recorded impact from which a softer hammer's sound is noted."""
 _QUIET_DBFS = -20.0
 """Peak in decibels of full scale below which sounds are noted as quiet."""
-METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254, "ft": 0.3048}
 
 
 def run(options: Options) -> int:
     """Render and write."""
-    contacts = _contacts(options)
+    contacts = given_contacts(options.position, options.contact_table, unit=options.unit, directions=options.direction)
     paths = _paths(options.output, contacts)
     field = load(options.field)
     refuse_far(contacts, field, advice=", see --unit")
-    for row, distance in off_surface(contacts.places, field.gain_field.points):
-        say(f"note: {contacts.label(row)} is {1e3 * distance:.3g} mm off the object")
+    note_off(contacts, field)
     if options.force != 1 and not field.origin.per_newton:
         say(f"note: the forces are not known: {options.force:g} is relative to an average recorded impact")
     if round(field.sample_rate) != field.sample_rate:
@@ -68,17 +65,6 @@ def run(options: Options) -> int:
     print_result(text, {**values, "peak": peak, "peak_dbfs": peak_dbfs}, json=options.json)
     next_command("avmsf export", options.field, "--to web -o page")
     return 0
-
-
-def _contacts(options: Options) -> Contacts:
-    """Return the contacts of the options or of their table."""
-    meters = METRES[options.unit]
-    if options.contact_table is not None:
-        contacts = read_contacts(options.contact_table, meters=meters)
-        if contacts.unused:
-            say(f"note: {contacts.table}: columns that are not used: {', '.join(contacts.unused)}")
-        return contacts
-    return contacts_at(options.position, meters=meters, directions=options.direction)
 
 
 def _softer(hard: Float[Tensor, " samples"], soft: Float[Tensor, " samples"]) -> float:

@@ -23,6 +23,7 @@ from avmsf.export.formats import MOST_POINTS
 from avmsf.export.objectfile import ObjectFile, read_object
 from avmsf.export.sampledfield import SampledField
 from avmsf.export.written import Written, no_modes, write_folder
+from avmsf.field.positions import points_on_object
 from avmsf.field.soundfield import SoundField
 
 FORMAT = 1
@@ -47,7 +48,7 @@ def make_bundle(
     *,
     object: Path | Surface | None = None,
     meters: float = 1.0,
-    surface: Path | None = None,
+    surface: Path | Surface | None = None,
     strikes: Impacts | None = None,
     limit: int = MOST_POINTS,
     live: Mapping[str, Any] | None = None,
@@ -56,13 +57,14 @@ def make_bundle(
     """Return a field's bundle, at no more than `limit` contacts.
 
     `object` is shown for it: a mesh whose coordinates count `meters` each, Gaussians, or the contacts alone. The mesh
-    `surface`, in meters, is what the reader can show instead, as the one that was made of Gaussians. `strikes` are
+    `surface`, in meters, is what the reader can show instead, such as that of the field's body. `strikes` are
     measured ones to compare with, `live` what a server behind the page offers. Raises `ExportError`, for a field
     without a mode too unless it may be `mute`, as an object's that is to be struck first.
     """
     remarks: tuple[str, ...] = ()
     if isinstance(field, SoundField):
-        count, sampled = len(field.gain_field.points), SampledField.of(field, limit=limit)
+        points = points_on_object(field.gain_field)
+        count, sampled = len(points), SampledField.of(field, points, limit=limit)
     else:
         count, sampled = len(field), field if len(field) <= limit else field.take(field.spread(limit))
     if len(sampled) < count:
@@ -89,7 +91,7 @@ def write_bundle(
     *,
     object: Path | Surface | None = None,
     meters: float = 1.0,
-    surface: Path | None = None,
+    surface: Path | Surface | None = None,
     strikes: Impacts | None = None,
     limit: int = MOST_POINTS,
     live: Mapping[str, Any] | None = None,

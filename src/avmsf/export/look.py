@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from trimesh.visual import ColorVisuals
 
+from avmsf.capture.surface import Surface
 from avmsf.capture.texturedmesh import TexturedMesh, read_textured_mesh
 from avmsf.export.objectfile import MOST_FACES, expect_alike, expect_readable, reduced
 from avmsf.export.sampledfield import SampledField
@@ -54,14 +55,17 @@ class Look:
         return cls(cloud.centers, torch.zeros(0, 3, dtype=torch.int64), normals, colors)
 
 
-def read_look(path: Path, sampled: SampledField, *, meters: float = 1.0) -> tuple[Look, tuple[str, ...]]:
+def read_look(source: Path | Surface, sampled: SampledField, *, meters: float = 1.0) -> tuple[Look, tuple[str, ...]]:
     """Read a mesh whose coordinates count `meters` each, and what differs from the file, a sentence each.
 
-    Meshes of more than `MOST_FACES` triangles are reduced. Raises `ExportError` for one that is huge, or not in the
-    field's unit, and `CaptureError` for a file that is not a mesh.
+    A `Surface` is in meters. Meshes of more than `MOST_FACES` triangles are reduced. Raises `ExportError` for one that
+    is huge, or not in the field's unit, and `CaptureError` for a file that is not a mesh.
     """
-    expect_readable(path)
-    mesh = read_textured_mesh(path, meters=meters)
+    if isinstance(source, Surface):
+        path, mesh = None, TexturedMesh.build(source.vertices, source.faces)
+    else:
+        expect_readable(source)
+        path, mesh = source, read_textured_mesh(source, meters=meters)
     expect_alike(mesh.vertices.double().numpy(), sampled.points, path)
     faces = len(mesh.faces)
     if faces <= MOST_FACES:
@@ -74,7 +78,7 @@ def read_look(path: Path, sampled: SampledField, *, meters: float = 1.0) -> tupl
     corner_rows = torch.from_numpy(np.array(small.faces, dtype=np.int64))
     shown = torch.from_numpy(np.array(small.visual.vertex_colors[:, :3], dtype=np.float32)) / 255.0
     vertices = torch.from_numpy(np.array(small.vertices)).float()
-    remark = f"{path} has {faces:,} triangles, too many for a browser: {len(corner_rows):,} are shown"
+    remark = f"{path or 'the surface'} has {faces:,} triangles, too many for a browser: {len(corner_rows):,} are shown"
     return Look.of_mesh(TexturedMesh.build(vertices, corner_rows, colors=shown[corner_rows])), (remark,)
 
 

@@ -13,6 +13,7 @@ from avmsf.export.normals import outward_normals
 from avmsf.field.gainfield import GainField
 from avmsf.field.gains.body import BodyGains
 from avmsf.field.gains.model import MixtureGains
+from avmsf.field.positions import points_on_object
 from avmsf.field.scaledgains import ScaledGains
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.pulse import ForcePulse
@@ -72,7 +73,7 @@ class SampledField:
         `normals` point out of the object; where they are not given they are those that the field's physics holds, or
         else are judged from how the points lie. Raises `ExportError` for points that are none, or not finite.
         """
-        places = sound_field.gain_field.points if points is None else points
+        places = points_on_object(sound_field.gain_field) if points is None else points
         _expect_places(places, normals, limit)
         if limit is not None and len(places) > limit:
             rows = spread_rows(places, limit)

@@ -55,7 +55,7 @@ def write_webpage(
     *,
     object: Path | Surface | None = None,
     meters: float = 1.0,
-    surface: Path | None = None,
+    surface: Path | Surface | None = None,
     strikes: Impacts | None = None,
     limit: int = MOST_POINTS,
     force: bool = False,

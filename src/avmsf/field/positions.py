@@ -1,14 +1,16 @@
-"""Whether positions lie on an object, by the points that its field knows."""
+"""Whether positions lie on an object, by the points that its field knows and the body of its gains."""
 
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float32, Float64
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf.capture.placement import TOLERANCE
 from avmsf.errors import PositionError
+from avmsf.field.gainfield import GainField
+from avmsf.field.scaledgains import body_of, length_of
 
 _FEW = 16
 """Positions up to which all distances take less time than a tree of the points."""
@@ -41,20 +43,35 @@ def expect_near(
         )
 
 
-def off_surface(positions: Float[Tensor, "contacts 3"], points: Float[Tensor, "points 3"]) -> list[tuple[int, float]]:
-    """Return the rows of positions that lie off the object, and their distances from its points, meters.
+def off_surface(positions: Float[Tensor, "contacts 3"], gains: GainField) -> list[tuple[int, float]]:
+    """Return the rows of positions that lie off the object of gains, and their distances from it, meters.
 
-    Off it is what is farther from the nearest point than `TOLERANCE` of the diagonal of the points' box, and farther
-    than twice the greatest distance from a point to its neighbor.
+    The object is the surface of the gains' body, or without a body their points. Off it is what is farther than
+    `TOLERANCE` of the diagonal of the points' box, and without a body farther than twice the greatest distance from a
+    point to its neighbor.
     """
-    known = points.detach().cpu().double()
-    distances = _distances(positions, known)
+    known, body = gains.points.detach().cpu().double(), body_of(gains)
     limit = TOLERANCE * float((known.amax(0) - known.amin(0)).norm())
-    if not bool((distances > limit).any()):
-        return []
-    neighbors, _ = cKDTree(known.numpy()).query(known.numpy(), k=2)
-    limit = max(limit, 2.0 * float(neighbors[:, -1].max()))
+    if body is not None:
+        length = length_of(gains)
+        distances = length * body.distances(positions.detach().cpu().double() / length)
+    else:
+        distances = _distances(positions, known)
+        if bool((distances > limit).any()):
+            neighbors, _ = cKDTree(known.numpy()).query(known.numpy(), k=2)
+            limit = max(limit, 2.0 * float(neighbors[:, -1].max()))
     return [(row, float(distances[row])) for row in torch.nonzero(distances > limit).flatten().tolist()]
+
+
+def points_on_object(gains: GainField) -> Float32[Tensor, "points 3"]:
+    """Return the points of gains that are not `off_surface`: a reconstruction may close a cavity of the body.
+
+    All of them where that would be none.
+    """
+    off = [row for row, _ in off_surface(gains.points, gains)]
+    on = torch.ones(len(gains.points), dtype=torch.bool)
+    on[off] = False
+    return gains.points[on] if bool(on.any()) else gains.points
 
 
 def _distances(

@@ -11,10 +11,12 @@ from torch import Tensor
 
 from avmsf._utils.records import RecordError, count_of, like
 from avmsf._utils.summary import short_repr
+from avmsf.capture.surface import Surface
 from avmsf.field.attention import AttentionGains
 from avmsf.field.gainfield import GainField, Gains
 from avmsf.field.gains.body import BodyGains
 from avmsf.field.gains.model import MixtureGains
+from avmsf.simulate.elastic import ElasticModes
 
 FITTED: dict[str, type[GainField]] = {each.kind: each for each in (AttentionGains, MixtureGains, BodyGains)}
 """The gain fields beneath all edits, fitted to recordings or guessed, by what a file calls them."""
@@ -110,6 +112,18 @@ class ScaledGains:
 def fitted_gains(gains: GainField) -> GainField:
     """Return gains as they were fitted, beneath all edits."""
     return gains.field if isinstance(gains, ScaledGains) else gains
+
+
+def body_of(gains: GainField) -> ElasticModes | None:
+    """Return the body whose mode shapes the fitted gains know, of the size before all edits; None without one."""
+    fitted = fitted_gains(gains)
+    return fitted.body if isinstance(fitted, MixtureGains | BodyGains) else None
+
+
+def surface_of(gains: GainField) -> Surface | None:
+    """Return the surface of the body that gains are computed on (object frame, meters); None without a body."""
+    body = body_of(gains)
+    return None if body is None else Surface(length_of(gains) * body.nodes.float(), body.triangles[:, :3])
 
 
 def length_of(gains: GainField) -> float:

@@ -345,11 +345,11 @@ class SoundField:
         """Return positions and directions as tensors. Warns of positions off the object."""
         contacts = as_vectors(positions, "positions")
         expect_near(contacts, self.gain_field.points)
-        off = off_surface(contacts, self.gain_field.points)
+        off = off_surface(contacts, self.gain_field)
         if off:
             row, distance = max(off, key=lambda each: each[1])
             message = (
-                f"positions, row {row}: expected positions on the object's points, got {len(off)} off them, this one "
+                f"positions, row {row}: expected positions on the object, got {len(off)} off them, this one "
                 f"by {1e3 * distance:.3g} mm; the gains there are extrapolated"
             )
             warnings.warn(PositionWarning(message, name="positions", row=row, value=distance), stacklevel=3)

@@ -59,6 +59,10 @@ class ElasticModes:
         """Return the unit normals, out of the body, of the triangles nearest to each place."""
         return self._normals_of(self._nearest(places))
 
+    def distances(self, places: Float[Tensor, "contacts 3"]) -> Float64[Tensor, " contacts"]:
+        """Return the distance of each place from the surface, meters."""
+        return torch.from_numpy(self._nearest(places).distances)
+
     def at_with_normals(
         self, places: Float[Tensor, "contacts 3"]
     ) -> tuple[Float64[Tensor, "contacts modes 3"], Float64[Tensor, "contacts 3"]]:

@@ -24,7 +24,8 @@ from avmsf.export.bundle import write_bundle
 from avmsf.export.formats import MOST_POINTS
 from avmsf.export.normals import outward_normals
 from avmsf.export.sampledfield import SampledField
-from avmsf.field.scaledgains import length_of
+from avmsf.field.positions import points_on_object
+from avmsf.field.scaledgains import fitted_gains, length_of, surface_of
 from avmsf.field.soundfield import SoundField
 from avmsf.scene.features import FeatureField
 from avmsf.scene.ply import read_splats
@@ -85,7 +86,7 @@ class Showcase:
             shown = find_object(self.opened) if fresh else None
             strikes, remarks = self._strikes(revision.field) if fresh else (None, ())
             mute = revision.field is None
-            surface = find_reconstructed(self.opened) if fresh else None
+            surface = self._surface(revision.field) if fresh else None
             remarks += write_bundle(
                 sampled, path, object=shown, meters=self.meters, surface=surface, strikes=strikes, mute=mute
             ).remarks
@@ -101,6 +102,16 @@ class Showcase:
                 tensor["file"] = f"revisions/{revision.number}/field.bin"
             self._shown[revision.number] = Shown(path, manifest, sampled, revision, self._first_of_field.remarks)
             self._forget()
+
+    def _surface(self, field: SoundField | None) -> Path | Surface | None:
+        """Return the surface to show in place of Gaussians or points: the field's body, or what was reconstructed.
+
+        None where a mesh of the object's own is shown. Like the points, it has the size before all edits.
+        """
+        shown = find_object(self.opened)
+        if field is None or (shown is not None and not is_gaussians(shown)):
+            return find_reconstructed(self.opened)
+        return surface_of(fitted_gains(field.gain_field)) or find_reconstructed(self.opened)
 
     def _sampled(self, revision: Revision) -> SampledField:
         field = revision.field
@@ -121,7 +132,7 @@ class Showcase:
 
     def _first(self, field: SoundField) -> SampledField:
         """Return the table of a field just opened, over its own points, or where it has none, over the object's."""
-        own = field.gain_field.points
+        own = points_on_object(field.gain_field)
         if len(own):
             sampled = SampledField.of(field, _thinned(own, MOST_POINTS))
             return replace(sampled, points=(sampled.points.double() / length_of(field.gain_field)).float())

@@ -67,12 +67,12 @@ class Options(Printing):
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE|FOLDER")]
     """A folder, or a file for gltf (.glb), faust (.dsp or .lib), uff (.uff) or a page in one file (.html)."""
     object: ShapeFile = None
-    """Mesh, or Gaussians as a .ply, to show; by default the capture's surface, or else the field's points."""
+    """Mesh, or Gaussians as a .ply, to show; by default the capture's mesh, or else the surface of the body that the
+    field's gains are computed on, or else the surface made from photographs, or else the field's points."""
     object_unit: Unit = "m"
     """Unit of the coordinates of the object's mesh."""
     capture: OtherCapture = None
-    """Capture folder: its mesh is shown, or the surface made from its photographs, and a page offers its recordings
-    next to the model's sounds."""
+    """Capture folder: its mesh is shown, see --object, and a page offers its recordings next to the model's sounds."""
     points: int | None = None
     """Maximum number of contacts, spread over the object; by default as many as the format's tools read easily."""
     overwrite: Flag = False

@@ -118,6 +118,11 @@ ShapeFile = Annotated[
 SettingsFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml"), Existing("a capture.toml", ())]
 OutputFolder = Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER"), NewFolder()]
 PlotsFolder = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER"), NewFolder()]
+ContactTable = Annotated[Path | None, tyro.conf.arg(metavar="TABLE.csv"), Existing("a table of contacts", ())]
+PositionList = Annotated[
+    tyro.conf.UseAppendAction[tuple[tuple[float, float, float], ...]], tyro.conf.arg(metavar="X Y Z")
+]
+"""Vectors, one for each time that the option is given."""
 NEW_TENSORS = NewFile((".safetensors",))
 """A field or features to write."""
 

@@ -10,12 +10,11 @@ import tyro
 
 from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.common import Flag, Printing, Unit, parse_options
-from avmsf.cli.options.paths import Existing, FieldFile, NewFile
+from avmsf.cli.options.paths import ContactTable, FieldFile, NewFile, PositionList
 from avmsf.modal.config import PulseShape
 from avmsf.simulate.recipe import LONGEST
 
 Coding = Literal["float32", "int16"]
-Points = tyro.conf.UseAppendAction[tuple[tuple[float, float, float], ...]]
 
 
 @dataclass(frozen=True)
@@ -33,13 +32,11 @@ class Options(Printing):
         Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER|FILE.wav"), NewFile((".wav",), or_folder=True)
     ]
     """Folder for the sounds; for a single contact also a file that ends in .wav."""
-    position: Annotated[Points, tyro.conf.arg(metavar="X Y Z")] = ()
+    position: PositionList = ()
     """A contact in the object's frame."""
-    direction: Annotated[Points, tyro.conf.arg(metavar="X Y Z")] = ()
+    direction: PositionList = ()
     """Direction of the impact at each --position, in the same order."""
-    contact_table: Annotated[Path | None, tyro.conf.arg(metavar="TABLE.csv"), Existing("a table of contacts", ())] = (
-        None
-    )
+    contact_table: ContactTable = None
     """Table of contacts. In it, a direction that is empty or 0,0,0 is not known."""
     unit: Unit = "m"
     """Unit of the coordinates. A field itself is in meters, whatever unit its capture has."""
