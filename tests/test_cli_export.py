@@ -326,6 +326,38 @@ def test_what_cannot_be_exported_is_said(field_file: Path, tmp_path: Path) -> No
     assert main(["export", *words, "--overwrite"]) == 0
 
 
+GIVEN = ((0.05, 0.03, 0.002), (0.045, 0.03, 0.002), (0.01, 0.07, 0.002))
+"""Contacts, meters."""
+
+
+@pytest.mark.parametrize("how", ["options", "table"])
+def test_a_sample_set_has_the_given_contacts_in_their_order(how: str, field_file: Path, tmp_path: Path) -> None:
+    words = [word for place in GIVEN for word in ("--position", *map(str, place))]
+    if how == "table":
+        lines = ["file,x,y,z", *(f"{row}.wav,{1e3 * x},{1e3 * y},{1e3 * z}" for row, (x, y, z) in enumerate(GIVEN))]
+        (tmp_path / "places.csv").write_text("\n".join(lines) + "\n")
+        words = ["--contact-table", str(tmp_path / "places.csv"), "--unit", "mm"]
+    assert main(["export", str(field_file), "--to", "wavs", "--output", str(tmp_path / "set"), *words]) == 0
+    with (tmp_path / "set" / "strikes.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    places = [[float(row[axis]) for axis in "xyz"] for row in rows]
+    np.testing.assert_allclose(places, GIVEN, atol=1e-9)
+    scale = json.loads((tmp_path / "set" / "manifest.json").read_text())["scale"]
+    expected = scale * load(field_file).render(torch.tensor(GIVEN, dtype=torch.float64))
+    for row, sound in zip(rows, expected, strict=True):
+        found = soundfile.read(tmp_path / "set" / row["file"], dtype="float32")[0]
+        # Both are float32, of a peak below 1.
+        np.testing.assert_allclose(found, sound.numpy(), atol=1e-5)
+
+
+def test_contacts_are_given_in_one_way(field_file: Path, tmp_path: Path) -> None:
+    words = [str(field_file), "--to", "wavs", "--output", str(tmp_path / "set"), "--position", "0.05", "0.03", "0.002"]
+    error = refused([*words, "--points", "3"])
+    assert (error.name, error.value) == ("--position", 2)
+    far = refused([*words[:-3], "50", "30", "2"])
+    assert (far.name, far.value) == ("--position", [50.0, 30.0, 2.0])
+
+
 def test_an_option_that_a_format_does_not_use_is_noted(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
     words = ["export", str(field_file), "--to", "faust", "-o", str(tmp_path / "a.dsp"), "--points", "3", "--quiet"]
     assert main([*words, "--rate", "8000", "--seconds", "1"]) == 0

@@ -13,6 +13,7 @@ from avmsf.capture.folder import read_capture
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import METRES, settings_of
 from avmsf.capture.surface import Surface
+from avmsf.cli.contacts import given_contacts, note_off, refuse_far
 from avmsf.cli.options.export import Options, unused_options
 from avmsf.cli.printing import figure, next_command, print_result, say
 from avmsf.config import CACHE
@@ -116,6 +117,9 @@ def _read(options: Options) -> SoundField | SampledField:
 
 
 def _sampled(field: SoundField | SampledField, options: Options) -> SampledField:
+    """Return the field at the contacts of the options, or at its own points spread over the object."""
+    if options.contacts_given:
+        return _at_given(field, options)
     most = options.points or POINTS[options.to]
     if isinstance(field, SoundField):
         points = points_on_object(field.gain_field)
@@ -125,6 +129,23 @@ def _sampled(field: SoundField | SampledField, options: Options) -> SampledField
     if len(sampled) < held and options.points is None:
         say(f"note: written: {len(sampled)} of the field's {counted(held, 'contact')}; --points sets the number")
     return sampled
+
+
+def _at_given(field: SoundField | SampledField, options: Options) -> SampledField:
+    """Return the field at the contacts of --position or --contact-table, in this order."""
+    if isinstance(field, SampledField):
+        raise ExportError.expected(
+            "a field file for --position and --contact-table",
+            got="a folder of the demo's layout, which has only its own points",
+            file=options.field,
+            name="--position",
+        )
+    contacts = given_contacts(options.position, options.contact_table, unit=options.unit)
+    refuse_far(contacts, field, advice=", see --unit")
+    note_off(contacts, field)
+    if contacts.directions is not None:
+        say(f"note: {contacts.table}: directions are not used; impacts go straight into the surface")
+    return SampledField.of(field, contacts.places)
 
 
 def _object(field: SoundField | SampledField, options: Options) -> tuple[Path | Surface | None, float]:
@@ -240,7 +261,7 @@ def _gltf(field: SoundField | SampledField, options: Options) -> Written:
 
 def _faust(field: SoundField | SampledField, options: Options) -> Written:
     sampled, noise = _sampled(field, options), not options.no_noise
-    if options.points is None:
+    if options.points is None and not options.contacts_given:
         asked = len(sampled)
         sampled, noise = fitted(sampled, noise=noise)
         if len(sampled) < asked:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import soundfile
+import torch
 from jaxtyping import Float32, Float64, Int
 from torch import Tensor
 
@@ -44,7 +45,7 @@ class Grid:
     """Which impacts are written."""
 
     contacts: int = 16
-    """How many contacts, as far apart as possible, one MIDI note each."""
+    """Contacts at most, one MIDI note each: all of the field's in their order, or so many of more, spread far apart."""
     layers: tuple[Layer, ...] = (Layer(),)
     """Each contact has one impact of each; they are sorted by their level."""
     seconds: float | None = None
@@ -68,7 +69,7 @@ def write_grid(field: SampledField, folder: str | Path, grid: Grid | None = None
         raise ExportError.expected(
             "whole hertz for wav files", field.sample_rate, got=f"{field.sample_rate:g} Hz", name="sample_rate"
         )
-    rows = field.spread(grid.contacts)
+    rows = torch.arange(len(field)) if len(field) <= grid.contacts else field.spread(grid.contacts)
     samples = field.samples if grid.seconds is None else max(1, round(grid.seconds * rate))
     pulses = [ForcePulse(layer.contact_time, layer.shape) for layer in grid.layers]
     sounds = [

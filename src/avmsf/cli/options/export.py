@@ -1,5 +1,6 @@
 """Options of `avmsf export`, and which of them each format uses."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -9,7 +10,15 @@ import tyro
 
 from avmsf.cli.options.common import Flag, Printing, Unit, parse_options
 from avmsf.cli.options.helptext import option_of
-from avmsf.cli.options.paths import Existing, NewFile, NewFolder, OtherCapture, ShapeFile
+from avmsf.cli.options.paths import (
+    ContactTable,
+    Existing,
+    NewFile,
+    NewFolder,
+    OtherCapture,
+    PositionList,
+    ShapeFile,
+)
 from avmsf.errors import ExportError
 from avmsf.export.formats import (
     FAUST_SUFFIXES,
@@ -23,15 +32,18 @@ from avmsf.export.formats import (
 from avmsf.field.header import read_record
 from avmsf.modal.config import PulseShape
 
+_CONTACTS = ("position", "contact_table", "unit")
 _USED: dict[Format, tuple[str, ...]] = {
     "web": ("object", "object_unit", "capture"),
-    "gltf": ("object", "object_unit", "capture", "up"),
-    "faust": ("no_noise",),
+    "gltf": ("object", "object_unit", "capture", "up", *_CONTACTS),
+    "faust": ("no_noise", *_CONTACTS),
     "avmsf-demo": ("object", "variant", "precision"),
-    "wavs": ("forces", "contact_times", "pulse", "seconds", "no_noise"),
-    "uff": ("functions",),
+    "wavs": ("forces", "contact_times", "pulse", "seconds", "no_noise", *_CONTACTS),
+    "uff": ("functions", *_CONTACTS),
 }
 """Options that each format uses, in addition to those that all use."""
+CHOOSING = frozenset(name for name, used in _USED.items() if "position" in used)
+"""Formats whose contacts can be given."""
 _OUTPUTS: dict[Format, NewFile | NewFolder] = {
     "web": NewFile(PAGE_SUFFIXES, or_folder=True),
     "gltf": NewFile(GLTF_SUFFIXES),
@@ -75,6 +87,13 @@ class Options(Printing):
     """Capture folder: its mesh is shown, see --object, and a page offers its recordings next to the model's sounds."""
     points: int | None = None
     """Maximum number of contacts, spread over the object; by default as many as the format's tools read easily."""
+    position: PositionList = ()
+    """faust, gltf, uff, wavs: a contact in the object's frame, in place of contacts spread over the object; once per
+    contact."""
+    contact_table: ContactTable = None
+    """faust, gltf, uff, wavs: table of contacts with the columns x,y,z, such as a capture's impacts.csv."""
+    unit: Unit = "m"
+    """Unit of --position and --contact-table."""
     overwrite: Flag = False
     """Replace files that no export wrote. Files of other names are not changed."""
     forces: tuple[float, ...] = (1.0,)
@@ -99,9 +118,22 @@ class Options(Printing):
     rate: float | None = None
     """Sample rate in Hz of a field in the demo's layout, which does not hold it."""
 
+    @property
+    def contacts_given(self) -> bool:
+        """Whether the contacts are given, and used by the format."""
+        return self.to in CHOOSING and bool(self.position or self.contact_table)
+
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
+        given = sum((bool(self.position), self.contact_table is not None, self.points is not None))
+        if self.contacts_given and given > 1:
+            raise ExportError.expected(
+                "contacts by one of --position, --contact-table and --points", given, name="--position"
+            )
+        for row, place in enumerate(self.position):
+            if not all(map(math.isfinite, place)):
+                raise ExportError.expected("finite coordinates", list(place), row=row, name="--position")
         if self.points is not None and self.points < 1:
             raise ExportError.expected("1 or more", self.points, name="--points")
         _OUTPUTS[self.to].check(self.output)
