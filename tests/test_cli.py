@@ -18,6 +18,7 @@ from avmsf.cli import VERBS, main
 from avmsf.errors import CaptureError
 from avmsf.field import PAPER, FitConfig
 from avmsf.field.store import load
+from avmsf.scene.plyheader import NEEDED
 from avmsf.simulate.plate import plate_modes
 from plate_capture import CONTACT_TIME, HIGHEST, PLATE, RATE, TINY, fill_plate
 from raising import raises
@@ -150,8 +151,16 @@ def test_output_that_nobody_reads_any_more_ends_quietly(field: Path) -> None:
 def test_a_terminal_is_told_that_something_goes_on_until_it_does(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
+    # Numbers are looked at only when all is loaded.
     nothing = tmp_path / "nothing.ply"
-    nothing.write_bytes(b"")
+    header = [
+        "ply",
+        "format ascii 1.0",
+        "element vertex 1",
+        *(f"property float {name}" for name in NEEDED),
+        "end_header",
+    ]
+    nothing.write_text("\n".join([*header, "nan " * len(NEEDED)]))
 
     class Terminal(io.StringIO):
         def isatty(self) -> bool:
@@ -270,7 +279,8 @@ def test_fit_writes_a_field_and_its_scores(capture: Path, tmp_path: Path, capsys
     out, err = capsys.readouterr()
     told = json.loads(out)
     field = load(path)
-    assert told["modes"] == len(field.bank) <= 12
+    assert told["modes"] == int(field.is_mode.sum()) > 0
+    assert told["modes"] + told["supporting_poles"] == len(field.bank) <= 12
     assert told["trained_on"] == list(field.origin.trained_on)
     assert told["trained_on"][0] == "003.wav"
     assert len(told["trained_on"]) == len(told["tested_on"]) == 4
@@ -499,8 +509,10 @@ def test_show_says_and_draws(field: Path, capture: Path, tmp_path: Path, capsys:
     told, fitted = json.loads(out), load(field)
     assert told["capture"] == "plate"
     assert told["sample_rate"] == RATE
-    assert told["mode_count"] == len(told["modes"]) == len(fitted.bank)
-    assert told["modes"][0]["frequency_hertz"] == float(fitted.bank.frequency[0])
+    frequency, is_mode = fitted.bank.frequency, fitted.is_mode
+    assert told["mode_count"] == len(told["modes"])
+    assert [each["frequency_hertz"] for each in told["modes"]] == frequency[is_mode].tolist()
+    assert [each["frequency_hertz"] for each in told["supporting_poles"]] == frequency[~is_mode].tolist()
     assert told["compared_with"]["which"] == "not training recordings"
     assert set(told["compared_with"]["recordings"]).isdisjoint(fitted.origin.trained_on)
     assert len(told["compared_with"]["recordings"]) == 3

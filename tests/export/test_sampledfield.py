@@ -1,16 +1,19 @@
 """A table of points sounds as the field that it was made from."""
 
+import json
 from dataclasses import replace
 
 import pytest
 import torch
 
 from avmsf.errors import ExportError
+from avmsf.export.bundle import write_bundle
 from avmsf.export.normals import outward_normals
 from avmsf.export.sampledfield import SampledField
 from avmsf.field.config import FitConfig
 from avmsf.field.scaledgains import ScaledGains
-from avmsf.field.soundfield import Origin, SoundField
+from avmsf.field.soundfield import SUPPORTING, Origin, SoundField
+from avmsf.modal.bank import ModalBank
 from avmsf.modal.pulse import ForcePulse
 from avmsf.modal.residual import Residual
 from made_fields import BANK, FIELDS, elastic, places, plate, positional
@@ -141,3 +144,18 @@ def test_normals_of_other_points_are_refused():
 def test_a_limit_of_none_is_refused():
     with raises(ExportError, name="limit", value=0):
         SampledField.of(sounding("positional"), limit=0)
+
+
+def test_supporting_poles_are_counted_among_the_modes_that_sound(tmp_path):
+    made = sounding("positional")
+    report = {SUPPORTING: [1, 4]}
+    # Twice as high, the last mode is beyond half the sample rate.
+    bank = ModalBank(2.0 * BANK.frequency, BANK.damping)
+    field = replace(made, bank=bank, origin=replace(made.origin, report=report))
+    assert field.is_mode.tolist() == [True, False, True, True, False]
+    table = SampledField.of(field)
+    assert len(table.frequency) == 4
+    assert table.supporting == table.take(torch.tensor([3])).supporting == (1,)
+    write_bundle(table, tmp_path / "page")
+    assert json.loads((tmp_path / "page" / "manifest.json").read_text())["supporting"] == [1]
+    assert SampledField.of(made).supporting == ()

@@ -23,7 +23,7 @@ from avmsf.field.soundfield import SoundField
 from avmsf.field.store import save
 from avmsf.pipeline.fitting import discard_unfinished, fit_capture, unfinished
 from avmsf.pipeline.guess import guess_field, known_surface
-from avmsf.pipeline.record import capture_settings_of, with_record
+from avmsf.pipeline.record import capture_settings_of, modes_words, with_record
 from avmsf.scene.featurestore import load_features, read_report
 from avmsf.wording import counted
 
@@ -105,7 +105,8 @@ def fitted_values(
     return {
         "field": str(path),
         "capture": fitted.origin.capture,
-        "modes": len(fitted.bank),
+        "modes": int(fitted.is_mode.sum()),
+        "supporting_poles": int((~fitted.is_mode).sum()),
         "trained_on": list(train.names),
         "tested_on": [] if test is None else list(test.names),
         "report": fitted.origin.report,
@@ -190,8 +191,9 @@ def summary(fitted: SoundField, contacts: int) -> str:
             f"with {best['frequency_factor'] ** 2:.2f} times the stiffness-to-density ratio of aluminum; it raises the "
             f"log likelihood of the gains at left-out contacts by {gained:.1f} per mode)"
         )
+    modes = modes_words(len(fitted.bank), int((~fitted.is_mode).sum()))
     return (
-        f"field of {fitted.origin.capture}: {counted(len(fitted.bank), 'mode')} from "
+        f"field of {fitted.origin.capture}: {modes} from "
         f"{counted(contacts, 'recording')}, gains by {gains}, {report.get('damping', 'shared')} damping{reason}, "
         f"{counted(report.get('steps', fitted.origin.config.steps), 'step')} end to end"
     )

@@ -27,7 +27,7 @@ from avmsf.field.scaledgains import surface_of
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.field.uncertainty import has_posterior, relative_gain_std, spectrum_band, training_contacts
-from avmsf.pipeline.record import RECORD, recorded
+from avmsf.pipeline.record import RECORD, modes_words, recorded
 from avmsf.scene.featureheader import holds_features
 from avmsf.scene.points import farthest_points
 from avmsf.wording import counted
@@ -52,11 +52,15 @@ def run(options: Options) -> int:
     points = _some(field.gain_field.points)
     gains = gains_at(field, points)
     level = levels(gains)
-    rows = mode_rows(field.bank, level)
+    every = list(zip(mode_rows(field.bank, level), field.is_mode.tolist(), strict=True))
+    rows, supporting = ([row for row, is_mode in every if is_mode is part] for part in (True, False))
     values = describe(field)
     screen = console(errors=options.json)
     screen.print(_words(values, quality_words(field, options.file)), soft_wrap=True)
     screen.print(mode_table(f"{counted(len(rows), 'mode')}, levels on average over the object", rows))
+    if supporting:
+        title = f"{counted(len(supporting), 'supporting pole')}: in the model, but not modes"
+        screen.print(mode_table(title, supporting))
     recorded = None
     if options.capture is not None:
         settings = None if options.settings is None else CaptureSettings.read(options.settings)
@@ -71,7 +75,7 @@ def run(options: Options) -> int:
         draw_field(field, options.plots, points=points, gains=gains, level=level, recorded=recorded)
     next_command("avmsf render", options.file, "--position X Y Z -o impact.wav")
     if options.json:
-        print_json(values | {"modes": [asdict(row) for row in rows]})
+        print_json(values | {"modes": list(map(asdict, rows)), "supporting_poles": list(map(asdict, supporting))})
     return 0
 
 
@@ -102,7 +106,8 @@ def describe(field: SoundField) -> dict[str, Any]:
         "capture": field.origin.capture,
         "sample_rate": field.sample_rate,
         "seconds": field.samples / field.sample_rate,
-        "mode_count": len(field.bank),
+        "mode_count": int(field.is_mode.sum()),
+        "supporting_pole_count": int((~field.is_mode).sum()),
         "points": len(points),
         "extent_meters": (points.amax(0) - points.amin(0)).tolist(),
         "bounds_meters": [points.amin(0).tolist(), points.amax(0).tolist()],
@@ -131,8 +136,9 @@ def draw_field(
 ) -> None:
     """Write the figures of a field, with some of the recordings `recorded` next to its sounds."""
     name = field.origin.capture or "field"
+    modes = modes_words(len(field.bank), int((~field.is_mode).sum()))
     pictures = {
-        "modes": draw_modes(field.bank, level, title=f"{counted(len(field.bank), 'mode')} of {name}"),
+        "modes": draw_modes(field.bank, level, title=f"{modes} of {name}"),
         "gains": draw_gains(points, gains, field.bank.frequency, title=f"gains of the strongest modes of {name}"),
     }
     if recorded is not None:
@@ -186,11 +192,13 @@ def _words(values: dict[str, Any], quality: list[str]) -> str:
     sides = zip("xyz", *values["bounds_meters"], strict=True)
     extent = ", ".join(f"{axis} {low:.3g} to {high:.3g}" for axis, low, high in sides)
     report = values["report"]
+    supporting = values["supporting_pole_count"]
+    poles = f" and {counted(supporting, 'supporting pole')}" if supporting else ""
     lines = [
         f"field of {values['capture'] or 'an unnamed capture'}",
         f"  sounds     {values['seconds']:.3g} s at {values['sample_rate']:g} Hz, "
         f"{'per newton' if values['per_newton'] else 'on the scale of the recordings'}",
-        f"  modes      {values['mode_count']}, {report.get('damping', 'shared')} damping",
+        f"  modes      {values['mode_count']}{poles}, {report.get('damping', 'shared')} damping",
         f"  noise      {values['residual_rms']:.2g} (root mean square of the residual)",
         f"  object     {values['points']} points, {extent} m",
         f"  gains      {_gains_words(values['gain_field'])}",

@@ -185,6 +185,7 @@ def _manifest(
         "samples": field.samples,
         "perNewton": field.per_newton,
         "modes": len(field.frequency),
+        "supporting": list(field.supporting),
         "points": len(field),
         "damping": "shared" if field.shared_damping else "perContact",
         "tensors": tensors,

@@ -58,6 +58,8 @@ class SampledField:
     """What the object is called."""
     origin: dict[str, Any] = field(default_factory=dict)
     """Where the field comes from, as plain values."""
+    supporting: tuple[int, ...] = ()
+    """Columns of the modes' tensors that are supporting poles, see `SoundField.is_mode`."""
 
     @classmethod
     def of(
@@ -110,6 +112,7 @@ class SampledField:
                 "trained_on": list(origin.trained_on),
                 "gain_field": sound_field.gain_field.kind,
             },
+            supporting_columns(sound_field),
         )
 
     @property
@@ -177,6 +180,12 @@ class SampledField:
             parts.append(modes if pulse is None else pulse.soften(modes, sample_rate=self.sample_rate))
         sounds = torch.cat(parts)
         return force * (sounds + added if noise else sounds)
+
+
+def supporting_columns(sound_field: SoundField) -> tuple[int, ...]:
+    """Return the places, among the modes that sound, of those that are supporting poles."""
+    sounding = sound_field.is_mode[sound_field.audible]
+    return tuple(torch.nonzero(~sounding).flatten().tolist())
 
 
 def spread_rows(points: Float[Tensor, "points 3"], count: int) -> Int[Tensor, " chosen"]:

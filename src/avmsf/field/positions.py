@@ -68,6 +68,8 @@ def points_on_object(gains: GainField) -> Float32[Tensor, "points 3"]:
 
     All of them where that would be none.
     """
+    if not len(gains.points):
+        return gains.points
     off = [row for row, _ in off_surface(gains.points, gains)]
     on = torch.ones(len(gains.points), dtype=torch.bool)
     on[off] = False

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from avmsf.scene.features import FeatureField
     from avmsf.tasks.hearing import Sound
 
+SUPPORTING = "supporting_poles"
+"""What a report calls the rows of the bank's poles that are no modes of the object."""
 _BATCH = 32
 """Contacts rendered at once, which bounds the memory."""
 
@@ -175,6 +177,16 @@ class SoundField:
     def audible(self) -> Bool[Tensor, " modes"]:
         """Which modes sound: those below half the sample rate, above which an edit may have moved some."""
         return self.bank.frequency < 0.5 * self.sample_rate
+
+    @property
+    def is_mode(self) -> Bool[Tensor, " modes"]:
+        """Which of the bank's poles are modes of the object; the others support the model of the recordings.
+
+        True for all where the report does not say it: in a field without recordings, or made without the pipeline.
+        """
+        rows = self.origin.report.get(SUPPORTING)
+        supporting = set(rows if isinstance(rows, list) else [])
+        return torch.tensor([row not in supporting for row in range(len(self.bank))], dtype=torch.bool)
 
     @classmethod
     def fit(

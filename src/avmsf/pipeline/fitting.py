@@ -24,7 +24,7 @@ from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.extract import Extraction, extract_modes, extract_once
 from avmsf.pipeline.bodies import candidate_bodies, stated_bodies
 from avmsf.pipeline.reconstruct import expect_on_object
-from avmsf.pipeline.record import finder_of, with_record
+from avmsf.pipeline.record import finder_of, modes_words, supporting_poles, with_record
 from avmsf.scene.features import FeatureField
 from avmsf.scene.symmetry import Symmetries
 from avmsf.scene.symmetrysearch import find_symmetries
@@ -72,7 +72,8 @@ def fit_capture(
     log(f"finding the modes of {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
     kept = None if output is None else unfinished(output, "modes")
     modes = extract_modes(train, finder_of(config)) if kept is None else extract_once(train, finder_of(config), kept)
-    log(f"fitting a field of {counted(len(modes.bank), 'mode')}")
+    supporting = supporting_poles(modes, train)
+    log(f"fitting a field of {modes_words(len(modes.bank), len(supporting))}")
     try:
         fitted = fit(
             train,
@@ -90,7 +91,7 @@ def fit_capture(
         if kept is not None:
             discard(kept)
         raise
-    return with_record(fitted, config, features_report or {}), modes
+    return with_record(fitted, config, features_report or {}, supporting=supporting), modes
 
 
 def _expect_start(capture: Capture, config: PipelineConfig) -> None:

@@ -34,7 +34,7 @@ from avmsf.geometry.closest import ClosestPoints
 from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.pipeline.bodies import candidate_bodies, stated_bodies
 from avmsf.pipeline.guess import expect_no_recordings, guess_field
-from avmsf.pipeline.record import finder_of, with_record
+from avmsf.pipeline.record import finder_of, modes_words, supporting_poles, with_record
 from avmsf.pipeline.scene import Listener, SceneStages
 from avmsf.pipeline.silhouettes import expect_contacts_in_outlines, judge_outlines
 from avmsf.pipeline.stages import Kept, StageFolder
@@ -139,7 +139,8 @@ def _reconstruct(
             config.gain_model, stated_bodies(config, bodies), symmetries=shape.symmetries, features=shape.features,
             log=listener.tell,
         )  # fmt: skip
-        listener.tell(f"fit: a field of {counted(len(modes.bank), 'mode')}")
+        supporting = supporting_poles(modes, train)
+        listener.tell(f"fit: a field of {modes_words(len(modes.bank), len(supporting))}")
         fitted = fit(
             train,
             shape.features if config.gain_model == Visual.kind else shape.points,
@@ -152,7 +153,7 @@ def _reconstruct(
             progress=fitting,
             device=config.device,
         )
-        save(with_record(fitted, config, shape.report), path)
+        save(with_record(fitted, config, shape.report, supporting=supporting), path)
 
     def is_final(path: Path) -> bool:
         """Whether a kept field has the elastic family, or there is still none, as for want of memory."""

@@ -1,13 +1,19 @@
 """What a pipeline's configuration means for captures, modes and the fields that it makes."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
+import torch
+
+from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.config import PipelineConfig
-from avmsf.field.soundfield import SoundField
+from avmsf.field.soundfield import SUPPORTING, SoundField
+from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.finders import ModeFinder, finder_named
+from avmsf.modal.extraction.quality import measure_quality
+from avmsf.wording import counted
 
 RECORD = "pipeline"
 """What a field's report calls the configuration that made it."""
@@ -31,18 +37,33 @@ def capture_settings_of(config: PipelineConfig, settings: CaptureSettings) -> Ca
     return settings.starting(config.time_zero)
 
 
-def with_record(made: SoundField, config: PipelineConfig, features: Mapping[str, Any]) -> SoundField:
+def with_record(
+    made: SoundField, config: PipelineConfig, features: Mapping[str, Any], *, supporting: Sequence[int] = ()
+) -> SoundField:
     """Return a field whose report has the configuration that made it, but for the fit's own, which it has anyway.
 
     `features` is the report of the features' file: it names the encoder that was taken and how the features were made,
-    which decide where `config.scene` does not, as for a file from elsewhere. Empty where there is none.
+    which decide where `config.scene` does not, as for a file from elsewhere. Empty where there is none. `supporting`
+    are the rows of the poles that are no modes of the object.
     """
     values = asdict(config)
     del values["fit"]
     values["scene"] = features.get("scene")
     values["encoder"] = features.get("encoder")
-    report = {**made.origin.report, RECORD: values}
+    report = {**made.origin.report, RECORD: values, SUPPORTING: list(supporting)}
     return replace(made, origin=replace(made.origin, report=report))
+
+
+def supporting_poles(modes: Extraction, impacts: Impacts) -> list[int]:
+    """Return the rows of the poles that are no modes of the object, from the recordings that they were found in."""
+    quality = measure_quality(modes.aligned(impacts).sounds, modes, sample_rate=impacts.sample_rate)
+    return torch.nonzero(~quality.is_mode).flatten().tolist()
+
+
+def modes_words(poles: int, supporting: int) -> str:
+    """Return how many of the poles of a model are modes of the object: "16 modes and 38 supporting poles"."""
+    modes = counted(poles - supporting, "mode")
+    return f"{modes} and {counted(supporting, 'supporting pole')}" if supporting else modes
 
 
 def recorded(field: SoundField) -> dict[str, Any]:

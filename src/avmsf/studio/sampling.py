@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.export.sampledfield import SampledField
+from avmsf.export.sampledfield import SampledField, supporting_columns
 from avmsf.field.scaledgains import fitted_gains, length_of
 from avmsf.field.soundfield import SoundField
 from avmsf.field.uncertainty import scale_of
@@ -40,4 +40,5 @@ def resample(sampled: SampledField, before: SoundField, after: SoundField) -> Sa
         damping=sampled.damping[..., columns] * change,
         sine=(sampled.sine[:, columns] * factor).float(),
         cosine=(sampled.cosine[:, columns] * factor).float(),
+        supporting=supporting_columns(after),
     )

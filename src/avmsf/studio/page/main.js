@@ -43,13 +43,15 @@ async function open() {
 
 function showTitle(studio) {
   studio.on("bundle", () => {
-    const { name, modes, points, sampleRate } = studio.bundle.manifest;
+    const { name, points, sampleRate, supporting = [] } = studio.bundle.manifest;
+    const poles = studio.bundle.manifest.modes;
+    const modes = poles ? poles - supporting.length : 0;
     at("name").textContent = name;
     document.title = studio.live ? `${name} · avmsf studio` : name;
     const facts = [
-      modes ? `${modes} modes` : null,
+      poles ? `${modes} modes` : null,
       points ? `${points.toLocaleString("en")} contacts` : null,
-      modes ? `${Math.round(sampleRate / 100) / 10} kHz` : null,
+      poles ? `${Math.round(sampleRate / 100) / 10} kHz` : null,
     ];
     at("facts").textContent = facts.filter(Boolean).join(" · ");
   });

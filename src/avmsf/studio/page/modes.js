@@ -8,6 +8,8 @@ export const decibels = (amplitude) => DECIBELS * Math.log(Math.max(amplitude, 1
 export class Modes {
   constructor({ manifest, tensors }) {
     this.count = manifest.modes ?? 0;
+    /** Rows that are no modes of the object, but describe what its modes do not explain. */
+    this.supporting = new Set(manifest.supporting ?? []);
     this.points = manifest.points ?? 0;
     this.sampleRate = manifest.sampleRate;
     this.shared = manifest.damping !== "perContact";

@@ -32,7 +32,8 @@ export function modeTable(studio) {
     const row = studio.row ?? modes.loudestRow;
     const levels = modes.levels(row);
     where.textContent =
-      studio.row === null ? "Levels at the loudest contact." : `Levels and decays at contact ${row}.`;
+      (studio.row === null ? "Levels at the loudest contact." : `Levels and decays at contact ${row}.`) +
+      (modes.supporting.size ? " In italics: supporting poles, which are not modes of the object." : "");
     const rows = levels.map((level, mode) => ({
       mode,
       frequency: modes.frequency(mode),
@@ -55,7 +56,7 @@ export function modeTable(studio) {
         choose.setAttribute("aria-label", title);
         return element(
           "tr",
-          { "data-mode": mode, onclick: () => studio.choose(studio.mode === mode ? null : mode) },
+          { "data-mode": mode, className: modes.supporting.has(mode) ? "supporting" : "", onclick: () => studio.choose(studio.mode === mode ? null : mode) },
           element("td", {}, choose),
           ...numbers.map((words) => element("td", {}, words === "NaN" ? "–" : words)),
         );
