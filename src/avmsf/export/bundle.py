@@ -1,8 +1,9 @@
-"""A field as a page reads it: `manifest.json`, tensors in `field.bin`, the object, its surface, measured impacts.
+"""A field as the page reads it: `manifest.json`, tensors in `field.bin`, the object, its surface, measured impacts.
 
-The manifest says where in `field.bin` each tensor lies, little endian and row by row: points, normals, frequency,
-damping, sine, noise, and cosine unless all of it is zero. Times and frequencies are float64, for a float32 frequency
-is out of phase after a second; amplitudes are float32. Strikes are float32 wav files in the field's own unit.
+The manifest has the offset of each tensor in `field.bin`, little endian and row-major: points, normals, frequency,
+damping, sine, noise, and cosine unless it is all zero. Dampings and frequencies are float64, because a float32
+frequency has a large phase error after a second; amplitudes are float32. Recorded impacts are float32 wav files in the
+field's unit.
 """
 
 import io
@@ -27,9 +28,9 @@ from avmsf.field.positions import points_on_object
 from avmsf.field.soundfield import SoundField
 
 FORMAT = 1
-"""Number of this format; it grows with every change that older pages could not read."""
+"""Version of this format, increased by every change that older pages cannot read."""
 SURFACE = "surface.glb"
-"""What the file of the surface is called."""
+"""Name of the surface's file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +39,9 @@ class Bundle:
 
     manifest: Mapping[str, Any]
     files: Mapping[str, bytes]
-    """Content by relative path, all but the manifest."""
+    """Contents by relative path, without the manifest."""
     remarks: tuple[str, ...] = ()
-    """What the page leaves out, a sentence each."""
+    """Notes on what the page leaves out."""
 
 
 def make_bundle(
@@ -54,12 +55,12 @@ def make_bundle(
     live: Mapping[str, Any] | None = None,
     mute: bool = False,
 ) -> Bundle:
-    """Return a field's bundle, at no more than `limit` contacts.
+    """Return a field's bundle at `limit` contacts at most.
 
-    `object` is shown for it: a mesh whose coordinates count `meters` each, Gaussians, or the contacts alone. The mesh
-    `surface`, in meters, is what the reader can show instead, such as that of the field's body. `strikes` are
-    measured ones to compare with, `live` what a server behind the page offers. Raises `ExportError`, for a field
-    without a mode too unless it may be `mute`, as an object's that is to be struck first.
+    `object` is the geometry to show: a mesh with coordinates in units of `meters`, Gaussians, or by default the
+    contacts. `surface`, in meters, is an alternative to switch to, such as the surface of the field's body. `strikes`
+    are recorded impacts for comparison, `live` describes the server of the page. A field without modes is allowed if
+    `mute`, for an object that is not recorded yet. Raises `ExportError`.
     """
     remarks: tuple[str, ...] = ()
     if isinstance(field, SoundField):
@@ -98,9 +99,9 @@ def write_bundle(
     mute: bool = False,
     force: bool = False,
 ) -> Written:
-    """Write a field's bundle as a folder, whole or not at all; the arguments are those of `make_bundle`.
+    """Write a field's bundle as a folder, atomically; the arguments are those of `make_bundle`.
 
-    A bundle that is there is replaced. Raises `ExportError` for another folder that is not empty, unless with `force`.
+    An earlier bundle is replaced. Raises `ExportError` for another folder that is not empty, unless `force` is set.
     """
     bundle = make_bundle(
         field, object=object, meters=meters, surface=surface, strikes=strikes, limit=limit, live=live, mute=mute
@@ -119,7 +120,7 @@ def write_files(files: Mapping[str, bytes], folder: Path) -> None:
 
 
 def _tensors(field: SampledField) -> dict[str, Shaped[np.ndarray, "..."]]:
-    # Javascript reads numbers only from a multiple of their size: those of eight bytes come first.
+    # JavaScript needs offsets that are multiples of the item size: float64 comes first.
     named: dict[str, Shaped[np.ndarray, ...]] = {
         "frequency": field.frequency.numpy(),
         "damping": field.damping.numpy(),

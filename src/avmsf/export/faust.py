@@ -17,11 +17,11 @@ from avmsf.export.sampledfield import SampledField
 from avmsf.export.written import Written, expect_ending, expect_free, generator, write_file
 
 _FEWEST = 16
-"""Points below which the noise is left out for more of them."""
+"""Number of points below which the noise is left out so that more points fit."""
 _ROW = 8
-"""Numbers in a line of text."""
+"""Numbers in one line."""
 MOST_NUMBERS = 150_000
-"""In all tables together: Faust took half a minute for as many, in 128 modes."""
+"""Maximum of all tables together: with 128 modes Faust compiles as many in half a minute."""
 
 
 def write_faust(field: SampledField, path: str | Path, *, noise: bool = True, force: bool = False) -> Written:
@@ -63,9 +63,9 @@ def _contacts(field: SampledField) -> str:
 
 
 def fitted(field: SampledField, *, noise: bool = True) -> tuple[SampledField, bool]:
-    """Return the field at as many of its points as Faust compiles in reasonable time, and whether with the noise.
+    """Return the field at as many points as Faust compiles in reasonable time, and whether the noise is included.
 
-    A noise so long that few points would fit is left out.
+    The noise is left out if it is so long that few points would fit.
     """
     sounding = noise and bool(field.noise.any())
     if sounding and _fitting(field, noise=True) < min(_FEWEST, len(field)):
@@ -84,7 +84,7 @@ def _numbers_at_a_point(field: SampledField) -> int:
 
 
 def faust_library(field: SampledField, *, noise: bool) -> str:
-    """Return the definitions, of which `strike(contact, force, contactTime, gate)` is the sound."""
+    """Return the definitions; `strike(contact, force, contactTime, gate)` is the sound."""
     points, modes = field.sine.shape
     numbers = points * _numbers_at_a_point(field) + noise * field.samples
     if numbers > MOST_NUMBERS:
@@ -110,8 +110,8 @@ def faust_library(field: SampledField, *, noise: bool) -> str:
 
 
 def _bank(field: SampledField) -> str:
-    """Return the resonators side by side, each with its mode's numbers, which the contact chooses from."""
-    # A table a mode: of one table for all modes Faust made as many copies in its mind, and took minutes.
+    """Return the parallel resonators, each with a table of its mode's parameters indexed by the contact."""
+    # One table for each mode: Faust copies a table for all modes once per mode, and takes minutes.
     lines = []
     for k, frequency in enumerate(field.frequency.tolist()):
         damping = repr(float(field.damping[k])) if field.shared_damping else _at_contact(field.damping[:, k])
@@ -134,7 +134,7 @@ def _waveform(values: Float[Tensor, " numbers"]) -> str:
 
 def _number(value: float) -> str:
     word = f"{value:.9g}"
-    # A number without a point would make the table one of whole numbers.
+    # Without a decimal point the table would be of integers.
     return word if any(mark in word for mark in ".en") else f"{word}.0"
 
 

@@ -1,4 +1,4 @@
-"""The formats that a field is written in, and what their files are called: imports nothing that computes."""
+"""Names, suffixes and default sizes of the export formats. Imports no numerical library."""
 
 from typing import Literal
 
@@ -6,7 +6,7 @@ Format = Literal["web", "gltf", "faust", "avmsf-demo", "wavs", "uff"]
 Precision = Literal["float16", "float32"]
 Axis = Literal["x", "y", "z"]
 MOST_POINTS = 20_000
-"""Contacts that a page gets unless more are asked for: 128 modes at each are 20 MB."""
+"""Default number of contacts of a page: 20 MB with 128 modes."""
 POINTS: dict[Format, int] = {
     "web": MOST_POINTS,
     "gltf": 2000,
@@ -15,9 +15,9 @@ POINTS: dict[Format, int] = {
     "wavs": 16,
     "uff": 1000,
 }
-"""Contacts that are written by default: as many as the format's tools read without effort."""
+"""Default number of contacts of each format, which its tools read quickly."""
 PAGE_SUFFIXES = (".html", ".htm")
-"""Endings of a page in one file."""
+"""Suffixes of a page in one file."""
 GLTF_SUFFIXES = (".glb",)
 FAUST_SUFFIXES = (".dsp", ".lib")
 UNIVERSAL_SUFFIXES = (".uff", ".unv")

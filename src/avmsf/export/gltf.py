@@ -1,9 +1,9 @@
 """A field as a `.glb` that any viewer shows, with its modes in the draft extension `KHR_audio_rigid_bodies`.
 
-The draft (seen in 2026, not ratified) sounds an impulse j at a point as the sum over modes of 2 pi f (shape . j)
-exp(-d t) sin(2 pi f t). Here an impulse of 1 N s straight into the surface is an impact of force 1, so a shape is minus
-the normal times the gain over 2 pi f. The draft leaves the absolute level to who plays it. It knows sines alone, one
-damping a mode, and no noise; what that leaves out lies in `extras`, where a reader that knows of it finds the rest.
+In the draft (as of 2026, not ratified) the sound of an impulse j at a point is the sum over modes of 2 pi f (shape . j)
+exp(-d t) sin(2 pi f t). Here an impulse of 1 N s perpendicular to the surface is an impact of force 1, so a shape is
+minus the normal times the gain over 2 pi f. The draft leaves the absolute level to the player. It has only sines, one
+damping for each mode, and no noise; phases, dampings at each contact and the noise are in `extras`.
 """
 
 import json
@@ -35,13 +35,13 @@ _TURNS: dict[Axis, tuple[float, float, float, float]] = {
     "y": (0.0, 0.0, 0.0, 1.0),
     "z": (-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)),
 }
-"""Quaternions x, y, z, w that rotate each axis to +y, which is up in glTF."""
+"""Quaternions (x, y, z, w) that rotate each axis to +y, which is up in glTF."""
 
 
 def write_gltf(
     sampled: SampledField, path: str | Path, *, look: Look | None = None, up: Axis = "z", force: bool = False
 ) -> Written:
-    """Write the object, or its points, and one modal model, the modes that matter most first.
+    """Write the object, or its points, and one modal model, with the modes sorted by energy.
 
     All coordinates are in the object's frame; the node rotates its axis `up` to glTF's +y. Raises
     `ExportError` for a name that does not end in .glb, and a field without modes.
@@ -61,14 +61,14 @@ def write_gltf(
 
 @dataclass
 class _Buffer:
-    """The binary part, and the records that say where in it everything lies."""
+    """The binary chunk, with its buffer views and accessors."""
 
     content: bytes = b""
     views: list[dict[str, Any]] = field(default_factory=list)
     accessors: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, values: Shaped[np.ndarray, "..."], *, bounds: bool = False, target: int | None = None) -> int:
-        """Append numbers and return their accessor: float32 or uint32, in threes where there are two axes."""
+        """Append an array as float32 or uint32 and return its accessor; arrays with two axes are of type VEC3."""
         whole = values.dtype.kind in "iu"
         packed = np.ascontiguousarray(values, dtype="<u4" if whole else "<f4")
         view = {"buffer": 0, "byteOffset": len(self.content), "byteLength": packed.nbytes}
@@ -143,7 +143,7 @@ def _document(
 
 
 def _extras(sampled: SampledField, order: Int[Tensor, " modes"], buffer: _Buffer) -> dict[str, Any]:
-    """Return what the draft has no place for; arrays as accessors, mode-major like the shapes."""
+    """Return what the draft cannot represent; arrays as accessors, mode-major like the shapes."""
     extras: dict[str, Any] = {
         "generator": generator(),
         "sampleRate": sampled.sample_rate,
@@ -162,7 +162,7 @@ def _extras(sampled: SampledField, order: Int[Tensor, " modes"], buffer: _Buffer
 
 
 def _glb(document: tuple[Mapping[str, Any], bytes]) -> bytes:
-    """Return the container: a header and two chunks, each a multiple of four bytes long."""
+    """Return the container: a header and two chunks, padded to multiples of four bytes."""
     text = json.dumps(document[0], separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     content = document[1] + b"\0" * (-len(document[1]) % 4)
@@ -182,5 +182,5 @@ def _remarks(sampled: SampledField) -> tuple[str, ...]:
 
 
 def _linear(colors: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
-    """Return colors as light, as glTF holds vertex colors, of colors as displayed (IEC 61966-2-1)."""
+    """Return linear colors, as vertex colors are in glTF, of sRGB colors (IEC 61966-2-1)."""
     return torch.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)

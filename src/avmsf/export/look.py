@@ -1,4 +1,4 @@
-"""What a viewer shows of an object beside its modes: triangles with colors, Gaussians' centers, or points."""
+"""Geometry for viewers: triangles with colors, centers of Gaussians, or points."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,14 +20,14 @@ from avmsf.scene.start import ZEROTH
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What a viewer shows: triangles with colors, or the field's points."""
+    """Geometry to show: triangles with colors, or points."""
 
     vertices: Float[Tensor, "vertices 3"]
     """Object frame, meters."""
     faces: Int[Tensor, "faces 3"]
-    """Rows of `vertices`; none for points."""
+    """Rows of `vertices`; empty for points."""
     normals: Float[Tensor, "vertices 3"]
-    """Unit vectors out of the object."""
+    """Outward unit normals."""
     colors: Float[Tensor, "vertices 3"] | None = None
     """Red, green, blue as displayed (sRGB), 0 to 1; None for gray."""
 
@@ -38,9 +38,9 @@ class Look:
 
     @classmethod
     def of_mesh(cls, mesh: TexturedMesh) -> "Look":
-        """Return a mesh, whose corners keep their own normals and colors where these differ between faces.
+        """Return a mesh; a vertex is split if its normal or color differs between faces.
 
-        Textures become colors of the corners.
+        Textures become vertex colors.
         """
         corners = torch.cat([mesh.vertices[mesh.faces], mesh.normals, _corner_colors(mesh)], dim=2).reshape(-1, 9)
         table, rows = np.unique(corners.numpy(), axis=0, return_inverse=True)
@@ -56,7 +56,7 @@ class Look:
 
 
 def read_look(source: Path | Surface, sampled: SampledField, *, meters: float = 1.0) -> tuple[Look, tuple[str, ...]]:
-    """Read a mesh whose coordinates count `meters` each, and what differs from the file, a sentence each.
+    """Read a mesh whose coordinates count `meters` each, and notes on differences from the file.
 
     A `Surface` is in meters. Meshes of more than `MOST_FACES` triangles are reduced. Raises `ExportError` for one that
     is huge, or not in the field's unit, and `CaptureError` for a file that is not a mesh.

@@ -138,7 +138,7 @@ def _modal(field: SampledField, gains: Float[np.ndarray, "points modes"]) -> tup
 
 
 def _remarks(field: SampledField, kept: Collection[str], others: Collection[str]) -> list[str]:
-    """Return what the user is told of the sound, and of the folder's other variants."""
+    """Return notes on the sound, and on the folder's other variants."""
     remarks = ["every mode starts as a cosine in the demo, with the field's level"]
     if field.noise.any():
         remarks.append("the residual noise is left out, since the demo has none")
@@ -210,7 +210,7 @@ def _read_modes(
 
 
 def is_demo(folder: Path) -> bool:
-    """Return whether this looks like a folder of the demo."""
+    """Return whether a folder has the layout of the demo."""
     return (folder / MANIFEST).is_file() and (folder / PICKING).is_file()
 
 

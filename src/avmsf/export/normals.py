@@ -1,4 +1,4 @@
-"""Which way is out of an object of which only points are known."""
+"""Outward normals of a surface that is given by points alone."""
 
 import numpy as np
 import torch
@@ -11,17 +11,17 @@ from torch import Tensor
 from avmsf.scene.neighborhoods import read_neighborhoods
 
 _NEIGHBORS = 12
-"""Points that a side is handed on to."""
+"""Neighbors in the graph along which the orientation is propagated."""
 _VIEWS = 128
-"""Directions from which a part's outermost points are looked at."""
+"""Directions in which the outermost points of a component are determined."""
 
 
 def outward_normals(points: Float[Tensor, "points 3"]) -> Float32[Tensor, "points 3"]:
-    """Return unit normals of the surface that points lie on, out of the object.
+    """Return outward unit normals of the surface on which points lie.
 
-    Planes through neighbors have no side. One side is handed on along the tree of neighbors that bends least (after
-    Hoppe et al. 1992), and each part of the surface is turned such that its outermost points, seen from all around,
-    face outwards. A few points have no surface: theirs point away from their middle.
+    Fitted planes have no orientation. It is propagated along the minimum spanning tree of the neighbor graph, weighted
+    by the change of the normal (Hoppe et al. 1992), and each connected component is oriented so that the normals of its
+    outermost points point outwards. The normals of very few points point away from their centroid.
     """
     places = points.detach().double().cpu().numpy()
     if len(places) <= _NEIGHBORS:
@@ -29,7 +29,7 @@ def outward_normals(points: Float[Tensor, "points 3"]) -> Float32[Tensor, "point
     normals = read_neighborhoods(places, count=_NEIGHBORS).normals
     _, rows = cKDTree(places).query(places, k=_NEIGHBORS + 1)
     tails, heads = np.repeat(np.arange(len(places)), _NEIGHBORS), rows[:, 1:].reshape(-1)
-    # Where the normals agree an edge costs next to nothing, but more than the nothing that a sparse graph leaves out.
+    # Not zero for equal normals: a sparse graph has no edges of weight zero.
     bend = 1.0 - np.abs(np.einsum("nd,nd->n", normals[tails], normals[heads])) + 1e-9
     edges = (np.minimum(tails, heads), np.maximum(tails, heads))
     _, first = np.unique(np.stack(edges, axis=1), axis=0, return_index=True)
@@ -63,7 +63,7 @@ def _away(places: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"
 
 
 def _sphere(count: int) -> Float[np.ndarray, "views 3"]:
-    """Return directions evenly over the sphere, along a spiral of golden angles."""
+    """Return evenly distributed directions: a Fibonacci spiral on the sphere."""
     height = 1 - (2 * np.arange(count) + 1) / count
     turn = np.pi * (3 - np.sqrt(5)) * np.arange(count)
     across = np.sqrt(1 - height**2)

@@ -19,21 +19,21 @@ from avmsf.errors import ExportError
 from avmsf.scene.ply import read_splats
 
 MOST_FACES = 200_000
-"""Triangles that a browser turns smoothly and picks quickly; a mesh of more is reduced."""
+"""Triangles that a browser displays and picks quickly; larger meshes are reduced."""
 _ALIKE = 3.0
-"""Factor between the sizes of object and field beyond which they are not in one unit."""
+"""Ratio of the sizes of object and field above which their units differ."""
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectFile:
-    """What a page loads in addition to the field."""
+    """The file of an object's geometry."""
 
     kind: Literal["mesh", "gaussians", "points"]
     name: str | None = None
-    """What the file is called; None for points, which the field itself holds."""
+    """Name of the file; None for points, which are those of the field."""
     content: bytes = b""
     remarks: tuple[str, ...] = ()
-    """What differs from the file that was given, a sentence each."""
+    """Notes on differences from the given file."""
 
 
 def read_object(

@@ -1,4 +1,4 @@
-"""One signed amplitude a mode, for formats in which all modes start alike."""
+"""Real signed amplitudes, for formats in which all modes have one phase."""
 
 import math
 from dataclasses import dataclass
@@ -13,28 +13,28 @@ from avmsf.modal.spectra import magnitude_stft
 from avmsf.modal.synthesis import synthesize
 
 _JUDGED = 8
-"""Points at which an export is compared with the field."""
+"""Number of points at which an export is compared with the field."""
 _WINDOW = 0.04
-"""Seconds in which levels are compared: about as finely as one hears."""
+"""Window of the short-time spectra, seconds: about the temporal resolution of hearing."""
 _FLOOR = 1e-3
-"""Magnitude, over the largest, below which nothing is compared: 60 dB."""
+"""Magnitude relative to the largest below which spectra are not compared: -60 dB."""
 
 
 @dataclass(frozen=True)
 class Deviation:
-    """How far an export's sounds are from the field's, at a few points."""
+    """Difference between an export's sounds and the field's, at a few points."""
 
     waveform: float
-    """Largest difference of samples, over the loudest sample."""
+    """Largest difference of samples, relative to the largest sample."""
     spectrum_db: float
     """Mean difference of short-time magnitude spectra, dB, weighted by the field's energy."""
 
 
 def signed_amplitudes(field: SampledField) -> Float32[Tensor, "points modes"]:
-    """Return how strongly each mode sounds at each point, positive or negative, whatever its phase.
+    """Return a real amplitude of each mode at each point, without its phase.
 
-    The size is that of sine and cosine together, so that no mode gets louder or fainter; the sign is that of the part
-    along the phase that all points agree on best, so that it changes where the mode has a node.
+    It is the magnitude of sine and cosine part, so that levels do not change, with the sign of the projection on the
+    phase that is common to all points, so that it changes at the mode's nodal lines.
     """
     amplitude = torch.complex(field.sine.double(), field.cosine.double())
     phase = common_phase(field.sine, field.cosine)
@@ -43,7 +43,7 @@ def signed_amplitudes(field: SampledField) -> Float32[Tensor, "points modes"]:
 
 
 def shared_dampings(field: SampledField) -> Float64[Tensor, " modes"]:
-    """Return one damping a mode, 1/s: its mean over points by the energy with which it sounds there."""
+    """Return one damping for each mode, 1/s: the mean over points, weighted by the mode's energy there."""
     if field.shared_damping:
         return field.damping
     energy = field.sine.double().square() + field.cosine.double().square()
@@ -59,7 +59,7 @@ def deviation(
     cosine: Float32[Tensor, "points modes"] | None,
     damping: Float64[Tensor, "*points modes"],
 ) -> Deviation:
-    """Return by how much these modes without noise miss the field at a few points."""
+    """Return the difference between these modes, without noise, and the field at a few points."""
     rows = field.spread(_JUDGED)
     zero = torch.zeros(len(rows), len(field.frequency))
     heard = synthesize(
@@ -75,7 +75,7 @@ def deviation(
 
 
 def importance(field: SampledField, damping: Float64[Tensor, " modes"]) -> Int[Tensor, " modes"]:
-    """Return the modes' rows, the one of most energy in all blows first."""
+    """Return the modes' rows, sorted by descending energy over all contacts."""
     energy = (field.sine.double().square() + field.cosine.double().square()).sum(0) / damping
     return torch.argsort(energy, descending=True, stable=True)
 

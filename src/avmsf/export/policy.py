@@ -1,8 +1,8 @@
-"""Content-Security-Policy of pages: each may load and run what it was written with, and nothing that data brings in.
+"""Content-Security-Policy of pages: a page runs only the scripts that it was written with.
 
-One exception: a page in a single file carries its modules as data: addresses, which no policy can tell from others. So
-it would also run a script element with such an address, if a flaw in the page let data add one. Inline scripts and
-event handlers that data brings in are refused there too.
+One exception: a page in a single file has its modules as data: addresses, which a policy cannot distinguish from
+others. It would also run a script element with such an address if a flaw in the page let data add one. Injected inline
+scripts and event handlers are blocked there too.
 """
 
 import base64

@@ -1,4 +1,4 @@
-"""A sound field as a table of points: all that is needed to strike it where there is neither Python nor its network."""
+"""A sound field sampled at points of the surface: all that other programs need to synthesize impacts there."""
 
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -21,43 +21,43 @@ from avmsf.modal.synthesis import synthesize
 from avmsf.scene.points import farthest_points, nearest_points
 
 _BATCH = 1024
-"""Points sampled at once, which bounds the memory."""
+"""Points sampled at once; bounds the memory."""
 _RENDERED = 32
-"""Blows rendered at once."""
+"""Contacts rendered at once; bounds the memory."""
 _DRAWN = 4
-"""Points that thinning chooses among, for each that it keeps: farthest points of all of a million take too long."""
+"""Candidates for each selected point: farthest point sampling of a million points takes too long."""
 
 
 @dataclass(frozen=True, eq=False)
 class SampledField:
-    """Blows straight into the surface at some points, phases resolved.
+    """Modal parameters of impacts perpendicular to the surface, at some points.
 
-    A blow of force 1 at a point sounds as the sum over modes of exp(-d t) (sine sin(2 pi f t) + cosine cos(2 pi f t)),
-    and the noise.
+    The sound of an impact of force 1 at a point is the sum over modes of exp(-d t) (sine sin(2 pi f t) + cosine
+    cos(2 pi f t)), plus the noise.
     """
 
     points: Float[Tensor, "points 3"]
-    """Where the gains are known, object frame, meters."""
+    """Contacts, object frame, meters."""
     normals: Float32[Tensor, "points 3"]
-    """Unit vectors out of the object there; a blow goes the other way."""
+    """Outward unit normals at the contacts; impacts have the opposite direction."""
     frequency: Float64[Tensor, " modes"]
     """Hz, all below half the sample rate."""
     damping: Float64[Tensor, "*points modes"]
-    """1/s; one row a point where it depends on the place, else no such axis."""
+    """1/s; one row for each point if the damping depends on the contact, otherwise one vector for all."""
     sine: Float32[Tensor, "points modes"]
     """Signed amplitudes of the sines, in the unit of the training sounds."""
     cosine: Float32[Tensor, "points modes"]
     """Signed amplitudes of the cosines; zero where all modes start as sines."""
     noise: Float32[Tensor, " samples"]
-    """What is heard beside the modes: the very draw that `SoundField.render` adds."""
+    """Residual noise: the realization that `SoundField.render` adds."""
     sample_rate: float
     """Samples per second of the training sounds, Hz."""
     per_newton: bool = False
-    """Whether force counts newtons; else a blow of force 1 is an average recorded one."""
+    """Whether forces are in newtons; otherwise force 1 is that of an average recorded impact."""
     name: str = ""
-    """What the object is called."""
+    """Name of the object."""
     origin: dict[str, Any] = field(default_factory=dict)
-    """Where the field comes from, as plain values."""
+    """Provenance of the field, as plain values."""
     supporting: tuple[int, ...] = ()
     """Columns of the modes' tensors that are supporting poles, see `SoundField.is_mode`."""
 
@@ -70,10 +70,11 @@ class SampledField:
         *,
         limit: int | None = None,
     ) -> "SampledField":
-        """Return the field at `points` (object frame, meters), or at its own; at most `limit` of them, spread evenly.
+        """Return the field at `points` (object frame, meters), by default at its own that lie on the object.
 
-        `normals` point out of the object; where they are not given they are those that the field's physics holds, or
-        else are judged from how the points lie. Raises `ExportError` for points that are none, or not finite.
+        More than `limit` points are reduced to evenly spread ones. `normals` are outward normals; by default those of
+        the field's body, or without a body estimated from the points. Raises `ExportError` for no points, and for
+        points that are not finite.
         """
         places = points_on_object(sound_field.gain_field) if points is None else points
         _expect_places(places, normals, limit)
@@ -122,22 +123,22 @@ class SampledField:
 
     @property
     def shared_damping(self) -> bool:
-        """Whether the dampings are the same everywhere."""
+        """Whether the dampings are the same at all contacts."""
         return self.damping.ndim == 1
 
     def __len__(self) -> int:
         return len(self.points)
 
     def nearest(self, places: Float[Tensor, "places 3"]) -> Int[Tensor, " places"]:
-        """Return the row of the point nearest to each place (object frame, meters)."""
+        """Return the row of the point nearest to each position (object frame, meters)."""
         return nearest_points(self.points, places)[:, 0]
 
     def spread(self, count: int) -> Int[Tensor, " chosen"]:
-        """Return `count` rows, or all where there are fewer, spread as far apart as they go."""
+        """Return `count` rows, or all if there are fewer, by farthest point sampling."""
         return spread_rows(self.points, min(count, len(self)))
 
     def take(self, rows: Int[Tensor, " chosen"]) -> "SampledField":
-        """Return the field at some of its points alone."""
+        """Return the field at some of its points."""
         return replace(
             self,
             points=self.points[rows],
@@ -160,10 +161,10 @@ class SampledField:
         pulse: ForcePulse | None = None,
         noise: bool = True,
     ) -> Float32[Tensor, "contacts samples"]:
-        """Return what `SoundField.render` does for blows at the points of some rows.
+        """Return the sounds of impacts at the points of some rows, as `SoundField.render` does.
 
-        Of `samples` samples, or as long as the training sounds, behind whose end there is no noise. With
-        `noise=False` the sounds are the modes alone.
+        `samples` is the length, by default that of the training sounds, after whose end there is no noise. With
+        `noise=False` the sounds contain only the modes.
         """
         length = self.samples if samples is None else samples
         added = torch.nn.functional.pad(self.noise, (0, max(0, length - self.samples)))[:length]
@@ -183,13 +184,13 @@ class SampledField:
 
 
 def supporting_columns(sound_field: SoundField) -> tuple[int, ...]:
-    """Return the places, among the modes that sound, of those that are supporting poles."""
+    """Return the indices of the supporting poles among the audible modes."""
     sounding = sound_field.is_mode[sound_field.audible]
     return tuple(torch.nonzero(~sounding).flatten().tolist())
 
 
 def spread_rows(points: Float[Tensor, "points 3"], count: int) -> Int[Tensor, " chosen"]:
-    """Return `count` rows of the points, each as far as it can be from those before it."""
+    """Return `count` rows of the points by farthest point sampling."""
     drawn = torch.arange(len(points))
     if len(points) > _DRAWN * count:
         drawn = torch.from_numpy(np.sort(np.random.default_rng(0).permutation(len(points))[: _DRAWN * count]))

@@ -35,9 +35,9 @@ _MOST_LINES = 1 << 16
 
 
 def write_universal(field: SampledField, path: str | Path, *, functions: int = 16, force: bool = False) -> Written:
-    """Write points, modes, and the response functions of `functions` points, spread as far apart as they go.
+    """Write points, modes, and the response functions of `functions` points (by farthest point sampling).
 
-    Where all modes start as sines, shapes are real: normal modes with undamped frequency and damping ratio. Else they
+    If all modes start as sines, shapes are real: normal modes with undamped frequency and damping ratio. Otherwise they
     are the residues of the complex eigenvalues -d + 2 pi i f. Raises `ExportError` for a name that does not end in .uff
     or .unv, and where pyuff is missing.
     """
@@ -54,11 +54,11 @@ def write_universal(field: SampledField, path: str | Path, *, functions: int = 1
     sets += [_function(field, row, frequencies) for row in rows.tolist()]
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder) / "field.uff"
-        # What pyuff prints and warns of concerns its own writing, and says nothing that the caller can act on.
+        # The output and warnings of pyuff are about its own implementation.
         with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             pyuff.UFF(str(place)).write_sets(sets, mode="overwrite")
-        # pyuff adds the time, by which the same field would give another file.
+        # Without the time, which pyuff adds, the same field gives the same file.
         content = _TIME.sub(lambda found: b" " * len(found[0]), place.read_bytes(), count=1)
     remarks = ["frequencies, dampings and shapes have six digits in data set 55, as the format sets them"]
     if not field.shared_damping:
@@ -169,7 +169,7 @@ def _mode(field: SampledField, mode: int, damping: Float64[Tensor, " modes"]) ->
 
 
 def _function(field: SampledField, row: int, frequencies: Float64[np.ndarray, " lines"]) -> dict[str, Any]:
-    # The direction is the axis nearest to the blow's, which goes against the normal.
+    # The direction is the axis nearest to that of the impact, which is opposite to the normal.
     blow = -field.normals[row].double()
     axis = int(blow.abs().argmax())
     direction = (axis + 1) * (1 if float(blow[axis]) > 0 else -1)

@@ -42,16 +42,16 @@ class Layer:
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Which impacts are written."""
+    """Impacts to write."""
 
     contacts: int = 16
-    """Contacts at most, one MIDI note each: all of the field's in their order, or so many of more, spread far apart."""
+    """Maximum number of contacts, one MIDI note each. More are reduced by farthest point sampling."""
     layers: tuple[Layer, ...] = (Layer(),)
     """Each contact has one impact of each; they are sorted by their level."""
     seconds: float | None = None
     """Length of the sounds; that of the training sounds where it is not given."""
     level_db: float = -1.0
-    """Peak of the loudest sound, dB relative to full scale; all sounds have one scale."""
+    """Peak of the loudest sound, dB relative to full scale; all sounds are scaled by one factor."""
     noise: bool = True
     """Whether the sounds have the residual noise in addition to the modes."""
 

@@ -1,8 +1,8 @@
-"""The studio's page with one field in it: a folder for any static host, or a single file.
+"""The studio's page with one field: a folder for any static host, or a single file.
 
-A single file holds the page's modules as data in its import map, and everything else as base64 that the modules turn
-into blobs: a browser loads no second file from beside a page that was opened from a disk. three and spark come from
-where the page's import map says, which is a public host.
+A single file has the page's modules as data: addresses in its import map, and all other files as base64, which the
+modules turn into blobs: a browser does not load other files for a page that was opened from a disk. The libraries three
+and spark are loaded from the public host that the import map names.
 """
 
 import base64
@@ -25,7 +25,7 @@ from avmsf.export.written import Written, generator, write_file, write_folder
 from avmsf.field.soundfield import SoundField
 
 IMPORT_MAP = re.compile(r'(<script type="importmap"[^>]*>)(.*?)(</script>)', re.DOTALL)
-"""Where the page says from where three and spark come."""
+"""The import map, which has the addresses of three and spark."""
 _TITLE = re.compile(r"<title>[^<]*</title>")
 _STYLE = re.compile(r'<link\b[^>]*\bhref="(?:\./)?page/(\w+\.css)"[^>]*>')
 _START = re.compile(r'<script type="module" src="(?:\./)?page/(\w+\.js)"[^>]*></script>')
@@ -46,7 +46,7 @@ MEDIA_TYPES = {
     ".wasm": "application/wasm",
     ".wav": "audio/wav",
 }
-"""What the page has use for, by suffix: nothing else is carried or served."""
+"""Media types of the page's files by suffix; no other files are included or served."""
 
 
 def write_webpage(
@@ -60,10 +60,10 @@ def write_webpage(
     limit: int = MOST_POINTS,
     force: bool = False,
 ) -> Written:
-    """Write a page on which the field is struck: one file where `output` ends in .html, else a folder.
+    """Write a page that plays the field: one file if `output` ends in .html, otherwise a folder.
 
-    The arguments are those of `make_bundle`, whose errors are raised; what is there and no export's is kept unless with
-    `force`.
+    The arguments are those of `make_bundle`, whose errors are raised. Files that are not of an earlier export are
+    overwritten only with `force`.
     """
     output = Path(output)
     bundle = make_bundle(field, object=object, meters=meters, surface=surface, strikes=strikes, limit=limit)
@@ -77,7 +77,7 @@ def write_webpage(
 
 
 def page_files() -> dict[str, bytes]:
-    """Return the studio's page by relative path: index.html, and all else under page/."""
+    """Return the files of the studio's page by relative path: index.html, and all others below page/."""
     folder = files("avmsf") / "studio" / "page"
     found = {each.name: each.read_bytes() for each in folder.iterdir() if each.is_file()}
     names = sorted(name for name in found if name.endswith((".js", ".css")))
@@ -85,7 +85,7 @@ def page_files() -> dict[str, bytes]:
 
 
 def single_file(bundle: Bundle, page: Mapping[str, bytes] | None = None) -> str:
-    """Return the page with a bundle, styles and modules inside it. `page` is that of `page_files` unless given."""
+    """Return the page with bundle, styles and modules in one file. `page` is by default that of `page_files`."""
     page = page_files() if page is None else page
     html = _titled(page["index.html"].decode(), bundle)
     modules = {name.removeprefix("page/"): each.decode() for name, each in page.items() if name.endswith(".js")}
@@ -98,7 +98,7 @@ def single_file(bundle: Bundle, page: Mapping[str, bytes] | None = None) -> str:
         f"<script>globalThis.avmsfInlined = {json.dumps(inlined)};</script>\n"
         '<script type="module">import "avmsf/{name}";</script>'
     )
-    # Who made it stands at its beginning, where a later export looks before it writes over it.
+    # The generator at the beginning is how a later export recognizes the file.
     html = html.replace("<!doctype html>\n", f"<!doctype html>\n<!-- {generator()} -->\n", 1)
     html = _once(_START, html, lambda found: begin.replace("{name}", found[1]), "script that starts the page")
     return with_policy(html, directives_of(html, single=True))
@@ -111,7 +111,7 @@ def _titled(html: str, bundle: Bundle) -> str:
 
 
 def _bare(source: str) -> str:
-    """Return a module that asks the import map for its neighbors: data has no place that `./` could start from."""
+    """Return a module with bare specifiers in its imports: a data: address has no base for relative ones."""
     return _IMPORTED.sub(r"\1\2avmsf/\3\2", source)
 
 

@@ -1,4 +1,4 @@
-"""What an export writes: complete files or folders, never over files that no export wrote, and notes on losses."""
+"""Output of exports: atomic files and folders that do not overwrite other files, and notes on losses."""
 
 import json
 import os
@@ -15,7 +15,7 @@ from avmsf.files import temporary_path, way_out, write_whole
 
 MANIFEST = "manifest.json"
 _READ = 4096
-"""Bytes at a file's beginning in which its writer is searched for."""
+"""Bytes at the beginning of a file that are searched for its generator."""
 _MADE_HERE = re.compile(
     rb"""
       ^//\ .*\ as\ exported\ by\ avmsf\ \d    # Faust
@@ -26,19 +26,19 @@ _MADE_HERE = re.compile(
     """,
     re.MULTILINE | re.VERBOSE,
 )
-"""What our own files have there, each by its format."""
+"""Marks of files that an export wrote, by format."""
 
 
 @dataclass(frozen=True, eq=False)
 class Written:
-    """What was written, and how near it comes to the field."""
+    """The files of an export, and their error."""
 
     sizes: Mapping[Path, int]
     """Bytes of each file."""
     remarks: tuple[str, ...] = ()
-    """What the format cannot hold, a sentence each."""
+    """Notes on what the format cannot represent."""
     error: float = 0.0
-    """Largest difference between the file's sound and `SampledField.render`, over the loudest sample."""
+    """Largest difference between the file's sound and `SampledField.render`, relative to the largest sample."""
     spectrum_error_db: float | None = None
     """Mean difference of their short-time magnitude spectra, dB, weighted by the field's energy; None: not measured."""
 
@@ -73,9 +73,10 @@ def no_modes(path: Path | None = None) -> ExportError:
 
 
 def write_file(path: Path, content: bytes, *, force: bool = False) -> dict[Path, int]:
-    """Write one file in one step; return its size. Raises `ExportError` where another program's file lies there.
+    """Write one file atomically and return its size. Raises `ExportError` if another program's file exists there.
 
-    A file is one of ours if its first kilobytes hold the mark of its format, or if it holds just this content.
+    A file counts as an export's if its first kilobytes contain the mark of its format, or if it has this content
+    already.
     """
     expect_free(path, content, force=force)
     write_whole(path, lambda place: place.write_bytes(content), raising=ExportError)
@@ -83,7 +84,7 @@ def write_file(path: Path, content: bytes, *, force: bool = False) -> dict[Path,
 
 
 def expect_free(path: Path, content: bytes, *, force: bool = False) -> None:
-    """Raise `ExportError` where `write_file` would."""
+    """Raise `ExportError` if `write_file` would."""
     if path.is_dir():
         raise ExportError(
             f"{path}: expected the name of a file, got a folder; name a file in it", file=path, value="folder"
@@ -95,11 +96,11 @@ def expect_free(path: Path, content: bytes, *, force: bool = False) -> None:
 def write_folder(
     folder: Path, fill: Callable[[Path], None], manifest: Mapping[str, object], *, force: bool = False
 ) -> dict[Path, int]:
-    """Let `fill` write files into a temporary folder, add the manifest, and put it all in place; return the sizes.
+    """Let `fill` write files into a temporary folder, add the manifest, and move all to `folder`; return the sizes.
 
-    The manifest lists the files, by which a folder of ours is known again and replaced as a whole. Into any other that
-    holds something files are put only with `force`, each in one step, and none is removed. Of a link it is the folder
-    that it leads to. Raises `ExportError`.
+    The manifest lists the files. A folder with no other files than its manifest lists is replaced as a whole. Other
+    folders that are not empty are written to only with `force`, file by file, and nothing in them is removed. A link is
+    followed. Raises `ExportError`.
     """
     place = folder.resolve()
     if folder.exists() and not folder.is_dir():
@@ -137,7 +138,7 @@ def _place(temporary: Path, folder: Path, *, whole: bool) -> None:
                 os.replace(path, place)
         return
     if folder.exists():
-        # A folder cannot be exchanged for another in one step: the old one stands aside until the new one is there.
+        # A folder cannot be replaced atomically: the old one is renamed until the new one is in place.
         aside = temporary.with_suffix(".old")
         os.replace(folder, aside)
         try:
@@ -156,7 +157,7 @@ def _made_here(path: Path) -> bool:
 
 
 def _folder_made_here(folder: Path) -> bool:
-    """Return whether all that lies in a folder is what one of our manifests lists."""
+    """Return whether a folder has only files that the manifest of an export lists."""
     try:
         manifest = read_json(folder / MANIFEST)
         listed = set(manifest["files"]) if manifest["generator"].startswith("avmsf ") else set()
