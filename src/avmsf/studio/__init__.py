@@ -1,1 +1,1 @@
-"""The page where an object is struck and heard, and the server of this one machine behind it."""
+"""The web page that plays an object, and its local server."""

@@ -1,9 +1,9 @@
-"""Capture mode: strikes added to an ordinary capture folder, one recording at a time, each whole or not at all.
+"""Capture mode: impacts added to a capture folder, one recording at a time, each atomically.
 
-What the table holds is read again for every request, so that a spreadsheet beside the page is no matter, and changed
-under a lock of the folder, so that two studios on one folder lose nothing of each other's. A recording is written
-before its row, and before both a note of what is about to be written, under the page's key: where the connection
-breaks, or the server, the page sends it again and nothing is there twice.
+The table is read again for every request, so that it can be edited in a spreadsheet at the same time, and changed under
+a lock of the folder, so that two studios do not overwrite each other's changes. Before a recording and its row are
+written, both are noted under the key of the page's request: if the connection or the server fails, the page repeats the
+request, and nothing is written twice.
 """
 
 import hashlib
@@ -34,7 +34,7 @@ _KEY = re.compile(r"[\x21-\x7e]{8,128}")
 
 
 class StrikeBook:
-    """The strikes of one capture folder. Its methods may be called from any thread, and block."""
+    """The impacts of one capture folder. Its methods are thread-safe, and block."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder.resolve()
@@ -48,7 +48,7 @@ class StrikeBook:
         return settings_of(self.folder)
 
     def describe(self) -> dict[str, Any]:
-        """Return all strikes with what `avmsf check` would say of them, and what is wrong with the whole."""
+        """Return all impacts with their reports of `avmsf check`, and the problems of the whole capture."""
         with self._lock:
             settings = self.settings
             strikes = [self._described(number, row, settings) for number, row in enumerate(self.table.rows())]
@@ -60,7 +60,7 @@ class StrikeBook:
         return {"folder": str(self.folder), "strikes": strikes, "problems": problems, "ready": ready}
 
     def strikes(self) -> list[Strike]:
-        """Return the strikes that can be understood and whose recordings are there, in the table's order."""
+        """Return the impacts that are valid and whose recordings exist, in the order of the table."""
         found = []
         with self._lock:
             settings = self.settings
@@ -80,10 +80,10 @@ class StrikeBook:
         return plain(self._expect_usable(recording, newtons=1.0)[0])
 
     def add(self, content: bytes, place: Place, *, key: str) -> dict[str, Any]:
-        """Write a strike and return it; of what came under the same key before, return what was written then.
+        """Write an impact and return it; for a key that was written before, return that impact.
 
-        Raises CaptureError for a recording that cannot be used, and RefusedError for a key that is none or was another
-        strike's.
+        Raises CaptureError for a recording that cannot be used, and RefusedError for an invalid key and for one of
+        another impact.
         """
         _expect_key(key)
         digest = hashlib.sha256(content + repr(place).encode()).hexdigest()
@@ -115,10 +115,10 @@ class StrikeBook:
             return self._found(journal[key]["file"])
 
     def redo(self, file: str, content: bytes, *, key: str | None = None, match: str | None = None) -> dict[str, Any]:
-        """Put another recording in a strike's place and return it; the one before is kept in the cache.
+        """Replace the recording of an impact and return the impact; the old recording is moved to the cache.
 
-        It is a wav file, whatever the one before was, and called so. What comes again under the same `key` is done
-        already. Raises RefusedError (409) where the recording is not the one whose digest is `match`.
+        The new file is a wav file whatever the old one was. A repeated request of the same `key` changes nothing.
+        Raises RefusedError (409) if the digest of the recording is not `match`.
         """
         digest = hashlib.sha256(content + repr(file).encode()).hexdigest()
         with self._lock, self.files.lock():
@@ -144,9 +144,9 @@ class StrikeBook:
             return self._found(new)
 
     def remove(self, file: str, *, match: str | None = None) -> None:
-        """Take a strike out of the table; its recording is kept in the cache.
+        """Remove an impact from the table; its recording is moved to the cache.
 
-        Raises RefusedError, 404 for no such strike, 409 where the recording is not the one whose digest is `match`.
+        Raises RefusedError: 404 for no such impact, 409 if the digest of the recording is not `match`.
         """
         with self._lock, self.files.lock():
             self._expect_own(file, match)
@@ -190,7 +190,7 @@ class StrikeBook:
         return bool(known.get("removed")) and not self._rows_of(known["file"])
 
     def _expect_own(self, file: str, match: str | None) -> None:
-        """Raise RefusedError unless one row has this recording, no link leads to it, and it is the one of `match`."""
+        """Raise RefusedError unless exactly one row has this recording, it is no link, and its digest is `match`."""
         self._found(file)
         lines = [row.line for _, row in self._rows_of(file)]
         if len(lines) > 1:

@@ -32,7 +32,7 @@ low."""
 
 
 def max_connections() -> int:
-    """Return how many connections this process can keep open, at most `MAX_CONNECTIONS`."""
+    """Return how many connections this process can keep open, `MAX_CONNECTIONS` at most."""
     try:
         import resource
     except ImportError:  # Windows has no such limit
@@ -97,7 +97,7 @@ class LimitedProtocol(H11Protocol):
         self._watch()
 
     def _watch(self) -> None:
-        """Count the time from the moment on at which nothing is being answered."""
+        """Start the timeout of an idle connection."""
         if self.cycle is not None and not self.cycle.response_complete:
             self._unwatch()
         elif self._idle_since is None and not self.transport.is_closing():

@@ -1,4 +1,4 @@
-"""What the page's sliders ask for, as one value, and the field that comes of it."""
+"""The page's sliders as one value, and the edited field that they give."""
 
 import math
 from collections import Counter
@@ -49,11 +49,11 @@ class ModeChange:
     mode: int
     """Row in the bank of the field as it was opened, counted from 0."""
     db: float = 0.0
-    """Change of its level; MUTE for none of it."""
+    """Change of its level, dB; MUTE for silence."""
     pitch: float = 1.0
-    """Factor on its frequency, beside that of all modes."""
+    """Factor on its frequency, in addition to that of all modes."""
     decay: float = 1.0
-    """Factor on the time in which it dies away, beside that of all modes."""
+    """Factor on its decay time, in addition to that of all modes."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Sliders:
     material: str | None = None
     """New material."""
     old: str | None = None
-    """What the object is of; told by its dampings where it is not given."""
+    """Material of the object; by default estimated from its dampings."""
     size: float = 1.0
     """The new object's lengths over the old one's."""
     pitch: float = 1.0
@@ -80,7 +80,8 @@ class Sliders:
     def read(cls, words: Mapping[str, Any], *, modes: int | None = None) -> "Sliders":
         """Return the sliders of a request for a field of so many `modes`.
 
-        Raises RefusedError (400) that names what is no slider, no number, outside `_LIMITS`, or more rows than modes.
+        Raises RefusedError (400), with the name of the entry, for unknown entries, values that are no numbers or
+        outside `_LIMITS`, and for more rows than modes.
         """
         known = ("base", "material", "size", "pitch", "decay", "brightness", "law", "modes")
         _expect_keys(words, known, "an edit")

@@ -1,8 +1,8 @@
-"""Who may ask this server what: the secret in the address, the host's name, the page's origin, sizes and paths.
+"""Access control of the server: secret in the address, host name, origin, sizes and paths.
 
-The server listens on this machine alone, but any page that a browser shows can send requests there. One that does not
-know the token is told nothing; a name that was bent to point here is no loopback name; and another page's requests say
-where they come from.
+The server listens on the loopback interface only, but any page in a browser can send requests there. Requests without
+the token get no information; host names other than loopback ones are rejected (DNS rebinding), and so are requests of
+other origins.
 """
 
 import secrets
@@ -23,7 +23,7 @@ NOTHING_HERE = "there is nothing at this address"
 LARGEST_UPLOAD = 64 << 20
 """Bytes of one request: a minute of stereo sound at 96 kHz, 32 bits."""
 LARGEST_WORDS = 1 << 20
-"""Bytes of one request that holds words and numbers alone."""
+"""Maximum size of a JSON request, bytes."""
 LOOPBACK = ("127.0.0.1", "localhost")
 """Names under which a browser may know this machine."""
 _HEADERS = {
@@ -37,12 +37,12 @@ _HEADERS = {
 
 
 def new_token() -> str:
-    """Return a secret that nobody guesses, of characters that addresses hold as they are."""
+    """Return a random token of characters that need no escaping in addresses."""
     return secrets.token_urlsafe(24)
 
 
 class Guard:
-    """Lets requests through to an ASGI application that may come through, without the token in their paths."""
+    """ASGI middleware that passes allowed requests on, without the token in their paths."""
 
     def __init__(self, app: ASGIApp, *, token: str, port: int, largest: int = LARGEST_UPLOAD) -> None:
         self.app, self.token, self.largest = app, token, largest
@@ -70,7 +70,7 @@ class Guard:
         await self.app(inner, self._bounded(receive), hardened)
 
     def _admit(self, scope: Scope) -> str:
-        """Return the path behind the token. Raises RefusedError for whatever is not the page's own request."""
+        """Return the path after the token. Raises RefusedError for requests that are not the page's own."""
         headers = Headers(scope=scope)
         hosts = headers.getlist("host")
         if len(hosts) != 1 or hosts[0].lower() not in self.hosts:
@@ -95,7 +95,7 @@ class Guard:
         return f"{slash}{rest}"
 
     def _bounded(self, receive: Receive) -> Receive:
-        """Return `receive` that raises RefusedError where more comes than may, without waiting for all of it."""
+        """Return a `receive` that raises RefusedError as soon as a request exceeds its maximum size."""
         taken = 0
 
         async def receive_bounded() -> Message:
@@ -128,7 +128,7 @@ def too_large(largest: int) -> RefusedError:
 
 
 def contained(folder: Path, name: str) -> Path:
-    """Return the file `name` in a folder. Raises RefusedError (404) for none, and for what links lead out of it."""
+    """Return the file `name` in a folder. Raises RefusedError (404) for no file, and for a link out of the folder."""
     home = folder.resolve()
     try:
         path = (home / name).resolve(strict=True)
@@ -141,7 +141,7 @@ def contained(folder: Path, name: str) -> Path:
 
 
 async def read_words(request: Request, *, largest: int = LARGEST_WORDS) -> dict[str, object]:
-    """Return the JSON object of a request. Raises RefusedError for another thing, and for more than `largest` bytes."""
+    """Return the JSON object of a request. Raises RefusedError for other content, and for more than `largest` bytes."""
     body = bytearray()
     async for part in request.stream():
         body += part
@@ -160,5 +160,5 @@ async def read_words(request: Request, *, largest: int = LARGEST_WORDS) -> dict[
 
 
 def nothing_here() -> RefusedError:
-    """Return what to raise where there is nothing, or nothing for who asks."""
+    """Return the error for an address that does not exist, or that the request may not access."""
     return RefusedError(404, NOTHING_HERE)

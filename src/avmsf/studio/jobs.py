@@ -1,7 +1,7 @@
-"""Work of minutes, in a process of its own: one at a time, heard of as it goes, ended with the server or before.
+"""Long computations in a worker process: one at a time, with progress events, ended with the server at the latest.
 
 The process is `python -m avmsf.studio.worker`. It gets a task as one line of JSON and answers with lines of JSON. Its
-standard input stays open as long as the server lives, so that it ends where the server was killed.
+standard input stays open as long as the server lives, so that the process ends even if the server is killed.
 """
 
 import asyncio
@@ -30,14 +30,14 @@ _LINE = 1 << 22
 _GRACE = 3.0
 """Seconds that a process has to end by itself."""
 _LAST_WORDS = 4000
-"""Characters kept of what a process says on its standard error."""
+"""Characters of the process's standard error that are kept."""
 
 
 class Job:
-    """One run of the worker, and all that was heard of it."""
+    """One run of the worker, and its events."""
 
     def __init__(self, kind: str, task: Event, finish: Finish, command: Sequence[str] = WORKER) -> None:
-        """Prepare `task` for the worker; `finish` makes of its result the last event, in which "error" may stand."""
+        """Prepare `task` for the worker; `finish` turns its result into the last event, which may have an "error"."""
         self.command = command
         self.identifier, self.kind, self.task, self.finish = secrets.token_hex(8), kind, task, finish
         self.events: list[Event] = []
@@ -47,7 +47,7 @@ class Job:
         self._process: asyncio.subprocess.Process | None = None
 
     async def run(self) -> None:
-        """Run to the end, whatever that is; the last event says how it went."""
+        """Run to the end; the last event has the outcome."""
         last = _STOPPED
         try:
             last = await self._work()
@@ -64,9 +64,9 @@ class Job:
             await self._tell(last, last=True)
 
     async def cancel(self) -> bool:
-        """Stop the process, and wait until it has stopped; what it has finished so far stays for the next run.
+        """Stop the process and wait for its end; completed stages are kept for the next run.
 
-        Returns whether it was stopped: a job whose result has come is waited for, and says what came of it.
+        Return whether it was stopped. A job that already has a result is completed instead.
         """
         if self.ended:
             return False
@@ -83,7 +83,7 @@ class Job:
         return self._cancelled
 
     async def listen(self, *, after: int = 0) -> AsyncIterator[tuple[int, Event]]:
-        """Yield the events from number `after` on, counted from 0, as they come, up to the last."""
+        """Yield the events from number `after` on, counted from 0, until the last one."""
         while True:
             async with self._heard:
                 while len(self.events) <= after and not self.ended:
@@ -180,7 +180,7 @@ class Jobs:
         return next((job for job in self._jobs.values() if not job.ended), None)
 
     def failure(self, kind: str) -> str | None:
-        """Return why nothing came of the last job of a kind; None where something did, or it has not ended."""
+        """Return the error of the last job of a kind; None if it succeeded or has not ended."""
         last = next((job for job in reversed(self._jobs.values()) if job.kind == kind), None)
         if last is None or not last.ended:
             return None
@@ -199,7 +199,7 @@ class Jobs:
             )
 
     def start(self, kind: str, task: Event, finish: Finish, command: Sequence[str] = WORKER) -> Job:
-        """Begin a job. Raises RefusedError (409) while another one runs."""
+        """Start a job. Raises RefusedError (409) while another one runs."""
         self.expect_none()
         job = Job(kind, task, finish, command)
         self._jobs[job.identifier] = job
@@ -228,7 +228,7 @@ def _signal_name(number: int) -> str:
 
 
 def _understand(line: bytes) -> Event | None:
-    """Return what a line says, None for what a library has printed."""
+    """Return the event of a line; None for the output of a library."""
     try:
         event = json.loads(line)
     except ValueError:

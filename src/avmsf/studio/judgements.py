@@ -1,4 +1,4 @@
-"""What `avmsf check` says of a capture's recordings and of the whole, remembered until a file is another one."""
+"""Reports of `avmsf check` on recordings and captures, cached until a file changes."""
 
 import os
 from pathlib import Path
@@ -24,7 +24,7 @@ class Judgements:
         self._lock = RLock()
 
     def strike(self, strike: Strike, settings: CaptureSettings) -> tuple[RecordingReport, str | None]:
-        """Return the report on a strike's recording, and its digest. Raises AvmsfError for what cannot be read."""
+        """Return the report on an impact's recording, and its digest. Raises AvmsfError for an unreadable one."""
         path = self.files.readable(strike.file)
         state = (strike, settings, _state(path))
         known = self._strikes.get(strike.file)

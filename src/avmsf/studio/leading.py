@@ -17,7 +17,7 @@ _MAX_PROMPT = 2000
 
 @dataclass(frozen=True)
 class Wish:
-    """Where a field shall be led: towards a recording, or towards words."""
+    """Target of a guided edit: a recording or a text."""
 
     like: bytes | None = None
     """A sound file."""
@@ -25,7 +25,7 @@ class Wish:
 
     @classmethod
     def read(cls, words: Mapping[str, Any], *, model: str | None) -> "Wish":
-        """Return the wish of a request for words. Raises RefusedError (400), and EditError without a `model`."""
+        """Return the target of a request with a text. Raises RefusedError (400), and EditError without a `model`."""
         unknown = sorted(set(words) - set(_KEYS))
         if unknown:
             raise RefusedError(
@@ -46,7 +46,7 @@ class Wish:
         return cls(prompt=prompt)
 
     def task(self, place: Path, *, steps: int, model: str | None) -> dict[str, Any]:
-        """Return the worker's task, whose files lie in `place`; the field is to be written there as `field`."""
+        """Return the worker's task, with its files in `place`; the edited field is written there as `field`."""
         task = {"task": "lead", "field": str(place / "field"), "output": str(place / "led"), "steps": steps}
         if self.like is None:
             return {**task, "prompt": self.prompt, "model": model}
@@ -60,7 +60,7 @@ def is_wish(words: Mapping[str, Any]) -> bool:
 
 
 def words_model(given: str | None) -> str | None:
-    """Return the model for edits by words: the given one, that of the hub's cache, or None where none can be used."""
+    """Return the model for text edits: the given one, or that in the hub's cache; None if there is none."""
     if any(find_spec(name) is None for name in ("diffusers", "torchsde", "transformers")):
         return None
     if given is not None:

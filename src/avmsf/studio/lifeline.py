@@ -1,4 +1,4 @@
-"""How a process that does a server's work comes to know that the server is no more, however it ended."""
+"""Detection of the server's end by its worker process."""
 
 import os
 import signal

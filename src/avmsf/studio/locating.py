@@ -1,4 +1,4 @@
-"""Where a recorded impact was, for the page: the tables are made ahead of time, a recording is answered at once."""
+"""Localization for the page: tables are computed in advance, so that a recording is located at once."""
 
 import base64
 import dataclasses
@@ -41,7 +41,7 @@ class Likeness:
 
 @dataclass(frozen=True, eq=False)
 class Finder:
-    """What is needed to locate impacts on one revision of a field; made when it is first asked for."""
+    """The locator of one revision of a field, made at its first use."""
 
     field: SoundField
     points: Float[Tensor, "points 3"]
@@ -61,11 +61,11 @@ class Finder:
 
     @property
     def symmetries(self) -> Symmetries | None:
-        """What explains why several places sound the same."""
+        """The reason why several positions sound the same."""
         return self.likeness.on(self.field, self.length)
 
     def prepare(self) -> None:
-        """Make all that takes time, once, whoever asks first."""
+        """Compute the tables, once for all threads."""
         with self._lock:
             self.locator.prepare(self.field.samples)
             _ = self.symmetries
@@ -73,7 +73,7 @@ class Finder:
     def locate(self, recording: Recording) -> list[dict[str, Any]]:
         """Return the impacts of a recording, each with a value for every point of the page.
 
-        Lengths are those of the page's picture, meters. Raises LocationError as `locate_impacts`.
+        Lengths are in the page's frame, meters. Raises LocationError as `locate_impacts`.
         """
         self.prepare()
         impacts = locate_impacts(self.field, recording, settings=self.settings, locator=self.locator)
@@ -94,10 +94,10 @@ class Finder:
 
 
 def read_upload(content: bytes, *, name: str = "the recording") -> Recording:
-    """Return the recording that a page has sent.
+    """Return a recording that the page has sent.
 
-    Raises CaptureError for what is no sound file, and RefusedError (413) for one that is long beyond use: a few bytes
-    hold hours of silence where it is compressed.
+    Raises CaptureError for a file that is no sound, and RefusedError (413) for one of excessive length: compressed
+    silence of hours takes a few bytes.
     """
     try:
         return decode_recording(SoundBytes(content), name)

@@ -1,7 +1,7 @@
-"""The page's two libraries, three and spark: from this machine where they were fetched before, else from a network.
+"""The page's libraries three and spark: from a local copy if there is one, otherwise from the network.
 
-The page names them by an import map, which points to a content network at pinned versions. What `fetch_modules` has
-brought into the user's cache takes its place, so that the page works without a network.
+The import map of the page points to a content delivery network, at pinned versions. A copy that `fetch_modules` has
+downloaded to the user's cache replaces these addresses, so that the page works without a network.
 """
 
 import json
@@ -25,7 +25,7 @@ _SECONDS = 600.0
 
 
 def cache_folder() -> Path:
-    """Return where a user's copy of the libraries is kept."""
+    """Return the folder of the user's copy of the libraries."""
     base = os.environ.get("XDG_CACHE_HOME", "")
     return (Path(base) if base else Path.home() / ".cache") / "avmsf" / "page"
 
@@ -82,7 +82,7 @@ def fetch_modules() -> Path:
 
 
 def with_local_modules(page: str) -> str:
-    """Return the page's HTML with its import map pointing to `modules/` beside it. Raises StudioError."""
+    """Return the page's HTML with an import map that points to `modules/`. Raises StudioError."""
     found = IMPORT_MAP.findall(page)
     if len(found) != 1:
         raise StudioError(

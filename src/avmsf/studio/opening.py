@@ -45,11 +45,10 @@ class Opened:
 
 
 def open_target(target: Path, *, object: Path | None = None, capture: Path | None = None) -> Opened:
-    """Return what is behind a path. Raises StudioError for a path from which there is nothing to see or hear.
+    """Return what a path opens. Raises StudioError for a path without a field, recordings or geometry.
 
-    A mesh becomes the surface of a capture folder, `capture` or one beside it of the mesh's name, and stays what it is.
-    Without `capture`, one that is called as a capture's own, surface.*, splats.ply or point_cloud.ply, opens the
-    folder that it lies in.
+    A mesh is copied as the surface of a capture folder: `capture`, or a folder of the mesh's name next to it. Without
+    `capture`, a mesh with a name that captures use (surface.*, splats.ply, point_cloud.ply) opens its own folder.
     """
     if object is not None and not object.is_file():
         raise StudioError(
@@ -153,7 +152,7 @@ def _open_mesh(mesh: Path, object: Path | None, capture: Path | None) -> Opened:
 
 
 def _named_by(mesh: Path) -> Iterator[Path]:
-    """Yield what a Wavefront mesh names beside it: its materials and their pictures."""
+    """Yield the files that a Wavefront mesh refers to: its materials and their textures."""
     if mesh.suffix.lower() != ".obj":
         return
     for name in _MATERIALS.findall(mesh.read_text(errors="replace")):

@@ -1,4 +1,4 @@
-"""Where a blow fell, as the page says it."""
+"""The contact of an impact in a request of the page."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,7 @@ from avmsf.studio.refusal import RefusedError, bad_request
 
 @dataclass(frozen=True)
 class Place:
-    """One blow's contact, and how it was struck."""
+    """Contact, direction and force of one impact."""
 
     contact: tuple[float, float, float]
     """Object frame, meters."""
@@ -21,7 +21,7 @@ class Place:
 
     @classmethod
     def read(cls, query: Mapping[str, str]) -> "Place":
-        """Return the place of a request's query x, y, z, perhaps nx, ny, nz, newtons. Raises RefusedError (400)."""
+        """Return the contact of a query x, y, z and optionally nx, ny, nz, newtons. Raises RefusedError (400)."""
         contact = _vector(query, REQUIRED[1:])
         if contact is None:
             raise RefusedError(

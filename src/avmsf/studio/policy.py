@@ -1,11 +1,11 @@
-"""What the page may load and run, as the header of the studio's answers says it."""
+"""Content-Security-Policy headers of the studio's responses."""
 
 from avmsf.export.policy import directives_of, policy_text
 
 _FRAMES = {"frame-ancestors": ["'none'"]}
-"""Only a header can say it."""
+"""Directive that is valid only in a header."""
 NOTHING = policy_text({"default-src": ["'none'"], **_FRAMES})
-"""Of all that is no page: whoever opens it as one gets nothing to run."""
+"""Policy of all responses that are not the page: they may run nothing if opened as a page."""
 
 
 def policy_of(page: str) -> str:

@@ -1,4 +1,4 @@
-"""Answers to requests that cannot be done: a message that says what to do, and an HTTP status."""
+"""Error responses: a message that says what to do, and an HTTP status."""
 
 import errno
 import json
@@ -20,9 +20,9 @@ UNUSABLE = 422
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 NUMERIC_ERRORS = (ValueError, ArithmeticError, torch.linalg.LinAlgError)  # type: ignore[attr-defined]
-"""What edits and searches raise for numbers that passed all checks and still lead to no result."""
+"""Errors of edits and searches for valid numbers that give no result."""
 FORESEEN_ERRORS = (OSError, MemoryError, RecursionError)
-"""Errors that `refusal_of` has an answer for, whatever was asked."""
+"""Errors that `refusal_of` has a response for."""
 _MAX_ECHO = 100
 """Characters of a request that an answer repeats."""
 _repr = reprlib.Repr()
@@ -57,7 +57,7 @@ class Answer(JSONResponse):
 
 
 def response_to(error: AvmsfError) -> Answer:
-    """Return the answer to the page: the error's message, and the `more` of a `RefusedError`."""
+    """Return the response: the error's message, and the `more` of a `RefusedError`."""
     status = error.status if isinstance(error, RefusedError) else UNUSABLE
     more = error.more if isinstance(error, RefusedError) else {}
     return Answer({"error": " ".join(str(error).split()), **more}, status)
@@ -86,7 +86,7 @@ def refusal_of(error: Exception) -> RefusedError:
 
 
 def bad_request(name: str, wanted: str, value: Any, *, got: str | None = None, advice: str = "") -> RefusedError:
-    """Return the answer (400) to a request with an entry that cannot be used; `got` stands for the value's echo."""
+    """Return the response (400) to an invalid entry; `got` is shown in place of its value."""
     message = f"{name}: expected {wanted}, got {got or echo(value)}{advice and f'; {advice}'}"
     return RefusedError(400, message, name=name, value=value)
 

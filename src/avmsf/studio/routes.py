@@ -1,4 +1,4 @@
-"""The addresses under the server's secret one, each of which asks the studio for one thing."""
+"""The routes below the server's secret address, one for each request of the page."""
 
 import json
 import traceback
@@ -26,7 +26,7 @@ from avmsf.studio.studio import Studio, unknown_base
 PAGE = Path(__file__).parent / "page"
 _SOUNDS = tuple(suffix for suffix, kind in MEDIA_TYPES.items() if kind.startswith("audio/"))
 _GONE = 499
-"""Nobody reads it: the page has hung up."""
+"""Response to a page that has disconnected."""
 Handler = Callable[[Request], Awaitable[Response]]
 
 
@@ -116,11 +116,11 @@ class Calls:
         )
 
     async def send_measured(self, request: Request) -> Response:
-        """The sound of a measured strike, as it is read."""
+        """The sound of a recorded impact, as the capture reads it."""
         return _file(self.studio.showcase.object_folder / "strikes", request)
 
     async def locate(self, request: Request) -> Response:
-        """Where a recorded blow fell."""
+        """Locate the impact of a recording."""
         return Answer(await self.studio.locate(await request.body()))
 
     async def edit(self, request: Request) -> Response:
@@ -129,7 +129,7 @@ class Calls:
         return Answer(done, 202 if "job" in done else 200)
 
     async def lead(self, request: Request) -> Response:
-        """Lead the sound towards a recording."""
+        """Optimize the sound towards a recording."""
         base = request.query_params.get("base", "")
         if not (base.isascii() and base.isdigit() and len(base) < 10):
             raise unknown_base(base)
@@ -144,12 +144,12 @@ class Calls:
         return Answer(await self.studio.save(await read_words(request)), 201)
 
     async def check(self, request: Request) -> Response:
-        """Judge a recording and forget it."""
+        """Check a recording without saving it."""
         content = await request.body()
         return Answer(await self.studio.with_book(lambda book: book.judge(content)))
 
     async def add_strike(self, request: Request) -> Response:
-        """Add a strike to the capture."""
+        """Add an impact to the capture."""
         place, key = Place.read(request.query_params), request.headers.get("idempotency-key", "")
         content = await request.body()
         return Answer(await self.studio.with_book(lambda book: book.add(content, place, key=key)), 201)
@@ -175,7 +175,7 @@ class Calls:
         return Answer({"job": self.studio.make_object().identifier}, 202)
 
     async def hear_job(self, request: Request) -> Response:
-        """What a job says, as server-sent events; a page that has lost the connection hears what it has missed."""
+        """The events of a job, as server-sent events; a page that reconnects gets the events that it has missed."""
         job = self.studio.jobs.named(request.path_params["job"])
         last = request.headers.get("last-event-id", "")
         after = int(last) + 1 if last.isdigit() and len(last) < 10 else 0
@@ -187,7 +187,7 @@ class Calls:
         return StreamingResponse(events(), media_type="text/event-stream")
 
     async def cancel_job(self, request: Request) -> Response:
-        """Stop a job, and say whether it was stopped or had ended."""
+        """Stop a job, and return whether it was stopped or had ended."""
         job = request.path_params["job"]
         stopped = await self.studio.jobs.named(job).cancel()
         return Answer({"cancelled" if stopped else "ended": job})
@@ -211,7 +211,7 @@ async def _send_from(folder: Path, request: Request) -> Response:
 
 
 def _file(folder: Path, request: Request, *, only: Sequence[str] = ()) -> Response:
-    """Return a file of a folder. Raises RefusedError (404) for other kinds than pages have use for."""
+    """Return a file of a folder. Raises RefusedError (404) for media types that the page does not use."""
     path = contained(folder, request.path_params["path"])
     kind = MEDIA_TYPES.get(path.suffix.lower())
     hidden = any(part.startswith(".") for part in path.relative_to(folder.resolve()).parts)

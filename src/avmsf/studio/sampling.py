@@ -1,4 +1,4 @@
-"""The table of an edited field without asking its gains anew: edits leave the ratios between places as they are."""
+"""The table of an edited field without new predictions: edits do not change the ratios of gains between contacts."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ def sample(field: SoundField, points: Float[Tensor, "points 3"], normals: Float[
 def resample(sampled: SampledField, before: SoundField, after: SoundField) -> SampledField | None:
     """Return the table of the field `after` an edit from that of the field `before`.
 
-    None where that cannot be: another fitted field, another phase, or a mode that could not be heard or was mute.
+    None if that is not possible: for another fitted field, another phase, or a mode that was inaudible or muted.
     """
     if fitted_gains(before.gain_field) is not fitted_gains(after.gain_field) or not torch.equal(
         before.phase, after.phase

@@ -1,4 +1,4 @@
-"""The tables that blows are located by, of the current revision: begun as soon as the sliders rest."""
+"""Localization tables of the current revision, computed as soon as the sliders are at rest."""
 
 import asyncio
 import sys
@@ -29,7 +29,7 @@ class Searches:
         self._ahead: asyncio.Task[None] | None = None
 
     def finder_of(self, revision: Revision) -> Finder:
-        """Return what locates blows on a revision; its tables are made when they are first asked for."""
+        """Return the locator of a revision; its tables are computed at the first use."""
         if self._finder is None or self._finder[0] != revision.number:
             field = revision.expect_field()
             points = self.showcase.current.sampled.points.double() * length_of(field.gain_field)
@@ -42,12 +42,12 @@ class Searches:
         return self._finder[1]
 
     def prepare_ahead(self) -> None:
-        """Make the current revision's tables, once what is under way is done, and no stale one's."""
+        """Compute the current revision's tables after the running computation, and skip those of older revisions."""
         if self._ahead is None or self._ahead.done():
             self._ahead = asyncio.create_task(self._prepare())
 
     def close(self) -> None:
-        """Begin with nothing more."""
+        """Start no further computation."""
         if self._ahead is not None:
             self._ahead.cancel()
 

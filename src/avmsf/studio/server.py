@@ -1,4 +1,4 @@
-"""The server of the page: on this machine alone, under an address that nobody else knows, until Ctrl-C."""
+"""The server of the page: on the loopback interface, at a secret address, until Ctrl-C."""
 
 import asyncio
 import errno
@@ -28,12 +28,12 @@ PORT = 8634
 """Where the page is without --port, so that a browser remembers what this page may do, such as use the microphone."""
 _HOME = "127.0.0.1"
 _HANGING = 1
-"""Seconds that an answer under way may take when the server ends."""
+"""Seconds that a running response may take when the server ends."""
 _OUT_OF_RESOURCES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 
 class PageServer(uvicorn.Server):
-    """Says where the page is as soon as it answers, and once where it cannot accept more connections."""
+    """Prints the address once the server responds, and a message when it cannot accept more connections."""
 
     def __init__(self, config: uvicorn.Config, announce: Callable[[], None]) -> None:
         super().__init__(config)
@@ -65,10 +65,10 @@ def serve(
     tell: Callable[[str], None],
     config: StudioConfig | None = None,
 ) -> bool:
-    """Serve the page until Ctrl-C; `tell` hears its address. Without `port` PORT, or a free one where that is taken.
+    """Serve the page until Ctrl-C; `tell` is called with its address.
 
-    Returns whether a thread still computes what nobody waits for any more. Raises StudioError where a given port is
-    taken, and as the readers of what is opened do.
+    Without `port` it is PORT, or a free one if that is in use. Return whether a thread is still computing a result that
+    is no longer needed. Raises StudioError if a given port is in use, and the errors of the readers.
     """
     with _listening(port) as listener, _temporary_folder() as folder:
         number, token = listener.getsockname()[1], new_token()
@@ -111,7 +111,7 @@ def _temporary_folder() -> tempfile.TemporaryDirectory[str]:
 
 
 def _open_browser(address: str, folder: Path) -> None:
-    """Open the page by way of a file that only its owner reads: everybody reads a browser's command line."""
+    """Open the page by a file that only its owner can read: the command line of a browser is public."""
     path = folder / "open.html"
     with open(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "w", encoding="utf-8") as file:
         file.write(f'<!doctype html><meta http-equiv="refresh" content="0; url={address}" />\n')

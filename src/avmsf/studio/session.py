@@ -1,7 +1,7 @@
-"""The field that is open in the page: revisions that never change, of which the last one is heard.
+"""The field that is open in the page: immutable revisions, the last of which is played.
 
-Whoever changes it says which revision that is based on; where another tab was faster, nothing is changed and the page
-is told so. Numbers of revisions only grow, an undone one's is never given again.
+Every change names the revision that it is based on; if another tab was faster, nothing is changed and the page gets a
+message. Revision numbers only increase; the number of an undone revision is not used again.
 """
 
 import os
@@ -26,7 +26,7 @@ _LONGEST_NAME = 200
 """Bytes: files' names have 255 at most, of which the ending and what a half-written file is called need some."""
 _MOST_ALIKE = 1000
 MOST_UNDONE = 100
-"""Revisions that can be gone back to."""
+"""Maximum number of undo steps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,18 +37,18 @@ class Revision:
     opening: int = 0
     """Which field it is of: counts those that were opened."""
     ground: SoundField | None = None
-    """The field as it was opened, saved or led last: what the sliders are relative to. None before there is one."""
+    """The field as opened, saved or optimized last, to which the sliders are relative; None without a field."""
     sliders: Sliders = REST
     """What was done to it since."""
     field: SoundField | None = None
-    """What is heard."""
+    """The field that is played."""
     remarks: tuple[str, ...] = ()
     """What its owner should know of it."""
     name: str | None = None
     """What it, or what it was made of, was saved as last; None for as it was opened."""
 
     def expect_field(self) -> SoundField:
-        """Return what is heard. Raises RefusedError (409) before there is a field."""
+        """Return the field that is played. Raises RefusedError (409) without a field."""
         if self.field is None:
             raise RefusedError(
                 409, "expected a field, got none yet; record impacts and reconstruct it first", name="field"
@@ -67,7 +67,7 @@ class Session:
 
     @property
     def current(self) -> Revision:
-        """What is heard now."""
+        """The current revision."""
         return self._current
 
     @property
@@ -76,14 +76,14 @@ class Session:
         return bool(self._past)
 
     def open(self, field: SoundField | None) -> Revision:
-        """Hear a field just read, or none; the one before it can be gone back to."""
+        """Make a field, or none, the current one; the previous one can be restored by undo."""
         with self._lock:
             before = self._current
             fresh = Revision(0, before.opening + 1, ground=field, field=field)
             return self._advance(fresh) if before.field is None else self._remember(fresh)
 
     def edit(self, base: int, sliders: Sliders) -> Revision:
-        """Set the sliders. Raises RefusedError (409) where `base` is not the current revision, and as edits do."""
+        """Set the sliders. Raises RefusedError (409) if `base` is not the current revision, and the errors of edits."""
         with self._lock:
             self.expect_current(base)
             self._current.expect_field()
@@ -100,7 +100,7 @@ class Session:
             return self._remember(led)
 
     def undo(self, base: int) -> Revision:
-        """Go back by one revision, under a new number. Raises RefusedError (409) as `edit`, and where there is none."""
+        """Undo the last revision, under a new number. Raises RefusedError (409) as `edit`, and if there is no other."""
         with self._lock:
             self.expect_current(base)
             if not self._past:
@@ -110,9 +110,9 @@ class Session:
             return undone
 
     def save(self, base: int, name: str) -> tuple[Path, Revision]:
-        """Write the field as it is to a new file of the folder, and let the sliders be relative to it.
+        """Write the current field to a new file of the folder, and make the sliders relative to it.
 
-        Raises RefusedError where there is a file of this name (409), or the name is none (400).
+        Raises RefusedError if a file of this name exists (409), or the name is invalid (400).
         """
         with self._lock:
             self.expect_current(base)
@@ -128,7 +128,7 @@ class Session:
                 raise
 
     def keep(self, field: SoundField, stem: str) -> Path:
-        """Write a field that is not heard to a new file of the folder, `stem` with a number where that is taken."""
+        """Write a field that is not the current one to a new file of the folder: `stem`, with a number if it exists."""
         for name in (stem, *(f"{stem} {number}" for number in range(2, _MOST_ALIKE))):
             path = self.home / f"{name}{SUFFIX}"
             try:
@@ -143,7 +143,7 @@ class Session:
         )
 
     def expect_current(self, base: int) -> None:
-        """Raise RefusedError (409), with the current revision, where `base` is another one."""
+        """Raise RefusedError (409), with the current revision, if `base` is another one."""
         if base != self._current.number:
             raise RefusedError(
                 409,
@@ -168,7 +168,7 @@ class Session:
 
 
 def _write_new(field: SoundField, path: Path) -> None:
-    """Write a field to a file that is not there yet. Raises RefusedError (409) where it is, and StudioError."""
+    """Write a field to a new file. Raises RefusedError (409) if the file exists, and StudioError."""
     try:
         os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     except FileExistsError as error:
@@ -186,7 +186,7 @@ def _write_new(field: SoundField, path: Path) -> None:
 
 
 def file_name(name: str) -> str:
-    """Return the file that a user's name stands for. Raises RefusedError (400) for a name that leads elsewhere."""
+    """Return the file of a name that the user gave. Raises RefusedError (400) for a name with a path."""
     stem = name.strip().removesuffix(SUFFIX)
     if not _NAME.fullmatch(stem) or _DEVICES.fullmatch(stem) or stem.endswith((".", " ")):
         raise bad_request("name", "letters, digits, spaces, - and _, such as bowl in wood", name)

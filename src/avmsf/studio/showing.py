@@ -1,4 +1,4 @@
-"""What the page fetches to see and hear: a folder of files for each revision, of which the last few are kept."""
+"""The files that the page fetches: one folder for each revision, of which the last few are kept."""
 
 import json
 import shutil
@@ -37,7 +37,7 @@ from avmsf.studio.session import Revision
 _CLICKED = 8_000
 """Points of an object without a field."""
 _KEPT = 4
-"""Revisions whose files are kept: a page may still be reading those of the one before."""
+"""Number of revisions whose files are kept: a page may still be reading the previous ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,18 +67,18 @@ class Showcase:
         return next(reversed(self._shown.values()))
 
     def files_of(self, number: int) -> Path:
-        """Return the folder of a revision's files; the last one's where they are no longer kept."""
+        """Return the folder of a revision's files, or of the last one's if they are no longer kept."""
         shown = self._shown.get(number)
         return (self.current if shown is None else shown).folder
 
     @property
     def object_folder(self) -> Path:
-        """The folder of the files that show the object, and of the measured strikes' sounds."""
+        """The folder with the object's files and the sounds of recorded impacts."""
         assert self._first_of_field is not None
         return self._first_of_field.folder
 
     def show(self, revision: Revision) -> None:
-        """Write a revision's files. Raises as `write_bundle`, and StudioError where there is nothing to click."""
+        """Write a revision's files. Raises the errors of `write_bundle`, and StudioError without geometry."""
         with self._lock:
             sampled = self._sampled(revision)
             path = self.folder / f"revision-{revision.number}"
@@ -104,9 +104,9 @@ class Showcase:
             self._forget()
 
     def _surface(self, field: SoundField | None) -> Path | Surface | None:
-        """Return the surface to show in place of Gaussians or points: the field's body, or what was reconstructed.
+        """Return the surface to show in place of Gaussians or points: the field's body, or the reconstructed surface.
 
-        None where a mesh of the object's own is shown. Like the points, it has the size before all edits.
+        None if a mesh of the object's own is shown. Like the points, it has the size before all edits.
         """
         shown = find_object(self.opened)
         if field is None or (shown is not None and not is_gaussians(shown)):
@@ -146,7 +146,7 @@ class Showcase:
         return SampledField(points, normals, empty, empty, nothing, nothing, torch.zeros(0), 48_000.0, False, name)
 
     def _clickable(self) -> tuple[Float32[Tensor, "points 3"], Float32[Tensor, "points 3"]]:
-        """Return points of the object where no field holds any. Raises StudioError where nothing shows the object."""
+        """Return points of the object for a field without points. Raises StudioError without geometry."""
         path = find_object(self.opened)
         if path is not None and not is_gaussians(path):
             return _on_mesh(read_surface(path, meters=self.meters))
@@ -198,9 +198,9 @@ class Showcase:
 
 
 def _on_mesh(surface: Surface) -> tuple[Float32[Tensor, "points 3"], Float32[Tensor, "points 3"]]:
-    """Return points all over a mesh, and the normals of its faces, on the whole outwards; its vertices without faces.
+    """Return points on a mesh and the normals of its faces, outward on average; its vertices if it has no faces.
 
-    Of faces that are not turned alike, the normals are judged from how the points lie.
+    For faces of inconsistent orientation the normals are estimated from the points.
     """
     mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy())
     if not len(surface.faces) or not mesh.area > 0:

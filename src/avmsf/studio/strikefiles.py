@@ -25,7 +25,7 @@ from avmsf.studio.refusal import RefusedError
 JOURNAL, REMOVED = "studio.json", "removed"
 """In the capture's cache: what was written under which key, and the recordings that were redone or taken out."""
 COMMAND = "avmsf studio"
-"""What other processes are told to wait for."""
+"""What other processes wait for, in their messages."""
 _WAIT = 10.0
 """Seconds to wait for another studio's change, which takes a fraction of one."""
 WAV = ".wav"
@@ -42,9 +42,9 @@ class StrikeFiles:
 
     @contextmanager
     def lock(self) -> Iterator[None]:
-        """Let no other studio change the table, the recordings or the note of keys meanwhile.
+        """Lock the table, the recordings and the keys against other studios.
 
-        Raises RefusedError (503), after which the page sends a recording again, where another one does for long.
+        Raises RefusedError (503) if another one holds the lock for long; the page then sends the recording again.
         """
         with ExitStack() as held:
             try:
@@ -56,7 +56,7 @@ class StrikeFiles:
             yield
 
     def readable(self, file: str) -> Path:
-        """Return a recording's path. Raises RefusedError (404) for one that leads out of the folder by a link."""
+        """Return a recording's path. Raises RefusedError (404) for a link out of the folder."""
         path = (self.folder / file).resolve()
         if not path.is_relative_to(self.folder):
             raise RefusedError(
@@ -65,9 +65,9 @@ class StrikeFiles:
         return path
 
     def own(self, file: str) -> Path:
-        """Return the path of a recording to change. Raises RefusedError (409) for a link, or one behind a link.
+        """Return the path of a recording to change. Raises RefusedError (409) for a link, or a path through one.
 
-        What a link leads to may be another strike's, or nothing of this capture.
+        The target of a link may belong to another impact or another capture.
         """
         path = self.folder / file
         if path.resolve() != path:
@@ -77,12 +77,12 @@ class StrikeFiles:
         return path
 
     def digest(self, file: str) -> str | None:
-        """Return what tells a recording from every other; None where it is not there."""
+        """Return a recording's digest; None if there is none."""
         path = self.readable(file)
         return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
 
     def is_free(self, file: str) -> bool:
-        """Whether nothing is called this."""
+        """Whether no file has this name."""
         return not os.path.lexists(self.folder / file)
 
     def next_name(self, taken: Iterable[str]) -> str:
@@ -101,7 +101,7 @@ class StrikeFiles:
         write_whole(self.own(file), lambda place: place.write_bytes(content), raising=CaptureError)
 
     def set_aside(self, file: str) -> None:
-        """Keep a recording in the cache too: under a second name, which needs no space, or as a copy."""
+        """Keep a recording in the cache too: by a hard link, which needs no space, or as a copy."""
         path = self.own(file)
         if not path.is_file():
             return
@@ -121,7 +121,7 @@ class StrikeFiles:
         self.own(file).unlink(missing_ok=True)
 
     def journal(self) -> dict[str, dict[str, Any]]:
-        """Return what was written under which key; nothing where the note is damaged."""
+        """Return what was written by key; empty if the record is damaged."""
         try:
             known = read_json(self.folder / CACHE / JOURNAL)
         except (OSError, ValueError):

@@ -21,7 +21,7 @@ _LINE = re.compile(r"[^\r\n]*(?:\r\n|\r|\n)|[^\r\n]+\Z")
 
 @dataclass(frozen=True)
 class StrikeTable:
-    """The table of one capture folder, read anew each time, for a spreadsheet may be at it too."""
+    """The table of one capture folder, read again each time, because a spreadsheet may change it."""
 
     folder: Path
 
@@ -31,7 +31,7 @@ class StrikeTable:
         return self.folder / TABLE
 
     def rows(self) -> list[Row]:
-        """Return the table's rows; none where there is no table yet, or one with nothing but its header."""
+        """Return the table's rows; empty without a table, or for one with only a header."""
         if not self.path.is_file():
             return []
         lines, separator = read_cells(self.path)
@@ -56,7 +56,7 @@ class StrikeTable:
         return [Row(line, dict(zip(header, cells, strict=True)), separator != ",") for line, cells in lines[1:]]
 
     def expect_room(self, place: Place) -> None:
-        """Raise RefusedError (422) for a strike that lacks what every row of the table has."""
+        """Raise RefusedError (422) for an impact without a value that every row of the table has."""
         names = [name.lower() for name in self._header()]
         for column, value, what in ((DIRECTION[0], place.direction, "direction"), (FORCE, place.newtons, "force")):
             if column in names and value is None:
@@ -68,7 +68,7 @@ class StrikeTable:
                 )
 
     def add(self, file: str, place: Place, settings: CaptureSettings) -> None:
-        """Write a row after the last; a table that is not there yet gets columns for what is known of the strike."""
+        """Append a row; a new table gets columns for the known values of the impact."""
         header = self._header()
         if not header:
             direction = () if place.direction is None else DIRECTION
@@ -85,7 +85,7 @@ class StrikeTable:
         self._write([mark, *lines, _written(cells, separator, end)])
 
     def remove(self, file: str) -> None:
-        """Take a recording's row out; with its last row the table goes."""
+        """Remove a recording's row; the table is deleted with its last row."""
         mark, lines, separator = self._text()
         [(begin, end, _)] = self._records(lines, separator, file)
         if len(self.rows()) == 1:
@@ -146,7 +146,7 @@ def posix(text: str) -> str:
 
 
 def _cells(names: Sequence[str], file: str, place: Place, settings: CaptureSettings) -> list[str]:
-    """Return a row's cells, in the table's unit; columns that nobody reads stay empty."""
+    """Return a row's cells, in the table's unit; unknown columns are empty."""
     values = dict(zip(REQUIRED[1:], (value / settings.meters for value in place.contact), strict=True))
     if place.direction is not None:
         length = math.hypot(*place.direction)

@@ -1,4 +1,4 @@
-"""All that one server has open, and what it does when the page asks: nothing of HTTP, nothing that blocks the loop."""
+"""The state of one server, and the operations that the page requests: no HTTP, nothing that blocks the event loop."""
 
 import shutil
 import tempfile
@@ -30,19 +30,19 @@ STEER_STEPS = 150
 _MAKING = "reconstruct the object from its images"
 """The kind of job that has something to click for its result."""
 _NAME = 50
-"""Characters of what is opened in the name of a field that is kept."""
+"""Characters of the opened name that are part of the name of a saved field."""
 
 
 @dataclass(frozen=True)
 class StudioConfig:
-    """What the page is offered beside what is opened."""
+    """Options of the page other than what is opened."""
 
     model: str | None = None
-    """Folder or name of a Stable Audio pipeline for edits by words; that of the hub's cache where there is one."""
+    """Folder or name of a Stable Audio pipeline for text edits; by default that in the hub's cache."""
     modes: int = MODES
-    """Most modes that a reconstruction keeps."""
+    """Maximum number of modes of a reconstruction."""
     steps: int = STEER_STEPS
-    """Steps of a descent towards a recording or words."""
+    """Steps of an optimization towards a recording or a text."""
     preset: Preset = "default"
     """Settings of a reconstruction."""
 
@@ -65,7 +65,7 @@ class Studio:
 
     @property
     def busy(self) -> bool:
-        """Whether a thread computes, which nothing can interrupt."""
+        """Whether a thread is computing, which cannot be interrupted."""
         return self.threads.busy
 
     async def begin(self) -> None:
@@ -85,7 +85,7 @@ class Studio:
         return {**shown.manifest, "live": self._live(shown.revision)}
 
     async def locate(self, content: bytes) -> dict[str, Any]:
-        """Return where the blows of a recording fell on the current revision. Raises LocationError, CaptureError."""
+        """Return the positions of a recording's impacts on the current revision. Raises LocationError, CaptureError."""
         recording = await self.threads.read(read_upload, content)
         revision = self.session.current
         finder = self.searches.finder_of(revision)
@@ -93,7 +93,7 @@ class Studio:
         return {"revision": revision.number, "impacts": blows}
 
     async def edit(self, words: dict[str, Any]) -> dict[str, Any]:
-        """Set the sliders, or start to lead the field towards a recording or words. Raises as edits do."""
+        """Set the sliders, or start to optimize the field towards a recording or a text. Raises the errors of edits."""
         base = base_of(words)
         if is_wish(words):
             return await self._lead(base, Wish.read(words, model=self.model))
@@ -101,7 +101,7 @@ class Studio:
         return self._changed(await self._compute(self.session.edit, base, sliders))
 
     async def lead(self, base: int, content: bytes) -> dict[str, Any]:
-        """Start to lead the field towards a recording. Raises CaptureError for one that cannot be used."""
+        """Start to optimize the field towards a recording. Raises CaptureError for one that cannot be used."""
         self.session.expect_current(base)
         await self.threads.read(read_upload, content)
         return await self._lead(base, Wish(like=content))
@@ -119,7 +119,7 @@ class Studio:
         return {"file": str(path), **self._changed(revision)}
 
     async def capture(self) -> dict[str, Any]:
-        """Return the capture's strikes, and what shows its object."""
+        """Return the capture's impacts, and the kind of the object's geometry."""
         book = self.expect_book()
         visible = find_object(self.opened)
         running = self.jobs.current
@@ -130,11 +130,11 @@ class Studio:
         }
 
     async def with_book(self, act: Callable[[StrikeBook], Result]) -> Result:
-        """Do something with the capture's strikes, one after another. Raises RefusedError (404) without a capture."""
+        """Change the capture's impacts, one request after another. Raises RefusedError (404) without a capture."""
         return await self.threads.write(act, self.expect_book())
 
     def expect_book(self) -> StrikeBook:
-        """Return the capture's strikes. Raises RefusedError: 404 without a capture, 503 while its folder is missing."""
+        """Return the capture's impacts. Raises RefusedError: 404 without a capture, 503 while its folder is missing."""
         if self.book is None:
             raise RefusedError(
                 404, "expected a capture folder, got only a field; start avmsf studio with --capture", name="capture"
@@ -148,7 +148,7 @@ class Studio:
         return self.book
 
     async def reconstruct(self) -> Job:
-        """Begin to make a field of the capture, which is heard when it is done."""
+        """Start to fit a field to the capture, which becomes the current one."""
         book = self.expect_book()
         strikes = await self.threads.read(book.strikes)
         if not strikes:
@@ -181,7 +181,7 @@ class Studio:
             raise
 
     async def _compute(self, act: Callable[..., Result], *arguments: Any) -> Result:
-        """Compute with a user's values. Raises RefusedError (422) where they lead to no result."""
+        """Compute with a user's values. Raises RefusedError (422) if they give no result."""
         try:
             return await self.threads.compute(act, *arguments)
         except NUMERIC_ERRORS as error:
@@ -219,7 +219,7 @@ class Studio:
         return done
 
     def _changed(self, revision: Revision) -> dict[str, Any]:
-        """Return what a page is told of a new revision."""
+        """Return what the page gets for a new revision."""
         self.searches.prepare_ahead()
         return {"revision": revision.number, "remarks": list(revision.remarks)}
 
@@ -248,7 +248,7 @@ class Studio:
 
 
 def base_of(words: dict[str, Any]) -> int:
-    """Return the revision that a change is of. Raises RefusedError (400) where the page does not say."""
+    """Return the revision that a change is based on. Raises RefusedError (400) if the request has none."""
     base = words.get("base")
     if not isinstance(base, int) or isinstance(base, bool):
         raise unknown_base(base)

@@ -21,7 +21,7 @@ class Threads:
 
     @property
     def busy(self) -> bool:
-        """Whether a thread computes, which nothing can interrupt."""
+        """Whether a thread is computing, which cannot be interrupted."""
         return self._busy > 0
 
     async def compute(self, act: Callable[..., Result], *arguments: Any) -> Result:
@@ -29,7 +29,7 @@ class Threads:
         return await anyio.to_thread.run_sync(partial(self._counted, act, *arguments), limiter=self._computing)
 
     async def compute_ahead(self, act: Callable[[], Result]) -> Result:
-        """Do what nobody waits for yet, beside that."""
+        """Compute in the background a result that is not needed yet."""
         return await anyio.to_thread.run_sync(partial(self._counted, act), limiter=self._preparing)
 
     async def write(self, act: Callable[..., Result], *arguments: Any) -> Result:
@@ -37,7 +37,7 @@ class Threads:
         return await anyio.to_thread.run_sync(partial(act, *arguments), limiter=self._writing)
 
     async def read(self, act: Callable[..., Result], *arguments: Any) -> Result:
-        """Look at files."""
+        """Read files in a thread."""
         return await anyio.to_thread.run_sync(partial(act, *arguments), limiter=self._reading)
 
     def _counted(self, act: Callable[..., Result], *arguments: Any) -> Result:

@@ -1,8 +1,8 @@
-"""The process that does work of minutes for the page: `python -m avmsf.studio.worker`.
+"""The process of long computations for the page: `python -m avmsf.studio.worker`.
 
-It reads one line of JSON, the task, and writes lines of JSON: {"stage", "done", "total", "words"} as it goes, with
-"loss", null for none, and "pitch" at each step of a lead, and {"result"} or {"error"} at the end. It ends with all
-that it has started where its standard input is closed.
+It reads one line of JSON, the task, and writes lines of JSON: {"stage", "done", "total", "words"} as progress, with
+"loss" (null for none) and "pitch" at each step of an optimization, and {"result"} or {"error"} at the end. It ends,
+with all that it has started, when its standard input is closed.
 """
 
 import json
@@ -41,11 +41,11 @@ from avmsf.tasks.stableaudio import StableAudio
 
 Values = Mapping[str, Any]
 _RARELY = 10
-"""Steps of a fit between two words about it."""
+"""Steps of a fit between two progress events."""
 
 
 class Voice:
-    """Tells the server how far the work is."""
+    """Sends progress events to the server."""
 
     def __init__(self, stream: TextIO) -> None:
         self.stream = stream
@@ -56,17 +56,17 @@ class Voice:
         self.stream.flush()
 
     def step(self, stage: str, done: int, total: int, words: str, **numbers: float | None) -> None:
-        """Say how far a stage is; `numbers` are for programs, beside the words."""
+        """Send the progress of a stage; `numbers` are for programs, in addition to the text."""
         self.say({"stage": stage, "done": done, "total": total, "words": words, **numbers})
 
     def tell(self, words: str) -> None:
-        """Say that a stage begins, which stands before the colon, and after it what of it."""
+        """Send that a stage begins: its name before the colon, a description after it."""
         stage, _, rest = words.partition(": ")
         self.step(stage, 0, 0, rest)
 
     @property
     def listener(self) -> Listener:
-        """Who hears of the stages of a reconstruction."""
+        """The listener of a reconstruction."""
         return Listener(self.tell, self._splatting, self._lifting)
 
     def _splatting(self, progress: SplatProgress) -> None:
@@ -77,12 +77,12 @@ class Voice:
         self.step("features", progress.done, progress.total, progress.view)
 
     def fitting(self, progress: Progress) -> None:
-        """Hear of a fit."""
+        """Send the progress of a fit."""
         if progress.step % _RARELY == 0 or progress.step == progress.steps:
             self.step("fit", progress.step, progress.steps, f"{progress.stage}, loss {progress.loss:.3g}")
 
     def steering(self, progress: GuidedEditProgress) -> None:
-        """Hear of an edit's descent."""
+        """Send the progress of an edit's optimization."""
         words = f"loss {progress.loss:.3g}, pitch x {progress.pitch:.4g}"
         # In JSON there is no NaN.
         loss = progress.loss if math.isfinite(progress.loss) else None
@@ -90,9 +90,9 @@ class Voice:
 
 
 def make_field(task: Values, voice: Voice) -> Values:
-    """Reconstruct the capture `folder`, copy its field to `output`, and return what its owner should know.
+    """Reconstruct the capture `folder`, copy its field to `output`, and return the notes on it.
 
-    The copy is what this reconstruction made, whatever another one puts in the place of `field` meanwhile.
+    The copy is the field of this reconstruction, even if another one replaces `field` meanwhile.
     """
     folder = Path(task["folder"])
     config = replace(PRESETS[task["preset"]], modes=int(task["modes"]))
@@ -129,7 +129,7 @@ def make_object(task: Values, voice: Voice) -> Values:
 
 
 def lead(task: Values, voice: Voice) -> Values:
-    """Lead a field towards a recording or words, and return the file of the edited one."""
+    """Optimize a field towards a recording or a text, and return the file of the edited one."""
     field = load(task["field"])
     guide: Guide
     if "recording" in task:
