@@ -119,7 +119,7 @@ class Studio:
         return {"file": str(path), **self._changed(revision)}
 
     async def capture(self) -> dict[str, Any]:
-        """Return the capture's impacts, and the kind of the object's geometry."""
+        """Return the impacts of the capture, and the name of the file that shows its object."""
         book = self.expect_book()
         visible = find_object(self.opened)
         running = self.jobs.current
