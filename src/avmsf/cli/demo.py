@@ -29,6 +29,7 @@ from avmsf.field.scaledgains import surface_of
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.pipeline.reconstruct import reconstruct
+from avmsf.pipeline.record import modes_words
 from avmsf.pipeline.scene import CLOUD
 from avmsf.scene.points import farthest_points
 from avmsf.scene.splatconfig import SplatConfig
@@ -108,10 +109,9 @@ def _go_all_the_way(
         shutil.move(made.surface, folder / SHAPE)
     shutil.rmtree(folder / CACHE)
     _write_sounds(folder / "sounds", field, train, heard)
+    poles = modes_words(len(field.bank), int((~field.is_mode).sum()))
     pictures = {
-        "modes": draw_modes(
-            made.modes.bank, levels(amplitudes(made.modes)), title=f"{len(made.modes.bank)} modes of the mug"
-        ),
+        "modes": draw_modes(made.modes.bank, levels(amplitudes(made.modes)), title=f"{poles} of the mug"),
         "spectrograms": draw_spectrograms(
             heard.sounds,
             field.render(heard.contacts, directions=heard.directions),
