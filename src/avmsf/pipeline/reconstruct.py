@@ -126,12 +126,11 @@ def _reconstruct(
     heard = {"impacts": train.digest(), "method": repr(method)}
     listener.tell(f"modes: {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
     found = stages.keep(MODES, heard, lambda path: extract_once(train, method, path, needed=True))
-    modes = extract_once(train, method, found.path)
+    modes, cache = extract_once(train, method, found.path), stages.folder / BODIES
 
     @once
     def bodies() -> CandidateBodies:
         listener.tell("bodies: finite-element models of the object")
-        cache = stages.folder / BODIES
         return candidate_bodies(shape.surface(), config.body, impacts=train, cache=cache, tell=listener.tell)
 
     def make(path: Path) -> None:
