@@ -96,8 +96,8 @@ def _next(places: np.ndarray, values: np.ndarray, failed: np.ndarray, *, thinnes
         curve, slope, _ = np.polyfit(places[around] - places[best], values[around], 2)
         if curve < 0:
             proposals.append(places[best] - 0.5 * slope / curve)
-    # Half way to a neighbor, the likelier one first; where they are near, the log evidence is about a parabola, on which
-    # a quarter of the neighbor's fall is lost there.
+    # Half way to a neighbor, the likelier one first; near the best one the log evidence is about a parabola, on which a
+    # quarter of the neighbor's fall is lost there.
     near = [row for row in (best - 1, best + 1) if 0 <= row < len(places)]
     if best == 0:
         # The first range is a guess below; above, the views or the object's width bound it.
