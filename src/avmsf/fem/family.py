@@ -140,7 +140,7 @@ def _of_shape(shape: Shape, count: int, dofs: int, filled: int, tell: Callable[[
 
 
 def _filled(found: CheckedSurface, count: int, dofs: int, tell: Callable[[str], None]) -> BodyFamily:
-    tell("tetrahedra: solid body")
+    tell("dividing the enclosed volume into tetrahedra")
     return BodyFamily((isotropic_modes(filled_solid(found, dofs), count=count),), ())
 
 

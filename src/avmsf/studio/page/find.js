@@ -140,7 +140,7 @@ function describe(studio, blow) {
   for (const [name, words] of facts) list.append(element("dt", {}, name), element("dd", {}, words));
   const parts = [list, button("Strike here", () => studio.strike(blow.row))];
   if (blow.equivalent_points?.length) {
-    parts.push(element("h3", {}, "Equivalent contacts"));
+    parts.push(element("h3", {}, "Other possible contacts"));
     const places = element("ul", { className: "listing" });
     for (const { position, probability, message } of blow.equivalent_points) {
       const text = `${millimeters(position)} mm, ${percent(probability)}${message ? `: ${message}` : ""}`;
