@@ -155,7 +155,7 @@ def test_a_demo_is_read_into_any_other_format(field_file: Path, tmp_path: Path) 
     words = ["--to", "wavs", "--output", str(tmp_path / "wavs"), "--points", "3"]
     assert main(["export", str(tmp_path / "demo"), *words]) == 0
     demo = read_demo(tmp_path / "demo").field
-    with (tmp_path / "wavs" / "strikes.csv").open() as file:
+    with (tmp_path / "wavs" / "samples.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 3
     scale = json.loads((tmp_path / "wavs" / "manifest.json").read_text())["scale"]
@@ -170,7 +170,7 @@ def test_wavs_have_the_layers_asked_for(field_file: Path, tmp_path: Path) -> Non
     words += ["--pulse", "hertz"]
     assert main([*words, "--forces", "0.5", "2", "--contact-times", "0.001", "0", "--seconds", "0.05"]) == 0
     assert json.loads((tmp_path / "w" / "manifest.json").read_text())["pulses"] == ["hertz", "hertz"]
-    with (tmp_path / "w" / "strikes.csv").open() as file:
+    with (tmp_path / "w" / "samples.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [(row["force"], row["contact_time"]) for row in rows] == [("0.5", "0.001"), ("2", "0")] * 2
     assert soundfile.info(tmp_path / "w" / rows[0]["file"]).frames == 400
@@ -208,7 +208,7 @@ def test_contacts_of_faust_and_of_wavs_have_the_same_numbers(field_file: Path, t
     assert str(contacts) in err
     assert main([*words, "wavs", "--output", str(tmp_path / "w"), "--seconds", "0.01"]) == 0
     tables = []
-    for path in (contacts, tmp_path / "w" / "strikes.csv"):
+    for path in (contacts, tmp_path / "w" / "samples.csv"):
         with path.open(newline="") as file:
             tables.append({row["contact"]: [row[axis] for axis in "xyz"] for row in csv.DictReader(file)})
     assert len(tables[0]) == 7
@@ -290,7 +290,7 @@ def test_a_folder_may_have_a_dot_in_its_name(field_file: Path, tmp_path: Path) -
     for name in ("bowl-1.2", "name.github.io", "old.wav"):
         words = ["--to", "wavs", "--output", str(tmp_path / name), "--points", "1", "--seconds", "0.01"]
         assert main(["export", str(field_file), *words]) == 0
-        assert (tmp_path / name / "strikes.csv").is_file()
+        assert (tmp_path / name / "samples.csv").is_file()
 
 
 @pytest.mark.parametrize(("to", "name"), [("gltf", "a.wav"), ("faust", "a"), ("uff", "a.txt")])
@@ -338,7 +338,7 @@ def test_a_sample_set_has_the_given_contacts_in_their_order(how: str, field_file
         (tmp_path / "places.csv").write_text("\n".join(lines) + "\n")
         words = ["--contact-table", str(tmp_path / "places.csv"), "--unit", "mm"]
     assert main(["export", str(field_file), "--to", "wavs", "--output", str(tmp_path / "set"), *words]) == 0
-    with (tmp_path / "set" / "strikes.csv").open() as file:
+    with (tmp_path / "set" / "samples.csv").open() as file:
         rows = list(csv.DictReader(file))
     places = [[float(row[axis]) for axis in "xyz"] for row in rows]
     np.testing.assert_allclose(places, GIVEN, atol=1e-9)

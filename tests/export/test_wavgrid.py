@@ -22,7 +22,7 @@ LAYERS = (Layer(0.25, 0.002), Layer(1.0, 0.0005), Layer(3.0))
 
 
 def rows(folder: Path) -> list[dict[str, str]]:
-    with (folder / "strikes.csv").open(newline="") as file:
+    with (folder / "samples.csv").open(newline="") as file:
         return list(csv.DictReader(file))
 
 

@@ -19,7 +19,7 @@ from avmsf.export.written import Written, write_folder
 from avmsf.modal.config import PulseShape
 from avmsf.modal.pulse import ForcePulse
 
-TABLE, INSTRUMENT, SOUNDS = "strikes.csv", "instrument.sfz", "sounds"
+TABLE, INSTRUMENT, SOUNDS = "samples.csv", "instrument.sfz", "sounds"
 _WHERE = ("x", "y", "z", "nx", "ny", "nz")
 _HOW = ("force", "contact_time", "midi_note", "velocity_low", "velocity_high")
 COLUMNS = ("file", *_WHERE, *_HOW, "seconds", "peak_db", "contact")
