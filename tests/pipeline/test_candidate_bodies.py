@@ -123,16 +123,6 @@ def test_the_most_probable_body_alone_is_made_finer_and_not_its_namesake() -> No
     assert (second["wall_thickness"], second["refined"]) == (0.00404, False)
 
 
-def test_of_likely_walls_that_differ_each_is_made_finer(monkeypatch: pytest.MonkeyPatch) -> None:
-    finer, good = Finer(), bodies()[1]
-    likely = [replace(good, wall=wall, fine=False) for wall in (0.004, 0.0042, 0.0064)]
-    monkeypatch.setattr("avmsf.field.gains.estimator.search_thickness", lambda *_: (likely, None))
-    # The wall's search is replaced: any maker of walls asks for it.
-    known = CandidateBodies(NominalBodies(tuple(likely), {}), finer, thicken=Finer())  # type: ignore[arg-type]
-    MixtureEstimator(bodies=known).start(case(), "shared")
-    assert [body.wall for body in finer.asked] == [0.004, 0.0064]
-
-
 @dataclass
 class Held:
     """Returns a known body as the free one held."""

@@ -48,9 +48,6 @@ _UPDATED = 64
 _PREDICTS = 1.4
 """Nats per mode that a free body has to add, below which supports are tried. A plate clamped at an edge and taken for
 free adds .5, a free one 2.3; mugs add 1.1 (held at the base) and 1.5, an aircraft .8 to 1.3."""
-_APART = 0.2
-"""Difference of log thickness from which on two likely walls are both computed finely: what the evidence, which takes
-the shape for right, leaves open (`fem.thickness`)."""
 _PLACES = 500
 """Points of the surface where the contacts that contradict the others may have been."""
 
@@ -117,7 +114,6 @@ class MixtureEstimator(GainRecipe):
         thickness = None
         if self.bodies is not None and self.bodies.thicken is not None and bodies:
             bodies, thickness = search_thickness(bodies, partial(fit.evidence, every), self.bodies.thicken)
-            bodies = self._refined_apart(bodies)
         while True:
             families = fit.families(every, bodies)
             model = fit(every, families)
@@ -195,20 +191,6 @@ class MixtureEstimator(GainRecipe):
         found = judgment.credibility
         little = found is not None and found.with_body - found.without_body < _PREDICTS
         return self.bodies is not None and (self.bodies.always_hold or little)
-
-    def _refined_apart(self, bodies: Sequence[NominalBody]) -> list[NominalBody]:
-        """Return bodies, the most probable one first, with the first one of each thickness computed finely.
-
-        The evidence of coarse bodies scatters by several nats, and finer elements alone make a body more probable: of
-        thicknesses about as probable, the one refined first would win.
-        """
-        found, walls = list(bodies), list[float]()
-        for row, body in enumerate(bodies):
-            wall = -math.inf if body.wall is None else math.log(body.wall)
-            if all(abs(wall - other) > _APART for other in walls):
-                walls.append(wall)
-                found[row] = self._refined(body) or body
-        return found
 
     def _refined(self, body: NominalBody) -> NominalBody | None:
         """Return a body with finer elements; None where it has been computed as finely as it can."""
