@@ -19,7 +19,7 @@ _RESOLUTION = 0.06
 """Difference of log thickness below which no body is computed between two: real walls vary by 3 to 5 %."""
 _FAR = 0.4
 """Difference of log thickness from which on three bodies say little of those between them. Of a dish from photographs a
-body of twice the best one's thickness was less probable by 66 nats; half way lay one more probable by 9."""
+body of twice the best one's thickness was less probable by 66 nats; one half way was by 9 nats more so."""
 _MOST = 8
 """Bodies computed at most, failures included."""
 _UNLIKELY = math.log(100.0)

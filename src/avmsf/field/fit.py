@@ -97,6 +97,8 @@ def fit(
     # Close modes may have passed one another on the way.
     order = torch.argsort(run.bank.frequency.detach())
     report = {"gain_model": recipe.name, **run.network.report, **report}
+    if order.tolist() != sorted(order.tolist()):
+        report["order"] = order.tolist()  # the row of each mode in the extraction
     bank = ModalBank(*(each.detach()[order] for each in (run.bank.frequency, run.bank.damping)))
     finished: GainField
     if isinstance(run.network, RefinedGains):

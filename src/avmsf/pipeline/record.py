@@ -50,7 +50,9 @@ def with_record(
     del values["fit"]
     values["scene"] = features.get("scene")
     values["encoder"] = features.get("encoder")
-    report = {**made.origin.report, RECORD: values, SUPPORTING: list(supporting)}
+    order = made.origin.report.get("order", range(len(made.bank)))
+    rows = [row for row, extracted in enumerate(order) if extracted in set(supporting)]
+    report = {**made.origin.report, RECORD: values, SUPPORTING: rows}
     return replace(made, origin=replace(made.origin, report=report))
 
 

@@ -74,8 +74,10 @@ def _fix_seed(library: Path) -> None:
         entries = [
             call["r_offset"] for call in calls.iter_relocations() if names.get_symbol(call["r_info_sym"]).name == _DRAW
         ]
-    loaded = [line.split(maxsplit=5) for line in Path("/proc/self/maps").read_text().splitlines()]
-    start = min(int(row[0].split("-")[0], 16) for row in loaded if row[-1] == str(library.resolve()))
+    loaded = [line.split(maxsplit=5) for line in Path("/proc/self/maps").read_text(errors="replace").splitlines()]
+    start = min((int(row[0].split("-")[0], 16) for row in loaded if row[-1] == str(library.resolve())), default=None)
+    if start is None:
+        return
     writable = [[int(end, 16) for end in row[0].split("-")] for row in loaded if row[1].startswith("rw")]
     for entry in entries:
         if any(low <= start + entry < high for low, high in writable):

@@ -40,8 +40,8 @@ PROFILE_PRIOR = (0.56, 0.28, 0.1, 0.027, 0.003, 0.015, 0.004, 0.008, 0.007)
 REMAINDER_PRIOR = (0.96, 0.04, 7e-4, 1e-4)
 """Typical share of the modes of a body with each of `REMAINDERS`.
 
-Both are chosen by hand, narrower than the mean posterior probabilities over the modes of seven simulated objects with 8
-impacts each, with which errors were larger (docs/decisions/few-impacts.md)."""
+Both are of an earlier measurement whose script was not kept: narrower than the mean posterior probabilities over the
+modes of seven simulated objects with 8 impacts each as they are printed now (docs/decisions/few-impacts.md)."""
 EQUAL_PRIOR = 0.2
 """Probability that a body is not typical, so that all profiles and remainders are equally probable."""
 REACH = 0.15
