@@ -122,21 +122,30 @@ def test_contacts_in_float32_and_float64_meet_the_same_points():
     assert same(fitted(SHORT, train=replace(impacts, contacts=impacts.contacts.float())), short_fit())
 
 
-def test_modes_come_out_by_frequency():
-    """Modes in the wrong order come out ascending, and each with its own gains."""
-    impacts = plate_impacts()
-    modes = plate_extraction(impacts)
+def flipped(modes: Extraction) -> Extraction:
     order = torch.arange(len(modes.bank)).flip(0)
-    flipped = Extraction(
+    return Extraction(
         ModalBank(modes.bank.frequency[order], modes.bank.damping[order]),
         modes.gains[:, order],
         modes.residual,
         modes.quadrature[:, order],
     )
-    field = fitted(replace(LONG, steps=0), modes=flipped)
+
+
+def test_modes_come_out_by_frequency():
+    """Modes in the wrong order come out ascending, and each with its own gains."""
+    impacts = plate_impacts()
+    modes = plate_extraction(impacts)
+    field = fitted(replace(LONG, steps=0), modes=flipped(modes))
     assert bool((field.bank.frequency.diff() > 0).all())
     gains = fit_sine_gains(impacts.sounds, modes.bank, sample_rate=impacts.sample_rate)
     assert float((field.gains(impacts.contacts) - gains).square().sum() / gains.square().sum()) < 0.02
+
+
+def test_supporting_poles_are_the_same_poles_in_the_field():
+    modes = flipped(plate_extraction(plate_impacts()))
+    field = fitted(SHORT, modes=modes, supporting=[0])
+    assert field.is_mode.tolist() == [True] * (len(modes.bank) - 1) + [False]
 
 
 @pytest.mark.parametrize("phase", ["common", "sine"])

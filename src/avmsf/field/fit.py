@@ -3,13 +3,13 @@
 import math
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from avmsf._utils.device import TRAINABLE, usable_device
@@ -19,13 +19,13 @@ from avmsf.capture.places import rows_by_place
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import AvmsfWarning, FieldFileError, FitError
 from avmsf.field.config import FitConfig
-from avmsf.field.gainfield import GainField
+from avmsf.field.gainfield import GainField, TrainableGains
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.losses import spectral_loss
 from avmsf.field.quality import with_quality
 from avmsf.field.recipes import GainCase, GainRecipe, along_phase, fingerprint, gain_case
-from avmsf.field.soundfield import Origin, SoundField
+from avmsf.field.soundfield import SUPPORTING, Origin, SoundField
 from avmsf.field.training import Targets, TrainingRun
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
@@ -69,6 +69,7 @@ def fit(
     checkpoint: str | Path | None = None,
     progress: Callable[[Progress], None] | None = None,
     device: torch.device | str | None = None,
+    supporting: Sequence[int] | None = None,
 ) -> SoundField:
     """Fit a sound field to recordings (paper, section 3.5).
 
@@ -79,7 +80,8 @@ def fit(
     the state is saved there during the fit, on interruption and at the end, and a fit of the same arguments continues
     from it to the same result; delete the file once the field is saved. The network and the spectral loss are trained
     on `device`, by default a CUDA GPU where there is one, with the same result up to rounding; clusters, the Gaussian
-    process and the field are on the CPU. Raises `FitError` for arguments that do not fit together, a fit that diverges
+    process and the field are on the CPU. `supporting` are the rows of `modes` that are not modes of the object, for
+    `SoundField.is_mode`. Raises `FitError` for arguments that do not fit together, a fit that diverges
     and a device that cannot be used, `FieldFileError` for a checkpoint of another fit.
     """
     config = FitConfig() if config is None else config
@@ -97,18 +99,12 @@ def fit(
     # Close modes may have passed one another on the way.
     order = torch.argsort(run.bank.frequency.detach())
     report = {"gain_model": recipe.name, **run.network.report, **report}
-    if order.tolist() != sorted(order.tolist()):
-        report["order"] = order.tolist()  # the row of each mode in the extraction
+    if supporting is not None:
+        report[SUPPORTING] = [row for row, found in enumerate(order.tolist()) if found in supporting]
     bank = ModalBank(*(each.detach()[order] for each in (run.bank.frequency, run.bank.damping)))
-    finished: GainField
-    if isinstance(run.network, RefinedGains):
-        parts = along_phase(*fit_gains(train.sounds, bank, sample_rate=train.sample_rate), case.phase[order])
-        finished = run.network.judged(order, torch.view_as_complex(parts.contiguous()))
-    else:
-        finished = run.network.finished(order)
     field = SoundField(
         bank,
-        finished,
+        _finished(run.network, order, bank, case),
         case.phase[order],
         Residual(run.residual.magnitude.detach().clone()),
         train.sample_rate,
@@ -120,6 +116,14 @@ def fit(
     if config.residual and not config.noise_rate and config.steps:
         field = _with_measured_residual(field, used)
     return with_quality(field, used, advise=features.on_surface)
+
+
+def _finished(network: TrainableGains, order: Int[Tensor, " modes"], bank: ModalBank, case: GainCase) -> GainField:
+    """Return trained gains with their modes in this order, those of the Gaussian process with their measured noise."""
+    if not isinstance(network, RefinedGains):
+        return network.finished(order)
+    parts = along_phase(*fit_gains(case.train.sounds, bank, sample_rate=case.train.sample_rate), case.phase[order])
+    return network.judged(order, torch.view_as_complex(parts.contiguous()))
 
 
 def _with_measured_residual(field: SoundField, train: Impacts) -> SoundField:

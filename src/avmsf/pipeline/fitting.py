@@ -86,12 +86,13 @@ def fit_capture(
             checkpoint=None if output is None else unfinished(output, "checkpoint"),
             progress=progress,
             device=config.device,
+            supporting=supporting,
         )
     except FitError:
         if kept is not None:
             discard(kept)
         raise
-    return with_record(fitted, config, features_report or {}, supporting=supporting), modes
+    return with_record(fitted, config, features_report or {}), modes
 
 
 def _expect_start(capture: Capture, config: PipelineConfig) -> None:

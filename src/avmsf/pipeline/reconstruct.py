@@ -128,7 +128,6 @@ def _reconstruct(
     found = stages.keep(MODES, heard, lambda path: extract_once(train, method, path, needed=True))
     modes, cache = extract_once(train, method, found.path), stages.folder / BODIES
 
-    @once
     def bodies() -> CandidateBodies:
         listener.tell("bodies: finite-element models of the object")
         return candidate_bodies(shape.surface(), config.body, impacts=train, cache=cache, tell=listener.tell)
@@ -151,8 +150,9 @@ def _reconstruct(
             checkpoint=stages.checkpoint(FIELD),
             progress=fitting,
             device=config.device,
+            supporting=supporting,
         )
-        save(with_record(fitted, config, shape.report, supporting=supporting), path)
+        save(with_record(fitted, config, shape.report), path)
 
     def is_final(path: Path) -> bool:
         """Whether a kept field has the elastic family, or there is still none, as for want of memory."""

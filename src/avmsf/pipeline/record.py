@@ -1,6 +1,6 @@
 """What a pipeline's configuration means for captures, modes and the fields that it makes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -9,7 +9,7 @@ import torch
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.config import PipelineConfig
-from avmsf.field.soundfield import SUPPORTING, SoundField
+from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.finders import ModeFinder, finder_named
 from avmsf.modal.extraction.quality import measure_quality
@@ -37,23 +37,17 @@ def capture_settings_of(config: PipelineConfig, settings: CaptureSettings) -> Ca
     return settings.starting(config.time_zero)
 
 
-def with_record(
-    made: SoundField, config: PipelineConfig, features: Mapping[str, Any], *, supporting: Sequence[int] = ()
-) -> SoundField:
+def with_record(made: SoundField, config: PipelineConfig, features: Mapping[str, Any]) -> SoundField:
     """Return a field whose report has the configuration that made it, but for the fit's own, which it has anyway.
 
     `features` is the report of the features' file: it names the encoder that was taken and how the features were made,
-    which decide where `config.scene` does not, as for a file from elsewhere. Empty where there is none. `supporting`
-    are the rows of the poles that are no modes of the object.
+    which decide where `config.scene` does not, as for a file from elsewhere. Empty where there is none.
     """
     values = asdict(config)
     del values["fit"]
     values["scene"] = features.get("scene")
     values["encoder"] = features.get("encoder")
-    order = made.origin.report.get("order", range(len(made.bank)))
-    rows = [row for row, extracted in enumerate(order) if extracted in set(supporting)]
-    report = {**made.origin.report, RECORD: values, SUPPORTING: rows}
-    return replace(made, origin=replace(made.origin, report=report))
+    return replace(made, origin=replace(made.origin, report={**made.origin.report, RECORD: values}))
 
 
 def supporting_poles(modes: Extraction, impacts: Impacts) -> list[int]:
