@@ -73,3 +73,15 @@ def test_what_is_no_edit_is_refused(entry, name, tmp_path):
     with raises(FieldFileError, name=name):
         replace(field, origin=replace(field.origin, report=report)).save(tmp_path / "field.safetensors")
         SoundField.load(tmp_path / "field.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("rows", "name"),
+    [(3, ""), ([[1]], ".0"), ([True], ".0"), ([0, 1.0], ".1"), ([-1], ".0"), ([10_000], ".0")],
+)
+def test_supporting_poles_that_are_no_rows_are_refused(rows, name, tmp_path):
+    field = fields()["mixture"]
+    report = {**field.origin.report, "supporting_poles": rows}
+    with raises(FieldFileError, name=f"origin.report.supporting_poles{name}"):
+        replace(field, origin=replace(field.origin, report=report)).save(tmp_path / "field.safetensors")
+        SoundField.load(tmp_path / "field.safetensors")

@@ -184,9 +184,9 @@ class SoundField:
 
         True for all where the report does not say it: in a field without recordings, or made without the pipeline.
         """
-        rows = self.origin.report.get(SUPPORTING)
-        supporting = set(rows if isinstance(rows, list) else [])
-        return torch.tensor([row not in supporting for row in range(len(self.bank))], dtype=torch.bool)
+        mask = torch.ones(len(self.bank), dtype=torch.bool)
+        mask[self.origin.report.get(SUPPORTING, [])] = False
+        return mask
 
     @classmethod
     def fit(

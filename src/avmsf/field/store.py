@@ -32,7 +32,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.gainfield import GainField
 from avmsf.field.header import ADVICE, FORMAT, KEY, UNREADABLE, WHAT, damaged, key_of, record_of_text, value_of
 from avmsf.field.scaledgains import FITTED, ScaledGains
-from avmsf.field.soundfield import FieldQuality, Origin, SoundField
+from avmsf.field.soundfield import SUPPORTING, FieldQuality, Origin, SoundField
 from avmsf.files import write_whole
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.alignment import Alignment
@@ -162,7 +162,7 @@ class _Header:
             trained_on=tuple(like(name, "", "origin.trained_on") for name in origin["trained_on"]),
             per_newton=like(origin["per_newton"], True, "origin.per_newton"),
             config=record_of(FitConfig(), record["config"], "config"),
-            report=_checked_edits(like(origin["report"], {}, "origin.report"), modes),
+            report=_checked_report(like(origin["report"], {}, "origin.report"), modes),
             settings=CaptureSettings.of(like(origin["settings"], {}, "origin.settings"), name="origin.settings"),
         )
         if (quality := read.report.get("quality")) is not None:
@@ -170,8 +170,15 @@ class _Header:
         return cls(rate, samples, kind, gains, read, skeleton)
 
 
-def _checked_edits(report: dict[str, Any], modes: int) -> dict[str, Any]:
-    """Return a report whose edits are called as this version calls them. Raises RecordError for what is no edit."""
+def _checked_report(report: dict[str, Any], modes: int) -> dict[str, Any]:
+    """Return a report whose edits are called as this version calls them.
+
+    Raises RecordError for what is no edit, and for supporting poles that are no rows of the bank.
+    """
+    for row, pole in enumerate(like(report.get(SUPPORTING, []), [], f"origin.report.{SUPPORTING}")):
+        name = f"origin.report.{SUPPORTING}.{row}"
+        if not 0 <= like(pole, 0, name) < modes:
+            raise RecordError.expected(f"a row from 0 to {modes - 1}", pole, name=name)
     edits = like(report.get("edits", []), [], "origin.report.edits")
     found = [_edit_of(entry, f"origin.report.edits.{row}", modes) for row, entry in enumerate(edits)]
     return {**report, "edits": found} if found else report
