@@ -170,7 +170,7 @@ def test_points_alone_have_no_body():
 
 def test_a_mesh_too_large_for_the_memory_is_refused_with_the_size_that_fits(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 2 * 377e6)
-    with raises(SimulationError, name="surface") as caught:
+    with raises(SimulationError, name="memory") as caught:
         nominal_bodies(sheet(), walls=[0.004], dofs=80_000)
     [reason] = caught.value.value
     assert all(number in reason for number in ("80000", "1.6 GB", "40000"))
@@ -279,7 +279,7 @@ def test_the_memory_is_asked_for_what_is_computed_and_for_nothing_that_is_kept(
     monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 0.0)
     again = nominal_bodies(sheet(), walls=walls, **settings)
     assert torch.equal(again.bodies[1].elastic.shapes, found.bodies[1].elastic.shapes)
-    with raises(SimulationError, name="surface") as caught:
+    with raises(SimulationError, name="memory") as caught:
         nominal_bodies(sheet(), walls=[0.005, 0.007], **settings)
     assert all("got 0 GB" in reason for reason in caught.value.value)
 

@@ -249,11 +249,12 @@ def test_stated_settings_that_leave_no_body_are_refused(config: BodyConfig, name
     stated_bodies(PipelineConfig(gain_model="smooth", body=config), make)
 
 
-def test_what_no_setting_is_the_reason_of_is_no_error() -> None:
-    def fail() -> CandidateBodies:
-        raise SimulationError("3.1 GB are free")
-
-    stated_bodies(PipelineConfig(body=BodyConfig(wall=0.004)), fail)
+def test_a_stated_wall_is_not_blamed_for_too_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("avmsf.simulate.nominalsolid._free_memory", lambda: 1000.0)
+    stated = PipelineConfig(body=BodyConfig(wall=0.004))
+    found = stated_bodies(stated, lambda: candidate_bodies(dome(), stated.body))
+    with raises(SimulationError, name="memory"):
+        found()
 
 
 def test_contacts_elsewhere_are_refused_before_any_body_is_computed() -> None:

@@ -133,15 +133,17 @@ def candidate_bodies(
 
 
 def wall_error(surface: Surface | Shape, wall: float, error: SimulationError) -> SimulationError:
-    """Return the error for a stated wall, meters, of which no body can be computed, with the reasons."""
+    """Return the error for a stated wall, meters, of which no body can be computed, with the reasons; 0 is solid."""
     seen = surface if isinstance(surface, Surface) else surface.as_seen()
     extent = float((seen.vertices.amax(0) - seen.vertices.amin(0)).max())
     reasons = "; ".join(error.value) if isinstance(error.value, list) else str(error)
+    if not wall:
+        wanted, advice = "a closed mesh for 0, a solid object", "close the mesh, or give the wall thickness in meters"
+    else:
+        wanted = f"a wall thickness in meters that an object of {extent:.3g} m can have"
+        advice = "give it in meters, as 0.003 for 3 mm, or leave it out"
     return SimulationError(
-        f"--body.wall: expected a wall thickness in meters that an object of {extent:.3g} m can have, got {wall:g} m "
-        f"({reasons}); give it in meters, as 0.003 for 3 mm, or leave it out",
-        name="wall",
-        value=wall,
+        f"--body.wall: expected {wanted}, got {wall:g} m ({reasons}); {advice}", name="wall", value=wall
     )
 
 

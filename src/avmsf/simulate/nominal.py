@@ -48,6 +48,8 @@ _FORMAT = 3
 """Number of the way in which bodies are made; kept files of another are not read."""
 _THICKNESSES = 5
 """Thicknesses that are computed at first of a shape whose wall is not known."""
+_MEANS = frozenset({"memory", "timeout", "pytetwild"})
+"""Names of errors that are no fault of a surface or its wall."""
 
 
 @runtime_checkable
@@ -126,39 +128,40 @@ def nominal_bodies(
     freedom, at most a fifth more; of several each has at most `TRIAL`, or `WALL_TRIAL`, enough to choose by, and
     `refined` makes the chosen one fine. Dense, noisy and inverted surfaces are mended, and `tell` hears of it; the wall
     of an open one lies behind its triangles, whichever way they face. Modes are kept by content in the folder `cache`,
-    for filling by tetrahedra comes out a little different each time; a damaged file is made again.
+    for they take most of the time; a damaged file is made again.
 
-    Raises SimulationError for a surface of points, for what does not fit into memory, and where no body can be had,
-    with the reason for each.
+    Raises SimulationError for a surface of points, and where no body can be had, with the reason for each: by the name
+    "surface", or by that of the reason where only memory, time or the mesher stood against it.
     """
     told = tell or (lambda words: None)
     maker = _Maker(surface, count, cache, told, material)
     _expect_settings(count, dofs, walls)
     guessed = walls is None
     wanted: list[float | None] = maker.guesses() if walls is None else list(dict.fromkeys(walls))
-    refused: dict[float | None, str] = {}
+    refused: dict[float | None, SimulationError] = {}
     likely: list[float | None] = []
     for wall in wanted:
         try:
             maker.expect_likely(wall, guessed=guessed)
             likely.append(wall)
         except SimulationError as error:
-            refused[wall] = str(error)
+            refused[wall] = error
     bodies = maker.bodies(likely, dofs, refused)
     reasons = _grouped(refused)
     for reason in reasons:
         told(f"candidate model left out: {reason}")
     if not bodies:
+        causes = {str(error.name) for error in refused.values()}
         other = "give the wall thickness in meters" if guessed else "give another wall thickness, or none"
         raise SimulationError(
             f"expected a surface with a finite-element model, got none ({'; '.join(reasons)}); repair the mesh, or "
             f"{other}",
-            name="surface",
+            name=min(causes) if causes <= _MEANS else "surface",
             value=reasons,
         )
     if len(bodies) == 1 and not bodies[0].fine:
         bodies = [refined(surface, bodies[0], dofs=dofs, cache=cache, tell=tell)]
-    return NominalBodies(tuple(bodies), MappingProxyType(refused))
+    return NominalBodies(tuple(bodies), MappingProxyType({wall: str(error) for wall, error in refused.items()}))
 
 
 def with_wall(
@@ -303,8 +306,10 @@ class _Maker:
                 self._tell(f"retrying with more tetrahedra ({error})")
         return NominalBody(wall, self._converged(wall, dofs))
 
-    def bodies(self, walls: Sequence[float | None], dofs: int, refused: dict[float | None, str]) -> list[NominalBody]:
-        """Return the bodies with these walls, fine if it is one; `refused` gets the reason of those that fail."""
+    def bodies(
+        self, walls: Sequence[float | None], dofs: int, refused: dict[float | None, SimulationError]
+    ) -> list[NominalBody]:
+        """Return the bodies with these walls, fine if it is one; `refused` gets the errors of those that fail."""
         bodies = []
         # Most of the time goes to factorizations, which release the interpreter's lock and keep a processor busy each.
         # The limit on BLAS is the whole process's: set by each thread for itself, it would not be taken back in order.
@@ -315,7 +320,7 @@ class _Maker:
                     try:
                         bodies.append(body.result())
                     except SimulationError as error:
-                        refused[wall] = str(error)
+                        refused[wall] = error
             finally:
                 pool.shutdown(cancel_futures=True)
         return bodies
@@ -449,11 +454,11 @@ def _expect_settings(count: int, dofs: int, walls: Sequence[float | None] | None
             raise SimulationError.expected("more than 0 m, or None for a solid object", wall, row=row, name="walls")
 
 
-def _grouped(refused: Mapping[float | None, str]) -> list[str]:
+def _grouped(refused: Mapping[float | None, SimulationError]) -> list[str]:
     """Return each reason once, after the names of all that it holds for."""
     names: dict[str, list[str]] = {}
-    for wall, reason in refused.items():
-        names.setdefault(reason, []).append(body_name(wall))
+    for wall, error in refused.items():
+        names.setdefault(str(error), []).append(body_name(wall))
     shown = {reason: f"{each[0]} to {each[-1]}" if len(each) > 2 else ", ".join(each) for reason, each in names.items()}
     return [f"{each}: {reason}" for reason, each in shown.items()]
 
