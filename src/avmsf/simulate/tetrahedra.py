@@ -1,9 +1,9 @@
-"""Any mesh or scan as tetrahedra, by pytetwild, which heeds neither holes nor self-intersections.
+"""Any mesh or scan as tetrahedra, by pytetwild, which allows holes and self-intersections.
 
-pytetwild inserts the triangles in an order that it draws afresh each time. Its seed is fixed from outside, so the same
-mesh has the same tetrahedra in each run; on macOS and Windows that cannot be done, and two runs differ in their
-tetrahedra and somewhat in the body's frequencies: keep the solid to keep its sounds. It runs in a process of its own,
-for it may crash, and never ends on some meshes.
+pytetwild inserts the triangles in a random order. Its seed is fixed from outside, so the same mesh has the same
+tetrahedra in each run. That cannot be done on macOS and Windows, nor where the library's table of functions is
+protected: there two runs differ in their tetrahedra and somewhat in the body's frequencies. Keep the solid to keep its
+sounds. It runs in a process of its own, for it may crash, and never ends on some meshes.
 """
 
 import importlib.util

@@ -8,6 +8,7 @@ import ctypes
 import sys
 from importlib.machinery import EXTENSION_SUFFIXES, ExtensionFileLoader, FileFinder
 from importlib.util import module_from_spec
+from mmap import PAGESIZE
 from pathlib import Path
 from types import ModuleType
 
@@ -74,14 +75,17 @@ def _fix_seed(library: Path) -> None:
         entries = [
             call["r_offset"] for call in calls.iter_relocations() if names.get_symbol(call["r_info_sym"]).name == _DRAW
         ]
+        # Addresses in the file count from here, rounded down to a page, and the library is loaded by whole pages.
+        first = min(segment["p_vaddr"] for segment in elf.iter_segments("PT_LOAD")) // PAGESIZE * PAGESIZE
     loaded = [line.split(maxsplit=5) for line in Path("/proc/self/maps").read_text(errors="replace").splitlines()]
     start = min((int(row[0].split("-")[0], 16) for row in loaded if row[-1] == str(library.resolve())), default=None)
     if start is None:
         return
     writable = [[int(end, 16) for end in row[0].split("-")] for row in loaded if row[1].startswith("rw")]
     for entry in entries:
-        if any(low <= start + entry < high for low, high in writable):
-            ctypes.c_void_p.from_address(start + entry).value = ctypes.cast(_SEED, ctypes.c_void_p).value
+        place = start + entry - first
+        if any(low <= place < high for low, high in writable):
+            ctypes.c_void_p.from_address(place).value = ctypes.cast(_SEED, ctypes.c_void_p).value
 
 
 if __name__ == "__main__":
