@@ -44,12 +44,14 @@ class StageFolder:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._counted: Sequence[str] = ()
-        self._number = 0
         self._log: Callable[[str], None] = lambda message: None
 
     def count(self, names: Sequence[str], log: Callable[[str], None]) -> None:
-        """From now on log the number of each of these outputs when its turn comes, such as "2 of 5: modes (cached)"."""
-        self._counted, self._number, self._log = names, 0, log
+        """From now on log the number of each of these outputs when its turn comes, such as "2 of 5: modes (cached)".
+
+        They come in this order; some may be left out.
+        """
+        self._counted, self._log = names, log
 
     def lock(self, command: str, *, wait: float = WAIT) -> AbstractContextManager[None]:
         """Return a context in which no other process or thread makes or replaces a stage here.
@@ -93,9 +95,8 @@ class StageFolder:
                 self.checkpoint(name).unlink(missing_ok=True)
         fresh = not current or (usable is not None and not usable(path))
         if name in self._counted:
-            self._number += 1
             cached = "" if fresh else " (cached)"
-            self._log(f"{self._number} of {len(self._counted)}: {Path(name).stem}{cached}")
+            self._log(f"{self._counted.index(name) + 1} of {len(self._counted)}: {Path(name).stem}{cached}")
         if not fresh:
             return Kept(path, known["digest"], float(known["seconds"]), fresh=False)
         _write(record, {"recipe": wanted, "digest": None, "seconds": 0.0})

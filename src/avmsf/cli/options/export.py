@@ -129,7 +129,10 @@ class Options(Printing):
         given = sum((bool(self.position), self.contact_table is not None, self.points is not None))
         if self.contacts_given and given > 1:
             raise ExportError.expected(
-                "contacts by one of --position, --contact-table and --points", given, name="--position"
+                "contacts by one of --position, --contact-table and --points",
+                given,
+                name="--position" if self.position else "--contact-table",
+                advice="leave out the others",
             )
         for row, place in enumerate(self.position):
             if not all(map(math.isfinite, place)):
