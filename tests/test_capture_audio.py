@@ -48,6 +48,11 @@ def test_a_missing_file_is_named_and_guessed(tmp_path: Path) -> None:
     (folder / "b.wav").rename(folder / "b1.wav")
     with raises(CaptureError, file="b.wav", value="b1.wav"):
         read_capture(folder)
+    (folder / "040.wav").write_bytes((folder / "a.wav").read_bytes())
+    for missing, near in (("005.wav", None), ("40.wav", "040.wav")):
+        fill(tmp_path, rows=("a.wav,0,0,0", f"{missing},1,0,0"))
+        with raises(CaptureError, file=missing, value=near):
+            read_capture(folder)
     fill(tmp_path, rows=("a.wav,0,0,0", "takes/b.wav,1,0,0"))
     with raises(CaptureError, file="takes/b.wav", value=None):
         read_capture(folder)

@@ -1,6 +1,7 @@
 """Names by which the files of a folder are recognized; importing this loads nothing that computes."""
 
 import heapq
+import re
 from collections.abc import Collection
 from difflib import get_close_matches
 from pathlib import Path
@@ -67,14 +68,23 @@ def missing_recording(path: Path, name: str, *, advice: str, used: Collection[Pa
 
 
 def _nearest_name(path: Path, used: Collection[Path]) -> str | None:
-    """Return the unused file with the most similar name to a path that does not exist, if any."""
+    """Return the unused file with the most similar name to a path that does not exist, if any.
+
+    A file with another number is another recording, not another spelling: 040.wav is not similar to 005.wav, 5.wav is.
+    """
     if not path.parent.is_dir():
         return None
     # The first by name: the order of a folder differs from disk to disk.
-    others = (other.name for other in path.parent.iterdir() if other not in used)
+    wanted = _numbers(path.name)
+    unused = (other.name for other in path.parent.iterdir() if other not in used)
+    others = (name for name in unused if not wanted or _numbers(name) in (wanted, []))
     names = {name.lower(): name for name in heapq.nsmallest(_MAX_NAMES_COMPARED, others)}
     found = get_close_matches(path.name.lower(), names, n=1, cutoff=0.7)
     return names[found[0]] if found else None
+
+
+def _numbers(name: str) -> list[int]:
+    return [int(digits) for digits in re.findall("[0-9]+", name)]
 
 
 def pictures_in(folder: Path, *, deep: bool) -> list[Path]:
