@@ -108,8 +108,8 @@ def evaluate(
     impacts = _impacts_of(test, "test")
     if train is not None:
         make = _expect_maker(renderer)
-        heard, impacts = align_split(_impacts_of(train, "train"), impacts)
-        renderer = make(heard)
+        aligned, impacts = align_split(_impacts_of(train, "train"), impacts)
+        renderer = make(aligned)
     made = expect_renderer(renderer)
     if isinstance(made, SoundField):
         impacts = made.aligned(impacts)

@@ -129,7 +129,7 @@ class ResultsFolder:
         for name in methods:
             if name in kept and kept[name] != methods[name]:
                 raise self._of_another_method(name, methods[name], kept[name])
-        given = {_OPTIONS: dict(options)} if options else {}
+        given = {_OPTIONS: dict(options or typed)} if options or typed else {}
         write_json(place, {**wanted, **given, "methods": {**kept, **methods}})
 
     def _of_another(

@@ -192,6 +192,9 @@ def _verb_first(words: Sequence[str]) -> list[str]:
 
 def _explain(words: list[str]) -> int:
     """Print the list of verbs and return 0, or print that there is no such verb and return 2."""
+    if words and words[0] in _COMMON:
+        print("avmsf: expected a command, got none; `avmsf --help` lists all.", file=sys.stderr)
+        return 2
     if words and words[0] not in ("-h", "--help"):
         near = [RENAMED[words[0]]] if words[0] in RENAMED else get_close_matches(words[0], VERBS, n=1)
         guess = f" Did you mean {near[0]}?" if near else ""
