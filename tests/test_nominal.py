@@ -75,7 +75,7 @@ def test_what_a_ball_encloses_vibrates_as_lambs_sphere_does_and_is_kept(tmp_path
     assert any(f"{len(inwards.faces)} of {len(inwards.faces)} triangles" in message for message in told)
     # Lamb: the torsional oscillation of degree 2, whose wave number times radius is 2.501, belongs to five modes.
     shear = math.sqrt(NOMINAL.young / (2 * (1 + NOMINAL.poisson)) / NOMINAL.density)
-    # Fillings differ from run to run, and their frequencies by 2 % at this size.
+    # Fillings by other seeds differ by 2 % in frequency at this size.
     assert found.elastic.frequency[:5].numpy() == pytest.approx(2.501 * shear / (2 * math.pi * 0.05), rel=0.04)
     kept = sorted(tmp_path.iterdir())
     again = nominal_bodies(inwards, walls=[None], count=20, dofs=10000, cache=tmp_path).bodies[0]

@@ -368,5 +368,5 @@ def _of_fewer(table: Table) -> tuple[str, ...]:
         return ()
     return (
         f"Not of all {len(table)} objects: {', '.join(fewer)}. Their means are of other objects than those of the "
-        "other rows, and are never marked as best; ratios and paired differences are of the same objects.",
+        "other rows, and not marked as best; ratios and paired differences are of the same objects.",
     )

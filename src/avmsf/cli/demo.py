@@ -137,7 +137,7 @@ def _go_all_the_way(
 
 
 def _title(train: Impacts, test: Impacts) -> str:
-    return f"{parts_words(train, test)}; lower is better; the lower bound has no noise, which L1-log counts"
+    return f"{parts_words(train, test)}; lower is better; L1-log counts noise, which the last row lacks"
 
 
 def _write_sounds(folder: Path, field: SoundField, train: Impacts, heard: Impacts) -> None:

@@ -21,7 +21,7 @@ _FAR = 0.4
 """Difference of log thickness from which on three bodies say little of those between them. Of a dish from photographs a
 body of twice the best one's thickness was less probable by 66 nats; one half way was by 9 nats more so."""
 _MOST = 8
-"""Bodies computed at most, failures included."""
+"""Bodies computed at most besides the first ones, failures included."""
 _UNLIKELY = math.log(100.0)
 """Log evidence (nats) below the most probable body's, from which on a body is no hypothesis."""
 _BELOW = math.log(4.0)

@@ -64,7 +64,7 @@ def off_surface(positions: Float[Tensor, "contacts 3"], gains: GainField) -> lis
 
 
 def points_on_object(gains: GainField) -> Float32[Tensor, "points 3"]:
-    """Return the points of gains that are not `off_surface`: a reconstruction may close a cavity of the body.
+    """Return the points of gains that are not `off_surface`: a reconstruction may close a deep cavity of the body.
 
     All of them where that would be none.
     """

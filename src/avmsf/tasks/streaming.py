@@ -108,7 +108,7 @@ class StreamingLocalizer:
 
     The first estimate of an impact uses `window` seconds from its onset on. With `later`, longer than that, a second
     and better one uses that length, or all up to the next impact. Impacts closer to each other than `window` count as
-    one, and one more than 17 dB below the decay of earlier ones is not detected. The first 15 ms of a stream count as
+    one, and one more than 11 dB below the decay of earlier ones is not detected. The first 15 ms of a stream count as
     its noise. The stream is high-pass filtered at `highpass` Hz, by default a twentieth of the lowest mode's frequency,
     at most 20 Hz; 0 turns the filter off. At most the length of the field's own sounds is used.
 

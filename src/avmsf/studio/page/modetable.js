@@ -56,7 +56,11 @@ export function modeTable(studio) {
         choose.setAttribute("aria-label", title);
         return element(
           "tr",
-          { "data-mode": mode, className: modes.supporting.has(mode) ? "supporting" : "", onclick: () => studio.choose(studio.mode === mode ? null : mode) },
+          {
+            "data-mode": mode,
+            className: modes.supporting.has(mode) ? "supporting" : "",
+            onclick: () => studio.choose(studio.mode === mode ? null : mode),
+          },
           element("td", {}, choose),
           ...numbers.map((words) => element("td", {}, words === "NaN" ? "–" : words)),
         );
