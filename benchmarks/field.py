@@ -10,7 +10,7 @@ import trimesh
 from jaxtyping import Float64
 from torch import Tensor
 
-from avmsf.bench.baselines import MeanGains, MeanWaveform, NearestStrike, WhiteNoise, floor, sine_floor
+from avmsf.bench.baselines import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor, sine_floor
 from avmsf.bench.conventions import PAPER
 from avmsf.bench.evaluation import Scores, evaluate, score, split
 from avmsf.bench.renderer import Renderer
@@ -268,7 +268,7 @@ def _judge(
     fields = {method: fit(train, features, modes, config, gains=gains) for method, gains in others.items()}
     renderers: dict[str, Renderer] = {
         "white_noise": WhiteNoise(train),
-        "nearest": NearestStrike(train),
+        "nearest": NearestRecording(train),
         "knn3_waveform": MeanWaveform(train),
         "knn3_gains": MeanGains(train, modes),
         # The warm-up moves no damping, so there is nothing to choose between.

@@ -58,7 +58,7 @@ class PlateLooks:
     """Positions of a plate, and no looks."""
 
     def __call__(self, identifier: str, look: Look, views: int | None = None) -> FeatureField:
-        if look != "positions":
+        if look not in ("surface", "positions"):
             raise SceneError(f"{identifier}: nothing shows its look")
         return FeatureField.from_points(plate_surface_points(plate_named(identifier), 200))
 

@@ -10,7 +10,7 @@ import pytest
 import soundfile
 import torch
 
-from avmsf.bench.baselines import MeanGains, MeanWaveform, NearestStrike, WhiteNoise, floor, sine_floor
+from avmsf.bench.baselines import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor, sine_floor
 from avmsf.bench.conventions import OBJECTFOLDER
 from avmsf.bench.evaluation import Scores, evaluate, score, split
 from avmsf.bench.metrics import relative_stft_error
@@ -45,7 +45,7 @@ def true_extraction(impacts: Impacts) -> Extraction:
 def renderers(train: Impacts) -> dict[str, Renderer]:
     return {
         "white_noise": WhiteNoise(train),
-        "nearest": NearestStrike(train),
+        "nearest": NearestRecording(train),
         "knn3_waveform": MeanWaveform(train),
         "knn3_gains": MeanGains(train, true_extraction(train)),
     }
@@ -91,7 +91,7 @@ def test_white_noise_takes_the_two_zeros_for_one_place():
 def test_nearest_and_means_are_those_of_a_full_search():
     train, test = split(plate_impacts())
     order = torch.cdist(test.contacts, train.contacts).argsort(dim=1)
-    assert torch.equal(NearestStrike(train).render(test.contacts), train.sounds[order[:, 0]])
+    assert torch.equal(NearestRecording(train).render(test.contacts), train.sounds[order[:, 0]])
     for count in (1, 3, 6):
         expected = train.sounds[order[:, :count]].mean(dim=1)
         found = MeanWaveform(train, count=count).render(test.contacts)
@@ -194,17 +194,17 @@ def test_splits_that_leave_too_little_are_refused():
 def test_who_knows_the_answer_scores_zero_and_the_rest_in_order():
     impacts = plate_impacts(40)
     train, test = split(impacts, fraction=0.5)
-    assert set(evaluate(NearestStrike(test), test).mean().values()) == {0.0}
-    scores = evaluate(NearestStrike(train), test)
+    assert set(evaluate(NearestRecording(test), test).mean().values()) == {0.0}
+    scores = evaluate(NearestRecording(train), test)
     assert scores.names == test.names
     assert set(scores.values) == {"relative_stft", "l1", "l1_log", "envelope"}
     assert scores.convention == "paper"
     noise = evaluate(WhiteNoise(train), test).mean()
     assert all(noise[metric] > value for metric, value in scores.mean().items())
     sizes = (256, 64)
-    chosen = evaluate(NearestStrike(train), test, fft_sizes=sizes, convention=OBJECTFOLDER)
+    chosen = evaluate(NearestRecording(train), test, fft_sizes=sizes, convention=OBJECTFOLDER)
     assert set(chosen.values) == {"relative_stft", "spectrogram", "envelope"}
-    rendered = NearestStrike(train).render(test.contacts)
+    rendered = NearestRecording(train).render(test.contacts)
     assert torch.equal(chosen.values["relative_stft"], relative_stft_error(rendered, test.sounds, fft_sizes=sizes))
 
 
@@ -269,13 +269,13 @@ def test_what_does_not_fit_together_is_refused():
     with raises(EvaluationError, name="extraction", value=24):
         MeanGains(train, true_extraction(test))
     with raises(EvaluationError, name="sample_rate", value=48000.0):
-        evaluate(NearestStrike(train), replace(test, sample_rate=48000.0))
+        evaluate(NearestRecording(train), replace(test, sample_rate=48000.0))
     with raises(EvaluationError, name="predicted", value=[len(test), 4410]):
-        evaluate(NearestStrike(train), replace(test, sounds=test.sounds[:, :4000]))
+        evaluate(NearestRecording(train), replace(test, sounds=test.sounds[:, :4000]))
     broken = test.sounds.clone()
     broken[0, 3] = math.nan
     with raises(EvaluationError, name="truth", row=0) as caught:
-        evaluate(NearestStrike(train), replace(test, sounds=broken))
+        evaluate(NearestRecording(train), replace(test, sounds=broken))
     assert f"({test.names[0]})" in str(caught.value)
 
 
@@ -298,7 +298,7 @@ def test_the_aircraft_scores_what_was_measured_before(shared, count, nearest, me
         found.append(
             [
                 evaluate(renderer, test).mean()["relative_stft"]
-                for renderer in (NearestStrike(train), MeanWaveform(train))
+                for renderer in (NearestRecording(train), MeanWaveform(train))
             ]
         )
     # Two digits were written down, and equally near strikes, of which the grid has many, may have been taken in

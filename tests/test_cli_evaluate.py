@@ -203,14 +203,14 @@ def test_no_figure_at_all_is_an_error(plates: Path, tmp_path: Path) -> None:
 def test_ctrl_c_keeps_what_is_there(
     plates: Path, tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from avmsf.bench.baselines import NearestStrike
+    from avmsf.bench.baselines import NearestRecording
 
-    def stop(self: NearestStrike, contacts: object, **how: object) -> None:
+    def stop(self: NearestRecording, contacts: object, **how: object) -> None:
         raise KeyboardInterrupt
 
     words = ["farthest", str(plates), *CHEAP, "--output", str(tmp_path / "results")]
     with monkeypatch.context() as patched:
-        patched.setattr(NearestStrike, "render", stop)
+        patched.setattr(NearestRecording, "render", stop)
         assert run(parse(words)) == 130
     assert capsys.readouterr().err.splitlines()[-1].startswith("avmsf evaluate: interrupted")
     kept = json.loads((tmp_path / "results" / "objects" / "a.json").read_text())

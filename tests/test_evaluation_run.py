@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from avmsf.bench.baselines import NearestStrike
+from avmsf.bench.baselines import NearestRecording
 from avmsf.bench.evaluation import evaluate, split
 from avmsf.bench.judging import Judging, spread
 from avmsf.bench.knowntruth import truth_at
@@ -75,7 +75,7 @@ class Counting:
         self.fits.append(task.name)
         if self.raising is not None:
             raise self.raising
-        return NearestStrike(task.train)
+        return NearestRecording(task.train)
 
     def __repr__(self) -> str:
         return "Counting()"
@@ -90,7 +90,7 @@ class Asking:
 
     def fit(self, task: Task) -> Renderer:
         self.ask(task)
-        return NearestStrike(task.train)
+        return NearestRecording(task.train)
 
     def __repr__(self) -> str:
         return "Asking()"
@@ -103,7 +103,7 @@ def test_figures_are_those_of_the_one_line_of_evaluation(plates: Path, tmp_path:
     assert record is not None
     (outcome,) = record.outcomes
     train, test = split(read_capture(plates / "a").impacts)
-    expected = evaluate(NearestStrike(train), test)
+    expected = evaluate(NearestRecording(train), test)
     assert record.cases[0].train == train.names
     assert record.cases[0].test == test.names
     for metric, values in expected.values.items():
@@ -342,7 +342,7 @@ def test_cdpam_is_taken_of_a_few_contacts(plates: Path, tmp_path: Path, monkeypa
     run_objects(evaluation, ("a",), ResultsFolder(tmp_path))
     (record,) = ResultsFolder(tmp_path).records()
     train, test = split(read_capture(plates / "a").impacts)
-    expected = (NearestStrike(train).render(test.contacts) - test.sounds).abs().sum(1)
+    expected = (NearestRecording(train).render(test.contacts) - test.sounds).abs().sum(1)
     values = record.outcomes[0].values["cdpam"]
     assert [row for row, value in enumerate(values) if value is not None] == [1, 4, 6]
     assert [values[row] for row in (1, 4, 6)] == pytest.approx(expected[[1, 4, 6]].tolist(), rel=1e-6)
@@ -351,11 +351,11 @@ def test_cdpam_is_taken_of_a_few_contacts(plates: Path, tmp_path: Path, monkeypa
 def test_at_full_scale_the_recordings_unit_does_not_matter(plates: Path, tmp_path: Path) -> None:
     impacts = read_capture(plates / "a").impacts
     train, test = split(impacts)
-    sounds, loudest = NearestStrike(train).render(test.contacts), float(impacts.sounds.abs().max())
-    judge = partial(Judging(cdpam=False).judge, NearestStrike(train), truth=None)
+    sounds, loudest = NearestRecording(train).render(test.contacts), float(impacts.sounds.abs().max())
+    judge = partial(Judging(cdpam=False).judge, NearestRecording(train), truth=None)
     one = judge(sounds, test, loudest=loudest)
     other = judge(1e-3 * sounds, replace(test, sounds=1e-3 * test.sounds), loudest=1e-3 * loudest)
-    raw = Judging(level="raw", cdpam=False).judge(NearestStrike(train), sounds, test, None, loudest=loudest)
+    raw = Judging(level="raw", cdpam=False).judge(NearestRecording(train), sounds, test, None, loudest=loudest)
     for metric in ("l1", "envelope"):
         assert other.values[metric] == pytest.approx(one.values[metric], rel=1e-4)
         assert raw.values[metric] == pytest.approx([loudest * each for each in one.values[metric]], rel=1e-4)

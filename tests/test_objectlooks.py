@@ -10,6 +10,7 @@ from avmsf.capture.datasets.dataset import DatasetReport, Look, ObjectFacts
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.surface import Surface
 from avmsf.capture.views.write import write_views
 from avmsf.config import PRESETS, LiftConfig, SceneConfig, ViewsConfig
 from avmsf.errors import SceneError
@@ -19,7 +20,7 @@ from avmsf.scene.features import FeatureField
 from avmsf.scene.ply import read_splats
 from avmsf.scene.splatconfig import SplatConfig
 from raising import raises
-from small_scene import slab_views, write_surface_file
+from small_scene import slab, slab_views, write_surface_file
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*neither texture nor colors")
 
@@ -33,8 +34,8 @@ class OneObject:
 
     name = "one"
 
-    def __init__(self, seen: Path | None) -> None:
-        self.seen = seen
+    def __init__(self, seen: Path | None, surface: Surface | None = None) -> None:
+        self.seen, self.surface = seen, surface
 
     def objects(self) -> tuple[str, ...]:
         return ("slab",)
@@ -44,7 +45,7 @@ class OneObject:
 
     def capture(self, identifier: str) -> Capture:
         contacts = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.2, 0.0], [0.1, 0.0, 0.1]], dtype=torch.float64)
-        return Capture("slab", Impacts(contacts, torch.zeros(3, 8), 100.0, ("a", "b", "c")))
+        return Capture("slab", Impacts(contacts, torch.zeros(3, 8), 100.0, ("a", "b", "c")), self.surface)
 
     def look(self, identifier: str) -> Look | None:
         return None if self.seen is None else Look(self.seen)
@@ -126,3 +127,15 @@ def test_a_mesh_may_be_preferred_to_the_photographs_beside_it(tmp_path: Path) ->
 def test_a_negative_number_of_views_is_refused() -> None:
     with raises(SceneError, name="count", value=-1):
         ViewsConfig(count=-1)
+
+
+def test_the_surface_of_a_mesh_needs_no_views_and_is_that_of_a_fit(tmp_path: Path) -> None:
+    found = ObjectLooks(OneObject(None, slab()), tmp_path / "cache", CONFIG, seed=3)("slab", "surface")
+    assert torch.equal(found.points, FeatureField.from_mesh(slab(), seed=3).points)
+    assert not (tmp_path / "cache").exists()
+
+
+@pytest.mark.slow
+def test_the_surface_is_that_of_the_views_where_a_mesh_does_not_count(seen: Path, tmp_path: Path) -> None:
+    looks = ObjectLooks(OneObject(seen, slab()), tmp_path, CONFIG, meshes=False)
+    assert torch.equal(looks("slab", "surface").points, looks("slab", "positions").points)

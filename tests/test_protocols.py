@@ -6,7 +6,7 @@ from itertools import pairwise
 import pytest
 import torch
 
-from avmsf.bench.cases import Case, Closest, Farthest, FewerViews, LeaveOneOut, Shots
+from avmsf.bench.cases import Case, Closest, Farthest, FewerViews, LeaveOneOut, Predefined, Shots
 from avmsf.bench.evaluation import split
 from avmsf.bench.methods import METHODS
 from avmsf.bench.protocols import BASELINE, PROTOCOLS, protocol_named
@@ -31,7 +31,8 @@ def places(impacts: Impacts, rows: tuple[int, ...]) -> set[tuple[float, ...]]:
 @pytest.mark.parametrize("name", PROTOCOLS)
 def test_training_and_test_contacts_never_mix(name: str, repeated: tuple[int, ...]) -> None:
     impacts = struck(repeated=repeated)
-    cases = PROTOCOLS[name].choosing.cases(impacts)
+    choosing = Predefined(("03", "05", "19")) if name == "predefined" else PROTOCOLS[name].choosing
+    cases = choosing.cases(impacts)
     assert len({case.key for case in cases}) == len(cases) > 0
     for case in cases:
         assert case.train
@@ -67,6 +68,20 @@ def test_leave_one_out_tests_every_impact_once() -> None:
     assert cases[2].test == (2, 6)
     assert all(len(case.train) + len(case.test) == 7 for case in cases)
     assert {case.label for case in cases} == {"leave-one-out"}
+
+
+def test_a_predefined_split_tests_the_named_recordings_and_trains_on_all_at_other_contacts() -> None:
+    impacts = struck(6, repeated=(2, 4))
+    (case,) = Predefined(("02", "05")).cases(impacts)
+    assert [impacts.names[row] for row in case.test] == ["02", "05"]
+    # 06 is at the contact of 02.
+    assert {impacts.names[row] for row in case.train} == {"00", "01", "03", "04", "07"}
+
+
+@pytest.mark.parametrize(("test", "name", "value"), [((), "count", 6), (("02", "99"), "test", "99")])
+def test_a_predefined_split_needs_names_of_recordings(test: tuple[str, ...], name: str, value: object) -> None:
+    with raises(EvaluationError, name=name, value=value):
+        Predefined(test).cases(struck(6))
 
 
 def test_shots_are_nested_and_judged_by_the_same_contacts() -> None:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from avmsf.bench import align_split, evaluate
-from avmsf.bench.baselines import NearestStrike
+from avmsf.bench.baselines import NearestRecording
 from avmsf.bench.caserun import CaseRun
 from avmsf.bench.cases import Case
 from avmsf.bench.fieldmethods import FieldMethod
@@ -97,9 +97,9 @@ def test_fields_are_fitted_to_own_starts_and_all_are_scored_from_the_peaks(
     peaks = own.delayed(own.sounds.abs().argmax(1).double())
     run, fitted = run_of(peaks, tmp_path, own), []
 
-    def fit(method: FieldMethod, task: Task) -> NearestStrike:
+    def fit(method: FieldMethod, task: Task) -> NearestRecording:
         fitted.append(task.train.sounds)
-        return NearestStrike(task.train)
+        return NearestRecording(task.train)
 
     monkeypatch.setattr(FieldMethod, "fit", fit)
     ours, published, nearest = (run.outcome(method_named(name)) for name in ("field-smooth", "paper", "nearest"))

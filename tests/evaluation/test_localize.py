@@ -12,7 +12,7 @@ import torch
 from matplotlib.figure import Figure
 
 from avmsf.bench import locatingmethods, report
-from avmsf.bench.baselines import NearestStrike, WhiteNoise
+from avmsf.bench.baselines import NearestRecording, WhiteNoise
 from avmsf.bench.fieldmethods import FieldMethod
 from avmsf.bench.gridfield import GridField
 from avmsf.bench.locatingbaselines import random_distance
@@ -39,11 +39,11 @@ from raising import raises
 def test_the_nearest_recording_finds_itself_and_noise_counts_as_a_random_point() -> None:
     train, points = plate_impacts(), plate_features().points
     size = float((points.amax(0) - points.amin(0)).norm())
-    assert located(NearestStrike(train), train, train, points).errors == {"rmed": (0.0,) * len(train)}
+    assert located(NearestRecording(train), train, train, points).errors == {"rmed": (0.0,) * len(train)}
     expected = [random_distance(points.double(), place[None]) / size for place in train.contacts]
     assert located(WhiteNoise(train), train, train, points).errors["rmed"] == pytest.approx(expected)
     silent = replace(train, sounds=0 * train.sounds)
-    assert located(NearestStrike(train), train, silent, points).errors["rmed"] == pytest.approx(expected)
+    assert located(NearestRecording(train), train, silent, points).errors["rmed"] == pytest.approx(expected)
 
 
 def smooth_field(train: Impacts, features: FeatureField) -> SoundField:

@@ -94,11 +94,12 @@ def test_encoders_are_loaded_once_on_the_device_and_only_for_who_reads_them(monk
     monkeypatch.setattr(DinoEncoder, "load", load)
     read = looks_of([METHODS["knn3"], METHODS["white-noise"], METHODS["diffsound"]], PROTOCOLS["farthest"])
     assert settled_lifts(LiftConfig(), read, device="cpu")[0] == LiftConfig()
+    assert settled_lifts(LiftConfig(), looks_of([METHODS["field-auto"]], PROTOCOLS["localize"]))[0] == LiftConfig()
     assert loaded == []
     # Recordings are located at the points that features have.
-    assert looks_of([METHODS["nearest"]], PROTOCOLS["localize"]) == {"positions"}
+    assert looks_of([METHODS["nearest"]], PROTOCOLS["localize"]) == {"surface"}
     read = looks_of([METHODS["field"], METHODS["field-auto"], METHODS["paper-grid"]], PROTOCOLS["farthest"])
-    assert read == {"visual", "positions", "paper"}
+    assert read == {"visual", "surface", "paper"}
     assert settled_lifts(LiftConfig(), read, device="cpu")[0].encoder == DINO
     assert loaded == [(DINO, "cpu")]
 

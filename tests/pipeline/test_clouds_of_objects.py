@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from avmsf.bench.baselines import NearestStrike
+from avmsf.bench.baselines import NearestRecording
 from avmsf.bench.judging import Judging
 from avmsf.bench.plan import Evaluation
 from avmsf.bench.protocols import PROTOCOLS
@@ -45,9 +45,9 @@ def test_methods_get_the_gaussians_of_their_object_and_views(tmp_path: Path) -> 
     class Asking:
         name = "asking"
 
-        def fit(self, task: Task) -> NearestStrike:
+        def fit(self, task: Task) -> NearestRecording:
             assert len(task.gaussians()) == 7
-            return NearestStrike(task.train)
+            return NearestRecording(task.train)
 
     for number, given in enumerate((clouds, None)):
         results = ResultsFolder(tmp_path / f"results {number}")

@@ -1,3 +1,5 @@
+from .baselines import MeanWaveform as MeanWaveform
+from .baselines import NearestRecording as NearestRecording
 from .evaluation import Scores as Scores
 from .evaluation import align_split as align_split
 from .evaluation import evaluate as evaluate

@@ -57,7 +57,7 @@ class WhiteNoise:
 
 
 @dataclass(frozen=True, eq=False)
-class NearestStrike:
+class NearestRecording:
     """The training sound whose contact is nearest."""
 
     train: Impacts

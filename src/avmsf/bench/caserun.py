@@ -142,7 +142,7 @@ class CaseRun:
         if not self.evaluation.protocol.locating:
             loudest = float(self.impacts.sounds.abs().max())
             return self.evaluation.judging.judge(renderer, sounds, self.scored.test, self.truth, loudest=loudest), {}
-        points, settings = self._shared(self.look)("positions").points, configured(method)
+        points, settings = self._shared(self.look)("surface").points, configured(method)
         published = settings is not None and settings.published
         found = located(
             renderer,

@@ -5,7 +5,7 @@ test at a training contact would be too easy.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float64
@@ -79,6 +79,29 @@ class Closest:
         places = Places.of(impacts)
         wanted = places.expect_part(self.fraction)
         return (places.case("closest", closest_points(places.contacts, wanted)),)
+
+
+@dataclass(frozen=True)
+class Predefined:
+    """Test recordings by their names; all others are for training, but for those at contacts of the test recordings."""
+
+    test: tuple[str, ...] = ()
+    """Names of test recordings."""
+
+    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
+        """Return the one case. Raises EvaluationError for a name that no recording has."""
+        unknown = sorted(set(self.test) - set(impacts.names))
+        if unknown:
+            raise EvaluationError.expected(
+                f"names of {counted(len(impacts.names), 'recording')}, {impacts.names[0]} to {impacts.names[-1]}",
+                unknown[0],
+                name="test",
+            )
+        places, tested = Places.of(impacts), {row for row, name in enumerate(impacts.names) if name in self.test}
+        chosen = [place for place, rows in enumerate(places.rows) if tested.isdisjoint(rows)]
+        places.expect(len(chosen))
+        case = places.case("predefined", chosen)
+        return (replace(case, test=tuple(sorted(tested))),)
 
 
 @dataclass(frozen=True)

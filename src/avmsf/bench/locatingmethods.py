@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from avmsf.bench.baselines import NearestStrike
+from avmsf.bench.baselines import NearestRecording
 from avmsf.bench.locating import LEVEL, Ground
 from avmsf.bench.locatingbaselines import NearestSpectrum
 from avmsf.bench.locatingimages import Images
@@ -112,7 +112,7 @@ def _finder(
     if isinstance(renderer, DiffSound):
         simulated = DiffSoundLocator.of(renderer, points)
         return lambda sound: ({"rmed": simulated.place(sound)}, None)
-    if isinstance(renderer, NearestStrike):
+    if isinstance(renderer, NearestRecording):
         similar = NearestSpectrum(train)
         return lambda sound: ({"rmed": similar.place(sound)}, None)
     return lambda sound: ({}, None)

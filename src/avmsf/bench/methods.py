@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from avmsf.bench.baselines import MeanGains, MeanWaveform, NearestStrike, RandomImpact, WhiteNoise
+from avmsf.bench.baselines import MeanGains, MeanWaveform, NearestRecording, RandomImpact, WhiteNoise
 from avmsf.bench.diffsoundmethod import DiffSoundMethod
 from avmsf.bench.fieldmethods import NETWORK, FieldMethod, UninformedField
 from avmsf.bench.gridfield import PAPER_GRID, QUICK_GRID, GridField
@@ -83,8 +83,8 @@ def _random_impact(task: Task) -> RandomImpact:
     return RandomImpact(task.stranger(), task.train.sample_rate)
 
 
-def _nearest(task: Task) -> NearestStrike:
-    return NearestStrike(task.train)
+def _nearest(task: Task) -> NearestRecording:
+    return NearestRecording(task.train)
 
 
 def _mean_waveform(task: Task) -> MeanWaveform:
@@ -136,7 +136,7 @@ def _quick(name: str, look: Look = "visual", **fit: Any) -> FieldMethod:
 
 def _process(name: str, model: GainModel) -> FieldMethod:
     """Return a Gaussian process over all kernel families, or over one."""
-    return FieldMethod(name, PipelineConfig(gain_model=model), "positions")
+    return FieldMethod(name, PipelineConfig(gain_model=model), "surface")
 
 
 FIELDS = (

@@ -9,6 +9,7 @@ PROTOCOL_NAMES = (
     "farthest",
     "leave-one-out",
     "closest",
+    "predefined",
     "shots",
     "learning-curve",
     "views",
@@ -80,7 +81,7 @@ def expect_suited(method: str, protocol: str) -> None:
     if method.startswith(RECORDED) and protocol in _SEVERAL_SETS:
         raise EvaluationError(
             f"{method}: expected a protocol that tests each recording once, got {protocol}, which trains on several "
-            "sets of recordings, and the folder holds the sounds of one; choose farthest, closest or leave-one-out",
+            "sets of recordings, and the folder holds the sounds of one; choose farthest, closest, predefined or leave-one-out",
             name="method",
             value=method,
         )

@@ -105,5 +105,5 @@ class Evaluation:
 
     def _described(self, method: Method) -> str:
         """Return what tells a method apart from another of its name. Methods that read no features share any folder."""
-        read = self.encoder is not None and isinstance(method, Looking)
+        read = self.encoder is not None and isinstance(method, Looking) and method.look != "surface"
         return f"{method!r}{ENCODER}{self.encoder}" if read else repr(method)

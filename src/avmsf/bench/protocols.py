@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from avmsf.bench.cases import Choosing, Closest, Farthest, FewerViews, Growing, LeaveOneOut, Shots
+from avmsf.bench.cases import Choosing, Closest, Farthest, FewerViews, Growing, LeaveOneOut, Predefined, Shots
 from avmsf.bench.names import expect_protocol
 
 BASELINE = "knn3"
@@ -24,7 +24,7 @@ _TABLE = (
     "field-elastic",
     "field-auto",
 )
-LEARNING_CURVE = "learning-curve"
+LEARNING_CURVE, PREDEFINED = "learning-curve", "predefined"
 _CURVES = (
     BASELINE,
     "knn3-directions",
@@ -73,6 +73,9 @@ PROTOCOLS = {
         EvaluationProtocol("leave-one-out", "Test on every contact once, after training on all others.", LeaveOneOut()),
         EvaluationProtocol(
             "closest", "Train on 20 % of the contacts, in one region; test on the others.", Closest(), subset="ablation"
+        ),
+        EvaluationProtocol(
+            PREDEFINED, "Test on the recordings that are named; train on those at other contacts.", Predefined()
         ),
         EvaluationProtocol(
             "shots",

@@ -16,9 +16,11 @@ from avmsf.modal.extraction.extract import Extraction
 from avmsf.scene.features import FeatureField
 from avmsf.scene.gaussians import GaussianCloud
 
-Look = Literal["positions", "visual", "unaligned", "paper", "paper-positions", "paper-unaligned"]
-"""Features of an object's points: only positions; positions with visual features, pooled over the object's symmetries;
-the same without pooling; the paper's features of Gaussians, only their positions, and the features without pooling."""
+Look = Literal["surface", "positions", "visual", "unaligned", "paper", "paper-positions", "paper-unaligned"]
+"""Features of an object's points. `surface`: positions of points on its mesh, or as `positions` without one.
+`positions`: only the positions of the points that visual features are of. `visual`: positions with visual features,
+pooled over the object's symmetries; `unaligned`: without pooling. `paper`: the paper's features of Gaussians;
+`paper-positions`: only their positions; `paper-unaligned`: without pooling."""
 
 
 _OMIT = "give one, or omit the methods that need it"

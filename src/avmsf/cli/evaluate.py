@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Console
 
 from avmsf._utils.device import TRAINABLE, usable_device
-from avmsf.bench.cases import Growing
+from avmsf.bench.cases import Growing, Predefined
 from avmsf.bench.fieldmethods import configured
 from avmsf.bench.judging import Judging
 from avmsf.bench.learningcurve import curves, draw_learning_curve
@@ -17,7 +17,7 @@ from avmsf.bench.methods import RecordedMethod, method_named
 from avmsf.bench.parallel import RunProgress, Workers, run_objects
 from avmsf.bench.pictures import save_picture
 from avmsf.bench.plan import Evaluation
-from avmsf.bench.protocols import LEARNING_CURVE, EvaluationProtocol, protocol_named
+from avmsf.bench.protocols import LEARNING_CURVE, PREDEFINED, EvaluationProtocol, protocol_named
 from avmsf.bench.report import PAGE, SUMMARY, TABLES, write_figures, write_page, write_summary
 from avmsf.bench.reporttables import Section
 from avmsf.bench.results import IDENTITY, ResultsFolder, write_json
@@ -46,7 +46,11 @@ def run(options: Options) -> int:
     protocol = protocol_named(options.protocol)
     if protocol.name == LEARNING_CURVE:
         protocol = replace(protocol, choosing=Growing(options.counts, options.starts))
-    elif options.counts or options.starts != Options.starts or options.metric != Options.metric:
+    elif protocol.name == PREDEFINED:
+        protocol = replace(protocol, choosing=Predefined(words_of(options.test)))
+    if protocol.name != PREDEFINED and options.test:
+        say(f"note: --test is not used by {protocol.name}, only by {PREDEFINED}")
+    if protocol.name != LEARNING_CURVE and (options.counts or options.starts != Options.starts or options.metric != Options.metric):
         say(f"note: --counts, --starts and --metric are not used by {protocol.name}, only by {LEARNING_CURVE}")
     methods = tuple(method_named(name) for name in words_of(options.methods) or protocol.methods)
     workers = Workers(options.workers, options.ray)
@@ -159,7 +163,8 @@ def evaluation_of(
     lift, paper = settled_lifts(options.lift, looks_of(methods, protocol), device=device)
     given = SceneConfig(ViewsConfig(source=options.visual_source), options.splat, options.lift)
     scene = replace(given, lift=lift)
-    looks = ObjectLooks(dataset, kept, scene, paper, device)
+    # Of a shape that is made from photographs alone, nothing may read the mesh.
+    looks = ObjectLooks(dataset, kept, scene, paper, device, meshes=options.geometry != "gaussians", seed=options.seed)
     cdpam = not options.no_cdpam and "cdpam" in protocol.metrics
     return Evaluation(
         dataset,
@@ -228,7 +233,7 @@ def settled_lifts(
 ) -> tuple[LiftConfig, LiftConfig]:
     """Return the settings of features, and those of the paper's form, with the encoders that `looks` are made with.
 
-    Without any look no encoder is loaded. The replacement of DINOv2 is printed. Raises SceneError where a look is the
+    Without a look at views no encoder is loaded. The replacement of DINOv2 is printed. Raises SceneError where a look is the
     paper's and its encoder is not available.
     """
     paper = PRESETS["paper"].scene.lift
@@ -237,13 +242,13 @@ def settled_lifts(
     if any(look.startswith("paper") for look in looks):
         choose_encoder(paper, tell=say, device=device)
         return replace(lift, encoder=paper.encoder), paper
-    return settled(lift, tell=say, device=device) if looks else lift, paper
+    return settled(lift, tell=say, device=device) if set(looks) - {"surface"} else lift, paper
 
 
 def looks_of(methods: Sequence[Method], protocol: EvaluationProtocol) -> frozenset[Look]:
     """Return the features that an evaluation reads: those of its methods, and the points that locate recordings."""
     read = {method.look for method in methods if isinstance(method, Looking)}
-    return frozenset(read | {"positions"} if protocol.locating else read)
+    return frozenset(read | {"surface"} if protocol.locating else read)
 
 
 def title_of(dataset: Dataset, folder: Path) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from rich.table import Table
 
-from avmsf.bench.baselines import MeanGains, MeanWaveform, NearestStrike, WhiteNoise, floor
+from avmsf.bench.baselines import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor
 from avmsf.bench.evaluation import Scores, evaluate, score
 from avmsf.bench.renderer import Renderer
 from avmsf.capture import Impacts
@@ -34,7 +34,7 @@ def compare(field: SoundField, train: Impacts, test: Impacts, modes: Extraction)
     train, test, count = modes.aligned(train), modes.aligned(test), min(3, len(train))
     renderers: dict[str, Renderer] = {
         "field": field,
-        "nearest recording": NearestStrike(train),
+        "nearest recording": NearestRecording(train),
         f"mean waveform of {count} nearest": MeanWaveform(train, count),
     }
     if train.directions is not None:

@@ -119,8 +119,14 @@ def fit_with_progress(
 ) -> SoundField:
     """Return what `SoundField.fit` returns."""
     if not isinstance(capture, Capture):
+        advice = (
+            "fit to the capture that holds them, whose shape the gains are predicted from; a fitted field is scored by "
+            "avmsf.evaluate(field, test) without train"
+            if isinstance(capture, Impacts)
+            else "read a folder by avmsf.Capture.read(folder)"
+        )
         raise FitError(
-            f"capture: expected a Capture, got {type(capture).__name__}; read a folder by avmsf.Capture.read(folder)",
+            f"capture: expected a Capture, got {type(capture).__name__}; {advice}",
             name="capture",
             value=type(capture).__name__,
         )

@@ -7,7 +7,7 @@ from pathlib import Path
 from avmsf._utils.locks import NO_LIMIT
 from avmsf.bench.task import Look
 from avmsf.capture.datasets.dataset import Dataset
-from avmsf.config import PRESETS, LiftConfig, SceneConfig, ViewsConfig
+from avmsf.config import AUTO, PRESETS, LiftConfig, SceneConfig, ViewsConfig
 from avmsf.errors import SceneError
 from avmsf.pipeline.scene import FEATURES, SceneStages
 from avmsf.pipeline.stages import StageFolder
@@ -36,18 +36,29 @@ class ObjectLooks:
     """How features are made in the paper's form."""
     device: str | None = None
     """Device of Gaussians and DINOv2; None for a GPU where there is one."""
+    meshes: bool = True
+    """Whether `surface` is an object's mesh where the dataset has one; else it is as `positions`."""
+    seed: int = 0
+    """Seed of the points on a mesh."""
 
     def __call__(self, identifier: str, look: Look, views: int | None = None) -> FeatureField:
         """Return what `look` means for an object, from at most `views` views, or from all for None.
 
-        Positions are those of the same points that looks are lifted onto, so that the two differ in nothing else; of an
-        object that nothing shows, they are its surface's, or fill the box of its contacts. Raises SceneError for the
-        looks of such an object, and DatasetError for an unknown one.
+        `positions` are those of the same points that looks are lifted onto, so that the two differ in nothing else; of
+        an object that nothing shows, they are its surface's, or fill the box of its contacts. `surface` is as in
+        `avmsf fit`, and needs no views of an object with a mesh. Raises SceneError for the looks of an object that
+        nothing shows, and DatasetError for an unknown one.
         """
-        bare = look.endswith("positions")
+        surface = self.dataset.capture(identifier).surface if look == "surface" and self.meshes else None
+        if surface is not None:
+            return FeatureField.from_mesh(surface, seed=self.seed)
+        bare = look == "surface" or look.endswith("positions")
         if bare and self.dataset.look(identifier) is None:
             return self._bare(identifier)
         lift = self.paper if look.startswith("paper") else self.config.lift
+        if look == "surface" and lift.encoder == AUTO:
+            # Positions do not depend on the encoder.
+            lift = replace(lift, encoder=DESCRIPTORS)
         lift = replace(lift, symmetry=not look.endswith("unaligned"))
         stages = self._stages(identifier, replace(self.config, lift=lift), views, name=NAMES.get(look, FEATURES))
         with stages.stages.lock("avmsf evaluate", wait=NO_LIMIT):

@@ -27,8 +27,8 @@ class Options(Printing):
     """
 
     protocol: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="PROTOCOL")]]
-    """The experiment: farthest, leave-one-out, closest, shots, learning-curve, views, ablation, non-symmetric, localize
-    or grid."""
+    """The experiment: farthest, leave-one-out, closest, predefined, shots, learning-curve, views, ablation,
+    non-symmetric, localize or grid."""
     data: tyro.conf.Positional[
         Annotated[
             Path, tyro.conf.arg(metavar="DATA"), Existing("a dataset, capture folders or one capture", ("a folder",))
@@ -44,6 +44,8 @@ class Options(Printing):
     cache: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Keep the objects' features here, which several evaluations of one dataset may share; by default in the folder of
     results."""
+    test: Annotated[tuple[str, ...], tyro.conf.arg(metavar="RECORDING ...")] = ()
+    """predefined: names of the recordings to test on, such as 009.wav, separated by commas or blanks."""
     counts: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = ()
     """learning-curve: numbers of training contacts; by default 3, 4, 6, 8, 12, 16, ... as long as a quarter of the
     contacts is held out."""
@@ -105,6 +107,10 @@ class Options(Printing):
         for name in words_of(self.methods):
             expect_method(name)
             expect_suited(name, self.protocol)
+        if self.protocol == "predefined" and not self.test:
+            raise EvaluationError.expected(
+                "names of the recordings to test on", "none", name="--test", advice="such as --test 009.wav,010.wav"
+            )
         expect_device(self.device, raising=EvaluationError)
         expect_modes(self.modes)
         expect_signs(self.data)
