@@ -1,6 +1,7 @@
 """`avmsf evaluate`: from a folder of captures to tables, and what can be got wrong on the way."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -95,6 +96,7 @@ WRONG = {
     "farhest plates": ("protocol", "farhest"),
     "farthest plates --methods knn3,fild": ("method", "fild"),
     "farthest plates --objects c": ("object", "c"),
+    "predefined plates": ("--test", "none"),
     "farthest plates --workers 0": ("workers", 0),
     "farthest plates --cdpam-contacts -1": ("cdpam_contacts", -1),
     "non-symmetric plates": ("subset", "non-symmetric"),
@@ -130,6 +132,19 @@ def test_what_is_taken_without_being_asked_for_is_printed(
     assert "note:" not in capsys.readouterr().err
 
 
+def test_options_of_another_protocol_are_noted(
+    plates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Streams
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["farthest", str(plates), *CHEAP, "--objects", "a", "--output", "results"]
+    assert run(parse([*words, "--starts", "2", "--test", "001.wav"])) == 0
+    notes = [line for line in capsys.readouterr().err.splitlines() if line.startswith("note")]
+    assert [[name for name in ("--test", "--starts", "--counts") if name in note] for note in notes] == [
+        ["--test"],
+        ["--starts"],
+    ]
+
+
 @pytest.mark.parametrize("words", WRONG)
 def test_what_is_wrong_is_said_before_anything_is_written(
     words: str, plates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -138,7 +153,9 @@ def test_what_is_wrong_is_said_before_anything_is_written(
     before = sorted(path.name for path in plates.parent.iterdir())
     name, value = WRONG[words]
     with raises(AvmsfError, name=name, value=value):
-        run(parse(words.split()))
+        options = parse(words.split())
+        options.check_inputs()
+        run(options)
     with raises(AvmsfError, file="nowhere"):
         run(parse(["farthest", "nowhere"]))
     assert sorted(path.name for path in plates.parent.iterdir()) == before
@@ -186,7 +203,7 @@ def test_all_methods_hear_the_start_of_sounds_and_share_the_modes_that_are_asked
     summary = json.loads((results / "summary.json").read_text())
     assert "relative_stft" in summary["methods"]["knn-gains"]
     assert "gain_error" not in summary["methods"]["knn-gains"]
-    assert ResultsFolder(results).identity()["modes"] == repr(ShortTime(128))
+    assert ResultsFolder(results).identity()["modes"] == {"kind": "ShortTime", **asdict(ShortTime(128))}
     with raises(EvaluationError, name="time_zero", value="peak"):
         run(parse(words))
     assert run(parse([*words[:-1], str(tmp_path / "others"), "--time-zero", "onset"])) == 0

@@ -34,8 +34,8 @@ IDENTITY = {
     "dataset": "ObjectFolder Real",
     "version": "0",
     "seed": 0,
-    "metrics": "m",
-    "modes": "n",
+    "metrics": {"kind": "m"},
+    "modes": {"kind": "n"},
     "methods": {"knn3": "", "paper": "", "nearest": ""},
 }
 

@@ -9,20 +9,20 @@ import torch
 
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.surface import Surface
-from avmsf.config import BodyConfig, PipelineConfig
+from avmsf.config import BodyConfig
 from avmsf.errors import FitError, SimulationError
 from avmsf.fem.supports import Support
-from avmsf.field.config import FitConfig
+from avmsf.field.config import FitConfig, GainModel
 from avmsf.field.fit import fit
 from avmsf.field.gains.bodies import CandidateBodies
-from avmsf.field.gains.estimator import MixtureEstimator, gain_variance
+from avmsf.field.gains.estimator import MixtureEstimator, estimator_for, gain_variance
 from avmsf.field.recipes import GainCase, gain_case
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesize_phased
-from avmsf.pipeline.bodies import candidate_bodies, stated_bodies
+from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.nominal import NominalBodies, NominalBody
 from made_dome import STIFFER, WALLS, bodies, dome, points, truth
@@ -243,18 +243,17 @@ def test_stated_settings_that_leave_no_body_are_refused(config: BodyConfig, name
     def make() -> CandidateBodies:
         return candidate_bodies(dome(), config)
 
-    for model in ("auto", "elastic"):
+    models: tuple[GainModel, ...] = ("auto", "elastic")
+    for model in models:
         with raises(SimulationError, name=name, value=value):
-            stated_bodies(PipelineConfig(gain_model=model, body=config), make)
-    stated_bodies(PipelineConfig(gain_model="smooth", body=config), make)
+            estimator_for(model, make)
+    estimator_for("smooth", make)
 
 
 def test_a_stated_wall_is_not_blamed_for_too_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("avmsf.simulate.nominalsolid._free_memory", lambda: 1000.0)
-    stated = PipelineConfig(body=BodyConfig(wall=0.004))
-    found = stated_bodies(stated, lambda: candidate_bodies(dome(), stated.body))
     with raises(SimulationError, name="memory"):
-        found()
+        candidate_bodies(dome(), BodyConfig(wall=0.004))
 
 
 def test_contacts_elsewhere_are_refused_before_any_body_is_computed() -> None:

@@ -81,7 +81,8 @@ def expect_suited(method: str, protocol: str) -> None:
     if method.startswith(RECORDED) and protocol in _SEVERAL_SETS:
         raise EvaluationError(
             f"{method}: expected a protocol that tests each recording once, got {protocol}, which trains on several "
-            "sets of recordings, and the folder holds the sounds of one; choose farthest, closest, predefined or leave-one-out",
+            "sets of recordings, and the folder holds the sounds of one; choose farthest, closest, predefined or "
+            "leave-one-out",
             name="method",
             value=method,
         )

@@ -1,7 +1,7 @@
 """The settings of an evaluation, in one value that can be sent to other processes."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from importlib.metadata import version
 from typing import Any, Protocol, runtime_checkable
 
@@ -97,8 +97,8 @@ class Evaluation:
             "dataset": self.title,
             "seed": self.seed,
             "time_zero": self.time_zero,
-            "metrics": repr(self.judging),
-            "modes": repr(self.finder),
+            "metrics": _plain(self.judging),
+            "modes": _plain(self.finder),
             "settings": dict(self.settings),
         }
         results.begin(identity, {method.name: self._described(method) for method in self.methods}, self.options)
@@ -107,3 +107,11 @@ class Evaluation:
         """Return what tells a method apart from another of its name. Methods that read no features share any folder."""
         read = self.encoder is not None and isinstance(method, Looking) and method.look != "surface"
         return f"{method!r}{ENCODER}{self.encoder}" if read else repr(method)
+
+
+def _plain(settings: Any) -> Any:
+    """Return settings as plain values, those of a dataclass by their names, with the name of its class as `kind`."""
+    if not is_dataclass(settings):
+        return settings
+    values = {each.name: _plain(getattr(settings, each.name)) for each in fields(settings)}
+    return {"kind": type(settings).__name__, **values}

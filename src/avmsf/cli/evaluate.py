@@ -27,6 +27,7 @@ from avmsf.capture.datasets import CaptureCollection, open_dataset
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.objectbar import ObjectBar
+from avmsf.cli.options.common import spelled
 from avmsf.cli.options.evaluate import Options, deciding, words_of
 from avmsf.cli.printing import console, decimals, print_json, say, table
 from avmsf.config import AUTO, PRESETS, LiftConfig, SceneConfig, TimeZero, ViewsConfig
@@ -37,21 +38,15 @@ from avmsf.pipeline.objectbodies import ObjectBodies
 from avmsf.pipeline.objectlooks import ObjectLooks
 from avmsf.wording import counted
 
+OPTIONS = {PREDEFINED: ("--test",), LEARNING_CURVE: ("--counts", "--starts", "--metric")}
+"""Options of one protocol alone."""
 _SHOWN = 5
 """Failures that are printed; the report lists all."""
 
 
 def run(options: Options) -> int:
     """Evaluate, and print the results; return 130 where Ctrl-C stopped it."""
-    protocol = protocol_named(options.protocol)
-    if protocol.name == LEARNING_CURVE:
-        protocol = replace(protocol, choosing=Growing(options.counts, options.starts))
-    elif protocol.name == PREDEFINED:
-        protocol = replace(protocol, choosing=Predefined(words_of(options.test)))
-    if protocol.name != PREDEFINED and options.test:
-        say(f"note: --test is not used by {protocol.name}, only by {PREDEFINED}")
-    if protocol.name != LEARNING_CURVE and (options.counts or options.starts != Options.starts or options.metric != Options.metric):
-        say(f"note: --counts, --starts and --metric are not used by {protocol.name}, only by {LEARNING_CURVE}")
+    protocol = _protocol_of(options)
     methods = tuple(method_named(name) for name in words_of(options.methods) or protocol.methods)
     workers = Workers(options.workers, options.ray)
     # All paths are made absolute: workers may run in folders of their own.
@@ -105,6 +100,19 @@ def run(options: Options) -> int:
     if options.json:
         print_json({**summary, "results": str(folder), **({"curves": drawn} if drawn else {})})
     return 0
+
+
+def _protocol_of(options: Options) -> EvaluationProtocol:
+    """Return the protocol with its own options, and print which of those that were given it does not use."""
+    protocol, given = protocol_named(options.protocol), spelled(options)
+    usual = spelled(Options(options.protocol, options.data))
+    for owner, names in OPTIONS.items():
+        unused = [name for name in names if given.get(name) != usual.get(name)]
+        if unused and owner != protocol.name:
+            say(f"note: {', '.join(unused)}: not used by {protocol.name}, only by {owner}")
+    if protocol.name == LEARNING_CURVE:
+        return replace(protocol, choosing=Growing(options.counts, options.starts))
+    return replace(protocol, choosing=Predefined(words_of(options.test))) if protocol.name == PREDEFINED else protocol
 
 
 def _print_failures(failures: Sequence[Mapping[str, Any]], screen: Console) -> None:
@@ -233,8 +241,8 @@ def settled_lifts(
 ) -> tuple[LiftConfig, LiftConfig]:
     """Return the settings of features, and those of the paper's form, with the encoders that `looks` are made with.
 
-    Without a look at views no encoder is loaded. The replacement of DINOv2 is printed. Raises SceneError where a look is the
-    paper's and its encoder is not available.
+    Without a look at views no encoder is loaded. The replacement of DINOv2 is printed. Raises SceneError where a look
+    is the paper's and its encoder is not available.
     """
     paper = PRESETS["paper"].scene.lift
     if lift.encoder != AUTO:

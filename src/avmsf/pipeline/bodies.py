@@ -7,16 +7,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from avmsf._utils.caching import once
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.placement import expect_placed, surface_points
 from avmsf.capture.surface import Surface
-from avmsf.config import BodyConfig, PipelineConfig
-from avmsf.errors import AvmsfError, SimulationError
+from avmsf.config import BodyConfig
+from avmsf.errors import SimulationError
 from avmsf.fem.supports import Support
-from avmsf.field.config import AUTO
 from avmsf.field.gains.bodies import CandidateBodies
-from avmsf.field.gains.elastic import Elastic
 from avmsf.simulate.nominal import NominalBody, Shape, nominal_bodies, refined, supported, with_wall
 
 
@@ -145,22 +142,6 @@ def wall_error(surface: Surface | Shape, wall: float, error: SimulationError) ->
     return SimulationError(
         f"--body.wall: expected {wanted}, got {wall:g} m ({reasons}); {advice}", name="wall", value=wall
     )
-
-
-def stated_bodies(config: PipelineConfig, bodies: Callable[[], CandidateBodies]) -> Callable[[], CandidateBodies]:
-    """Return `bodies`, computed once, for a gain model that uses them.
-
-    Raises SimulationError, where their settings are not the defaults, for those that leave no body: a wall or degrees
-    of freedom that cannot be. Other failures are left to the gain model: "auto" does without bodies.
-    """
-    found = once(bodies)
-    if config.body != BodyConfig() and config.gain_model in (AUTO, Elastic.kind):
-        try:
-            found()
-        except AvmsfError as error:
-            if error.name in ("wall", "dofs"):
-                raise
-    return found
 
 
 def roughened(surface: Surface, part: float, *, seed: int) -> Surface:

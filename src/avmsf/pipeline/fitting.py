@@ -22,7 +22,7 @@ from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.estimator import estimator_for
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.extract import Extraction, extract_modes, extract_once
-from avmsf.pipeline.bodies import candidate_bodies, stated_bodies
+from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.reconstruct import expect_on_object
 from avmsf.pipeline.record import finder_of, modes_words, supporting_poles, with_record
 from avmsf.scene.features import FeatureField
@@ -65,7 +65,7 @@ def fit_capture(
     cache = None if output is None else unfinished(output, "bodies")
     gains = estimator_for(
         config.gain_model,
-        stated_bodies(config, lambda: _bodies(capture, config, cache, log)),
+        lambda: _bodies(capture, config, cache, log),
         symmetries=lambda: _symmetries(capture, config),
         log=None if capture.surface is None and features is None else log,
     )
@@ -119,14 +119,9 @@ def fit_with_progress(
 ) -> SoundField:
     """Return what `SoundField.fit` returns."""
     if not isinstance(capture, Capture):
-        advice = (
-            "fit to the capture that holds them, whose shape the gains are predicted from; a fitted field is scored by "
-            "avmsf.evaluate(field, test) without train"
-            if isinstance(capture, Impacts)
-            else "read a folder by avmsf.Capture.read(folder)"
-        )
         raise FitError(
-            f"capture: expected a Capture, got {type(capture).__name__}; {advice}",
+            f"capture: expected a Capture, got {type(capture).__name__}; read a folder by avmsf.Capture.read(folder). "
+            "A fitted field is scored by avmsf.evaluate(field, test), without train",
             name="capture",
             value=type(capture).__name__,
         )

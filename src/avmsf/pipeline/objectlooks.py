@@ -7,7 +7,7 @@ from pathlib import Path
 from avmsf._utils.locks import NO_LIMIT
 from avmsf.bench.task import Look
 from avmsf.capture.datasets.dataset import Dataset
-from avmsf.config import AUTO, PRESETS, LiftConfig, SceneConfig, ViewsConfig
+from avmsf.config import AUTO, DESCRIPTORS, PRESETS, LiftConfig, SceneConfig, ViewsConfig
 from avmsf.errors import SceneError
 from avmsf.pipeline.scene import FEATURES, SceneStages
 from avmsf.pipeline.stages import StageFolder

@@ -32,7 +32,7 @@ from avmsf.files import write_whole
 from avmsf.geometry import ObjectShape
 from avmsf.geometry.closest import ClosestPoints
 from avmsf.modal.extraction.extract import Extraction, extract_once
-from avmsf.pipeline.bodies import candidate_bodies, stated_bodies
+from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.guess import expect_no_recordings, guess_field
 from avmsf.pipeline.record import finder_of, modes_words, supporting_poles, with_record
 from avmsf.pipeline.scene import Listener, SceneStages
@@ -134,7 +134,7 @@ def _reconstruct(
 
     def make(path: Path) -> None:
         gains = estimator_for(
-            config.gain_model, stated_bodies(config, bodies), symmetries=shape.symmetries, features=shape.features,
+            config.gain_model, bodies, symmetries=shape.symmetries, features=shape.features,
             log=listener.tell,
         )  # fmt: skip
         supporting = supporting_poles(modes, train)

@@ -211,7 +211,8 @@ def estimator_for(
     """Return the estimator of this name; the network reads `features`, or the fit's own.
 
     `bodies` computes what may lie behind the object's surface. Where it raises an AvmsfError, `auto` has no elastic
-    family, which `log` reports, and takes the `symmetries` of the object's shape; with `elastic` the error passes.
+    family, which `log` reports, and takes the `symmetries` of the object's shape. With `elastic` the error passes, and
+    always that of a stated wall or number of degrees of freedom that cannot be (with the name `wall` or `dofs`).
     """
     if name == NETWORK:
         return Attention(features, NETWORK)
@@ -221,7 +222,7 @@ def estimator_for(
     try:
         return MixtureEstimator(kinds, bodies())
     except AvmsfError as error:
-        if name == Elastic.kind:
+        if name == Elastic.kind or error.name in ("wall", "dofs"):
             raise
         if log is not None:
             log(f"no elastic mode shapes: {error}")
