@@ -9,7 +9,7 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
 from avmsf.field.soundfield import SoundField
 from avmsf.localization.contact_map import ContactMap
-from avmsf.tasks.hearing import Heard, Sound, hear
+from avmsf.tasks.hearing import Sound, hear
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.posterior import Force
 
@@ -60,19 +60,17 @@ def locate(
             locator = _locator_of(field)
         finder = Locator.of(field, points=points, directions=directions) if locator is None else locator
         found = finder.locate(heard.sound, highest=heard.highest, force=known)
-    measured = _measured_force_notes(heard, field, known)
+    measured = measured_force_notes(heard.newtons, field, known)
     return judged(replace(found, notes=(*heard.notes, *measured, *found.notes)))
 
 
-def _measured_force_notes(heard: Heard, field: SoundField, force: Force | None) -> tuple[str, ...]:
-    """Return a note where a known force, in newtons, is not the one in the recording's force channel."""
-    if force is None or not heard.newtons or not field.origin.per_newton:
+def measured_force_notes(newtons: float | None, field: SoundField, force: Force | None) -> tuple[str, ...]:
+    """Return a note where a known force is not the one in the recording's force channel, `newtons`."""
+    if force is None or not newtons or not field.origin.per_newton:
         return ()
-    if 1.0 / SAME_FORCE < force.expected / heard.newtons < SAME_FORCE:
+    if 1.0 / SAME_FORCE < force.expected / newtons < SAME_FORCE:
         return ()
-    return (
-        f"expected a force of {heard.newtons:.3g} N as in the recording's force channel, got {force.expected:.3g} N",
-    )
+    return (f"expected a force of {newtons:.3g} N as in the recording's force channel, got {force.expected:.3g} N",)
 
 
 @lru_cache(maxsize=1)
