@@ -13,8 +13,8 @@ from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_floats, as_rate
 from avmsf.capture.audio import Recording, read_recording
-from avmsf.capture.blow import clipping, expect_sudden
-from avmsf.capture.onset import Pulse, find_second_blow, find_second_push
+from avmsf.capture.impulse_checks import check_impulsive, find_clipping
+from avmsf.capture.onset import Pulse, find_second_impact, find_second_push
 from avmsf.capture.prepare import prepare, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.starts import latest_start
@@ -73,7 +73,7 @@ def hear(
             prepared = prepare(whole, replace(chosen, align=False))
         # Of one channel all is used, the silence before the impact too.
         heard = whole.response() if len(whole.channels) == 1 else prepared.sound
-        expect_sudden(heard, sample_rate=whole.sample_rate, name=whole.name)
+        check_impulsive(heard, sample_rate=whole.sample_rate, name=whole.name)
     except CaptureError as error:
         raise location_error(error) from error
     # A pulse that was divided out took the force of the impact with it.
@@ -189,7 +189,7 @@ def describe(recording: Recording, settings: CaptureSettings) -> list[str]:
         response = recording.response(settings.response_channel, force_channel=settings.force_channel)
     except CaptureError as error:
         raise location_error(error) from error
-    clipped = clipping(response, name=recording.name)
+    clipped = find_clipping(response, name=recording.name)
     return [] if clipped is None else [clipped]
 
 
@@ -256,5 +256,5 @@ def _second(
     if pulse is not None and settings.force_channel is not None:
         force = recording.channel(settings.force_channel)
         return find_second_push(force, pulse, sample_rate=rate, seconds=seconds)
-    second = find_second_blow(sound, 0, sample_rate=rate, seconds=seconds)
+    second = find_second_impact(sound, 0, sample_rate=rate, seconds=seconds)
     return None if second is None else begin + second
