@@ -11,11 +11,11 @@ from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.scaledgains import ScaledGains
 from avmsf.field.soundfield import Origin, SoundField
+from avmsf.localization.locator import Locator
+from avmsf.localization.tempering import calibrate_tempering
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
 from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts
-from avmsf.tasks.heed import calibrate_tempering
-from avmsf.tasks.locator import Locator
 
 PLATE = Plate()
 HIGHEST = 2500.0

@@ -13,16 +13,16 @@ from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.localization.contact_map import ContactMap
+from avmsf.localization.likelihood import Force
+from avmsf.localization.locate import DOUBTFUL, STRANGE, UNLIKE, judged, locate
+from avmsf.localization.locator import Locator
+from avmsf.localization.smoothing import contacts_of
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesize_phased
 from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
-from avmsf.tasks.locate import DOUBTFUL, STRANGE, UNLIKE, judged, locate
-from avmsf.tasks.locator import Locator
 from avmsf.tasks.modes import adjust_modes
-from avmsf.tasks.posterior import Force
-from avmsf.tasks.slack import contacts_of
 from believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
 from raising import raises
 from unsaved_gains import Unsaved

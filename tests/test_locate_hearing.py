@@ -10,9 +10,9 @@ import torch
 from avmsf.capture.audio import Recording
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
-from avmsf.tasks.hearing import at_field_rate, hear
-from avmsf.tasks.locate import locate
-from avmsf.tasks.locator import Locator
+from avmsf.localization.locate import locate
+from avmsf.localization.locator import Locator
+from avmsf.localization.preprocess import at_field_rate, hear
 from raising import raises
 from test_locate import RATE, locator_of, missed, struck, true_field
 

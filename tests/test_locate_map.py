@@ -6,9 +6,9 @@ import torch
 
 from avmsf.errors import ArrayError, LocationError
 from avmsf.localization.contact_map import ContactMap, EquivalentPoint
+from avmsf.localization.locator import Locator
 from avmsf.scene.symmetry import MirrorSymmetry, RotationalSymmetry, Symmetries
 from avmsf.simulate.plate import plate_surface_points
-from avmsf.tasks.locator import Locator
 from raising import raises
 from test_locate import PLATE, TrueGains, field_of, struck
 

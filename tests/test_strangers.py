@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from avmsf.tasks.amplitudes import Extractor
-from avmsf.tasks.locate import DOUBTFUL, STRANGE, locate
-from avmsf.tasks.multi_impact import locate_impacts
-from avmsf.tasks.streaming import StreamingLocalizer
+from avmsf.localization.amplitudes import Extractor
+from avmsf.localization.locate import DOUBTFUL, STRANGE, locate
+from avmsf.localization.multi_impact import locate_impacts
+from avmsf.localization.streaming import StreamingLocalizer
 from damped_plates import RATE, damped_blows, damped_field, damped_locator
 
 FOREIGN = [("wood", "wood", 0.2), ("wood", "wood", 0.33), ("plastic", "wood", 0.2), ("plastic", "plastic", 0.2)]

@@ -19,10 +19,10 @@ from avmsf.cli.options.locate import parse
 from avmsf.errors import CaptureError
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import save
+from avmsf.localization.locator import Locator
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesize
 from avmsf.plotting.style import FIRST, SECOND
-from avmsf.tasks.locator import Locator
 from made_fields import BANK, positional
 from raising import raises
 

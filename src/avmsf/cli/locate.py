@@ -25,11 +25,11 @@ from avmsf.errors import AvmsfError, LocationError
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.localization.contact_map import ContactMap, not_located, symmetries_of
+from avmsf.localization.likelihood import Force
+from avmsf.localization.locate import locate
+from avmsf.localization.locator import Locator
+from avmsf.localization.multi_impact import locate_impacts
 from avmsf.scene.symmetry import Symmetries
-from avmsf.tasks.locate import locate
-from avmsf.tasks.locator import Locator
-from avmsf.tasks.multi_impact import locate_impacts
-from avmsf.tasks.posterior import Force
 
 UNLOCATED = 2
 """The exit code where a recording could not be located."""

@@ -142,8 +142,8 @@ class ContactMap:
     notes: tuple[str, ...] = field(default=())
     """What a user should know about the recording, in sentences."""
     evidence: float = math.inf
-    """Log Bayes factor of an impact somewhere on the object against noise (see `avmsf.tasks.posterior`): 0 where both
-    explain the sound's gains equally well."""
+    """Log Bayes factor of an impact somewhere on the object against noise (see `avmsf.localization.likelihood`): 0
+    where both explain the sound's gains equally well."""
     refusal: str | None = None
     """Why the recording was rejected, as that of another object; None if it was located."""
 

@@ -9,9 +9,9 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
 from avmsf.field.soundfield import SoundField
 from avmsf.localization.contact_map import ContactMap
-from avmsf.tasks.hearing import Sound, hear
-from avmsf.tasks.locator import Locator
-from avmsf.tasks.posterior import Force
+from avmsf.localization.likelihood import Force
+from avmsf.localization.locator import Locator
+from avmsf.localization.preprocess import Sound, hear
 
 STRANGE = 0.5
 """Mismatch ratio (see `ContactMap`) above which a sound is taken for another object's."""

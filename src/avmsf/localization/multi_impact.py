@@ -18,11 +18,12 @@ from avmsf.capture.prepare import remove_rumble, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError, LocationError
 from avmsf.field.soundfield import SoundField
+from avmsf.localization.amplitudes import Extractor
 from avmsf.localization.contact_map import ContactMap
-from avmsf.modal.bank import ModalBank
-from avmsf.modal.synthesis import synthesize
-from avmsf.tasks.amplitudes import Extractor
-from avmsf.tasks.hearing import (
+from avmsf.localization.likelihood import Force
+from avmsf.localization.locate import judged, measured_force_notes
+from avmsf.localization.locator import Locator
+from avmsf.localization.preprocess import (
     Sound,
     as_recording,
     at_field_rate,
@@ -32,9 +33,8 @@ from avmsf.tasks.hearing import (
     read_if_path,
     settings_for,
 )
-from avmsf.tasks.locate import judged, measured_force_notes
-from avmsf.tasks.locator import Locator
-from avmsf.tasks.posterior import Force
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.synthesis import synthesize
 from avmsf.wording import counted
 
 _GUARD_SECONDS = 0.005

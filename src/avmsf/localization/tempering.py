@@ -18,10 +18,10 @@ from torch import Tensor
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.soundfield import SoundField
 from avmsf.field.uncertainty import fitted_mixture, scale_of
+from avmsf.localization.likelihood import PredictedGains, judge
+from avmsf.localization.prediction import judges_itself, patches, predict, unknown, widened
+from avmsf.localization.smoothing import areas_of, contacts_of, spread_by
 from avmsf.scene.points import farthest_points
-from avmsf.tasks.foretelling import judges_itself, patches, predict, unknown, widened
-from avmsf.tasks.posterior import PredictedGains, judge
-from avmsf.tasks.slack import areas_of, contacts_of, spread_by
 
 _STRIKES = 12
 """Strikes that are left out, at most: those farthest apart."""
