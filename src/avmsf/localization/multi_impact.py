@@ -58,11 +58,12 @@ def locate_impacts(
 ) -> list[tuple[float, ContactMap]]:
     """Return the onset of each impact in a recording, seconds, and its map, in order.
 
-    Bare samples are at `sample_rate` Hz, or at the field's rate; `settings` as for `hear`; `force`, of every impact, as
-    for `locate`; `locator` is one made of the field before. The decaying sound of earlier impacts is fitted by
-    the object's modes just before an impact, extrapolated and subtracted. Impacts on other objects are left out, which
-    a note says, and impacts closer than 30 ms count as one. Raises LocationError as `hear`, for settings with
-    `normalize = "deconvolve"` where the recording has a force channel, and where no impact can be located.
+    Bare samples are at `sample_rate` Hz, or at the field's rate; `settings` as for `preprocess_recording`; `force`, of
+    every impact, as for `locate`; `locator` is one made of the field before. The decaying sound of earlier impacts is
+    fitted by the object's modes just before an impact, extrapolated and subtracted. Impacts on other objects are left
+    out, which a note says, and impacts closer than 30 ms count as one. Raises LocationError as `preprocess_recording`,
+    for settings with `normalize = "deconvolve"` where the recording has a force channel, and where no impact can be
+    located.
     """
     known = None if force is None else Force.of(force)
     recording = read_if_path(recording)
@@ -187,8 +188,8 @@ def predict_ringing(
     rate = field.sample_rate
     stop = start - min(round(_GUARD_SECONDS * rate), (start - last) // 4)
     begin = max(last, stop - round(_FIT_SECONDS * rate))
-    heard = torch.nonzero(field.bank.frequency < min(0.5 * rate, highest or 0.5 * rate)).flatten()
-    bank = ModalBank(field.bank.frequency[heard], field.bank.damping[heard])
+    audible = torch.nonzero(field.bank.frequency < min(0.5 * rate, highest or 0.5 * rate)).flatten()
+    bank = ModalBank(field.bank.frequency[audible], field.bank.damping[audible])
     extractor = Extractor.of(bank, sample_rate=rate, samples=stop - begin)
     values = extractor.extract(sound[begin:stop], color=None).values
     seconds = (start - begin) / rate
