@@ -31,6 +31,7 @@ from avmsf.fem.family import BodyFamily, body_family
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
+from avmsf.localization.locator import Locator
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import extract_modes
 from avmsf.modal.synthesis import synthesize
@@ -41,7 +42,6 @@ from avmsf.simulate.material import Material, material_named
 from avmsf.simulate.sim20 import sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from avmsf.simulate.simulationfolder import write_simulation
-from avmsf.tasks.locator import Locator
 from benchmarks.costs import method_costs
 from benchmarks.material import surface_features
 from benchmarks.paperrun import paper_runs

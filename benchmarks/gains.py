@@ -23,6 +23,7 @@ from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.recipes import GainCase
 from avmsf.field.soundfield import SoundField
 from avmsf.geometry import ObjectShape
+from avmsf.localization.locator import Locator
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.residual import Residual
@@ -34,7 +35,6 @@ from avmsf.scene.points import farthest_points
 from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.sim20 import SIM20
 from avmsf.simulate.truth import Truth
-from avmsf.tasks.locator import Locator
 from benchmarks.ablation import ablation, outliers, supports
 from benchmarks.fewimpacts import few
 from benchmarks.material import MissingDataError, example_capture

@@ -29,6 +29,9 @@ from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import Attention, GainRecipe
 from avmsf.field.soundfield import SoundField
+from avmsf.localization.locate import locate
+from avmsf.localization.locator import Locator
+from avmsf.localization.streaming import LocatedImpact, StreamingLocalizer
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.residual import Residual
 from avmsf.pipeline.bodies import candidate_bodies
@@ -39,9 +42,6 @@ from avmsf.simulate.shapes.shape import Symmetry
 from avmsf.simulate.sim20 import NON_SYMMETRIC, SIM20, sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from avmsf.simulate.truth import Truth, read_truth
-from avmsf.tasks.locate import locate
-from avmsf.tasks.locator import Locator
-from avmsf.tasks.streaming import LocatedImpact, StreamingLocalizer
 from benchmarks.look import slab
 from benchmarks.material import STRUCK, capture_in_place, shared_data, surface_features
 from benchmarks.report import Options, Report, Table, show, tell

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from avmsf.field.gainfield import Gains
 from avmsf.field.soundfield import Origin, SoundField
+from avmsf.localization.locator import Locator
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
 from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
-from avmsf.tasks.locator import Locator
 from unsaved_gains import Unsaved
 
 RATE, SECONDS, LENGTH = 44100.0, 0.4, 0.24

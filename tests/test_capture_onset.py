@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from avmsf.capture.audio import read_recording
-from avmsf.capture.onset import find_onset, find_pulse, find_second_blow, find_second_push
+from avmsf.capture.onset import find_onset, find_pulse, find_second_impact, find_second_push
 from capture_folder import ring
 
 
@@ -75,9 +75,9 @@ def test_a_double_hit_is_heard(rate: int, level_db: float) -> None:
     seconds = 3.0 if rate == 400 else 1.0
     sound = ring(seconds, rate=rate, seed=1)
     delay = round(0.3 * seconds * rate)
-    assert find_second_blow(sound, 0, sample_rate=float(rate), seconds=seconds) is None
+    assert find_second_impact(sound, 0, sample_rate=float(rate), seconds=seconds) is None
     sound[delay:] += 10 ** (level_db / 20) * ring(seconds, rate=rate, seed=2)[:-delay]
-    second = find_second_blow(sound, 0, sample_rate=float(rate), seconds=seconds)
+    second = find_second_impact(sound, 0, sample_rate=float(rate), seconds=seconds)
     # Half a window: 5 ms, or 32 samples, and a hop.
     assert second is not None
     assert abs(second - delay) <= max(64, 0.01 * rate)
@@ -91,7 +91,7 @@ def test_beating_and_room_noise_are_no_second_blow() -> None:
     generator = np.random.default_rng(0)
     sound = sound + 1e-3 * generator.standard_normal(len(time))
     sound[rate : rate + 400] += 0.02 * generator.standard_normal(400)
-    assert find_second_blow(sound, 0, sample_rate=float(rate), seconds=2.0) is None
+    assert find_second_impact(sound, 0, sample_rate=float(rate), seconds=2.0) is None
 
 
 def test_measured_bowl_clips_begin_one_second_in_and_hold_one_blow(shared: Path) -> None:
@@ -100,7 +100,7 @@ def test_measured_bowl_clips_begin_one_second_in_and_hold_one_blow(shared: Path)
         recording = read_recording(path)
         sound = recording.channels[0]
         onsets.append(find_onset(sound, sample_rate=recording.sample_rate))
-        assert find_second_blow(sound, onsets[-1], sample_rate=recording.sample_rate, seconds=5.0) is None, path.name
+        assert find_second_impact(sound, onsets[-1], sample_rate=recording.sample_rate, seconds=5.0) is None, path.name
     # The recorder kept 1 s before each hit. The clips' peaks lie up to 4.3 ms (205 samples) later and 184 samples
     # apart; their onsets agree to .1 ms.
     assert len(onsets) == 8
@@ -117,7 +117,7 @@ def test_measured_single_blows_raise_no_alarm(shared: Path) -> None:
         sound, rate = recording.channels[0], recording.sample_rate
         onset = find_onset(sound, sample_rate=float(rate))
         assert onset / rate < 0.015, path.name
-        assert find_second_blow(sound, onset, sample_rate=float(rate), seconds=6.0) is None, path.name
+        assert find_second_impact(sound, onset, sample_rate=float(rate), seconds=6.0) is None, path.name
 
 
 def test_measured_forces_hold_one_push(shared: Path) -> None:
@@ -137,7 +137,7 @@ def test_repeated_measured_blows_are_heard_where_the_force_shows_them(shared: Pa
     sound, force = recording.channels
     first = find_pulse(force)
     pushed = find_second_push(force, first, sample_rate=44_100.0, seconds=10.0)
-    heard = find_second_blow(sound, first.start, sample_rate=44_100.0, seconds=10.0)
+    heard = find_second_impact(sound, first.start, sample_rate=44_100.0, seconds=10.0)
     assert pushed is not None
     assert heard is not None
     # Half of a 10 ms window, and the pulse's own length.

@@ -17,10 +17,10 @@ from avmsf.cli.options.locate import parse
 from avmsf.errors import LocationError
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import load, save
+from avmsf.localization.locator import Locator
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesize
-from avmsf.tasks.locator import Locator
 from made_fields import BANK, positional
 from raising import raises
 

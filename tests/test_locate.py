@@ -13,16 +13,16 @@ from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.localization.contact_map import ContactMap
+from avmsf.localization.likelihood import Force
+from avmsf.localization.locate import MIN_EXPLAINED, REJECT_ABOVE, WARN_ABOVE, judged, locate
+from avmsf.localization.locator import Locator
+from avmsf.localization.smoothing import distinct_contacts
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesize_phased
 from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
-from avmsf.tasks.locate import DOUBTFUL, STRANGE, UNLIKE, judged, locate
-from avmsf.tasks.locator import Locator
 from avmsf.tasks.modes import adjust_modes
-from avmsf.tasks.posterior import Force
-from avmsf.tasks.slack import contacts_of
 from believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
 from raising import raises
 from unsaved_gains import Unsaved
@@ -294,7 +294,7 @@ def test_another_plate_is_refused_with_the_number(length):
     impacts = struck(4, seed=6, plate=replace(PLATE, length=length, width=length / 1.3))
     locator = locator_of()
     for sound in impacts.sounds:
-        assert locator.locate(sound).mismatch_ratio > 1.5 * STRANGE
+        assert locator.locate(sound).mismatch_ratio > 1.5 * REJECT_ABOVE
         found = locate(true_field(), sound, locator=locator)
         assert f"a mismatch ratio of {found.mismatch_ratio:.2f}" in found.refusal
         for name in ("position", "most_probable"):
@@ -309,7 +309,7 @@ def test_its_own_sounds_are_not_taken_for_another_plates(noise_db):
     # Noise, were it as loud as the sound, counts neither for the modes nor against them.
     for sound in struck(8, seed=6, noise_db=noise_db).sounds:
         found = locator_of().locate(sound)
-        assert found.mismatch_ratio < DOUBTFUL
+        assert found.mismatch_ratio < WARN_ABOVE
         assert found.modal_energy > 0.85
 
 
@@ -318,7 +318,7 @@ def test_what_falls_between_is_doubted_in_words():
     assert judged(found) is found
     (note,) = judged(replace(found, modal_energy=0.8, null_energy=0.5)).notes
     assert all(each in note for each in ("80 %", "50 %", "a mismatch ratio of 0.40"))
-    (note,) = judged(replace(found, explained_energy=0.9 * UNLIKE)).notes
+    (note,) = judged(replace(found, explained_energy=0.9 * MIN_EXPLAINED)).notes
     assert " 9 %" in note
     # Where modes out of tune explain all as well, a rounding is no misfit.
     assert judged(replace(found, modal_energy=1.0 - 1e-4, null_energy=1.0 - 1e-5)).notes == ()
@@ -381,10 +381,10 @@ def test_sounds_without_an_impact_are_refused(sound, name, value):
 def test_fields_that_were_edited_and_know_no_contacts_are_located_on_too():
     impacts = struck(2, seed=44)
     for field in (true_field(), adjust_modes(true_field(), pitch=1.1)):
-        assert contacts_of(field) is None
+        assert distinct_contacts(field) is None
         assert Locator.of(field).smoothing is None
     higher = adjust_modes(replace(true_field(), origin=Origin(trained_on=("a", "b"))), pitch=1.1)
-    assert contacts_of(higher) == 2
+    assert distinct_contacts(higher) == 2
     sound = higher.render(impacts.contacts[:1])[0]
     found = Locator.of(higher).locate(sound)
     assert missed(found, found.most_probable, impacts.contacts[0]) < 0.05
@@ -393,9 +393,9 @@ def test_fields_that_were_edited_and_know_no_contacts_are_located_on_too():
 def test_contacts_that_a_field_does_not_use_are_not_counted():
     contacts = bar_contacts(8)
     gains = elastic_field(contacts, drawn_gains(contacts, seed=1))
-    assert contacts_of(sound_field(gains)) == 8
-    assert contacts_of(sound_field(gains.without(torch.arange(8) < 3))) == 5
-    assert contacts_of(adjust_modes(sound_field(gains.without(torch.arange(8) < 3)), pitch=1.1)) == 5
+    assert distinct_contacts(sound_field(gains)) == 8
+    assert distinct_contacts(sound_field(gains.without(torch.arange(8) < 3))) == 5
+    assert distinct_contacts(adjust_modes(sound_field(gains.without(torch.arange(8) < 3)), pitch=1.1)) == 5
 
 
 def test_lengths_that_are_used_are_kept():

@@ -8,8 +8,8 @@ import torch
 from avmsf.capture.audio import Recording
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
-from avmsf.tasks.locator import Locator
-from avmsf.tasks.multi_impact import detect_onsets, locate_impacts, predict_ringing
+from avmsf.localization.locator import Locator
+from avmsf.localization.multi_impact import detect_onsets, locate_impacts, predict_ringing
 from raising import raises
 from test_locate import PLATE, RATE, locator_of, missed, struck, true_field
 
@@ -101,3 +101,20 @@ def test_settings_count_as_for_one_impact(locator):
         locate_impacts(true_field(), both, settings=settings, locator=locator)
     plain = replace(settings, normalize="auto")
     assert len(locate_impacts(true_field(), both, settings=plain, locator=locator)) == 2
+
+
+def test_a_force_that_the_force_channel_contradicts_is_noted_for_its_impact(locator):
+    starts = [0.1, 0.3]
+    sound, _ = overlapping(starts, [1.0, 0.8], seed=36)
+    push = np.zeros(len(sound))
+    for start, newtons in zip(starts, (8.0, 16.0), strict=True):
+        begin = round(start * RATE) - 4
+        push[begin : begin + 9] = 0.5 * newtons * np.sin(np.pi * np.arange(1, 10) / 10)
+    both = Recording("session.wav", np.stack([push, sound.double().numpy()]), RATE, "FLOAT")
+    field = replace(true_field(), origin=replace(true_field().origin, per_newton=True))
+    settings, finder = (
+        CaptureSettings(force_channel=1, response_channel=2, force_scale=2.0),
+        replace(locator, field=field),
+    )
+    found = locate_impacts(field, both, settings=settings, force=8.0, locator=finder)
+    assert [any("force channel" in note for note in each.notes) for _, each in found] == [False, True]

@@ -4,11 +4,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from avmsf.errors import LocationError
+from avmsf.errors import ArrayError, LocationError
 from avmsf.localization.contact_map import ContactMap, EquivalentPoint
+from avmsf.localization.locator import Locator
 from avmsf.scene.symmetry import MirrorSymmetry, RotationalSymmetry, Symmetries
 from avmsf.simulate.plate import plate_surface_points
-from avmsf.tasks.locator import Locator
 from raising import raises
 from test_locate import PLATE, TrueGains, field_of, struck
 
@@ -41,6 +41,14 @@ def test_region_is_the_smallest_set_of_that_probability():
     assert found.region(0.97).sum() == 5
     with raises(LocationError, name="level", value=1.5):
         found.region(1.5)
+
+
+def test_a_map_contains_the_contacts_whose_nearest_point_is_in_its_region():
+    found = made([0.05, 0.5, 0.3, 0.05, 0.1])
+    assert [found.contains([0.01 * row + 0.004, 0.02, 0.0]) for row in range(5)] == found.region().tolist()
+    assert not found.contains((0.02, 0.0, 0.0), 0.5)
+    with raises(ArrayError, name="contact", value=[1, 2]):
+        found.contains([0.01, 0.0])
 
 
 def test_the_credible_radius_and_the_standard_deviation_are_those_about_the_most_probable_point():

@@ -22,11 +22,11 @@ from avmsf.errors import EvaluationError, LocationError
 from avmsf.evaluation.diffsound_locator import DiffSoundLocator
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.localization.contact_map import ContactMap
+from avmsf.localization.locator import Locator
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesize
 from avmsf.scene.symmetry import MirrorSymmetry, RotationalSymmetry, Symmetries
 from avmsf.simulate.shapes.shape import Symmetry
-from avmsf.tasks.locator import Locator
 from made_fields import BANK, positional
 from raising import raises
 

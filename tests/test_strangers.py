@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from avmsf.tasks.amplitudes import Extractor
-from avmsf.tasks.locate import DOUBTFUL, STRANGE, locate
-from avmsf.tasks.multi_impact import locate_impacts
-from avmsf.tasks.streaming import StreamingLocalizer
+from avmsf.localization.amplitudes import Extractor
+from avmsf.localization.locate import REJECT_ABOVE, WARN_ABOVE, locate
+from avmsf.localization.multi_impact import locate_impacts
+from avmsf.localization.streaming import StreamingLocalizer
 from damped_plates import RATE, damped_blows, damped_field, damped_locator
 
 FOREIGN = [("wood", "wood", 0.2), ("wood", "wood", 0.33), ("plastic", "wood", 0.2), ("plastic", "plastic", 0.2)]
@@ -25,7 +25,7 @@ def test_broad_modes_explain_a_stranger_and_it_is_refused(material, other, lengt
     for sound in damped_blows(other, length=length, heard_by=material):
         found = locator.locate(sound)
         shares.append(found.modal_energy)
-        assert found.mismatch_ratio > STRANGE
+        assert found.mismatch_ratio > REJECT_ABOVE
         assert "mismatch ratio" in locate(damped_field(material), recorded(sound), locator=locator).refusal
     # What the modes explain tells nothing here: of strangers half and more.
     assert max(shares) > 0.5
@@ -35,7 +35,7 @@ def test_broad_modes_explain_a_stranger_and_it_is_refused(material, other, lengt
 @pytest.mark.parametrize("noise_db", [-40.0, 0.0])
 def test_own_sounds_of_damped_plates_fit(material, noise_db):
     for sound in damped_blows(material, heard_by=material, noise_db=noise_db):
-        assert damped_locator(material).locate(sound).mismatch_ratio <= DOUBTFUL
+        assert damped_locator(material).locate(sound).mismatch_ratio <= WARN_ABOVE
 
 
 @pytest.mark.parametrize(("material", "other", "length"), FOREIGN)

@@ -12,12 +12,12 @@ from torch import Tensor
 
 from avmsf.errors import LocationError
 from avmsf.field.soundfield import Origin, SoundField
+from avmsf.localization.locator import Locator
+from avmsf.localization.ringing import Ringing
+from avmsf.localization.streaming import WINDOW_SECONDS, LocatedImpact, StreamingLocalizer
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesize
-from avmsf.tasks.locator import Locator
 from avmsf.tasks.modes import adjust_modes
-from avmsf.tasks.ringing import Ringing
-from avmsf.tasks.streaming import WINDOW_SECONDS, LocatedImpact, StreamingLocalizer
 from made_fields import BANK, positional
 from raising import raises
 

@@ -18,7 +18,7 @@ from .bench.evaluation import evaluate as evaluate
 from .capture import Capture as Capture
 from .capture import Surface as Surface
 from .field.soundfield import SoundField as SoundField
+from .localization.locate import locate as locate
 from .modal.extraction.extract import extract_modes as extract_modes
-from .tasks.locate import locate as locate
 
 __version__: str

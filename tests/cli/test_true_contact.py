@@ -16,12 +16,13 @@ from avmsf.cli import locate as verb
 from avmsf.cli.locate import run
 from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.locate import parse
+from avmsf.errors import CaptureError
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import save
+from avmsf.localization.locator import Locator
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesize
 from avmsf.plotting.style import FIRST, SECOND
-from avmsf.tasks.locator import Locator
 from made_fields import BANK, positional
 from raising import raises
 
@@ -63,6 +64,7 @@ def test_the_true_contact_is_red_at_its_place_and_the_found_one_blue(
     diagonal = float((points.amax(0) - points.amin(0)).norm())
     assert blow["true_contact"] == pytest.approx(points[OTHER].tolist(), abs=1e-6)
     assert blow["error"] == pytest.approx(distance, abs=1e-6)
+    assert blow["in_region"] is False
     assert blow["rmed_posterior"] == pytest.approx(distance / diagonal, abs=1e-6)
     assert blow["rmed"] == pytest.approx(distance / diagonal, abs=1e-6)
     (figure,) = figures
@@ -88,6 +90,47 @@ def test_the_distance_is_printed_without_pictures(
     assert run(parse([field, recording, "--true-contact", *true])) == 0
     distance = 1000 * float((points[STRUCK] - points[OTHER]).norm())
     assert f"{distance:.1f} mm from the true contact" in capsys.readouterr().out
+
+
+def test_a_table_gives_each_recording_its_contact_and_the_last_line_sums_up(
+    hit: tuple[str, str, torch.Tensor], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    field, recording, points = hit
+    paths = [tmp_path / name for name in ("a/hit.wav", "b/hit.wav", "other.wav")]
+    for path in paths:
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(Path(recording).read_bytes())
+    rows = ("b/hit.wav", points[OTHER]), ("a/hit.wav", points[STRUCK]), ("none.wav", points[OTHER])
+    table = tmp_path / "impacts.csv"
+    lines = [",".join([name, *(f"{1000 * value:.9g}" for value in place.tolist())]) for name, place in rows]
+    table.write_text("\n".join(["file,x,y,z", *lines]))
+    words = [field, *map(str, paths), "--true-contact-table", str(table), "--unit", "mm", "--json"]
+    assert run(parse(words)) == 0
+    out, err = capsys.readouterr()
+    first, second, third = json.loads(out)["impacts"]
+    distance = float((points[STRUCK] - points[OTHER]).norm())
+    assert (first["error"], second["error"]) == pytest.approx((0.0, distance), abs=1e-6)
+    assert (first["in_region"], second["in_region"]) == (True, False)
+    assert "error" not in third
+    assert f"note: {table}: expected one row for {paths[2]}" in err
+    (summary,) = (line for line in err.splitlines() if "RMED" in line)
+    assert f"{500 * distance:.1f} mm" in summary
+    assert "1 of 2" in summary
+
+
+def test_a_table_that_names_no_recordings_or_has_another_unit_is_refused(
+    hit: tuple[str, str, torch.Tensor], tmp_path: Path
+) -> None:
+    field, recording, _ = hit
+    table = tmp_path / "places.csv"
+    table.write_text("x,y,z\n0,0,0\n")
+    with raises(CaptureError, file=table, name="file"):
+        run(parse([field, recording, "--true-contact-table", str(table)]))
+    table.write_text("file,x,y,z\nhit.wav,120,40,0\n")
+    with raises(OutputError, file=table, row=2):
+        run(parse([field, recording, "--true-contact-table", str(table)]))
+    with raises(OutputError, name="--true-contact"):
+        parse([field, recording, "--true-contact-table", str(table), "--true-contact", "0", "0", "0"]).check_inputs()
 
 
 @pytest.mark.parametrize("wrong", [("120", "40", "0"), (str(math.nan), "0", "0")])

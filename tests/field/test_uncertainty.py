@@ -21,9 +21,9 @@ from avmsf.field.uncertainty import (
     training_contacts,
     unedited_mixture,
 )
+from avmsf.localization.locator import Locator
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
-from avmsf.tasks.locator import Locator
 from avmsf.tasks.modes import adjust_modes
 from believing_field import (
     BANK,

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from avmsf.tasks import locator as module
-from avmsf.tasks.locator import Locator, _Length
+from avmsf.localization import locator as module
+from avmsf.localization.locator import Locator, _Length
 from opened_plate import plate_field
 
 THREADS = 8

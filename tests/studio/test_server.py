@@ -34,6 +34,8 @@ from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load, save
 from avmsf.files import copy_whole
 from avmsf.localization.contact_map import enlarged
+from avmsf.localization.locator import Locator
+from avmsf.localization.multi_impact import locate_impacts
 from avmsf.scene.ply import write_splats
 from avmsf.scene.start import StartPoints, starting_cloud
 from avmsf.scene.symmetrysearch import find_symmetries
@@ -45,10 +47,8 @@ from avmsf.studio.opening import Opened, find_object, open_target
 from avmsf.studio.routes import PAGE
 from avmsf.studio.server import serve
 from avmsf.studio.studio import StudioConfig
-from avmsf.tasks.locator import Locator
 from avmsf.tasks.material import change_material
 from avmsf.tasks.modes import adjust_modes
-from avmsf.tasks.multi_impact import locate_impacts
 from capture_folder import fill, ring
 from opened_plate import RATE, blow, open_plate, plate_field, wav
 from plate_capture import fill_plate

@@ -31,7 +31,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, LocationError
 from avmsf.evaluation.diffsound_locator import DiffSoundLocator
 from avmsf.localization.contact_map import ContactMap
-from avmsf.tasks.locator import Locator
+from avmsf.localization.locator import Locator
 
 METHODS = ("random", "nearest", "cosine", "posterior")
 DIFFSOUND = "diffsound"

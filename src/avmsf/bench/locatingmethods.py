@@ -18,9 +18,9 @@ from avmsf.evaluation.diffsound import DiffSound
 from avmsf.evaluation.diffsound_locator import DiffSoundLocator
 from avmsf.field.soundfield import SoundField
 from avmsf.localization.contact_map import ContactMap
+from avmsf.localization.locator import Locator
 from avmsf.localization.published import PublishedLocator
 from avmsf.scene.points import farthest_points
-from avmsf.tasks.locator import Locator
 
 CANDIDATES = 2000
 """Candidate points: 2 % of the diagonal apart, which is less than the smallest errors."""

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from avmsf.capture.audio import EIGHT_BIT, Recording, clipped_samples
-from avmsf.capture.onset import SECONDS_BEFORE, find_second_blow, find_second_push
+from avmsf.capture.onset import SECONDS_BEFORE, find_second_impact, find_second_push
 from avmsf.capture.prepare import Prepared, remove_rumble
 from avmsf.capture.settings import CaptureSettings
 from avmsf.wording import counted
@@ -63,7 +63,7 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
         clipped += clipped_samples(force)
         second = find_second_push(force, prepared.pulse, sample_rate=rate, seconds=settings.kept_seconds(rate))
     else:
-        second = find_second_blow(response, prepared.onset, sample_rate=rate, seconds=settings.kept_seconds(rate))
+        second = find_second_impact(response, prepared.onset, sample_rate=rate, seconds=settings.kept_seconds(rate))
     problems = []
     others = [each for each in range(1, len(recording.channels) + 1) if each not in (channel, settings.force_channel)]
     if settings.response_channel is None and any(

@@ -1,4 +1,4 @@
-"""When a blow begins, in a force channel or in a sound, and whether a second one follows."""
+"""When an impact begins, in a force channel or in a sound, and whether a second one follows."""
 
 from dataclasses import dataclass
 
@@ -7,12 +7,12 @@ from jaxtyping import Float64
 
 SECONDS_BEFORE = 0.02
 """How long before its first strong swing a sound may have begun, seconds."""
-FORCE_OF_SECOND_BLOW = 0.15
-"""Share of the first pulse's peak above which another push counts as a second blow."""
-ENERGY_OF_SECOND_BLOW = 10**-2.6
-"""Share of the first blow's energy that a second one must bring: -26 dB."""
-RISE_OF_SECOND_BLOW = 10**0.6
-"""Ratio of energy after to energy before that a second blow must reach in the median bin: 6 dB."""
+FORCE_OF_SECOND_IMPACT = 0.15
+"""Share of the first pulse's peak above which another push counts as a second impact."""
+ENERGY_OF_SECOND_IMPACT = 10**-2.6
+"""Share of the first impact's energy that a second one must bring: -26 dB."""
+RISE_OF_SECOND_IMPACT = 10**0.6
+"""Ratio of energy after to energy before that a second impact must reach in the median bin: 6 dB."""
 
 
 @dataclass(frozen=True)
@@ -61,17 +61,18 @@ def find_second_push(
     """
     begin = pulse.stop + max(8, round(0.002 * sample_rate))
     later = (force[begin : pulse.start + round(seconds * sample_rate)] - pulse.rest) / pulse.height
-    touches = np.flatnonzero(later > FORCE_OF_SECOND_BLOW)
+    touches = np.flatnonzero(later > FORCE_OF_SECOND_IMPACT)
     return begin + int(touches[0]) if len(touches) else None
 
 
 def find_onset(sound: Float64[np.ndarray, " frames"], *, sample_rate: float) -> int:
-    """Return the sample at which the first strong blow departs from the noise before it.
+    """Return the sample at which the first strong impact departs from the noise before it.
 
-    The loudest sample will not do: where modes beat it comes milliseconds after the blow, by another amount for each
+    The loudest sample will not do: where modes beat it comes milliseconds after the impact, by another amount for each
     contact, and shifts the modes' phases from one recording to the next. So the first swing to half the peak is found,
     and then the first sample within 20 ms before it that exceeds both a tenth of the peak and five times the noise
-    (root mean square of all that lies earlier still). Of several blows, the first that reaches half the loudest counts.
+    (root mean square of all that lies earlier still). Of several impacts, the first that reaches half the loudest
+    counts.
     """
     level = np.abs(sound - np.median(sound))
     peak = level.max()
@@ -82,15 +83,15 @@ def find_onset(sound: Float64[np.ndarray, " frames"], *, sample_rate: float) -> 
     return begin + int(np.argmax(level[begin : swing + 1] >= threshold))
 
 
-def find_second_blow(
+def find_second_impact(
     sound: Float64[np.ndarray, " frames"], onset: int, *, sample_rate: float, seconds: float
 ) -> int | None:
     """Return the sample, within half a window, at which the object was struck again within `seconds`, or None.
 
-    A blow excites all modes at once, where beating doublets raise a few: so in windows of 10 ms (at least 64
-    samples) the median rise over the bins that the first blow excited (to within 20 dB of the strongest), against the
+    An impact excites all modes at once, where beating doublets raise a few: so in windows of 10 ms (at least 64
+    samples) the median rise over the bins that the first impact excited (to within 20 dB of the strongest), against the
     loudest of the three windows before, must reach 6 dB; and the energy that comes new into these bins must be more
-    than -26 dB of the first blow's, for a clack of the hammer's handle or a noise in the room lies between the modes.
+    than -26 dB of the first impact's, for a clack of the hammer's handle or a noise in the room lies between the modes.
     A bounce within two windows of the first touch is not told from it: that takes a force channel.
     """
     size = max(64, round(0.01 * sample_rate))
@@ -111,7 +112,7 @@ def find_second_blow(
         before = power[max(0, frame - 16) : frame - 3].max(axis=0)
         rise = np.median((power[frame] + floor) / (before + floor))
         brought = np.maximum(power[frame] - before, 0).sum() / first.sum()
-        if rise > RISE_OF_SECOND_BLOW and brought > ENERGY_OF_SECOND_BLOW:
+        if rise > RISE_OF_SECOND_IMPACT and brought > ENERGY_OF_SECOND_IMPACT:
             return onset + frame * hop + size // 2
     return None
 

@@ -78,19 +78,21 @@ def contacts_at(
     )
 
 
-def read_contacts(path: Path, *, meters: float) -> Contacts:
+def read_contacts(path: Path, *, meters: float, named: bool = False) -> Contacts:
     """Read a table with the columns x, y, z and perhaps file, nx, ny and nz, such as a capture's impacts.csv.
 
-    Other columns are listed as `unused`. Sounds are named by the column `file`, else by number. Raises `CaptureError`
-    with the line at fault as `row`, counted from 1 with the header, as in all tables.
+    Other columns are listed as `unused`. Sounds are named by the column `file`, else by number; with `named`, a table
+    without that column is refused. Raises `CaptureError` with the line at fault as `row`, counted from 1 with the
+    header, as in all tables.
     """
     lines, separator = read_cells(path)
     header = [name.lower() for name in lines[0][1]] if lines else []
-    missing = [name for name in _COLUMNS if name not in header]
+    missing = [name for name in ("file", *_COLUMNS)[not named :] if name not in header]
     if missing or len(lines) < 2:
         lacking = f"no column {missing[0]}" if missing else "no row"
+        columns = "file,x,y,z" if named else "x,y,z (and optionally file)"
         raise CaptureError(
-            f"{path}: expected a header with x,y,z (and optionally file) and one row for each impact, got {lacking}",
+            f"{path}: expected a header with {columns} and one row for each impact, got {lacking}",
             file=path,
             row=lines[0][0] if lines else None,
             name=missing[0] if missing else None,
@@ -112,6 +114,19 @@ def read_contacts(path: Path, *, meters: float) -> Contacts:
     located = torch.tensor(places, dtype=torch.float64) * meters
     unused = tuple(name or "(no name)" for name in header if name not in ("file", *_COLUMNS, *_NORMALS))
     return Contacts(located, tuple(names), known, table=path, lines=numbers, unused=unused)
+
+
+def row_of(contacts: Contacts, recording: Path) -> int | None:
+    """Return the row of a table that names a recording: by the file's name, and by its folders if several rows do.
+
+    None where no row does, or none alone.
+    """
+    whole = recording.resolve()
+    sound = whole if whole.suffix.lower() == ".wav" else whole.with_name(f"{whole.name}.wav")
+    rows = [row for row, name in enumerate(contacts.names) if PurePosixPath(name).name == sound.name]
+    if len(rows) > 1:
+        rows = [row for row in rows if sound.as_posix().endswith(f"/{contacts.names[row]}")]
+    return rows[0] if len(rows) == 1 else None
 
 
 def refuse_far(contacts: Contacts, field: SoundField, *, advice: str = "") -> None:

@@ -1,9 +1,11 @@
 """`avmsf locate`: contacts of recorded impacts, as text, heat maps and point clouds."""
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from statistics import mean, median
 from typing import Any
 
 import torch
@@ -14,7 +16,8 @@ from avmsf.bench.contactpictures import draw_contact, write_contact_cloud
 from avmsf.bench.pictures import save_picture
 from avmsf.capture import CaptureSettings
 from avmsf.capture.audio import Recording, read_recording
-from avmsf.cli.contacts import Contacts, refuse_far
+from avmsf.capture.settings import METRES
+from avmsf.cli.contacts import Contacts, read_contacts, refuse_far, row_of
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.locate import RECORDING, Options
 from avmsf.cli.printing import console, figure, next_command, print_json, say
@@ -22,11 +25,11 @@ from avmsf.errors import AvmsfError, LocationError
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.localization.contact_map import ContactMap, not_located, symmetries_of
+from avmsf.localization.likelihood import Force
+from avmsf.localization.locate import locate
+from avmsf.localization.locator import Locator
+from avmsf.localization.multi_impact import locate_impacts
 from avmsf.scene.symmetry import Symmetries
-from avmsf.tasks.locate import locate
-from avmsf.tasks.locator import Locator
-from avmsf.tasks.multi_impact import locate_impacts
-from avmsf.tasks.posterior import Force
 
 UNLOCATED = 2
 """The exit code where a recording could not be located."""
@@ -37,7 +40,7 @@ def run(options: Options) -> int:
     settings = None if options.settings is None else CaptureSettings.read(options.settings)
     force = None if options.force is None else Force(options.force)
     known = _Known(load(options.field))
-    truth = _true_contact(options, known.field)
+    truths = _true_contacts(options, known.field)
     say("preparing the gains over the surface and their posterior, once a run (seconds to minutes)")
     screen = console(errors=options.json)
     quality = known.field.quality
@@ -57,13 +60,17 @@ def run(options: Options) -> int:
             failures.append({"recording": str(path), "error": " ".join(str(error).split())})
             say(f"avmsf locate: {failures[-1]['error']}")
             continue
+        truth = None if truths is None else _true_contact(truths, path)
         for values, contact in answers:
             if truth is not None and contact is not None:
-                values |= _error(contact, truth)
+                values |= _error(contact, truth, options.probability)
             screen.print(_words(values), soft_wrap=True)
             if contact is not None and options.output is not None:
                 values |= _draw(contact, options.output, _name(path, taken), values, truth)
             found.append(values)
+    summary = _summary(found)
+    if summary is not None:
+        screen.print(summary, soft_wrap=True)
     next_command("avmsf suggest", options.field)
     if options.json:
         print_json({"field": str(options.field), "quality": verdict, "impacts": found, "failures": failures})
@@ -115,25 +122,56 @@ def _impacts(
     return [(None, found)]
 
 
-def _true_contact(options: Options, field: SoundField) -> Float64[Tensor, " 3"] | None:
-    """Return the true contact. Raises OutputError where it is far from the object, as in another unit."""
-    if options.true_contact is None:
+def _true_contacts(options: Options, field: SoundField) -> Contacts | None:
+    """Return the true contacts, if any. Raises OutputError for one far from the object, as in another unit."""
+    meters = METRES[options.unit]
+    if options.true_contact_table is not None:
+        contacts = read_contacts(options.true_contact_table, meters=meters, named=True)
+    elif options.true_contact is not None:
+        place = torch.tensor([options.true_contact], dtype=torch.float64) * meters
+        contacts = Contacts(place, ("true",), option="--true-contact")
+    else:
         return None
-    place = torch.tensor(options.true_contact, dtype=torch.float64)
-    refuse_far(Contacts(place[None], ("true",), option="--true-contact"), field)
-    return place
+    refuse_far(contacts, field)
+    return contacts
 
 
-def _error(contact: ContactMap, truth: Float64[Tensor, " 3"]) -> dict[str, Any]:
+def _true_contact(contacts: Contacts, recording: Path) -> Float64[Tensor, " 3"] | None:
+    """Return a recording's true contact; where a table does not have it, note that."""
+    row = 0 if contacts.table is None else row_of(contacts, recording)
+    if row is None:
+        say(f"note: {contacts.table}: expected one row for {recording}, got none; its distance is not known")
+        return None
+    return contacts.places[row]
+
+
+def _error(contact: ContactMap, truth: Float64[Tensor, " 3"], level: float) -> dict[str, Any]:
     """Return how far the most probable contact is from the true one, and both estimates relative to the diagonal.
 
-    `rmed` is of the point of least cosine distance, as in `avmsf evaluate localize`.
+    `rmed` is of the point of least cosine distance, as in `avmsf evaluate localize`; `in_region` says whether the
+    credible region contains the true contact.
     """
     diagonal = float((contact.points.amax(0) - contact.points.amin(0)).norm())
     places = (contact.points[int(contact.distance.argmin())], contact.position)
     cosine, likely = (float((place.double() - truth).norm()) for place in places)
     relative = {"rmed": cosine / diagonal, "rmed_posterior": likely / diagonal}
-    return {"true_contact": truth.tolist(), "error": likely, **relative}
+    inside = {"in_region": contact.contains(truth, level)}
+    return {"true_contact": truth.tolist(), "error": likely, **relative, **inside}
+
+
+def _summary(impacts: Sequence[dict[str, Any]]) -> str | None:
+    """Return one line on all located impacts of known contacts; None where it is known of one at most."""
+    known = [each for each in impacts if "error" in each]
+    if len(known) < 2:
+        return None
+    rmed, posterior = (100 * mean(each[name] for each in known) for name in ("rmed", "rmed_posterior"))
+    inside = sum(each["in_region"] for each in known)
+    return (
+        f"{len(known)} located impacts of known contacts: median distance "
+        f"{1000 * median(each['error'] for each in known):.1f} mm, RMED {posterior:.1f} % ({rmed:.1f} % by cosine "
+        f"distance), {inside} of {len(known)} true contacts within the "
+        f"{100 * known[0]['credible_region']['probability']:g} % region"
+    )
 
 
 def _describe(name: str, seconds: float | None, contact: ContactMap, known: _Known, level: float) -> dict[str, Any]:
@@ -156,7 +194,11 @@ def _words(values: dict[str, Any]) -> str:
     ]
     if "rmed" in values:
         error, share = 1000 * values["error"], 100 * values["rmed_posterior"]
-        lines.append(f"  {error:.1f} mm from the true contact ({share:.1f} % of the diagonal)")
+        side = "within" if values["in_region"] else "outside"
+        lines.append(
+            f"  {error:.1f} mm from the true contact ({share:.1f} % of the diagonal), which is {side} the "
+            f"{100 * region['probability']:g} % region"
+        )
     if values["multimodal"]:
         lines.append("  ambiguous: there are other possible positions")
     lines += [f"  {other['message']}" for other in values["equivalent_points"]]

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from avmsf.field.config import GainModel
     from avmsf.field.suggest import Suggestions
     from avmsf.localization.contact_map import ContactMap
+    from avmsf.localization.preprocess import Sound
     from avmsf.scene.features import FeatureField
-    from avmsf.tasks.hearing import Sound
 
 SUPPORTING = "supporting_poles"
 """What a report calls the rows of the bank's poles that are no modes of the object."""
@@ -273,7 +273,7 @@ class SoundField:
         `progress`, the standard error says so. `avmsf.locate` takes more arguments. Raises LocationError for a
         recording that is silent or too short.
         """
-        from avmsf.tasks.locate import locate
+        from avmsf.localization.locate import locate
 
         return locate(self, recording, sample_rate=sample_rate, progress=progress)
 

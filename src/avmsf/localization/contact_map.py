@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from avmsf._utils.arrays import ArrayLike, as_floats, as_vectors
 from avmsf._utils.summary import short_repr
 from avmsf.errors import AvmsfError, LocationError
 from avmsf.field.soundfield import SoundField
@@ -141,8 +142,8 @@ class ContactMap:
     notes: tuple[str, ...] = field(default=())
     """What a user should know about the recording, in sentences."""
     evidence: float = math.inf
-    """Log Bayes factor of an impact somewhere on the object against noise (see `avmsf.tasks.posterior`): 0 where both
-    explain the sound's gains equally well."""
+    """Log Bayes factor of an impact somewhere on the object against noise (see `avmsf.localization.likelihood`): 0
+    where both explain the sound's gains equally well."""
     refusal: str | None = None
     """Why the recording was rejected, as that of another object; None if it was located."""
 
@@ -184,6 +185,14 @@ class ContactMap:
         inside = torch.zeros(len(self.points), dtype=torch.bool)
         inside[order[before < level]] = True
         return inside
+
+    def contains(self, contact: ArrayLike, level: float = LEVEL) -> bool:
+        """Return whether `region` contains the point that is nearest to a contact, [3], object frame, meters.
+
+        Raises ArrayError for what is no position.
+        """
+        position = as_vectors(as_floats(contact, "contact")[None], "contact")[0].double()
+        return bool(self.region(level)[(self.points.double() - position).norm(dim=1).argmin()])
 
     def credible_radius(self, level: float = LEVEL) -> float:
         """Return the distance from `position` within which the contact lies with a probability of `level`, meters."""

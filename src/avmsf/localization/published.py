@@ -35,8 +35,8 @@ class PublishedLocator:
         The sound starts where the field's training sounds do and has their sample rate. Raises LocationError where no
         mode of the field is found in it.
         """
-        heard = sound.detach().cpu()[None, : self.field.samples]
-        recorded = ShortTime().gains(heard, self.field.bank, self.field.sample_rate)[0]
+        given = sound.detach().cpu()[None, : self.field.samples]
+        recorded = ShortTime().gains(given, self.field.bank, self.field.sample_rate)[0]
         if not bool(recorded.any()):
             raise LocationError.expected(
                 "one of the field's modes", name="sound", advice="record the impact louder, or with less noise"

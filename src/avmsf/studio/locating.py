@@ -17,10 +17,10 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import RecordingLengthError
 from avmsf.field.soundfield import SoundField
 from avmsf.localization.contact_map import LEVEL, ContactMap, enlarged, symmetries_of
+from avmsf.localization.locator import Locator
+from avmsf.localization.multi_impact import locate_impacts
 from avmsf.scene.symmetry import Symmetries
 from avmsf.studio.refusal import RefusedError
-from avmsf.tasks.locator import Locator
-from avmsf.tasks.multi_impact import locate_impacts
 
 
 class Likeness:

@@ -1,4 +1,4 @@
-"""Uses of a sound field: localization of impacts and editing."""
+"""Editing of a sound field."""
 
 import lazy_loader
 

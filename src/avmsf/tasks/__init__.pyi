@@ -2,14 +2,8 @@ from .config import DistillationConfig as DistillationConfig
 from .config import GuidedEditConfig as GuidedEditConfig
 from .distillation import DecoderDistillation as DecoderDistillation
 from .guided import edit_towards as edit_towards
-from .locate import locate as locate
-from .locator import Locator as Locator
 from .material import change_material as change_material
 from .materialstatistics import MaterialStatistics as MaterialStatistics
 from .modes import adjust_modes as adjust_modes
-from .multi_impact import locate_impacts as locate_impacts
-from .posterior import Force as Force
 from .reference import Reference as Reference
 from .stableaudio import StableAudio as StableAudio
-from .streaming import LocatedImpact as LocatedImpact
-from .streaming import StreamingLocalizer as StreamingLocalizer

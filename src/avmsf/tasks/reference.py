@@ -13,8 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.capture.audio import read_recording
-from avmsf.capture.blow import clipping, expect_sudden
-from avmsf.capture.onset import find_second_blow
+from avmsf.capture.impulse_checks import check_impulsive, find_clipping
+from avmsf.capture.onset import find_second_impact
 from avmsf.capture.prepare import prepare, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import AvmsfWarning, CaptureError, EditError
@@ -144,13 +144,13 @@ def read_clip(path: Path, *, sample_rate: float) -> Float[Tensor, " samples"]:
         strongest = int(np.argmax(np.var(recording.channels, axis=1)))
         mono = replace(recording, channels=recording.channels[strongest : strongest + 1])
         prepared = prepare(mono, CaptureSettings())
-        expect_sudden(mono.response(), sample_rate=mono.sample_rate, name=mono.name)
+        check_impulsive(mono.response(), sample_rate=mono.sample_rate, name=mono.name)
     except CaptureError as error:
         raise EditError(f"reference {error}", **{**error.attributes, "file": path}) from error
     sound, rate = prepared.sound, mono.sample_rate
-    clipped = clipping(mono.response(), name=mono.name)
+    clipped = find_clipping(mono.response(), name=mono.name)
     notes = [] if clipped is None else [AvmsfWarning(clipped, file=path, name="clipping")]
-    second = find_second_blow(sound, 0, sample_rate=rate, seconds=len(sound) / rate)
+    second = find_second_impact(sound, 0, sample_rate=rate, seconds=len(sound) / rate)
     if second is not None:
         at = (prepared.onset / rate, (prepared.onset + second) / rate)
         notes.append(

@@ -44,6 +44,14 @@ def alike(points: torch.Tensor) -> Sites:
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_kernels_are_loadings_times_factors(kind):
+    family, known, others = made(kind, impacts(6, seed=1)), impacts(4, seed=3), impacts(9, seed=2)
+    rows = every(family).flip(0)
+    found = family.factors(others, known) @ family.loadings(known, rows).mT
+    assert torch.allclose(found, family.between(others, known, rows), rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("count", [4, 12])
 def test_kernels_are_covariances_everywhere(kind, count):
     """Symmetric and positive semidefinite among the reference impacts and any others together."""

@@ -119,6 +119,11 @@ def weighed(values: torch.Tensor, floor: torch.Tensor, given: Hypotheses) -> Ker
     return replace(found, kernels=given.kernels, weights=weights)
 
 
+def spread_of(given: KernelMixture, cross: torch.Tensor, own: torch.Tensor) -> torch.Tensor:
+    """Return the standard deviation at places of these covariances with the contacts, and variances."""
+    return given.spread(own, torch.einsum("hpc,hcs->ps", cross, given.solve()), given.explained(cross))
+
+
 def test_evidence_is_the_textbook_one():
     values, floor, _ = drawn()
     found = log_evidence(*(torch.from_numpy(each.copy()) for each in (among(), values, floor)))
@@ -158,13 +163,22 @@ def test_evidence_does_not_depend_on_the_batches(monkeypatch):
 def test_mean_and_spread_are_those_of_the_sum_over_hypotheses():
     joint = torch.from_numpy(joint_kernels().copy())
     cross, own = joint[:, CONTACTS:, :CONTACTS], torch.diagonal(joint, dim1=1, dim2=2)[:, CONTACTS:]
-    mean, spread = torch.einsum("hpc,hcs->ps", cross, mixture().solve()), mixture().spread(cross, own)
+    mean, spread = torch.einsum("hpc,hcs->ps", cross, mixture().solve()), spread_of(mixture(), cross, own)
     for series in range(SERIES):
         expected = textbook_prediction(
             list(range(CONTACTS)), list(range(CONTACTS, CONTACTS + PLACES)), series, noise=False
         )
         assert mean[:, series].numpy() == pytest.approx(expected[0], rel=1e-8, abs=1e-10)
         assert spread[:, series].numpy() == pytest.approx(expected[1], rel=1e-6)
+
+
+def test_covariances_of_few_factors_explain_as_much_by_their_quadratic_forms():
+    generator = torch.Generator().manual_seed(4)
+    loadings = torch.randn(KERNELS - 1, CONTACTS, 3, generator=generator, dtype=torch.float64)
+    factors = torch.randn(PLACES, 3, generator=generator, dtype=torch.float64)
+    forms = mixture().explained_forms(range(1, KERNELS), lambda rows: loadings[rows])
+    found = torch.einsum("pf,sfg,pg->ps", factors, forms, factors)
+    assert torch.allclose(found, mixture().explained(factors @ loadings.mT, 1), rtol=1e-9)
 
 
 def test_the_prior_of_the_scale_is_integrated_over():
@@ -381,7 +395,7 @@ def test_scaled_values_scale_mean_and_deviation(factor):
     assert torch.allclose(other.weights, one.weights, rtol=1e-8)
     pairs = [
         (other.solve(), factor * one.solve()),
-        (other.spread(cross, own), abs(factor) * one.spread(cross, own)),
+        (spread_of(other, cross, own), abs(factor) * spread_of(one, cross, own)),
         (other.standard_error(), abs(factor) * one.standard_error()),
         (other.leave_out(GROUPS)[0], factor * one.leave_out(GROUPS)[0]),
         (other.leave_out(GROUPS)[1], abs(factor) * one.leave_out(GROUPS)[1]),

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from avmsf.capture.places import SAME_PLACE, places_of
+from avmsf.field.gains import model as module
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import fit_mixture
 from avmsf.field.gains.mixture import NOISE_SHARES
@@ -74,6 +75,23 @@ def test_mean_and_deviation_are_those_of_all_hypotheses(elastic):
     assert torch.allclose(series_of(gains_at(given)), mean, rtol=1e-5, atol=1e-6)
     found = deviation_at(given)
     assert torch.allclose(torch.cat([found[..., 0], found[..., 1]], dim=1), deviation, rtol=1e-4, atol=1e-6)
+
+
+def undecided() -> MixtureGains:
+    """Return the model in which every kernel of all families has a weight."""
+    given = model()
+    kept = tuple(torch.arange(len(family.shares)) for family in given.families)
+    kernels = torch.cat([family.kernels() for family in given.families])
+    weights = 0.5 + draw(len(kernels), len(NOISE_SHARES), 2 * MODES, seed=8)
+    mixture = replace(given.mixture, kernels=kernels, weights=weights / weights.sum((0, 1)))
+    return replace(given, kept=kept, mixture=mixture)
+
+
+def test_the_deviation_does_not_depend_on_how_it_is_computed(monkeypatch):
+    """Neither on the batches, nor on whether few factors stand for many kernels."""
+    whole, other = deviation_at(undecided()), undecided()
+    monkeypatch.setattr(module, "_MEMORY", 0)
+    assert torch.allclose(deviation_at(other), whole, rtol=1e-6, atol=1e-9)
 
 
 def torn() -> MixtureGains:

@@ -8,8 +8,8 @@ from typing import Annotated
 import tyro
 
 from avmsf.cli.options.checks import OutputError
-from avmsf.cli.options.common import Flag, Printing, parse_options
-from avmsf.cli.options.paths import Existing, FieldFile, OutputFolder, SettingsFile
+from avmsf.cli.options.common import Flag, Printing, Unit, parse_options
+from avmsf.cli.options.paths import ContactTable, Existing, FieldFile, OutputFolder, SettingsFile
 from avmsf.errors import AvmsfError
 
 RECORDING = Existing("a recording", ("a recording",))
@@ -37,8 +37,13 @@ class Options(Printing):
     probability: float = 0.9
     """Probability that the contact lies within the region that is reported."""
     true_contact: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
-    """True contact of every impact, in meters: its distance is printed, and the heat maps mark it red and the located
-    one blue."""
+    """True contact of every impact: its distance is printed, and whether it lies within the region; the heat maps mark
+    it red and the located one blue."""
+    true_contact_table: ContactTable = None
+    """The same of each recording, by its file name: a table with the columns file,x,y,z, such as a capture's
+    impacts.csv."""
+    unit: Unit = "m"
+    """Unit of --true-contact and --true-contact-table. A field itself is in meters, whatever unit its capture has."""
     output: OutputFolder = None
     """Folder for a heat map and a colored point cloud of every impact, NAME.png and NAME.ply."""
 
@@ -58,6 +63,12 @@ class Options(Printing):
                 failures.append(error)
         if len(failures) == len(self.recordings):
             raise failures[0]
+        if self.true_contact is not None and self.true_contact_table is not None:
+            raise OutputError(
+                "expected true contacts either by --true-contact X Y Z or by --true-contact-table TABLE.csv, got both",
+                name="--true-contact",
+                value=list(self.true_contact),
+            )
         if not 0.0 < self.probability < 1.0:
             raise OutputError.expected(
                 "a probability between 0 and 1, such as 0.9", self.probability, name="--probability"

@@ -78,7 +78,7 @@ class Elastic(KernelFamily):
         self.modes = replace(modes, shapes=modes.shapes.float().double(), perturbations=None)
         self.frequency_weights = torch.softmax(frequency_log_prior(), dim=0)
         """Probability of each pair of `FACTORS` and `FREQUENCY_ERRORS`, the pairs of one factor in a row."""
-        self._latest: tuple[Sites, Float64[Tensor, "sites shapes"]] | None = None
+        self._latest: tuple[tuple[Sites, Float64[Tensor, "sites shapes"]], ...] = ()
         self._reach = torch.tensor([REACH * size], dtype=torch.float64)
         apart = torch.log(modes.frequency[:, None] / modes.frequency)
         profiles = [1.0 / (1.0 + (2.0 * apart / tau).square()) for tau in PERTURBATIONS]
@@ -111,6 +111,15 @@ class Elastic(KernelFamily):
         for row, share in enumerate(shares[:, :-1]):
             found[row] += (one * share) @ other.T
         return found
+
+    def factors(self, sites: Sites, known: Sites) -> Float64[Tensor, "sites factors"]:
+        """Return the components of each shape, and the remainder's kernel with each known impact."""
+        return torch.cat([self._along(sites), self._remainder(sites, known)], dim=1)
+
+    def loadings(self, known: Sites, kept: Int[Tensor, " kept"]) -> Float64[Tensor, "kept known factors"]:
+        """Return the components of each shape at the known impacts, and one for each of these, times their shares."""
+        shares, one = self.shares[kept][:, None], torch.eye(len(known), dtype=torch.float64)
+        return torch.cat([shares[..., :-1] * self._along(known), shares[..., -1:] * one], dim=2)
 
     def mean(
         self, sites: Sites, known: Sites, coefficients: Float64[Tensor, "basis contacts series"]
@@ -220,11 +229,13 @@ class Elastic(KernelFamily):
     def _along(self, sites: Sites) -> Float64[Tensor, "sites shapes"]:
         if sites is self.reference:
             return self._known
-        # Covariances ask for the same impacts once for each mode.
+        # Covariances ask for the same impacts, and the same known ones, once for each mode.
         latest = self._latest
-        if latest is None or latest[0] is not sites:
-            self._latest = latest = (sites, self.modes.gains(sites.points, sites.directions))
-        return latest[1]
+        found = next((along for known, along in latest if known is sites), None)
+        if found is None:
+            found = self.modes.gains(sites.points, sites.directions)
+            self._latest = (*latest[-1:], (sites, found))
+        return found
 
     def _remainder(self, sites: Sites, others: Sites) -> Float64[Tensor, "sites others"]:
         return squared_exponential(sites.points, others.points, self._reach)[0] * sites.cosine(others)

@@ -131,6 +131,15 @@ class KernelFamily(ABC):
         """Return some kernels between two sets of impacts."""
         return torch.einsum("hb,bso->hso", self.shares[kept], self.basis(sites, others))
 
+    def factors(self, sites: Sites, known: Sites) -> Float64[Tensor, "sites factors"]:
+        """Return what the covariances of all kernels with known impacts are linear in: the basis with each."""
+        return self.basis(sites, known).permute(1, 2, 0).flatten(1)
+
+    def loadings(self, known: Sites, kept: Int[Tensor, " kept"]) -> Float64[Tensor, "kept known factors"]:
+        """Return the matrices by which the factors of impacts give some kernels between these and known impacts."""
+        one = torch.eye(len(known), dtype=torch.float64)
+        return (one[:, :, None] * self.shares[kept][:, None, None]).flatten(2)
+
     def own(self, sites: Sites, kept: Int[Tensor, " kept"]) -> Float64[Tensor, "kept sites"]:
         """Return some kernels of each impact with itself."""
         return self.shares[kept] @ self.diagonal(sites)

@@ -32,9 +32,10 @@ whose probabilities maximize the summed evidence with a pseudo-count. Within a c
 to series. So a series whose few values say little borrows from the others (MacKay, Neural Computation 4, 1992).
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float64, Int
@@ -73,6 +74,27 @@ class Hypotheses:
     """Probability of each category, summing to one."""
     log_prior: Float64[Tensor, "kernels series"]
     """Log probability of each kernel within its category, for each series."""
+
+
+class _Pairs(NamedTuple):
+    """Hypotheses, each of one series: a kernel and a noise share."""
+
+    kernel: Int[Tensor, " pairs"]
+    series: Int[Tensor, " pairs"]
+    weight: Float64[Tensor, " pairs"]
+    variance: Float64[Tensor, " pairs"]
+    """v."""
+    inverse: Float64[Tensor, "pairs contacts"]
+    """1 / (lambda + v)."""
+    solved: Float64[Tensor, "pairs contacts"]
+    """U' C^-1 y."""
+    quadratic: Float64[Tensor, " pairs"]
+    """Q."""
+    scale: Float64[Tensor, " pairs"]
+    """s^2."""
+
+    def take(self, rows: Int[Tensor, " rows"] | slice) -> "_Pairs":
+        return _Pairs(*(each[rows] for each in self))
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,12 +163,14 @@ class KernelMixture:
 
     def solve(self) -> Float64[Tensor, "kernels contacts series"]:
         """Return the sum over noise shares of weight times C^-1 y: a mean at a place is k' times it, over kernels."""
-        return self.eigen[1] @ self._averaged[0]
+        pairs = self._pairs
+        averaged = self.projected.new_zeros(len(self.kernels), self.values.shape[1], len(self.values))
+        averaged.index_put_((pairs.kernel, pairs.series), pairs.weight[:, None] * pairs.solved, accumulate=True)
+        return self.eigen[1] @ averaged.mT
 
     def standard_error(self) -> Float64[Tensor, " series"]:
         """Return the standard deviation of the noise in each value."""
-        scale = self.quadratic / len(self.values)
-        return (self.weights * scale * self.noise_variance).sum((0, 1)).sqrt()
+        return self._summed(self._pairs.weight * self._pairs.scale * self._pairs.variance).sqrt()
 
     def smoother(self) -> Float64[Tensor, "series contacts contacts"]:
         """Return the matrix of each series by which the mean at the contacts is linear in the values there."""
@@ -176,51 +200,82 @@ class KernelMixture:
         for group in torch.unique(groups).tolist():
             rows = torch.nonzero(groups == group).flatten()
             weights, error, variance = self._left_out(rows)
-            middle = torch.einsum("hqs,hqks->ks", weights, error)
-            square = torch.einsum("hqs,hqks->ks", weights, variance + error.square())
-            mean[rows] = self.values[rows] - middle
-            deviation[rows] = (square - middle.square()).clamp_min(_TINY).sqrt()
+            middle = self._summed(weights[:, None] * error)
+            square = self._summed(weights[:, None] * (variance + error.square()))
+            mean[rows] = self.values[rows] - middle.T
+            deviation[rows] = (square - middle.square()).clamp_min(_TINY).sqrt().T
         return mean, deviation
 
     def _left_out(self, rows: Int[Tensor, " rows"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the weights without the rows' values, and each hypothesis's errors and variances of these.
+        """Return the weights of the `_pairs` without the rows' values, and their errors and variances of these.
 
-        The shapes are (kernels, noises, series), and twice (kernels, noises, rows, series).
+        The shapes are (pairs,), and twice (pairs, rows).
         """
-        count, left = len(self.values), max(len(self.values) - len(rows), 1)
-        along = self.eigen[1][:, rows]
-        logs, errors, variances = [], [], []
-        for noise, inverse in enumerate(self._inverses()):
-            solved = torch.einsum("hkn,hns->hsk", along, self.projected * inverse)
-            block = torch.einsum("hkn,hns,hln->hskl", along, inverse, along)
-            covariance = torch.linalg.inv(block)
-            error = torch.einsum("hskl,hsl->hsk", covariance, solved)
-            quadratic = self.quadratic[:, noise].clamp_min(_TINY)
-            rest = (quadratic - (error * solved).sum(2)).clamp_min(_TINY)
-            change = count * quadratic.log() - left * rest.log() - torch.logdet(block)
-            logs.append(self.weights[:, noise].log() + 0.5 * change)
-            errors.append(error.mT)
-            variances.append((rest[..., None] / left * torch.diagonal(covariance, dim1=2, dim2=3)).mT)
-        joint = torch.stack(logs, dim=1)
-        weights = torch.softmax(joint.flatten(0, 1), dim=0).reshape(joint.shape)
-        return weights, torch.stack(errors, dim=1), torch.stack(variances, dim=1)
+        count, left, pairs = len(self.values), max(len(self.values) - len(rows), 1), self._pairs
+        along = self.eigen[1][pairs.kernel[:, None], rows]
+        solved = torch.einsum("pkn,pn->pk", along, pairs.solved)
+        block = (along * pairs.inverse[:, None]) @ along.mT
+        covariance = torch.linalg.inv(block)
+        error = torch.einsum("pkl,pl->pk", covariance, solved)
+        rest = (pairs.quadratic - (error * solved).sum(1)).clamp_min(_TINY)
+        change = count * pairs.quadratic.clamp_min(_TINY).log() - left * rest.log() - torch.logdet(block)
+        logs = pairs.weight.log() + 0.5 * change
+        highest = torch.full((self.values.shape[1],), -torch.inf, dtype=torch.float64)
+        highest.scatter_reduce_(0, pairs.series, logs, "amax")
+        weights = (logs - highest[pairs.series]).exp()
+        weights = weights / self._summed(weights)[pairs.series]
+        return weights, error, rest[:, None] / left * torch.diagonal(covariance, dim1=1, dim2=2)
+
+    def explained(
+        self, cross: Float64[Tensor, "some places contacts"], first: int = 0
+    ) -> Float64[Tensor, "places series"]:
+        """Return the sum over hypotheses of weight times (k' C^-1 y)^2 - s^2 k' C^-1 k, of kernels from `first` on.
+
+        `cross` holds each of these kernels' covariances between places and contacts.
+        """
+        total = torch.zeros(cross.shape[1], self.values.shape[1], dtype=torch.float64)
+        for row, each in enumerate(cross, first):
+            pairs, along = self._pairs_of(row), each @ self.eigen[1][row]
+            found = (along @ pairs.solved.T).square_().sub_(along.square() @ (pairs.scale[:, None] * pairs.inverse).T)
+            total.index_add_(1, pairs.series, found.mul_(pairs.weight))
+        return total
+
+    def explained_forms(
+        self, kernels: range, loadings: Callable[[Int[Tensor, " some"]], Float64[Tensor, "some contacts factors"]]
+    ) -> Float64[Tensor, "series factors factors"]:
+        """Return for each series the symmetric matrix N by which `explained` of some kernels is z' N z.
+
+        A kernel's covariances between a place and the contacts are its loadings times the place's factors z. `loadings`
+        takes the numbers of kernels, counted from the first.
+        """
+        inside = (self._pairs.kernel >= kernels.start) & (self._pairs.kernel < kernels.stop)
+        forms = []
+        for series in range(self.values.shape[1]):
+            pairs = self._pairs.take(torch.nonzero(inside & (self._pairs.series == series)).flatten())
+            rows, place = torch.unique(pairs.kernel, return_inverse=True)
+            each = pairs.solved[:, :, None] * pairs.solved[:, None]
+            torch.diagonal(each, dim1=1, dim2=2).sub_(pairs.scale[:, None] * pairs.inverse)
+            middle = torch.zeros(len(rows), *each.shape[1:], dtype=torch.float64)
+            middle.index_add_(0, place, each.mul_(pairs.weight[:, None, None]))
+            along = self.eigen[1][rows].mT @ loadings(rows - kernels.start)
+            forms.append((middle @ along).flatten(0, 1).T @ along.flatten(0, 1))
+        return torch.stack(forms)
 
     def spread(
-        self, cross: Float64[Tensor, "kernels places contacts"], own: Float64[Tensor, "kernels places"]
+        self,
+        own: Float64[Tensor, "kernels places"],
+        mean: Float64[Tensor, "places series"],
+        explained: Float64[Tensor, "places series"],
     ) -> Float64[Tensor, "places series"]:
         """Return the standard deviation at places, within hypotheses and between them, without noise.
 
-        `cross` holds each kernel's covariances between places and contacts, `own` its variance at each place.
+        `own` is each kernel's variance at each place, `mean` the values' mean there, and `explained` that of all
+        kernels.
         """
-        scale = (self.weights * self.quadratic).sum(1) / len(self.values)
-        square = own.mT @ scale
-        mean = torch.zeros_like(square)
-        for row, (series, weights, solved) in enumerate(self._weighted):
-            along = cross[row] @ self.eigen[1][row]
-            mean.addmm_(along, self._averaged[0][row])
-            square.index_add_(1, series, (along @ solved).square_().mul_(weights))
-            square.addmm_(along.square_(), self._averaged[1][row], alpha=-1.0)
-        return (square - mean.square()).clamp_min(0.0).sqrt()
+        pairs = self._pairs
+        scale = torch.zeros(len(self.kernels), self.values.shape[1], dtype=torch.float64)
+        scale.index_put_((pairs.kernel, pairs.series), pairs.weight * pairs.scale, accumulate=True)
+        return (own.mT @ scale + explained - mean.square()).clamp_min(0.0).sqrt()
 
     def mean_magnitude(self, cross: Float64[Tensor, "kernels places contacts"]) -> Float64[Tensor, "places series"]:
         """Return the mean over hypotheses of the magnitude of each one's mean at places; `cross` as in `spread`."""
@@ -231,40 +286,42 @@ class KernelMixture:
         return found
 
     @cached_property
-    def _averaged(self) -> tuple[Tensor, Tensor]:
-        """The sums over noise shares of weight times U' C^-1 y, and of weight times s^2 / (lambda + v).
-
-        Both have the shape (kernels, contacts, series).
-        """
-        solved, reduced = torch.zeros_like(self.projected), torch.zeros_like(self.projected)
-        for row, inverse in enumerate(self._inverses()):
-            weights = self.weights[:, row, None]
-            solved += weights * inverse * self.projected
-            reduced += weights * self.quadratic[:, row, None] / len(self.values) * inverse
-        return solved, reduced
+    def _pairs(self) -> "_Pairs":
+        """The hypotheses of weight above zero of each series, by kernel: of many only a few have one."""
+        kernel, noise, series = torch.nonzero(self.weights, as_tuple=True)
+        variance = self.noise_variance[noise, series]
+        inverse = 1.0 / (self.eigen[0][kernel] + variance[:, None])
+        projected = self.projected[kernel, :, series]
+        quadratic = (projected.square() * inverse).sum(1)
+        weight, scale = self.weights[kernel, noise, series], quadratic / len(self.values)
+        return _Pairs(kernel, series, weight, variance, inverse, projected * inverse, quadratic, scale)
 
     @cached_property
-    def _weighted(self) -> list[tuple[Tensor, Tensor, Tensor]]:
-        """For each kernel the series and the weights above zero, and U' C^-1 y of each of these (contacts, pairs)."""
-        values, found = self.eigen[0], []
-        for row, weights in enumerate(self.weights):
-            noise, series = torch.nonzero(weights, as_tuple=True)
-            variance = values[row][:, None] + self.noise_variance[noise, series]
-            found.append((series, weights[noise, series], self.projected[row][:, series] / variance))
-        return found
+    def _ends(self) -> list[int]:
+        """Where the `_pairs` of each kernel begin, and where the last end."""
+        return torch.searchsorted(self._pairs.kernel, torch.arange(len(self.kernels) + 1)).tolist()
+
+    def _pairs_of(self, kernel: int) -> "_Pairs":
+        return self._pairs.take(slice(self._ends[kernel], self._ends[kernel + 1]))
+
+    def _summed(self, values: Float64[Tensor, "pairs *rest"]) -> Float64[Tensor, "series *rest"]:
+        """Return the sum over each series' `_pairs`."""
+        total = torch.zeros(self.values.shape[1], *values.shape[1:], dtype=torch.float64)
+        return total.index_add_(0, self._pairs.series, values)
 
     @cached_property
     def _padded(self) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
-        """Rows of some kernels, and their part of `_weighted` with C^-1 y for U' C^-1 y (kernels, contacts, pairs).
+        """Rows of some kernels, and the series, weights and C^-1 y (kernels, contacts, pairs) of their `_pairs`.
 
         Kernels with about as many pairs are together; those with fewer are filled with weights of zero.
         """
         found = []
-        order = sorted(range(len(self.weights)), key=lambda row: len(self._weighted[row][0]))
-        for rows in torch.split(torch.tensor(order), _TOGETHER):
-            series, weights, solved = zip(*(self._weighted[row] for row in rows.tolist()), strict=True)
-            full = pad_sequence([each.T for each in solved], batch_first=True).mT
-            which, weighed = (pad_sequence(list(each), batch_first=True) for each in (series, weights))
+        order = torch.argsort(torch.tensor(self._ends).diff(), stable=True)
+        for rows in torch.split(order, _TOGETHER):
+            pairs = [self._pairs_of(row) for row in rows.tolist()]
+            full = pad_sequence([each.solved for each in pairs], batch_first=True).mT
+            which = pad_sequence([each.series for each in pairs], batch_first=True)
+            weighed = pad_sequence([each.weight for each in pairs], batch_first=True)
             found.append((rows, which, weighed, self.eigen[1][rows] @ full))
         return found
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import torch
@@ -338,8 +338,29 @@ class MixtureGains:
         return mixture.leave_out(self.places)
 
     def _spread(self, sites: Sites) -> Float64[Tensor, "sites series"]:
-        pairs = zip(self.families, self.kept, strict=True)
-        return self.mixture.spread(self._cross(sites), torch.cat([family.own(sites, kept) for family, kept in pairs]))
+        own, first, explained = [], 0, torch.zeros(len(sites), self.mixture.values.shape[1], dtype=torch.float64)
+        for family, kept, forms in zip(self.families, self.kept, self._forms, strict=True):
+            own.append(family.own(sites, kept))
+            if forms is None:
+                explained += self.mixture.explained(family.between(sites, self.training, kept), first)
+            else:
+                factors = family.factors(sites, self.training)
+                explained += torch.stack([((factors @ form) * factors).sum(1) for form in forms], dim=1)
+            first += len(kept)
+        return self.mixture.spread(torch.cat(own), self._mean(sites), explained)
+
+    @cached_property
+    def _forms(self) -> list[Float64[Tensor, "series _factors _factors"] | None]:
+        """`KernelMixture.explained_forms` of each family; None where covariances are smaller or the memory is."""
+        found: list[Float64[Tensor, "series _factors _factors"] | None] = []
+        first = 0
+        for family, kept in zip(self.families, self.kept, strict=True):
+            rows, first = range(first, first + len(kept)), first + len(kept)
+            count = family.loadings(self.training, kept[:1]).shape[2]
+            small = count < len(kept) and self.mixture.values.shape[1] * count**2 <= _MEMORY
+            loadings = partial(_loadings, family, self.training, kept)
+            found.append(self.mixture.explained_forms(rows, loadings) if small else None)
+        return found
 
     def _mean(self, sites: Sites) -> Float64[Tensor, "sites series"]:
         pairs = zip(self.families, self._coefficients, strict=True)
@@ -391,6 +412,12 @@ def series_of(values: Complex128[Tensor, "contacts modes"]) -> Float64[Tensor, "
 def _complex(series: Float64[Tensor, "contacts series"]) -> Complex128[Tensor, "contacts modes"]:
     real, imaginary = series.chunk(2, dim=1)
     return torch.complex(real, imaginary)
+
+
+def _loadings(
+    family: KernelFamily, known: Sites, kept: Int[Tensor, " kept"], rows: Int[Tensor, " rows"]
+) -> Float64[Tensor, "rows contacts factors"]:
+    return family.loadings(known, kept[rows])
 
 
 def _gains(series: Float64[Tensor, "contacts series"]) -> Gains:

@@ -32,7 +32,7 @@ BETWEEN = (1.6, 0.35, 0.07, 0.015)
 INDEPENDENT = (0.25, 0.4)
 """Exponent of the tempered likelihood where a field's errors dominate: of a field that explains nothing of a sound even
 at its best point, and of one that explains all of it. Chosen on plates, where the 90 % region then held nine impacts in
-ten; elsewhere it held as few as four. So a field's own contacts calibrate it (`avmsf.tasks.heed`)."""
+ten; elsewhere it held as few as four. So a field's own contacts calibrate it (`avmsf.localization.tempering`)."""
 SHIFT_DEVIATION = 2e-4
 """Standard deviation of that, seconds."""
 _COARSE, _FINE = 0.9, 0.3
@@ -126,7 +126,7 @@ class Judgement:
     def tempering(self, explained: float, *, factor: float = 1.0) -> float:
         """Return the exponent of the tempered likelihood, where the likeliest point explains that part of the sound.
 
-        `factor` on `INDEPENDENT` is that of one field, as `avmsf.tasks.heed` measures it.
+        `factor` on `INDEPENDENT` is that of one field, as `avmsf.localization.tempering` measures it.
         """
         least, most = INDEPENDENT
         together = min(1.0, factor * (least + (most - least) * explained))
@@ -245,10 +245,10 @@ class _Trial:
         return torch.sort(torch.topk(match / size, count).indices).values
 
     def _turned(self, step: float) -> tuple[Float64[Tensor, " shifts"], Complex64[Tensor, "shifts modes"]]:
-        """Return the shifts of `delays_of` for what is heard, and the amplitudes turned back by each."""
+        """Return the shifts of `delays_of` for the amplitudes, and these turned back by each."""
         frequency = self.predicted.frequency
-        heard = self.weights.double() * self.values.abs().square()
-        shifts = delays_of(heard, frequency, step=step)
+        energy = self.weights.double() * self.values.abs().square()
+        shifts = delays_of(energy, frequency, step=step)
         back = torch.polar(torch.ones((), dtype=torch.float64), -2.0 * math.pi * shifts[:, None] * frequency)
         return shifts, (self.values * back).to(torch.complex64)
 
@@ -261,7 +261,7 @@ class _Trial:
         """Return the log of the likelihood of points, summed over misfits, the likeliest's force, and the shift."""
         steps, turned = self._turned(_FINE)
         prior = -0.5 * (steps / SHIFT_DEVIATION).square()
-        weighted, heard = self._weighted(turned), turned[0].abs().square()
+        weighted, energy = self._weighted(turned), turned[0].abs().square()
         evidence, forces, shifts = [], [], []
         for part in torch.split(rows, _BATCH):
             gains, power = self.predicted.gains[part], self.predicted.power[part]
@@ -273,7 +273,7 @@ class _Trial:
             tried = []
             for misfit in misfits:
                 error = torch.add(variance, power + self.predicted.usual, alpha=0.5 * misfit**2)
-                tried.append(self._weigh(cross, heard, power, error, self.strengths.forces(part, misfit)))
+                tried.append(self._weigh(cross, energy, power, error, self.strengths.forces(part, misfit)))
             found, strength = (torch.stack(each) for each in zip(*tried, strict=True))
             evidence.append(torch.logsumexp(found, 0) + prior[chosen].float())
             forces.append(strength.gather(0, found.argmax(0)[None])[0])
@@ -283,7 +283,7 @@ class _Trial:
     def _weigh(
         self,
         cross: Float32[Tensor, "rows modes"],
-        heard: Float32[Tensor, " modes"],
+        energy: Float32[Tensor, " modes"],
         power: Float32[Tensor, "rows modes"],
         error: Float32[Tensor, "rows modes"],
         squares: Float32[Tensor, " rows"],
@@ -296,7 +296,7 @@ class _Trial:
         match = torch.linalg.vecdot(weights, cross)
         own = torch.linalg.vecdot(weights, power).clamp_min(_TINY)
         strength = match / own
-        found = weights.log().sum(1) - weights @ heard + match * strength - 0.5 * own.log()
+        found = weights.log().sum(1) - weights @ energy + match * strength - 0.5 * own.log()
         if self.force is None:
             return found - 0.5 * squares.log(), strength
         size = strength.abs().clamp_min(_TINY)

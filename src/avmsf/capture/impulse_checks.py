@@ -8,11 +8,11 @@ from jaxtyping import Float64
 from avmsf.capture.audio import clipped_samples
 from avmsf.errors import CaptureError
 
-_SUDDEN = 10 ** (6.0 / 20.0)
+_MIN_RISE = 10 ** (6.0 / 20.0)
 """How far the loudest hundredth of a second must stand above the quietest, 6 dB: the least that an impact does."""
 
 
-def expect_sudden(sound: Float64[np.ndarray, " samples"], *, sample_rate: float, name: str) -> None:
+def check_impulsive(sound: Float64[np.ndarray, " samples"], *, sample_rate: float, name: str) -> None:
     """Raise `CaptureError` for a sound that neither rises nor falls: a hum, or noise.
 
     Sounds shorter than 80 ms are too short to tell.
@@ -23,7 +23,7 @@ def expect_sudden(sound: Float64[np.ndarray, " samples"], *, sample_rate: float,
     frames = sound[: len(sound) // size * size].reshape(-1, size)
     levels = np.sqrt(np.mean((frames - frames.mean(axis=1, keepdims=True)) ** 2, axis=1))
     loudest, quietest = float(levels.max()), float(np.quantile(levels, 0.1))
-    if loudest < _SUDDEN * quietest:
+    if loudest < _MIN_RISE * quietest:
         level = 20 * math.log10(loudest / quietest)
         raise CaptureError(
             f"{name}: expected an impact, its loudest 10 ms at least 6 dB above its quietest, got {level:.1f} dB; "
@@ -33,7 +33,7 @@ def expect_sudden(sound: Float64[np.ndarray, " samples"], *, sample_rate: float,
         )
 
 
-def clipping(response: Float64[np.ndarray, " frames"], *, name: str) -> str | None:
+def find_clipping(response: Float64[np.ndarray, " frames"], *, name: str) -> str | None:
     """Return a message on how much of a sound is clipped; None where nothing is."""
     clipped = clipped_samples(response)
     if not clipped:

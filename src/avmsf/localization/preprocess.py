@@ -13,8 +13,8 @@ from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_floats, as_rate
 from avmsf.capture.audio import Recording, read_recording
-from avmsf.capture.blow import clipping, expect_sudden
-from avmsf.capture.onset import Pulse, find_second_blow, find_second_push
+from avmsf.capture.impulse_checks import check_impulsive, find_clipping
+from avmsf.capture.onset import Pulse, find_second_impact, find_second_push
 from avmsf.capture.prepare import prepare, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.starts import latest_start
@@ -24,14 +24,14 @@ from avmsf.wording import counted
 
 Sound = str | Path | Recording | ArrayLike
 """The path of a sound file, a recording, or samples alone: [samples]."""
-_HELD = 0.9
+_USABLE_BANDWIDTH = 0.9
 """Part of half a sample rate up to which a recording of another rate still holds all of a sound."""
-_FINEST = 2000
+_MAX_RATIO_TERMS = 2000
 """Largest terms of the ratio between two rates."""
 
 
 @dataclass(frozen=True, eq=False)
-class Heard:
+class PreparedImpact:
     """One impact, prepared."""
 
     sound: Float32[Tensor, " samples"]
@@ -46,13 +46,13 @@ class Heard:
     """Peak force by the recording's force channel; None without one."""
 
 
-def hear(
+def preprocess_recording(
     recording: Sound,
     field: SoundField,
     *,
     sample_rate: float | int | None = None,
     settings: CaptureSettings | None = None,
-) -> Heard:
+) -> PreparedImpact:
     """Prepare a recorded impact for a field like the recordings that it was fitted to.
 
     By the settings of that capture, which the field stores, or by `settings`. The impact is searched for in all of the
@@ -72,8 +72,8 @@ def hear(
             # It starts with its impact as those did that the field was fitted to, which were not cut.
             prepared = prepare(whole, replace(chosen, align=False))
         # Of one channel all is used, the silence before the impact too.
-        heard = whole.response() if len(whole.channels) == 1 else prepared.sound
-        expect_sudden(heard, sample_rate=whole.sample_rate, name=whole.name)
+        samples = whole.response() if len(whole.channels) == 1 else prepared.sound
+        check_impulsive(samples, sample_rate=whole.sample_rate, name=whole.name)
     except CaptureError as error:
         raise location_error(error) from error
     # A pulse that was divided out took the force of the impact with it.
@@ -89,7 +89,7 @@ def hear(
         sound = sound[: max(second - begin, shortest_allowed(rate))]
     at_rate, highest, remark = at_field_rate(sound, whole, field, speed=chosen.playback_speed)
     newtons = None if prepared.pulse is None else abs(prepared.pulse.height * chosen.force_scale)
-    return Heard(at_rate, prepared.onset, highest, (*notes, *remark), newtons)
+    return PreparedImpact(at_rate, prepared.onset, highest, (*notes, *remark), newtons)
 
 
 def read_if_path(recording: Sound) -> Recording | ArrayLike:
@@ -189,7 +189,7 @@ def describe(recording: Recording, settings: CaptureSettings) -> list[str]:
         response = recording.response(settings.response_channel, force_channel=settings.force_channel)
     except CaptureError as error:
         raise location_error(error) from error
-    clipped = clipping(response, name=recording.name)
+    clipped = find_clipping(response, name=recording.name)
     return [] if clipped is None else [clipped]
 
 
@@ -203,7 +203,7 @@ def at_field_rate(
     own, rate = recording.sample_rate * speed, field.sample_rate
     if own == rate:
         return torch.from_numpy(sound.astype(np.float32)), None, []
-    highest = _HELD * 0.5 * min(own, rate)
+    highest = _USABLE_BANDWIDTH * 0.5 * min(own, rate)
     frequency = field.bank.frequency
     held = int((frequency < highest).sum())
     if not held:
@@ -214,7 +214,7 @@ def at_field_rate(
             name="sample_rate",
             value=own,
         )
-    ratio = Fraction(rate / own).limit_denominator(_FINEST)
+    ratio = Fraction(rate / own).limit_denominator(_MAX_RATIO_TERMS)
     resampled = scipy.signal.resample_poly(sound, ratio.numerator, ratio.denominator, padtype="line")
     note = f"{recording.name} was resampled from {own:g} Hz to the field's {rate:g} Hz"
     left_out = int((frequency < 0.5 * rate).sum()) - held
@@ -256,5 +256,5 @@ def _second(
     if pulse is not None and settings.force_channel is not None:
         force = recording.channel(settings.force_channel)
         return find_second_push(force, pulse, sample_rate=rate, seconds=seconds)
-    second = find_second_blow(sound, 0, sample_rate=rate, seconds=seconds)
+    second = find_second_impact(sound, 0, sample_rate=rate, seconds=seconds)
     return None if second is None else begin + second

@@ -9,15 +9,15 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
 from avmsf.field.soundfield import SoundField
 from avmsf.localization.contact_map import ContactMap
-from avmsf.tasks.hearing import Heard, Sound, hear
-from avmsf.tasks.locator import Locator
-from avmsf.tasks.posterior import Force
+from avmsf.localization.likelihood import Force
+from avmsf.localization.locator import Locator
+from avmsf.localization.preprocess import Sound, preprocess_recording
 
-STRANGE = 0.5
+REJECT_ABOVE = 0.5
 """Mismatch ratio (see `ContactMap`) above which a sound is taken for another object's."""
-DOUBTFUL = 0.3
+WARN_ABOVE = 0.3
 """The same, above which a note says that it may be."""
-UNLIKE = 0.1
+MIN_EXPLAINED = 0.1
 """Part of a sound's energy that an impact at the most probable position explains, below which a note is given."""
 SAME_FORCE = 1.41
 """Factor between a known force and the recorded one from which on a note is given: 3 dB, as `Force` is uncertain."""
@@ -39,12 +39,12 @@ def locate(
 
     `recording` is the path of a sound file, a Recording, or the samples of one channel. Bare samples are at
     `sample_rate` Hz, or at the field's rate. `settings` take the place of those of the capture that the field was
-    fitted to (see `hear`), `points` and `directions` as for `Locator.of`. `force` is the peak force of the impact, a
-    number or `Force`, see `Locator.locate`; a note says where the recording's own force channel differs. `locator` is
-    one made of the field before, with points of its own. That of the last field and its own points is cached, so that
-    of several recordings only the first waits for it. With `progress`, the standard error says that it works. The sound
-    of another object has a `refusal` in place of a position, see `judged`. Raises LocationError as `hear` and
-    `Locator.locate`, and for a locator of another field or given with points.
+    fitted to (see `preprocess_recording`), `points` and `directions` as for `Locator.of`. `force` is the peak force of
+    the impact, a number or `Force`, see `Locator.locate`; a note says where the recording's own force channel differs.
+    `locator` is one made of the field before, with points of its own. That of the last field and its own points is
+    cached, so that of several recordings only the first waits for it. With `progress`, the standard error says that it
+    works. The sound of another object has a `refusal` in place of a position, see `judged`. Raises LocationError as
+    `preprocess_recording` and `Locator.locate`, and for a locator of another field or given with points.
     """
     if locator is not None and (locator.field is not field or points is not None or directions is not None):
         what = "points or directions" if locator.field is field else "another field"
@@ -55,24 +55,22 @@ def locate(
         )
     known = None if force is None else Force.of(force)
     with working("locating the impact; the first of a field takes seconds to minutes", shown=progress):
-        heard = hear(recording, field, sample_rate=sample_rate, settings=settings)
+        impact = preprocess_recording(recording, field, sample_rate=sample_rate, settings=settings)
         if locator is None and points is None and directions is None:
             locator = _locator_of(field)
         finder = Locator.of(field, points=points, directions=directions) if locator is None else locator
-        found = finder.locate(heard.sound, highest=heard.highest, force=known)
-    measured = _measured_force_notes(heard, field, known)
-    return judged(replace(found, notes=(*heard.notes, *measured, *found.notes)))
+        found = finder.locate(impact.sound, highest=impact.highest, force=known)
+    measured = measured_force_notes(impact.newtons, field, known)
+    return judged(replace(found, notes=(*impact.notes, *measured, *found.notes)))
 
 
-def _measured_force_notes(heard: Heard, field: SoundField, force: Force | None) -> tuple[str, ...]:
-    """Return a note where a known force, in newtons, is not the one in the recording's force channel."""
-    if force is None or not heard.newtons or not field.origin.per_newton:
+def measured_force_notes(newtons: float | None, field: SoundField, force: Force | None) -> tuple[str, ...]:
+    """Return a note where a known force is not the one in the recording's force channel, `newtons`."""
+    if force is None or not newtons or not field.origin.per_newton:
         return ()
-    if 1.0 / SAME_FORCE < force.expected / heard.newtons < SAME_FORCE:
+    if 1.0 / SAME_FORCE < force.expected / newtons < SAME_FORCE:
         return ()
-    return (
-        f"expected a force of {heard.newtons:.3g} N as in the recording's force channel, got {force.expected:.3g} N",
-    )
+    return (f"expected a force of {newtons:.3g} N as in the recording's force channel, got {force.expected:.3g} N",)
 
 
 @lru_cache(maxsize=1)
@@ -91,10 +89,10 @@ def judged(found: ContactMap) -> ContactMap:
     """
     modal, null, ratio = 100 * found.modal_energy, 100 * found.null_energy, found.mismatch_ratio
     share = f"the object's modes explain {modal:.0f} % of it, detuned modes {null:.0f} %"
-    if ratio > STRANGE:
+    if ratio > REJECT_ABOVE:
         refusal = (
-            f"expected a mismatch ratio of at most {DOUBTFUL:g}, as of this object's impacts, got a mismatch ratio of "
-            f"{ratio:.2f}: another object, no impact, or noise ({share}); record it again, or choose another field"
+            f"expected a mismatch ratio of at most {WARN_ABOVE:g}, as of this object's impacts, got a mismatch ratio "
+            f"of {ratio:.2f}: another object, no impact, or noise ({share}); record it again, or choose another field"
         )
         return found.rejected(refusal)
     if found.evidence <= 0.0:
@@ -104,9 +102,9 @@ def judged(found: ContactMap) -> ContactMap:
             "recordings"
         )
         return found.rejected(refusal)
-    if ratio > DOUBTFUL:
+    if ratio > WARN_ABOVE:
         note = f"the sound may be of another object, or hold other sounds: a mismatch ratio of {ratio:.2f} ({share})"
-    elif found.explained_energy < UNLIKE:
+    elif found.explained_energy < MIN_EXPLAINED:
         note = (
             "the position may be wrong: an impact at the most probable one explains "
             f"{100 * found.explained_energy:.0f} % of the sound ({share})"

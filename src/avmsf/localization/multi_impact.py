@@ -13,16 +13,17 @@ from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike
 from avmsf.capture.audio import Recording, refuse_silence
-from avmsf.capture.onset import find_onset
+from avmsf.capture.onset import find_onset, find_pulse
 from avmsf.capture.prepare import remove_rumble, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError, LocationError
 from avmsf.field.soundfield import SoundField
+from avmsf.localization.amplitudes import Extractor
 from avmsf.localization.contact_map import ContactMap
-from avmsf.modal.bank import ModalBank
-from avmsf.modal.synthesis import synthesize
-from avmsf.tasks.amplitudes import Extractor
-from avmsf.tasks.hearing import (
+from avmsf.localization.likelihood import Force
+from avmsf.localization.locate import judged, measured_force_notes
+from avmsf.localization.locator import Locator
+from avmsf.localization.preprocess import (
     Sound,
     as_recording,
     at_field_rate,
@@ -32,9 +33,8 @@ from avmsf.tasks.hearing import (
     read_if_path,
     settings_for,
 )
-from avmsf.tasks.locate import judged
-from avmsf.tasks.locator import Locator
-from avmsf.tasks.posterior import Force
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.synthesis import synthesize
 from avmsf.wording import counted
 
 _GUARD_SECONDS = 0.005
@@ -58,11 +58,12 @@ def locate_impacts(
 ) -> list[tuple[float, ContactMap]]:
     """Return the onset of each impact in a recording, seconds, and its map, in order.
 
-    Bare samples are at `sample_rate` Hz, or at the field's rate; `settings` as for `hear`; `force`, of every impact, as
-    for `Locator.locate`; `locator` is one made of the field before. The decaying sound of earlier impacts is fitted by
-    the object's modes just before an impact, extrapolated and subtracted. Impacts on other objects are left out, which
-    a note says, and impacts closer than 30 ms count as one. Raises LocationError as `hear`, for settings with
-    `normalize = "deconvolve"` where the recording has a force channel, and where no impact can be located.
+    Bare samples are at `sample_rate` Hz, or at the field's rate; `settings` as for `preprocess_recording`; `force`, of
+    every impact, as for `locate`; `locator` is one made of the field before. The decaying sound of earlier impacts is
+    fitted by the object's modes just before an impact, extrapolated and subtracted. Impacts on other objects are left
+    out, which a note says, and impacts closer than 30 ms count as one. Raises LocationError as `preprocess_recording`,
+    for settings with `normalize = "deconvolve"` where the recording has a force channel, and where no impact can be
+    located.
     """
     known = None if force is None else Force.of(force)
     recording = read_if_path(recording)
@@ -79,6 +80,7 @@ def locate_impacts(
     notes = describe(whole, chosen)
     sound = _without_rumble(whole, chosen)
     onsets = detect_onsets(sound, sample_rate=whole.sample_rate)
+    forces = _peak_forces(whole, onsets, chosen)
     resampled, highest, remark = at_field_rate(sound, whole, field, speed=chosen.playback_speed)
     finder = Locator.of(field) if locator is None else locator
     ratio = len(resampled) / len(sound)
@@ -96,7 +98,9 @@ def locate_impacts(
         except LocationError as error:
             refused.append((seconds, error))
             continue
-        found.append((seconds, replace(located, notes=(*notes, *remark, *located.notes))))
+        newtons = None if forces is None else forces[number]
+        measured = measured_force_notes(newtons, field, known)
+        found.append((seconds, replace(located, notes=(*notes, *remark, *measured, *located.notes))))
     if not found:
         raise refused[0][1]
     if not refused:
@@ -123,6 +127,15 @@ def _without_rumble(recording: Recording, settings: CaptureSettings) -> Float64[
         return remove_rumble(response, settings.highpass, recording)
     except CaptureError as error:
         raise location_error(error) from error
+
+
+def _peak_forces(recording: Recording, onsets: list[int], settings: CaptureSettings) -> list[float] | None:
+    """Return the peak force of each impact by the recording's force channel, 0 for a silent one; None without one."""
+    if settings.force_channel is None:
+        return None
+    guard = round(_GUARD_SECONDS * recording.sample_rate)
+    parts = np.split(recording.channel(settings.force_channel), [max(0, onset - guard) for onset in onsets])[1:]
+    return [abs(find_pulse(part).height * settings.force_scale) if np.ptp(part) > 0 else 0.0 for part in parts]
 
 
 def detect_onsets(sound: Float64[np.ndarray, " frames"], *, sample_rate: float) -> list[int]:
@@ -175,8 +188,8 @@ def predict_ringing(
     rate = field.sample_rate
     stop = start - min(round(_GUARD_SECONDS * rate), (start - last) // 4)
     begin = max(last, stop - round(_FIT_SECONDS * rate))
-    heard = torch.nonzero(field.bank.frequency < min(0.5 * rate, highest or 0.5 * rate)).flatten()
-    bank = ModalBank(field.bank.frequency[heard], field.bank.damping[heard])
+    audible = torch.nonzero(field.bank.frequency < min(0.5 * rate, highest or 0.5 * rate)).flatten()
+    bank = ModalBank(field.bank.frequency[audible], field.bank.damping[audible])
     extractor = Extractor.of(bank, sample_rate=rate, samples=stop - begin)
     values = extractor.extract(sound[begin:stop], color=None).values
     seconds = (start - begin) / rate

@@ -1,4 +1,4 @@
-"""What blows at points are foretold to sound like, mode by mode, and how wrong that is thought to be."""
+"""Predicted gains of impacts at points, mode by mode, and the variance of their errors."""
 
 from statistics import NormalDist
 
@@ -13,27 +13,27 @@ from avmsf.field.uncertainty import fitted_mixture, has_posterior
 _BATCH = 2048
 """Points whose gains are asked for at once."""
 _NEIGHBORS = 8
-"""Of a point, by which it is told how gains vary about it."""
+"""Nearest points from which the variance of gains around a point is estimated."""
 _PATCH = 1.0 / 9.0
 """Variance over a square of surface around a point, over the mean square difference from the squares about it."""
 _LEVEL = 0.9
 """Part of the gains that intervals are to hold."""
-_TOLD = 3
-"""Contacts that a field needs to say how wrong it is."""
+_MIN_CONTACTS = 3
+"""Contacts from which on a field's errors are estimated by leave-one-out."""
 
 
-def judges_itself(field: SoundField) -> bool:
-    """Return whether a field's own strikes tell how wrong it is where it was not struck."""
-    return has_posterior(field) and len(fitted_mixture(field).contacts) >= _TOLD
+def can_self_calibrate(field: SoundField) -> bool:
+    """Return whether a field's own contacts suffice to estimate its errors elsewhere."""
+    return has_posterior(field) and len(fitted_mixture(field).contacts) >= _MIN_CONTACTS
 
 
-def widened(field: SoundField) -> float:
-    """Return the factor on a field's deviations with which they hold what it does not know; 1 where that is unknown.
+def calibration_factor(field: SoundField) -> float:
+    """Return the factor that calibrates a field's posterior standard deviations; 1 where there are too few contacts.
 
-    With it intervals of 90 % hold so many of the gains at contacts left out, each part of each mode counted alike: weak
-    modes, whose deviations are too small, count as much in a place's likelihood as strong ones.
+    With it intervals of 90 % contain 90 % of the gains at contacts left out, each part of each mode counted alike: weak
+    modes, whose deviations are too small, count as much in a position's likelihood as strong ones.
     """
-    if not judges_itself(field):
+    if not can_self_calibrate(field):
         return 1.0
     errors = fitted_mixture(field).standardized_errors().abs()
     return float(torch.nanquantile(errors.flatten(), _LEVEL)) / NormalDist().inv_cdf(0.5 + _LEVEL / 2.0)
@@ -55,14 +55,14 @@ def predict(
     return torch.cat(gains), torch.cat(dampings) if dampings else None
 
 
-def unknown(
+def predictive_variance(
     sound_field: SoundField,
     points: Float[Tensor, "points 3"],
     directions: Float[Tensor, "points 3"] | None,
     *,
     factor: float,
 ) -> Float32[Tensor, "points modes"]:
-    """Return the variance of what the field does not know of its gains, its deviations times `factor`."""
+    """Return the posterior variance of the gains, the deviations multiplied by `factor`; zero without a posterior."""
     variances = []
     for rows in torch.split(torch.arange(len(points)), _BATCH):
         with torch.no_grad():
@@ -73,10 +73,10 @@ def unknown(
     return torch.cat(variances)
 
 
-def patches(
+def local_variance(
     points: Float[Tensor, "points 3"], gains: Complex64[Tensor, "points modes"]
 ) -> Float32[Tensor, "points modes"]:
-    """Return the variance of gains over the patch of surface that each point stands for."""
+    """Return the variance of gains over the patch of surface that each point represents."""
     count = min(_NEIGHBORS, len(points) - 1)
     total = torch.zeros(gains.shape)
     if count < 1:

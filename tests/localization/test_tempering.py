@@ -11,11 +11,11 @@ from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.scaledgains import ScaledGains
 from avmsf.field.soundfield import Origin, SoundField
+from avmsf.localization.locator import Locator
+from avmsf.localization.tempering import calibrate_tempering
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
 from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts
-from avmsf.tasks.heed import calibrate_tempering
-from avmsf.tasks.locator import Locator
 
 PLATE = Plate()
 HIGHEST = 2500.0
@@ -61,14 +61,14 @@ def test_modes_that_an_edit_muted_have_no_say() -> None:
     assert calibrate_tempering(muted) == pytest.approx(calibrate_tempering(plate_field(40)), rel=0.2)
 
 
-def test_fields_with_too_few_strikes_are_trusted_as_fields_are_on_the_whole() -> None:
+def test_fields_with_too_few_contacts_are_trusted_as_fields_are_on_the_whole() -> None:
     few = plate_field(20)
     only = few.gain_field.without(torch.arange(20) >= 2)
     assert calibrate_tempering(replace(few, gain_field=only)) == 1.0
     assert calibrate_tempering(plate_field(1, again=20)) == 1.0
 
 
-def test_a_strike_in_the_same_place_as_another_is_left_out_with_it() -> None:
+def test_a_contact_in_the_same_place_as_another_is_left_out_with_it() -> None:
     # Predicted from itself, an impact would be found to a hair's breadth.
     assert calibrate_tempering(plate_field(12, again=2)) == pytest.approx(calibrate_tempering(plate_field(12)), rel=0.3)
 
@@ -76,8 +76,8 @@ def test_a_strike_in_the_same_place_as_another_is_left_out_with_it() -> None:
 def test_regions_are_the_wider_the_less_a_mode_counts() -> None:
     field = plate_field(40)
     sound, sizes = field.render(field.gain_field.points[200:201])[0], []
-    for heed in (1.0, 0.1, 0.01):
+    for factor in (1.0, 0.1, 0.01):
         locator = Locator.of(field)
-        vars(locator)["_tempering_factor"] = heed
+        vars(locator)["_tempering_factor"] = factor
         sizes.append(int(locator.locate(sound).region().sum()))
     assert sizes[0] < sizes[1] < sizes[2]

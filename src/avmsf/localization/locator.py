@@ -15,16 +15,16 @@ from avmsf._utils.summary import short_repr
 from avmsf.capture.prepare import shortest_allowed
 from avmsf.errors import LocationError
 from avmsf.field.soundfield import SoundField
+from avmsf.localization.amplitudes import Amplitudes, Extractor
 from avmsf.localization.contact_map import ContactMap
 from avmsf.localization.cosine_distance import cosine_distance
+from avmsf.localization.detuning import DetunedModes
+from avmsf.localization.likelihood import Force, Judgement, PredictedGains, judge
+from avmsf.localization.prediction import calibration_factor, local_variance, predict, predictive_variance
+from avmsf.localization.preprocess import not_finite, silent, too_short
+from avmsf.localization.smoothing import distinct_contacts, smoothing_matrix
+from avmsf.localization.tempering import calibrate_tempering
 from avmsf.modal.bank import ModalBank
-from avmsf.tasks.amplitudes import Amplitudes, Extractor
-from avmsf.tasks.detuning import DetunedModes
-from avmsf.tasks.foretelling import patches, predict, unknown, widened
-from avmsf.tasks.hearing import not_finite, silent, too_short
-from avmsf.tasks.heed import calibrate_tempering
-from avmsf.tasks.posterior import Force, Judgement, PredictedGains, judge
-from avmsf.tasks.slack import contacts_of, spread_by
 
 _UNIT = 1e-3
 """How far a direction's length may be from one."""
@@ -85,15 +85,15 @@ class Locator:
         parts = None if areas is None else as_floats(areas, "areas")
         _expect_points(positions, ways, parts)
         gains, dampings = predict(field, positions, ways)
-        variance = unknown(field, positions, ways, factor=widened(field))
+        variance = predictive_variance(field, positions, ways, factor=calibration_factor(field))
         return cls(
             field,
             positions.float(),
             gains,
-            variance + patches(positions, gains),
+            variance + local_variance(positions, gains),
             dampings,
             torch.ones(len(positions), dtype=torch.float64) if parts is None else parts.double(),
-            spread_by(positions, contacts=contacts_of(field)),
+            smoothing_matrix(positions, contacts=distinct_contacts(field)),
             use_residual,
         )
 

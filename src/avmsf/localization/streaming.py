@@ -19,10 +19,10 @@ from avmsf.capture.onset import find_onset
 from avmsf.capture.prepare import shortest_allowed
 from avmsf.errors import LocationError
 from avmsf.localization.contact_map import ContactMap
+from avmsf.localization.locate import judged
+from avmsf.localization.locator import Locator
+from avmsf.localization.ringing import Ringing
 from avmsf.modal.bank import ModalBank
-from avmsf.tasks.locate import judged
-from avmsf.tasks.locator import Locator
-from avmsf.tasks.ringing import Ringing
 
 WINDOW_SECONDS = 0.04
 """Length of an impact's sound that its first estimate uses."""
