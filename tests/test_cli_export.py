@@ -229,6 +229,16 @@ def test_a_sample_set_names_its_instrument(field_file: Path, tmp_path: Path, cap
     assert instrument.read_text().count("<region>") == 6
 
 
+def test_a_new_parent_folder_is_said_once(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
+    words = ["export", str(field_file), "--to", "uff", "--output", str(tmp_path / "new" / "dir" / "a.uff")]
+    folder = str(tmp_path / "new" / "dir")
+    said = []
+    for _ in range(2):
+        assert main(words) == 0
+        said.append([line.endswith(folder) for line in capsys.readouterr().err.splitlines()].count(True))
+    assert said == [1, 0]
+
+
 def test_a_page_is_a_folder_or_one_file(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
     words = ["export", str(field_file), "--to", "web", "--points", "30"]
     for name in ("page", "page", "page.html"):

@@ -66,6 +66,8 @@ _WAITING = frozenset({"studio"})
 """Verbs that wait for their user most of the time."""
 _COMMON = frozenset({"--quiet", "--verbose", "--json"})
 """Options that may also stand before the verb."""
+_OUTPUTS = ("output", "plots")
+"""Options that name what a verb writes."""
 _WIDEST = 120
 """Columns of the list of verbs, at most."""
 _AGAIN = 0.05
@@ -108,8 +110,13 @@ def _run(words: list[str]) -> int:
             with _loading(quiet=options.quiet):
                 verb = import_module(f"avmsf.cli.{words[0]}")
             _show_plainly()
+            paths = [getattr(options, name, None) for name in _OUTPUTS]
+            absent = sorted({path.parent for path in paths if path is not None and not path.parent.exists()})
             with _compilation_announced():
                 code: int = verb.run(options)
+            for folder in absent:
+                if folder.is_dir() and not options.quiet:
+                    print(f"created folder {printable(str(folder))}", file=sys.stderr)
         except Exception as error:
             if not isinstance(error, AvmsfError) and not lacks_memory(error):
                 raise
