@@ -19,7 +19,7 @@ from typing import TextIO
 import avmsf
 from avmsf._utils.memory import NO_MEMORY, lacks_memory
 from avmsf._utils.text import printable
-from avmsf.cli.heartbeat import beating, verbosity
+from avmsf.cli.heartbeat import beating, meanwhile, verbosity
 from avmsf.errors import AvmsfError, AvmsfWarning
 
 VERBS = {
@@ -217,7 +217,7 @@ def _compilation_announced() -> AbstractContextManager[None]:
     # Imports rich, which help on the whole does not need.
     from avmsf.cli.printing import say
 
-    announced: AbstractContextManager[None] = module.announced(say)
+    announced: AbstractContextManager[None] = module.announced(say, meanwhile)
     return announced
 
 
