@@ -307,7 +307,7 @@ def _units(folder: Path, rows: Sequence[Row], settings: CaptureSettings) -> list
     placement = judge_placement(contacts, surface_points(surface))
     if not placement.other_unit and NARROWEST <= placement.diagonal <= WIDEST:
         return []
-    units = fitting_units_of(placement, settings)
+    units: dict[str, Any] = fitting_units_of(placement, settings)
     size = placement.diagonal / settings.surface_meters * replace(settings, **units).surface_meters
     reason = (
         f"The contacts then lie on the surface, {size:.3g} m across. In the present units the contacts are "

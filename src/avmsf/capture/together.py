@@ -1,6 +1,5 @@
 """What the recordings and contacts of one capture must have in common, and what looks wrong when compared."""
 
-import itertools
 import math
 from collections import Counter, defaultdict
 from collections.abc import Sequence
@@ -205,9 +204,11 @@ def fitting_units_of(placement: Placement, settings: CaptureSettings) -> dict[st
         return {}
     ratio = settings.meters * (1.0 if mistake is None else mistake.factor) / settings.surface_meters
     pairs = [
-        pair for pair in itertools.product(METRES, repeat=2)
-        if math.isclose(METRES[pair[0]] / METRES[pair[1]], ratio, rel_tol=1e-6)
-    ]  # fmt: skip
+        (unit, surface_unit)
+        for unit, meters in METRES.items()
+        for surface_unit, surface_meters in METRES.items()
+        if math.isclose(meters / surface_meters, ratio, rel_tol=1e-6)
+    ]
 
     def changes(pair: tuple[str, str]) -> dict[str, str]:
         unit, surface_unit = pair
