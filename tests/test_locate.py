@@ -22,7 +22,7 @@ from avmsf.tasks.locate import DOUBTFUL, STRANGE, UNLIKE, judged, locate
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.modes import adjust_modes
 from avmsf.tasks.posterior import Force
-from avmsf.tasks.slack import contacts_of
+from avmsf.tasks.smoothing import contacts_of
 from believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
 from raising import raises
 from unsaved_gains import Unsaved

@@ -14,8 +14,8 @@ from avmsf.field.soundfield import Origin, SoundField
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
 from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts
-from avmsf.tasks.heed import calibrate_tempering
 from avmsf.tasks.locator import Locator
+from avmsf.tasks.tempering import calibrate_tempering
 
 PLATE = Plate()
 HIGHEST = 2500.0
@@ -76,8 +76,8 @@ def test_a_strike_in_the_same_place_as_another_is_left_out_with_it() -> None:
 def test_regions_are_the_wider_the_less_a_mode_counts() -> None:
     field = plate_field(40)
     sound, sizes = field.render(field.gain_field.points[200:201])[0], []
-    for heed in (1.0, 0.1, 0.01):
+    for factor in (1.0, 0.1, 0.01):
         locator = Locator.of(field)
-        vars(locator)["_tempering_factor"] = heed
+        vars(locator)["_tempering_factor"] = factor
         sizes.append(int(locator.locate(sound).region().sum()))
     assert sizes[0] < sizes[1] < sizes[2]

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_floats, as_rate
 from avmsf.capture.audio import Recording, read_recording
-from avmsf.capture.blow import clipping, expect_sudden
+from avmsf.capture.impact_checks import clipping, expect_sudden
 from avmsf.capture.onset import Pulse, find_second_blow, find_second_push
 from avmsf.capture.prepare import prepare, shortest_allowed
 from avmsf.capture.settings import CaptureSettings

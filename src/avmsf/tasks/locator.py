@@ -20,11 +20,11 @@ from avmsf.localization.cosine_distance import cosine_distance
 from avmsf.modal.bank import ModalBank
 from avmsf.tasks.amplitudes import Amplitudes, Extractor
 from avmsf.tasks.detuning import DetunedModes
-from avmsf.tasks.foretelling import patches, predict, unknown, widened
 from avmsf.tasks.hearing import not_finite, silent, too_short
-from avmsf.tasks.heed import calibrate_tempering
 from avmsf.tasks.posterior import Force, Judgement, PredictedGains, judge
-from avmsf.tasks.slack import contacts_of, spread_by
+from avmsf.tasks.prediction import patches, predict, unknown, widened
+from avmsf.tasks.smoothing import contacts_of, smoothing_kernel
+from avmsf.tasks.tempering import calibrate_tempering
 
 _UNIT = 1e-3
 """How far a direction's length may be from one."""
@@ -93,7 +93,7 @@ class Locator:
             variance + patches(positions, gains),
             dampings,
             torch.ones(len(positions), dtype=torch.float64) if parts is None else parts.double(),
-            spread_by(positions, contacts=contacts_of(field)),
+            smoothing_kernel(positions, contacts=contacts_of(field)),
             use_residual,
         )
 

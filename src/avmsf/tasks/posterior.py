@@ -32,7 +32,7 @@ BETWEEN = (1.6, 0.35, 0.07, 0.015)
 INDEPENDENT = (0.25, 0.4)
 """Exponent of the tempered likelihood where a field's errors dominate: of a field that explains nothing of a sound even
 at its best point, and of one that explains all of it. Chosen on plates, where the 90 % region then held nine impacts in
-ten; elsewhere it held as few as four. So a field's own contacts calibrate it (`avmsf.tasks.heed`)."""
+ten; elsewhere it held as few as four. So a field's own contacts calibrate it (`avmsf.tasks.tempering`)."""
 SHIFT_DEVIATION = 2e-4
 """Standard deviation of that, seconds."""
 _COARSE, _FINE = 0.9, 0.3
@@ -126,7 +126,7 @@ class Judgement:
     def tempering(self, explained: float, *, factor: float = 1.0) -> float:
         """Return the exponent of the tempered likelihood, where the likeliest point explains that part of the sound.
 
-        `factor` on `INDEPENDENT` is that of one field, as `avmsf.tasks.heed` measures it.
+        `factor` on `INDEPENDENT` is that of one field, as `avmsf.tasks.tempering` measures it.
         """
         least, most = INDEPENDENT
         together = min(1.0, factor * (least + (most - least) * explained))

@@ -1,4 +1,4 @@
-"""What blows at points are foretold to sound like, mode by mode, and how wrong that is thought to be."""
+"""Predicted gains of impacts at points, and the calibrated standard deviations of their errors."""
 
 from statistics import NormalDist
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.capture.audio import read_recording
-from avmsf.capture.blow import clipping, expect_sudden
+from avmsf.capture.impact_checks import clipping, expect_sudden
 from avmsf.capture.onset import find_second_blow
 from avmsf.capture.prepare import prepare, shortest_allowed
 from avmsf.capture.settings import CaptureSettings

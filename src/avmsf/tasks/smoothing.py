@@ -1,4 +1,4 @@
-"""How far off a field's places are: between the contacts that it was fitted to, its gains are drawn out and squeezed.
+"""Smoothing of the probabilities of points, since a field's positions between its contacts are uncertain.
 
 What a field made of few contacts says of a place is often true of one nearby, in all modes at once. No deviation of
 single modes tells that. So an answer is spread by a part of the distance between the contacts.
@@ -17,7 +17,7 @@ from avmsf.field.gains.model import MixtureGains
 from avmsf.field.scaledgains import fitted_gains
 from avmsf.field.soundfield import SoundField
 
-SLACK = 0.06
+POSITION_STD = 0.06
 """Standard deviation of a place over the distance between contacts, along each direction: measured on plates."""
 _MOST = 0.03
 """The same over the object's diagonal, at most."""
@@ -42,7 +42,7 @@ def areas_of(points: Float[Tensor, "points 3"]) -> Float64[Tensor, " points"]:
     return torch.from_numpy(np.pi * distances[:, -1] ** 2 / (count + 0.5))
 
 
-def spread_by(points: Float[Tensor, "points 3"], *, contacts: int | None) -> csr_array | None:
+def smoothing_kernel(points: Float[Tensor, "points 3"], *, contacts: int | None) -> csr_array | None:
     """Return what spreads probabilities of points (meters) over those about: [points, points], its columns sum to one.
 
     None for a field of unknown contacts, and for points that are all at one place.
@@ -51,7 +51,7 @@ def spread_by(points: Float[Tensor, "points 3"], *, contacts: int | None) -> csr
         return None
     areas = areas_of(points)
     diagonal = float((points.amax(0) - points.amin(0)).norm())
-    off = min(SLACK * math.sqrt(float(areas.sum()) / contacts), _MOST * diagonal)
+    off = min(POSITION_STD * math.sqrt(float(areas.sum()) / contacts), _MOST * diagonal)
     # A place may be anywhere in the square that a point stands for, before it is moved and after.
     deviation = math.sqrt(off**2 + float(areas.median()) / 6.0)
     if off <= 0.0:

@@ -1,4 +1,4 @@
-"""How much a field's modes tell of a place where it errs: its own strikes, each left out in turn, are asked.
+"""The tempering factor of a field's likelihoods, calibrated on its own impacts, each left out in turn.
 
 How far the errors of modes hang together depends on what is wrong with a field: a body that is nearly the object's errs
 in all modes at once, splines between few contacts err in each mode by itself. No constant serves both. But every field
@@ -19,9 +19,9 @@ from avmsf.field.gains.model import MixtureGains
 from avmsf.field.soundfield import SoundField
 from avmsf.field.uncertainty import fitted_mixture, scale_of
 from avmsf.scene.points import farthest_points
-from avmsf.tasks.foretelling import judges_itself, patches, predict, unknown, widened
 from avmsf.tasks.posterior import PredictedGains, judge
-from avmsf.tasks.slack import areas_of, contacts_of, spread_by
+from avmsf.tasks.prediction import judges_itself, patches, predict, unknown, widened
+from avmsf.tasks.smoothing import areas_of, contacts_of, smoothing_kernel
 
 _STRIKES = 12
 """Strikes that are left out, at most: those farthest apart."""
@@ -54,7 +54,7 @@ def calibrate_tempering(field: SoundField) -> float:
     places, factor = gains.points[rows], widened(fitted)
     about = patches(gains.points, predict(fitted, gains.points, None)[0])[rows]
     prior = areas_of(places).clamp_min(1e-300).log() if len(places) > 2 else torch.zeros(len(places)).double()
-    slack = spread_by(places, contacts=contacts_of(fitted))
+    kernel = smoothing_kernel(places, contacts=contacts_of(fitted))
     # A locator does not hear the others either.
     kept = torch.nonzero(field.audible & (scale_of(field) != 0.0)).flatten()
     turned = torch.polar(torch.ones_like(field.phase), field.phase)[kept]
@@ -74,7 +74,7 @@ def calibrate_tempering(field: SoundField) -> float:
         trusts = torch.tensor(
             [found.tempering(explained, factor=tried) for tried in _TRIED.tolist()], dtype=torch.float64
         )
-        score += _log_score(trusts[:, None] * found.log_likelihood + prior, truth, slack)
+        score += _log_score(trusts[:, None] * found.log_likelihood + prior, truth, kernel)
     return float(_TRIED[int(score.argmax())])
 
 
@@ -108,17 +108,19 @@ def _foretold(
     return PredictedGains(gains, power, variance, usual, field.bank.frequency[kept].double())
 
 
-def _explained(foretold: Tensor, heard: Tensor, weights: Float64[Tensor, " modes"]) -> float:
+def _explained(predicted: Tensor, heard: Tensor, weights: Float64[Tensor, " modes"]) -> float:
     """Return the part of the energy of what was heard that gains explain at their best force."""
-    own = float((weights * foretold.abs().square()).sum())
-    match = float((weights * (heard.conj() * foretold).real).sum())
+    own = float((weights * predicted.abs().square()).sum())
+    match = float((weights * (heard.conj() * predicted).real).sum())
     whole = float((weights * heard.abs().square()).sum())
     return 0.0 if own == 0.0 else min(1.0, match**2 / own / whole)
 
 
-def _log_score(logs: Float64[Tensor, "tried points"], truth: int, slack: csr_array | None) -> Float64[Tensor, " tried"]:
+def _log_score(
+    logs: Float64[Tensor, "tried points"], truth: int, kernel: csr_array | None
+) -> Float64[Tensor, " tried"]:
     """Return the logarithm of the probability of the true point under each of several posteriors."""
     probability = torch.softmax(logs, 1)
-    if slack is not None:
-        probability = torch.from_numpy((slack @ probability.numpy().T).T)
+    if kernel is not None:
+        probability = torch.from_numpy((kernel @ probability.numpy().T).T)
     return probability[:, truth].clamp_min(1e-300).log()
