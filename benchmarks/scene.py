@@ -17,7 +17,7 @@ from avmsf.config import LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
 from avmsf.field.config import FitConfig
 from avmsf.field.store import load
 from avmsf.pipeline.reconstruct import reconstruct
-from avmsf.pipeline.scene import Listener
+from avmsf.pipeline.scene import ProgressListener
 from avmsf.scene.refine import orbit_spread, refine
 from avmsf.scene.splatconfig import SplatConfig
 from benchmarks.dino import measure_dino
@@ -92,7 +92,7 @@ def _pipeline(options: Options) -> Report:
             config,
             cache=Path(place) / "cache",
             settings=CaptureSettings(),
-            listener=Listener(tell),
+            listener=ProgressListener(tell),
         )
         taken = time.perf_counter() - begun
         error = evaluate(load(made.field), test).mean()["relative_stft"]

@@ -1,5 +1,6 @@
 """What the user can get wrong at the command line: exit code 2 and one line that says what to do."""
 
+import json
 import math
 import subprocess
 import sys
@@ -123,9 +124,11 @@ def test_one_line_says_what_is_wrong(words: str, place: Path, capsys: Streams, m
 
 
 @pytest.mark.slow
-def test_a_process_ends_with_2_and_an_empty_standard_output(place: Path) -> None:
+def test_a_process_ends_with_2_and_the_error_as_json(place: Path) -> None:
     code = "import sys; from avmsf.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", code, "modes", "nowhere", "--json"]
     ran = subprocess.run(command, cwd=place, capture_output=True, text=True, timeout=60, check=False)
-    assert (ran.returncode, ran.stdout) == (2, "")
-    assert ran.stderr.splitlines()[-1].startswith("avmsf modes: nowhere: expected a capture folder")
+    assert ran.returncode == 2
+    error = json.loads(ran.stdout)["error"]
+    assert error["file"] == "nowhere"
+    assert ran.stderr.splitlines()[-1] == f"avmsf modes: {error['message']}"

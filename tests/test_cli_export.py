@@ -3,7 +3,6 @@
 import csv
 import json
 import re
-import shlex
 import warnings
 from pathlib import Path
 
@@ -32,7 +31,7 @@ from avmsf.tasks.material import change_material
 from avmsf.tasks.modes import adjust_modes
 from believing_field import ELASTIC, bar, bar_points
 from capture_folder import fill
-from made_fields import BANK, SIDES, positional
+from made_fields import BANK, SIDES, directional, positional, saved
 
 Streams = pytest.CaptureFixture[str]
 RATE, SAMPLES = 8000.0, 1200
@@ -223,10 +222,21 @@ def test_a_sample_set_names_its_instrument(field_file: Path, tmp_path: Path, cap
     instrument = output / "instrument.sfz"
     assert json.loads(out)["instrument"] == str(instrument)
     assert str(instrument) in err
-    # One force is one velocity layer; the command that makes several can be run as it is.
-    following = shlex.split(err.splitlines()[-1].removeprefix("next: avmsf "))
-    assert main([*following, "--points", "2", "--seconds", "0.05"]) == 0
+    # One force is one velocity layer; the same command makes several with the options of the last line.
+    following = err.splitlines()[-1]
+    assert following.startswith("next: ")
+    assert main([*words, *re.search(r"--forces( [\d.]+)+", following)[0].split()]) == 0
     assert instrument.read_text().count("<region>") == 6
+
+
+def test_a_new_parent_folder_is_said_once(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
+    words = ["export", str(field_file), "--to", "uff", "--output", str(tmp_path / "new" / "dir" / "a.uff")]
+    folder = str(tmp_path / "new" / "dir")
+    said = []
+    for _ in range(2):
+        assert main(words) == 0
+        said.append([line.endswith(folder) for line in capsys.readouterr().err.splitlines()].count(True))
+    assert said == [1, 0]
 
 
 def test_a_page_is_a_folder_or_one_file(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
@@ -344,6 +354,31 @@ def test_a_sample_set_has_the_given_contacts_in_their_order(how: str, field_file
     np.testing.assert_allclose(places, GIVEN, atol=1e-9)
     scale = json.loads((tmp_path / "set" / "manifest.json").read_text())["scale"]
     expected = scale * load(field_file).render(torch.tensor(GIVEN, dtype=torch.float64))
+    for row, sound in zip(rows, expected, strict=True):
+        found = soundfile.read(tmp_path / "set" / row["file"], dtype="float32")[0]
+        # Both are float32, of a peak below 1.
+        np.testing.assert_allclose(found, sound.numpy(), atol=1e-5)
+
+
+def test_a_sample_set_has_the_directions_of_the_table(tmp_path: Path) -> None:
+    path = saved(directional(), tmp_path)
+    ways = torch.tensor([[0.6, 0.0, -0.8], [0.0, 0.0, 2.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
+    lines = [
+        "x,y,z,nx,ny,nz",
+        *(",".join(map(str, (*place, *way))) for place, way in zip(GIVEN, ways.tolist(), strict=True)),
+    ]
+    (tmp_path / "places.csv").write_text("\n".join(lines) + "\n")
+    words = ["--contact-table", str(tmp_path / "places.csv"), "--no-noise"]
+    assert main(["export", str(path), "--to", "wavs", "--output", str(tmp_path / "set"), *words]) == 0
+    with (tmp_path / "set" / "samples.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    normals = torch.tensor([[float(row[axis]) for axis in ("nx", "ny", "nz")] for row in rows], dtype=torch.float64)
+    torch.testing.assert_close(normals[:2], -torch.nn.functional.normalize(ways[:2]), atol=1e-6, rtol=0.0)
+    scale = json.loads((tmp_path / "set" / "manifest.json").read_text())["scale"]
+    places = torch.tensor(GIVEN, dtype=torch.float64)
+    expected = scale * load(path).render(places, directions=ways, noise=False)
+    straight = scale * load(path).render(places, noise=False)
+    assert float((expected - straight)[:2].abs().amax()) > 0.01
     for row, sound in zip(rows, expected, strict=True):
         found = soundfile.read(tmp_path / "set" / row["file"], dtype="float32")[0]
         # Both are float32, of a peak below 1.

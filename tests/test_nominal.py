@@ -121,7 +121,7 @@ def test_both_sides_of_a_wall_are_filled_and_given_no_wall():
 def test_boxes_that_overlap_are_one_body():
     one, other = trimesh.creation.box((0.3, 0.05, 0.02)), trimesh.creation.box((0.05, 0.2, 0.015))
     found = nominal_bodies(surface_of(trimesh.util.concatenate([one, other])), walls=[None, 0.001], count=6, dofs=6000)
-    assert [body.name for body in found.bodies] == ["enclosed volume"]
+    assert [body.name for body in found.bodies] == ["solid body"]
     volume = 0.3 * 0.05 * 0.02 + (0.2 - 0.05) * 0.05 * 0.015
     assert found.bodies[0].elastic.mass == pytest.approx(NOMINAL.density * volume, rel=0.05)
     assert "2 parts" in found.refused[0.001]
@@ -131,7 +131,7 @@ def test_boxes_that_overlap_are_one_body():
 def test_the_aircraft_is_filled(shared: Path):
     surface = read_surface(shared / "aircraft_response/surface.obj")
     found = nominal_bodies(surface, count=6, dofs=12_000)
-    assert [body.name for body in found.bodies] == ["enclosed volume"]
+    assert [body.name for body in found.bodies] == ["solid body"]
     # Its wings bend first, far below all else: as metal plates of 8 mm over 1.5 m do.
     assert 10 < float(found.bodies[0].elastic.frequency[0]) < 20
 
@@ -143,7 +143,7 @@ def test_parts_that_do_not_touch_are_refused_with_all_reasons():
     with raises(SimulationError, name="surface") as caught:
         nominal_bodies(apart, walls=[None, 0.001], count=6, dofs=3000)
     filled, walled = caught.value.value
-    for name, reason in (("enclosed volume", filled), ("wall of 1 mm", walled)):
+    for name, reason in (("solid body", filled), ("wall of 1 mm", walled)):
         assert reason.startswith(f"{name}: ")
         assert "2 parts" in reason
 

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import cache
 from typing import Any
 
@@ -52,25 +52,33 @@ def _without_disk_errors(step: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @contextmanager
-def announced(tell: Callable[[str], None]) -> Iterator[None]:
-    """Report what is compiled meanwhile: once for each part of the package. Nothing where all is cached."""
-    with event.install_listener("numba:compile", _Announcer(tell)):
+def announced(tell: Callable[[str], None], meanwhile: Callable[[str], AbstractContextManager[None]]) -> Iterator[None]:
+    """Report what is compiled: to `tell` once for each part of the package, and by `meanwhile` for as long as it takes.
+
+    Nothing is reported where all is cached.
+    """
+    with event.install_listener("numba:compile", _Announcer(tell, meanwhile)):
         yield
 
 
 class _Announcer(event.Listener):
-    def __init__(self, tell: Callable[[str], None]) -> None:
-        self.tell, self.told = tell, set[str]()
+    def __init__(self, tell: Callable[[str], None], meanwhile: Callable[[str], AbstractContextManager[None]]) -> None:
+        self.tell, self.meanwhile, self.told = tell, meanwhile, set[str]()
+        # A function is compiled within another that calls it; numba compiles in one thread at a time.
+        self.running: list[AbstractContextManager[None]] = []
 
     def on_start(self, event: event.Event) -> None:
         package, _, rest = event.data["dispatcher"].py_func.__module__.partition(".")
-        part = rest.partition(".")[0]
-        if package == __package__ and part not in self.told:
+        part, ours = rest.partition(".")[0], package == __package__
+        words = f"compiling {_PARTS.get(part, part)} for this processor (once; the result is cached)"
+        self.running.append(self.meanwhile(words) if ours else nullcontext())
+        self.running[-1].__enter__()
+        if ours and part not in self.told:
             self.told.add(part)
-            self.tell(f"compiling {_PARTS.get(part, part)} for this processor (once; the result is cached)")
+            self.tell(words)
 
     def on_end(self, event: event.Event) -> None:
-        pass
+        self.running.pop().__exit__(None, None, None)
 
 
 _PARTS = {"field": "the fit", "geometry": "distances", "modal": "the search for modes", "scene": "the rasterizer"}

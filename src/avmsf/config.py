@@ -110,7 +110,7 @@ class BodyConfig:
     __repr__ = changes_repr
 
     wall: float | None = None
-    """Wall thickness of the object, meters; 0 for a solid object. By default several are tried, and the recordings
+    """Wall thickness of the object, meters; 0 for a solid body. By default several are tried, and the recordings
     decide."""
     shapes: int = 80
     """Number of the lowest elastic mode shapes for the gains and for updating stiffness and density."""
@@ -123,7 +123,7 @@ class BodyConfig:
 
     def __post_init__(self) -> None:
         if self.wall is not None and not 0 <= self.wall < float("inf"):
-            raise SimulationError.expected("meters, or 0 for a solid object", self.wall, name="wall")
+            raise SimulationError.expected("meters, or 0 for a solid body", self.wall, name="wall")
         if self.shapes < 1:
             raise SimulationError(f"shapes: expected 1 or more, got {self.shapes}", name="shapes", value=self.shapes)
 

@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
+import trimesh
 
 from avmsf.capture import CaptureSettings, check, read_capture
 from avmsf.capture.proposals import Proposal, propose_settings, settings_text, write_settings
+from avmsf.capture.settings import METRES
 from avmsf.errors import CaptureError
 from capture_folder import RATE, fill, ring
 
@@ -214,3 +216,35 @@ def test_different_rates_are_refused_as_a_capture_and_nothing_is_proposed(tmp_pa
     soundfile.write(folder / "b.wav", samples, 96000)
     assert propose_settings(folder) == ()
     assert not check(folder).readable
+
+
+@pytest.mark.parametrize(
+    ("contacts", "surface", "proposed"),
+    [
+        ("m", "m", {}),
+        ("mm", "m", {"unit": "mm", "surface_unit": "m"}),
+        ("m", "mm", {"surface_unit": "mm"}),
+        ("mm", "mm", {"unit": "mm"}),
+        ("mm", "cm", {"unit": "mm", "surface_unit": "cm"}),
+        ("in", "mm", {"unit": "in", "surface_unit": "mm"}),
+    ],
+)
+def test_both_units_are_found_from_the_contacts_and_the_surface(
+    tmp_path: Path, contacts: str, surface: str, proposed: dict[str, object]
+) -> None:
+    box = trimesh.creation.box((0.24, 0.16, 0.12))
+    places = trimesh.sample.sample_surface(box, 12, seed=0)[0] / METRES[contacts]
+    names = [f"{number:02}.wav" for number in range(len(places))]
+    rows = [f"{name},{x:.6g},{y:.6g},{z:.6g}" for name, (x, y, z) in zip(names, places, strict=True)]
+    sounds = {name: ring(0.3, before=0.05, seed=row) for row, name in enumerate(names)}
+    folder = fill(tmp_path, rows=rows, replace=sounds)
+    box.apply_scale(1 / METRES[surface]).export(folder / "surface.obj")
+    proposals = propose_settings(folder)
+    assert {each.key: each.value for each in proposals} == proposed
+    if proposed:
+        assert any(
+            f'{key} = "{unit}"' in problem for problem in check(folder).problems for key, unit in proposed.items()
+        )
+        write_settings(folder, proposals)
+    assert check(folder).readable
+    assert propose_settings(folder) == ()

@@ -1,7 +1,10 @@
 """How a verb ends that cannot go on: by one sentence and an exit code."""
 
+import json
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from types import FrameType
@@ -137,3 +140,45 @@ def test_a_terminal_obeys_nothing_that_stands_in_a_file(run: Callable[..., int],
     assert not {*out, *err} & set("\x1b\x07\x9b\u202e")
     assert "title" in out
     assert "title" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "attributes"),
+    [
+        ("modes nowhere", {"file": "nowhere"}),
+        ("fit nowhere -o f.safetensors --device tpu", {"file": "nowhere"}),
+        ("fitt", {"value": "fitt"}),
+        ("--quiet", {"value": None}),
+        ("fit nowhere -o f.safetensors --preset mine", {}),
+        ("render --position 0 0 0", {}),
+    ],
+)
+def test_a_refusal_is_one_json_object_where_json_is_asked_for(
+    words: str, attributes: dict[str, object], capsys: Streams
+) -> None:
+    endings = []
+    for asked in ([], ["--json"]):
+        try:
+            code: object = main([*asked, *words.split()])
+        except SystemExit as ending:
+            code = ending.code
+        endings.append((code, capsys.readouterr()))
+    (code, plain), (code_too, said) = endings
+    assert code == code_too == 2
+    assert plain.out == ""
+    assert said.err.splitlines()[-1] == plain.err.splitlines()[-1]
+    error = json.loads(said.out)["error"]
+    assert set(error) == {"message", "file", "row", "name", "value"}
+    assert {key: error[key] for key in attributes} == attributes
+    assert error["message"].split()[0] in said.err
+
+
+@pytest.mark.parametrize("words", [["--help"], ["--version"], ["fit", "--help"], ["--json", "fitt"]])
+def test_a_closed_output_ends_silently(words: list[str]) -> None:
+    code = "import sys; from avmsf.cli import main; sys.exit(main(sys.argv[1:]))"
+    run = subprocess.Popen([sys.executable, "-c", code, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert run.stdout is not None
+    run.stdout.close()
+    _, told = run.communicate(timeout=60)
+    assert b"BrokenPipe" not in told
+    assert run.returncode == 141

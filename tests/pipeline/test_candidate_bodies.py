@@ -172,7 +172,7 @@ def test_estimators_of_other_bodies_or_elements_have_other_digests() -> None:
 def test_reasons_against_other_bodies_are_reported() -> None:
     known = CandidateBodies(NominalBodies(bodies()[1:2], {None: "the mesh is open"}))
     report = MixtureEstimator(bodies=known).start(case(), "shared").report
-    assert report["unavailable"] == {"enclosed volume": "the mesh is open"}
+    assert report["unavailable"] == {"solid body": "the mesh is open"}
 
 
 @pytest.mark.parametrize("directions", [None, torch.zeros(12, 3)], ids=["no directions", "directions of length zero"])

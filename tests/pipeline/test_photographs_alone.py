@@ -44,7 +44,7 @@ def test_photographs_alone_give_elastic_mode_shapes(slab: Path, capsys: Streams)
     made = json.loads(capsys.readouterr().out)
     report = made["report"]
     assert Elastic.kind not in report["unavailable"]
-    assert report["bodies"][0]["body"].startswith("enclosed volume")
+    assert report["bodies"][0]["body"].startswith("solid body")
     assert report["bodies"][0]["weight"] > 0
     assert main(["reconstruct", str(slab), *SMALL, *bodies, "--json"]) == 0
     again = json.loads(capsys.readouterr().out)

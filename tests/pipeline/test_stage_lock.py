@@ -13,7 +13,7 @@ from avmsf.cli import main
 from avmsf.config import CACHE, PipelineConfig
 from avmsf.errors import FolderInUseError
 from avmsf.pipeline.reconstruct import reconstruct
-from avmsf.pipeline.scene import Listener
+from avmsf.pipeline.scene import ProgressListener
 from avmsf.pipeline.stages import StageFolder
 from plate_capture import fill_plate
 
@@ -70,7 +70,7 @@ def test_reconstruct_is_refused_before_it_reads_what_another_one_writes(tmp_path
             PipelineConfig("smooth", modes=4),
             cache=tmp_path / "cache",
             settings=CaptureSettings(),
-            listener=Listener(),
+            listener=ProgressListener(),
         )
     assert refused.value.holder["command"] == "avmsf reconstruct mug"
     assert sorted(each.name for each in (tmp_path / "cache").iterdir()) == ["stages.lock"]

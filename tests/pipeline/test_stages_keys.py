@@ -23,7 +23,7 @@ from avmsf.field.store import load
 from avmsf.pipeline import reconstruct as module
 from avmsf.pipeline import stages
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.pipeline.scene import Listener
+from avmsf.pipeline.scene import ProgressListener
 from avmsf.pipeline.stages import StageFolder
 from avmsf.simulate import nominal, recipe
 from avmsf.tasks import guided_checkpoint
@@ -122,7 +122,7 @@ def test_a_field_does_not_depend_on_free_memory_and_is_made_again_once_there_are
             ),
             cache=tmp_path / "cache",
             settings=CaptureSettings(),
-            listener=Listener(),
+            listener=ProgressListener(),
         )
         return {each.stage: each.fresh for each in made.stages}["fit"]
 

@@ -1,6 +1,7 @@
-"""Settings that would help to read a capture folder, found from its recordings, and the `capture.toml` that says so.
+"""Settings that would help to read a capture folder, found from its content, and the `capture.toml` that says so.
 
-A setting is proposed only where the recordings themselves show that it helps. docs/decisions/reading-recordings.md has
+A setting is proposed only where the recordings themselves, or for units the contacts and the surface, show that it
+helps. docs/decisions/reading-recordings.md has
 the figures behind the bounds.
 """
 
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Complex128, Float64
 from scipy.special import stdtrit
 
@@ -20,10 +22,13 @@ from avmsf._utils.text_files import read_toml
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.measure import HIGHEST_NOISE_DB, decibels, noise_level
 from avmsf.capture.onset import SECONDS_BEFORE, find_onset, find_pulse
+from avmsf.capture.placement import judge_placement, surface_points
 from avmsf.capture.prepare import Prepared, prepare
-from avmsf.capture.settings import SETTINGS, CaptureSettings, settings_of
+from avmsf.capture.settings import METRES, SETTINGS, CaptureSettings, settings_of
 from avmsf.capture.starts import shorten, start_with_impact
-from avmsf.capture.table import Strike, read_rows, understand
+from avmsf.capture.surface import find_surface
+from avmsf.capture.table import Row, Strike, read_rows, understand
+from avmsf.capture.together import NARROWEST, WIDEST, fitting_units_of
 from avmsf.errors import CaptureError
 from avmsf.files import unwritable
 
@@ -76,16 +81,18 @@ def propose_settings(folder: str | Path, settings: CaptureSettings | None = None
     try:
         chosen = set(read_toml(folder / SETTINGS)) if settings is None and (folder / SETTINGS).is_file() else set()
         settings = settings or settings_of(folder)
-        strikes = list(_strikes(folder, settings))
+        rows = read_rows(folder)[0]
     except (CaptureError, OSError, ValueError):
         return ()
     defaults = vars(CaptureSettings())
     chosen |= {key for key, value in vars(settings).items() if value != defaults[key]}
-    proposals: list[Proposal] = []
+    proposals: list[Proposal] = [] if chosen & {"unit", "surface_unit"} else _units(folder, rows, settings)
+    units: dict[str, Any] = {each.key: each.value for each in proposals}
+    strikes = list(_strikes(rows, replace(settings, **units)))
     if not chosen & {"force_channel", "response_channel"}:
         proposals += choose_channels([channel_figures(recording) for _, recording in _recordings(folder, strikes)])
-        found: dict[str, Any] = {each.key: each.value for each in proposals}
-        settings = replace(settings, **found)
+    found: dict[str, Any] = {each.key: each.value for each in proposals}
+    settings = replace(settings, **found)
     evidence = Evidence(settings)
     for strike, recording in _recordings(folder, strikes):
         evidence.add(strike, recording)
@@ -113,7 +120,9 @@ def write_settings(folder: str | Path, proposals: Sequence[Proposal]) -> Path:
 
 def settings_text(proposals: Sequence[Proposal]) -> str:
     """Return the text of a `capture.toml` with these settings, each below its reason."""
-    head = "# Proposed by `avmsf check --write-settings` from the recordings; change or remove what does not suit.\n"
+    head = (
+        "# Proposed by `avmsf check --write-settings` from the folder's files; change or remove what does not suit.\n"
+    )
     reasons = (textwrap.wrap(each.reason, 100, initial_indent="# ", subsequent_indent="# ") for each in proposals)
     parts = ("\n".join([*reason, each.line, ""]) for reason, each in zip(reasons, proposals, strict=True))
     return "\n".join([head, *parts])
@@ -284,8 +293,31 @@ class Evidence:
         )
 
 
-def _strikes(folder: Path, settings: CaptureSettings) -> Iterator[Strike]:
-    for row in read_rows(folder)[0]:
+def _units(folder: Path, rows: Sequence[Row], settings: CaptureSettings) -> list[Proposal]:
+    """Return the units in which contacts lie on the surface, where the present ones cannot be meant."""
+    try:
+        surface = find_surface(folder, settings)
+    except CaptureError:
+        return []
+    # Contacts too far from the origin for the present unit are needed here.
+    strikes = list(_strikes(rows, replace(settings, unit="mm")))
+    if surface is None or not strikes:
+        return []
+    contacts = torch.tensor([each.contact for each in strikes], dtype=torch.float64) * settings.meters / METRES["mm"]
+    placement = judge_placement(contacts, surface_points(surface))
+    if not placement.other_unit and NARROWEST <= placement.diagonal <= WIDEST:
+        return []
+    units: dict[str, Any] = fitting_units_of(placement, settings)
+    size = placement.diagonal / settings.surface_meters * replace(settings, **units).surface_meters
+    reason = (
+        f"The contacts then lie on the surface, {size:.3g} m across. In the present units the contacts are "
+        f"{placement.spread:.3g} m across and the surface {placement.diagonal:.3g} m."
+    )
+    return [Proposal(key, unit, reason) for key, unit in units.items()]
+
+
+def _strikes(rows: Sequence[Row], settings: CaptureSettings) -> Iterator[Strike]:
+    for row in rows:
         try:
             yield understand(row, settings)
         except CaptureError:

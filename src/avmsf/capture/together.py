@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from avmsf.capture.location import Location
-from avmsf.capture.placement import Mistake, judge_placement, surface_points
+from avmsf.capture.placement import Placement, judge_placement, surface_points
 from avmsf.capture.prepare import shortest_allowed
 from avmsf.capture.settings import METRES, CaptureSettings
 from avmsf.capture.surface import Surface, find_surface
@@ -23,6 +23,8 @@ WIDEST = 10.0
 """Meters across beyond which contacts are more likely in another unit."""
 NARROWEST = 1e-3
 """Meters across below which they are."""
+USUAL_SIZE = 0.2
+"""Meters across of objects that are struck and recorded."""
 USUAL_RANGE_DB = 80.0
 """Level between a recording and the median beyond which its scale is doubtful: a contact near the nodes of most modes
 takes 40 dB, a soft impact 30."""
@@ -156,7 +158,7 @@ def judge_surface(strikes: Sequence[Strike], surface: Surface, *, settings: Capt
     placement = judge_placement(contacts, surface_points(surface))
     if placement.on_surface:
         return []
-    found = placement.describe([f"row {strike.line}" for strike in strikes]) + _mending(placement.mistake, settings)
+    found = placement.describe([f"row {strike.line}" for strike in strikes]) + _advice(placement, settings)
     farthest = float(placement.distances.max())
     if placement.other_unit:
         raise CaptureError(
@@ -190,19 +192,40 @@ def expect_one_unit(folder: Path, settings: CaptureSettings) -> None:
         judge_surface(strikes, surface, settings=settings)
 
 
-def _mending(mistake: Mistake | None, settings: CaptureSettings) -> str:
-    """Return what to write in capture.toml where a unit alone is wrong."""
-    if mistake is None or not mistake.unit_only:
-        return ""
+def fitting_units_of(placement: Placement, settings: CaptureSettings) -> dict[str, str]:
+    """Return the settings `unit` and `surface_unit` to change so that contacts and surface fit, as far as units do it.
 
-    def named(meters: float) -> list[str]:
-        return [unit for unit, length in METRES.items() if abs(length / meters - 1) < 1e-6]
+    Where both count one unit, the surface's size says which: the one that gives an object of `NARROWEST` to `WIDEST`,
+    the present one if it does, else the one that comes nearest to `USUAL_SIZE`. Empty where nothing is to change, or
+    no units explain what is wrong.
+    """
+    mistake = placement.mistake
+    if placement.mostly_off if mistake is None else not mistake.unit_only:
+        return {}
+    ratio = settings.meters * (1.0 if mistake is None else mistake.factor) / settings.surface_meters
+    pairs = [
+        (unit, surface_unit)
+        for unit, meters in METRES.items()
+        for surface_unit, surface_meters in METRES.items()
+        if math.isclose(meters / surface_meters, ratio, rel_tol=1e-6)
+    ]
 
-    contacts, shape = named(settings.meters * mistake.factor), named(settings.surface_meters / mistake.factor)
-    if contacts and (mistake.factor < 1 or not shape):
-        shape_unit = settings.surface_unit or settings.unit
-        return f' If so, write unit = "{contacts[0]}" and surface_unit = "{shape_unit}" in capture.toml'
-    return f' If so, write surface_unit = "{shape[0]}" in capture.toml' if shape else ""
+    def changes(pair: tuple[str, str]) -> dict[str, str]:
+        unit, surface_unit = pair
+        changed = {} if unit == settings.unit else {"unit": unit}
+        return changed | ({} if surface_unit == (settings.surface_unit or unit) else {"surface_unit": surface_unit})
+
+    def price(pair: tuple[str, str]) -> tuple[bool, bool, float]:
+        size = placement.diagonal * METRES[pair[1]] / settings.surface_meters
+        return not NARROWEST <= size <= WIDEST, bool(changes(pair)), abs(math.log(size / USUAL_SIZE))
+
+    return changes(min(pairs, key=price)) if pairs else {}
+
+
+def _advice(placement: Placement, settings: CaptureSettings) -> str:
+    """Return what to write in capture.toml where units alone are wrong."""
+    lines = [f'{key} = "{value}"' for key, value in fitting_units_of(placement, settings).items()]
+    return f" If so, write {' and '.join(lines)} in capture.toml" if lines else ""
 
 
 def _diagonal(points: Sequence[Sequence[float]]) -> float:

@@ -19,7 +19,7 @@ from typing import TextIO
 import avmsf
 from avmsf._utils.memory import NO_MEMORY, lacks_memory
 from avmsf._utils.text import printable
-from avmsf.cli.heartbeat import beating, verbosity
+from avmsf.cli.heartbeat import beating, meanwhile, verbosity
 from avmsf.errors import AvmsfError, AvmsfWarning
 
 VERBS = {
@@ -60,10 +60,14 @@ INTERRUPTED = 130
 """The exit code that shells give a command ended by Ctrl-C."""
 TERMINATED = 143
 """The exit code that shells give a command ended by SIGTERM."""
+REFUSED = 2
+"""The exit code of input that cannot be used."""
 _WAITING = frozenset({"studio"})
 """Verbs that wait for their user most of the time."""
 _COMMON = frozenset({"--quiet", "--verbose", "--json"})
 """Options that may also stand before the verb."""
+_OUTPUTS = ("output", "plots")
+"""Options that name what a verb writes."""
 _WIDEST = 120
 """Columns of the list of verbs, at most."""
 _AGAIN = 0.05
@@ -75,7 +79,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Raises SystemExit, as command lines do, for a verb's help (0) and for options that cannot be understood (2).
     """
-    words = _verb_first(sys.argv[1:] if arguments is None else arguments)
+    try:
+        try:
+            return _run(_verb_first(sys.argv[1:] if arguments is None else arguments))
+        finally:
+            # What is still buffered would otherwise fail after the end of this function.
+            sys.stdout.flush()
+    except BrokenPipeError:
+        # Whoever read the output has closed it, as `head` does; Python would complain again when it flushes.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return CLOSED
+
+
+def _run(words: list[str]) -> int:
+    """Run the verb that comes first in the words and return its exit code, as `main` does."""
     if words[:1] == ["--version"]:
         print(avmsf.__version__)
         return 0
@@ -93,24 +110,45 @@ def main(arguments: Sequence[str] | None = None) -> int:
             with _loading(quiet=options.quiet):
                 verb = import_module(f"avmsf.cli.{words[0]}")
             _show_plainly()
+            paths = [getattr(options, name, None) for name in _OUTPUTS]
+            absent = sorted({path.parent for path in paths if path is not None and not path.parent.exists()})
             with _compilation_announced():
                 code: int = verb.run(options)
-        except BrokenPipeError:
-            # Whoever read the output has closed it, as `head` does; Python would complain again when it flushes.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return CLOSED
+            for folder in absent:
+                if folder.is_dir() and not options.quiet:
+                    print(f"created folder {printable(str(folder))}", file=sys.stderr)
         except Exception as error:
             if not isinstance(error, AvmsfError) and not lacks_memory(error):
                 raise
-            sentence = str(error) if isinstance(error, AvmsfError) else NO_MEMORY
-            print(f"avmsf {words[0]}: {printable(' '.join(sentence.split()))}", file=sys.stderr)
-            return 2
+            known = error if isinstance(error, AvmsfError) else AvmsfError(NO_MEMORY)
+            print(f"avmsf {words[0]}: {_sentence(known)}", file=sys.stderr)
+            return _refuse(known, words)
+        except SystemExit as ending:
+            # Of options that cannot be understood, which the standard error has explained.
+            if message := getattr(ending, "message", ""):
+                _refuse(AvmsfError(message), words)
+            raise
         except KeyboardInterrupt:
             print(f"avmsf {words[0]}: interrupted", file=sys.stderr)
             code = INTERRUPTED
         finally:
             verbosity.quiet = verbosity.verbose = False
         return TERMINATED if code == INTERRUPTED and signal.SIGTERM in received else code
+
+
+def _refuse(error: AvmsfError, words: Sequence[str]) -> int:
+    """Return the exit code of an error; where the words ask for JSON, print it as an object to the standard output."""
+    if "--json" in words:
+        # Imports rich, which other errors do not need.
+        from avmsf.cli.printing import print_json
+
+        print_json({"error": {"message": _sentence(error), **error.attributes}})
+    return REFUSED
+
+
+def _sentence(error: AvmsfError) -> str:
+    """Return the message of an error on one line."""
+    return printable(" ".join(str(error).split()))
 
 
 @contextmanager
@@ -179,7 +217,7 @@ def _compilation_announced() -> AbstractContextManager[None]:
     # Imports rich, which help on the whole does not need.
     from avmsf.cli.printing import say
 
-    announced: AbstractContextManager[None] = module.announced(say)
+    announced: AbstractContextManager[None] = module.announced(say, meanwhile)
     return announced
 
 
@@ -192,15 +230,13 @@ def _verb_first(words: Sequence[str]) -> list[str]:
 
 def _explain(words: list[str]) -> int:
     """Print the list of verbs and return 0, or print that there is no such verb and return 2."""
-    if words and words[0] in _COMMON:
-        print("avmsf: expected a command, got none; `avmsf --help` lists all.", file=sys.stderr)
-        return 2
     if words and words[0] not in ("-h", "--help"):
+        given = None if words[0] in _COMMON else words[0]
         near = [RENAMED[words[0]]] if words[0] in RENAMED else get_close_matches(words[0], VERBS, n=1)
-        guess = f" Did you mean {near[0]}?" if near else ""
-        problem = f"expected a command, got {printable(words[0])!r}.{guess} `avmsf --help` lists all."
-        print(f"avmsf: {problem}", file=sys.stderr)
-        return 2
+        advice = f"did you mean {near[0]}? `avmsf --help` lists all" if near else "`avmsf --help` lists all"
+        error = AvmsfError.expected("a command", given, name="avmsf", advice=advice)
+        print(_sentence(error), file=sys.stderr)
+        return _refuse(error, words)
     indent = max(map(len, VERBS)) + 4
     width = min(shutil.get_terminal_size().columns, _WIDEST)
     rows = {**VERBS, "--help": "Print this list.", "--version": "Print the version."}

@@ -52,7 +52,7 @@ def run(options: Options) -> int:
         screen.print(f"and {len(problems) - MAX_PRINTED} more; --json prints all", soft_wrap=True)
     if options.write_settings and not proposals:
         left = "; settings that the messages above name are yours to choose" if problems else ""
-        screen.print(f"the recordings alone determine no further setting: nothing was written{left}", soft_wrap=True)
+        screen.print(f"the folder's files determine no further setting: nothing was written{left}", soft_wrap=True)
     if not options.write_settings:
         for each in proposals:
             screen.print(f"proposed: {each.line} (--write-settings writes it). {each.reason}", soft_wrap=True)

@@ -15,7 +15,7 @@ from avmsf.capture.settings import METRES, settings_of
 from avmsf.capture.surface import Surface
 from avmsf.cli.contacts import given_contacts, note_off, refuse_far
 from avmsf.cli.options.export import Options, unused_options
-from avmsf.cli.printing import figure, next_command, print_result, say
+from avmsf.cli.printing import figure, print_result, say
 from avmsf.config import CACHE
 from avmsf.errors import ExportError
 from avmsf.export.faust import contacts_path, fitted, write_faust
@@ -74,8 +74,7 @@ def run(options: Options) -> int:
     print_result(text, values, json=options.json)
     say(f"next: {_following(options)}")
     if options.to == "wavs" and len(options.forces) == 1:
-        layered = f"--to wavs --output {shlex.quote(str(options.output))} --forces 0.3 1 3"
-        next_command("avmsf export", options.field, layered)
+        say("next: the same command with --forces 0.3 1 3, for a layer at each force")
     return 0
 
 
@@ -143,9 +142,7 @@ def _at_given(field: SoundField | SampledField, options: Options) -> SampledFiel
     contacts = given_contacts(options.position, options.contact_table, unit=options.unit)
     refuse_far(contacts, field, advice=", see --unit")
     note_off(contacts, field)
-    if contacts.directions is not None:
-        say(f"note: {contacts.table}: directions are not used; impacts go straight into the surface")
-    return SampledField.of(field, contacts.places)
+    return SampledField.of(field, contacts.places, directions=contacts.directions)
 
 
 def _object(field: SoundField | SampledField, options: Options) -> tuple[Path | Surface | None, float]:

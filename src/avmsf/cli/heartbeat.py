@@ -66,6 +66,18 @@ def doing(text: str) -> None:
     _activity.text = text
 
 
+@contextmanager
+def meanwhile(text: str) -> Iterator[None]:
+    """Let `text` be what is going on while the block runs, and afterwards what was before, if nothing else began."""
+    before = _activity.text, _activity.since
+    _activity.text, _activity.since = text, time.monotonic()
+    try:
+        yield
+    finally:
+        if _activity.text == text:
+            _activity.text, _activity.since = before
+
+
 def _without_numbers(text: str) -> str:
     return re.sub(r"[-+.e\d]+", "", text)
 

@@ -11,7 +11,7 @@ from rich.text import Text
 from avmsf.cli.heartbeat import doing, verbosity
 from avmsf.cli.printing import SafeColumn, console, say
 from avmsf.field.fit import Progress as FitProgress
-from avmsf.pipeline.scene import Listener
+from avmsf.pipeline.scene import ProgressListener
 from avmsf.scene.lift import LiftProgress
 from avmsf.scene.splat import SplatProgress
 from avmsf.wording import counted
@@ -54,9 +54,9 @@ class OverallBar:
         self._bar.stop()
 
     @property
-    def listener(self) -> Listener:
+    def listener(self) -> ProgressListener:
         """Who hears of the stages that lead to features."""
-        return Listener(self.tell, self._splatting, self._lifting)
+        return ProgressListener(self.tell, self._splatting, self._lifting)
 
     @property
     def left(self) -> float:

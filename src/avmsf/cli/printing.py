@@ -101,8 +101,8 @@ def print_result(text: str, values: Mapping[str, Any], *, json: bool) -> None:
 
 
 def json_text(value: Mapping[str, Any]) -> str:
-    """Return valid JSON: what is not a finite number becomes null, which NaN is not."""
-    return json.dumps(_plain(value), indent=2, ensure_ascii=False, allow_nan=False)
+    """Return valid JSON: numbers that are not finite become null, and what JSON does not know becomes text."""
+    return json.dumps(_plain(value), indent=2, ensure_ascii=False, allow_nan=False, default=str)
 
 
 def _plain(value: Any) -> Any:

@@ -12,7 +12,7 @@ from avmsf.wording import counted
 
 
 class FitBar:
-    """One bar a stage, with its loss and the time it has left; in a file or a pipe, a line each few seconds."""
+    """One bar a stage, with its own loss and the time it has left; in a file or a pipe, a line each few seconds."""
 
     def __init__(self) -> None:
         self.live = sys.stderr.isatty()
@@ -21,7 +21,7 @@ class FitBar:
             TextColumn("{task.description}"),
             BarColumn(),
             MofNCompleteColumn(),
-            TextColumn("loss {task.fields[loss]}"),
+            TextColumn("{task.fields[loss]}"),
             TimeRemainingColumn(),
             console=console(errors=True),
             disable=not self.live or verbosity.quiet,
@@ -41,16 +41,18 @@ class FitBar:
         self.bar.start()
         if progress.step <= progress.warmup:
             stage, step, steps = f"{progress.stage}, warm-up", progress.step, progress.warmup
+            loss = f"squared gain error {figure(progress.loss)}"
         else:
             stage, step = f"{progress.stage}, end to end", progress.step - progress.warmup
             steps = progress.steps - progress.warmup
+            loss = f"spectral loss {figure(progress.loss)}"
         if stage != self.stage and self.live:
             self.bar.remove_task(self.task)
             self.task = self.bar.add_task(stage, total=steps, loss="–")
         self.stage = stage
         if self.live:
-            self.bar.update(self.task, completed=step, loss=figure(progress.loss))
+            self.bar.update(self.task, completed=step, loss=loss)
         elif step == steps:
-            say(f"{stage}: {counted(steps, 'step')}, loss {figure(progress.loss)}")
+            say(f"{stage}: {counted(steps, 'step')}, {loss}")
         else:
-            doing(f"{stage}: step {step} of {steps}, loss {figure(progress.loss)}")
+            doing(f"{stage}: step {step} of {steps}, {loss}")

@@ -7,7 +7,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from avmsf.cli.heartbeat import doing, verbosity
 from avmsf.cli.printing import SafeColumn, console, figure, say
-from avmsf.pipeline.scene import Listener
+from avmsf.pipeline.scene import ProgressListener
 from avmsf.scene.lift import LiftProgress
 from avmsf.scene.splat import SplatProgress
 
@@ -41,9 +41,9 @@ class SceneBar:
         self.bar.stop()
 
     @property
-    def listener(self) -> Listener:
+    def listener(self) -> ProgressListener:
         """Who hears of the stages."""
-        return Listener(say, self.splatting, self.lifting, counting=say)
+        return ProgressListener(say, self.splatting, self.lifting, counting=say)
 
     def stop(self) -> None:
         """Leave the screen to another bar."""

@@ -30,7 +30,7 @@ _DRAWN = 4
 
 @dataclass(frozen=True, eq=False)
 class SampledField:
-    """Modal parameters of impacts perpendicular to the surface, at some points.
+    """Modal parameters of impacts at some points, perpendicular to the surface unless other directions are given.
 
     The sound of an impact of force 1 at a point is the sum over modes of exp(-d t) (sine sin(2 pi f t) + cosine
     cos(2 pi f t)), plus the noise.
@@ -39,7 +39,7 @@ class SampledField:
     points: Float[Tensor, "points 3"]
     """Contacts, object frame, meters."""
     normals: Float32[Tensor, "points 3"]
-    """Outward unit normals at the contacts; impacts have the opposite direction."""
+    """Outward unit normals at the contacts, or the opposites of given directions: impacts go against them."""
     frequency: Float64[Tensor, " modes"]
     """Hz, all below half the sample rate."""
     damping: Float64[Tensor, "*points modes"]
@@ -68,25 +68,32 @@ class SampledField:
         points: Float[Tensor, "points 3"] | None = None,
         normals: Float[Tensor, "normals 3"] | None = None,
         *,
+        directions: Float[Tensor, "points 3"] | None = None,
         limit: int | None = None,
     ) -> "SampledField":
         """Return the field at `points` (object frame, meters), by default at its own that lie on the object.
 
         More than `limit` points are reduced to evenly spread ones. `normals` are outward normals; by default those of
-        the field's body, or without a body estimated from the points. Raises `ExportError` for no points, and for
-        points that are not finite.
+        the field's body, or without a body estimated from the points. `directions` are those of the impacts at given
+        points, as in `SoundField.render`; one of length zero is against the normal. Raises `ExportError` for no
+        points, and for points that are not finite.
         """
         places = points_on_object(sound_field.gain_field) if points is None else points
         _expect_places(places, normals, limit)
         if limit is not None and len(places) > limit:
             rows = spread_rows(places, limit)
-            places, normals = places[rows], None if normals is None else normals[rows]
+            places = places[rows]
+            normals, directions = (None if each is None else each[rows] for each in (normals, directions))
         if normals is None:
             normals = _known_normals(sound_field.gain_field, places)
         if normals is None:
             normals = outward_normals(places)
+        if directions is not None:
+            normals = torch.where(directions.any(1, keepdim=True), -directions.double(), normals.double())
         heard = torch.nonzero(sound_field.audible).flatten()
-        known = [sound_field.known(part) for part in torch.split(places, _BATCH)]
+        parts = torch.split(places, _BATCH)
+        ways = [None] * len(parts) if directions is None else torch.split(directions, _BATCH)
+        known = [sound_field.known(part, directions=way) for part, way in zip(parts, ways, strict=True)]
         along, ahead = torch.cos(sound_field.phase), torch.sin(sound_field.phase)
         sines, cosines = [], []
         for part in known:

@@ -1,4 +1,4 @@
-"""The bodies that one surface may enclose: a filled one, or walls of any thickness, of any isotropic material."""
+"""The bodies that one surface may enclose: a solid one, or walls of any thickness, of any isotropic material."""
 
 import math
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from avmsf.simulate.solid import Solid
 DOFS = WALL_TRIAL
 """Degrees of freedom of each wall, about: prisms along walls of a pot and a tube are 1 % too stiff in frequency."""
 FILLED_DOFS = 40_000
-"""Of a filled body, about: tetrahedra lock where they fill thin parts."""
+"""Of a solid body, about: tetrahedra lock where they fill thin parts."""
 _HOLES = 0.01
 """Part of a closed surface that lids over holes make up, below which the holes are defects of a scan. The mouth of a
 bottle is about as much."""
@@ -45,9 +45,9 @@ class BodyFamily:
     bodies: tuple[IsotropicModes, ...]
     """By ascending thickness."""
     thickness: tuple[float, ...]
-    """Of their walls on average, meters; empty for a filled body, which is alone."""
+    """Of their walls on average, meters; empty for a solid body, which is alone."""
     make: Callable[[float], Solid] | None = None
-    """Makes the body of another thickness, meters; None for a filled body. Raises SimulationError where it cannot."""
+    """Makes the body of another thickness, meters; None for a solid body. Raises SimulationError where it cannot."""
 
     @property
     def walled(self) -> bool:
@@ -100,7 +100,7 @@ def body_family(
 ) -> BodyFamily:
     """Return the bodies of a surface, with their lowest `count` modes.
 
-    Walls have about `dofs` degrees of freedom, a filled body `filled`.
+    Walls have about `dofs` degrees of freedom, a solid body `filled`.
 
     A closed mesh that shows both sides of one wall has walls of `_SCALES` times its thickness behind its larger side;
     another closed mesh is filled. An open mesh has walls of `WALLS` times its size. A shape from photographs has walls
@@ -140,7 +140,7 @@ def _of_shape(shape: Shape, count: int, dofs: int, filled: int, tell: Callable[[
 
 
 def _filled(found: CheckedSurface, count: int, dofs: int, tell: Callable[[str], None]) -> BodyFamily:
-    tell("dividing the enclosed volume into tetrahedra")
+    tell("dividing the body into tetrahedra")
     return BodyFamily((isotropic_modes(filled_solid(found, dofs), count=count),), ())
 
 

@@ -12,6 +12,8 @@ from avmsf.errors import PositionError
 from avmsf.field.gainfield import GainField
 from avmsf.field.scaledgains import body_of, length_of
 
+OFF_SURFACE = "it sounds about as the nearest point of the object does"
+"""What is said of a position off the object: features and mode shapes are those of the nearest point."""
 _FEW = 16
 """Positions up to which all distances take less time than a tree of the points."""
 

@@ -135,7 +135,7 @@ def wall_error(surface: Surface | Shape, wall: float, error: SimulationError) ->
     extent = float((seen.vertices.amax(0) - seen.vertices.amin(0)).max())
     reasons = "; ".join(error.value) if isinstance(error.value, list) else str(error)
     if not wall:
-        wanted, advice = "a closed mesh for 0, a solid object", "close the mesh, or give the wall thickness in meters"
+        wanted, advice = "a closed mesh for 0, a solid body", "close the mesh, or give the wall thickness in meters"
     else:
         wanted = f"a wall thickness in meters that an object of {extent:.3g} m can have"
         advice = "give it in meters, as 0.003 for 3 mm, or leave it out"

@@ -35,7 +35,7 @@ from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.guess import expect_no_recordings, guess_field
 from avmsf.pipeline.record import finder_of, modes_words, supporting_poles, with_record
-from avmsf.pipeline.scene import Listener, SceneStages
+from avmsf.pipeline.scene import ProgressListener, SceneStages
 from avmsf.pipeline.silhouettes import expect_contacts_in_outlines, judge_outlines
 from avmsf.pipeline.stages import Kept, StageFolder
 from avmsf.scene.features import FeatureField
@@ -88,7 +88,7 @@ def reconstruct(
     *,
     cache: Path,
     settings: CaptureSettings,
-    listener: Listener,
+    listener: ProgressListener,
     fitting: Callable[[Progress], None] | None = None,
 ) -> Reconstruction:
     """Make views, Gaussians, features, modes and a field of a capture, or what of these has to be made anew.
@@ -118,7 +118,7 @@ def _reconstruct(
     *,
     stages: StageFolder,
     settings: CaptureSettings,
-    listener: Listener,
+    listener: ProgressListener,
     fitting: Callable[[Progress], None] | None,
 ) -> Reconstruction:
     shape = _shape(folder, capture, config, stages, settings=settings, listener=listener)
@@ -180,7 +180,7 @@ def reconstruct_guess(
     *,
     cache: Path,
     settings: CaptureSettings,
-    listener: Listener,
+    listener: ProgressListener,
 ) -> Path:
     """Return the file of a field that is guessed for an object without recordings, made anew where something changed.
 
@@ -272,7 +272,7 @@ def _shape(
     stages: StageFolder,
     *,
     settings: CaptureSettings,
-    listener: Listener,
+    listener: ProgressListener,
 ) -> _Shape:
     scene = SceneStages(folder, stages, config.scene, settings=settings, listener=listener, device=config.device)
     bare = capture.surface is not None and not len(capture.surface.faces)
@@ -324,7 +324,7 @@ def _surface_stage(
     config: PipelineConfig,
     surface: Callable[[], Surface | ObjectShape],
     digest: str,
-    listener: Listener,
+    listener: ProgressListener,
 ) -> dict[str, Kept]:
     """Return the stage of the object's surface; none where its shape is unknown or the gain model needs none."""
     if config.gain_model == NETWORK:

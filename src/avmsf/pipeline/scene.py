@@ -39,7 +39,7 @@ def _say_nothing(words: str) -> None:
 
 
 @dataclass(frozen=True)
-class Listener:
+class ProgressListener:
     """Callbacks that receive the progress of the stages."""
 
     tell: Callable[[str], None] = _say_nothing
@@ -66,7 +66,7 @@ class SceneStages:
         config: SceneConfig,
         *,
         settings: CaptureSettings,
-        listener: Listener | None = None,
+        listener: ProgressListener | None = None,
         name: str = FEATURES,
         device: str | None = None,
     ) -> None:
@@ -76,7 +76,7 @@ class SceneStages:
         """
         self.device = device
         self.folder, self.stages, self.config, self.settings, self.name = folder, stages, config, settings, name
-        self.listener = Listener() if listener is None else listener
+        self.listener = ProgressListener() if listener is None else listener
         found = find_source(folder, settings, prefer=config.views.source)
         preferred = config.views.source == "mesh" and found is not None and found.kind == "mesh"
         self.splats = None if preferred else find_splats(folder)

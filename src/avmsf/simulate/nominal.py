@@ -82,7 +82,7 @@ class NominalBody:
     """One guess at what lies behind an object's surface, and how it would vibrate."""
 
     wall: float | None
-    """Thickness of its wall, meters; None for a filled body."""
+    """Thickness of its wall, meters; None for a solid body."""
     elastic: ElasticModes
     """Nominal material."""
     fine: bool = True
@@ -105,7 +105,7 @@ class NominalBodies:
     """All guesses from which modes could be computed."""
 
     bodies: tuple[NominalBody, ...]
-    """At least one: the filled body first, then walls from thin to thick, or as the user states them."""
+    """At least one: the solid body first, then walls from thin to thick, or as the user states them."""
     refused: Mapping[float | None, str]
     """Reasons why others could not be had, by the others' walls: names of two may be alike."""
 
@@ -148,8 +148,6 @@ def nominal_bodies(
             refused[wall] = error
     bodies = maker.bodies(likely, dofs, refused)
     reasons = _grouped(refused)
-    for reason in reasons:
-        told(f"candidate model left out: {reason}")
     if not bodies:
         causes = {str(error.name) for error in refused.values()}
         other = "give the wall thickness in meters" if guessed else "give another wall thickness, or none"
@@ -159,6 +157,8 @@ def nominal_bodies(
             name=min(causes) if causes <= _MEANS else "surface",
             value=reasons,
         )
+    for reason in reasons:
+        told(_without(reason))
     if len(bodies) == 1 and not bodies[0].fine:
         bodies = [refined(surface, bodies[0], dofs=dofs, cache=cache, tell=tell)]
     return NominalBodies(tuple(bodies), MappingProxyType({wall: str(error) for wall, error in refused.items()}))
@@ -181,7 +181,7 @@ def with_wall(
     try:
         return _Maker(surface, count, cache, told).body(wall, dofs, fine=False)
     except SimulationError as error:
-        told(f"candidate model left out: {body_name(wall)}: {error}")
+        told(_without(f"{body_name(wall)}: {error}"))
         return None
 
 
@@ -240,7 +240,7 @@ def supported(
             except SimulationError as error:
                 if support is None:
                     raise
-                told(f"candidate model left out: {body.name}, {support.name}: {error}")
+                told(_without(f"{body.name}, {support.name}: {error}"))
     except SimulationError as error:
         told(f"{body.name}: no supports tested: {error}")
     return tuple(bodies)
@@ -445,13 +445,13 @@ def _expect_settings(count: int, dofs: int, walls: Sequence[float | None] | None
         raise SimulationError(f"dofs: expected {FEWEST} or more, got {dofs}", name="dofs", value=dofs)
     if walls is not None and not len(walls):
         raise SimulationError(
-            "walls: expected thicknesses in meters, or None for a solid object, got an empty list",
+            "walls: expected thicknesses in meters, or None for a solid body, got an empty list",
             name="walls",
             value=[],
         )
     for row, wall in enumerate(walls or ()):
         if wall is not None and not 0 < wall < float("inf"):
-            raise SimulationError.expected("more than 0 m, or None for a solid object", wall, row=row, name="walls")
+            raise SimulationError.expected("more than 0 m, or None for a solid body", wall, row=row, name="walls")
 
 
 def _grouped(refused: Mapping[float | None, SimulationError]) -> list[str]:
@@ -463,9 +463,14 @@ def _grouped(refused: Mapping[float | None, SimulationError]) -> list[str]:
     return [f"{each}: {reason}" for reason, each in shown.items()]
 
 
+def _without(reason: str) -> str:
+    """Return what `tell` hears of a body that cannot be had, where there are others; without an error's advice."""
+    return f"not tried as the body: {reason.partition('; ')[0]}; the other candidates are compared"
+
+
 def body_name(wall: float | None) -> str:
     """Return what a body of this wall, meters, is called, with two digits; None is all that the surface encloses."""
-    return "enclosed volume" if wall is None else f"wall of {_millimeters(wall, 2)}"
+    return "solid body" if wall is None else f"wall of {_millimeters(wall, 2)}"
 
 
 def _millimeters(meters: float, digits: int) -> str:

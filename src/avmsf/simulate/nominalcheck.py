@@ -73,7 +73,7 @@ class CheckedSurface:
         if held is not None and wall > _HOLLOW * held:
             raise SimulationError(
                 f"expected a wall of at most {1000 * _HOLLOW * held:.2g} mm in a mesh that is {1000 * held:.2g} mm "
-                "thick on average, got a thicker one; use a solid object",
+                "thick on average, got a thicker one; use a solid body",
                 name="wall",
                 value=wall,
             )

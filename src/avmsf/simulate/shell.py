@@ -48,7 +48,7 @@ def shell(surface: Surface, *, thickness: float, detail: float = 0.04) -> Solid:
         middle = 0.5 * abs(skin.volume) / skin.areas.sum()
         raise SimulationError(
             f"thickness: expected less than the {4 * middle:.2g} m of the closed surface on average, got "
-            f"{thickness:.3g} m; use a solid object (0 m), or a wall of {middle:.1g} m",
+            f"{thickness:.3g} m; use a solid body (0 m), or a wall of {middle:.1g} m",
             name="thickness",
             value=thickness,
         )

@@ -27,7 +27,7 @@ from avmsf.field.store import load, save
 from avmsf.files import copy_whole
 from avmsf.pipeline.reconstruct import reconstruct
 from avmsf.pipeline.record import capture_settings_of
-from avmsf.pipeline.scene import Listener, SceneStages
+from avmsf.pipeline.scene import ProgressListener, SceneStages
 from avmsf.pipeline.stages import StageFolder
 from avmsf.scene.lift import LiftProgress
 from avmsf.scene.splat import SplatProgress
@@ -65,9 +65,9 @@ class Voice:
         self.step(stage, 0, 0, rest)
 
     @property
-    def listener(self) -> Listener:
+    def listener(self) -> ProgressListener:
         """The listener of a reconstruction."""
-        return Listener(self.tell, self._splatting, self._lifting)
+        return ProgressListener(self.tell, self._splatting, self._lifting)
 
     def _splatting(self, progress: SplatProgress) -> None:
         if progress.step % _RARELY == 0 or progress.step == progress.steps:

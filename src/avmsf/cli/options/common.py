@@ -56,7 +56,7 @@ def parse_options(
 ) -> T:
     """Return the options that the words spell; leaves by SystemExit for help and for what cannot be understood.
 
-    Raises `InputError` for an option that has another name now.
+    The latter is a `UsageExit`. Raises `InputError` for an option that has another name now.
     """
     for word in words:
         if word in _RENAMED:

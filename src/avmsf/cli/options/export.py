@@ -91,7 +91,8 @@ class Options(Printing):
     """faust, gltf, uff, wavs: a contact in the object's frame, in place of contacts spread over the object; once per
     contact."""
     contact_table: ContactTable = None
-    """faust, gltf, uff, wavs: table of contacts with the columns x,y,z, such as a capture's impacts.csv."""
+    """faust, gltf, uff, wavs: table of contacts with the columns x,y,z, and nx,ny,nz for directions of impacts, such
+    as a capture's impacts.csv."""
     unit: Unit = "m"
     """Unit of --position and --contact-table."""
     overwrite: Flag = False

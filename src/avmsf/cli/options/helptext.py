@@ -14,8 +14,9 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import MISSING, Field, fields, is_dataclass
+from itertools import takewhile
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -35,11 +36,11 @@ _NAMES: dict[object, str] = {int: "N", float: "NUMBER", str: "TEXT", Path: "FILE
 
 
 class _Page(io.StringIO):
-    """Help on its way to a terminal or to a file, which has no colors."""
+    """Help, or an error, on its way to a terminal or to a file, which has no colors."""
 
-    def __init__(self) -> None:
+    def __init__(self, stream: Any) -> None:
         super().__init__()
-        self.stream = sys.stdout
+        self.stream = stream
 
     @property
     def encoding(self) -> str:  # type: ignore[override]
@@ -51,6 +52,14 @@ class _Page(io.StringIO):
         return self.stream.isatty()
 
 
+class UsageExit(SystemExit):
+    """Options cannot be understood, as the standard error explains; `message` is its first sentence."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(2)
+        self.message = message
+
+
 def paragraphs(text: str) -> str:
     """Return a docstring with a line for each paragraph."""
     return "\n\n".join(" ".join(part.split()) for part in inspect.cleandoc(text).split("\n\n"))
@@ -58,19 +67,34 @@ def paragraphs(text: str) -> str:
 
 @contextmanager
 def one_column() -> Iterator[None]:
-    """Let help have one column of boxes, however wide the terminal is, below text that fills the lines."""
+    """Let help have one column of boxes, however wide the terminal is, below text that fills the lines.
+
+    Raises `UsageExit` where the block leaves with an error.
+    """
     width = min(_WIDEST, shutil.get_terminal_size().columns)
-    before, page = os.environ.get("COLUMNS"), _Page()
+    before, page, errors = os.environ.get("COLUMNS"), _Page(sys.stdout), _Page(sys.stderr)
     os.environ["COLUMNS"] = str(width)
     try:
-        with redirect_stdout(page):
+        with redirect_stdout(page), redirect_stderr(errors):
             yield
+    except SystemExit as ending:
+        if ending.code:
+            raise UsageExit(_message(errors.getvalue())) from None
+        raise
     finally:
+        print(errors.getvalue(), end="", file=sys.stderr)
         del os.environ["COLUMNS"]
         if before is not None:
             os.environ["COLUMNS"] = before
         for line in re.sub(r"\n{3,}", "\n\n", page.getvalue()).splitlines():
             print(_with_title(line.rstrip()) if _BOX.search(line) else textwrap.fill(line, width))
+
+
+def _message(box: str) -> str:
+    """Return the sentence in the box of an error: what is below its title and above its first rule."""
+    lines = [re.sub(r"\x1b\[[\d;]*m|[│╭╮╰╯]", "", line).strip() for line in box.splitlines()]
+    message = takewhile(lambda line: not line or line.strip("─-"), lines[1:])
+    return " ".join(line for line in message if line)
 
 
 def _with_title(line: str) -> str:

@@ -6,6 +6,7 @@ from typing import Any, TypeVar, get_type_hints
 
 import tyro
 
+from avmsf.cli.options.helptext import one_column
 from avmsf.config import PRESETS, Preset
 
 T = TypeVar("T")
@@ -18,7 +19,8 @@ class _Preset:
 
 def preset_of(words: Sequence[str]) -> Preset:
     """Return the preset that the words name; it is read first, since it decides the defaults of all others."""
-    chosen, _ = tyro.cli(_Preset, args=words, add_help=False, return_unknown_args=True)
+    with one_column():
+        chosen, _ = tyro.cli(_Preset, args=words, add_help=False, return_unknown_args=True)
     return chosen.preset
 
 
