@@ -262,7 +262,7 @@ def _judged(case: LocatingCase, options: LocatingOptions, seconds: list[float]) 
     return scores
 
 
-def _strangers(options: LocatingOptions) -> Report:
+def _other_objects(options: LocatingOptions) -> Report:
     """Count what `locate` refuses: of an object's own recordings, and of sounds that are none of its."""
     names = ("aircraft_response", "tree43", "ruler10")
     captures = {name: read_capture(shared_data() / name) for name in names}
@@ -293,9 +293,9 @@ def _strangers(options: LocatingOptions) -> Report:
         for kind, refusals in heard.items():
             share = mean(refusal is not None for refusal in refusals)
             by_gains = sum(refusal is not None and "log Bayes factor" in refusal for refusal in refusals)
-            found[f"locate.strangers.{name}.{kind.replace(' ', '_')}"] = share
+            found[f"locate.other_objects.{name}.{kind.replace(' ', '_')}"] = share
             rows.append([f"{name}: {kind}", len(refusals), share, by_gains])
-    title = "locate.strangers: sounds at the field's rate, and the part of them that is refused"
+    title = "locate.other_objects: sounds at the field's rate, and the part of them that is refused"
     return Report(tables=(Table(title, ("sounds", "count", "refused", "by their gains"), rows),), figures=found)
 
 
@@ -413,7 +413,7 @@ PARTS: dict[str, Callable[[LocatingOptions], Report]] = {
     "aircraft": _aircraft,
     "sim20": _sim20,
     "stream": _stream,
-    "strangers": _strangers,
+    "other-objects": _other_objects,
 }
 
 

@@ -85,7 +85,7 @@ def judged(found: ContactMap) -> ContactMap:
     positions, no better than noise would. The thresholds of the mismatch ratio come from simulated plates of wood,
     plastic, ceramic and steel, a measured aircraft and a recorded bowl: their own sounds have ratios of .3 at most, as
     long as noise is no louder than they are, and 98 in 100 of others more than .5. `python -m benchmarks.locating
-    --parts strangers` reports what is refused of other sounds and of an object's own.
+    --parts other-objects` reports what is refused of other sounds and of an object's own.
     """
     modal, null, ratio = 100 * found.modal_energy, 100 * found.null_energy, found.mismatch_ratio
     share = f"the object's modes explain {modal:.0f} % of it, detuned modes {null:.0f} %"
