@@ -16,7 +16,7 @@ from avmsf.bench.evaluation import Scores, evaluate, score, split
 from avmsf.bench.metrics import relative_stft_error
 from avmsf.bench.renderer import Renderer, expect_renderer
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import EvaluationError
+from avmsf.errors import EvaluationError, FitError
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_gains
@@ -239,6 +239,11 @@ def test_what_is_no_renderer_is_refused(made):
         expect_renderer(made)
 
 
+def fit_to_recordings(train):
+    """Raise what `SoundField.fit` raises for recordings without a capture."""
+    raise FitError("no capture", name="capture", value=type(train).__name__)
+
+
 def test_training_recordings_are_for_what_makes_a_renderer():
     train, test = split(plate_impacts(4))
     assert evaluate(lambda heard: Silent(heard.sample_rate), test, train=train).mean()["relative_stft"] == 1.0
@@ -248,6 +253,8 @@ def test_training_recordings_are_for_what_makes_a_renderer():
         evaluate(WithoutDirections(22050.0), test)
     with raises(EvaluationError, name="renderer", value="int"):
         evaluate(lambda heard: 3, test, train=train)
+    with raises(EvaluationError, name="renderer", value="SoundField"):
+        evaluate(fit_to_recordings, test, train=train)
 
 
 def test_scores_have_means_and_standard_errors():

@@ -15,7 +15,7 @@ from avmsf.bench.metrics import PerContact, default_fft_sizes, relative_stft_err
 from avmsf.bench.renderer import Renderer, expect_renderer
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import EvaluationError, ExtractionError, PositionWarning
+from avmsf.errors import EvaluationError, ExtractionError, FitError, PositionWarning
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.scene.points import farthest_points
@@ -109,7 +109,18 @@ def evaluate(
     if train is not None:
         make = _expect_maker(renderer)
         aligned, impacts = align_split(_impacts_of(train, "train"), impacts)
-        renderer = make(aligned)
+        try:
+            renderer = make(aligned)
+        except FitError as error:
+            if error.name != "capture":
+                raise
+            raise EvaluationError.expected(
+                "a renderer made of recordings alone",
+                "SoundField",
+                got="a SoundField, whose fit needs the shape in a Capture",
+                name="renderer",
+                advice="give avmsf.SoundField.fit(train), without `train`: it aligns the test recordings itself",
+            ) from error
     made = expect_renderer(renderer)
     if isinstance(made, SoundField):
         impacts = made.aligned(impacts)

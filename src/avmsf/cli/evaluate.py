@@ -171,7 +171,7 @@ def evaluation_of(
     lift, paper = settled_lifts(options.lift, looks_of(methods, protocol), device=device)
     given = SceneConfig(ViewsConfig(source=options.visual_source), options.splat, options.lift)
     scene = replace(given, lift=lift)
-    # Of a shape that is made from photographs alone, nothing may read the mesh.
+    # With the shape from photographs, no method may read the mesh.
     looks = ObjectLooks(dataset, kept, scene, paper, device, meshes=options.geometry != "gaussians", seed=options.seed)
     cdpam = not options.no_cdpam and "cdpam" in protocol.metrics
     return Evaluation(

@@ -132,11 +132,14 @@ class KernelFamily(ABC):
         return torch.einsum("hb,bso->hso", self.shares[kept], self.basis(sites, others))
 
     def factors(self, sites: Sites, known: Sites) -> Float64[Tensor, "sites factors"]:
-        """Return what the covariances of all kernels with known impacts are linear in: the basis with each."""
+        """Return vectors z of impacts for which each kernel's covariances with the known ones are `loadings` times z.
+
+        Here the basis with each known impact.
+        """
         return self.basis(sites, known).permute(1, 2, 0).flatten(1)
 
     def loadings(self, known: Sites, kept: Int[Tensor, " kept"]) -> Float64[Tensor, "kept known factors"]:
-        """Return the matrices by which the factors of impacts give some kernels between these and known impacts."""
+        """Return the matrix of each of some kernels that gives covariances with known impacts from `factors`."""
         one = torch.eye(len(known), dtype=torch.float64)
         return (one[:, :, None] * self.shares[kept][:, None, None]).flatten(2)
 

@@ -2,7 +2,8 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
+from itertools import accumulate
 from typing import Any, ClassVar
 
 import torch
@@ -27,6 +28,8 @@ NEIGHBORS = 3
 """Nearest recordings that are averaged, as in the paper's baseline."""
 _MEMORY = 16_000_000
 """Covariances between places and contacts that are held at once, over all kernels."""
+_FORM_ENTRIES = 16_000_000
+"""Largest number of entries of one family's matrices for the variance, which are kept: 128 MB."""
 _POSITIONAL: dict[str, type[KernelFamily]] = {each.kind: each for each in (Unstructured, Smooth, ThinPlate)}
 _OF_OBJECT = {Elastic.kind: "bodies", Symmetric.kind: "symmetries", Visual.kind: "features"}
 """Families that know something of the object, and the entry of the record with its size."""
@@ -351,16 +354,22 @@ class MixtureGains:
 
     @cached_property
     def _forms(self) -> list[Float64[Tensor, "series _factors _factors"] | None]:
-        """`KernelMixture.explained_forms` of each family; None where covariances are smaller or the memory is."""
-        found: list[Float64[Tensor, "series _factors _factors"] | None] = []
-        first = 0
-        for family, kept in zip(self.families, self.kept, strict=True):
-            rows, first = range(first, first + len(kept)), first + len(kept)
-            count = family.loadings(self.training, kept[:1]).shape[2]
-            small = count < len(kept) and self.mixture.values.shape[1] * count**2 <= _MEMORY
-            loadings = partial(_loadings, family, self.training, kept)
-            found.append(self.mixture.explained_forms(rows, loadings) if small else None)
-        return found
+        """`KernelMixture.explained_forms` of each family.
+
+        None for a family that has fewer kernels than factors, or whose matrices would exceed `_FORM_ENTRIES`: its
+        covariances with the training impacts, kernel by kernel, are cheaper.
+        """
+        firsts = accumulate(map(len, self.kept), initial=0)
+        return [self._form(*each) for each in zip(self.families, self.kept, firsts, strict=False)]
+
+    def _form(
+        self, family: KernelFamily, kept: Int[Tensor, " kept"], first: int
+    ) -> Float64[Tensor, "series factors factors"] | None:
+        count = family.loadings(self.training, kept[:1]).shape[2]
+        if count >= len(kept) or self.mixture.values.shape[1] * count**2 > _FORM_ENTRIES:
+            return None
+        kernels = range(first, first + len(kept))
+        return self.mixture.explained_forms(kernels, lambda rows: family.loadings(self.training, kept[rows]))
 
     def _mean(self, sites: Sites) -> Float64[Tensor, "sites series"]:
         pairs = zip(self.families, self._coefficients, strict=True)
@@ -412,12 +421,6 @@ def series_of(values: Complex128[Tensor, "contacts modes"]) -> Float64[Tensor, "
 def _complex(series: Float64[Tensor, "contacts series"]) -> Complex128[Tensor, "contacts modes"]:
     real, imaginary = series.chunk(2, dim=1)
     return torch.complex(real, imaginary)
-
-
-def _loadings(
-    family: KernelFamily, known: Sites, kept: Int[Tensor, " kept"], rows: Int[Tensor, " rows"]
-) -> Float64[Tensor, "rows contacts factors"]:
-    return family.loadings(known, kept[rows])
 
 
 def _gains(series: Float64[Tensor, "contacts series"]) -> Gains:
