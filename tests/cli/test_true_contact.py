@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from avmsf.bench.sides import ALL_SIDES, view_from
 from avmsf.cli import locate as verb
+from avmsf.cli.contacts import Contacts, rows_of
 from avmsf.cli.locate import run
 from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.locate import parse
@@ -118,6 +119,38 @@ def test_a_table_gives_each_recording_its_contact_and_the_last_line_sums_up(
     assert "1 of 2" in summary
 
 
+def test_a_table_may_have_absolute_paths_and_any_format(
+    hit: tuple[str, str, torch.Tensor], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    field, recording, points = hit
+    sound = tmp_path / "hit.flac"
+    soundfile.write(sound, soundfile.read(recording)[0], RATE)
+    table = tmp_path / "places.csv"
+    place = ",".join(f"{value:.9g}" for value in points[STRUCK].tolist())
+    table.write_text(f"file,x,y,z\n{sound},{place}\n")
+    assert run(parse([field, str(sound), "--true-contact-table", str(table), "--json"])) == 0
+    (impact,) = json.loads(capsys.readouterr().out)["impacts"]
+    assert impact["error"] == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("names", "recording", "rows"),
+    [
+        (("hit.wav",), "a/hit.wav", [0]),
+        (("b/hit.wav",), "a/hit.wav", [0]),
+        (("hit.wav", "a/hit.wav"), "a/hit.wav", [1]),
+        (("hit.wav", "a/hit.wav"), "b/hit.wav", [0]),
+        (("a/hit.wav", "x/a/hit.wav", "y/a/hit.wav"), "/x/a/hit.wav", [1]),
+        (("/x/hit.wav", "/y/hit.wav"), "/y/hit.wav", [1]),
+        (("a/hit.wav", "b/hit.wav"), "c/hit.wav", [0, 1]),
+        (("other.wav", "a/hit.flac"), "a/hit.wav", []),
+    ],
+)
+def test_a_recording_has_the_row_with_most_of_its_path(names: tuple[str, ...], recording: str, rows: list[int]) -> None:
+    contacts = Contacts(torch.zeros(len(names), 3, dtype=torch.float64), names)
+    assert rows_of(contacts, Path(recording)) == rows
+
+
 def test_a_table_that_names_no_recordings_or_has_another_unit_is_refused(
     hit: tuple[str, str, torch.Tensor], tmp_path: Path
 ) -> None:
@@ -125,6 +158,9 @@ def test_a_table_that_names_no_recordings_or_has_another_unit_is_refused(
     table = tmp_path / "places.csv"
     table.write_text("x,y,z\n0,0,0\n")
     with raises(CaptureError, file=table, name="file"):
+        run(parse([field, recording, "--true-contact-table", str(table)]))
+    table.write_text("x,y,z,file\n0,0,0\n")
+    with raises(CaptureError, file=table, row=2, name="file"):
         run(parse([field, recording, "--true-contact-table", str(table)]))
     table.write_text("file,x,y,z\nhit.wav,120,40,0\n")
     with raises(OutputError, file=table, row=2):

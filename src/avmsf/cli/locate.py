@@ -17,7 +17,7 @@ from avmsf.bench.pictures import save_picture
 from avmsf.capture import CaptureSettings
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.settings import METRES
-from avmsf.cli.contacts import Contacts, read_contacts, refuse_far, row_of
+from avmsf.cli.contacts import Contacts, read_contacts, refuse_far, rows_of
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.locate import RECORDING, Options
 from avmsf.cli.printing import console, figure, next_command, print_json, say
@@ -126,7 +126,7 @@ def _true_contacts(options: Options, field: SoundField) -> Contacts | None:
     """Return the true contacts, if any. Raises OutputError for one far from the object, as in another unit."""
     meters = METRES[options.unit]
     if options.true_contact_table is not None:
-        contacts = read_contacts(options.true_contact_table, meters=meters, named=True)
+        contacts = read_contacts(options.true_contact_table, meters=meters, recordings=True)
     elif options.true_contact is not None:
         place = torch.tensor([options.true_contact], dtype=torch.float64) * meters
         contacts = Contacts(place, ("true",), option="--true-contact")
@@ -137,12 +137,13 @@ def _true_contacts(options: Options, field: SoundField) -> Contacts | None:
 
 
 def _true_contact(contacts: Contacts, recording: Path) -> Float64[Tensor, " 3"] | None:
-    """Return a recording's true contact; where a table does not have it, note that."""
-    row = 0 if contacts.table is None else row_of(contacts, recording)
-    if row is None:
-        say(f"note: {contacts.table}: expected one row for {recording}, got none; its distance is not known")
+    """Return a recording's true contact; where a table does not have one row for it, note that."""
+    rows = [0] if contacts.table is None else rows_of(contacts, recording)
+    if len(rows) != 1:
+        got = len(rows) or "none"
+        say(f"note: {contacts.table}: expected one row for {recording}, got {got}; its distance is not known")
         return None
-    return contacts.places[row]
+    return contacts.places[rows[0]]
 
 
 def _error(contact: ContactMap, truth: Float64[Tensor, " 3"], level: float) -> dict[str, Any]:
