@@ -132,7 +132,7 @@ def _true_contacts(options: Options, field: SoundField) -> Contacts | None:
         contacts = Contacts(place, ("true",), option="--true-contact")
     else:
         return None
-    refuse_far(contacts, field)
+    refuse_far(contacts, field, advice=", see --unit")
     return contacts
 
 
