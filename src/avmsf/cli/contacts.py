@@ -15,7 +15,7 @@ from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.common import Unit
 from avmsf.cli.printing import say
 from avmsf.errors import CaptureError, PositionError
-from avmsf.field.positions import OFF_SURFACE, expect_near, off_surface
+from avmsf.field.positions import expect_near, off_surface, off_surface_gains
 from avmsf.field.soundfield import SoundField
 
 _COLUMNS = ("x", "y", "z")
@@ -149,7 +149,7 @@ def note_off(contacts: Contacts, field: SoundField) -> None:
     """Print a note for each contact that is not on the object's surface, with its distance, see `off_surface`."""
     for row, distance in off_surface(contacts.places, field.gain_field):
         where = f"{1e3 * distance:.3g} mm off the object's surface"
-        say(f"note: {contacts.label(row)} is {where}; {OFF_SURFACE}")
+        say(f"note: {contacts.label(row)} is {where}; {off_surface_gains(field.gain_field)}")
 
 
 def _number(text: str, path: Path, line: int, column: str, separator: str) -> float:
