@@ -9,7 +9,7 @@ from avmsf.errors import LocationError
 from avmsf.field.gainfield import Gains
 from avmsf.field.soundfield import Origin
 from avmsf.localization.likelihood import Force
-from avmsf.localization.locate import MIN_EXPLAINED, REJECT_ABOVE, WARN_ABOVE, judged, locate
+from avmsf.localization.locate import MIN_EXPLAINED, REJECT_ABOVE, WARN_ABOVE, assess_match, locate
 from avmsf.localization.locator import Locator
 from avmsf.localization.smoothing import distinct_contacts
 from avmsf.modal.extraction.least_squares import fit_gains
@@ -239,20 +239,20 @@ def test_its_own_sounds_are_not_taken_for_another_plates(noise_db):
 
 def test_what_falls_between_is_doubted_in_words():
     found = locator_of().locate(struck(1, seed=6).sounds[0])
-    assert judged(found) is found
-    (note,) = judged(replace(found, modal_energy=0.8, null_energy=0.5)).notes
+    assert assess_match(found) is found
+    (note,) = assess_match(replace(found, modal_energy=0.8, null_energy=0.5)).notes
     assert all(each in note for each in ("80 %", "50 %", "a mismatch ratio of 0.40"))
-    (note,) = judged(replace(found, explained_energy=0.9 * MIN_EXPLAINED)).notes
+    (note,) = assess_match(replace(found, explained_energy=0.9 * MIN_EXPLAINED)).notes
     assert " 9 %" in note
     # Where modes out of tune explain all as well, a rounding is no misfit.
-    assert judged(replace(found, modal_energy=1.0 - 1e-4, null_energy=1.0 - 1e-5)).notes == ()
+    assert assess_match(replace(found, modal_energy=1.0 - 1e-4, null_energy=1.0 - 1e-5)).notes == ()
 
 
 @pytest.mark.parametrize("noise_db", [-40.0, 0.0])
 @pytest.mark.parametrize(("taps", "seed"), [(None, 6), (25, 6), (25, 5)], ids=["true", "held out", "trained on"])
 def test_own_sounds_are_explained_better_than_by_noise(taps, seed, noise_db):
     for sound in struck(12, seed=seed, noise_db=noise_db).sounds:
-        found = judged(locator_of(taps).locate(sound))
+        found = assess_match(locator_of(taps).locate(sound))
         assert found.refusal is None
         assert found.evidence > 0.0
 
@@ -273,7 +273,7 @@ def with_the_modes_of_no_place(seed):
 @pytest.mark.parametrize("taps", [None, 25])
 def test_a_sound_whose_modes_are_so_strong_at_no_place_has_none(taps):
     for seed in range(6):
-        found = judged(locator_of(taps).locate(with_the_modes_of_no_place(seed)))
+        found = assess_match(locator_of(taps).locate(with_the_modes_of_no_place(seed)))
         # Its frequencies and dampings are the object's: only the strengths tell.
         assert found.mismatch_ratio < 0.01
         assert found.evidence <= 0.0

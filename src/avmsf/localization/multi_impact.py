@@ -21,7 +21,7 @@ from avmsf.field.soundfield import SoundField
 from avmsf.localization.amplitudes import Extractor
 from avmsf.localization.contact_map import ContactMap
 from avmsf.localization.likelihood import Force
-from avmsf.localization.locate import judged, measured_force_notes
+from avmsf.localization.locate import assess_match, measured_force_notes
 from avmsf.localization.locator import Locator
 from avmsf.localization.preprocess import (
     Sound,
@@ -91,7 +91,7 @@ def locate_impacts(
     ratio = len(resampled) / len(sound)
     starts = [round(onset * ratio) for onset in onsets]
     found = []
-    refused: list[tuple[float, LocationError]] = []
+    rejected: list[tuple[float, LocationError]] = []
     for number, (onset, start) in enumerate(zip(onsets, starts, strict=True)):
         end = starts[number + 1] if number + 1 < len(starts) else len(resampled)
         own = resampled[start : min(end, start + field.samples)].double()
@@ -99,18 +99,20 @@ def locate_impacts(
             own = own - predict_ringing(field, resampled, starts[number - 1], start, len(own), highest=highest)
         seconds = onset / whole.sample_rate
         try:
-            located = _accepted(judged(finder.locate(own.float(), highest=highest, force=known)), whole.name, seconds)
+            located = _accepted(
+                assess_match(finder.locate(own.float(), highest=highest, force=known)), whole.name, seconds
+            )
         except LocationError as error:
-            refused.append((seconds, error))
+            rejected.append((seconds, error))
             continue
         measured = measured_force_notes(forces[number], field, known)
         found.append((seconds, replace(located, notes=(*notes, *remark, *measured, *located.notes))))
     if not found:
-        raise refused[0][1]
-    if not refused:
+        raise rejected[0][1]
+    if not rejected:
         return found
-    times = ", ".join(f"{seconds:.3f}" for seconds, _ in refused)
-    left_out = f"{whole.name}: {counted(len(refused), 'impact')}, at {times} s, could not be located: {refused[0][1]}"
+    times = ", ".join(f"{seconds:.3f}" for seconds, _ in rejected)
+    left_out = f"{whole.name}: {counted(len(rejected), 'impact')}, at {times} s, could not be located: {rejected[0][1]}"
     return [(seconds, replace(each, notes=(*each.notes, left_out))) for seconds, each in found]
 
 
