@@ -47,6 +47,8 @@ _ONSET_RATIO, _MIN_RELATIVE_LEVEL = 4.0, 0.1
 """Level of the prediction residual at an onset, at least: over that before it, and over its largest."""
 _TRAVEL_SECONDS = 0.02
 """Longest time from a push to the onset of its sound: a microphone up to 6.9 m away. Impacts are farther apart."""
+_PUSH_SECONDS = 0.005
+"""Longest time from the onset to the peak of the push, with a near microphone and a soft hammer."""
 _MIN_PUSH_RATIO = 12.0
 """Range of the force channel around a push, at least, over the standard deviation of its noise: noise has 10 at most.
 """
@@ -64,11 +66,11 @@ def locate_impacts(
     """Return the onset of each impact in a recording, seconds, and its map, in order.
 
     Bare samples are at `sample_rate` Hz, or at the field's rate; `settings` as for `preprocess_recording`; `force`, of
-    every impact, as for `locate`; `locator` is one made of the field before. The decaying sound of earlier impacts is
-    fitted by the object's modes just before an impact, extrapolated and subtracted. Impacts on other objects are left
-    out, which a note says, and impacts closer than 30 ms count as one. Raises LocationError as `preprocess_recording`,
-    for settings with `normalize = "deconvolve"` where the recording has a force channel, and where no impact can be
-    located.
+    every impact, as for `locate`, is compared with the push in the force channel up to 20 ms before the onset;
+    `locator` is one made of the field before. The decaying sound of earlier impacts is fitted by the object's modes
+    just before an impact, extrapolated and subtracted. Impacts on other objects are left out, which a note says, and
+    impacts closer than 30 ms count as one. Raises LocationError as `preprocess_recording`, where no impact can be
+    located, and for settings with `normalize = "deconvolve"` where the recording has a force channel.
     """
     known = None if force is None else Force.of(force)
     recording = read_if_path(recording)
@@ -138,12 +140,12 @@ def _without_rumble(recording: Recording, settings: CaptureSettings) -> Float64[
 def _peak_forces(recording: Recording, onsets: list[int], settings: CaptureSettings) -> list[float | None]:
     """Return the peak force of each impact by the recording's force channel; None without a push above the noise.
 
-    The push is searched from `_TRAVEL_SECONDS` before the onset of the sound to `_GUARD_SECONDS` after it.
+    The push is searched from `_TRAVEL_SECONDS` before the onset of the sound to `_PUSH_SECONDS` after it.
     """
     if settings.force_channel is None:
         return [None] * len(onsets)
     force = recording.channel(settings.force_channel)
-    before, after = (round(seconds * recording.sample_rate) for seconds in (_TRAVEL_SECONDS, _GUARD_SECONDS))
+    before, after = (round(seconds * recording.sample_rate) for seconds in (_TRAVEL_SECONDS, _PUSH_SECONDS))
     parts = [force[max(0, onset - before) : onset + after] for onset in onsets]
     # From the 90 % quantile of Gaussian noise: pushes take less than a tenth of the time.
     limit = _MIN_PUSH_RATIO / 1.645 * float(np.quantile(np.abs(force - np.median(force)), 0.9))
