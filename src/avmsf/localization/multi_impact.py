@@ -101,9 +101,7 @@ def locate_impacts(
             own = own - predict_ringing(field, resampled, starts[number - 1], start, len(own), highest=highest)
         seconds = onset / whole.sample_rate
         try:
-            located = _accepted(
-                assess_match(finder.locate(own.float(), highest=highest, force=known)), whole.name, seconds
-            )
+            located = _accepted(finder.locate(own.float(), highest=highest, force=known), whole.name, seconds)
         except LocationError as error:
             rejected.append((seconds, error))
             continue
@@ -118,8 +116,9 @@ def locate_impacts(
     return [(seconds, replace(each, notes=(*each.notes, left_out))) for seconds, each in found]
 
 
-def _accepted(located: ContactMap, recording: str, seconds: float) -> ContactMap:
-    """Return the map of the impact at `seconds` as it is; raises LocationError for an impact on another object."""
+def _accepted(found: ContactMap, recording: str, seconds: float) -> ContactMap:
+    """Return the map of the impact at `seconds`, see `assess_match`; raises LocationError for one on another object."""
+    located = assess_match(found)
     if located.refusal is not None:
         raise LocationError(
             f"{recording}, impact at {seconds:.3f} s: {located.refusal}", file=recording, name="impact", value=seconds
