@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from avmsf.bench.sides import ALL_SIDES, view_from
 from avmsf.cli import locate as verb
+from avmsf.cli.contacts import Contacts, rows_of
 from avmsf.cli.locate import run
 from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.locate import parse
@@ -59,7 +60,9 @@ def test_the_true_contact_is_red_at_its_place_and_the_found_one_blue(
     monkeypatch.setattr(verb, "save_picture", lambda figure, path: figures.append(figure))
     true = [f"{value:.9g}" for value in points[OTHER].tolist()]
     assert run(parse([field, recording, "--output", str(tmp_path), "--true-contact", *true, "--json"])) == 0
-    (blow,) = json.loads(capsys.readouterr().out)["impacts"]
+    results = json.loads(capsys.readouterr().out)
+    assert results["summary"] is None
+    (blow,) = results["impacts"]
     distance = float((points[STRUCK] - points[OTHER]).norm())
     diagonal = float((points.amax(0) - points.amin(0)).norm())
     assert blow["true_contact"] == pytest.approx(points[OTHER].tolist(), abs=1e-6)
@@ -82,17 +85,7 @@ def test_the_true_contact_is_red_at_its_place_and_the_found_one_blue(
             assert np.asarray(scatter.get_offsets())[marked] == pytest.approx(place[None, :2], abs=1e-6)
 
 
-def test_the_distance_is_printed_without_pictures(
-    hit: tuple[str, str, torch.Tensor], capsys: pytest.CaptureFixture[str]
-) -> None:
-    field, recording, points = hit
-    true = [f"{value:.9g}" for value in points[OTHER].tolist()]
-    assert run(parse([field, recording, "--true-contact", *true])) == 0
-    distance = 1000 * float((points[STRUCK] - points[OTHER]).norm())
-    assert f"{distance:.1f} mm from the true contact" in capsys.readouterr().out
-
-
-def test_a_table_gives_each_recording_its_contact_and_the_last_line_sums_up(
+def test_a_table_gives_each_recording_its_contact_and_the_summary_is_over_them(
     hit: tuple[str, str, torch.Tensor], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     field, recording, points = hit
@@ -106,16 +99,48 @@ def test_a_table_gives_each_recording_its_contact_and_the_last_line_sums_up(
     table.write_text("\n".join(["file,x,y,z", *lines]))
     words = [field, *map(str, paths), "--true-contact-table", str(table), "--unit", "mm", "--json"]
     assert run(parse(words)) == 0
-    out, err = capsys.readouterr()
-    first, second, third = json.loads(out)["impacts"]
+    results = json.loads(capsys.readouterr().out)
+    first, second, third = results["impacts"]
     distance = float((points[STRUCK] - points[OTHER]).norm())
     assert (first["error"], second["error"]) == pytest.approx((0.0, distance), abs=1e-6)
     assert (first["in_region"], second["in_region"]) == (True, False)
     assert "error" not in third
-    assert f"note: {table}: expected one row for {paths[2]}" in err
-    (summary,) = (line for line in err.splitlines() if "RMED" in line)
-    assert f"{500 * distance:.1f} mm" in summary
-    assert "1 of 2" in summary
+    diagonal = float((points.amax(0) - points.amin(0)).norm())
+    relative = 0.5 * distance / diagonal
+    wanted = {"impacts": 2, "median_error": 0.5 * distance, "rmed": relative, "rmed_posterior": relative}
+    assert results["summary"] == pytest.approx({**wanted, "in_region": 0.5}, abs=1e-6)
+
+
+def test_a_table_may_have_absolute_paths_and_any_format(
+    hit: tuple[str, str, torch.Tensor], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    field, recording, points = hit
+    sound = tmp_path / "hit.flac"
+    soundfile.write(sound, soundfile.read(recording)[0], RATE)
+    table = tmp_path / "places.csv"
+    place = ",".join(f"{value:.9g}" for value in points[STRUCK].tolist())
+    table.write_text(f"file,x,y,z\n{sound},{place}\n")
+    assert run(parse([field, str(sound), "--true-contact-table", str(table), "--json"])) == 0
+    (impact,) = json.loads(capsys.readouterr().out)["impacts"]
+    assert impact["error"] == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("names", "recording", "rows"),
+    [
+        (("hit.wav",), "a/hit.wav", [0]),
+        (("b/hit.wav",), "a/hit.wav", [0]),
+        (("hit.wav", "a/hit.wav"), "a/hit.wav", [1]),
+        (("hit.wav", "a/hit.wav"), "b/hit.wav", [0]),
+        (("a/hit.wav", "x/a/hit.wav", "y/a/hit.wav"), "/x/a/hit.wav", [1]),
+        (("/x/hit.wav", "/y/hit.wav"), "/y/hit.wav", [1]),
+        (("a/hit.wav", "b/hit.wav"), "c/hit.wav", [0, 1]),
+        (("other.wav", "a/hit.flac"), "a/hit.wav", []),
+    ],
+)
+def test_a_recording_has_the_row_with_most_of_its_path(names: tuple[str, ...], recording: str, rows: list[int]) -> None:
+    contacts = Contacts(torch.zeros(len(names), 3, dtype=torch.float64), names)
+    assert rows_of(contacts, Path(recording)) == rows
 
 
 def test_a_table_that_names_no_recordings_or_has_another_unit_is_refused(
@@ -125,6 +150,9 @@ def test_a_table_that_names_no_recordings_or_has_another_unit_is_refused(
     table = tmp_path / "places.csv"
     table.write_text("x,y,z\n0,0,0\n")
     with raises(CaptureError, file=table, name="file"):
+        run(parse([field, recording, "--true-contact-table", str(table)]))
+    table.write_text("x,y,z,file\n0,0,0\n")
+    with raises(CaptureError, file=table, row=2, name="file"):
         run(parse([field, recording, "--true-contact-table", str(table)]))
     table.write_text("file,x,y,z\nhit.wav,120,40,0\n")
     with raises(OutputError, file=table, row=2):

@@ -3,7 +3,7 @@
 import torch
 
 from avmsf.field.gains.body import BodyGains
-from avmsf.field.positions import off_surface, points_on_object
+from avmsf.field.positions import off_surface, off_surface_gains, points_on_object
 from avmsf.field.scaledgains import ScaledGains, surface_of
 from believing_field import LENGTH, bar, bar_points
 from made_fields import positional
@@ -23,6 +23,13 @@ def test_a_place_on_a_false_floor_is_off_the_body_by_its_height() -> None:
     ((row, distance),) = off_surface(above, closed())
     assert row == 1
     assert abs(distance - HEIGHT) < 1e-6
+
+
+def test_only_a_body_has_the_gains_of_its_nearest_point() -> None:
+    assert off_surface_gains(closed()) != off_surface_gains(positional())
+    assert off_surface_gains(ScaledGains(closed(), torch.ones(6, dtype=torch.float64), 2.0)) == off_surface_gains(
+        closed()
+    )
 
 
 def test_points_of_the_false_floor_are_no_contacts() -> None:

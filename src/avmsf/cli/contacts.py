@@ -15,7 +15,7 @@ from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.common import Unit
 from avmsf.cli.printing import say
 from avmsf.errors import CaptureError, PositionError
-from avmsf.field.positions import OFF_SURFACE, expect_near, off_surface
+from avmsf.field.positions import expect_near, off_surface, off_surface_gains
 from avmsf.field.soundfield import SoundField
 
 _COLUMNS = ("x", "y", "z")
@@ -30,7 +30,7 @@ class Contacts:
     places: Float64[Tensor, "contacts 3"]
     """Object frame, meters."""
     names: tuple[str, ...]
-    """Paths of wav files in the output folder."""
+    """Paths of wav files in the output folder, or of recordings."""
     directions: Float64[Tensor, "contacts 3"] | None = None
     """Of the impacts, zero where unknown; None if none is known."""
     option: str = "--position"
@@ -78,19 +78,19 @@ def contacts_at(
     )
 
 
-def read_contacts(path: Path, *, meters: float, named: bool = False) -> Contacts:
+def read_contacts(path: Path, *, meters: float, recordings: bool = False) -> Contacts:
     """Read a table with the columns x, y, z and perhaps file, nx, ny and nz, such as a capture's impacts.csv.
 
-    Other columns are listed as `unused`. Sounds are named by the column `file`, else by number; with `named`, a table
-    without that column is refused. Raises `CaptureError` with the line at fault as `row`, counted from 1 with the
-    header, as in all tables.
+    Other columns are listed as `unused`. Sounds are named by the column `file`, else by number. By default they are
+    files to write in an output folder. With `recordings` they are files to read, in any folder, and every row must name
+    one. Raises `CaptureError` with the line at fault as `row`, counted from 1 with the header, as in all tables.
     """
     lines, separator = read_cells(path)
     header = [name.lower() for name in lines[0][1]] if lines else []
-    missing = [name for name in ("file", *_COLUMNS)[not named :] if name not in header]
+    missing = [name for name in ("file", *_COLUMNS)[not recordings :] if name not in header]
     if missing or len(lines) < 2:
         lacking = f"no column {missing[0]}" if missing else "no row"
-        columns = "file,x,y,z" if named else "x,y,z (and optionally file)"
+        columns = "file,x,y,z" if recordings else "x,y,z (and optionally file)"
         raise CaptureError(
             f"{path}: expected a header with {columns} and one row for each impact, got {lacking}",
             file=path,
@@ -103,7 +103,10 @@ def read_contacts(path: Path, *, meters: float, named: bool = False) -> Contacts
         row = dict(zip(header, cells, strict=False))
         places.append([_number(row.get(name, ""), path, line, name, separator) for name in _COLUMNS])
         normals.append([_number(row.get(name) or "0", path, line, name, separator) for name in _NORMALS])
-        names.append(_wav_name(row["file"], path, line) if "file" in row else f"{len(places):03d}.wav")
+        if recordings or "file" in row:
+            names.append(_wav_name(row.get("file", ""), path, line, anywhere=recordings))
+        else:
+            names.append(f"{len(places):03d}.wav")
     repeated = next((place for place, name in enumerate(names) if name in names[:place]), None)
     if repeated is not None:
         line, name = lines[1 + repeated][0], names[repeated]
@@ -116,17 +119,16 @@ def read_contacts(path: Path, *, meters: float, named: bool = False) -> Contacts
     return Contacts(located, tuple(names), known, table=path, lines=numbers, unused=unused)
 
 
-def row_of(contacts: Contacts, recording: Path) -> int | None:
-    """Return the row of a table that names a recording: by the file's name, and by its folders if several rows do.
+def rows_of(contacts: Contacts, recording: Path) -> list[int]:
+    """Return the rows of a table that have the file name of a recording.
 
-    None where no row does, or none alone.
+    If the path of one of them is the end of the recording's path, only that row is returned: of several such rows, the
+    one with the longest path.
     """
-    whole = recording.resolve()
-    sound = whole if whole.suffix.lower() == ".wav" else whole.with_name(f"{whole.name}.wav")
+    sound = _with_suffix(PurePosixPath(recording.absolute().as_posix()))
     rows = [row for row, name in enumerate(contacts.names) if PurePosixPath(name).name == sound.name]
-    if len(rows) > 1:
-        rows = [row for row in rows if sound.as_posix().endswith(f"/{contacts.names[row]}")]
-    return rows[0] if len(rows) == 1 else None
+    ends = [row for row in rows if str(sound).endswith("/" + contacts.names[row].lstrip("/"))]
+    return [max(ends, key=lambda row: len(contacts.names[row]))] if ends else rows
 
 
 def refuse_far(contacts: Contacts, field: SoundField, *, advice: str = "") -> None:
@@ -147,7 +149,7 @@ def note_off(contacts: Contacts, field: SoundField) -> None:
     """Print a note for each contact that is not on the object's surface, with its distance, see `off_surface`."""
     for row, distance in off_surface(contacts.places, field.gain_field):
         where = f"{1e3 * distance:.3g} mm off the object's surface"
-        say(f"note: {contacts.label(row)} is {where}; {OFF_SURFACE}")
+        say(f"note: {contacts.label(row)} is {where}; {off_surface_gains(field.gain_field)}")
 
 
 def _number(text: str, path: Path, line: int, column: str, separator: str) -> float:
@@ -161,11 +163,21 @@ def _number(text: str, path: Path, line: int, column: str, separator: str) -> fl
     return value
 
 
-def _wav_name(text: str, path: Path, line: int) -> str:
+def _wav_name(text: str, path: Path, line: int, *, anywhere: bool) -> str:
     sound = PurePosixPath(text.replace("\\", "/"))
-    if not sound.name or sound.is_absolute() or ".." in sound.parts or ":" in sound.parts[0]:
-        raise _cell_error(path, line, "file", "the name of a wav file inside the output folder", text)
-    return str(sound if sound.suffix.lower() == ".wav" else sound.with_name(f"{sound.name}.wav"))
+    if not sound.name or not (anywhere or _is_inside(sound)):
+        wanted = "the name of a recording" if anywhere else "the name of a wav file inside the output folder"
+        raise _cell_error(path, line, "file", wanted, text)
+    return str(_with_suffix(sound))
+
+
+def _is_inside(sound: PurePosixPath) -> bool:
+    """Return whether a path, which is not empty, stays in the folder that it is taken from."""
+    return not (sound.is_absolute() or ".." in sound.parts or ":" in sound.parts[0])
+
+
+def _with_suffix(sound: PurePosixPath) -> PurePosixPath:
+    return sound if sound.suffix.lower() == ".wav" else sound.with_name(f"{sound.name}.wav")
 
 
 def _cell_error(path: Path, line: int, column: str, wanted: str, text: str) -> CaptureError:

@@ -17,7 +17,7 @@ from avmsf.bench.pictures import save_picture
 from avmsf.capture import CaptureSettings
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.settings import METRES
-from avmsf.cli.contacts import Contacts, read_contacts, refuse_far, row_of
+from avmsf.cli.contacts import Contacts, read_contacts, refuse_far, rows_of
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.locate import RECORDING, Options
 from avmsf.cli.printing import console, figure, next_command, print_json, say
@@ -70,10 +70,11 @@ def run(options: Options) -> int:
             found.append(values)
     summary = _summary(found)
     if summary is not None:
-        screen.print(summary, soft_wrap=True)
+        screen.print(_summary_line(summary, options.probability), soft_wrap=True)
     next_command("avmsf suggest", options.field)
     if options.json:
-        print_json({"field": str(options.field), "quality": verdict, "impacts": found, "failures": failures})
+        results = {"impacts": found, "summary": summary, "failures": failures}
+        print_json({"field": str(options.field), "quality": verdict, **results})
     return UNLOCATED if failures or any(each["position"] is None for each in found) else 0
 
 
@@ -126,23 +127,24 @@ def _true_contacts(options: Options, field: SoundField) -> Contacts | None:
     """Return the true contacts, if any. Raises OutputError for one far from the object, as in another unit."""
     meters = METRES[options.unit]
     if options.true_contact_table is not None:
-        contacts = read_contacts(options.true_contact_table, meters=meters, named=True)
+        contacts = read_contacts(options.true_contact_table, meters=meters, recordings=True)
     elif options.true_contact is not None:
         place = torch.tensor([options.true_contact], dtype=torch.float64) * meters
         contacts = Contacts(place, ("true",), option="--true-contact")
     else:
         return None
-    refuse_far(contacts, field)
+    refuse_far(contacts, field, advice=", see --unit")
     return contacts
 
 
 def _true_contact(contacts: Contacts, recording: Path) -> Float64[Tensor, " 3"] | None:
-    """Return a recording's true contact; where a table does not have it, note that."""
-    row = 0 if contacts.table is None else row_of(contacts, recording)
-    if row is None:
-        say(f"note: {contacts.table}: expected one row for {recording}, got none; its distance is not known")
+    """Return a recording's true contact; where a table does not have one row for it, note that."""
+    rows = [0] if contacts.table is None else rows_of(contacts, recording)
+    if len(rows) != 1:
+        got = len(rows) or "none"
+        say(f"note: {contacts.table}: expected one row for {recording}, got {got}; its distance is not known")
         return None
-    return contacts.places[row]
+    return contacts.places[rows[0]]
 
 
 def _error(contact: ContactMap, truth: Float64[Tensor, " 3"], level: float) -> dict[str, Any]:
@@ -159,18 +161,25 @@ def _error(contact: ContactMap, truth: Float64[Tensor, " 3"], level: float) -> d
     return {"true_contact": truth.tolist(), "error": likely, **relative, **inside}
 
 
-def _summary(impacts: Sequence[dict[str, Any]]) -> str | None:
-    """Return one line on all located impacts of known contacts; None where it is known of one at most."""
+def _summary(impacts: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
+    """Return values over the located impacts of known contacts; None where there are fewer than two.
+
+    These are their number, the median error in meters, the mean of both relative errors, and the fraction of the true
+    contacts that are within their credible region.
+    """
     known = [each for each in impacts if "error" in each]
     if len(known) < 2:
         return None
-    rmed, posterior = (100 * mean(each[name] for each in known) for name in ("rmed", "rmed_posterior"))
-    inside = sum(each["in_region"] for each in known)
+    means = {name: mean(each[name] for each in known) for name in ("rmed", "rmed_posterior", "in_region")}
+    return {"impacts": len(known), "median_error": median(each["error"] for each in known), **means}
+
+
+def _summary_line(summary: dict[str, Any], level: float) -> str:
+    count = summary["impacts"]
     return (
-        f"{len(known)} located impacts of known contacts: median distance "
-        f"{1000 * median(each['error'] for each in known):.1f} mm, RMED {posterior:.1f} % ({rmed:.1f} % by cosine "
-        f"distance), {inside} of {len(known)} true contacts within the "
-        f"{100 * known[0]['credible_region']['probability']:g} % region"
+        f"{count} located impacts of known contacts: median distance {1000 * summary['median_error']:.1f} mm, RMED "
+        f"{100 * summary['rmed_posterior']:.1f} % ({100 * summary['rmed']:.1f} % by cosine distance), "
+        f"{round(count * summary['in_region'])} of {count} true contacts within the {100 * level:g} % region"
     )
 
 

@@ -12,8 +12,6 @@ from avmsf.errors import PositionError
 from avmsf.field.gainfield import GainField
 from avmsf.field.scaledgains import body_of, length_of
 
-OFF_SURFACE = "it sounds about as the nearest point of the object does"
-"""What is said of a position off the object: features and mode shapes are those of the nearest point."""
 _FEW = 16
 """Positions up to which all distances take less time than a tree of the points."""
 
@@ -63,6 +61,16 @@ def off_surface(positions: Float[Tensor, "contacts 3"], gains: GainField) -> lis
             neighbors, _ = cKDTree(known.numpy()).query(known.numpy(), k=2)
             limit = max(limit, 2.0 * float(neighbors[:, -1].max()))
     return [(row, float(distances[row])) for row in torch.nonzero(distances > limit).flatten().tolist()]
+
+
+def off_surface_gains(gains: GainField) -> str:
+    """Return a message on which gains a position off the object has.
+
+    Mode shapes of a body are those of its nearest surface point; kernels of the position take the position itself.
+    """
+    if body_of(gains) is None:
+        return "the gains there are extrapolated"
+    return "its gains are about those of the nearest surface point"
 
 
 def points_on_object(gains: GainField) -> Float32[Tensor, "points 3"]:

@@ -20,7 +20,7 @@ from avmsf.errors import PositionWarning
 from avmsf.field.config import FitConfig
 from avmsf.field.gainfield import GainField, Gains
 from avmsf.field.gains.model import MixtureGains
-from avmsf.field.positions import OFF_SURFACE, expect_near, off_surface
+from avmsf.field.positions import expect_near, off_surface, off_surface_gains
 from avmsf.field.scaledgains import fitted_gains, length_of
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.alignment import Alignment
@@ -362,7 +362,7 @@ class SoundField:
             row, distance = max(off, key=lambda each: each[1])
             message = (
                 f"positions, row {row}: expected positions on the object, got {len(off)} off them, this one "
-                f"by {1e3 * distance:.3g} mm; {OFF_SURFACE}"
+                f"by {1e3 * distance:.3g} mm; {off_surface_gains(self.gain_field)}"
             )
             warnings.warn(PositionWarning(message, name="positions", row=row, value=distance), stacklevel=3)
         ways = None if directions is None else as_directions(directions, "directions", count=len(contacts))

@@ -189,7 +189,7 @@ class ContactMap:
     def contains(self, contact: ArrayLike, level: float = LEVEL) -> bool:
         """Return whether `region` contains the point that is nearest to a contact, [3], object frame, meters.
 
-        Raises ArrayError for what is no position.
+        Raises ArrayError for what is no position, and LocationError where the recording was rejected.
         """
         position = as_vectors(as_floats(contact, "contact")[None], "contact")[0].double()
         return bool(self.region(level)[(self.points.double() - position).norm(dim=1).argmin()])

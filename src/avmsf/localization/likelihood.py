@@ -7,11 +7,11 @@ An impact at x of unknown force and polarity s, with an error t of its onset, ha
 one complex number a mode: a(x) are the predicted gains, n is the variance of the extraction's noise, v(x) the field's
 posterior variance, and r the relative error of fields and impacts beyond that, of b(x), the mean of the gains' squares
 at x and over the surface. The force is integrated over, with the scale-free prior p(s) = 1 / |s| unless it is known; t
-is its maximum-likelihood value; r is averaged over `MISFITS` and `BETWEEN`, weighted by their likelihood. An accurate
-field thus has a narrow posterior, and an inaccurate one a broad posterior. Errors of a field are correlated between
-modes, so the likelihood is tempered where the field's errors dominate: its logarithm is multiplied by an exponent below
-1, which is smaller the less of the sound's energy the field explains (`INDEPENDENT`). Dampings are no evidence, even of
-a field whose dampings vary with the contact: these only correct the gains.
+is its maximum-likelihood value; r is averaged over `RELATIVE_ERRORS` and `MORE_RELATIVE_ERRORS`, weighted by their
+likelihood. An accurate field thus has a narrow posterior, and an inaccurate one a broad posterior. Errors of a field
+are correlated between modes, so the likelihood is tempered where the field's errors dominate: its logarithm is
+multiplied by an exponent below 1, which is smaller the less of the sound's energy the field explains (`INDEPENDENT`).
+Dampings are no evidence, even of a field whose dampings vary with the contact: these only correct the gains.
 """
 
 import math
@@ -25,10 +25,10 @@ from avmsf._utils.arrays import ArrayLike, as_floats
 from avmsf.errors import ArrayError, LocationError
 from avmsf.localization.cosine_distance import delays_of
 
-MISFITS = (0.8, 0.15, 0.03)
+RELATIVE_ERRORS = (0.8, 0.15, 0.03)
 """Relative errors r of the gains for which the likelihood of every point is computed."""
-BETWEEN = (1.6, 0.35, 0.07, 0.015)
-"""More of them, for the likely points."""
+MORE_RELATIVE_ERRORS = (1.6, 0.35, 0.07, 0.015)
+"""More of these, for the likely points."""
 INDEPENDENT = (0.25, 0.4)
 """Exponent of the tempered likelihood where a field's errors dominate: of a field that explains nothing of a sound even
 at its best point, and of one that explains all of it. Chosen on plates, where the 90 % region then held nine impacts in
@@ -38,8 +38,8 @@ SHIFT_DEVIATION = 2e-4
 _COARSE, _FINE = 0.9, 0.3
 """Step between the tried shifts of the onset, as phase of the sound's typical frequency in radians: at all points, and
 at the preselected ones."""
-_CLOSELY = 2000
-"""Preselected points, whose gains match best; the likelihood is computed for these."""
+_PRESELECTED = 2000
+"""Number of preselected points, whose gains match best; the likelihood is computed for these."""
 _NEGLIGIBLE = 40.0
 """Log likelihood below the largest from which on a point is negligible."""
 _LEVEL_STEP, _LEVEL_LIMIT = 0.1, 28.0
@@ -104,7 +104,7 @@ class Force:
 
 
 @dataclass(frozen=True, eq=False)
-class Judgement:
+class LikelihoodResult:
     """The likelihood of every point, given a sound."""
 
     log_likelihood: Float64[Tensor, " points"]
@@ -113,15 +113,15 @@ class Judgement:
     """The force of greatest likelihood, with its sign; 0 at points that were not preselected."""
     shift: Float64[Tensor, " points"]
     """The shift of the onset of greatest likelihood, seconds from the impact to the sound's first sample."""
-    noisy: float
+    noise_fraction: float
     """Fraction of the errors' variance that is noise, 0 to 1."""
-    random: float
-    """Log likelihood, with the same constant, of noise in place of an impact; see `_Trial.random`."""
+    noise_log_likelihood: float
+    """Log likelihood, with the same constant, of noise in place of an impact; see `_Trial.noise_log_likelihood`."""
 
     def evidence(self, areas: Float64[Tensor, " points"]) -> float:
         """Return the log Bayes factor of an impact at some point, with a prior by area, against noise."""
         prior = areas.log() - areas.sum().log()
-        return float(torch.logsumexp(self.log_likelihood + prior, 0)) - self.random
+        return float(torch.logsumexp(self.log_likelihood + prior, 0)) - self.noise_log_likelihood
 
     def tempering(self, explained: float, *, factor: float = 1.0) -> float:
         """Return the exponent of the tempered likelihood, where the likeliest point explains that part of the sound.
@@ -132,26 +132,26 @@ class Judgement:
         together = min(1.0, factor * (least + (most - least) * explained))
         # Noise errs in every mode by itself. Not the arithmetic mean: where modes of a field that errs tell a twentieth
         # of their number, a tenth of noise would make that a seventh.
-        return together ** (1.0 - self.noisy)
+        return together ** (1.0 - self.noise_fraction)
 
 
-def judge(
+def evaluate_likelihood(
     predicted: PredictedGains,
     amplitudes: Complex128[Tensor, " modes"],
     noise: Float64[Tensor, " modes"],
     *,
     force: Force | None = None,
-) -> Judgement:
+) -> LikelihoodResult:
     """Return the likelihood of each point, given amplitudes and the variances of their errors."""
     # In units in which the strongest is one, so that float32 holds all squares.
     unit = float(amplitudes.abs().max())
     values, errors = amplitudes / unit, (noise / unit**2).float()
     strength = None if force is None else replace(force, expected=force.expected / unit)
     trial = _Trial.of(predicted, values, errors, strength)
-    rows = trial.alike(_CLOSELY)
-    found = trial.judge(rows, MISFITS)
+    rows = trial.preselect(_PRESELECTED)
+    found = trial.evaluate(rows, RELATIVE_ERRORS)
     near = torch.nonzero(found[0] > found[0].max() - _NEGLIGIBLE).flatten()
-    finer = trial.judge(rows[near], BETWEEN)
+    finer = trial.evaluate(rows[near], MORE_RELATIVE_ERRORS)
     better = finer[0] > found[0][near]
     found[1][near[better]] = finer[1][better]
     found[0][near] = torch.logaddexp(found[0][near], finer[0])
@@ -160,7 +160,7 @@ def judge(
     evidence = torch.full((count,), float(logs.min()), dtype=torch.float64)
     forces, shifts = torch.zeros(count, dtype=torch.float64), torch.zeros(count, dtype=torch.float64)
     evidence[rows], forces[rows], shifts[rows] = logs, unit * found[1].double(), found[2]
-    return Judgement(evidence, forces, shifts, trial.noisy, trial.random())
+    return LikelihoodResult(evidence, forces, shifts, trial.noise_fraction, trial.noise_log_likelihood())
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,9 +183,9 @@ class _Strengths:
             weights @ surplus, predicted.power @ weights, predicted.variance @ weights, weights @ predicted.usual
         )
 
-    def forces(self, rows: Int64[Tensor, " rows"], misfit: float) -> Float32[Tensor, " rows"]:
+    def forces(self, rows: Int64[Tensor, " rows"], relative_error: float) -> Float32[Tensor, " rows"]:
         """Return the squares of the forces at which impacts, with their errors, have the sound's energy."""
-        part = 0.5 * misfit**2
+        part = 0.5 * relative_error**2
         own = (1.0 + part) * self.power[rows] + self.variance[rows] + part * self.usual
         return (self.sound / own.clamp_min(_TINY)).clamp(1e-24, 1e24)
 
@@ -201,7 +201,7 @@ class _Trial:
     """One over the errors' variance, roughly: with these the shift is found."""
     strengths: _Strengths
     force: Force | None
-    noisy: float
+    noise_fraction: float
     """Fraction of the errors' variance that is noise."""
 
     @classmethod
@@ -215,13 +215,13 @@ class _Trial:
         """Return the trial of amplitudes of which the greatest has magnitude one."""
         usual, unknown = predicted.usual, predicted.variance.mean(0)
         level = (values.abs().square().float() - noise).clamp_min(0.0).sum() / (usual + unknown).sum()
-        error = level.clamp_min(1e-12) * (unknown + MISFITS[1] ** 2 * usual)
+        error = level.clamp_min(1e-12) * (unknown + RELATIVE_ERRORS[1] ** 2 * usual)
         weights = 1.0 / (noise + error)
-        noisy = float((weights * noise).mean())
-        return cls(predicted, values, noise, weights, _Strengths.of(predicted, values, noise), force, noisy)
+        noise_fraction = float((weights * noise).mean())
+        return cls(predicted, values, noise, weights, _Strengths.of(predicted, values, noise), force, noise_fraction)
 
-    def random(self) -> float:
-        """Return the log likelihood of noise, of any level, with the constant of `judge`.
+    def noise_log_likelihood(self) -> float:
+        """Return the log likelihood of noise, of any level, with the constant of `evaluate_likelihood`.
 
         Noise is one of two, equally probable: errors of the extraction that are louder than they are taken for, or
         modes of random phase that are as strong relative to each other as the field expects on average over the
@@ -231,11 +231,11 @@ class _Trial:
         noise, usual = self.noise.double(), (self.predicted.usual + self.predicted.variance.mean(0)).double()
         variance = torch.cat([levels * noise, noise + levels * usual / usual.mean()])
         logs = -(variance.log() + self.values.abs().square() / variance).sum(1)
-        # The likelihood of a point is a sum over misfits, and leaves a factor of the integral over the force out.
-        constant = math.log(len(MISFITS) + len(BETWEEN)) - 0.5 * math.log(math.pi)
+        # The likelihood of a point is a sum over the relative errors, and leaves out a factor of the force's integral.
+        constant = math.log(len(RELATIVE_ERRORS) + len(MORE_RELATIVE_ERRORS)) - 0.5 * math.log(math.pi)
         return float(torch.logsumexp(logs, 0)) + math.log(_LEVEL_STEP / 2.0) + constant
 
-    def alike(self, count: int) -> Int64[Tensor, " rows"]:
+    def preselect(self, count: int) -> Int64[Tensor, " rows"]:
         """Return the rows, ascending, of the points whose gains match the amplitudes best, whatever the force."""
         if len(self.predicted.gains) <= count:
             return torch.arange(len(self.predicted.gains))
@@ -255,10 +255,10 @@ class _Trial:
     def _weighted(self, turned: Complex64[Tensor, "shifts modes"]) -> Float32[Tensor, "two_modes shifts"]:
         return torch.view_as_real(turned * self.weights).flatten(1).T.contiguous()
 
-    def judge(
-        self, rows: Int64[Tensor, " rows"], misfits: tuple[float, ...]
+    def evaluate(
+        self, rows: Int64[Tensor, " rows"], relative_errors: tuple[float, ...]
     ) -> tuple[Float32[Tensor, " rows"], Float32[Tensor, " rows"], Float64[Tensor, " rows"]]:
-        """Return the log of the likelihood of points, summed over misfits, the likeliest's force, and the shift."""
+        """Return the log likelihood, summed over relative errors, and the force and shift of the likeliest one."""
         steps, turned = self._turned(_FINE)
         prior = -0.5 * (steps / SHIFT_DEVIATION).square()
         weighted, energy = self._weighted(turned), turned[0].abs().square()
@@ -271,16 +271,18 @@ class _Trial:
             both = torch.view_as_real(gains) * torch.view_as_real(turned[chosen])
             cross, variance = both[..., 0] + both[..., 1], self.predicted.variance[part]
             tried = []
-            for misfit in misfits:
-                error = torch.add(variance, power + self.predicted.usual, alpha=0.5 * misfit**2)
-                tried.append(self._weigh(cross, energy, power, error, self.strengths.forces(part, misfit)))
+            for relative_error in relative_errors:
+                error = torch.add(variance, power + self.predicted.usual, alpha=0.5 * relative_error**2)
+                tried.append(
+                    self._marginalize_force(cross, energy, power, error, self.strengths.forces(part, relative_error))
+                )
             found, strength = (torch.stack(each) for each in zip(*tried, strict=True))
             evidence.append(torch.logsumexp(found, 0) + prior[chosen].float())
             forces.append(strength.gather(0, found.argmax(0)[None])[0])
             shifts.append(steps[chosen])
         return torch.cat(evidence), torch.cat(forces), torch.cat(shifts)
 
-    def _weigh(
+    def _marginalize_force(
         self,
         cross: Float32[Tensor, "rows modes"],
         energy: Float32[Tensor, " modes"],

@@ -43,8 +43,8 @@ def locate(
     the impact, a number or `Force`, see `Locator.locate`; a note says where the recording's own force channel differs.
     `locator` is one made of the field before, with points of its own. That of the last field and its own points is
     cached, so that of several recordings only the first waits for it. With `progress`, the standard error says that it
-    works. The sound of another object has a `refusal` in place of a position, see `judged`. Raises LocationError as
-    `preprocess_recording` and `Locator.locate`, and for a locator of another field or given with points.
+    works. The sound of another object has a `refusal` in place of a position, see `assess_match`. Raises LocationError
+    as `preprocess_recording` and `Locator.locate`, and for a locator of another field or given with points.
     """
     if locator is not None and (locator.field is not field or points is not None or directions is not None):
         what = "points or directions" if locator.field is field else "another field"
@@ -61,7 +61,7 @@ def locate(
         finder = Locator.of(field, points=points, directions=directions) if locator is None else locator
         found = finder.locate(impact.sound, highest=impact.highest, force=known)
     measured = measured_force_notes(impact.newtons, field, known)
-    return judged(replace(found, notes=(*impact.notes, *measured, *found.notes)))
+    return assess_match(replace(found, notes=(*impact.notes, *measured, *found.notes)))
 
 
 def measured_force_notes(newtons: float | None, field: SoundField, force: Force | None) -> tuple[str, ...]:
@@ -78,14 +78,14 @@ def _locator_of(field: SoundField) -> Locator:
     return Locator.of(field)
 
 
-def judged(found: ContactMap) -> ContactMap:
+def assess_match(found: ContactMap) -> ContactMap:
     """Return where an impact was, with a refusal where that cannot be found, and with a note where it is uncertain.
 
-    A sound is refused where an object's modes do not fit it, and where the field explains its gains, over all
+    A sound is rejected where an object's modes do not fit it, and where the field explains its gains, over all
     positions, no better than noise would. The thresholds of the mismatch ratio come from simulated plates of wood,
     plastic, ceramic and steel, a measured aircraft and a recorded bowl: their own sounds have ratios of .3 at most, as
     long as noise is no louder than they are, and 98 in 100 of others more than .5. `python -m benchmarks.locating
-    --parts other-objects` reports what is refused of other sounds and of an object's own.
+    --parts other-objects` reports what is rejected of other sounds and of an object's own.
     """
     modal, null, ratio = 100 * found.modal_energy, 100 * found.null_energy, found.mismatch_ratio
     share = f"the object's modes explain {modal:.0f} % of it, detuned modes {null:.0f} %"

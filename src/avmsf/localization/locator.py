@@ -19,7 +19,7 @@ from avmsf.localization.amplitudes import Amplitudes, Extractor
 from avmsf.localization.contact_map import ContactMap
 from avmsf.localization.cosine_distance import cosine_distance
 from avmsf.localization.detuning import DetunedModes
-from avmsf.localization.likelihood import Force, Judgement, PredictedGains, judge
+from avmsf.localization.likelihood import Force, LikelihoodResult, PredictedGains, evaluate_likelihood
 from avmsf.localization.prediction import calibration_factor, local_variance, predict, predictive_variance
 from avmsf.localization.preprocess import not_finite, silent, too_short
 from avmsf.localization.smoothing import distinct_contacts, smoothing_matrix
@@ -129,9 +129,9 @@ class Locator:
         values, noise = length.separate(amplitudes)
         _expect_more_than_noise(values, noise)
         scaled = length.scaled(known)
-        found = judge(length.predicted, values, noise, force=scaled)
+        found = evaluate_likelihood(length.predicted, values, noise, force=scaled)
         # The force does not say whether the impact was on this object.
-        free = found if scaled is None else judge(length.predicted, values, noise)
+        free = found if scaled is None else evaluate_likelihood(length.predicted, values, noise)
         row = int(torch.argmax(found.log_likelihood))
         explained = length.explained(amplitudes, found, row)
         exponent = found.tempering(explained, factor=self.tempering_factor)
@@ -253,7 +253,7 @@ class _Length:
         recorded = self.extractor.mixing @ (kept * values)
         return cosine_distance(self.gains, recorded, self.extractor.bank.frequency)
 
-    def explained(self, amplitudes: Amplitudes, found: Judgement, row: int) -> float:
+    def explained(self, amplitudes: Amplitudes, found: LikelihoodResult, row: int) -> float:
         """Return the fraction of the sound's energy that an impact at a point explains."""
         extractor = self.extractor
         turned = torch.polar(
@@ -292,7 +292,9 @@ def _decorrelated(
     return PredictedGains(gains, power, variance, usual, shares.T @ extractor.bank.frequency)
 
 
-def _force_notes(force: Force, free: Judgement, exponent: float, unit: float, *, per_newton: bool) -> tuple[str, ...]:
+def _force_notes(
+    force: Force, free: LikelihoodResult, exponent: float, unit: float, *, per_newton: bool
+) -> tuple[str, ...]:
     """Return a note where no likely position has about that force; `free` is what the sound says without it."""
     likely = exponent * (free.log_likelihood - free.log_likelihood.max()) > _LIKELY
     forces = free.force[likely].abs()

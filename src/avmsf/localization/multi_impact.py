@@ -21,7 +21,7 @@ from avmsf.field.soundfield import SoundField
 from avmsf.localization.amplitudes import Extractor
 from avmsf.localization.contact_map import ContactMap
 from avmsf.localization.likelihood import Force
-from avmsf.localization.locate import judged, measured_force_notes
+from avmsf.localization.locate import assess_match, measured_force_notes
 from avmsf.localization.locator import Locator
 from avmsf.localization.preprocess import (
     Sound,
@@ -45,6 +45,13 @@ _PREDICTION_SECONDS = 0.006
 """Length of the past from which linear prediction takes the next sample."""
 _ONSET_RATIO, _MIN_RELATIVE_LEVEL = 4.0, 0.1
 """Level of the prediction residual at an onset, at least: over that before it, and over its largest."""
+_TRAVEL_SECONDS = 0.02
+"""Longest time from a push to the onset of its sound: a microphone up to 6.9 m away. Impacts are farther apart."""
+_PUSH_SECONDS = 0.005
+"""Longest time from the onset to the peak of the push, with a near microphone and a soft hammer."""
+_MIN_PUSH_RATIO = 12.0
+"""Range of the force channel around a push, at least, over the standard deviation of its noise: noise has 10 at most.
+"""
 
 
 def locate_impacts(
@@ -59,11 +66,11 @@ def locate_impacts(
     """Return the onset of each impact in a recording, seconds, and its map, in order.
 
     Bare samples are at `sample_rate` Hz, or at the field's rate; `settings` as for `preprocess_recording`; `force`, of
-    every impact, as for `locate`; `locator` is one made of the field before. The decaying sound of earlier impacts is
-    fitted by the object's modes just before an impact, extrapolated and subtracted. Impacts on other objects are left
-    out, which a note says, and impacts closer than 30 ms count as one. Raises LocationError as `preprocess_recording`,
-    for settings with `normalize = "deconvolve"` where the recording has a force channel, and where no impact can be
-    located.
+    every impact, as for `locate`, is compared with the push in the force channel up to 20 ms before the onset;
+    `locator` is one made of the field before. The decaying sound of earlier impacts is fitted by the object's modes
+    just before an impact, extrapolated and subtracted. Impacts on other objects are left out, which a note says, and
+    impacts closer than 30 ms count as one. Raises LocationError as `preprocess_recording`, where no impact can be
+    located, and for settings with `normalize = "deconvolve"` where the recording has a force channel.
     """
     known = None if force is None else Force.of(force)
     recording = read_if_path(recording)
@@ -86,7 +93,7 @@ def locate_impacts(
     ratio = len(resampled) / len(sound)
     starts = [round(onset * ratio) for onset in onsets]
     found = []
-    refused: list[tuple[float, LocationError]] = []
+    rejected: list[tuple[float, LocationError]] = []
     for number, (onset, start) in enumerate(zip(onsets, starts, strict=True)):
         end = starts[number + 1] if number + 1 < len(starts) else len(resampled)
         own = resampled[start : min(end, start + field.samples)].double()
@@ -94,24 +101,24 @@ def locate_impacts(
             own = own - predict_ringing(field, resampled, starts[number - 1], start, len(own), highest=highest)
         seconds = onset / whole.sample_rate
         try:
-            located = _accepted(judged(finder.locate(own.float(), highest=highest, force=known)), whole.name, seconds)
+            located = _accepted(finder.locate(own.float(), highest=highest, force=known), whole.name, seconds)
         except LocationError as error:
-            refused.append((seconds, error))
+            rejected.append((seconds, error))
             continue
-        newtons = None if forces is None else forces[number]
-        measured = measured_force_notes(newtons, field, known)
+        measured = measured_force_notes(forces[number], field, known)
         found.append((seconds, replace(located, notes=(*notes, *remark, *measured, *located.notes))))
     if not found:
-        raise refused[0][1]
-    if not refused:
+        raise rejected[0][1]
+    if not rejected:
         return found
-    times = ", ".join(f"{seconds:.3f}" for seconds, _ in refused)
-    left_out = f"{whole.name}: {counted(len(refused), 'impact')}, at {times} s, could not be located: {refused[0][1]}"
+    times = ", ".join(f"{seconds:.3f}" for seconds, _ in rejected)
+    left_out = f"{whole.name}: {counted(len(rejected), 'impact')}, at {times} s, could not be located: {rejected[0][1]}"
     return [(seconds, replace(each, notes=(*each.notes, left_out))) for seconds, each in found]
 
 
-def _accepted(located: ContactMap, recording: str, seconds: float) -> ContactMap:
-    """Return the map of the impact at `seconds` as it is; raises LocationError for an impact on another object."""
+def _accepted(found: ContactMap, recording: str, seconds: float) -> ContactMap:
+    """Return the map of the impact at `seconds`, see `assess_match`; raises LocationError for one on another object."""
+    located = assess_match(found)
     if located.refusal is not None:
         raise LocationError(
             f"{recording}, impact at {seconds:.3f} s: {located.refusal}", file=recording, name="impact", value=seconds
@@ -129,13 +136,19 @@ def _without_rumble(recording: Recording, settings: CaptureSettings) -> Float64[
         raise location_error(error) from error
 
 
-def _peak_forces(recording: Recording, onsets: list[int], settings: CaptureSettings) -> list[float] | None:
-    """Return the peak force of each impact by the recording's force channel, 0 for a silent one; None without one."""
+def _peak_forces(recording: Recording, onsets: list[int], settings: CaptureSettings) -> list[float | None]:
+    """Return the peak force of each impact by the recording's force channel; None without a push above the noise.
+
+    The push is searched from `_TRAVEL_SECONDS` before the onset of the sound to `_PUSH_SECONDS` after it.
+    """
     if settings.force_channel is None:
-        return None
-    guard = round(_GUARD_SECONDS * recording.sample_rate)
-    parts = np.split(recording.channel(settings.force_channel), [max(0, onset - guard) for onset in onsets])[1:]
-    return [abs(find_pulse(part).height * settings.force_scale) if np.ptp(part) > 0 else 0.0 for part in parts]
+        return [None] * len(onsets)
+    force = recording.channel(settings.force_channel)
+    before, after = (round(seconds * recording.sample_rate) for seconds in (_TRAVEL_SECONDS, _PUSH_SECONDS))
+    parts = [force[max(0, onset - before) : onset + after] for onset in onsets]
+    # From the 90 % quantile of Gaussian noise: pushes take less than a tenth of the time.
+    limit = _MIN_PUSH_RATIO / 1.645 * float(np.quantile(np.abs(force - np.median(force)), 0.9))
+    return [abs(find_pulse(part).height * settings.force_scale) if np.ptp(part) > limit else None for part in parts]
 
 
 def detect_onsets(sound: Float64[np.ndarray, " frames"], *, sample_rate: float) -> list[int]:

@@ -19,7 +19,7 @@ from avmsf.capture.onset import find_onset
 from avmsf.capture.prepare import shortest_allowed
 from avmsf.errors import LocationError
 from avmsf.localization.contact_map import ContactMap
-from avmsf.localization.locate import judged
+from avmsf.localization.locate import assess_match
 from avmsf.localization.locator import Locator
 from avmsf.localization.ringing import Ringing
 from avmsf.modal.bank import ModalBank
@@ -258,7 +258,7 @@ class StreamingLocalizer:
         start = len(state.recent) - (state.clock - pending.onset)
         sound = state.recent[start : start + length] - self._modes.render(earlier, length)
         try:
-            found = judged(self.locator.locate(sound.float()))
+            found = assess_match(self.locator.locate(sound.float()))
             if found.refusal is not None:
                 raise LocationError(f"the impact: {found.refusal}", name="impact", value=pending.onset / self.rate)
         except LocationError as error:

@@ -18,7 +18,7 @@ from torch import Tensor
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.soundfield import SoundField
 from avmsf.field.uncertainty import fitted_mixture, scale_of
-from avmsf.localization.likelihood import PredictedGains, judge
+from avmsf.localization.likelihood import PredictedGains, evaluate_likelihood
 from avmsf.localization.prediction import (
     calibration_factor,
     can_self_calibrate,
@@ -32,7 +32,7 @@ from avmsf.scene.points import farthest_points
 _MAX_HOLDOUT = 12
 """Contacts that are left out, at most: those farthest apart."""
 _POINTS = 300
-"""Points of the surface at which the likelihood is computed, and those nearest to the contacts."""
+"""Number of points of the surface at which the likelihood is computed, besides those nearest to the contacts."""
 _FACTORS = torch.logspace(-2.0, 0.6, 27, dtype=torch.float64)
 _LOG_PRIOR_STD = 1.0
 """Standard deviation of the factor's logarithm without any contact: e times as much or as little."""
@@ -74,7 +74,9 @@ def calibrate_tempering(field: SoundField) -> float:
             continue
         loudest = float(measured.abs().max())
         known = _predicted(replace(field, gain_field=left), places, about, kept, factor=factor)
-        found = judge(known, measured, torch.full(measured.shape, _NOISE * loudest**2, dtype=torch.float64))
+        found = evaluate_likelihood(
+            known, measured, torch.full(measured.shape, _NOISE * loudest**2, dtype=torch.float64)
+        )
         row = int(found.log_likelihood.argmax())
         explained = _explained_energy(
             known.gains[row].to(measured), measured, 1.0 / (4.0 * field.bank.damping[kept].double())

@@ -40,8 +40,7 @@ class Options(Printing):
     """True contact of every impact: its distance is printed, and whether it lies within the region; the heat maps mark
     it red and the located one blue."""
     true_contact_table: ContactTable = None
-    """The same of each recording, by its file name: a table with the columns file,x,y,z, such as a capture's
-    impacts.csv."""
+    """True contacts of several recordings: a table with the columns file,x,y,z, such as a capture's impacts.csv."""
     unit: Unit = "m"
     """Unit of --true-contact and --true-contact-table. A field itself is in meters, whatever unit its capture has."""
     output: OutputFolder = None

@@ -22,8 +22,7 @@ class Options(Printing):
     """Write the sounds of impacts anywhere on the object as wav files.
 
     Contacts come from --position, once per contact, or from a table with the columns x,y,z and optionally file and
-    nx,ny,nz, such as a capture's impacts.csv. Each contact is moved to the nearest point of the object. An impact
-    without a direction is perpendicular to the surface.
+    nx,ny,nz, such as a capture's impacts.csv. An impact without a direction is perpendicular to the surface.
     """
 
     field: tyro.conf.Positional[FieldFile]

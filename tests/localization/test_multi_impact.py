@@ -10,8 +10,8 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
 from avmsf.localization.locator import Locator
 from avmsf.localization.multi_impact import detect_onsets, locate_impacts, predict_ringing
+from located_plate import PLATE, RATE, locator_of, missed, struck, true_field
 from raising import raises
-from test_locate import PLATE, RATE, locator_of, missed, struck, true_field
 
 
 @pytest.fixture
@@ -103,18 +103,28 @@ def test_settings_count_as_for_one_impact(locator):
     assert len(locate_impacts(true_field(), both, settings=plain, locator=locator)) == 2
 
 
-def test_a_force_that_the_force_channel_contradicts_is_noted_for_its_impact(locator):
-    starts = [0.1, 0.3]
-    sound, _ = overlapping(starts, [1.0, 0.8], seed=36)
-    push = np.zeros(len(sound))
-    for start, newtons in zip(starts, (8.0, 16.0), strict=True):
-        begin = round(start * RATE) - 4
-        push[begin : begin + 9] = 0.5 * newtons * np.sin(np.pi * np.arange(1, 10) / 10)
+def noted(push: np.ndarray, sound: torch.Tensor, locator: Locator) -> list[bool]:
+    """Return which of two impacts, given as 8 N each, have a note on the force channel, which counts 2 N."""
     both = Recording("session.wav", np.stack([push, sound.double().numpy()]), RATE, "FLOAT")
     field = replace(true_field(), origin=replace(true_field().origin, per_newton=True))
-    settings, finder = (
-        CaptureSettings(force_channel=1, response_channel=2, force_scale=2.0),
-        replace(locator, field=field),
-    )
-    found = locate_impacts(field, both, settings=settings, force=8.0, locator=finder)
-    assert [any("force channel" in note for note in each.notes) for _, each in found] == [False, True]
+    settings = CaptureSettings(force_channel=1, response_channel=2, force_scale=2.0)
+    found = locate_impacts(field, both, settings=settings, force=8.0, locator=replace(locator, field=field))
+    return [any("force channel" in note for note in each.notes) for _, each in found]
+
+
+@pytest.mark.parametrize("lead", [0.0, 0.01])
+def test_a_force_that_the_force_channel_contradicts_is_noted_for_its_impact(lead, locator):
+    starts = [0.1, 0.3]
+    sound, _ = overlapping(starts, [1.0, 0.8], seed=36)
+    push = 1e-3 * np.random.default_rng(0).standard_normal(len(sound))
+    for start, newtons in zip(starts, (8.0, 16.0), strict=True):
+        begin = round((start - lead) * RATE) - 4
+        push[begin : begin + 9] += 0.5 * newtons * np.sin(np.pi * np.arange(1, 10) / 10)
+    assert noted(push, sound, locator) == [False, True]
+
+
+@pytest.mark.parametrize("level", [0.0, 1.0])
+def test_noise_in_the_force_channel_is_no_force(level, locator):
+    sound, _ = overlapping([0.1, 0.3], [1.0, 0.8], seed=36)
+    push = level * np.random.default_rng(0).standard_normal(len(sound))
+    assert noted(push, sound, locator) == [False, False]

@@ -9,8 +9,8 @@ from avmsf.localization.contact_map import ContactMap, EquivalentPoint
 from avmsf.localization.locator import Locator
 from avmsf.scene.symmetry import MirrorSymmetry, RotationalSymmetry, Symmetries
 from avmsf.simulate.plate import plate_surface_points
+from located_plate import PLATE, TrueGains, field_of, struck
 from raising import raises
-from test_locate import PLATE, TrueGains, field_of, struck
 
 
 def middle() -> torch.Tensor:
