@@ -96,7 +96,7 @@ WRONG = {
     "farhest plates": ("protocol", "farhest"),
     "farthest plates --methods knn3,fild": ("method", "fild"),
     "farthest plates --objects c": ("object", "c"),
-    "predefined plates": ("--test", "none"),
+    "predefined plates": ("--test", None),
     "farthest plates --workers 0": ("workers", 0),
     "farthest plates --cdpam-contacts -1": ("cdpam_contacts", -1),
     "non-symmetric plates": ("subset", "non-symmetric"),

@@ -109,7 +109,7 @@ class Options(Printing):
             expect_suited(name, self.protocol)
         if self.protocol == "predefined" and not self.test:
             raise EvaluationError.expected(
-                "names of the recordings to test on", "none", name="--test", advice="such as --test 009.wav,010.wav"
+                "names of the recordings to test on", name="--test", advice="such as --test 009.wav,010.wav"
             )
         expect_device(self.device, raising=EvaluationError)
         expect_modes(self.modes)
