@@ -15,7 +15,7 @@ from avmsf.capture.settings import METRES, settings_of
 from avmsf.capture.surface import Surface
 from avmsf.cli.contacts import given_contacts, note_off, refuse_far
 from avmsf.cli.options.export import Options, unused_options
-from avmsf.cli.printing import figure, print_result, say
+from avmsf.cli.printing import figure, next_step, print_result, say
 from avmsf.config import CACHE
 from avmsf.errors import ExportError
 from avmsf.export.faust import contacts_path, fitted, write_faust
@@ -72,9 +72,9 @@ def run(options: Options) -> int:
         text += f"; {contacts} has the coordinates of each contact"
         values["contacts"] = str(contacts)
     print_result(text, values, json=options.json)
-    say(f"next: {_following(options)}")
+    next_step(_following(options))
     if options.to == "wavs" and len(options.forces) == 1:
-        say("next: the same command with --forces 0.3 1 3, for a layer at each force")
+        next_step("the same command with --forces 0.3 1 3, for a layer at each force")
     return 0
 
 
