@@ -119,14 +119,14 @@ def _sampled(field: SoundField | SampledField, options: Options) -> SampledField
     """Return the field at the contacts of the options, or at its own points spread over the object."""
     if options.contacts_given:
         return _at_given(field, options)
-    most = options.points or POINTS[options.to]
+    most = options.contacts or POINTS[options.to]
     if isinstance(field, SoundField):
         points = points_on_object(field.gain_field)
         sampled, held = SampledField.of(field, points, limit=most), len(points)
     else:
         sampled, held = field if len(field) <= most else field.take(field.spread(most)), len(field)
-    if len(sampled) < held and options.points is None:
-        say(f"note: written: {len(sampled)} of the field's {counted(held, 'contact')}; --points sets the number")
+    if len(sampled) < held and options.contacts is None:
+        say(f"note: written: {len(sampled)} of the field's {counted(held, 'contact')}; --contacts sets the number")
     return sampled
 
 
@@ -227,7 +227,7 @@ def _web(field: SoundField | SampledField, options: Options) -> Written:
         object=source,
         meters=meters,
         strikes=_recordings(field, options.capture),
-        limit=options.points or POINTS["web"],
+        limit=options.contacts or POINTS["web"],
         force=options.overwrite,
     )
 
@@ -258,7 +258,7 @@ def _gltf(field: SoundField | SampledField, options: Options) -> Written:
 
 def _faust(field: SoundField | SampledField, options: Options) -> Written:
     sampled, noise = _sampled(field, options), not options.no_noise
-    if options.points is None and not options.contacts_given:
+    if options.contacts is None and not options.contacts_given:
         asked = len(sampled)
         sampled, noise = fitted(sampled, noise=noise)
         if len(sampled) < asked:
@@ -269,7 +269,7 @@ def _faust(field: SoundField | SampledField, options: Options) -> Written:
 def _demo(field: SoundField | SampledField, options: Options) -> Written:
     scene = options.field / SCENE
     source = scene if options.object is None and scene.is_file() else options.object
-    most = options.points or POINTS["avmsf-demo"]
+    most = options.contacts or POINTS["avmsf-demo"]
     sampled = _sampled(field, options)
     cloud = _gaussians(source, 1.0, sampled)
     if source is not None:
