@@ -128,8 +128,8 @@ def _run(words: list[str]) -> int:
             return _report_error(known, words)
         except SystemExit as ending:
             # Of options that cannot be understood, which the standard error has explained.
-            if error := getattr(ending, "error", None):
-                _report_error(error, words)
+            if misused := getattr(ending, "error", None):
+                _report_error(misused, words)
             raise
         except KeyboardInterrupt:
             print(f"avmsf {words[0]}: interrupted", file=sys.stderr)

@@ -50,7 +50,7 @@ class Existing:
             found = None if path.exists() else "no such file or folder"
         except OSError as error:
             # Its name is too long, or a folder above it may not be searched.
-            found = error.strerror.lower()
+            found = str(error.strerror).lower()
         if found is not None:
             raise InputError.expected(self.what, got=found, file=path, advice="check the name")
         kind = kind_of(path)
