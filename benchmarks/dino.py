@@ -36,7 +36,7 @@ _LOOKS = 10
 
 
 def measure_dino(options: Options) -> Report:
-    """Fit the Gaussians and return how well they foretell photographs, and what that took."""
+    """Fit the Gaussians and return how well they predict photographs, and what that took."""
     command = [sys.executable, "-m", "benchmarks.dino", *(["--quick-look"] if options.quick_look else [])]
     shared_data()
     done = subprocess.run(command, cwd=REPOSITORY, stdout=subprocess.PIPE, text=True, check=False)

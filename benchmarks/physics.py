@@ -123,7 +123,7 @@ def _fitted(folder: Path, cache: Path, wall: str, dofs: int) -> dict[str, float]
 
 
 def _coverage(options: Options) -> Report:
-    """Foretell what 32 blows with each object have of each mode, from 8."""
+    """Predict the gains of 32 impacts on each object from those of 8."""
     rows: list[list[str | float]] = []
     for name in COVERED[:1] if options.quick_look else COVERED:
         made = simulate_object(sim20_recipe(name), name=name)

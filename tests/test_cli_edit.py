@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import soundfile
 import torch
@@ -175,6 +176,18 @@ def test_the_table_has_the_modes_of_most_energy(field: Path, capsys: Streams, mo
     out = capsys.readouterr().out
     assert re.search(rf"│ +{faintest}\b", out)
     assert "level change" in out
+
+
+def test_the_contact_of_the_sounds_has_its_unit(field: Path) -> None:
+    sounds = []
+    for unit, meters in (("m", 1.0), ("mm", 1e-3)):
+        place = [f"{value / meters:.6f}" for value in PLACES[1].tolist()]
+        folder = field.with_name(unit)
+        edited(field, "--pitch", "2", "--plots", str(folder), "--position", *place, "--unit", unit)
+        sounds.append(soundfile.read(folder / "before.wav")[0])
+    # Coordinates are written to a micrometer.
+    assert np.allclose(*sounds, atol=1e-4)
+    assert np.abs(sounds[0]).max() > 0.1
 
 
 @pytest.mark.parametrize(("decay", "noted"), [("0.1", False), ("0.9", False), ("2", True)])

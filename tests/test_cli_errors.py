@@ -38,6 +38,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+LONG, TOO_LONG = 300 * "x", "File name too long"
 AT = "--position 0.1 0.05 0"
 TABLE = "render field.safetensors --output s --contact-table"
 WRONG: dict[str, dict[str, Any]] = {
@@ -98,10 +99,16 @@ WRONG: dict[str, dict[str, Any]] = {
     f"{TABLE} short.csv": {"file": "short.csv", "row": 2, "name": "z", "value": ""},
     f"{TABLE} twice.csv": {"file": "twice.csv", "row": 3, "name": "file", "value": "a.wav"},
     f"{TABLE} outside.csv": {"file": "outside.csv", "row": 2, "name": "file", "value": "../a.wav"},
+    f"render field.safetensors {AT} --output {LONG}/x.wav": {"file": f"{LONG}/x.wav", "value": TOO_LONG},
+    f"render field.safetensors {AT} --output {LONG}": {"file": LONG, "value": TOO_LONG},
+    f"edit field.safetensors --pitch 2 -o {LONG[:240]}.safetensors": {"value": TOO_LONG},
+    f"export field.safetensors --to web -o {LONG}/x.html": {"file": f"{LONG}/x.html", "value": TOO_LONG},
+    f"demo {LONG}": {"file": LONG, "value": TOO_LONG},
+    f"info {LONG}": {"file": LONG},
     "info nowhere.safetensors": {"file": "nowhere.safetensors"},
     "info field.safetensors --capture fast": {"name": "sample_rate"},
     "demo plate": {"file": "plate"},
-    "demo words.csv": {"file": "words.csv", "value": "file"},
+    "demo words.csv": {"file": "words.csv", "name": "suffix", "value": ".csv"},
 }
 
 

@@ -41,6 +41,7 @@ def test_a_dataset_becomes_tables_and_a_page(plates: Path, tmp_path: Path, capsy
     assert (kept["dataset"], kept["objects"], kept["test_contacts"]) == ("plates", 2, 16)
     assert "b: done (2 of 2, " in err
     assert "L1-log" in err
+    assert err.splitlines()[-1].startswith("next: avmsf evaluate ")
     assert "# farthest on plates" in (tmp_path / "results" / "report.md").read_text()
     before = (tmp_path / "results" / "objects" / "a.json").read_bytes()
     assert run(parse(["farthest", *words])) == 0
@@ -96,7 +97,7 @@ WRONG = {
     "farhest plates": ("protocol", "farhest"),
     "farthest plates --methods knn3,fild": ("method", "fild"),
     "farthest plates --objects c": ("object", "c"),
-    "predefined plates": ("--test", "none"),
+    "predefined plates": ("--test", None),
     "farthest plates --workers 0": ("workers", 0),
     "farthest plates --cdpam-contacts -1": ("cdpam_contacts", -1),
     "non-symmetric plates": ("subset", "non-symmetric"),

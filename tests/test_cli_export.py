@@ -48,7 +48,7 @@ def field_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_mesh_goes_into_the_glb(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
     trimesh.creation.box([1000 * side for side in SIDES]).export(tmp_path / "plate.stl")
-    words = ["--object", str(tmp_path / "plate.stl"), "--object-unit", "mm", "--points", "20", "--up", "x"]
+    words = ["--object", str(tmp_path / "plate.stl"), "--object-unit", "mm", "--contacts", "20", "--up", "x"]
     assert main(["export", str(field_file), "--to", "gltf", "--output", str(tmp_path / "a.glb"), *words]) == 0
     out, err = capsys.readouterr()
     assert f"wrote {tmp_path / 'a.glb'}: gltf, " in out
@@ -121,11 +121,11 @@ def test_faust_gets_what_it_compiles_unless_asked_for_more(
     text = (tmp_path / "a.dsp").read_text()
     assert "points = 64;" in text
     assert "noiseDraw" not in text
-    assert refused([*words, "--points", "64"]).value == 1840
+    assert refused([*words, "--contacts", "64"]).value == 1840
 
 
 def test_without_noise_is_a_flag(field_file: Path, tmp_path: Path) -> None:
-    words = ["--to", "faust", "--output", str(tmp_path / "a.dsp"), "--points", "3", "--no-noise"]
+    words = ["--to", "faust", "--output", str(tmp_path / "a.dsp"), "--contacts", "3", "--no-noise"]
     assert main(["export", str(field_file), *words]) == 0
     assert "noiseDraw" not in (tmp_path / "a.dsp").read_text()
 
@@ -139,7 +139,7 @@ def test_the_demo_goes_out_in_and_out_again(field_file: Path, tmp_path: Path) ->
     torch.testing.assert_close(demo.field.points, cloud.centers)
     true = SampledField.of(load(field_file), cloud.centers)
     torch.testing.assert_close(demo.field.cosine.abs(), torch.hypot(true.sine, true.cosine))
-    words = ["--to", "avmsf-demo", "--output", str(again), "--points", "11", "--variant", "glass"]
+    words = ["--to", "avmsf-demo", "--output", str(again), "--contacts", "11", "--variant", "glass"]
     assert main(["export", str(first), *words]) == 0
     assert json.loads((again / "manifest.json").read_text())["variants"] == ["glass"]
     short = read_demo(again)
@@ -151,7 +151,7 @@ def test_the_demo_goes_out_in_and_out_again(field_file: Path, tmp_path: Path) ->
 
 def test_a_demo_is_read_into_any_other_format(field_file: Path, tmp_path: Path) -> None:
     assert main(["export", str(field_file), "--to", "avmsf-demo", "--output", str(tmp_path / "demo")]) == 0
-    words = ["--to", "wavs", "--output", str(tmp_path / "wavs"), "--points", "3"]
+    words = ["--to", "wavs", "--output", str(tmp_path / "wavs"), "--contacts", "3"]
     assert main(["export", str(tmp_path / "demo"), *words]) == 0
     demo = read_demo(tmp_path / "demo").field
     with (tmp_path / "wavs" / "samples.csv").open() as file:
@@ -165,7 +165,7 @@ def test_a_demo_is_read_into_any_other_format(field_file: Path, tmp_path: Path) 
 
 
 def test_wavs_have_the_layers_asked_for(field_file: Path, tmp_path: Path) -> None:
-    words = ["export", str(field_file), "--to", "wavs", "--output", str(tmp_path / "w"), "--points", "2"]
+    words = ["export", str(field_file), "--to", "wavs", "--output", str(tmp_path / "w"), "--contacts", "2"]
     words += ["--pulse", "hertz"]
     assert main([*words, "--forces", "0.5", "2", "--contact-times", "0.001", "0", "--seconds", "0.05"]) == 0
     assert json.loads((tmp_path / "w" / "manifest.json").read_text())["pulses"] == ["hertz", "hertz"]
@@ -176,7 +176,17 @@ def test_wavs_have_the_layers_asked_for(field_file: Path, tmp_path: Path) -> Non
 
 
 def test_wavs_without_noise_are_the_modes(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
-    words = ["export", str(field_file), "--to", "wavs", "--output", str(tmp_path / "w"), "--points", "1", "--no-noise"]
+    words = [
+        "export",
+        str(field_file),
+        "--to",
+        "wavs",
+        "--output",
+        str(tmp_path / "w"),
+        "--contacts",
+        "1",
+        "--no-noise",
+    ]
     assert main(words) == 0
     assert "--no-noise" not in capsys.readouterr().err
     sampled = SampledField.of(load(field_file), limit=1)
@@ -190,7 +200,7 @@ def test_wavs_without_noise_are_the_modes(field_file: Path, tmp_path: Path, caps
 @pytest.mark.parametrize("name", ["a.dsp", "a.lib", "a.uff"])
 def test_other_formats_say_their_size(name: str, field_file: Path, tmp_path: Path, capsys: Streams) -> None:
     to = "uff" if name == "a.uff" else "faust"
-    words = ["export", str(field_file), "--to", to, "--output", str(tmp_path / name), "--points", "5"]
+    words = ["export", str(field_file), "--to", to, "--output", str(tmp_path / name), "--contacts", "5"]
     assert main(words) == 0
     size = sum(path.stat().st_size for path in tmp_path.iterdir())
     assert f"{to}, {size / 1e6:.3g} MB, " in capsys.readouterr().out
@@ -199,7 +209,7 @@ def test_other_formats_say_their_size(name: str, field_file: Path, tmp_path: Pat
 
 
 def test_contacts_of_faust_and_of_wavs_have_the_same_numbers(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
-    words = ["export", str(field_file), "--points", "7", "--to"]
+    words = ["export", str(field_file), "--contacts", "7", "--to"]
     assert main([*words, "faust", "--output", str(tmp_path / "a.dsp"), "--json"]) == 0
     contacts = tmp_path / "a.contacts.csv"
     out, err = capsys.readouterr()
@@ -216,7 +226,7 @@ def test_contacts_of_faust_and_of_wavs_have_the_same_numbers(field_file: Path, t
 
 def test_a_sample_set_names_its_instrument(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
     output = tmp_path / "samples"
-    words = ["export", str(field_file), "--to", "wavs", "--output", str(output), "--points", "2", "--seconds", "0.05"]
+    words = ["export", str(field_file), "--to", "wavs", "--output", str(output), "--contacts", "2", "--seconds", "0.05"]
     assert main([*words, "--json"]) == 0
     out, err = capsys.readouterr()
     instrument = output / "instrument.sfz"
@@ -240,7 +250,7 @@ def test_a_new_parent_folder_is_said_once(field_file: Path, tmp_path: Path, caps
 
 
 def test_a_page_is_a_folder_or_one_file(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
-    words = ["export", str(field_file), "--to", "web", "--points", "30"]
+    words = ["export", str(field_file), "--to", "web", "--contacts", "30"]
     for name in ("page", "page", "page.html"):
         assert main([*words, "--output", str(tmp_path / name)]) == 0
     manifest = json.loads((tmp_path / "page" / "manifest.json").read_text())
@@ -268,7 +278,7 @@ def test_a_page_is_a_folder_or_one_file(field_file: Path, tmp_path: Path, capsys
 def test_what_follows_names_what_was_written(
     to: str, name: str, named: str, field_file: Path, tmp_path: Path, capsys: Streams
 ) -> None:
-    words = ["export", str(field_file), "--to", to, "--output", str(tmp_path / name), "--points", "3"]
+    words = ["export", str(field_file), "--to", to, "--output", str(tmp_path / name), "--contacts", "3"]
     assert main([*words, *(["--forces", "1", "2", "--seconds", "0.01"] if to == "wavs" else [])]) == 0
     (following,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("next: ")]
     assert named in following
@@ -298,7 +308,7 @@ def test_a_files_name_is_no_folders(to: str, name: str, field_file: Path, tmp_pa
 def test_a_folder_may_have_a_dot_in_its_name(field_file: Path, tmp_path: Path) -> None:
     (tmp_path / "old.wav").mkdir()
     for name in ("bowl-1.2", "name.github.io", "old.wav"):
-        words = ["--to", "wavs", "--output", str(tmp_path / name), "--points", "1", "--seconds", "0.01"]
+        words = ["--to", "wavs", "--output", str(tmp_path / name), "--contacts", "1", "--seconds", "0.01"]
         assert main(["export", str(field_file), *words]) == 0
         assert (tmp_path / name / "samples.csv").is_file()
 
@@ -315,8 +325,8 @@ def test_a_wrong_ending_is_refused_before_anything_else_is_said(
 
 def test_what_cannot_be_exported_is_said(field_file: Path, tmp_path: Path) -> None:
     field, out = str(field_file), str(tmp_path / "out")
-    error = refused([field, "--to", "wavs", "--output", out, "--points", "0"])
-    assert (error.name, error.value) == ("--points", 0)
+    error = refused([field, "--to", "wavs", "--output", out, "--contacts", "0"])
+    assert (error.name, error.value) == ("--contacts", 0)
     assert refused([str(tmp_path), "--to", "wavs", "--output", out]).file == tmp_path
     words = [field, "--to", "wavs", "--output", out, "--forces", "1", "2", "3", "--contact-times", "0", "0"]
     error = refused(words)
@@ -331,7 +341,7 @@ def test_what_cannot_be_exported_is_said(field_file: Path, tmp_path: Path) -> No
     assert refused(words).file == tmp_path / "box.ply"
     assert not (tmp_path / "out").exists()
     (tmp_path / "a.dsp").write_text("theirs")
-    words = [field, "--to", "faust", "--output", str(tmp_path / "a.dsp"), "--points", "3"]
+    words = [field, "--to", "faust", "--output", str(tmp_path / "a.dsp"), "--contacts", "3"]
     assert refused(words).file == tmp_path / "a.dsp"
     assert main(["export", *words, "--overwrite"]) == 0
 
@@ -387,14 +397,14 @@ def test_a_sample_set_has_the_directions_of_the_table(tmp_path: Path) -> None:
 
 def test_contacts_are_given_in_one_way(field_file: Path, tmp_path: Path) -> None:
     words = [str(field_file), "--to", "wavs", "--output", str(tmp_path / "set"), "--position", "0.05", "0.03", "0.002"]
-    error = refused([*words, "--points", "3"])
+    error = refused([*words, "--contacts", "3"])
     assert (error.name, error.value) == ("--position", 2)
     far = refused([*words[:-3], "50", "30", "2"])
     assert (far.name, far.value) == ("--position", [50.0, 30.0, 2.0])
 
 
 def test_an_option_that_a_format_does_not_use_is_noted(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
-    words = ["export", str(field_file), "--to", "faust", "-o", str(tmp_path / "a.dsp"), "--points", "3", "--quiet"]
+    words = ["export", str(field_file), "--to", "faust", "-o", str(tmp_path / "a.dsp"), "--contacts", "3", "--quiet"]
     assert main([*words, "--rate", "8000", "--seconds", "1"]) == 0
     notes = [line for line in capsys.readouterr().err.splitlines() if "is not used by --to faust" in line]
     assert [line.split()[1] for line in notes] == ["--seconds", "--rate"]

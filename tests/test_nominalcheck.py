@@ -107,7 +107,7 @@ def test_what_is_not_noisy_stays_as_it_is():
 
 
 def test_a_rough_form_that_is_no_noise_stays():
-    # Each vertex lies on a wave that its neighbors foretell, though triangles turn by more than noise would make them.
+    # Each vertex lies on a wave that its neighbors predict, though triangles turn by more than noise would make them.
     x, y = np.meshgrid(np.linspace(0, 1, 49), np.linspace(0, 1, 49), indexing="ij")
     rows = np.arange(x.size).reshape(x.shape)
     a, b, c, d = (part.ravel() for part in (rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:]))

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from avmsf.capture.cameras import View
-from avmsf.capture.views import read_sparse_points, read_views
+from avmsf.capture.views import colmap_binary, colmap_text, read_sparse_points, read_views
 from avmsf.capture.views.colmap import MODELS, read_colmap
 from avmsf.errors import CaptureError
 from raising import raises
@@ -177,6 +177,12 @@ def test_truncated_binary_files_are_named_wherever_they_end(tmp_path: Path, file
         (tmp_path / file).write_bytes(content[:kept])
         with raises(CaptureError, file=file, value=kept):
             read()
+
+
+@pytest.mark.parametrize("read", [colmap_binary.read_cameras, colmap_text.read_cameras])
+def test_what_is_no_readable_file_is_named(tmp_path: Path, read: Callable[[Path], object]) -> None:
+    with raises(CaptureError, file=tmp_path, value="Is a directory"):
+        read(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What gain fields of tests lack that only foretell: doubt, and a form in a file."""
+"""What gain fields of tests lack that only predict: an uncertainty, and a form in a file."""
 
 import torch
 

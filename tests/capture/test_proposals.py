@@ -242,9 +242,8 @@ def test_both_units_are_found_from_the_contacts_and_the_surface(
     proposals = propose_settings(folder)
     assert {each.key: each.value for each in proposals} == proposed
     if proposed:
-        assert any(
-            f'{key} = "{unit}"' in problem for problem in check(folder).problems for key, unit in proposed.items()
-        )
+        problems = "\n".join(check(folder).problems)
+        assert all(f'{key} = "{unit}"' in problems for key, unit in proposed.items())
         write_settings(folder, proposals)
     assert check(folder).readable
     assert propose_settings(folder) == ()

@@ -1,19 +1,22 @@
 """How a verb ends that cannot go on: by one sentence and an exit code."""
 
+import io
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import FrameType
 
 import pytest
 import torch
 
-from avmsf.cli import check, main
-from avmsf.cli.printing import console, print_json, print_text, say, table
+from avmsf.cli import check, main, modes
+from avmsf.cli.printing import console, next_command, print_json, print_text, say, table
 from avmsf.errors import CaptureError
 
 Streams = pytest.CaptureFixture[str]
@@ -149,13 +152,27 @@ def test_a_terminal_obeys_nothing_that_stands_in_a_file(run: Callable[..., int],
         ("fit nowhere -o f.safetensors --device tpu", {"file": "nowhere"}),
         ("fitt", {"value": "fitt"}),
         ("--quiet", {"value": None}),
-        ("fit nowhere -o f.safetensors --preset mine", {}),
-        ("render --position 0 0 0", {}),
+        ("fit nowhere -o f.safetensors --preset mine", {"name": "--preset", "value": "mine"}),
+        ("export nowhere --to cheese -o out", {"name": "--to", "value": "cheese"}),
+        ("render --position 0 0 0", {"name": "FIELD.safetensors", "value": None}),
+        ("render nowhere --position 0 0 0", {"name": "--output", "value": None}),
+        ("fit nowhere -o f.safetensors --steps many", {"name": "--steps", "value": "many"}),
+        ("render nowhere -o f --force 1,5", {"name": "--force", "value": "1,5"}),
+        ("render nowhere -o f --position 0 a 1", {"name": "--position", "value": "0 a 1"}),
+        ("render nowhere -o f --position 0 1", {"name": "--position", "value": None}),
+        ("export nowhere --to wavs -o f --forces 1 b", {"name": "--forces", "value": "1 b"}),
+        ("fit nowhere -o f.safetensors --stps 3", {"name": "avmsf fit", "value": "--stps"}),
+        ("fit nowhere more -o f.safetensors", {"name": "avmsf fit", "value": "more"}),
     ],
 )
-def test_a_refusal_is_one_json_object_where_json_is_asked_for(
-    words: str, attributes: dict[str, object], capsys: Streams
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
+def test_an_error_is_one_json_object_where_json_is_asked_for(
+    words: str, attributes: dict[str, object], encoding: str, capsys: Streams
 ) -> None:
+    # It decides what boxes are drawn with.
+    for stream in (sys.stdout, sys.stderr):
+        assert isinstance(stream, io.TextIOWrapper)
+        stream.reconfigure(encoding=encoding)
     endings = []
     for asked in ([], ["--json"]):
         try:
@@ -166,11 +183,50 @@ def test_a_refusal_is_one_json_object_where_json_is_asked_for(
     (code, plain), (code_too, said) = endings
     assert code == code_too == 2
     assert plain.out == ""
-    assert said.err.splitlines()[-1] == plain.err.splitlines()[-1]
+    assert said.err == plain.err
     error = json.loads(said.out)["error"]
     assert set(error) == {"message", "file", "row", "name", "value"}
     assert {key: error[key] for key in attributes} == attributes
-    assert error["message"].split()[0] in said.err
+    if said.err.startswith("avmsf"):
+        assert said.err.splitlines() in ([error["message"]], [f"avmsf {words.split()[0]}: {error['message']}"])
+    else:
+        # tyro's box, which explains more.
+        assert error["message"].startswith(f"{error['name']}")
+        assert str(error["value"] or "got") in error["message"]
+
+
+def test_the_argument_in_place_of_a_subcommand_is_named(capsys: Streams) -> None:
+    with pytest.raises(SystemExit):
+        main(["dataset", "chk", "--json"])
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert (error["name"], error["value"]) == ("avmsf dataset", "chk")
+
+
+def test_the_last_line_is_the_next_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Streams) -> None:
+    def write(options: modes.Options) -> int:
+        (tmp_path / "new").mkdir()
+        say("wrote new/report.md")
+        next_command("avmsf modes", tmp_path)
+        return 0
+
+    monkeypatch.setattr(modes, "run", write)
+    monkeypatch.setattr(modes.Options, "check_inputs", lambda options: None)
+    assert main(["modes", ".", "--plots", str(tmp_path / "new" / "plots")]) == 0
+    assert capsys.readouterr().err.splitlines() == [
+        "wrote new/report.md",
+        f"created folder {tmp_path / 'new'}",
+        f"next: avmsf modes {tmp_path}",
+    ]
+
+
+@pytest.mark.parametrize("closing", [">&-", "2>&-", ">&- 2>&-"])
+@pytest.mark.parametrize(("words", "code"), [("--version", 0), ("fit --help", 0), ("fitt", 2), ("info nowhere", 2)])
+def test_a_closed_descriptor_changes_no_exit_code(words: str, code: int, closing: str) -> None:
+    verb = "import sys; from avmsf.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = f"exec {shlex.quote(sys.executable)} -c {shlex.quote(verb)} {words} {closing}"
+    ran = subprocess.run(command, shell=True, capture_output=True, text=True, timeout=60, check=False)
+    assert ran.returncode == code
+    assert "Traceback" not in ran.stderr
 
 
 @pytest.mark.parametrize("words", [["--help"], ["--version"], ["fit", "--help"], ["--json", "fitt"]])

@@ -27,6 +27,8 @@ def test_help_fills_the_terminal_and_states_only_defaults_that_say_something(
     page = capsys.readouterr().out
     assert max(map(len, page.splitlines())) <= COLUMNS
     assert not re.search(r"╭─ [\w -]+ options", page)
+    # Sentences of options begin with a capital.
+    assert not re.search(r"--help +[a-z]", page)
     assert {len(line) for line in page.splitlines() if line[:1] in "╭╰│" and line} <= {COLUMNS}
     assert not re.search(r"\(default: (None|False|True)?\)|\[[A-Z]+ \[|\bINT\b|\bFLOAT\b|\bWhether\b", page)
 

@@ -24,7 +24,7 @@ from avmsf.tasks.config import DistillationConfig, GuidedEditConfig
 from avmsf.tasks.distillation import AudioDiffusion, DecoderDistillation
 from avmsf.tasks.guided import Guide, GuidedEditProgress, edit_towards
 from avmsf.tasks.material import change_material
-from avmsf.tasks.parameters import HIERARCHICAL, INDEPENDENT, PUBLISHED, SEARCHED, Parameterisation
+from avmsf.tasks.parameters import HIERARCHICAL, INDEPENDENT, PUBLISHED, SEARCHED, Parameterization
 
 GENERATED = 3.0
 """Seconds of a sound that is generated from a prompt only."""
@@ -91,7 +91,7 @@ class Steered:
 
     name: str
     guide: Callable[[EditTask], Guide]
-    parameters: Parameterisation
+    parameters: Parameterization
     config: Mapping[str, Any] = field(default_factory=dict)
     """Settings of `GuidedEditConfig` other than the seed, which is the task's."""
 

@@ -93,10 +93,11 @@ def _run_remotely(
                     cause = getattr(error, "cause", None)
                     if isinstance(cause, Exception) and not isinstance(cause, ray.exceptions.RayError):
                         raise cause from None
-                    raise EvaluationError(
-                        f"{identifier}: the worker process ended early ({str(error).splitlines()[0]}); run the command "
-                        "again, with fewer --workers if memory ran out",
+                    raise EvaluationError.expected(
+                        "a worker process that finishes",
+                        got=f"one that ended early ({str(error).splitlines()[0]})",
                         name=identifier,
+                        advice="run the command again, with fewer --workers if memory ran out",
                     ) from error
                 heard(RunProgress(f"{identifier}: done", len(identifiers) - len(pending), len(identifiers)))
     finally:
@@ -119,10 +120,11 @@ def _cluster(ray: ModuleType, workers: Workers) -> Iterator[None]:
     try:
         ray.init(**settings)
     except (ConnectionError, RuntimeError, ValueError) as error:
-        where = "this computer" if workers.address is None else f"--ray {workers.address}"
-        raise EvaluationError(
-            f"ray does not start on {where}: {' '.join(str(error).split())}", name="ray", value=workers.address
-        ) from error
+        wanted, advice = "a cluster to connect to", "check that it runs and has this address"
+        if workers.address is None:
+            wanted, advice = "ray to start on this computer", "use --workers 1, which needs no ray"
+        reason = " ".join(str(error).split())
+        raise EvaluationError.expected(wanted, workers.address, got=reason, name="ray", advice=advice) from error
     try:
         yield
     finally:

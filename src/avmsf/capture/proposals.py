@@ -1,8 +1,7 @@
 """Settings that would help to read a capture folder, found from its content, and the `capture.toml` that says so.
 
-A setting is proposed only where the recordings themselves, or for units the contacts and the surface, show that it
-helps. docs/decisions/reading-recordings.md has
-the figures behind the bounds.
+A setting is proposed only where data show that it helps: the recordings, or for units the contacts and the surface.
+docs/decisions/reading-recordings.md has the measurements behind the limits.
 """
 
 import json

@@ -60,7 +60,7 @@ INTERRUPTED = 130
 """The exit code that shells give a command ended by Ctrl-C."""
 TERMINATED = 143
 """The exit code that shells give a command ended by SIGTERM."""
-REFUSED = 2
+BAD_INPUT = 2
 """The exit code of input that cannot be used."""
 _WAITING = frozenset({"studio"})
 """Verbs that wait for their user most of the time."""
@@ -79,6 +79,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Raises SystemExit, as command lines do, for a verb's help (0) and for options that cannot be understood (2).
     """
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            # Python has no stream where the descriptor is closed, as by `>&-`; the next file would take its place.
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w", encoding="utf-8"))
     try:
         try:
             return _run(_verb_first(sys.argv[1:] if arguments is None else arguments))
@@ -110,23 +114,22 @@ def _run(words: list[str]) -> int:
             with _loading(quiet=options.quiet):
                 verb = import_module(f"avmsf.cli.{words[0]}")
             _show_plainly()
+            # Imports rich, which help on the whole does not need, and every verb does.
+            from avmsf.cli.printing import announcing_folders
+
             paths = [getattr(options, name, None) for name in _OUTPUTS]
-            absent = sorted({path.parent for path in paths if path is not None and not path.parent.exists()})
-            with _compilation_announced():
+            with _compilation_announced(), announcing_folders(path.parent for path in paths if path is not None):
                 code: int = verb.run(options)
-            for folder in absent:
-                if folder.is_dir() and not options.quiet:
-                    print(f"created folder {printable(str(folder))}", file=sys.stderr)
         except Exception as error:
             if not isinstance(error, AvmsfError) and not lacks_memory(error):
                 raise
             known = error if isinstance(error, AvmsfError) else AvmsfError(NO_MEMORY)
             print(f"avmsf {words[0]}: {_sentence(known)}", file=sys.stderr)
-            return _refuse(known, words)
+            return _report_error(known, words)
         except SystemExit as ending:
             # Of options that cannot be understood, which the standard error has explained.
-            if message := getattr(ending, "message", ""):
-                _refuse(AvmsfError(message), words)
+            if misused := getattr(ending, "error", None):
+                _report_error(misused, words)
             raise
         except KeyboardInterrupt:
             print(f"avmsf {words[0]}: interrupted", file=sys.stderr)
@@ -136,14 +139,14 @@ def _run(words: list[str]) -> int:
         return TERMINATED if code == INTERRUPTED and signal.SIGTERM in received else code
 
 
-def _refuse(error: AvmsfError, words: Sequence[str]) -> int:
+def _report_error(error: AvmsfError, words: Sequence[str]) -> int:
     """Return the exit code of an error; where the words ask for JSON, print it as an object to the standard output."""
     if "--json" in words:
         # Imports rich, which other errors do not need.
         from avmsf.cli.printing import print_json
 
         print_json({"error": {"message": _sentence(error), **error.attributes}})
-    return REFUSED
+    return BAD_INPUT
 
 
 def _sentence(error: AvmsfError) -> str:
@@ -236,7 +239,7 @@ def _explain(words: list[str]) -> int:
         advice = f"did you mean {near[0]}? `avmsf --help` lists all" if near else "`avmsf --help` lists all"
         error = AvmsfError.expected("a command", given, name="avmsf", advice=advice)
         print(_sentence(error), file=sys.stderr)
-        return _refuse(error, words)
+        return _report_error(error, words)
     indent = max(map(len, VERBS)) + 4
     width = min(shutil.get_terminal_size().columns, _WIDEST)
     rows = {**VERBS, "--help": "Print this list.", "--version": "Print the version."}

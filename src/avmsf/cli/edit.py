@@ -12,10 +12,12 @@ from torch import Tensor
 
 from avmsf.bench.editpictures import HeardModes, draw_edit, draw_sound_change
 from avmsf.bench.pictures import save_picture
+from avmsf.capture.settings import METRES
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.clapcurve import CLAP
 from avmsf.cli.contacts import contacts_at, refuse_far
 from avmsf.cli.editmaterial import MaterialChange
+from avmsf.cli.options.common import Unit
 from avmsf.cli.options.edit import AFTER, BEFORE, CURVE, MODES, SPECTROGRAMS, ModeOptions, Options
 from avmsf.cli.printing import console, decimals, figure, next_command, print_json, say, table
 from avmsf.cli.steering import Steering, beside
@@ -72,7 +74,7 @@ def run(options: Options) -> int:
     """Edit, write, and print the result; return 130 where Ctrl-C stopped it."""
     asked = _Edit.of(options)
     old = load(options.field)
-    contact = _contact(old, options.position)
+    contact = _contact(old, options.position, unit=options.unit)
     try:
         new = _edited(options, asked, old)
     except KeyboardInterrupt:
@@ -146,11 +148,11 @@ def _edited(options: Options, asked: _Edit, field: SoundField) -> SoundField:
     return field
 
 
-def _contact(field: SoundField, at: tuple[float, float, float] | None) -> Float[Tensor, " 3"]:
+def _contact(field: SoundField, at: tuple[float, float, float] | None, *, unit: Unit = "m") -> Float[Tensor, " 3"]:
     """Return the contact of the sounds: the requested one, or the loudest of some."""
     if at is not None:
-        chosen = contacts_at([at], meters=1.0)
-        refuse_far(chosen, field)
+        chosen = contacts_at([at], meters=METRES[unit])
+        refuse_far(chosen, field, advice=", see --unit")
         return chosen.places[0].double()
     points = field.gain_field.points
     some = points[:: max(1, len(points) // _CANDIDATES)]

@@ -1,5 +1,6 @@
 """`avmsf evaluate`: the errors of methods on a dataset, as tables and as a page."""
 
+import shlex
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
@@ -29,7 +30,7 @@ from avmsf.cli import INTERRUPTED
 from avmsf.cli.objectbar import ObjectBar
 from avmsf.cli.options.common import spelled
 from avmsf.cli.options.evaluate import Options, deciding, words_of
-from avmsf.cli.printing import console, decimals, print_json, say, table
+from avmsf.cli.printing import console, decimals, next_command, next_step, print_json, say, table
 from avmsf.config import AUTO, PRESETS, LiftConfig, SceneConfig, TimeZero, ViewsConfig
 from avmsf.errors import EvaluationError
 from avmsf.modal.extraction.finders import finder_named
@@ -99,6 +100,9 @@ def run(options: Options) -> int:
         screen.print(f"wrote {path}", soft_wrap=True)
     if options.json:
         print_json({**summary, "results": str(folder), **({"curves": drawn} if drawn else {})})
+    next_step(f"open {shlex.quote(str(folder / PAGE))} in a browser")
+    other = "farthest" if protocol.name == LEARNING_CURVE else LEARNING_CURVE
+    next_command(f"avmsf evaluate {other}", options.data)
     return 0
 
 

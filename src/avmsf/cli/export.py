@@ -15,7 +15,7 @@ from avmsf.capture.settings import METRES, settings_of
 from avmsf.capture.surface import Surface
 from avmsf.cli.contacts import given_contacts, note_off, refuse_far
 from avmsf.cli.options.export import Options, unused_options
-from avmsf.cli.printing import figure, print_result, say
+from avmsf.cli.printing import figure, next_step, print_result, say
 from avmsf.config import CACHE
 from avmsf.errors import ExportError
 from avmsf.export.faust import contacts_path, fitted, write_faust
@@ -72,9 +72,9 @@ def run(options: Options) -> int:
         text += f"; {contacts} has the coordinates of each contact"
         values["contacts"] = str(contacts)
     print_result(text, values, json=options.json)
-    say(f"next: {_following(options)}")
+    next_step(_following(options))
     if options.to == "wavs" and len(options.forces) == 1:
-        say("next: the same command with --forces 0.3 1 3, for a layer at each force")
+        next_step("the same command with --forces 0.3 1 3, for a layer at each force")
     return 0
 
 
@@ -119,14 +119,14 @@ def _sampled(field: SoundField | SampledField, options: Options) -> SampledField
     """Return the field at the contacts of the options, or at its own points spread over the object."""
     if options.contacts_given:
         return _at_given(field, options)
-    most = options.points or POINTS[options.to]
+    most = options.contacts or POINTS[options.to]
     if isinstance(field, SoundField):
         points = points_on_object(field.gain_field)
         sampled, held = SampledField.of(field, points, limit=most), len(points)
     else:
         sampled, held = field if len(field) <= most else field.take(field.spread(most)), len(field)
-    if len(sampled) < held and options.points is None:
-        say(f"note: written: {len(sampled)} of the field's {counted(held, 'contact')}; --points sets the number")
+    if len(sampled) < held and options.contacts is None:
+        say(f"note: written: {len(sampled)} of the field's {counted(held, 'contact')}; --contacts sets the number")
     return sampled
 
 
@@ -227,7 +227,7 @@ def _web(field: SoundField | SampledField, options: Options) -> Written:
         object=source,
         meters=meters,
         strikes=_recordings(field, options.capture),
-        limit=options.points or POINTS["web"],
+        limit=options.contacts or POINTS["web"],
         force=options.overwrite,
     )
 
@@ -258,7 +258,7 @@ def _gltf(field: SoundField | SampledField, options: Options) -> Written:
 
 def _faust(field: SoundField | SampledField, options: Options) -> Written:
     sampled, noise = _sampled(field, options), not options.no_noise
-    if options.points is None and not options.contacts_given:
+    if options.contacts is None and not options.contacts_given:
         asked = len(sampled)
         sampled, noise = fitted(sampled, noise=noise)
         if len(sampled) < asked:
@@ -269,7 +269,7 @@ def _faust(field: SoundField | SampledField, options: Options) -> Written:
 def _demo(field: SoundField | SampledField, options: Options) -> Written:
     scene = options.field / SCENE
     source = scene if options.object is None and scene.is_file() else options.object
-    most = options.points or POINTS["avmsf-demo"]
+    most = options.contacts or POINTS["avmsf-demo"]
     sampled = _sampled(field, options)
     cloud = _gaussians(source, 1.0, sampled)
     if source is not None:

@@ -15,7 +15,7 @@ from avmsf.cli.alignment import describe_alignment
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.checks import read_settings
 from avmsf.cli.options.fit import Options
-from avmsf.cli.printing import console, next_command, print_json, say
+from avmsf.cli.printing import console, next_command, next_step, print_json, say
 from avmsf.cli.progress import FitBar
 from avmsf.cli.scores import compare, parts_words, quality_words, score_table, score_values
 from avmsf.errors import FitError
@@ -136,7 +136,7 @@ def _run_guess(options: Options, material: str, settings: CaptureSettings) -> in
 def next_after_fit(output: Path, *, trial: bool) -> None:
     """Print what is useful after a fit: after a `trial` on a part of the recordings, a fit to all of them."""
     if trial:
-        say("next: the same command without --train-fraction and --train-count, to fit to all recordings")
+        next_step("the same command without --train-fraction and --train-count, to fit to all recordings")
     else:
         next_command("avmsf render", output, "--position X Y Z -o impact.wav")
 

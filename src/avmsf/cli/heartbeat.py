@@ -68,7 +68,7 @@ def doing(text: str) -> None:
 
 @contextmanager
 def meanwhile(text: str) -> Iterator[None]:
-    """Let `text` be what is going on while the block runs, and afterwards what was before, if nothing else began."""
+    """Show `text` as the activity while the block runs; then the earlier one again, unless another has begun."""
     before = _activity.text, _activity.since
     _activity.text, _activity.since = text, time.monotonic()
     try:

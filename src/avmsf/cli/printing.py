@@ -4,7 +4,8 @@ import json
 import math
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -77,10 +78,38 @@ def say(text: str) -> None:
     printed(text)
 
 
+_absent: set[Path] = set()
+"""Folders of outputs that were not there when the verb began, and have not been printed since."""
+
+
+@contextmanager
+def announcing_folders(folders: Iterable[Path]) -> Iterator[None]:
+    """Print which of these folders the block has created: before what is useful next, or at its end."""
+    _absent.update(folder for folder in folders if not folder.exists())
+    try:
+        yield
+        _say_created()
+    finally:
+        _absent.clear()
+
+
+def _say_created() -> None:
+    for folder in sorted(_absent):
+        if folder.is_dir():
+            _absent.remove(folder)
+            say(f"created folder {folder}")
+
+
+def next_step(text: str) -> None:
+    """Print what is useful next, unless --quiet is given: the last lines of a verb."""
+    _say_created()
+    say(f"next: {text}")
+
+
 def next_command(command: str, path: Path | None = None, options: str = "") -> None:
     """Print a command that is useful next, unless --quiet is given."""
     words = [command, *([] if path is None else [shlex.quote(str(path))]), *([options] if options else [])]
-    say(f"next: {' '.join(words)}")
+    next_step(" ".join(words))
 
 
 def print_text(text: str) -> None:

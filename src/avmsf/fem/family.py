@@ -20,7 +20,7 @@ from avmsf.simulate.solid import Solid
 
 DOFS = WALL_TRIAL
 """Degrees of freedom of each wall, about: prisms along walls of a pot and a tube are 1 % too stiff in frequency."""
-FILLED_DOFS = 40_000
+SOLID_DOFS = 40_000
 """Of a solid body, about: tetrahedra lock where they fill thin parts."""
 _HOLES = 0.01
 """Part of a closed surface that lids over holes make up, below which the holes are defects of a scan. The mouth of a
@@ -95,22 +95,22 @@ def body_family(
     *,
     count: int,
     dofs: int = DOFS,
-    filled: int = FILLED_DOFS,
+    solid_dofs: int = SOLID_DOFS,
     tell: Callable[[str], None] | None = None,
 ) -> BodyFamily:
     """Return the bodies of a surface, with their lowest `count` modes.
 
-    Walls have about `dofs` degrees of freedom, a solid body `filled`.
+    Walls have about `dofs` degrees of freedom, a solid body `solid_dofs`.
 
     A closed mesh that shows both sides of one wall has walls of `_SCALES` times its thickness behind its larger side;
-    another closed mesh is filled. An open mesh has walls of `WALLS` times its size. A shape from photographs has walls
-    all over its range of thickness, or is filled where it has no cavity.
+    another closed mesh is solid. An open mesh has walls of `WALLS` times its size. A shape from photographs has walls
+    all over its range of thickness, or is solid where it has no cavity.
 
     Raises SimulationError for points without triangles, and where no body can be made, with the reason.
     """
     told = tell or (lambda words: None)
     if not isinstance(surface, Surface):
-        return _of_shape(surface, count, dofs, filled, told)
+        return _of_shape(surface, count, dofs, solid_dofs, told)
     found = checked(surface, tell=told)
     if found.lids > _HOLES:
         make = wall_solids(found, dofs)
@@ -119,15 +119,15 @@ def body_family(
     wall = wall_of(found.skin)
     scaled = None if wall is None else _scaled(wall, dofs)
     if wall is None or scaled is None:
-        return _filled(found, count, filled, told)
+        return _solid_body(found, count, solid_dofs, told)
     mean = wall.thickness
     return _of_walls(lambda thickness: scaled(thickness / mean), [mean * scale for scale in _SCALES], count, told)
 
 
-def _of_shape(shape: Shape, count: int, dofs: int, filled: int, tell: Callable[[str], None]) -> BodyFamily:
+def _of_shape(shape: Shape, count: int, dofs: int, solid_dofs: int, tell: Callable[[str], None]) -> BodyFamily:
     between = shape.thickness_range
     if between is None:
-        return _filled(checked(shape.as_seen(), tell=tell), count, filled, tell)
+        return _solid_body(checked(shape.as_seen(), tell=tell), count, solid_dofs, tell)
 
     def make(thickness: float) -> Solid:
         try:
@@ -139,7 +139,7 @@ def _of_shape(shape: Shape, count: int, dofs: int, filled: int, tell: Callable[[
     return _of_walls(make, np.geomspace(*between, _THICKNESSES).tolist(), count, tell)
 
 
-def _filled(found: CheckedSurface, count: int, dofs: int, tell: Callable[[str], None]) -> BodyFamily:
+def _solid_body(found: CheckedSurface, count: int, dofs: int, tell: Callable[[str], None]) -> BodyFamily:
     tell("dividing the body into tetrahedra")
     return BodyFamily((isotropic_modes(filled_solid(found, dofs), count=count),), ())
 

@@ -126,9 +126,9 @@ def nominal_bodies(
     and walls of `WALLS` times the surface's size where the surface is a sheet or holds much more than the wall would;
     of a `Shape`, walls all over its range of thickness. Where one body is left, it has about `dofs` degrees of
     freedom, at most a fifth more; of several each has at most `TRIAL`, or `WALL_TRIAL`, enough to choose by, and
-    `refined` makes the chosen one fine. Dense, noisy and inverted surfaces are mended, and `tell` hears of it; the wall
-    of an open one lies behind its triangles, whichever way they face. Modes are kept by content in the folder `cache`,
-    for they take most of the time; a damaged file is made again.
+    `refined` makes the chosen one fine. Dense, noisy and inverted surfaces are repaired, and `tell` is called with a
+    note; the wall of an open one lies behind its triangles, whichever way they face. Modes are kept by content in the
+    folder `cache`, for they take most of the time; a damaged file is made again.
 
     Raises SimulationError for a surface of points, and where no body can be had, with the reason for each: by the name
     "surface", or by that of the reason where only memory, time or the mesher stood against it.
@@ -175,7 +175,7 @@ def with_wall(
 ) -> NominalBody | None:
     """Return the body with a wall of this thickness, meters, coarse as those of `nominal_bodies`; None if that fails.
 
-    `tell` hears why.
+    `tell` is called with the reason.
     """
     told = tell or (lambda words: None)
     try:
@@ -196,7 +196,8 @@ def refined(
     """Return a body of `nominal_bodies` computed with about `dofs` degrees of freedom; a fine one as it is.
 
     Where that fails, for want of memory or because it cannot be filled so finely, the coarser one is returned, which
-    was good enough to choose by, and `tell` hears of it. Raises SimulationError for settings that cannot be meant.
+    was good enough to choose by, and `tell` is called with the reason. Raises SimulationError for settings that cannot
+    be meant.
     """
     if body.fine:
         return body
@@ -224,8 +225,8 @@ def supported(
     """Return a free body of `nominal_bodies`, and held where an object may be: at its lowest face or point, or an edge.
 
     All have the same tetrahedra, of `TRIAL` or `WALL_TRIAL` degrees of freedom at most, enough to choose by; `refined`
-    makes the chosen one fine, without a check of its convergence. Those whose modes cannot be computed are left out, of
-    which `tell` hears; none are returned if the free one's cannot.
+    makes the chosen one fine, without a check of its convergence. Those whose modes cannot be computed are left out,
+    and `tell` is called with the reason; none are returned if the free one's cannot.
     """
     told = tell or (lambda words: None)
     trial = TRIAL if isinstance(surface, Surface) else WALL_TRIAL
@@ -464,7 +465,7 @@ def _grouped(refused: Mapping[float | None, SimulationError]) -> list[str]:
 
 
 def _without(reason: str) -> str:
-    """Return what `tell` hears of a body that cannot be had, where there are others; without an error's advice."""
+    """Return the note of a body that cannot be had, where there are others; without an error's advice."""
     return f"not tried as the body: {reason.partition('; ')[0]}; the other candidates are compared"
 
 

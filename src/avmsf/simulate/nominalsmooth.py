@@ -2,7 +2,7 @@
 
 A scan's noise is drawn afresh at each vertex, while a surface runs on from one vertex to the next. Of the surfaces
 that balance closeness to the vertices against bending, (1 + strength L L) places = vertices with L the mean difference
-from the neighbors, generalised cross-validation takes the one that would foretell left-out vertices best.
+from the neighbors, generalized cross-validation takes the one that would predict left-out vertices best.
 """
 
 import math
@@ -49,7 +49,7 @@ def roughness(skin: Skin) -> float:
 def denoised(skin: Skin) -> tuple[Skin, float]:
     """Return a noisy mesh without its noise, and how far that moved the vertices, meters, root mean square.
 
-    A mesh that is not rough, or whose vertices foretell each other no better when smoothed, comes back as it is, with
+    A mesh that is not rough, or whose vertices predict each other no better when smoothed, comes back as it is, with
     0. The volume of a closed one stays.
     """
     if roughness(skin) < ROUGH:

@@ -89,6 +89,6 @@ def expect_prompt(prompt: str) -> str:
     """Return a prompt without surrounding blanks. Raises `EditError` for an empty one."""
     if not prompt.strip():
         raise EditError(
-            'expected a prompt, such as "a wooden bowl is struck", got an empty one', name="prompt", value=prompt
+            'expected a prompt, such as "an impact on a wooden bowl", got an empty one', name="prompt", value=prompt
         )
     return prompt.strip()

@@ -22,7 +22,7 @@ from avmsf.tasks.clips import level
 from avmsf.tasks.config import GuidedEditConfig
 from avmsf.tasks.guided_checkpoint import asked
 from avmsf.tasks.modaledit import ModalEdit, Struck
-from avmsf.tasks.parameters import HIERARCHICAL, EditVariables, Parameterisation
+from avmsf.tasks.parameters import HIERARCHICAL, EditVariables, Parameterization
 
 _PROBES = 16
 """Contacts, far apart, for the strongest modes, the start and the level."""
@@ -85,7 +85,7 @@ def edit_towards(
     guide: Guide,
     *,
     config: GuidedEditConfig | None = None,
-    parameters: Parameterisation = HIERARCHICAL,
+    parameters: Parameterization = HIERARCHICAL,
     progress: Callable[[GuidedEditProgress], None] | None = None,
     checkpoint: str | Path | None = None,
     device: torch.device | str = "cpu",
@@ -112,7 +112,7 @@ class _Steering:
         field: SoundField,
         guide: Guide,
         config: GuidedEditConfig,
-        parameters: Parameterisation,
+        parameters: Parameterization,
         checkpoint: Path | None,
         device: torch.device | str,
     ) -> None:

@@ -14,7 +14,7 @@ _QUANTITIES = ("pitch", "shift", "damping", "damping_shift", "scale")
 
 
 @dataclass(frozen=True)
-class Parameterisation:
+class Parameterization:
     """Rates are those of Adam, in logarithms a step, falling to a twentieth; 0 fixes a quantity at its initial value.
 
     The penalty on a quantity of single modes is half the mean square over modes of its value over its standard
@@ -47,14 +47,14 @@ class Parameterisation:
     """Whether gains of a mode from f1 to f2 Hz are multiplied by f1 / f2 when the edit ends (paper, section 3.6)."""
 
 
-HIERARCHICAL = Parameterisation("hierarchical", 0.02, 0.02, 0.003, 0.01, 0.02, 0.05)
+HIERARCHICAL = Parameterization("hierarchical", 0.02, 0.02, 0.003, 0.01, 0.02, 0.05)
 """The paper's factor on all frequencies, and ours: one on all dampings, penalties on single modes, a search first."""
-PUBLISHED = Parameterisation("published", 0.02, 0.0, 0.003, 0.01, 0.02, 0.0, searches=False, gains_follow=True)
+PUBLISHED = Parameterization("published", 0.02, 0.0, 0.003, 0.01, 0.02, 0.0, searches=False, gains_follow=True)
 """The paper's: f = exp(log alpha + log f0 + delta), dampings and gains of single modes, no penalty.
 
 The rates, which the paper does not state, are those of `HIERARCHICAL`.
 """
-INDEPENDENT = Parameterisation("independent", 0.0, 0.0, 0.02, 0.02, 0.02, 0.0, searches=False)
+INDEPENDENT = Parameterization("independent", 0.0, 0.0, 0.02, 0.02, 0.02, 0.0, searches=False)
 """The paper's baseline, after Audio-SDS: independent frequencies, dampings and gains, no common factors.
 
 The rates are this package's, those of the common factors above; Audio-SDS states .05 for its parameters.
@@ -69,7 +69,7 @@ PARAMETERISATIONS = {each.name: each for each in (HIERARCHICAL, PUBLISHED, INDEP
 class EditVariables:
     """The variables of an edit, and their optimizer."""
 
-    def __init__(self, start: ModalEdit, edited: Int[Tensor, " edited"], parameters: Parameterisation) -> None:
+    def __init__(self, start: ModalEdit, edited: Int[Tensor, " edited"], parameters: Parameterization) -> None:
         """Begin at `start`; the modes `edited` move by themselves, the others follow the common factors alone.
 
         Quantities whose rate is 0 stay where they begin.

@@ -66,7 +66,7 @@ class StableAudio:
         """Load a pipeline of the hub by name, or a folder that holds one.
 
         On CUDA and in bfloat16 where there is a GPU, else on the CPU in float32, by default. Raises `EditError` where
-        diffusers is missing, where the model is neither here nor to be downloaded (its licence has to be accepted
+        diffusers is missing, where the model is neither here nor to be downloaded (its license has to be accepted
         first), for a folder that holds another model or a part of one, and for a device that is not there or whose
         memory does not hold the model.
         """

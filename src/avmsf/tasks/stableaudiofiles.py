@@ -99,7 +99,7 @@ def _from_hub(kind: Any, name: str) -> Path:
         return Path(kind.download(name))
     except Exception as error:  # the hub's client raises whatever the network beneath it does
         raise EditError(
-            f"{name}: the model is not in the cache, and its download failed ({why_not(error)}); "
+            f"{name}: expected a model in the cache or one that can be downloaded, got neither ({why_not(error)}); "
             f"accept the license at https://huggingface.co/{name}, create a token at "
             "https://huggingface.co/settings/tokens and run hf auth login; or, on a computer with a network, run "
             f"hf download {name} --local-dir FOLDER --exclude 'model.*', copy FOLDER here and give its path",

@@ -36,7 +36,9 @@ class _Reader:
         try:
             self.content = path.read_bytes()
         except OSError as error:
-            raise CaptureError(f"{path}: cannot be read ({error.strerror})", file=path) from error
+            raise CaptureError.expected(
+                "a readable file", error.strerror, file=path, advice="get read permission, or export the model again"
+            ) from error
 
     def take(self, layout: str) -> tuple[Any, ...]:
         """Return the next values, laid out as `struct` says."""

@@ -44,7 +44,10 @@ def _lines(path: Path) -> list[tuple[int, str]]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise CaptureError(f"{path}: cannot be read as text ({error})", file=path) from error
+        reason = getattr(error, "strerror", None) or str(error)
+        raise CaptureError.expected(
+            "a readable text file", reason, file=path, advice="get read permission, or export the model again as text"
+        ) from error
     lines = [(row, line.strip()) for row, line in enumerate(text.splitlines(), start=1)]
     return [(row, line) for row, line in lines if not line.startswith("#")]
 

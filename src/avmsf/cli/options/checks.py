@@ -6,6 +6,7 @@ from avmsf.capture.filenames import find_surface_file
 from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.table import read_strikes
 from avmsf.errors import AvmsfError, CaptureError, ExtractionError
+from avmsf.files import temporary_path, unwritable
 
 DEVICES = ("cpu", "cuda")
 """Kinds of devices that commands compute on."""
@@ -23,7 +24,7 @@ def expect_writable(path: Path | None) -> None:
     """Raise `OutputError` where no file can be written at `path`, where one is given: before work of minutes."""
     if path is None:
         return
-    if path.is_dir():
+    if is_folder(path):
         raise OutputError(f"{path}: expected the name of a file, got a folder", file=path, value="folder")
     folder = path.parent
     existing = next(place for place in (folder, *folder.resolve().parents) if place.exists())
@@ -31,6 +32,19 @@ def expect_writable(path: Path | None) -> None:
         raise OutputError(
             f"{path}: expected a folder at {existing}, got a file; choose another folder", file=existing, value="file"
         )
+
+
+def is_folder(path: Path) -> bool:
+    """Return whether a folder is at the path of an output. Raises `OutputError` where the system accepts no such path.
+
+    Its name may be too long, or a folder above it may not be searched.
+    """
+    try:
+        # Files are written under a longer name first.
+        (temporary_path(path) if path.name else path).exists()
+        return path.is_dir()
+    except OSError as error:
+        raise unwritable(path, error, raising=OutputError) from error
 
 
 def expect_device(name: str | None, *, raising: type[AvmsfError]) -> None:

@@ -8,6 +8,7 @@ from typing import Annotated
 import tyro
 
 from avmsf.cli.options.common import Printing, parse_options
+from avmsf.cli.options.paths import NewFolder
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,7 @@ class Options(Printing):
     determine the thickness of the mug's wall, and tested on the other 4.
     """
 
-    folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="FOLDER")]] = Path("demo")
+    folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="FOLDER"), NewFolder()]] = Path("demo")
     """Folder for all results; an earlier demo in it is replaced."""
 
 

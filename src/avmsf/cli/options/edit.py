@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from avmsf.cli.options.checks import OutputError, expect_device, expect_writable
-from avmsf.cli.options.common import Printing, parse_options
+from avmsf.cli.options.common import Printing, Unit, parse_options
 from avmsf.cli.options.helptext import option_of
 from avmsf.cli.options.paths import NEW_TENSORS, FieldFile, NewFile, PlotsFolder
 from avmsf.errors import EditError
@@ -96,7 +96,7 @@ class GuideOptions:
     """
 
     prompt: Annotated[str | None, tyro.conf.arg(metavar="TEXT")] = None
-    """Text that describes the sound, such as "a wooden bowl is struck", for a text-to-audio model; needs the extra
+    """Text that describes the sound, such as "an impact on a wooden bowl", for a text-to-audio model; needs the extra
     `text`."""
     like: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="WAV|FOLDER ...")] = ()
     """Recordings of impacts on another object to imitate: files or folders of them."""
@@ -197,7 +197,9 @@ class Options(Printing):
     """Write modes.png, spectrograms.png, before.wav and after.wav to this folder; with --clap also clap.png, the score
     over the steps."""
     position: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
-    """Contact of these sounds in meters, on the object as it was; by default where it is loudest."""
+    """Contact of these sounds, on the object as it was; by default where it is loudest."""
+    unit: Unit = "m"
+    """Unit of --position. A field itself is in meters, whatever unit its capture has."""
 
     def check_inputs(self) -> None:
         """Raise the package's errors for an edit that cannot be done or written."""

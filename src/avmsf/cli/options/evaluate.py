@@ -11,7 +11,7 @@ from avmsf.bench.names import expect_method, expect_protocol, expect_suited
 from avmsf.capture.datasets.signs import expect_signs
 from avmsf.cli.options.checks import expect_device, expect_modes
 from avmsf.cli.options.common import Flag, Printing, parse_options, spelled
-from avmsf.cli.options.paths import Existing, OutputFolder
+from avmsf.cli.options.paths import CacheFolder, Existing, OutputFolder
 from avmsf.config import BodyConfig, Geometry, LiftConfig, TimeZero
 from avmsf.errors import EvaluationError
 from avmsf.modal.config import ExtractionMethod
@@ -41,7 +41,7 @@ class Options(Printing):
     """Objects, separated by commas or blanks; by default those of the protocol."""
     output: OutputFolder = None
     """Folder of results; by default evaluation/DATASET/PROTOCOL in the current folder."""
-    cache: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    cache: CacheFolder = None
     """Keep the objects' features here, which several evaluations of one dataset may share; by default in the folder of
     results."""
     test: Annotated[tuple[str, ...], tyro.conf.arg(metavar="RECORDING ...")] = ()
@@ -109,7 +109,7 @@ class Options(Printing):
             expect_suited(name, self.protocol)
         if self.protocol == "predefined" and not self.test:
             raise EvaluationError.expected(
-                "names of the recordings to test on", "none", name="--test", advice="such as --test 009.wav,010.wav"
+                "names of the recordings to test on", name="--test", advice="such as --test 009.wav,010.wav"
             )
         expect_device(self.device, raising=EvaluationError)
         expect_modes(self.modes)

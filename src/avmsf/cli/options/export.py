@@ -60,7 +60,7 @@ _OF_SOME = {"rate"}.union(*_USED.values())
 class Options(Printing):
     """Write a field for other tools: web page, glTF, Faust, samplers, modal analysis.
 
-    web: a page on which the object can be struck, as a folder for any static host or as one .html file. gltf: a .glb
+    web: a page that plays impacts on the object, as a folder for any static host or as one .html file. gltf: a .glb
     that any viewer shows, with the draft extension KHR_audio_rigid_bodies. faust: a .dsp with controls, or a .lib
     without. avmsf-demo: the layout of the paper's own demo. wavs: sounds with a table and an SFZ instrument, for
     samplers. uff: the universal file format, for modal analysis. What a format cannot hold is printed.
@@ -85,7 +85,7 @@ class Options(Printing):
     """Unit of the coordinates of the object's mesh."""
     capture: OtherCapture = None
     """Capture folder: its mesh is shown, see --object, and a page offers its recordings next to the model's sounds."""
-    points: int | None = None
+    contacts: int | None = None
     """Maximum number of contacts, spread over the object; by default as many as the format's tools read easily."""
     position: PositionList = ()
     """faust, gltf, uff, wavs: a contact in the object's frame, in place of contacts spread over the object; once per
@@ -127,10 +127,10 @@ class Options(Printing):
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
-        given = sum((bool(self.position), self.contact_table is not None, self.points is not None))
+        given = sum((bool(self.position), self.contact_table is not None, self.contacts is not None))
         if self.contacts_given and given > 1:
             raise ExportError.expected(
-                "contacts by one of --position, --contact-table and --points",
+                "contacts by one of --position, --contact-table and --contacts",
                 given,
                 name="--position" if self.position else "--contact-table",
                 advice="leave out the others",
@@ -138,8 +138,8 @@ class Options(Printing):
         for row, place in enumerate(self.position):
             if not all(map(math.isfinite, place)):
                 raise ExportError.expected("finite coordinates", list(place), row=row, name="--position")
-        if self.points is not None and self.points < 1:
-            raise ExportError.expected("1 or more", self.points, name="--points")
+        if self.contacts is not None and self.contacts < 1:
+            raise ExportError.expected("1 or more", self.contacts, name="--contacts")
         _OUTPUTS[self.to].check(self.output)
         if not self.field.is_dir():
             read_record(self.field)

@@ -16,13 +16,14 @@ import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import MISSING, Field, fields, is_dataclass
-from itertools import takewhile
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import tyro
 from tyro.constructors import StructConstructorSpec, StructFieldSpec, StructTypeInfo
+
+from avmsf.cli.options.usage import UsageExit, usage_error
 
 _WIDEST = 129
 """Columns of help: in wider ones tyro sets its boxes side by side."""
@@ -32,6 +33,8 @@ _TITLE = re.compile(r"(?<=[ m])([A-Za-z][\w-]*)((?:\x1b\[[\d;]*m)*) options(?=.*
 """The title that tyro gives to a group of options; on a terminal, its words have colors."""
 _TITLES = {"splat": "Gaussians", "lift": "features", "body": "bodies", "guided-edit": "guided edits"}
 """What groups of options set, where it is not what their prefix says."""
+_HELP_OF_TYRO, _HELP = "show this help message and exit", "Show this help and exit."
+"""What tyro says of --help, and what it is to say, as the other options do."""
 _NAMES: dict[object, str] = {int: "N", float: "NUMBER", str: "TEXT", Path: "FILE"}
 
 
@@ -50,14 +53,6 @@ class _Page(io.StringIO):
     def isatty(self) -> bool:
         """Return whether it goes to a terminal."""
         return self.stream.isatty()
-
-
-class UsageExit(SystemExit):
-    """Options cannot be understood, as the standard error explains; `message` is its first sentence."""
-
-    def __init__(self, message: str) -> None:
-        super().__init__(2)
-        self.message = message
 
 
 def paragraphs(text: str) -> str:
@@ -79,22 +74,16 @@ def one_column() -> Iterator[None]:
             yield
     except SystemExit as ending:
         if ending.code:
-            raise UsageExit(_message(errors.getvalue())) from None
+            raise UsageExit(usage_error(errors.getvalue())) from None
         raise
     finally:
         print(errors.getvalue(), end="", file=sys.stderr)
         del os.environ["COLUMNS"]
         if before is not None:
             os.environ["COLUMNS"] = before
-        for line in re.sub(r"\n{3,}", "\n\n", page.getvalue()).splitlines():
+        text = page.getvalue().replace(_HELP_OF_TYRO, _HELP.ljust(len(_HELP_OF_TYRO)))
+        for line in re.sub(r"\n{3,}", "\n\n", text).splitlines():
             print(_with_title(line.rstrip()) if _BOX.search(line) else textwrap.fill(line, width))
-
-
-def _message(box: str) -> str:
-    """Return the sentence in the box of an error: what is below its title and above its first rule."""
-    lines = [re.sub(r"\x1b\[[\d;]*m|[│╭╮╰╯]", "", line).strip() for line in box.splitlines()]
-    message = takewhile(lambda line: not line or line.strip("─-"), lines[1:])
-    return " ".join(line for line in message if line)
 
 
 def _with_title(line: str) -> str:

@@ -11,7 +11,7 @@ import tyro
 
 from avmsf._utils.headers import read_metadata
 from avmsf.capture.filenames import PICTURE_SUFFIXES, VIDEO_SUFFIXES
-from avmsf.cli.options.checks import OutputError, expect_writable
+from avmsf.cli.options.checks import OutputError, expect_writable, is_folder
 from avmsf.errors import AvmsfError
 from avmsf.field import header as field_header
 from avmsf.scene import featureheader
@@ -46,11 +46,16 @@ class Existing:
 
     def check(self, path: Path) -> None:
         """Raise `InputError` where nothing is at the path, or something of a kind that is known and no other use."""
-        if not path.exists():
-            raise InputError.expected(self.what, got="no such file or folder", file=path, advice="check the name")
-        found = kind_of(path)
-        if found is not None and found not in self.kinds:
-            raise InputError(f"{path}: expected {self.what}, got {found}; name another", file=path, value=found)
+        try:
+            found = None if path.exists() else "no such file or folder"
+        except OSError as error:
+            # Its name is too long, or a folder above it may not be searched.
+            found = str(error.strerror).lower()
+        if found is not None:
+            raise InputError.expected(self.what, got=found, file=path, advice="check the name")
+        kind = kind_of(path)
+        if kind is not None and kind not in self.kinds:
+            raise InputError(f"{path}: expected {self.what}, got {kind}; name another", file=path, value=kind)
 
 
 @dataclass(frozen=True)
@@ -78,7 +83,7 @@ class NewFile:
     def check(self, path: Path) -> None:
         """Raise `OutputError` for a path where no file can be written, and for the ending of another format."""
         suffix = path.suffix.lower()
-        if self.or_folder and (path.is_dir() or suffix not in FILE_SUFFIXES):
+        if self.or_folder and (is_folder(path) or suffix not in FILE_SUFFIXES):
             return
         expect_writable(path)
         if suffix not in self.suffixes:
@@ -97,7 +102,7 @@ class NewFolder:
 
     def check(self, path: Path) -> None:
         """Raise `OutputError` for a path where no folder can be made, and for a name with the ending of a file."""
-        if not path.is_dir() and path.suffix.lower() in FILE_SUFFIXES:
+        if not is_folder(path) and path.suffix.lower() in FILE_SUFFIXES:
             raise OutputError(
                 f"{path}: expected the name of a folder, got one with {path.suffix}; use {path.with_suffix('')}",
                 file=path,
@@ -118,6 +123,7 @@ ShapeFile = Annotated[
 SettingsFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml"), Existing("a capture.toml", ())]
 OutputFolder = Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER"), NewFolder()]
 PlotsFolder = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER"), NewFolder()]
+CacheFolder = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER"), NewFolder()]
 ContactTable = Annotated[Path | None, tyro.conf.arg(metavar="TABLE.csv"), Existing("a table of contacts", ())]
 PositionList = Annotated[
     tyro.conf.UseAppendAction[tuple[tuple[float, float, float], ...]], tyro.conf.arg(metavar="X Y Z")

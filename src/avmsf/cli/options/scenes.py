@@ -10,7 +10,7 @@ from avmsf.capture.filenames import expect_views
 from avmsf.capture.settings import CaptureSettings
 from avmsf.cli.options.checks import expect_device, read_settings
 from avmsf.cli.options.common import Printing
-from avmsf.cli.options.paths import Existing, SettingsFile
+from avmsf.cli.options.paths import CacheFolder, Existing, SettingsFile
 from avmsf.config import CACHE, SceneConfig
 from avmsf.errors import SceneError
 
@@ -27,7 +27,7 @@ class SceneOptions(Printing):
         ]
     ]
     """Folder with photographs (transforms.json, a COLMAP model, or only images/), a video, a mesh or Gaussians."""
-    cache: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    cache: CacheFolder = None
     """Cache the output of each stage here, by default in FOLDER/.avmsf."""
     settings: SettingsFile = None
     """Use this capture.toml instead of the folder's own."""

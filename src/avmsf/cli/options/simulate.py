@@ -2,13 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from avmsf.cli.options.common import Flag, Printing, parse_options
-from avmsf.cli.options.paths import InputError
+from avmsf.cli.options.paths import CacheFolder, InputError, OutputFolder
 from avmsf.errors import SimulationError
 from avmsf.simulate.example import EXAMPLE
 from avmsf.simulate.recipe import ObjectRecipe
@@ -27,11 +26,11 @@ class Options(Printing):
     what: tyro.conf.Positional[Annotated[str | None, tyro.conf.arg(metavar="NAME")]] = None
     """sim-20 for the benchmark set, the name of one of its objects, or example for the object of `avmsf demo`; nothing
     for an object of your own."""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = None
+    output: OutputFolder = None
     """Output folder."""
     list: Flag = False
     """Only list the set's objects, the shapes and the materials."""
-    cache: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    cache: CacheFolder = None
     """Cache of elastic modes, which take most of the time: other hammers, noises and views are then fast."""
     recipe: Annotated[ObjectRecipe, tyro.conf.arg(name="")] = field(default_factory=ObjectRecipe)
     """The object, its impacts, recordings and images; for an object of the set, what differs from it."""

@@ -64,7 +64,7 @@ def training_objects(
 ) -> Iterator[TrainingObject]:
     """Yield the objects of recipes, kept in files beneath `cache` where it is given.
 
-    An object that cannot be simulated or splatted is left out, and `tell` hears why.
+    An object that cannot be simulated or splatted is left out, and `tell` is called with the reason.
     """
     for number, recipe in enumerate(recipes, 1):
         name = f"{number} of {len(recipes)}, {recipe.kind}-{recipe.material}"

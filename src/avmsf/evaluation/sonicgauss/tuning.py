@@ -79,7 +79,7 @@ def train(
 ) -> list[float]:
     """Train in place on so many clips, in random order without repetition in each round, and return the losses.
 
-    `tell` hears the step and its loss. All chance starts at `seed`, that of dropout too.
+    `tell` is called with the step and its loss. All chance starts at `seed`, that of dropout too.
     """
     generator = torch.Generator().manual_seed(seed)
     optimizer = torch.optim.AdamW(parameters, lr=config.rate, betas=config.betas, weight_decay=config.decay)
