@@ -64,6 +64,11 @@ def quality_words(field: SoundField, path: Path) -> list[str]:
     return [f"{field.quality}{more}"]
 
 
+def body_warnings(field: SoundField) -> list[str]:
+    """Return the warning of a field's most probable body; empty where there is none."""
+    return [f"warning: {field.body.warning}"] if field.body is not None and field.body.warning else []
+
+
 def score_table(title: str, scores: Mapping[str, Scores]) -> Table:
     """Return the means for printing, with the standard error of the first metric."""
     rows = []
