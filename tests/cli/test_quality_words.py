@@ -10,8 +10,9 @@ import torch
 
 from avmsf.cli import main
 from avmsf.cli.fit import summary
+from avmsf.cli.heartbeat import verbosity
 from avmsf.cli.options import suggest
-from avmsf.cli.scores import body_warnings, quality_words
+from avmsf.cli.scores import body_warnings, outlier_words, quality_words
 from avmsf.errors import FieldFileError
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import save
@@ -110,3 +111,21 @@ def test_a_damaged_report_of_a_body_is_refused(tmp_path: Path, damage: dict[str,
     report = body_report(wall=0.0013, ratio=1.0, searched=True)
     with pytest.raises(FieldFileError):
         save(field_with(report | damage), tmp_path / "jug.safetensors")
+
+
+def test_an_outlier_says_first_what_was_done_and_has_figures_only_for_verbose(monkeypatch: pytest.MonkeyPatch) -> None:
+    figures = {"place": [0.046, -0.003, 0.1], "ratio": -1.9, "place_ratio": 1.6, "distance": 0.0086, "reversed": False}
+    report: dict[str, object] = {
+        "outliers": {"a.wav": "a.wav contradicts", "b.wav": "b.wav contradicts"},
+        "outlier_figures": {"a.wav": figures},
+        "excluded": ["a.wav"],
+    }
+    left_out, used = outlier_words(field_with(report))
+    assert left_out.startswith("left out")
+    assert used.startswith("used")
+    assert "1.9" not in left_out
+    monkeypatch.setattr(verbosity, "verbose", True)
+    left_out, used = outlier_words(field_with(report))
+    assert "-1.9" in left_out
+    assert "(0.046, -0.003, 0.1) m" in left_out
+    assert used.endswith("contradicts")

@@ -17,7 +17,15 @@ from avmsf.cli.options.checks import read_settings
 from avmsf.cli.options.fit import Options
 from avmsf.cli.printing import console, next_command, next_step, print_json, say
 from avmsf.cli.progress import FitBar
-from avmsf.cli.scores import body_warnings, compare, parts_words, quality_words, score_table, score_values
+from avmsf.cli.scores import (
+    body_warnings,
+    compare,
+    outlier_words,
+    parts_words,
+    quality_words,
+    score_table,
+    score_values,
+)
 from avmsf.errors import FitError
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import save
@@ -95,7 +103,7 @@ def print_fitted(
     if test is not None:
         screen.print(score_table(f"{parts_words(train, test)}; lower is better", scores))
     for words in (
-        *describe_outliers(fitted),
+        *outlier_words(fitted),
         summary(fitted, len(train)),
         *body_warnings(fitted),
         *quality_words(fitted, path),
@@ -169,16 +177,6 @@ def part_contacts(
     if count is not None:
         return split(impacts, count=count, start=start)
     return impacts, None
-
-
-def describe_outliers(fitted: SoundField) -> list[str]:
-    """Return a line for each recording whose contact is an outlier."""
-    report = fitted.origin.report
-    excluded = report.get("excluded", [])
-    return [
-        f"check its row in impacts.csv: {found}; {'left out of the fit' if name in excluded else 'used in the fit'}"
-        for name, found in report.get("outliers", {}).items()
-    ]
 
 
 def summary(fitted: SoundField, contacts: int) -> str:

@@ -19,7 +19,7 @@ from avmsf.cli.modes import mode_table
 from avmsf.cli.modetable import levels, mode_rows
 from avmsf.cli.options.info import Options
 from avmsf.cli.printing import console, next_command, print_json, say
-from avmsf.cli.scores import body_warnings, quality_words, score_table, score_values
+from avmsf.cli.scores import body_warnings, outlier_words, quality_words, score_table, score_values
 from avmsf.field.attention import AttentionGains
 from avmsf.field.config import NETWORK
 from avmsf.field.gains.body import BodyGains
@@ -210,9 +210,7 @@ def _words(field: SoundField, values: dict[str, Any], quality: list[str]) -> str
         lines.append(f"  body       {field.body} (the most probable one)")
     lines += [f"  {words}" for words in body_warnings(field)]
     lines += [f"  quality    {words}" for words in quality]
-    excluded = report.get("excluded", ())
-    for name, words in report.get("outliers", {}).items():
-        lines.append(f"  {'left out' if name in excluded else 'outlier'}   {words}")
+    lines += [f"  {words}" for words in outlier_words(field)]
     for edit in report.get("edits", []):
         lines.append(f"  edited     {_edit_words(edit)}")
     if report.get("validated"):
