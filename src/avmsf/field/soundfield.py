@@ -99,7 +99,7 @@ class FieldQuality:
         return (
             "By leave-one-out, the field is no better than the mean of the three nearest recordings: relative STFT "
             f"errors of {self.error:.2f} and {self.nearest_mean:.2f} ({self.positions} positions). Record more "
-            "positions; without a mesh, give one."
+            "positions; without a mesh, add one, or make the shape from photographs by avmsf reconstruct."
         )
 
     @property
