@@ -239,7 +239,9 @@ class Outlier:
 
     def figures(self) -> dict[str, Any]:
         """Return its place and ratios as plain values."""
-        return {name: value for name, value in asdict(self).items() if name != "row"}
+        figures = asdict(self) | {"place": list(self.place)}
+        del figures["row"]
+        return figures
 
 
 @dataclass(frozen=True)
