@@ -17,7 +17,15 @@ from avmsf.cli.options.checks import read_settings
 from avmsf.cli.options.fit import Options
 from avmsf.cli.printing import console, next_command, next_step, print_json, say
 from avmsf.cli.progress import FitBar
-from avmsf.cli.scores import compare, parts_words, quality_words, score_table, score_values
+from avmsf.cli.scores import (
+    body_warnings,
+    compare,
+    outlier_words,
+    parts_words,
+    quality_words,
+    score_table,
+    score_values,
+)
 from avmsf.errors import FitError
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import save
@@ -94,7 +102,12 @@ def print_fitted(
     """Print the errors of a field in the file `path` at held-out recordings, the outliers, and its quality."""
     if test is not None:
         screen.print(score_table(f"{parts_words(train, test)}; lower is better", scores))
-    for words in (*describe_outliers(fitted), summary(fitted, len(train)), *quality_words(fitted, path)):
+    for words in (
+        *outlier_words(fitted),
+        summary(fitted, len(train)),
+        *body_warnings(fitted),
+        *quality_words(fitted, path),
+    ):
         screen.print(words, soft_wrap=True)
 
 
@@ -110,6 +123,7 @@ def fitted_values(
         "trained_on": list(train.names),
         "tested_on": [] if test is None else list(test.names),
         "report": fitted.origin.report,
+        "body": None if fitted.body is None else fitted.body.record(),
         "scores": score_values(scores),
     }
 
@@ -165,31 +179,16 @@ def part_contacts(
     return impacts, None
 
 
-def describe_outliers(fitted: SoundField) -> list[str]:
-    """Return a line for each recording whose contact is an outlier."""
-    report = fitted.origin.report
-    excluded = report.get("excluded", [])
-    return [
-        f"check its row in impacts.csv: {found}; {'left out of the fit' if name in excluded else 'used in the fit'}"
-        for name, found in report.get("outliers", {}).items()
-    ]
-
-
 def summary(fitted: SoundField, contacts: int) -> str:
     """Return the summary of a fit."""
-    report = fitted.origin.report
+    report, body = fitted.origin.report, fitted.body
     reason = f" ({report['damping_reason']})" if "damping_reason" in report else ""
     gains = report.get("gain_model", "attention")
-    credibility = report.get("credibility") or {}
-    if credibility.get("credible"):
-        best, thickness = report["bodies"][0], report.get("thickness")
-        between = "{low:.2g} to {high:.2g} mm" if thickness and best["wall_thickness"] is not None else ""
-        interval = between.format(**{key: 1000 * value for key, value in (thickness or {}).items()})
-        gained = credibility["with_body"] - credibility["without_body"]
+    if body is not None:
+        gained = report["credibility"]["with_body"] - report["credibility"]["without_body"]
         gains += (
-            f" (most probable body: {best['body']}{interval and ', 90 % interval of the wall ' + interval}, "
-            f"with {best['frequency_factor'] ** 2:.2f} times the stiffness-to-density ratio of aluminum; it raises the "
-            f"log likelihood of the gains at left-out contacts by {gained:.1f} per mode)"
+            f" (most probable body: {body}; it raises the log likelihood of the gains at left-out contacts by "
+            f"{gained:.1f} per mode)"
         )
     modes = modes_words(len(fitted.bank), int((~fitted.is_mode).sum()))
     return (

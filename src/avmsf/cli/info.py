@@ -19,7 +19,7 @@ from avmsf.cli.modes import mode_table
 from avmsf.cli.modetable import levels, mode_rows
 from avmsf.cli.options.info import Options
 from avmsf.cli.printing import console, next_command, print_json, say
-from avmsf.cli.scores import quality_words, score_table, score_values
+from avmsf.cli.scores import body_warnings, outlier_words, quality_words, score_table, score_values
 from avmsf.field.attention import AttentionGains
 from avmsf.field.config import NETWORK
 from avmsf.field.gains.body import BodyGains
@@ -56,7 +56,7 @@ def run(options: Options) -> int:
     rows, supporting = ([row for row, is_mode in every if is_mode is part] for part in (True, False))
     values = describe(field)
     screen = console(errors=options.json)
-    screen.print(_words(values, quality_words(field, options.file)), soft_wrap=True)
+    screen.print(_words(field, values, quality_words(field, options.file)), soft_wrap=True)
     screen.print(mode_table(f"{counted(len(rows), 'mode')}, levels on average over the object", rows))
     if supporting:
         title = f"{counted(len(supporting), 'supporting pole')}: in the model, but not modes"
@@ -116,6 +116,7 @@ def describe(field: SoundField) -> dict[str, Any]:
         "per_newton": field.origin.per_newton,
         "trained_on": list(field.origin.trained_on),
         "pipeline": {**recorded(field), "fit": asdict(field.origin.config)},
+        "body": None if field.body is None else field.body.record(),
         "report": {name: value for name, value in field.origin.report.items() if name != RECORD},
     }
 
@@ -188,7 +189,7 @@ def _gains_words(gains: dict[str, Any]) -> str:
     return f"Gaussian process over {families} kernels, by {counted(gains['contacts'], 'contact')}"
 
 
-def _words(values: dict[str, Any], quality: list[str]) -> str:
+def _words(field: SoundField, values: dict[str, Any], quality: list[str]) -> str:
     sides = zip("xyz", *values["bounds_meters"], strict=True)
     extent = ", ".join(f"{axis} {low:.3g} to {high:.3g}" for axis, low, high in sides)
     report = values["report"]
@@ -205,10 +206,11 @@ def _words(values: dict[str, Any], quality: list[str]) -> str:
         f"  fitted to  {counted(len(values['trained_on']), 'recording')}",
     ]
     lines += [] if "guess" in report else _pipeline_lines(values["pipeline"])
+    if field.body is not None:
+        lines.append(f"  body       {field.body} (the most probable one)")
+    lines += [f"  {words}" for words in body_warnings(field)]
     lines += [f"  quality    {words}" for words in quality]
-    excluded = report.get("excluded", ())
-    for name, words in report.get("outliers", {}).items():
-        lines.append(f"  {'left out' if name in excluded else 'outlier'}   {words}")
+    lines += [f"  {words}" for words in outlier_words(field)]
     for edit in report.get("edits", []):
         lines.append(f"  edited     {_edit_words(edit)}")
     if report.get("validated"):

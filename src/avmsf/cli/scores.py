@@ -3,6 +3,7 @@
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from rich.table import Table
@@ -12,6 +13,7 @@ from avmsf.bench.evaluation import Scores, evaluate, score
 from avmsf.bench.renderer import Renderer
 from avmsf.capture import Impacts
 from avmsf.capture.places import places_of
+from avmsf.cli.heartbeat import verbosity
 from avmsf.cli.printing import figure, table
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.extract import Extraction
@@ -62,6 +64,30 @@ def quality_words(field: SoundField, path: Path) -> list[str]:
         return []
     more = f" More contacts: avmsf suggest {shlex.quote(str(path))}" if field.quality.advice else ""
     return [f"{field.quality}{more}"]
+
+
+def body_warnings(field: SoundField) -> list[str]:
+    """Return the warning of a field's most probable body; empty where there is none."""
+    return [f"warning: {field.body.warning}"] if field.body is not None and field.body.warning else []
+
+
+def outlier_words(field: SoundField) -> list[str]:
+    """Return a line for each recording that contradicts the others: what was done, why it may be; --verbose figures."""
+    report = field.origin.report
+    lines = []
+    for name, words in report.get("outliers", {}).items():
+        done = "left out of the fit" if name in report.get("excluded", ()) else "used in the fit all the same"
+        found = report.get("outlier_figures", {}).get(name)
+        lines.append(f"{done}: {words}" + (f" ({_figures(found)})" if verbosity.verbose and found else ""))
+    return lines
+
+
+def _figures(found: Mapping[str, Any]) -> str:
+    where = ", ".join(f"{each + 0.0:.4g}" for each in found["place"])
+    return (
+        f"log likelihood ratio per mode {found['ratio']:.2g}, and {found['place_ratio']:.2g} at ({where}) m, "
+        f"{found['distance']:.2g} m away; plausible above 0"
+    )
 
 
 def score_table(title: str, scores: Mapping[str, Scores]) -> Table:

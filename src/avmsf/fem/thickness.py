@@ -27,7 +27,7 @@ _UNLIKELY = math.log(100.0)
 _BELOW = math.log(4.0)
 """How far the log thickness is searched below the first range, whose lower end is a guess; with no end, gains that no
 wall explains made it ever thinner (from 1 to .06 mm)."""
-_DISCREPANCY = 0.2
+DISCREPANCY = 0.2
 """Standard deviation of the log thickness that errors of the shape leave, which the evidence takes for right: the root
 mean square log ratio to the truth over 11 simulated walls from photographs (most are .82 to .94, one is 1.4)."""
 _STEPS = 2000
@@ -114,9 +114,9 @@ def _next(places: np.ndarray, values: np.ndarray, failed: np.ndarray, *, thinnes
 
 def _posterior(walls: Sequence[tuple[float, float]]) -> ThicknessPosterior:
     places, values = np.log([wall for wall, _ in walls]), np.array([each for _, each in walls])
-    grid = np.linspace(places[0] - 3 * _DISCREPANCY, places[-1] + 3 * _DISCREPANCY, _STEPS)
+    grid = np.linspace(places[0] - 3 * DISCREPANCY, places[-1] + 3 * DISCREPANCY, _STEPS)
     likely = np.exp(np.interp(grid, places, values - values.max(), left=-np.inf, right=-np.inf))
-    density = gaussian_filter1d(likely, _DISCREPANCY / (grid[1] - grid[0]), mode="constant")
+    density = gaussian_filter1d(likely, DISCREPANCY / (grid[1] - grid[0]), mode="constant")
     share = np.cumsum(density) / density.sum()
     low, median, high = np.exp(grid[np.searchsorted(share, [0.05, 0.5, 0.95])])
     return ThicknessPosterior(float(median), float(low), float(high))

@@ -21,6 +21,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.gainfield import GainField, Gains
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.positions import expect_near, off_surface, off_surface_gains
+from avmsf.field.probablebody import ProbableBody
 from avmsf.field.scaledgains import fitted_gains, length_of
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.alignment import Alignment
@@ -98,7 +99,7 @@ class FieldQuality:
         return (
             "By leave-one-out, the field is no better than the mean of the three nearest recordings: relative STFT "
             f"errors of {self.error:.2f} and {self.nearest_mean:.2f} ({self.positions} positions). Record more "
-            "positions; without a mesh, give one."
+            "positions; without a mesh, add one, or make the shape from photographs by avmsf reconstruct."
         )
 
     @property
@@ -157,12 +158,12 @@ class SoundField:
             f"SoundField({self.origin.capture!r}, {self.bank}, gains {self.gain_field.kind!r} of {fitted} recordings, "
             f"{seconds:.3g} s at {self.sample_rate:g} Hz)"
         )
-        quality = self.quality
-        if quality is None:
-            return text
-        return (
-            f"{text}\nleave-one-out error {quality.error:.2f}, mean of 3 nearest recordings {quality.nearest_mean:.2f}"
-        )
+        quality, body = self.quality, self.body
+        if quality is not None:
+            text += (
+                f"\nleave-one-out error {quality.error:.2f}, mean of 3 nearest recordings {quality.nearest_mean:.2f}"
+            )
+        return f"{text}\n{body.warning}" if body is not None and body.warning else text
 
     @property
     def quality(self) -> FieldQuality | None:
@@ -172,6 +173,14 @@ class SoundField:
         """
         found = None if self.origin.report.get("edits") else self.origin.report.get("quality")
         return FieldQuality.of(found) if isinstance(found, dict) else None
+
+    @property
+    def body(self) -> ProbableBody | None:
+        """The most probable body behind the surface, with a warning where no material could be so stiff.
+
+        None where no body predicts the contacts from one another, and for an edited field.
+        """
+        return None if self.origin.report.get("edits") else ProbableBody.of(self.origin.report)
 
     @property
     def audible(self) -> Bool[Tensor, " modes"]:

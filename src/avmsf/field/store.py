@@ -31,6 +31,7 @@ from avmsf.errors import FieldFileError
 from avmsf.field.config import FitConfig
 from avmsf.field.gainfield import GainField
 from avmsf.field.header import ADVICE, FORMAT, KEY, UNREADABLE, WHAT, damaged, key_of, record_of_text, value_of
+from avmsf.field.probablebody import ProbableBody
 from avmsf.field.scaledgains import FITTED, ScaledGains
 from avmsf.field.soundfield import SUPPORTING, FieldQuality, Origin, SoundField
 from avmsf.files import write_whole
@@ -167,6 +168,7 @@ class _Header:
         )
         if (quality := read.report.get("quality")) is not None:
             FieldQuality.of(quality)
+        _ = ProbableBody.of(read.report)
         return cls(rate, samples, kind, gains, read, skeleton)
 
 

@@ -151,9 +151,15 @@ def test_exchanged_labels_are_found_with_the_places_exchanged() -> None:
         apart = torch.tensor(found[row].place, dtype=torch.float64) - true.points[row]
         assert float(apart.norm()) < 2.0 / 11.0
     names = [f"hit{row}" for row in range(CONTACTS)]
-    text = found[9].describe(names, labels.points.float())
-    assert "hit9" in text
+    text = found[9].describe(names, labels.points.float(), directed=True, with_body=False)
+    assert "hit9 " in text
     assert "hit16" in text
+    assert "nx,ny,nz" not in text
+    assert "body" not in text
+    # A direction that was not given is the first cause to look for, and a body the last.
+    other = found[9].describe(names, labels.points.float(), directed=False, with_body=True)
+    assert other.index("nx,ny,nz") < other.index("hit16") < other.index("position") < other.index("body")
+    assert found[9].figures()["place_ratio"] == found[9].place_ratio
 
 
 def test_a_reversed_direction_is_found_at_its_own_place() -> None:

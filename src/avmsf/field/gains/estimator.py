@@ -393,11 +393,18 @@ def _report(
 def _judgment_report(judgment: Judgment, case: GainCase, used: Int[Tensor, " used"]) -> dict[str, Any]:
     names, contacts, credibility = case.train.names, case.train.contacts, judgment.credibility
     kept = set(used.tolist())
-    straight = "" if case.train.directions is not None else (
-        "; it was taken to be straight into the surface: an edge needs the direction of the impact, nx,ny,nz"
-    )  # fmt: skip
+    with_body, given = credibility is not None and credibility.credible, case.train.directions
     return {
-        "outliers": {names[each.row]: each.describe(names, contacts) + straight for each in judgment.outliers},
+        "outliers": {
+            names[each.row]: each.describe(
+                names,
+                contacts,
+                directed=given is not None and bool(given[each.row].any()),
+                with_body=with_body,
+            )
+            for each in judgment.outliers
+        },
+        "outlier_figures": {names[each.row]: each.figures() for each in judgment.outliers},
         "excluded": [name for row, name in enumerate(names) if row not in kept],
         "credibility": None if credibility is None else asdict(credibility) | {"credible": credibility.credible},
     }

@@ -29,8 +29,9 @@ say little of the gains nothing is an outlier.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
+from typing import Any
 
 import torch
 from jaxtyping import Complex128, Float, Float64, Int
@@ -211,24 +212,36 @@ class Outlier:
     reversed: bool
     """Whether the opposite direction explains it at its own place."""
 
-    def describe(self, names: Sequence[str], contacts: Float[Tensor, "contacts 3"]) -> str:
-        """Return a message on it, from the names and positions (meters) of all training contacts."""
-        ratios = f"log likelihood ratio per mode {self.ratio:.2g}, there {self.place_ratio:.2g}; plausible above 0"
-        if self.distance == 0.0 and self.reversed:
-            return f"{names[self.row]} fits its contact if its direction or its polarity is reversed ({ratios})"
-        if self.distance == 0.0:
-            return f"{names[self.row]} fits its contact in another direction ({ratios})"
+    def describe(
+        self, names: Sequence[str], contacts: Float[Tensor, "contacts 3"], *, directed: bool, with_body: bool
+    ) -> str:
+        """Return its possible causes in words, the most frequent first.
+
+        From the names and positions (meters) of all training contacts, whether its direction was given, and whether
+        it was judged with a body.
+        """
+        causes = [] if directed else ["no direction, at an edge or a handle (give nx,ny,nz)"]
         place = torch.tensor(self.place, dtype=torch.float64)
         apart = (contacts.double() - place).norm(dim=1)
         own, apart[self.row] = float(apart[self.row]), torch.inf
         other = int(apart.argmin())
-        where = ", ".join(f"{each + 0.0:.4g}" for each in self.place)
-        found = f"{names[self.row]} does not fit its contact; it fits ({where}) m, {self.distance:.2g} m away"
         if float(apart[other]) < own:
-            found += f", nearest to {names[other]}: their labels may have been exchanged"
+            causes.append(f"its label was exchanged with that of {names[other]}")
         if self.reversed:
-            found += "; or its direction or its polarity is reversed"
-        return f"{found} ({ratios})"
+            causes.append("a reversed direction or polarity" if directed else "a reversed polarity")
+        elif directed and self.distance == 0.0:
+            causes.append("a wrong direction")
+        if self.distance > 0.0:
+            causes.append("a wrong position")
+        if with_body:
+            causes.append("a body that does not fit")
+        return f"{names[self.row]} contradicts the other recordings; possible causes: {', '.join(causes)}"
+
+    def figures(self) -> dict[str, Any]:
+        """Return its place and ratios as plain values."""
+        figures = asdict(self) | {"place": list(self.place)}
+        del figures["row"]
+        return figures
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,81 @@
+"""The body that a fit found most probable behind the object's surface, and whether any material could be so stiff."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from avmsf._utils.records import like
+from avmsf.fem.supports import FREE
+from avmsf.fem.thickness import DISCREPANCY
+from avmsf.simulate.material import MATERIALS
+from avmsf.simulate.nominal import LARGEST_ERROR, NOMINAL
+
+
+@dataclass(frozen=True)
+class ProbableBody:
+    """The most probable body of a fit."""
+
+    name: str
+    """In words, with the thickness of its wall if it has one."""
+    wall_thickness: float | None
+    """Meters; None for a body without an even wall."""
+    wall_interval: tuple[float, float] | None
+    """That holds the thickness with a probability of 90 %, meters; None where it was not searched for."""
+    stiffness_ratio: float
+    """Young's modulus over density that the measured frequencies need, over that of aluminum."""
+    support: str
+    """How it was held."""
+
+    @classmethod
+    def of(cls, report: Mapping[str, Any]) -> "ProbableBody | None":
+        """Return it from a fit's report; None where no body is credible. Raises RecordError for a damaged report."""
+        credibility = like(report.get("credibility") or {}, {}, "origin.report.credibility")
+        if not credibility.get("credible"):
+            return None
+        name = "origin.report.bodies.0"
+        best = like(next(iter(like(report.get("bodies"), [], "origin.report.bodies")), None), {}, name)
+        factor, wall = like(best["frequency_factor"], 1.0, name), best["wall_thickness"]
+        searched, interval = like(report.get("thickness") or {}, {}, "origin.report.thickness"), None
+        if wall is not None:
+            wall = like(wall, 0.0, name)
+            if searched:
+                low, high = (like(searched[each], 0.0, "origin.report.thickness") for each in ("low", "high"))
+                interval = low, high
+        return cls(like(best["body"], "", name), wall, interval, factor**2, like(best.get("support", FREE), "", name))
+
+    def __str__(self) -> str:
+        """Return all of it in words."""
+        interval = ""
+        if self.wall_interval is not None:
+            low, high = (1000 * each for each in self.wall_interval)
+            interval = f", 90 % interval of the wall {low:.2g} to {high:.2g} mm"
+        support = FREE if self.support == FREE else f"held: {self.support}"
+        ratio = f"{self.stiffness_ratio:.2f} times the stiffness-to-density ratio of aluminum"
+        return f"{self.name}{interval}, {support}, with {ratio}"
+
+    @property
+    def warning(self) -> str:
+        """Say that the body is stiffer than any material of the table; empty where it is not.
+
+        Frequencies of real bodies differ from those of even ones by `LARGEST_ERROR`, and the ratio goes with their
+        square. A wall that was found is uncertain by `DISCREPANCY`, which its interval allows for: one that is too thin
+        by that much needs frequencies higher by up to as much.
+        """
+        stiffest = max(MATERIALS.values(), key=lambda each: each.young / each.density)
+        over = self.stiffness_ratio * (NOMINAL.young / NOMINAL.density) / (stiffest.young / stiffest.density)
+        uncertain = 0.0 if self.wall_interval is None else DISCREPANCY
+        if over <= ((1.0 + LARGEST_ERROR) * (1.0 + uncertain)) ** 2:
+            return ""
+        wrong, measure = "body", "check the unit of the mesh"
+        if self.wall_thickness is not None:
+            wrong = f"wall of {1000 * self.wall_thickness:.2g} mm"
+            measure = "measure the wall and give --body.wall"
+        return (
+            f"The fit needs {over:.2g} times the stiffness-to-density ratio of {stiffest.name}, the stiffest material "
+            f"of the table, so the {wrong} is probably wrong, as where directions of impacts on edges are missing: "
+            f"give nx,ny,nz for impacts on edges and handles, or {measure}."
+        )
+
+    def record(self) -> dict[str, Any]:
+        """Return it as plain values, with the warning."""
+        return asdict(self) | {"warning": self.warning or None}
