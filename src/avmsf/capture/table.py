@@ -223,7 +223,7 @@ def fitting_units(written: float) -> str:
     if not fitting:
         return "no unit fits an object of 1 cm to 5 m, so correct the row"
     choices = " or ".join(f'unit = "{unit}" ({meters:.3g} m)' for unit, meters in fitting)
-    return f"write the unit in capture.toml: {choices}; add surface_unit if the mesh has another unit"
+    return f"write the unit in capture.toml: {choices}"
 
 
 def _judge_header(header: Sequence[str], path: Path) -> list[CaptureWarning]:
