@@ -157,3 +157,22 @@ def test_contacts_too_far_away_share_one_message(tmp_path: Path) -> None:
     assert "300" in reports[1].problems[0]
     (line,) = shared_problems(reports)
     assert line.startswith("2 recordings")
+
+
+@pytest.mark.parametrize("names", ["abc", "abcdef"])
+def test_recordings_in_a_subfolder_are_named(tmp_path: Path, names: str) -> None:
+    rows = [f"{name}.wav,0.1,0,0.{place}" for place, name in enumerate(names, start=1)]
+    sounds = {f"{name}.wav": ring() for name in names}
+    folder = fill(tmp_path / "bowl", rows=rows, replace=sounds)
+    (folder / "taps").mkdir()
+    for name in sounds:
+        (folder / name).rename(folder / "taps" / name)
+    report = check(folder)
+    assert not report.readable
+    messages = [*report.problems, *(problem for row in report.recordings for problem in row.problems)]
+    assert any("write taps/a.wav" in message for message in messages)
+    with raises(CaptureError, name="file", value=list(sounds)) as caught:
+        read_capture(folder)
+    assert "write taps/a.wav" in str(caught.value)
+    (folder / "impacts.csv").write_text("\n".join([HEADER, *(f"taps/{row}" for row in rows)]))
+    assert check(folder).readable

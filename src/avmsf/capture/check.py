@@ -15,6 +15,7 @@ from avmsf.capture.table import (
     TABLE,
     Row,
     Strike,
+    advice_for_missing,
     fitting_units,
     is_missing,
     missing_recording_of,
@@ -90,7 +91,8 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
         reports = [replace(each, problems=(words,)) if each.line in far else each for each in reports]
     refused = _check_contacts(folder, strikes, rows, settings=settings, problems=problems)
     if len(missing) > MAX_SUGGESTIONS:
-        refused.append(f"{TABLE}: expected a file for each row, got none for {len(missing)} of {len(rows)}")
+        lack = f"{TABLE}: expected a file for each row, got none for {len(missing)} of {len(rows)}"
+        refused.append(f"{lack}; {advice_for_missing(folder, missing)}")
     comparable = len(sounds) > 1 and len({each.rate for each in sounds}) == 1
     uncut = comparable and stay_uncut([each.start for each in sounds], rate=sounds[0].rate, settings=settings)
     if uncut:
