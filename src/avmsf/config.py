@@ -22,7 +22,7 @@ DESCRIPTORS = "descriptors"
 AUTO = "auto"
 CACHE = ".avmsf"
 """Folder inside a capture folder that keeps the outputs of the stages."""
-KEPT_FIELD = "field.safetensors"
+CACHED_FIELD = "field.safetensors"
 """Name of the field in it."""
 
 

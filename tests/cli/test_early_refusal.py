@@ -12,7 +12,7 @@ from avmsf.bench.methods import METHODS
 from avmsf.bench.names import METHOD_NAMES, PROTOCOL_NAMES
 from avmsf.bench.protocols import PROTOCOLS
 from avmsf.cli.options.paths import ExistingField, InputError
-from avmsf.config import CACHE, KEPT_FIELD
+from avmsf.config import CACHE, CACHED_FIELD
 from avmsf.errors import SimulationError
 from avmsf.scene.plyheader import NEEDED
 from avmsf.simulate.material import material_named
@@ -125,7 +125,7 @@ def test_names_are_those_of_the_methods_and_protocols() -> None:
 
 def test_the_field_that_a_folder_keeps_is_named(tmp_path: Path) -> None:
     folder, advice = tmp_path / "bowl", []
-    kept = folder / CACHE / KEPT_FIELD
+    kept = folder / CACHE / CACHED_FIELD
     for _ in range(2):
         (tmp_path / "bowl" / CACHE).mkdir(parents=True, exist_ok=True)
         with raises(InputError, file=folder, value="a folder") as caught:

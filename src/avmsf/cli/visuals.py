@@ -101,7 +101,7 @@ def contacts_outside(folder: Path, settings: CaptureSettings | None, visual: Vis
         contacts = contacts_of(read_rows(folder)[0], settings)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CaptureWarning)
-            views = read_views(folder, longest=LONGEST, most=MAX_VIEWS, meters=settings.views_meters)
+            views = read_views(folder, longest=LONGEST, max_views=MAX_VIEWS, meters=settings.views_meters)
             views = find_foreground(views)
     except CaptureError:
         return None

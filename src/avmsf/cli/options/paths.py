@@ -12,7 +12,7 @@ import tyro
 from avmsf._utils.headers import read_metadata
 from avmsf.capture.filenames import PICTURE_SUFFIXES, VIDEO_SUFFIXES
 from avmsf.cli.options.checks import OutputError, expect_writable, is_folder
-from avmsf.config import CACHE, KEPT_FIELD
+from avmsf.config import CACHE, CACHED_FIELD
 from avmsf.errors import AvmsfError
 from avmsf.field import header as field_header
 from avmsf.scene import featureheader
@@ -56,8 +56,8 @@ class Existing:
             raise InputError.expected(self.what, got=found, file=path, advice="check the name")
         kind = kind_of(path)
         if kind is not None and kind not in self.kinds:
-            kept = path / CACHE / KEPT_FIELD
-            other = kept if "a sound field" in self.kinds and kept.is_file() else "another"
+            cached = path / CACHE / CACHED_FIELD
+            other = cached if "a sound field" in self.kinds and cached.is_file() else "another"
             raise InputError(f"{path}: expected {self.what}, got {kind}; name {other}", file=path, value=kind)
 
 
