@@ -236,6 +236,13 @@ def test_evaluation_aligns_recordings_as_the_fit_did(tmp_path):
     assert scores[0] < unaligned
 
 
+def test_a_field_is_evaluated_over_the_length_of_the_recordings():
+    whole = capture().impacts
+    shorter = replace(whole, sounds=whole.sounds[:, :-73])
+    sounds = field().render(shorter.contacts, shorter.directions, samples=shorter.sounds.shape[1])
+    assert avmsf.evaluate(field(), shorter).mean() == score(sounds, shorter).mean()
+
+
 def test_modes_are_extracted_from_a_capture_or_its_impacts():
     one, other = (avmsf.extract_modes(each).bank for each in (capture(), capture().impacts))
     torch.testing.assert_close(one.frequency, other.frequency)

@@ -10,6 +10,7 @@ import pytest
 import soundfile
 
 from avmsf.capture import CaptureSettings, check, read_capture
+from avmsf.capture.measure import shared_problems
 from avmsf.errors import CaptureError
 from capture_folder import HEADER, RATE, ROWS, fill, ring
 from raising import raises
@@ -146,3 +147,32 @@ def test_a_missing_file_may_be_one_that_no_row_has(tmp_path: Path) -> None:
     (problem,) = check(folder).recordings[2].problems
     assert "a.wav" not in problem
     assert "b.wav" not in problem
+
+
+def test_contacts_too_far_away_share_one_message(tmp_path: Path) -> None:
+    rows = (*ROWS[:1], "b.wav,0,200,0", "c.wav,0,0,-300")
+    reports = check(fill(tmp_path / "two", rows=rows)).recordings
+    assert [row.readable for row in reports] == [True, False, False]
+    assert reports[1].problems == reports[2].problems
+    assert "300" in reports[1].problems[0]
+    (line,) = shared_problems(reports)
+    assert line.startswith("2 recordings")
+
+
+@pytest.mark.parametrize("names", ["abc", "abcdef"])
+def test_recordings_in_a_subfolder_are_named(tmp_path: Path, names: str) -> None:
+    rows = [f"{name}.wav,0.1,0,0.{place}" for place, name in enumerate(names, start=1)]
+    sounds = {f"{name}.wav": ring() for name in names}
+    folder = fill(tmp_path / "bowl", rows=rows, replace=sounds)
+    (folder / "taps").mkdir()
+    for name in sounds:
+        (folder / name).rename(folder / "taps" / name)
+    report = check(folder)
+    assert not report.readable
+    messages = [*report.problems, *(problem for row in report.recordings for problem in row.problems)]
+    assert any("write taps/a.wav" in message for message in messages)
+    with raises(CaptureError, name="file", value=list(sounds)) as caught:
+        read_capture(folder)
+    assert "write taps/a.wav" in str(caught.value)
+    (folder / "impacts.csv").write_text("\n".join([HEADER, *(f"taps/{row}" for row in rows)]))
+    assert check(folder).readable

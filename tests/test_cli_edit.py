@@ -92,6 +92,26 @@ def test_a_material_by_its_name_with_pictures_sounds_and_numbers(field: Path, ca
     assert float((ratios - levels[1] / levels[0]).abs().min()) < 1e-4 * levels[1] / levels[0]
 
 
+def notes(capsys: Streams) -> list[str]:
+    return [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
+
+
+def test_the_factor_on_positions_is_printed(field: Path, capsys: Streams) -> None:
+    edited(field, "--from", "ceramic", "--scale", "1.5")
+    assert any("1.5 times" in note for note in notes(capsys))
+    edited(field, "--pitch", "0.5")
+    assert not any("times as large" in note for note in notes(capsys))
+
+
+@pytest.mark.parametrize(("level", "noise", "noted"), [(-9, 1e-3, True), (-3, 1e-3, False), (-9, 0.0, False)])
+def test_noise_that_stays_while_modes_become_softer_is_noted(
+    field: Path, capsys: Streams, level: float, noise: float, noted: bool
+) -> None:
+    save(replace(ceramic(), residual=Residual(torch.full((9,), noise))), field)
+    edited(field, *(word for hertz in FREQUENCY.tolist() for word in ("--mode-db", str(hertz), str(level))))
+    assert [f"{-level} dB" in note for note in notes(capsys) if "--no-noise" in note] == [True] * noted
+
+
 def test_constants_stand_in_place_of_the_tables(field: Path) -> None:
     new = edited(field, "--from", "ceramic", "--young", "1e10", "--beta", "2e-7", "--law", "ratio-only")
     custom = replace(CERAMIC, young=1e10, beta=2e-7)
@@ -270,7 +290,7 @@ def test_edits_are_shown_by_what_they_did(field: Path, capsys: Streams) -> None:
     words = ["--from", "ceramic", "--to-material", "wood", "--scale", "2", "--alpha", "4000", "--pitch", "10"]
     edited(field, *words, "--mode-db", "850", "-inf", "--mode-db", "2300", "6", "--mode-decay", "1300", "4")
     assert main(["info", str(field.with_name("new.safetensors"))]) == 0
-    lines = [line.strip() for line in capsys.readouterr().out.splitlines() if "edited" in line]
+    lines = [line.strip() for line in capsys.readouterr().out.splitlines() if line.startswith("  edited ")]
     law = "law displacement, modes overdamped: "
     assert lines == [
         f"edited     change_material, from ceramic to wood with alpha changed, size 2, {law}2",
@@ -426,9 +446,9 @@ def test_what_cannot_be_done_is_said_before_any_work(field: Path, capsys: Stream
     refused("--from", None, "--from", "wood")
     refused("--prompt", ("--prompt", "--like"), "--prompt", "a bell", "--like", "like.wav")
     refused("--like", ("--like", "--like-material"), "--like-material", "wood", "--like", "like.wav")
-    refused("material", "cheese", "--like-material", "cheese")
+    refused("--like-material", "cheese", "--like-material", "cheese")
     refused("prompt", "  ", "--prompt", "  ")
-    refused("material", "cheese", "--to-material", "cheese")
+    refused("--to-material", "cheese", "--to-material", "cheese")
     refused("young", -1.0, "--from", "ceramic", "--young", "-1")
     refused("size", 0.0, "--from", "ceramic", "--scale", "0")
     refused("pitch", 0.0, "--pitch", "0")

@@ -22,6 +22,8 @@ DESCRIPTORS = "descriptors"
 AUTO = "auto"
 CACHE = ".avmsf"
 """Folder inside a capture folder that keeps the outputs of the stages."""
+CACHED_FIELD = "field.safetensors"
+"""Name of the field in it."""
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,15 @@ from PIL import Image
 
 from avmsf.capture import CaptureSettings
 from avmsf.capture.filenames import pictures_in
+from avmsf.capture.settings import METRES
 from avmsf.capture.views.read import find_shots
 from avmsf.capture.views.shots import without_camera
+from avmsf.capture.views.write import write_views
 from avmsf.cli import main
 from avmsf.cli.visuals import VisualInputs, visual_inputs
 from capture_folder import fill
-from small_scene import write_surface_file
+from plate_capture import fill_plate
+from small_scene import slab_views, write_surface_file
 from views_folder import frames, ring, write_image, write_transforms
 
 Streams = pytest.CaptureFixture[str]
@@ -132,3 +135,24 @@ def test_the_report_has_them_and_leads_to_the_command_that_uses_them(
     report: dict[str, Any] = json.loads(capsys.readouterr().out)
     assert report["visual_inputs"]["photographs"] == 4 * pictured
     assert len(report["visual_inputs"]["problems"]) == pictured
+
+
+@pytest.mark.parametrize("unit", ["m", "mm", "in"])
+def test_the_unit_of_contacts_is_found_from_photographs(tmp_path: Path, capsys: Streams, unit: str) -> None:
+    folder = fill_plate(tmp_path / "slab", surface=False)
+    write_views(slab_views(64), tmp_path / "views")
+    for each in (tmp_path / "views").iterdir():
+        each.rename(folder / each.name)
+    header, *rows = (folder / "impacts.csv").read_text().split()
+    cells = [row.split(",") for row in rows]
+    for row in cells:
+        row[1:4] = [str(float(cell) / METRES[unit]) for cell in row[1:4]]
+    (folder / "impacts.csv").write_text("\n".join([header, *map(",".join, cells)]))
+    (folder / "capture.toml").unlink()
+    proposed = [] if unit == "m" else [unit]
+    for words, found in (((), proposed), (("--write-settings",), proposed), ((), [])):
+        assert main(["check", str(folder), "--json", *words]) in (0, 2)
+        proposals = json.loads(capsys.readouterr().out)["proposals"]
+        assert [each["value"] for each in proposals if each["key"] == "unit"] == found
+    if proposed:
+        assert CaptureSettings.read(folder / "capture.toml").unit == unit

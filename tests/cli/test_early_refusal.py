@@ -11,7 +11,12 @@ import pytest
 from avmsf.bench.methods import METHODS
 from avmsf.bench.names import METHOD_NAMES, PROTOCOL_NAMES
 from avmsf.bench.protocols import PROTOCOLS
+from avmsf.cli.options.paths import ExistingField, InputError
+from avmsf.config import CACHE, CACHED_FIELD
+from avmsf.errors import SimulationError
 from avmsf.scene.plyheader import NEEDED
+from avmsf.simulate.material import material_named
+from raising import raises
 
 STORED = Path(__file__).parents[1] / "data" / "format-8" / "mixture.safetensors"
 REFUSED = (
@@ -116,3 +121,23 @@ def test_no_refusal_loads_torch(place: Path) -> None:
 def test_names_are_those_of_the_methods_and_protocols() -> None:
     assert tuple(METHODS) == METHOD_NAMES
     assert tuple(PROTOCOLS) == PROTOCOL_NAMES
+
+
+def test_the_field_that_a_folder_keeps_is_named(tmp_path: Path) -> None:
+    folder, advice = tmp_path / "bowl", []
+    kept = folder / CACHE / CACHED_FIELD
+    for _ in range(2):
+        (tmp_path / "bowl" / CACHE).mkdir(parents=True, exist_ok=True)
+        with raises(InputError, file=folder, value="a folder") as caught:
+            ExistingField().check(folder)
+        advice.append(str(caught.value))
+        kept.touch()
+    assert [str(kept) in each for each in advice] == [False, True]
+
+
+@pytest.mark.parametrize(("name", "near"), [("wodo", "wood"), ("kryptonite", None)])
+def test_a_similar_material_is_suggested(name: str, near: str | None) -> None:
+    with raises(SimulationError, name="--to-material", value=name) as caught:
+        material_named(name, option="--to-material")
+    assert ("did you mean" in str(caught.value)) == (near is not None)
+    assert near is None or str(caught.value).endswith(f"{near}?")

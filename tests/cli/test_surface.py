@@ -1,6 +1,7 @@
 """The object's surface as an output of its own: alone, in three formats, and of a reconstruction."""
 
 import json
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from avmsf.bench.surfacepictures import draw_surface
 from avmsf.capture import Surface, read_surface
 from avmsf.capture.views.write import write_views
 from avmsf.cli import main
+from avmsf.cli.info import gains_at
 from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.surface import parse
 from avmsf.errors import EvaluationError
@@ -109,3 +111,12 @@ def test_the_picture_is_written_beside_the_surface_and_with_a_field(tmp_path: Pa
     assert (tmp_path / "with" / "surface.png").is_file()
     assert (tmp_path / "edited" / "surface.png").is_file()
     assert not (tmp_path / "without" / "surface.png").exists()
+
+
+def test_points_of_a_field_off_its_surface_are_drawn_without_a_warning() -> None:
+    contacts = bar_contacts(6)
+    field = sound_field(elastic_field(contacts, drawn_gains(contacts, seed=1)))
+    above = contacts.float() + torch.tensor([0.0, 0.0, 0.1])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert gains_at(field, above).shape == (6, len(field.bank))

@@ -151,6 +151,10 @@ def test_a_table_that_names_no_recordings_or_has_another_unit_is_refused(
     table.write_text("x,y,z\n0,0,0\n")
     with raises(CaptureError, file=table, name="file"):
         run(parse([field, recording, "--true-contact-table", str(table)]))
+    table.write_text("tap,x_mm\n1,2\n")
+    with raises(CaptureError, file=table, name="file", value=["tap", "x_mm"]) as caught:
+        run(parse([field, recording, "--true-contact-table", str(table)]))
+    assert "tap, x_mm" in str(caught.value)
     table.write_text("x,y,z,file\n0,0,0\n")
     with raises(CaptureError, file=table, row=2, name="file"):
         run(parse([field, recording, "--true-contact-table", str(table)]))

@@ -101,9 +101,9 @@ def evaluate(
 
     With the training recordings as `train`, `renderer` is a class or function that makes one from them. It gets them,
     and is scored on `test`, as the methods of `avmsf evaluate` are: aligned with one another (`align_split`). Without
-    them, recordings are taken as they are; for a SoundField, those that are not aligned yet are aligned as its fit
-    aligned those it was fitted to. Raises as `score`, and EvaluationError for what is no renderer, and for one at
-    another sample rate.
+    them, recordings are taken as they are. For a SoundField, those that are not aligned yet are aligned as its fit
+    aligned those it was fitted to, and its sounds are as long as the recordings. Raises as `score`, and EvaluationError
+    for what is no renderer, and for one at another sample rate.
     """
     impacts = _impacts_of(test, "test")
     if train is not None:
@@ -134,7 +134,11 @@ def evaluate(
     with torch.no_grad(), warnings.catch_warnings():
         # Reading the capture has warned of contacts off the object.
         warnings.simplefilter("ignore", PositionWarning)
-        sounds = made.render(impacts.contacts, directions=impacts.directions)
+        if isinstance(made, SoundField):
+            samples = impacts.sounds.shape[1]
+            sounds = made.render(impacts.contacts, impacts.directions, samples=samples)
+        else:
+            sounds = made.render(impacts.contacts, directions=impacts.directions)
     return score(sounds, impacts, convention=convention, fft_sizes=fft_sizes)
 
 

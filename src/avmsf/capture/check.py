@@ -11,9 +11,12 @@ from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.starts import stay_uncut
 from avmsf.capture.surface import find_surface
 from avmsf.capture.table import (
+    FARTHEST,
     TABLE,
     Row,
     Strike,
+    advice_for_missing,
+    fitting_units,
     is_missing,
     missing_recording_of,
     read_rows,
@@ -67,9 +70,10 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
         return CaptureReport(False, (), (str(error),))
     problems = [str(each) for each in warned]
     reports, strikes, sounds = list[RecordingReport](), list[Strike](), list[_Sound]()
+    far = dict[int, float]()
     missing, files = list[str](), [row.cells["file"].replace("\\", "/") for row in rows]
     for row in rows:
-        strike, prepared, report = _check_row(folder, row, settings=settings, missing=missing, files=files)
+        strike, prepared, report = _check_row(folder, row, settings=settings, missing=missing, far=far, files=files)
         reports.append(report)
         if strike is not None:
             strikes.append(strike)
@@ -77,9 +81,18 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
             rate = report.sample_rate or 0.0
             start = replace(prepared, sound=prepared.sound[: margin_length(rate)].copy())
             sounds.append(_Sound(report.file, len(prepared.sound), rate, prepared.peak, start))
+    if len(far) > 1:
+        # One message for all, with which they are listed together.
+        largest = max(far.values())
+        words = (
+            f"expected a contact within {FARTHEST:g} m of the origin, got coordinates of up to {largest:g} "
+            f"(unit = {settings.unit!r}): {fitting_units(largest)}"
+        )
+        reports = [replace(each, problems=(words,)) if each.line in far else each for each in reports]
     refused = _check_contacts(folder, strikes, rows, settings=settings, problems=problems)
     if len(missing) > MAX_SUGGESTIONS:
-        refused.append(f"{TABLE}: expected a file for each row, got none for {len(missing)} of {len(rows)}")
+        lack = f"{TABLE}: expected a file for each row, got none for {len(missing)} of {len(rows)}"
+        refused.append(f"{lack}; {advice_for_missing(folder, missing)}")
     comparable = len(sounds) > 1 and len({each.rate for each in sounds}) == 1
     uncut = comparable and stay_uncut([each.start for each in sounds], rate=sounds[0].rate, settings=settings)
     if uncut:
@@ -102,11 +115,18 @@ def _wav_files(folder: Path) -> list[str]:
 
 
 def _check_row(
-    folder: Path, row: Row, *, settings: CaptureSettings, missing: list[str], files: Sequence[str]
+    folder: Path,
+    row: Row,
+    *,
+    settings: CaptureSettings,
+    missing: list[str],
+    far: dict[int, float],
+    files: Sequence[str],
 ) -> tuple[Strike | None, Prepared | None, RecordingReport]:
-    """Return one row parsed as far as possible, its sound, and its report; add its file to `missing` where it is.
+    """Return one row parsed as far as possible, its sound, and its report.
 
-    `files` are those of all rows.
+    Its file is added to `missing` where it is, and the largest coordinate of a contact too far away, by its line, to
+    `far`. `files` are those of all rows.
     """
     strike = None
     try:
@@ -118,6 +138,8 @@ def _check_row(
             raise missing_recording_of(folder, strike.file, files)
         prepared, report = read_strike(folder, strike, settings=settings)
     except CaptureError as error:
+        if error.name == "unit":
+            far[row.line] = max(map(abs, error.value))
         file = strike.file if strike is not None else row.cells["file"]
         return strike, None, RecordingReport(file=file, line=row.line, readable=False, problems=(str(error),))
     return strike, prepared, report

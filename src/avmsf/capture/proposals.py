@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from jaxtyping import Complex128, Float64
 from scipy.special import stdtrit
+from torch import Tensor
 
 from avmsf._utils.text_files import read_toml
 from avmsf.capture.audio import Recording, read_recording
@@ -69,12 +70,15 @@ class Proposal:
         return f"{self.key} = {json.dumps(self.value)}"
 
 
-def propose_settings(folder: str | Path, settings: CaptureSettings | None = None) -> tuple[Proposal, ...]:
+def propose_settings(
+    folder: str | Path, settings: CaptureSettings | None = None, *, factor: float | None = None
+) -> tuple[Proposal, ...]:
     """Return the settings other than the present ones that would help to read a folder, with the reasons.
 
     `settings`, where given, take the place of the folder's `capture.toml`. A key that the file holds, or that differs
-    from its default, was chosen and is left alone. Recordings that cannot be read are passed over; raises nothing for
-    bad input.
+    from its default, was chosen and is left alone. `factor`, where given, is the one that the contacts have to be
+    multiplied by to lie on the object in its photographs: it decides the unit where there is no surface. Recordings
+    that cannot be read are passed over; raises nothing for bad input.
     """
     folder = Path(folder)
     try:
@@ -85,7 +89,7 @@ def propose_settings(folder: str | Path, settings: CaptureSettings | None = None
         return ()
     defaults = vars(CaptureSettings())
     chosen |= {key for key, value in vars(settings).items() if value != defaults[key]}
-    proposals: list[Proposal] = [] if chosen & {"unit", "surface_unit"} else _units(folder, rows, settings)
+    proposals: list[Proposal] = [] if chosen & {"unit", "surface_unit"} else _units(folder, rows, settings, factor)
     units: dict[str, Any] = {each.key: each.value for each in proposals}
     strikes = list(_strikes(rows, replace(settings, **units)))
     if not chosen & {"force_channel", "response_channel"}:
@@ -292,17 +296,31 @@ class Evidence:
         )
 
 
-def _units(folder: Path, rows: Sequence[Row], settings: CaptureSettings) -> list[Proposal]:
-    """Return the units in which contacts lie on the surface, where the present ones cannot be meant."""
+def contacts_of(rows: Sequence[Row], settings: CaptureSettings) -> Float64[Tensor, "contacts 3"]:
+    """Return the contacts of all rows that can be read, meters, also those too far from the origin for the unit."""
+    strikes = _strikes(rows, replace(settings, unit="mm"))
+    contacts = torch.tensor([each.contact for each in strikes], dtype=torch.float64).reshape(-1, 3)
+    return contacts * settings.meters / METRES["mm"]
+
+
+def unit_named(meters: float) -> str | None:
+    """Return the unit of a length, meters, if it is one."""
+    return next((unit for unit, length in METRES.items() if abs(length / meters - 1) < 1e-6), None)
+
+
+def _units(folder: Path, rows: Sequence[Row], settings: CaptureSettings, factor: float | None = None) -> list[Proposal]:
+    """Return the units in which contacts lie on the object, where the present ones cannot be meant."""
     try:
         surface = find_surface(folder, settings)
     except CaptureError:
         return []
-    # Contacts too far from the origin for the present unit are needed here.
-    strikes = list(_strikes(rows, replace(settings, unit="mm")))
-    if surface is None or not strikes:
+    contacts = contacts_of(rows, settings)
+    if not len(contacts):
         return []
-    contacts = torch.tensor([each.contact for each in strikes], dtype=torch.float64) * settings.meters / METRES["mm"]
+    if surface is None:
+        unit = None if factor is None else unit_named(factor * settings.meters)
+        reason = "The contacts then lie on the object in the photographs; in the present unit most are outside of it."
+        return [] if unit is None else [Proposal("unit", unit, reason)]
     placement = judge_placement(contacts, surface_points(surface))
     if not placement.other_unit and NARROWEST <= placement.diagonal <= WIDEST:
         return []

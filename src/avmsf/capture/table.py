@@ -1,6 +1,7 @@
 """`impacts.csv`: one row for each recording, with the contact and, where known, the impact's direction and force."""
 
 import csv
+import glob
 import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -196,7 +197,7 @@ def _refuse_missing(folder: Path, strikes: Sequence[Strike]) -> None:
         shown = f"{', '.join(missing[:5])}{', …' * (len(missing) > 5)}"
         raise CaptureError(
             f"{folder / TABLE}: expected a file for each row, got none for {len(missing)} of {len(strikes)} "
-            f"({shown}); copy them there, or correct their names",
+            f"({shown}); {advice_for_missing(folder, missing)}",
             file=folder / TABLE,
             name="file",
             value=missing,
@@ -213,8 +214,28 @@ def is_missing(path: Path) -> bool:
 
 def missing_recording_of(folder: Path, file: str, files: Sequence[str]) -> CaptureError:
     """Return the error of a recording of a table that does not exist; `files` are those of all rows."""
+    below = _path_below(folder, file)
+    if below is not None:
+        message = f"{file}: expected a sound file, got none; write {below} in {TABLE}"
+        return CaptureError(message, file=folder / file, name="file", value=below)
     advice = f"copy it there, or remove its row from {TABLE}"
     return missing_recording(folder / file, file, advice=advice, used={folder / each for each in files})
+
+
+def advice_for_missing(folder: Path, missing: Sequence[str]) -> str:
+    """Return what to do where several recordings of a table do not exist."""
+    for file in missing:
+        below = _path_below(folder, file)
+        if below is not None:
+            return f"write {below} in place of {file}, and so on"
+    return "copy them there, or correct their names"
+
+
+def _path_below(folder: Path, file: str) -> str | None:
+    """Return the path, in the folder, of a file in a subfolder that has the name of a missing one; None without."""
+    found = sorted(path.relative_to(folder) for path in folder.rglob(glob.escape(PurePosixPath(file).name)))
+    seen = (path.as_posix() for path in found if not any(part.startswith(".") for part in path.parts))
+    return next(seen, None)
 
 
 def fitting_units(written: float) -> str:
@@ -223,7 +244,7 @@ def fitting_units(written: float) -> str:
     if not fitting:
         return "no unit fits an object of 1 cm to 5 m, so correct the row"
     choices = " or ".join(f'unit = "{unit}" ({meters:.3g} m)' for unit, meters in fitting)
-    return f"write the unit in capture.toml: {choices}; add surface_unit if the mesh has another unit"
+    return f"write the unit in capture.toml: {choices}"
 
 
 def _judge_header(header: Sequence[str], path: Path) -> list[CaptureWarning]:

@@ -89,7 +89,7 @@ def read_contacts(path: Path, *, meters: float, recordings: bool = False) -> Con
     header = [name.lower() for name in lines[0][1]] if lines else []
     missing = [name for name in ("file", *_COLUMNS)[not recordings :] if name not in header]
     if missing or len(lines) < 2:
-        lacking = f"no column {missing[0]}" if missing else "no row"
+        lacking = "no row" if not missing else f"only {', '.join(header)}" if header else "an empty file"
         columns = "file,x,y,z" if recordings else "x,y,z (and optionally file)"
         raise CaptureError(
             f"{path}: expected a header with {columns} and one row for each impact, got {lacking}",

@@ -37,6 +37,9 @@ _CANDIDATES = 64
 _NEAR = 0.02
 """By which part a mode's frequency may be off the one that it is called by."""
 
+_LOUD_NOISE_DB = 6.0
+"""Decrease of the modes' level, dB, from which on the noise, whose level stays, may be too loud: half the amplitude."""
+
 
 @dataclass(frozen=True)
 class Sliders(ModeOptions):
@@ -97,6 +100,15 @@ def run(options: Options) -> int:
         screen.print(
             f"note: the longest T60 is {figure(ringing)} s and rendered sounds last {figure(seconds)} s; render and "
             f"export with --seconds {math.ceil(10 * ringing) / 10:g}",
+            soft_wrap=True,
+        )
+    if options.change.size != 1.0:
+        screen.print(f"note: positions on the edited object are {options.change.size:g} times as large", soft_wrap=True)
+    softer = _level(before) - _level(after)
+    if _LOUD_NOISE_DB < softer < math.inf and bool(new.residual.magnitude.any()):
+        screen.print(
+            f"note: the modes are {softer:.0f} dB softer and the residual noise is as loud as before; `avmsf render "
+            "--no-noise` leaves it out",
             soft_wrap=True,
         )
     if options.plots is not None:
@@ -204,6 +216,11 @@ def _rows(before: HeardModes, after: HeardModes) -> list[dict[str, Any]]:
 def _longest(modes: HeardModes) -> float:
     """Return the longest T60 of the modes that sound, s; zero without one."""
     return float(torch.where(modes.size > 0, modes.t60, 0.0).max())
+
+
+def _level(modes: HeardModes) -> float:
+    """Return the level of all modes together, dB; -inf without one that sounds."""
+    return float(20.0 * torch.log10(modes.size.norm()))
 
 
 def _change(row: dict[str, Any]) -> str:

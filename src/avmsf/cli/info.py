@@ -1,6 +1,6 @@
 """`avmsf info`: what a field, Gaussians or features hold, as text and pictures."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +67,7 @@ def run(options: Options) -> int:
         doing("comparing the field with the capture's recordings")
         recorded, what = _held_out(read_capture(options.capture, settings).impacts, field)
         recorded = field.aligned(recorded)
-        scores = {"field": evaluate(Fitted(field, recorded.sounds.shape[1]), recorded)}
+        scores = {"field": evaluate(field, recorded)}
         screen.print(score_table(f"{counted(len(recorded), 'contact')}, {what}; lower is better", scores))
         values |= {"compared_with": {"recordings": list(recorded.names), "which": what, "scores": score_values(scores)}}
     if options.plots is not None:
@@ -77,25 +77,6 @@ def run(options: Options) -> int:
     if options.json:
         print_json(values | {"modes": list(map(asdict, rows)), "supporting_poles": list(map(asdict, supporting))})
     return 0
-
-
-@dataclass(frozen=True, eq=False)
-class Fitted:
-    """A field whose sounds have the length of the recordings that it is compared with."""
-
-    field: SoundField
-    samples: int
-
-    @property
-    def sample_rate(self) -> float:
-        """Samples per second, Hz."""
-        return self.field.sample_rate
-
-    def render(
-        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Float[Tensor, "contacts samples"]:
-        """Return the field's sounds."""
-        return self.field.render(contacts, directions=directions, samples=self.samples)
 
 
 def describe(field: SoundField) -> dict[str, Any]:
@@ -122,8 +103,8 @@ def describe(field: SoundField) -> dict[str, Any]:
 
 
 def gains_at(field: SoundField, points: Float[Tensor, "points 3"]) -> Float[Tensor, "points modes"]:
-    """Return the gains at many points."""
-    return torch.cat([field.gains(part) for part in torch.split(points, _BATCH)])
+    """Return the gains at many points, without a warning for a point of the field's own that is off its surface."""
+    return torch.cat([field.known(part).mean for part in torch.split(points, _BATCH)])
 
 
 def draw_field(

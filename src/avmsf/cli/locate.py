@@ -177,9 +177,10 @@ def _summary(impacts: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
 def _summary_line(summary: dict[str, Any], level: float) -> str:
     count = summary["impacts"]
     return (
-        f"{count} located impacts of known contacts: median distance {1000 * summary['median_error']:.1f} mm, RMED "
-        f"{100 * summary['rmed_posterior']:.1f} % ({100 * summary['rmed']:.1f} % by cosine distance), "
-        f"{round(count * summary['in_region'])} of {count} true contacts within the {100 * level:g} % region"
+        f"{count} located impacts of known contacts: median distance {1000 * summary['median_error']:.1f} mm, mean "
+        f"distance over the object's diagonal (RMED) {100 * summary['rmed_posterior']:.1f} % "
+        f"({100 * summary['rmed']:.1f} % by cosine distance), {round(count * summary['in_region'])} of {count} true "
+        f"contacts within the {100 * level:g} % region"
     )
 
 
@@ -196,10 +197,11 @@ def _words(values: dict[str, Any]) -> str:
         return f"{values['recording']}{when}: {values['status']}: {values['reason']}"
     region = values["credible_region"]
     where = ", ".join(f"{value + 0.0:.4f}" for value in values["position"])
+    chance = f", with {100 * values['probability']:.0f} %" if values["multimodal"] else ""
     lines = [
-        f"{values['recording']}{when}: impact at ({where}) m; {100 * region['probability']:g} % within "
-        f"{figure(1000 * region['radius'], 2)} mm, {figure(100 * region['surface_fraction'], 2)} % of the surface; the "
-        f"field explains {100 * values['explained_energy']:.0f} % of the sound"
+        f"{values['recording']}{when}: impact at ({where}) m{chance}; {100 * region['probability']:g} % within "
+        f"{figure(1000 * region['radius'], 2)} mm, {figure(100 * region['surface_fraction'], 2)} % of the surface; an "
+        f"impact there explains {100 * values['explained_energy']:.0f} % of the sound"
     ]
     if "rmed" in values:
         error, share = 1000 * values["error"], 100 * values["rmed_posterior"]

@@ -1,16 +1,22 @@
 """What shows the object in a capture folder: found by names and camera files, without reading pictures or shapes."""
 
 import importlib.util
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
 from PIL import Image
 
 from avmsf.capture.filenames import find_surface_file, pictures_in
+from avmsf.capture.proposals import contacts_of
 from avmsf.capture.settings import CaptureSettings, settings_of
-from avmsf.capture.views.read import find_shots
+from avmsf.capture.table import read_rows
+from avmsf.capture.views.foreground import find_foreground
+from avmsf.capture.views.read import find_shots, read_views
 from avmsf.capture.views.shots import listed, mask_names
+from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError, SceneError
+from avmsf.pipeline.silhouettes import LONGEST, MAX_VIEWS, expect_contacts_in_outlines
 from avmsf.pipeline.sources import find_source, find_splats
 from avmsf.wording import counted
 
@@ -81,6 +87,29 @@ def visual_inputs(folder: Path, settings: CaptureSettings | None) -> VisualInput
         None if splats is None else splats.name,
         tuple(problems),
     )
+
+
+def contacts_outside(folder: Path, settings: CaptureSettings | None, visual: VisualInputs) -> CaptureError | None:
+    """Return the error of contacts in another unit than the cameras of photographs, as `avmsf reconstruct` raises it.
+
+    It compares some of the photographs, at a low resolution. None where there is a mesh, or nothing to compare.
+    """
+    if visual.cameras is None or visual.mesh is not None:
+        return None
+    try:
+        settings = settings or settings_of(folder)
+        contacts = contacts_of(read_rows(folder)[0], settings)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CaptureWarning)
+            views = read_views(folder, longest=LONGEST, max_views=MAX_VIEWS, meters=settings.views_meters)
+            views = find_foreground(views)
+    except CaptureError:
+        return None
+    try:
+        expect_contacts_in_outlines(contacts, views, settings)
+    except CaptureError as error:
+        return error
+    return None
 
 
 def _photographs(

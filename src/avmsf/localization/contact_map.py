@@ -70,7 +70,7 @@ class EquivalentPoint:
     """Its angle in radians, for a rotation."""
 
     def __str__(self) -> str:
-        where = " ".join(f"{round(value, 4) + 0.0:.4g}" for value in self.position.tolist())
+        where = ", ".join(f"{round(value, 4) + 0.0:.4g}" for value in self.position.tolist())
         if self.symmetry is None:
             why = "no known symmetry of the object explains it"
         elif isinstance(self.symmetry, MirrorSymmetry):
@@ -270,7 +270,10 @@ class ContactMap:
         )
 
     def describe(self, symmetries: Symmetries | None = None, level: float = LEVEL) -> dict[str, Any]:
-        """Return the results as plain values, lengths in meters; of a rejected recording the status and the reason."""
+        """Return the results as plain values, lengths in meters; of a rejected recording the status and the reason.
+
+        `probability` is that of the peak of the region that contains the position.
+        """
         common = {
             "explained_energy": self.explained_energy,
             "modal_energy": self.modal_energy,
@@ -281,9 +284,11 @@ class ContactMap:
         if self.refusal is not None:
             return not_located(self.refusal) | common
         others = self.equivalent_points(symmetries, level)
+        own = next(peak for peak in self.peaks(level) if peak.points[self.most_probable])
         return {
             "status": LOCATED,
             "position": self.position.tolist(),
+            "probability": own.probability,
             "credible_region": {
                 "probability": level,
                 "radius": self.credible_radius(level),

@@ -88,7 +88,7 @@ def assess_match(found: ContactMap) -> ContactMap:
     --parts other-objects` reports what is rejected of other sounds and of an object's own.
     """
     modal, null, ratio = 100 * found.modal_energy, 100 * found.null_energy, found.mismatch_ratio
-    share = f"the object's modes explain {modal:.0f} % of it, detuned modes {null:.0f} %"
+    share = f"with free gains the object's modes explain {modal:.0f} % of it, modes of shifted frequencies {null:.0f} %"
     if ratio > REJECT_ABOVE:
         refusal = (
             f"expected a mismatch ratio of at most {WARN_ABOVE:g}, as of this object's impacts, got a mismatch ratio "
@@ -106,7 +106,7 @@ def assess_match(found: ContactMap) -> ContactMap:
         note = f"the sound may be of another object, or hold other sounds: a mismatch ratio of {ratio:.2f} ({share})"
     elif found.explained_energy < MIN_EXPLAINED:
         note = (
-            "the position may be wrong: an impact at the most probable one explains "
+            "the position may be wrong: an impact at the most probable one, with the field's gains, explains "
             f"{100 * found.explained_energy:.0f} % of the sound ({share})"
         )
     else:

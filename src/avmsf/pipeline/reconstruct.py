@@ -19,7 +19,7 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.surface import find_surface, read_surface, write_surface
 from avmsf.capture.views import read_views
 from avmsf.capture.warning import CaptureWarning
-from avmsf.config import PipelineConfig
+from avmsf.config import CACHED_FIELD, PipelineConfig
 from avmsf.errors import AvmsfError, CaptureError, SceneError
 from avmsf.field.config import NETWORK
 from avmsf.field.fit import Progress, fit
@@ -45,7 +45,7 @@ from avmsf.wording import counted
 
 SURFACE = "surface.ply"
 """What the stage of the object's surface calls its output, in meters."""
-MODES, FIELD = "modes.safetensors", "field.safetensors"
+MODES, FIELD = "modes.safetensors", CACHED_FIELD
 """What the last stages call their outputs."""
 OFF_MESH = 0.02
 """Distance of a Gaussian from a mesh, over its size, up to which it is of its surface: three pixels of a photograph in

@@ -12,7 +12,8 @@ from torch import Tensor
 from avmsf.capture.cameras import Camera, View
 from avmsf.capture.meshviews import MeshTracer
 from avmsf.capture.placement import FACTORS, WRONG_ROWS
-from avmsf.capture.settings import METRES, CaptureSettings
+from avmsf.capture.proposals import unit_named
+from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.surface import Surface
 from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.capture.warning import CaptureWarning
@@ -115,7 +116,7 @@ def expect_contacts_in_outlines(
     if not fitting:
         return
     factor = max(fitting)
-    name = next((unit for unit, size in METRES.items() if abs(size / (factor * settings.meters) - 1) < 1e-6), None)
+    name = unit_named(factor * settings.meters)
     mended = f'write unit = "{name}" in capture.toml' if name else "scale the contacts or the cameras"
     raise CaptureError(
         f"unit: expected contacts on the object in the photographs, got most outside of its outlines, and inside when "
@@ -150,14 +151,10 @@ def _share_inside(contacts: Float[Tensor, "contacts 3"], views: Sequence[View]) 
 
 def _mending(factor: float, settings: CaptureSettings) -> str:
     """Return what to write in capture.toml where the mesh times a factor fits the cameras."""
-
-    def named(meters: float) -> str | None:
-        return next((unit for unit, length in METRES.items() if abs(length / meters - 1) < 1e-6), None)
-
-    views, contacts = named(settings.views_meters / factor), named(settings.meters * factor)
+    views, contacts = unit_named(settings.views_meters / factor), unit_named(settings.meters * factor)
     if views is not None:
         return f'write views_unit = "{views}" in capture.toml'
-    mesh = named(settings.surface_meters * factor)
+    mesh = unit_named(settings.surface_meters * factor)
     if contacts is not None and mesh is not None:
         return f'write unit = "{contacts}" and surface_unit = "{mesh}" in capture.toml'
     return "scale the cameras or the mesh"

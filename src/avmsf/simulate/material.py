@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from difflib import get_close_matches
 
 from avmsf.errors import SimulationError
 
@@ -52,8 +53,13 @@ MATERIALS = {material.name: material for material in (CERAMIC, GLASS, WOOD, PLAS
 """The table that DiffSound simulates with, by name."""
 
 
-def material_named(name: str) -> Material:
-    """Return the material of this name, whatever its case. Raises SimulationError with the names there are."""
+def material_named(name: str, *, option: str = "material") -> Material:
+    """Return the material of this name, whatever its case.
+
+    Raises SimulationError with the names there are; `option` is the name of what was given.
+    """
     if name.lower() not in MATERIALS:
-        raise SimulationError.expected(f"one of {', '.join(MATERIALS)}", name, name="material")
+        near = get_close_matches(name.lower(), MATERIALS, n=1)
+        advice = f"did you mean {near[0]}?" if near else ""
+        raise SimulationError.expected(f"one of {', '.join(MATERIALS)}", name, name=option, advice=advice)
     return MATERIALS[name.lower()]

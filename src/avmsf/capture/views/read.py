@@ -23,16 +23,17 @@ def read_views(
     folder: str | Path,
     *,
     longest: int | None = None,
+    max_views: int | None = None,
     meters: float = 1.0,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[View, ...]:
     """Read a folder of photographs with cameras, sorted by name, as undistorted views.
 
-    `folder` holds a `transforms.json` or a COLMAP model (in `sparse/0`, `sparse` or itself, images in `images/`), or
-    is the path of a JSON file of that kind; the JSON goes first where both are there. Masks come from the images'
-    alpha channel, from the files that the JSON names, or from `masks/`. `longest` is the most pixels of a side;
-    larger images are scaled down with their cameras. `meters` is the length of the file's unit. `progress` is called
-    with the number of images done and of all.
+    `folder` holds a `transforms.json` or a COLMAP model (in `sparse/0`, `sparse` or itself, images in `images/`), or is
+    the path of a JSON file of that kind; the JSON goes first where both are there. Masks come from the images' alpha
+    channel, from the files that the JSON names, or from `masks/`. `longest` is the most pixels of a side; larger images
+    are scaled down with their cameras. Of more than `max_views` images, only every second one or fewer are read.
+    `meters` is the length of the file's unit. `progress` is called with the number of images done and of all.
 
     Warns with CaptureWarning of what was not used or was corrected. Raises CaptureError where cameras cannot be read,
     where an image's shape does not fit its camera's, or where fewer than three views remain.
@@ -53,6 +54,8 @@ def read_views(
     if unused:
         message = f"{counted(len(unused), 'image')} not used, without a camera: {listed(unused)}"
         findings.remarks.append(Remark(message, name="cameras", value=unused))
+    if max_views is not None:
+        shots = shots[:: max(1, -(-len(shots) // max_views))]
     views = []
     for done, shot in enumerate(shots, start=1):
         view = read_view(shot, base, longest, meters, findings)

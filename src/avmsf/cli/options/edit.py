@@ -148,7 +148,7 @@ class GuideOptions:
                 value=tuple(self._guides),
             )
         if self.like_material is not None:
-            material_named(self.like_material)
+            material_named(self.like_material, option="--like-material")
         if not self._guides:
             given = [*(name for name in _changed(self) if name == "--parameters"), *_changed(self.config)]
             _expect_unchanged(given, "--prompt, --like or --like-material")
@@ -206,9 +206,9 @@ class Options(Printing):
         super().check_inputs()
         self.steering.expect_usable()
         expect_device(self.steering.device, raising=EditError)
-        for name in (self.change.material, self.change.old):
+        for option, name in (("--to-material", self.change.material), ("--from", self.change.old)):
             if name is not None:
-                material_named(name)
+                material_named(name, option=option)
         if self.change.law != MaterialOptions.law and not self.change.asked:
             raise EditError.expected("--to-material, --scale or a constant of a material with it", name="--law")
         if self.position is not None and self.plots is None:

@@ -95,7 +95,7 @@ class Options(Printing):
         if self.material is None:
             expect_capture(self.capture, self.settings)
         else:
-            material_named(self.material)
+            material_named(self.material, option="--material")
             refuse_with_material(self)
 
 
@@ -112,7 +112,9 @@ def expect_split(fraction: float | None, count: int | None) -> None:
     if count is not None and fraction is not None:
         raise FitError("expected --train-count or --train-fraction, got both; leave one out", name="--train-count")
     if fraction is not None and not 0.0 < fraction < 1.0:
-        raise EvaluationError.expected("a fraction of training contacts between 0 and 1", fraction, name="fraction")
+        raise EvaluationError.expected(
+            "a fraction of training contacts between 0 and 1, such as 0.75", fraction, name="--train-fraction"
+        )
 
 
 def refuse_with_material(options: Any) -> None:

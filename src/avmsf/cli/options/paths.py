@@ -12,6 +12,7 @@ import tyro
 from avmsf._utils.headers import read_metadata
 from avmsf.capture.filenames import PICTURE_SUFFIXES, VIDEO_SUFFIXES
 from avmsf.cli.options.checks import OutputError, expect_writable, is_folder
+from avmsf.config import CACHE, CACHED_FIELD
 from avmsf.errors import AvmsfError
 from avmsf.field import header as field_header
 from avmsf.scene import featureheader
@@ -55,7 +56,9 @@ class Existing:
             raise InputError.expected(self.what, got=found, file=path, advice="check the name")
         kind = kind_of(path)
         if kind is not None and kind not in self.kinds:
-            raise InputError(f"{path}: expected {self.what}, got {kind}; name another", file=path, value=kind)
+            cached = path / CACHE / CACHED_FIELD
+            other = cached if "a sound field" in self.kinds and cached.is_file() else "another"
+            raise InputError(f"{path}: expected {self.what}, got {kind}; name {other}", file=path, value=kind)
 
 
 @dataclass(frozen=True)

@@ -86,7 +86,7 @@ class Options(SceneOptions):
         expect_modes(self.modes)
         expect_split(self.train_fraction, self.train_count)
         if self.material is not None:
-            material_named(self.material)
+            material_named(self.material, option="--material")
             refuse_with_material(self)
 
     def expect_folder(self, settings: CaptureSettings) -> None:
