@@ -8,8 +8,9 @@ from functools import partial
 import numpy as np
 import pytest
 
-from avmsf.fem.thickness import search_thickness
-from avmsf.simulate.nominal import NominalBody
+from avmsf.fem.thickness import DISCREPANCY, largest_factor, search_thickness
+from avmsf.simulate.material import MATERIALS
+from avmsf.simulate.nominal import NOMINAL, NominalBody
 from made_dome import bodies
 
 
@@ -98,3 +99,10 @@ def test_other_thicknesses_are_tried_where_a_body_cannot_be_had() -> None:
     assert len({round(each, 9) for each in asked}) == len(asked) > 1
     assert thickness is not None
     assert thickness.low < 0.0029 < thickness.high
+
+
+def test_the_right_wall_of_every_material_is_below_the_largest_factor() -> None:
+    speeds = [math.sqrt(each.young / each.density * NOMINAL.density / NOMINAL.young) for each in MATERIALS.values()]
+    # A bending wall that is taken to be thinner by a part needs frequencies higher by as much.
+    assert max(speeds) * (1.0 + DISCREPANCY) < largest_factor(searched=True) < max(speeds) * 1.3
+    assert largest_factor(searched=True) == pytest.approx((1.0 + DISCREPANCY) * largest_factor(searched=False))

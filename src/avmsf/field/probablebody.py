@@ -1,14 +1,16 @@
 """The body that a fit found most probable behind the object's surface, and whether any material could be so stiff."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from avmsf._utils.records import like
 from avmsf.fem.supports import FREE
-from avmsf.fem.thickness import DISCREPANCY
+from avmsf.fem.thickness import largest_factor
+from avmsf.field.gains.elastic import FREQUENCY_ERRORS
 from avmsf.simulate.material import MATERIALS
-from avmsf.simulate.nominal import LARGEST_ERROR, NOMINAL
+from avmsf.simulate.nominal import NOMINAL
 
 
 @dataclass(frozen=True)
@@ -57,15 +59,15 @@ class ProbableBody:
     def warning(self) -> str:
         """Say that the body is stiffer than any material of the table; empty where it is not.
 
-        Frequencies of real bodies differ from those of even ones by `LARGEST_ERROR`, and the ratio goes with their
-        square. A wall that was found is uncertain by `DISCREPANCY`, which its interval allows for: one that is too thin
-        by that much needs frequencies higher by up to as much.
+        With the margin of `largest_factor`, at which the search for a wall ends.
         """
+        searched = self.wall_interval is not None
+        # A search allows no larger factor: one that is within a step of the grid would have been larger.
+        step = 1.0 + FREQUENCY_ERRORS[0] if searched else 1.0
+        if math.sqrt(self.stiffness_ratio) * step <= largest_factor(searched=searched):
+            return ""
         stiffest = max(MATERIALS.values(), key=lambda each: each.young / each.density)
         over = self.stiffness_ratio * (NOMINAL.young / NOMINAL.density) / (stiffest.young / stiffest.density)
-        uncertain = 0.0 if self.wall_interval is None else DISCREPANCY
-        if over <= ((1.0 + LARGEST_ERROR) * (1.0 + uncertain)) ** 2:
-            return ""
         wrong, measure = "body", "check the unit of the mesh"
         if self.wall_thickness is not None:
             wrong = f"wall of {1000 * self.wall_thickness:.2g} mm"

@@ -133,6 +133,16 @@ def test_a_factor_on_all_frequencies_is_found(factor):
     assert abs(math.log(found / factor)) <= 0.01
 
 
+def test_no_factor_above_the_largest_is_considered():
+    sites = impacts(12, seed=1)
+    gains, others = measured(sites, factor=1.8), families(sites)[:-1]
+    body = Elastic(sites, SIZE, plate(), largest_factor=1.28)
+    weigh_factors([WeighedFamily.of(each, gains, NOISE_SHARES) for each in (*others, body)], gains)
+    weights = body.frequency_weights.reshape(len(FACTORS), -1).sum(1)
+    assert float(weights.sum()) == pytest.approx(1.0)
+    assert float(weights[FACTORS > 1.28].sum()) == 0.0
+
+
 def test_a_fit_finds_the_factor_and_predicts_as_well_with_it():
     sites = impacts(8, seed=1)
     nominal, scaled = (fitted(sites, elastic=True, gains=measured(sites, factor=each)) for each in (1.0, 0.75))

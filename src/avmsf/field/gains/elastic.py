@@ -72,11 +72,13 @@ class Elastic(KernelFamily):
 
     kind: ClassVar[str] = "elastic"
 
-    def __init__(self, reference: Sites, size: float, modes: ElasticModes) -> None:
+    def __init__(self, reference: Sites, size: float, modes: ElasticModes, *, largest_factor: float = math.inf) -> None:
+        """Set up from the body's shapes and the largest factor on its frequencies that a material can explain."""
         super().__init__(reference, size)
+        self.largest_factor = largest_factor
         # As a file keeps them, so that a field that was read renders what the saved one does.
         self.modes = replace(modes, shapes=modes.shapes.float().double(), perturbations=None)
-        self.frequency_weights = torch.softmax(frequency_log_prior(), dim=0)
+        self.frequency_weights = torch.softmax(frequency_log_prior(largest_factor), dim=0)
         """Probability of each pair of `FACTORS` and `FREQUENCY_ERRORS`, the pairs of one factor in a row."""
         self._latest: tuple[tuple[Sites, Float64[Tensor, "sites shapes"]], ...] = ()
         self._reach = torch.tensor([REACH * size], dtype=torch.float64)
@@ -241,10 +243,14 @@ class Elastic(KernelFamily):
         return squared_exponential(sites.points, others.points, self._reach)[0] * sites.cosine(others)
 
 
-def frequency_log_prior() -> Float64[Tensor, " pairs"]:
-    """Return the log density of the log factor of each pair in `Elastic.frequency_weights` before any measurement."""
+def frequency_log_prior(largest: float = math.inf) -> Float64[Tensor, " pairs"]:
+    """Return the log density of the log factor of each pair in `Elastic.frequency_weights` before any measurement.
+
+    Minus infinity for factors above the largest one.
+    """
     terms = [
         math.log(weight / deviation) - 0.5 * ((torch.log(FACTORS) - mean) / deviation).square()
         for weight, mean, deviation in _FACTOR_PRIOR
     ]
-    return torch.logsumexp(torch.stack(terms), dim=0).repeat_interleave(len(FREQUENCY_ERRORS))
+    density = torch.logsumexp(torch.stack(terms), dim=0).masked_fill(largest < FACTORS, -torch.inf)
+    return density.repeat_interleave(len(FREQUENCY_ERRORS))

@@ -15,7 +15,7 @@ from torch import Tensor
 from avmsf.capture.placement import expect_placed
 from avmsf.errors import AvmsfError, FitError
 from avmsf.fem.supports import FREE, FREE_PRIOR
-from avmsf.fem.thickness import search_thickness
+from avmsf.fem.thickness import largest_factor, search_thickness
 from avmsf.fem.updating import update
 from avmsf.field.config import AUTO, NETWORK, GainModel
 from avmsf.field.gains.bodies import CandidateBodies
@@ -33,6 +33,7 @@ from avmsf.scene.features import GEOMETRY, FeatureField
 from avmsf.scene.points import farthest_points
 from avmsf.scene.symmetry import Symmetries
 from avmsf.scene.symmetrycharacters import Group, groups_of
+from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.nominal import NominalBody, body_name
 
 POSITIONAL: dict[str, type[KernelFamily]] = {Smooth.kind: Smooth, ThinPlate.kind: ThinPlate}
@@ -109,11 +110,14 @@ class MixtureEstimator(GainRecipe):
         directional = bool(bodies) or (given is not None and bool(given.any()))
         groups = () if bodies or self.symmetries is None else groups_of(self.symmetries)
         self._expect_inputs(case, groups)
-        fit = _Fit(case, self.kinds, _sites(case, bodies), directional, groups)
         hold = None if self.bodies is None else self.bodies.hold
+        thicken = None if self.bodies is None else self.bodies.thicken
+        # Of a wall that is too thin, shapes of high modes may fit as well as those of the right one.
+        largest = math.inf if thicken is None else largest_factor(searched=True)
+        fit = _Fit(case, self.kinds, _sites(case, bodies), directional, groups, largest)
         thickness = None
-        if self.bodies is not None and self.bodies.thicken is not None and bodies:
-            bodies, thickness = search_thickness(bodies, partial(fit.evidence, every), self.bodies.thicken)
+        if thicken is not None and bodies:
+            bodies, thickness = search_thickness(bodies, partial(fit.evidence, every), thicken)
         while True:
             families = fit.families(every, bodies)
             model = fit(every, families)
@@ -241,6 +245,12 @@ class _Fit:
     """Whether directions are known, or a body says which way its surface faces."""
     groups: tuple[Group, ...]
     """Symmetries of the object's shape."""
+    largest_factor: float
+    """The largest factor on the frequencies of bodies."""
+
+    def elastic(self, sites: Sites, size: float, modes: ElasticModes) -> Elastic:
+        """Return the family of a body."""
+        return Elastic(sites, size, modes, largest_factor=self.largest_factor)
 
     @cached_property
     def measured(self) -> MeasuredGains:
@@ -262,7 +272,7 @@ class _Fit:
         features = self.case.features
         if Visual.kind in self.kinds and features.encoder != GEOMETRY:
             found.append(Visual(sites, size, features.points, features.features))
-        return [*found, *(Elastic(sites, size, body.elastic) for body in bodies)]
+        return [*found, *(self.elastic(sites, size, body.elastic) for body in bodies)]
 
     def __call__(
         self,
@@ -279,7 +289,7 @@ class _Fit:
         sites, size = self.sites.take(rows), 2.0 * self.case.features.half_diagonal
         measured = self.at(rows)
         others = [WeighedFamily.of(each, measured, NOISE_SHARES) for each in self.families(rows, [])]
-        elastic = (WeighedFamily.of(Elastic(sites, size, body.elastic), measured, NOISE_SHARES) for body in bodies)
+        elastic = (WeighedFamily.of(self.elastic(sites, size, each.elastic), measured, NOISE_SHARES) for each in bodies)
         return [total_evidence([*others, each], measured) for each in elastic]
 
     def updated(self, rows: Int[Tensor, " rows"], body: NominalBody) -> NominalBody | None:
@@ -294,7 +304,7 @@ class _Fit:
         found = update(
             body.elastic, sites.points, sites.directions, measured.frequency, measured.values.real,
             measured.informative.chunk(2)[0],
-            lambda modes: matched(others, Elastic(sites, size, modes), measured),
+            lambda modes: matched(others, self.elastic(sites, size, modes), measured),
         )  # fmt: skip
         return None if found is None else replace(body, elastic=found[0], updated=found[1])
 

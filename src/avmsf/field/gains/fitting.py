@@ -184,7 +184,9 @@ def weigh_factors(families: Sequence[WeighedFamily], measured: MeasuredGains) ->
             density = each.family.match(torch.log(measured.frequency), rows)
             single = torch.logsumexp(density + _shape(each, each.family)[:, rows], dim=1)
             both = torch.logaddexp(single, unknown[rows])
-            each.family.frequency_weights = torch.softmax(both.sum(1) + frequency_log_prior(), dim=0)
+            each.family.frequency_weights = torch.softmax(
+                both.sum(1) + frequency_log_prior(each.family.largest_factor), dim=0
+            )
 
 
 def matched(families: Sequence[WeighedFamily], elastic: Elastic, measured: MeasuredGains) -> Matched:
