@@ -199,7 +199,7 @@ class Options(Printing):
     position: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
     """Contact of these sounds, on the object as it was; by default where it is loudest."""
     unit: Unit = "m"
-    """Unit of --position. A field itself is in meters, whatever unit its capture has."""
+    """Unit of --position. The field itself is in meters, also where its capture is in another unit."""
 
     def check_inputs(self) -> None:
         """Raise the package's errors for an edit that cannot be done or written."""

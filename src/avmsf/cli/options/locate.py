@@ -42,7 +42,8 @@ class Options(Printing):
     true_contact_table: ContactTable = None
     """True contacts of several recordings: a table with the columns file,x,y,z, such as a capture's impacts.csv."""
     unit: Unit = "m"
-    """Unit of --true-contact and --true-contact-table. A field itself is in meters, whatever unit its capture has."""
+    """Unit of --true-contact and --true-contact-table. The field itself is in meters, also where its capture is in
+    another unit."""
     output: OutputFolder = None
     """Folder for a heat map and a colored point cloud of every impact, NAME.png and NAME.ply."""
 

@@ -38,7 +38,7 @@ class Options(Printing):
     contact_table: ContactTable = None
     """Table of contacts. In it, a direction that is empty or 0,0,0 is not known."""
     unit: Unit = "m"
-    """Unit of the coordinates. A field itself is in meters, whatever unit its capture has."""
+    """Unit of the coordinates. The field itself is in meters, also where its capture is in another unit."""
     force: float = 1.0
     """Peak force of the impact, in newtons if the field knows forces, otherwise relative to an average recorded
     impact."""
