@@ -56,6 +56,13 @@ def test_a_missing_file_is_named_and_guessed(tmp_path: Path) -> None:
     fill(tmp_path, rows=("a.wav,0,0,0", "takes/b.wav,1,0,0"))
     with raises(CaptureError, file="takes/b.wav", value=None):
         read_capture(folder)
+    # A recording with a row of its own is of another contact.
+    (folder / "takes").mkdir()
+    (folder / "takes" / "hammer on rim.wav").write_bytes((folder / "a.wav").read_bytes())
+    for rows, below in ((("a.wav,0,0,0",), "takes/hammer on rim.wav"), (("takes/hammer on rim.wav,0,0,0",), None)):
+        fill(tmp_path, rows=(*rows, "hammer on rim.wav,1,0,0"))
+        with raises(CaptureError, file="hammer on rim.wav", value=below):
+            read_capture(folder)
 
 
 def test_mixed_rates_are_refused_with_their_counts(tmp_path: Path) -> None:

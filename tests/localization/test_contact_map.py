@@ -98,7 +98,7 @@ def test_other_positions_include_a_broader_peak_and_not_the_answer():
     assert found.position.tolist() == pytest.approx([0.26, 0.0, 0.0])
     assert (broad.probability, narrow.probability) == (pytest.approx(0.56), pytest.approx(0.15))
     told = found.describe(level=0.999)
-    assert told["probability"] == pytest.approx(0.29)
+    assert told["position_probability"] == pytest.approx(0.29)
     positions = [each["position"][0] for each in told["equivalent_points"]]
     assert positions == [pytest.approx(0.0, abs=0.08), pytest.approx(0.2)]
 

@@ -92,7 +92,7 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
     refused = _check_contacts(folder, strikes, rows, settings=settings, problems=problems)
     if len(missing) > MAX_SUGGESTIONS:
         lack = f"{TABLE}: expected a file for each row, got none for {len(missing)} of {len(rows)}"
-        refused.append(f"{lack}; {advice_for_missing(folder, missing)}")
+        refused.append(f"{lack}; {advice_for_missing(folder, missing, files)}")
     comparable = len(sounds) > 1 and len({each.rate for each in sounds}) == 1
     uncut = comparable and stay_uncut([each.start for each in sounds], rate=sounds[0].rate, settings=settings)
     if uncut:

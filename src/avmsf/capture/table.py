@@ -197,7 +197,7 @@ def _refuse_missing(folder: Path, strikes: Sequence[Strike]) -> None:
         shown = f"{', '.join(missing[:5])}{', …' * (len(missing) > 5)}"
         raise CaptureError(
             f"{folder / TABLE}: expected a file for each row, got none for {len(missing)} of {len(strikes)} "
-            f"({shown}); {advice_for_missing(folder, missing)}",
+            f"({shown}); {advice_for_missing(folder, missing, [strike.file for strike in strikes])}",
             file=folder / TABLE,
             name="file",
             value=missing,
@@ -214,7 +214,7 @@ def is_missing(path: Path) -> bool:
 
 def missing_recording_of(folder: Path, file: str, files: Sequence[str]) -> CaptureError:
     """Return the error of a recording of a table that does not exist; `files` are those of all rows."""
-    below = _path_below(folder, file)
+    below = _path_below(folder, file, files)
     if below is not None:
         message = f"{file}: expected a sound file, got none; write {below} in {TABLE}"
         return CaptureError(message, file=folder / file, name="file", value=below)
@@ -222,20 +222,22 @@ def missing_recording_of(folder: Path, file: str, files: Sequence[str]) -> Captu
     return missing_recording(folder / file, file, advice=advice, used={folder / each for each in files})
 
 
-def advice_for_missing(folder: Path, missing: Sequence[str]) -> str:
-    """Return what to do where several recordings of a table do not exist."""
+def advice_for_missing(folder: Path, missing: Sequence[str], files: Sequence[str]) -> str:
+    """Return what to do where several recordings of a table do not exist; `files` are those of all rows."""
     for file in missing:
-        below = _path_below(folder, file)
+        below = _path_below(folder, file, files)
         if below is not None:
             return f"write {below} in place of {file}, and so on"
     return "copy them there, or correct their names"
 
 
-def _path_below(folder: Path, file: str) -> str | None:
-    """Return the path, in the folder, of a file in a subfolder that has the name of a missing one; None without."""
-    found = sorted(path.relative_to(folder) for path in folder.rglob(glob.escape(PurePosixPath(file).name)))
+def _path_below(folder: Path, file: str, files: Sequence[str]) -> str | None:
+    """Return the path of a file in a subfolder that has the name of a missing one and no row; None without."""
+    if PurePosixPath(file).name != file:
+        return None
+    found = sorted(path.relative_to(folder) for path in folder.rglob(glob.escape(file)))
     seen = (path.as_posix() for path in found if not any(part.startswith(".") for part in path.parts))
-    return next(seen, None)
+    return next((path for path in seen if path not in files), None)
 
 
 def fitting_units(written: float) -> str:

@@ -197,7 +197,7 @@ def _words(values: dict[str, Any]) -> str:
         return f"{values['recording']}{when}: {values['status']}: {values['reason']}"
     region = values["credible_region"]
     where = ", ".join(f"{value + 0.0:.4f}" for value in values["position"])
-    chance = f", with {100 * values['probability']:.0f} %" if values["multimodal"] else ""
+    chance = f", with {100 * values['position_probability']:.0f} %" if values["multimodal"] else ""
     lines = [
         f"{values['recording']}{when}: impact at ({where}) m{chance}; {100 * region['probability']:g} % within "
         f"{figure(1000 * region['radius'], 2)} mm, {figure(100 * region['surface_fraction'], 2)} % of the surface; an "

@@ -272,7 +272,7 @@ class ContactMap:
     def describe(self, symmetries: Symmetries | None = None, level: float = LEVEL) -> dict[str, Any]:
         """Return the results as plain values, lengths in meters; of a rejected recording the status and the reason.
 
-        `probability` is that of the peak of the region that contains the position.
+        `position_probability` is that of the peak of the region that contains the position.
         """
         common = {
             "explained_energy": self.explained_energy,
@@ -288,7 +288,7 @@ class ContactMap:
         return {
             "status": LOCATED,
             "position": self.position.tolist(),
-            "probability": own.probability,
+            "position_probability": own.probability,
             "credible_region": {
                 "probability": level,
                 "radius": self.credible_radius(level),
