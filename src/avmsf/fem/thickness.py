@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from avmsf.simulate.material import MATERIALS
+from avmsf.simulate.material import STIFFEST
 from avmsf.simulate.nominal import LARGEST_ERROR, NOMINAL, NominalBody
 
 _RESOLUTION = 0.06
@@ -42,9 +42,12 @@ def largest_factor(*, searched: bool) -> float:
     differ from those of even ones (`LARGEST_ERROR`). Where the thickness of its wall is `searched`, one too thin by the
     `DISCREPANCY` needs frequencies higher by up to as much.
     """
-    stiffest = max(each.young / each.density for each in MATERIALS.values())
     uncertain = 1.0 + (DISCREPANCY if searched else 0.0)
-    return (1.0 + LARGEST_ERROR) * uncertain * math.sqrt(stiffest * NOMINAL.density / NOMINAL.young)
+    return (
+        (1.0 + LARGEST_ERROR)
+        * uncertain
+        * math.sqrt(STIFFEST.young / STIFFEST.density * NOMINAL.density / NOMINAL.young)
+    )
 
 
 @dataclass(frozen=True)

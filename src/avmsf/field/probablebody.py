@@ -9,7 +9,7 @@ from avmsf._utils.records import like
 from avmsf.fem.supports import FREE
 from avmsf.fem.thickness import largest_factor
 from avmsf.field.gains.elastic import FREQUENCY_ERRORS
-from avmsf.simulate.material import MATERIALS
+from avmsf.simulate.material import STIFFEST
 from avmsf.simulate.nominal import NOMINAL
 
 
@@ -66,14 +66,13 @@ class ProbableBody:
         step = 1.0 + FREQUENCY_ERRORS[0] if searched else 1.0
         if math.sqrt(self.stiffness_ratio) * step <= largest_factor(searched=searched):
             return ""
-        stiffest = max(MATERIALS.values(), key=lambda each: each.young / each.density)
-        over = self.stiffness_ratio * (NOMINAL.young / NOMINAL.density) / (stiffest.young / stiffest.density)
+        over = self.stiffness_ratio * (NOMINAL.young / NOMINAL.density) / (STIFFEST.young / STIFFEST.density)
         wrong, measure = "body", "check the unit of the mesh"
         if self.wall_thickness is not None:
             wrong = f"wall of {1000 * self.wall_thickness:.2g} mm"
             measure = "measure the wall and give --body.wall"
         return (
-            f"The fit needs {over:.2g} times the stiffness-to-density ratio of {stiffest.name}, the stiffest material "
+            f"The fit needs {over:.2g} times the stiffness-to-density ratio of {STIFFEST.name}, the stiffest material "
             f"of the table, so the {wrong} is probably wrong, as where directions of impacts on edges are missing: "
             f"give nx,ny,nz for impacts on edges and handles, or {measure}."
         )

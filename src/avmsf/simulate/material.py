@@ -53,6 +53,10 @@ MATERIALS = {material.name: material for material in (CERAMIC, GLASS, WOOD, PLAS
 """The table that DiffSound simulates with, by name."""
 
 
+STIFFEST = max(MATERIALS.values(), key=lambda each: each.young / each.density)
+"""Of the table, relative to its density."""
+
+
 def material_named(name: str, *, option: str = "material") -> Material:
     """Return the material of this name, whatever its case.
 
