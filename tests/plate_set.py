@@ -22,9 +22,17 @@ def plate_named(name: str) -> Plate:
 
 
 def fill_plates(
-    folder: Path, names: tuple[str, ...] = ("a", "b", "c"), *, count: int = 10, truth: bool = False
+    folder: Path,
+    names: tuple[str, ...] = ("a", "b", "c"),
+    *,
+    count: int = 10,
+    truth: bool = False,
+    recordings: str = "{:02d}.wav",
 ) -> Path:
-    """Write captures of plates; with `truth`, as simulated objects have it, and a surface to be seen."""
+    """Write captures of plates; with `truth`, as simulated objects have it, and a surface to be seen.
+
+    `recordings` makes a recording's name from its row.
+    """
     for number, name in enumerate(names):
         generator = torch.Generator().manual_seed(number)
         plate = plate_named(name)
@@ -38,7 +46,7 @@ def fill_plates(
             highest=HIGHEST,
             contact_time=5e-4,
         )
-        impacts = replace(impacts, names=tuple(f"{row:02d}.wav" for row in range(count)))
+        impacts = replace(impacts, names=tuple(map(recordings.format, range(count))))
         write_capture(Capture(name, impacts, _surface(plate) if truth else None), folder / name)
         if truth:
             modes = plate_modes(plate, impacts.contacts, highest=HIGHEST, contact_time=5e-4)
