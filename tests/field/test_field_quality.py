@@ -9,6 +9,7 @@ from avmsf.bench.baselines import MeanWaveform
 from avmsf.bench.evaluation import evaluate
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
+from avmsf.field.quality import smallest_within_error
 from avmsf.field.soundfield import FieldQuality
 from avmsf.field.store import load, save
 from avmsf.field.suggest import suggest
@@ -62,6 +63,26 @@ def test_what_recordings_have_in_common_beside_their_modes_is_kept(tmp_path):
     assert torch.equal(known.render(test.contacts), field.render(test.contacts))
     # Longer than the recordings there is silence, as beyond their end nothing is known.
     assert torch.equal(known.render(test.contacts, samples=SAMPLES + 50)[:, :100], known.render(test.contacts)[:, :100])
+
+
+def test_the_smallest_share_is_taken_that_is_not_surely_worse_than_the_best():
+    sign = torch.tensor([1.0, -1.0, 1.0, -1.0])
+    best = 0.7 + 0.1 * sign
+    # Standard errors of the differences are .058 and .115.
+    assert smallest_within_error(torch.stack([best + 0.3 - 0.1 * sign, best + 0.1 + 0.2 * sign, best])) == 1
+    assert smallest_within_error(torch.stack([best + 0.3 - 0.1 * sign, best + 0.2 + 0.2 * sign, best])) == 2
+
+
+def test_where_places_say_nothing_the_spread_counts_and_new_sounds_are_nearer():
+    recorded = replace(strikes(20), before=None, after=None)
+    order = torch.randperm(20, generator=torch.Generator().manual_seed(0))
+    mixed = replace(recorded, contacts=recorded.contacts[order])
+    train, test = mixed.take(range(16)), mixed.take(range(16, 20))
+    field = fitted(train)
+    assert field.gain_field.spread_share > 0.0
+    means = replace(field, gain_field=replace(field.gain_field, spread_share=0.0))
+    with_spread, without = (evaluate(each, test).mean()["relative_stft"] for each in (field, means))
+    assert with_spread < 0.98 * without
 
 
 def test_without_a_residual_none_is_kept():

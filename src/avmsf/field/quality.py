@@ -1,7 +1,9 @@
 """How well a field predicts its own contacts from each other, where it should be recorded next, and its residual."""
 
+import math
 from dataclasses import asdict, replace
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -16,37 +18,50 @@ from avmsf.modal.residual import Residual
 
 MIN_PLACES = 4
 """Places below which leaving one out says nothing of the field of all."""
+SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
+"""Spread shares that are tried."""
 
 
 def with_quality(field: SoundField, train: Impacts, *, advise: bool = True) -> SoundField:
-    """Return a field with the residual that predicts its own contacts best, and its quality in the report.
+    """Return a field with the residual and spread share that predict its own contacts best, and its quality reported.
 
-    The residual is the stationary noise of the field, or the mean of what the three nearest recordings have in
-    addition to their modes, by the error at contacts left out. `train` holds the recordings that the gain model uses,
-    row for row. A field of fewer than `MIN_PLACES` places keeps its noise and has no quality. `advise`: whether to name
+    The residual is the stationary noise of the field, or the mean of what the three nearest recordings have in addition
+    to their modes. By the error at contacts left out; of the shares the smallest within one standard error of the best,
+    since fewer contacts leave more spread. `train` holds the recordings that the gain model uses, row for row. A field
+    of fewer than `MIN_PLACES` places keeps its noise, a share of zero, and has no quality. `advise`: whether to name
     the contact to record next, one of the field's points; not if these are not on the object.
     """
     gains = field.gain_field
     if not isinstance(gains, MixtureGains) or gains.place_count < MIN_PLACES:
         return field
     samples, places = train.sounds.shape[1], gains.places
-    modes, fitted = (
-        field.modal_sounds(Gains(each.real.float(), each.imag.float()), samples)
-        for each in (gains.leave_one_out(), gains.values)
-    )
-    errors = {"noise": _error(field, modes + field.noise(samples), train)}
+    fitted = field.modal_sounds(Gains(gains.values.real.float(), gains.values.imag.float()), samples)
     recordings = (train.sounds - fitted).float()
     rows, signs = gains.nearest(gains.training, places)
     averaged = (train.sounds[rows] * signs[..., None]).float().mean(1)
+    residuals = {"noise": field.noise(samples)}
     if field.origin.config.residual:
-        errors["recordings"] = _error(field, modes + (recordings[rows] * signs[..., None]).mean(1), train)
-    best = min(errors, key=lambda each: errors[each])
+        residuals["recordings"] = (recordings[rows] * signs[..., None]).mean(1)
+    modes = [field.modal_sounds(gains.left_out_estimate(share), samples) for share in SHARES]
+    error = _Error(field, train)
+    errors = {kind: torch.stack([error(each + added) for each in modes]) for kind, added in residuals.items()}
+    best = min(errors, key=lambda kind: float(errors[kind].mean(1).min()))
     if best == "recordings":
         field = replace(field, residual=Residual(field.residual.magnitude, recordings))
+    chosen = smallest_within_error(errors[best])
+    field = replace(field, gain_field=replace(gains, spread_share=SHARES[chosen]))
+    reached = {kind: float(each[chosen].mean()) for kind, each in errors.items()}
     advice = _next(field, gains) if advise else ()
-    found = FieldQuality(gains.place_count, errors[best], _error(field, averaged, train), *advice)
-    report = {**field.origin.report, "quality": asdict(found), "residual": errors}
+    found = FieldQuality(gains.place_count, reached[best], float(error(averaged).mean()), *advice)
+    report = {**field.origin.report, "quality": asdict(found), "residual": reached}
     return replace(field, origin=replace(field.origin, report=report))
+
+
+def smallest_within_error(errors: Float[Tensor, "choices contacts"]) -> int:
+    """Return the first choice whose mean error is within one standard error, of the difference, of the least one."""
+    more = errors - errors[errors.mean(1).argmin()]
+    allowed = more.std(1) / math.sqrt(errors.shape[1])
+    return int((more.mean(1) <= allowed).double().argmax())
 
 
 def _next(field: SoundField, gains: MixtureGains) -> tuple[tuple[float, float, float], float] | tuple[()]:
@@ -64,8 +79,15 @@ def _next(field: SoundField, gains: MixtureGains) -> tuple[tuple[float, float, f
     return (x, y, z), distance
 
 
-def _error(field: SoundField, sounds: Float[Tensor, "contacts samples"], train: Impacts) -> float:
-    """Return the relative STFT error, over all contacts together."""
-    sizes, hops, _ = field.origin.config.resolutions(train.sample_rate)
-    target = spectral_target(train.sounds.float(), fft_sizes=sizes, hops=hops)
-    return float(spectral_loss(sounds.float(), target)) / len(sizes)
+class _Error:
+    """Relative STFT errors of sounds at the contacts of recordings, whose mean is that of all contacts together."""
+
+    def __init__(self, field: SoundField, train: Impacts) -> None:
+        sizes, hops, _ = field.origin.config.resolutions(train.sample_rate)
+        self.targets = [spectral_target(each[None], fft_sizes=sizes, hops=hops) for each in train.sounds.float()]
+        loud = torch.tensor([[float(norm.sum()) for norm in each.norms] for each in self.targets])
+        self.weight = (loud / loud.mean(0).clamp_min(torch.finfo(loud.dtype).tiny)).mean(1) / len(sizes)
+
+    def __call__(self, sounds: Float[Tensor, "contacts samples"]) -> Float[Tensor, " contacts"]:
+        pairs = zip(sounds.float(), self.targets, strict=True)
+        return self.weight * torch.stack([spectral_loss(each[None], target) for each, target in pairs])

@@ -324,7 +324,7 @@ def test_a_model_that_knows_no_directions_takes_none():
 
 @pytest.mark.parametrize("elastic", [True, False])
 def test_a_model_comes_back_from_its_tensors_to_the_last_bit(elastic):
-    given = model(elastic=elastic).judged_by(1.1 * model(elastic=elastic).values)
+    given = replace(model(elastic=elastic).judged_by(1.1 * model(elastic=elastic).values), spread_share=0.75)
     record = json.loads(json.dumps(given.record()))
     tensors = {name: tensor.detach().clone().contiguous() for name, tensor in given.tensors().items()}
     skeleton = MixtureGains.skeleton(record)
@@ -334,6 +334,7 @@ def test_a_model_comes_back_from_its_tensors_to_the_last_bit(elastic):
     back = MixtureGains.restore(record, tensors)
     assert torch.equal(gains_at(back), gains_at(given))
     assert torch.equal(deviation_at(back), deviation_at(given))
+    assert torch.equal(back.point_estimate(ASKED.points).parts, given.point_estimate(ASKED.points).parts)
     assert torch.equal(back.at(ASKED.points).mean, given.at(ASKED.points).mean)
     assert torch.equal(back.leave_one_out(), given.leave_one_out())
     assert torch.equal(back.standardized_errors(), given.standardized_errors())
@@ -350,6 +351,7 @@ WRONG = {
     "contacts": [None, 0, [14]],
     "modes": [None, 0, 1.5],
     "directional": [None, 1, "yes"],
+    "spread_share": ["1", -0.1, 1.1],
     "families": [None, 3, [], ["smooth"], ["attention", "smooth", "elastic"], "smooth", NO_LIST],
     "kernels": [None, 3, [], [1], ["2", 1, 1], [0, 1, 1]],
     "bodies": [None, 3, [], [{}], [[]], [{"nodes": 0, "triangles": 3, "shapes": 2}], ["nodes"], [1]],
@@ -361,7 +363,8 @@ def test_wrong_records_are_refused(name):
     """By errors that the reader of files expects."""
     record = model().record()
     missing = {key: value for key, value in record.items() if key != name}
-    for wrong in (missing, *({**record, name: value} for value in WRONG[name])):
+    # Files of earlier versions have no share.
+    for wrong in (*[missing] * (name != "spread_share"), *({**record, name: value} for value in WRONG[name])):
         with pytest.raises((ValueError, TypeError, KeyError)):
             MixtureGains.skeleton(wrong)
 

@@ -32,6 +32,7 @@ whose probabilities maximize the summed evidence with a pseudo-count. Within a c
 to series. So a series whose few values say little borrows from the others (MacKay, Neural Computation 4, 1992).
 """
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -95,6 +96,18 @@ class _Pairs(NamedTuple):
 
     def take(self, rows: Int[Tensor, " rows"] | slice) -> "_Pairs":
         return _Pairs(*(each[rows] for each in self))
+
+
+class Predictions(NamedTuple):
+    """Values as those of other contacts predict them."""
+
+    mean: Float64[Tensor, "contacts series"]
+    deviation: Float64[Tensor, "contacts series"]
+    """Standard deviation of a measured value, noise included."""
+    of_means: Float64[Tensor, "contacts series"]
+    """Mean over hypotheses of the magnitude of each one's mean."""
+    magnitude: Float64[Tensor, "contacts series"]
+    """Mean magnitude of the value without noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,32 +197,34 @@ class KernelMixture:
         ]
         return torch.stack(found)
 
-    def leave_out(
-        self, groups: Int[Tensor, " contacts"]
-    ) -> tuple[Float64[Tensor, "contacts series"], Float64[Tensor, "contacts series"]]:
-        """Return the mean of each value given the values of all other groups, and its standard deviation.
+    def leave_out(self, groups: Int[Tensor, " contacts"]) -> Predictions:
+        """Return what the values of all other groups predict of each value.
 
         Contacts of the same number in `groups` are left out together. With B the block of C^-1 of a group's rows, the
         group's error is e = B^-1 (C^-1 y) and its covariance given the others s^2 B^-1 (Rasmussen and Williams, 2006,
         equations 5.10 to 5.12, for blocks). Without the group's k values the quadratic form is Q - (C^-1 y)' e, and the
         evidence changes by n/2 log Q - (n-k)/2 log(Q - (C^-1 y)' e) - 1/2 log|B|: the hypotheses are weighed again by
-        the other groups' values alone, with the same prior. What the prior of the scale says of all values stays. The
-        deviation is that of a measured value, noise included.
+        the other groups' values alone, with the same prior. What the prior of the scale says of all values stays.
         """
-        mean, deviation = torch.empty_like(self.values), torch.empty_like(self.values)
+        found = Predictions(*(torch.empty_like(self.values) for _ in Predictions._fields))
+        series = self._pairs.series
         for group in torch.unique(groups).tolist():
             rows = torch.nonzero(groups == group).flatten()
-            weights, error, variance = self._left_out(rows)
+            weights, error, variance, noise = self._left_out(rows)
+            location = self.values[rows].T[series] - error
             middle = self._summed(weights[:, None] * error)
-            square = self._summed(weights[:, None] * (variance + error.square()))
-            mean[rows] = self.values[rows] - middle.T
-            deviation[rows] = (square - middle.square()).clamp_min(_TINY).sqrt().T
-        return mean, deviation
+            square = self._summed(weights[:, None] * (variance + noise[:, None] + error.square()))
+            found.mean[rows] = self.values[rows] - middle.T
+            found.deviation[rows] = (square - middle.square()).clamp_min(_TINY).sqrt().T
+            found.of_means[rows] = self._summed(weights[:, None] * location.abs()).T
+            found.magnitude[rows] = self._summed(weights[:, None] * _mean_magnitude(location, variance)).T
+        return found
 
-    def _left_out(self, rows: Int[Tensor, " rows"]) -> tuple[Tensor, Tensor, Tensor]:
+    def _left_out(self, rows: Int[Tensor, " rows"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return the weights of the `_pairs` without the rows' values, and their errors and variances of these.
 
-        The shapes are (pairs,), and twice (pairs, rows).
+        The variances are those without noise, and last that of the noise. The shapes are (pairs,), twice (pairs, rows)
+        and (pairs,).
         """
         count, left, pairs = len(self.values), max(len(self.values) - len(rows), 1), self._pairs
         along = self.eigen[1][pairs.kernel[:, None], rows]
@@ -224,7 +239,9 @@ class KernelMixture:
         highest.scatter_reduce_(0, pairs.series, logs, "amax")
         weights = (logs - highest[pairs.series]).exp()
         weights = weights / self._summed(weights)[pairs.series]
-        return weights, error, rest[:, None] / left * torch.diagonal(covariance, dim1=1, dim2=2)
+        scale, own = rest / left, torch.diagonal(covariance, dim1=1, dim2=2)
+        variance = scale[:, None] * (own - pairs.variance[:, None]).clamp_min(0.0)
+        return weights, error, variance, scale * pairs.variance
 
     def explained(
         self, cross: Float64[Tensor, "some places contacts"], first: int = 0
@@ -277,12 +294,26 @@ class KernelMixture:
         scale.index_put_((pairs.kernel, pairs.series), pairs.weight * pairs.scale, accumulate=True)
         return (own.mT @ scale + explained - mean.square()).clamp_min(0.0).sqrt()
 
-    def mean_magnitude(self, cross: Float64[Tensor, "kernels places contacts"]) -> Float64[Tensor, "places series"]:
-        """Return the mean over hypotheses of the magnitude of each one's mean at places; `cross` as in `spread`."""
+    def mean_magnitude(
+        self,
+        cross: Float64[Tensor, "kernels places contacts"],
+        own: Float64[Tensor, "kernels places"],
+        share: float,
+    ) -> Float64[Tensor, "places series"]:
+        """Return the mean magnitude at places, of which `share` takes the deviation within hypotheses into account.
+
+        The rest is the mean over hypotheses of the magnitude of each one's mean. `cross` holds each kernel's
+        covariances between places and contacts, `own` its variance at each place.
+        """
         found = torch.zeros(cross.shape[1], self.values.shape[1], dtype=torch.float64)
-        for rows, series, weights, solved in self._padded:
-            each = (cross[rows] @ solved).abs_().mul_(weights[:, None])
-            found.index_add_(1, series.flatten(), each.transpose(0, 1).flatten(1))
+        for rows, (series, weight, solved, inverse, scale) in self._padded:
+            along = cross[rows] @ self.eigen[1][rows]
+            each = along @ solved.mT
+            magnitude = each.abs()
+            if share:
+                variance = scale[:, None] * (own[rows][..., None] - along.square() @ inverse.mT).clamp_min_(0.0)
+                magnitude = magnitude.lerp(_mean_magnitude(each, variance), share)
+            found.index_add_(1, series.flatten(), magnitude.mul_(weight[:, None]).transpose(0, 1).flatten(1))
         return found
 
     @cached_property
@@ -310,8 +341,8 @@ class KernelMixture:
         return total.index_add_(0, self._pairs.series, values)
 
     @cached_property
-    def _padded(self) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
-        """Rows of some kernels, and the series, weights and C^-1 y (kernels, contacts, pairs) of their `_pairs`.
+    def _padded(self) -> list[tuple[Tensor, tuple[Tensor, ...]]]:
+        """Rows of some kernels; the series, weights, U' C^-1 y, 1 / (lambda + v) and s^2 of their `_pairs`.
 
         Kernels with about as many pairs are together; those with fewer are filled with weights of zero.
         """
@@ -319,10 +350,9 @@ class KernelMixture:
         order = torch.argsort(torch.tensor(self._ends).diff(), stable=True)
         for rows in torch.split(order, _TOGETHER):
             pairs = [self._pairs_of(row) for row in rows.tolist()]
-            full = pad_sequence([each.solved for each in pairs], batch_first=True).mT
-            which = pad_sequence([each.series for each in pairs], batch_first=True)
-            weighed = pad_sequence([each.weight for each in pairs], batch_first=True)
-            found.append((rows, which, weighed, self.eigen[1][rows] @ full))
+            parts = ("series", "weight", "solved", "inverse", "scale")
+            each = (pad_sequence([getattr(pair, name) for pair in pairs], batch_first=True) for name in parts)
+            found.append((rows, tuple(each)))
         return found
 
     def _inverses(self) -> Iterator[Float64[Tensor, "kernels contacts series"]]:
@@ -401,6 +431,14 @@ def active_series(values: Float64[Tensor, "contacts series"]) -> Bool[Tensor, " 
     """Return which series have any energy, over the strongest's: more than rounding leaves of none."""
     power = values.square().sum(0)
     return power > 1e-20 * power.max()
+
+
+def _mean_magnitude(mean: Float64[Tensor, "*shape"], variance: Float64[Tensor, "*shape"]) -> Float64[Tensor, "*shape"]:
+    """Return the mean of the magnitude of normal variables: that of the folded normal distribution."""
+    deviation = variance.sqrt()
+    scaled = mean / deviation.clamp_min(_TINY)
+    around = deviation * math.sqrt(2.0 / math.pi) * torch.exp(-0.5 * scaled.square())
+    return around + mean * torch.erf(scaled * math.sqrt(0.5))
 
 
 def _eigen(kernels: Float64[Tensor, "kernels contacts contacts"]) -> tuple[Tensor, Tensor]:

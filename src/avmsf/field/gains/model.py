@@ -18,7 +18,7 @@ from avmsf.fem.modestate import mode_sizes, mode_skeleton, mode_tensors, restore
 from avmsf.field.gainfield import Gains
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import Family, KernelFamily, Sites, nearest_sites, sites_along
-from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
+from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture, Predictions
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.scene.symmetrycharacters import Group
@@ -63,6 +63,8 @@ class MixtureGains:
     """Of the kept kernels in this order; its series are the real parts of all modes' gains, then the imaginary ones."""
     directional: bool
     """Whether directions of impacts are known, or a body says which way its surface faces."""
+    spread_share: float = 0.0
+    """How much of the deviation within hypotheses the magnitudes of rendered gains take into account, 0 to 1."""
     measured: Complex128[Tensor, "contacts modes"] | None = None
     """The gains of the field's own modes in the recordings, by which the model judges itself; None for `values`."""
     report: dict[str, Any] = field(default_factory=dict)
@@ -129,9 +131,9 @@ class MixtureGains:
     def point_estimate(
         self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
     ) -> Gains:
-        """Return the mean magnitudes of what each hypothesis predicts, with the signs of the mean gains."""
+        """Return the mean magnitudes of the gains, as far as `spread_share` goes, with the signs of the mean gains."""
         sites = self.sites(contacts, directions)
-        magnitudes = [self.mixture.mean_magnitude(self._cross(some)) for some in self._batches(sites)]
+        magnitudes = [self._magnitude(some) for some in self._batches(sites)]
         return _gains(torch.cat(magnitudes).copysign(self._mean(sites)))
 
     def deviation(
@@ -152,16 +154,20 @@ class MixtureGains:
 
     def leave_one_out(self) -> Complex128[Tensor, "contacts modes"]:
         """Return the gains at each contact as the measured ones at all other places predict them."""
-        return _complex(self._left_out[0])
+        return _complex(self._left_out.mean)
+
+    def left_out_estimate(self, share: float) -> Gains:
+        """Return `point_estimate` at each contact from the measured gains at all other places, for a spread share."""
+        left = self._left_out
+        return _gains(left.of_means.lerp(left.magnitude, share).copysign(left.mean))
 
     def standardized_errors(self) -> Float64[Tensor, "contacts modes 2"]:
         """Return the leave-one-place-out errors of the measured gains over their predicted standard deviations.
 
         NaN for parts of modes without any gains.
         """
-        mean, deviation = self._left_out
-        measured = self.values if self.measured is None else self.measured
-        scores = (series_of(measured) - mean) / deviation
+        left, measured = self._left_out, self.values if self.measured is None else self.measured
+        scores = (series_of(measured) - left.mean) / left.deviation
         power = self.mixture.values.square().sum(0)
         return _parts(torch.where(power > 0, scores, torch.nan))
 
@@ -221,6 +227,7 @@ class MixtureGains:
             "contacts": contacts,
             "modes": modes,
             "directional": self.directional,
+            "spread_share": self.spread_share,
             "families": [family.kind for family in self.families],
             "kernels": [len(each) for each in self.kept],
             "bodies": [mode_sizes(family.modes) for family in self._of(Elastic)],
@@ -266,6 +273,8 @@ class MixtureGains:
                 wanted = families.count(kind)
                 raise RecordError(f"{name}: expected {wanted} as in families, got {given}", name=name, value=given)
         like(record["directional"], True, "directional")
+        if not 0.0 <= like(record.get("spread_share", 0.0), 0.0, "spread_share") <= 1.0:
+            raise RecordError.expected("0 to 1", record["spread_share"], name="spread_share")
         single, double, integer = torch.float32, torch.float64, torch.int64
         sizes: dict[str, tuple[torch.dtype, *tuple[int, ...]]] = {
             "points": (single, points, 3),
@@ -314,7 +323,9 @@ class MixtureGains:
         kernels = torch.cat([family.kernels()[rows] for family, rows in zip(families, kept, strict=True)])
         values, measured = (torch.view_as_complex(tensors[name].contiguous()) for name in ("values", "measured"))
         mixture = KernelMixture(kernels, series_of(values), tensors["noise_floor"], tensors["weights"])
-        return cls(tensors["points"], training, families, tuple(kept), mixture, record["directional"], measured)
+        # Files of earlier versions have none: their fields were chosen with each hypothesis's mean alone.
+        share = record.get("spread_share", 0.0)
+        return cls(tensors["points"], training, families, tuple(kept), mixture, record["directional"], share, measured)
 
     def _of(self, kind: type[Family]) -> list[Family]:
         """Return the families of a kind."""
@@ -335,7 +346,7 @@ class MixtureGains:
         return [family.coefficients(kept, each) for family, kept, each in rows]
 
     @cached_property
-    def _left_out(self) -> tuple[Float64[Tensor, "contacts series"], Float64[Tensor, "contacts series"]]:
+    def _left_out(self) -> Predictions:
         """Of the measured gains: those that were refined end to end have seen the recordings that are left out."""
         mixture = self.mixture if self.measured is None else self.mixture.with_values(series_of(self.measured))
         return mixture.leave_out(self.places)
@@ -376,10 +387,11 @@ class MixtureGains:
         means = [family.mean(sites, self.training, coefficients) for family, coefficients in pairs]
         return torch.stack(means).sum(0)
 
-    def _cross(self, sites: Sites) -> Float64[Tensor, "kernels sites contacts"]:
-        """Return the covariances between places and contacts of each kept kernel."""
-        pairs = zip(self.families, self.kept, strict=True)
-        return torch.cat([family.between(sites, self.training, kept) for family, kept in pairs])
+    def _magnitude(self, sites: Sites) -> Float64[Tensor, "sites series"]:
+        pairs = list(zip(self.families, self.kept, strict=True))
+        cross = torch.cat([family.between(sites, self.training, kept) for family, kept in pairs])
+        own = torch.cat([family.own(sites, kept) for family, kept in pairs])
+        return self.mixture.mean_magnitude(cross, own, self.spread_share)
 
     def _batches(self, sites: Sites) -> Iterator[Sites]:
         """Yield the sites in batches whose covariances fit the memory; one, without any, where there are none."""
