@@ -247,6 +247,9 @@ def test_a_record_is_refused_where_anything_is_missing_or_wrong(name, tmp_path):
         for other in wrong[type(value)]:
             with raises(FieldFileError, file="plate.safetensors"):
                 load(changed(name, tmp_path, {}, {"gains": whole | {key: other}}))
+        if key == "spread_share":
+            # Files of earlier versions have none.
+            continue
         missing = {each: whole[each] for each in whole if each != key}
         with raises(FieldFileError, file="plate.safetensors", name=key):
             load(changed(name, tmp_path, {}, {"gains": missing}))

@@ -363,7 +363,6 @@ def test_wrong_records_are_refused(name):
     """By errors that the reader of files expects."""
     record = model().record()
     missing = {key: value for key, value in record.items() if key != name}
-    # Files of earlier versions have no share.
     for wrong in (*[missing] * (name != "spread_share"), *({**record, name: value} for value in WRONG[name])):
         with pytest.raises((ValueError, TypeError, KeyError)):
             MixtureGains.skeleton(wrong)
