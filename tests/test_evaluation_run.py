@@ -130,6 +130,9 @@ def test_a_failing_method_stops_no_other_and_is_tried_again(plates: Path, tmp_pa
     told = "no fit" if isinstance(fault, AvmsfError) else "ZeroDivisionError: by zero"
     assert [each["failure"] for each in summary["failures"]] == [told, told]
     assert set(summary["methods"]) == {"knn3"}
+    kept = [each.failure or "" for each in results.read("a").outcomes if each.method == "counting"]
+    # A fault of the program keeps the place where it happened.
+    assert ["in fit" in failure for failure in kept] == [not isinstance(fault, AvmsfError)]
     run_objects(planned(plates, replace(broken, raising=None), "knn3"), ("a", "b"), results)
     summary = summed(tmp_path)
     assert summary["failures"] == []

@@ -1,48 +1,45 @@
-"""Names of the hub are told from paths, one question says whether it answers, and settings are JSON objects."""
+"""Names of the hub are told from paths, a download that fails has a reason, and settings are JSON objects."""
 
 import json
 import threading
-from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
-from types import ModuleType
-from urllib.error import HTTPError, URLError
 
 import pytest
 
 from avmsf.errors import SceneError
-from avmsf.hub import expect_answer, is_hub_name, read_settings
+from avmsf.hub import is_hub_name, read_settings, why_not
 from raising import raises
 
 
-@pytest.fixture
-def constants(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """Return the settings of the hub's client, which may ask."""
-    found: ModuleType = pytest.importorskip("huggingface_hub.constants")
-    monkeypatch.setattr(found, "HF_HUB_OFFLINE", False)
-    return found
+class Gate(BaseHTTPRequestHandler):
+    """Refuses everything, with the code that is the first part of the path."""
+
+    def do_HEAD(self) -> None:
+        self.send_error(int(self.path.split("/")[1]))
+
+    def do_GET(self) -> None:
+        self.do_HEAD()
+
+    def log_message(self, *_: object) -> None:
+        return
 
 
-@pytest.fixture(params=[401])
-def asked(
-    constants: ModuleType, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
-) -> Iterator[list[str]]:
-    """Paths that a hub of our own is asked for; it refuses all, as the hub does gated models, or otherwise."""
-    paths: list[str] = []
-
-    class Gate(BaseHTTPRequestHandler):
-        def do_HEAD(self) -> None:
-            paths.append(self.path)
-            self.send_error(request.param)
-
-        def log_message(self, *_: object) -> None:
-            return
-
+@pytest.mark.parametrize("code", [401, 404, 503, None])
+def test_why_a_model_cannot_be_had_is_the_servers_code_or_that_there_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int | None
+) -> None:
+    client = pytest.importorskip("huggingface_hub")
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
     with HTTPServer(("127.0.0.1", 0), Gate) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        monkeypatch.setattr(constants, "ENDPOINT", f"http://127.0.0.1:{server.server_port}")
-        yield paths
+        place = "http://127.0.0.1:9" if code is None else f"http://127.0.0.1:{server.server_port}/{code}"
+        with pytest.raises(OSError) as caught:
+            client.snapshot_download("owner/model", cache_dir=tmp_path, endpoint=place)
         server.shutdown()
+    assert why_not(caught.value) == (
+        "the server cannot be reached" if code is None else f"the server answered with code {code}"
+    )
 
 
 @pytest.mark.parametrize("name", ["laion/clap-htsat-unfused", "stabilityai/stable-audio-open-1.0"])
@@ -57,32 +54,6 @@ def test_a_path_is_no_name(source: str) -> None:
 
 def test_a_path_object_is_no_name() -> None:
     assert not is_hub_name(Path("owner/model"))
-
-
-def test_a_refusal_is_an_answer(asked: list[str]) -> None:
-    expect_answer("owner/model", "config.json")
-    assert asked == ["/owner/model/resolve/main/config.json"]
-
-
-@pytest.mark.parametrize("asked", [503], indirect=True)
-def test_a_hub_that_fails_does_not_answer(asked: list[str]) -> None:
-    with pytest.raises(HTTPError) as caught:
-        expect_answer("owner/model", "config.json")
-    assert caught.value.code == 503
-    assert len(asked) == 1
-
-
-def test_offline_nobody_is_asked(asked: list[str], constants: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
-    expect_answer("owner/model", "config.json")
-    assert asked == []
-
-
-def test_where_nobody_answers_it_is_told(constants: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
-    with pytest.raises(URLError) as caught:
-        expect_answer("owner/model", "config.json")
-    assert isinstance(caught.value.reason, ConnectionRefusedError)
 
 
 @pytest.mark.parametrize(

@@ -306,6 +306,29 @@ def test_the_worker_ends_when_its_parent_does(taken: tuple[View, ...], tmp_path:
     assert not (tmp_path / "result.json").exists()
 
 
+def test_only_what_cannot_be_written_is_called_unwritable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = pictures(tmp_path / "cup", "abc")
+    (tmp_path / "file").write_text("")
+    with raises(CaptureError, file="sfm") as caught:
+        estimate_cameras(folder / "images", tmp_path / "file" / "sfm")
+    assert "writable" in str(caught.value)
+
+    def gone(*_: object, **__: object) -> None:
+        raise FileNotFoundError(2, "No such file or directory", str(folder / "images/b.png"))
+
+    monkeypatch.setattr("avmsf.capture.sfm._stage_image", gone)
+    with raises(CaptureError, file="b.png"):
+        estimate_cameras(folder / "images", folder)
+    monkeypatch.undo()
+
+    def full(*_: object, **__: object) -> None:
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr("avmsf.capture.sfm.subprocess.Popen", full)
+    with raises(CaptureError, name="starting"):
+        estimate_cameras(folder / "images", folder)
+
+
 def test_what_cannot_begin_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = pictures(tmp_path / "cup", "ab")
     with raises(CaptureError, file="images", name="photographs", value=2):

@@ -7,7 +7,9 @@ import pytest
 import scipy.signal
 import torch
 
+from avmsf.errors import ArrayError
 from avmsf.modal.spectra import envelope, htk_filters, log_mel, magnitude_stft, slaney_filters
+from raising import raises
 
 
 def noise(rows: int, samples: int, seed: int = 0) -> torch.Tensor:
@@ -116,7 +118,7 @@ def test_log_mel_is_a_logarithm_above_its_floor():
 
 @pytest.mark.parametrize("make", [htk_filters, slaney_filters])
 def test_filters_refuse_a_band_or_a_count_that_the_fft_cannot_give(make):
-    with pytest.raises(ValueError):
+    with raises(ArrayError, name="highest"):
         make(10, fft_size=512, sample_rate=8000.0, lowest=0.0, highest=5000.0)
-    with pytest.raises(ValueError):
+    with raises(ArrayError, name="count"):
         make(80, fft_size=128, sample_rate=44100.0, lowest=0.0, highest=22050.0)

@@ -1,9 +1,7 @@
-"""Published models: their names on the hub, whether the hub answers, and their settings."""
+"""Published models: their names on the hub, why one cannot be had, and their settings."""
 
 from pathlib import Path
 from typing import Any
-from urllib.error import HTTPError, URLError
-from urllib.request import Request, urlopen
 
 from avmsf._utils.text_files import read_json
 from avmsf.errors import AvmsfError
@@ -18,29 +16,14 @@ def is_hub_name(source: str | Path) -> bool:
     return isinstance(source, str) and len(words) == 2 and all(words) and words[0][0] not in ".~"
 
 
-def expect_answer(name: str, file: str) -> None:
-    """Ask the hub once for a model's file, unless its client is told to stay offline; raise OSError where nobody is.
-
-    Without a network, or where the hub itself fails, its client tries again for half a minute. A refusal is an answer:
-    the client asks again with the user's token. Needs the package huggingface_hub.
-    """
-    from huggingface_hub import constants
-
-    if constants.HF_HUB_OFFLINE:
-        return
-    try:
-        urlopen(Request(f"{constants.ENDPOINT}/{name}/resolve/main/{file}", method="HEAD"), timeout=HUB_SECONDS).close()
-    except HTTPError as refusal:
-        refusal.close()
-        if refusal.code >= 500:
-            raise
-
-
-def why_not(error: Exception) -> str:
-    """Return in plain words why a model could not be downloaded."""
-    if isinstance(error, HTTPError):
-        return f"the server answered with code {error.code}"
-    if isinstance(error, URLError | ConnectionError | TimeoutError):
+def why_not(error: BaseException) -> str:
+    """Return in plain words why a model could not be downloaded, from an error of the hub's client or its cause."""
+    response = getattr(error, "response", None)
+    if response is not None:
+        return f"the server answered with code {response.status_code}"
+    if error.__cause__ is not None:
+        return why_not(error.__cause__)
+    if "Connect" in type(error).__name__ or isinstance(error, ConnectionError | TimeoutError):
         return "the server cannot be reached"
     return next(iter(str(error).strip().splitlines()), type(error).__name__)[:200].rstrip(".")
 

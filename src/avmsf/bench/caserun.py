@@ -22,10 +22,10 @@ from avmsf.bench.locatingmethods import located
 from avmsf.bench.methods import report_of
 from avmsf.bench.plan import Evaluation
 from avmsf.bench.renderer import Renderer, expect_renderer
-from avmsf.bench.results import CaseRecord, Outcome, one_line
+from avmsf.bench.results import CaseRecord, Outcome, failure_of
 from avmsf.bench.task import Look, Method, Task
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import AvmsfError, EvaluationError
+from avmsf.errors import EvaluationError
 from avmsf.fem.family import BodyFamily
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.modal.extraction.extract import Extraction, extract_once
@@ -113,10 +113,8 @@ class CaseRun:
                 sounds = renderer.render(recordings.test.contacts, directions=recordings.test.directions)
             render_seconds = time.perf_counter() - begun
             judgement, maps = self._judgement(method, recordings, renderer, sounds)
-        except AvmsfError as error:
-            return Outcome(self.case.key, method.name, failure=one_line(error))
         except Exception as error:  # A fault in one method must not cost the others their hours.
-            return Outcome(self.case.key, method.name, failure=f"{type(error).__name__}: {one_line(error)}")
+            return Outcome(self.case.key, method.name, failure=failure_of(error))
         return Outcome(
             self.case.key,
             method.name,

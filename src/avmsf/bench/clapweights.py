@@ -7,7 +7,7 @@ from typing import Any, Final
 from torch import nn
 
 from avmsf.errors import EvaluationError
-from avmsf.hub import HUB_SECONDS, expect_answer, is_hub_name, read_settings, why_not
+from avmsf.hub import HUB_SECONDS, is_hub_name, read_settings, why_not
 
 MODELS: Final = ("laion/clap-htsat-unfused", "laion/clap-htsat-fused", "laion/larger_clap_general")
 """Names under which the hub has networks that fit."""
@@ -114,7 +114,6 @@ def _from_hub(name: str) -> Path:
     except Exception:  # not in the cache: the hub's client has an error of its own for each way of not being there
         pass
     try:
-        expect_answer(name, _CONFIG)
         for weights in _WEIGHTS:
             folder = Path(snapshot_download(name, allow_patterns=[*settings, weights], etag_timeout=HUB_SECONDS))
             if (folder / weights).is_file():

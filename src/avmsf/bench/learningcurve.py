@@ -54,7 +54,7 @@ def curves(record: ObjectRecord, *, metric: str) -> tuple[Curve, ...]:
         raise EvaluationError(
             f"{record.identifier}: expected a metric of {', '.join(known)}, got {metric!r}"
             if known
-            else f"{record.identifier}: {reason or 'no value'}",
+            else f"{record.identifier}: {(reason or 'no value').splitlines()[0]}",
             name="metric",
             value=metric,
         )

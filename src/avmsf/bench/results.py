@@ -3,13 +3,14 @@
 import json
 import math
 import re
+import traceback
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from avmsf._utils.text_files import read_json
-from avmsf.errors import EvaluationError
+from avmsf.errors import AvmsfError, EvaluationError
 from avmsf.files import write_whole
 
 IDENTITY, OBJECTS = "protocol.json", "objects"
@@ -44,7 +45,7 @@ class Outcome:
     maps: Mapping[str, str] = field(default_factory=dict)
     """Files of located contacts' maps, likewise."""
     failure: str | None = None
-    """Reason for missing values, in one line."""
+    """Reason for missing values, in the first line (`failure_of`)."""
     digest: str = ""
     """Of the files that a method's sounds are read from (`FromFiles`); empty for all other methods."""
 
@@ -217,9 +218,12 @@ def write_json(place: Path, values: Mapping[str, Any]) -> None:
     write_whole(place, lambda path: path.write_text(words + "\n", encoding="utf-8"), raising=EvaluationError)
 
 
-def one_line(error: Exception) -> str:
-    """Return an error's message as one line."""
-    return " ".join(str(error).split())
+def failure_of(error: Exception) -> str:
+    """Return an error of the package as one line; any other with its name, and its traceback in the lines below."""
+    message = " ".join(str(error).split())
+    if isinstance(error, AvmsfError):
+        return message
+    return "\n".join((f"{type(error).__name__}: {message}", *traceback.format_tb(error.__traceback__)))
 
 
 def natural(words: str) -> tuple[tuple[int, int, str], ...]:

@@ -15,7 +15,7 @@ from avmsf.bench.cases import Case, Places
 from avmsf.bench.knowntruth import truth_at, truth_from_first_sample, truth_of
 from avmsf.bench.otherobjects import draw_stranger
 from avmsf.bench.plan import Evaluation
-from avmsf.bench.results import CaseRecord, ObjectRecord, ResultsFolder, one_line
+from avmsf.bench.results import CaseRecord, ObjectRecord, ResultsFolder, failure_of
 from avmsf.bench.task import FromFiles
 from avmsf.capture.datasets.dataset import ObjectFacts
 from avmsf.capture.impacts import Impacts
@@ -43,11 +43,8 @@ def run_object(
             if truth is not None:
                 truth = truth_from_first_sample(truth_at(truth, impacts.names), impacts)
             facts, cases = evaluation.dataset.facts(identifier), evaluation.protocol.choosing.cases(impacts)
-        except AvmsfError as error:
-            results.write(replace(record, failure=one_line(error)))
-            return
-        except (OSError, ValueError) as error:  # A damaged object must not cost the others their hours.
-            results.write(replace(record, failure=f"{type(error).__name__}: {one_line(error)}"))
+        except (AvmsfError, OSError, ValueError) as error:  # A damaged object must not cost the others their hours.
+            results.write(replace(record, failure=failure_of(error)))
             return
         record = _described(_of_same_recordings(record, digest, evaluation, results), impacts, facts, cases)
         results.write(record)

@@ -14,8 +14,6 @@ from avmsf.evaluation.sonicgauss.small import SmallWeights
 from avmsf.evaluation.sonicgauss.small_renderer import TUNING, SmallRenderer, fit_small
 from avmsf.evaluation.sonicgauss.tuning import TrainingConfig
 
-"""What the names of the methods begin with; a folder or a file follows."""
-
 
 @dataclass(frozen=True)
 class SonicGaussMethod:

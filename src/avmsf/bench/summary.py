@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from avmsf.bench.protocols import BASELINE
-from avmsf.bench.results import ObjectRecord
+from avmsf.bench.results import ObjectRecord, Outcome
 
 RISING = frozenset({"mac", "found"})
 """Metrics of which more is better; all others are errors, and only they have ratios."""
@@ -171,18 +171,22 @@ def missing_of(records: Iterable[ObjectRecord], wanted: Mapping[str, Sequence[st
 
 
 def failures_of(records: Iterable[ObjectRecord]) -> list[dict[str, str | None]]:
-    """Return the failures with their reasons."""
+    """Return the failures with their reasons, each in one line."""
     found: list[dict[str, str | None]] = []
     for record in records:
         if record.failure is not None:
-            found.append({"object": record.identifier, "case": None, "method": None, "failure": record.failure})
+            found.append({"object": record.identifier, "case": None, "method": None, "failure": _reason(record)})
         order = {case.key: number for number, case in enumerate(record.cases)}
         failed = [each for each in record.outcomes if each.failure is not None]
         found += [
-            {"object": record.identifier, "case": each.case, "method": each.method, "failure": each.failure}
+            {"object": record.identifier, "case": each.case, "method": each.method, "failure": _reason(each)}
             for each in sorted(failed, key=lambda each: (order.get(each.case, len(order)), each.method))
         ]
     return found
+
+
+def _reason(failed: ObjectRecord | Outcome) -> str:
+    return (failed.failure or "").partition("\n")[0]
 
 
 def times_of(records: Iterable[ObjectRecord]) -> dict[str, dict[str, Any]]:

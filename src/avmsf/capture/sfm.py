@@ -119,6 +119,9 @@ def estimate_cameras(
         (output / "sparse").mkdir(exist_ok=True)
         os.rename(begun / "models" / str(models[0]["number"]), output / "sparse" / "0")
     except OSError as error:
+        place = Path(error.filename or output)
+        if place.is_relative_to(images) or (not begun.is_relative_to(place) and not place.is_relative_to(output)):
+            raise CaptureError.expected("a readable file", error.strerror, file=place) from error
         raise unwritable(output, error, raising=CaptureError) from error
     finally:
         shutil.rmtree(begun, ignore_errors=True)
@@ -242,9 +245,14 @@ def _run_worker(begun: Path, *, timeout: float, progress: Callable[[MotionProgre
     # -P keeps this folder, whose modules have common names, from where the worker looks for libraries.
     command = [sys.executable, "-P", str(WORKER), str(begun / "job.json")]
     with open(log, "wb") as output:
-        worker = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
-        )
+        try:
+            worker = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+            )
+        except OSError as error:
+            raise CaptureError.expected(
+                "a process for structure from motion", error.strerror, name="starting"
+            ) from error
         try:
             while worker.poll() is None:
                 seconds = time.monotonic() - start

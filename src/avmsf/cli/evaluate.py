@@ -19,6 +19,7 @@ from avmsf.bench.parallel import RunProgress, Workers, run_objects
 from avmsf.bench.pictures import save_picture
 from avmsf.bench.plan import Evaluation
 from avmsf.bench.protocols import LEARNING_CURVE, PREDEFINED, EvaluationProtocol, protocol_named
+from avmsf.bench.published import PUBLISHED
 from avmsf.bench.report import PAGE, SUMMARY, TABLES, write_figures, write_page, write_summary
 from avmsf.bench.reporttables import Section
 from avmsf.bench.results import IDENTITY, ResultsFolder, write_json
@@ -265,7 +266,10 @@ def looks_of(methods: Sequence[Method], protocol: EvaluationProtocol) -> frozens
 
 def title_of(dataset: Dataset, folder: Path) -> str:
     """Return a dataset's name in reports: captures by their folder, which identifies them."""
-    return folder.resolve().name if isinstance(dataset, CaptureCollection) else dataset.name
+    if not isinstance(dataset, CaptureCollection):
+        return dataset.name
+    name = folder.resolve().name
+    return f"{name} (captures)" if any(name in each.titles for each in PUBLISHED) else name
 
 
 def _print(part: Section, screen: Console) -> None:

@@ -13,6 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf.errors import ArrayError
+
 
 def magnitude_stft(
     sounds: Float[Tensor, "contacts samples"], *, fft_size: int, hop: int
@@ -65,7 +67,7 @@ def htk_filters(
 ) -> Float[Tensor, "mels bins"]:
     """Return triangles of height one, evenly spaced on the mel scale 2595 log10(1 + f / 700).
 
-    They fill the band from `lowest` to `highest`. Frequencies in Hz; float64. Raises ValueError for a band outside 0 Hz
+    They fill the band from `lowest` to `highest`. Frequencies in Hz; float64. Raises ArrayError for a band outside 0 Hz
     to half the rate, and where a triangle is so narrow that it falls between two bins.
     """
     ends = [2595.0 * math.log10(1.0 + frequency / 700.0) for frequency in (lowest, highest)]
@@ -97,9 +99,10 @@ def _triangles(edges: Float[Tensor, " edges"], *, fft_size: int, sample_rate: fl
     """Return triangles of height one over each three edges in a row (Hz), sampled at the FFT's bins."""
     # Edges come back from the mel scale with rounding, so that the top may exceed half the rate by its last digit.
     if not 0.0 <= edges[0] < edges[-1] <= 0.5 * sample_rate * (1.0 + 1e-9):
-        raise ValueError(
-            f"mel filters need 0 <= lowest < highest <= {0.5 * sample_rate:g} Hz, half the sample rate; "
-            f"got {edges[0]:g} to {edges[-1]:g} Hz"
+        raise ArrayError.expected(
+            f"mel filters from 0 Hz or above to {0.5 * sample_rate:g} Hz, half the sample rate, at most",
+            f"{edges[0]:g} to {edges[-1]:g} Hz",
+            name="highest",
         )
     bins = torch.arange(fft_size // 2 + 1, dtype=torch.float64) * (sample_rate / fft_size)
     rising = (bins - edges[:-2, None]) / (edges[1:-1] - edges[:-2])[:, None]
@@ -107,8 +110,11 @@ def _triangles(edges: Float[Tensor, " edges"], *, fft_size: int, sample_rate: fl
     triangles = torch.clamp(torch.minimum(rising, falling), min=0.0)
     empty = torch.nonzero(triangles.sum(dim=1) == 0.0).flatten()
     if len(empty):
-        raise ValueError(
-            f"{len(edges) - 2} mel filters are too many for an FFT of {fft_size} samples at {sample_rate:g} Hz: filter "
-            f"{int(empty[0]) + 1} falls between two bins; use fewer filters or a longer FFT"
+        raise ArrayError.expected(
+            f"mel filters that each hold a bin of an FFT of {fft_size} samples at {sample_rate:g} Hz",
+            len(edges) - 2,
+            got=f"{len(edges) - 2} filters, of which number {int(empty[0]) + 1} falls between two bins",
+            name="count",
+            advice="use fewer filters or a longer FFT",
         )
     return triangles

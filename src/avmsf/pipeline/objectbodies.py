@@ -16,7 +16,6 @@ from avmsf.pipeline.bodies import candidate_bodies, roughened
 from avmsf.pipeline.scene import SceneStages
 from avmsf.pipeline.stages import StageFolder
 
-"""What an object's shape is known by: its mesh; Gaussians fitted to its views; its mesh as a bad scan has it."""
 NOISE = 0.02
 """Displacement of a noisy mesh's vertices over the object's size."""
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from avmsf.errors import SceneError
-from avmsf.hub import HUB_SECONDS, expect_answer, read_settings, why_not
+from avmsf.hub import HUB_SECONDS, read_settings, why_not
 from avmsf.scene.encode import unit_image
 
 MODELS: Final = tuple(
@@ -126,15 +126,14 @@ def _find(source: str | Path) -> tuple[Path, str]:
 def _from_hub(name: str) -> Path:
     """Return the folder of a model in the hub's cache, after downloading it where it is not there."""
     _transformers()
-    from huggingface_hub import hf_hub_download, try_to_load_from_cache
+    from huggingface_hub import snapshot_download, try_to_load_from_cache
 
     wanted = (_CONFIG, _PREPROCESSOR, _WEIGHTS)
     cached = [try_to_load_from_cache(name, file) for file in wanted]
     if all(isinstance(path, str) for path in cached):
         return Path(str(cached[0])).parent
     try:
-        expect_answer(name, _CONFIG)
-        paths = [hf_hub_download(name, file, etag_timeout=HUB_SECONDS) for file in wanted]
+        return Path(snapshot_download(name, allow_patterns=list(wanted), etag_timeout=HUB_SECONDS))
     except Exception as error:  # the hub's client raises whatever the network beneath it does
         raise SceneError(
             f"{name}: expected its weights, got none: they could not be downloaded ({why_not(error)}); save {_CONFIG}, "
@@ -143,7 +142,6 @@ def _from_hub(name: str) -> Path:
             name="encoder",
             value=name,
         ) from error
-    return Path(paths[0]).parent
 
 
 def _load_model(folder: Path, device: torch.device) -> nn.Module:

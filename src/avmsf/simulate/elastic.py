@@ -63,13 +63,6 @@ class ElasticModes:
         """Return the distance of each place from the surface, meters."""
         return torch.from_numpy(self._nearest(places).distances)
 
-    def at_with_normals(
-        self, places: Float[Tensor, "contacts 3"]
-    ) -> tuple[Float64[Tensor, "contacts modes 3"], Float64[Tensor, "contacts 3"]]:
-        """Return what `at` and `normals` do, for one search of the surface."""
-        found = self._nearest(places)
-        return self._shapes_in(found), self._normals_of(found)
-
     def gains(
         self, places: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"]
     ) -> Float64[Tensor, "contacts modes"]:

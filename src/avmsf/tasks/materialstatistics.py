@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,14 +11,12 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from avmsf._utils.arrays import Seed, generator_of
-from avmsf.errors import EditError, ExtractionError
+from avmsf.errors import EditError
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.extraction.extract import extract_sounds
-from avmsf.modal.extraction.finders import HighResolution
 from avmsf.modal.synthesis import synthesize
 from avmsf.simulate.material import Material
-from avmsf.tasks.reference import Reference, read_clip, wav_files
+from avmsf.tasks.reference import Reference
 
 _QUANTILES = 64
 _POINTS = 64
@@ -103,30 +100,6 @@ class MaterialStatistics:
         spread = float((apart**2).sum())
         slope = float((apart * loud).sum()) / spread if spread > 0 else 0.0
         return cls(name, frequency[order][rows], float(law[0] / columns[0]), float(law[1] / columns[1]), slope)
-
-    @classmethod
-    def of_recordings(
-        cls, paths: str | Path | Sequence[str | Path], *, name: str | None = None, sample_rate: float = 44100.0
-    ) -> "MaterialStatistics":
-        """Summarize the modes in recordings of impacts on objects of one material; a folder means its wav files.
-
-        They are resampled to `sample_rate`, Hz. Raises `EditError` for what cannot be read, is silent or too short, and
-        where a recording holds no modes.
-        """
-        found = wav_files(paths)
-        banks, gains = [], []
-        for path in found:
-            clip = read_clip(path, sample_rate=sample_rate)
-            try:
-                modes = extract_sounds(clip[None], sample_rate=sample_rate, method=HighResolution(modes=_MODES))
-            except ExtractionError as error:
-                raise EditError(
-                    f"{path}: expected an impact with modes, got {error}",
-                    **{**error.attributes, "file": path},
-                ) from error
-            banks.append(modes.bank)
-            gains.append(torch.hypot(modes.gains[0], modes.quadrature[0]))
-        return cls.of_modes(banks, gains, name=name or found[0].parent.name)
 
     @classmethod
     def transform(cls, field: SoundField, old: Material, new: Material) -> "MaterialStatistics":

@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from avmsf.errors import EditError
-from avmsf.hub import expect_answer, is_hub_name, read_settings, why_not
+from avmsf.hub import is_hub_name, read_settings, why_not
 from avmsf.tasks.config import STABLE_AUDIO
 
 _CLASS, _INDEX = "StableAudioPipeline", "model_index.json"
@@ -95,7 +95,6 @@ def _from_hub(kind: Any, name: str) -> Path:
     except Exception:  # not there, or not whole; the client raises whatever it does
         pass
     try:
-        expect_answer(name, _INDEX)
         return Path(kind.download(name))
     except Exception as error:  # the hub's client raises whatever the network beneath it does
         raise EditError(

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
 from scipy.signal import resample_poly
 from torch import Tensor
 
@@ -15,7 +17,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.onset import find_onset
 from avmsf.errors import ExtractionError
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.extraction.extract import extract_modes, extract_sounds
+from avmsf.modal.extraction.extract import extract_modes, extract_once, extract_sounds
 from avmsf.modal.extraction.finders import HighResolution, ShortTime, lowest_frequency
 from avmsf.modal.synthesis import synthesize
 from avmsf.simulate.plate import Plate, PlateModes, plate_modes, sample_contacts, strike
@@ -301,6 +303,17 @@ def test_the_bowls_doublet_is_resolved(shared: Path):
 def test_no_modes_at_all_cannot_be_asked_for(method) -> None:
     with raises(ExtractionError, name="modes", value=0):
         method(modes=0)
+
+
+@pytest.mark.parametrize("lacking", ["frequency", "quadrature", "residual"])
+def test_a_kept_file_that_lacks_a_tensor_is_made_again(tmp_path: Path, lacking: str) -> None:
+    impacts, path = recorded(-40.0)[0], tmp_path / "modes.safetensors"
+    found = extract_once(impacts, HighResolution(modes=4), path)
+    with safe_open(path, framework="pt") as file:
+        kept, metadata = {name: file.get_tensor(name) for name in file.keys()}, file.metadata()  # noqa: SIM118
+    del kept[lacking]
+    save_file(kept, path, metadata)
+    assert torch.equal(extract_once(impacts, HighResolution(modes=4), path).bank.frequency, found.bank.frequency)
 
 
 def test_the_same_sounds_give_the_same_modes_to_the_last_bit() -> None:

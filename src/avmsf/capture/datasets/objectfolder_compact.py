@@ -25,7 +25,6 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.surface import Surface, find_surface
 from avmsf.errors import CaptureError, DatasetError
 
-"""What a complete copy holds; pictures, touch and spectrograms beside them are not used."""
 POINTS = ArrayForm("float64", (1024, 3))
 SETTINGS = CaptureSettings(normalize="none")
 SPLITS = ("train", "val", "test")

@@ -38,7 +38,6 @@ from avmsf.simulate.nominal import NominalBody, body_name
 
 POSITIONAL: dict[str, type[KernelFamily]] = {Smooth.kind: Smooth, ThinPlate.kind: ThinPlate}
 """Families that need nothing but the contacts, by name."""
-"""The Gaussian process over all kernel families, the paper's attention network, or the process over one family."""
 FAMILIES = (*POSITIONAL, Symmetric.kind, Elastic.kind)
 """What the model is made of besides the unstructured family, which is always there."""
 KNOWN = (*FAMILIES, Visual.kind)

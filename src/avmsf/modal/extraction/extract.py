@@ -182,16 +182,16 @@ def _read(path: Path, digest: str, train: Impacts) -> Extraction | None:
                 return None
             # Clones, for what the file maps into memory goes with it.
             read = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError):
+        kept = {name.removeprefix(_ALIGNMENT): each for name, each in read.items() if name.startswith(_ALIGNMENT)}
+        return Extraction(
+            ModalBank(read["frequency"], read["damping"]),
+            read["gains"],
+            Residual(read["residual"]),
+            read["quadrature"],
+            Alignment.restore(kept, train.names, recording_keys(train)) if kept else None,
+        )
+    except (SafetensorError, OSError, KeyError):
         return None
-    kept = {name.removeprefix(_ALIGNMENT): each for name, each in read.items() if name.startswith(_ALIGNMENT)}
-    return Extraction(
-        ModalBank(read["frequency"], read["damping"]),
-        read["gains"],
-        Residual(read["residual"]),
-        read["quadrature"],
-        Alignment.restore(kept, train.names, recording_keys(train)) if kept else None,
-    )
 
 
 def _digest(train: Impacts, method: ModeFinder) -> str:

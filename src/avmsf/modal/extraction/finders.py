@@ -28,8 +28,6 @@ nothing in sine phase, and the gain of what is heard would be enormous."""
 _PERIODS = 50
 """How many periods of the lowest frequency the sounds last: with fewer, a mode is not told from rumble."""
 
-"""Finders by name."""
-
 
 @runtime_checkable
 class ModeFinder(Protocol):
