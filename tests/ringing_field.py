@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 import torch
 
-from avmsf.field.gainfield import Gains
+from avmsf.field.gainfield import GainField, Gains
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
@@ -17,7 +17,7 @@ GAINS = (1.0, -0.8, 0.9, 0.6, -0.7, 0.4)
 
 
 @dataclass(frozen=True, eq=False)
-class SameGains:
+class SameGains(GainField):
     """Gains that do not depend on the place."""
 
     gains: torch.Tensor
@@ -30,12 +30,6 @@ class SameGains:
 
     def at(self, contacts, directions=None) -> Gains:
         return Gains(self.gains.expand(len(contacts), -1))
-
-    def point_estimate(self, contacts, directions=None) -> Gains:
-        return self.at(contacts, directions)
-
-    def deviation(self, contacts, directions=None) -> None:
-        return None
 
     def record(self) -> dict[str, Any]:
         return {"modes": len(self.gains)}

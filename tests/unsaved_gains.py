@@ -1,16 +1,10 @@
 """What gain fields of tests lack that only predict: an uncertainty, and a form in a file."""
 
-import torch
+from avmsf.field.gainfield import GainField
 
 
-class Unsaved:
-    """A gain field that knows no doubt and is never kept in a file."""
-
-    def point_estimate(self, contacts: torch.Tensor, directions: torch.Tensor | None = None):
-        return self.at(contacts, directions)
-
-    def deviation(self, contacts: torch.Tensor, directions: torch.Tensor | None = None) -> None:
-        return None
+class Unsaved(GainField):
+    """A gain field without a posterior that is never kept in a file."""
 
     def record(self):
         raise NotImplementedError

@@ -1,11 +1,10 @@
 """What `--help` prints of every verb, and hints for names of earlier versions."""
 
-import re
 from collections.abc import Callable
 
 import pytest
 
-from avmsf.cli import RENAMED, VERBS, main
+from avmsf.cli import RENAMED, main
 from avmsf.cli.options.edit import parse as parse_edit
 from avmsf.cli.options.features import parse as parse_features
 from avmsf.cli.options.simulate import parse as parse_simulate
@@ -13,24 +12,6 @@ from avmsf.errors import AvmsfError
 from raising import raises
 
 Streams = pytest.CaptureFixture[str]
-COLUMNS = 80
-
-
-@pytest.mark.parametrize("verb", VERBS)
-def test_help_fills_the_terminal_and_states_only_defaults_that_say_something(
-    verb: str, capsys: Streams, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", str(COLUMNS))
-    with pytest.raises(SystemExit) as left:
-        main([*(("dataset", "check") if verb == "dataset" else (verb,)), "--help"])
-    assert left.value.code == 0
-    page = capsys.readouterr().out
-    assert max(map(len, page.splitlines())) <= COLUMNS
-    assert not re.search(r"╭─ [\w -]+ options", page)
-    # Sentences of options begin with a capital.
-    assert not re.search(r"--help +[a-z]", page)
-    assert {len(line) for line in page.splitlines() if line[:1] in "╭╰│" and line} <= {COLUMNS}
-    assert not re.search(r"\(default: (None|False|True)?\)|\[[A-Z]+ \[|\bINT\b|\bFLOAT\b|\bWhether\b", page)
 
 
 def test_an_option_may_have_another_name_than_its_attribute() -> None:
@@ -66,10 +47,3 @@ def test_verbs_of_earlier_versions_lead_to_those_of_today(word: str, capsys: Str
 def test_an_option_of_an_earlier_version_leads_to_that_of_today(capsys: Streams) -> None:
     assert main(["render", "field.safetensors", "--at", "0", "0", "0", "-o", "s"]) == 2
     assert "--position" in capsys.readouterr().err
-
-
-def test_words_of_a_choice_are_listed_as_words(capsys: Streams) -> None:
-    with pytest.raises(SystemExit):
-        main(["export", "field.safetensors", "--to", "cheese", "-o", "out"])
-    err = " ".join(capsys.readouterr().err.replace("│", "").split())
-    assert "web, gltf, faust" in err

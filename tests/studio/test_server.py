@@ -53,6 +53,7 @@ from capture_folder import fill, ring
 from opened_plate import RATE, blow, open_plate, plate_field, wav
 from plate_capture import fill_plate
 from raising import raises
+from ringing_field import SameGains
 from served import Served, served
 
 
@@ -455,16 +456,12 @@ def test_a_capture_with_a_field_is_struck_and_its_strikes_are_marked(tmp_path: P
 
 
 def test_a_field_without_geometry_says_so(tmp_path: Path) -> None:
-    class Nowhere:
-        def __init__(self, field: object) -> None:
-            self.field = field
-
-        def __getattr__(self, name: str) -> object:
-            return torch.zeros(0, 3) if name == "points" else getattr(self.field, name)
+    class Nowhere(SameGains):
+        points = torch.zeros(0, 3)
 
     opened = open_plate(tmp_path / "opened")
     field = plate_field()
-    bare = replace(field, gain_field=Nowhere(field.gain_field))
+    bare = replace(field, gain_field=Nowhere(torch.zeros(len(field.bank))))
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(studio, "load", lambda path: bare)
         with raises(StudioError, name="object"):

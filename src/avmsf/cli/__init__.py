@@ -127,9 +127,10 @@ def _run(words: list[str]) -> int:
             print(f"avmsf {words[0]}: {_sentence(known)}", file=sys.stderr)
             return _report_error(known, words)
         except SystemExit as ending:
-            # Of options that cannot be understood, which the standard error has explained.
-            if misused := getattr(ending, "error", None):
-                _report_error(misused, words)
+            if ending.code == BAD_INPUT:
+                # Of options that cannot be understood, which the standard error has explained.
+                advice = f"see `avmsf {words[0]} --help`"
+                _report_error(AvmsfError.expected("known options", words[1:], name=words[0], advice=advice), words)
             raise
         except KeyboardInterrupt:
             print(f"avmsf {words[0]}: interrupted", file=sys.stderr)

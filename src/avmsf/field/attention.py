@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from avmsf._utils.records import RecordError, count_of, like, record_of
 from avmsf.field.config import AttentionShape
-from avmsf.field.gainfield import Gains, TrainableGains
+from avmsf.field.gainfield import GainField, Gains, TrainableGains
 from avmsf.scene.features import FeatureField, Regions
 
 _MAX_LAYERS = 64
@@ -21,7 +21,7 @@ to build before it can be compared with the file's tensors."""
 _EXAMPLE = AttentionShape(clusters=1, bands=0, width=1, hidden=1, layers=0, feature_scale=1.0)
 
 
-class AttentionGains(TrainableGains):
+class AttentionGains(TrainableGains, GainField):
     """Gains from a contact's own feature and from attention over the object's regions (paper, eqs. 7-11).
 
     Holds the points it looks contacts up in, so that a saved network needs nothing else.
@@ -104,12 +104,6 @@ class AttentionGains(TrainableGains):
         """Return the gains at the contacts, for any direction, and the factors where dampings vary."""
         return self.read(self.feature_field.nearest(contacts))
 
-    def point_estimate(
-        self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Gains:
-        """Return what `at` does."""
-        return self.at(contacts, directions)
-
     def read(self, rows: Int[Tensor, " contacts"]) -> Gains:
         """Return what `at` does for the points of the given rows; differentiable in the network's parameters."""
         feature = self.features[rows] * self.shape.feature_scale
@@ -121,12 +115,6 @@ class AttentionGains(TrainableGains):
         hidden = self.head(torch.cat([self.project(attention @ value), feature], dim=1))
         factors = None if self.to_dampings is None else torch.exp(self.to_dampings(hidden))
         return Gains(self.to_gains(hidden) * self.gain_scale, damping=factors)
-
-    def deviation(
-        self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Float[Tensor, "contacts modes 2"] | None:
-        """Return None: the network has no posterior."""
-        return None
 
     def finished(self, order: Int[Tensor, " modes"]) -> "AttentionGains":
         """Return the network with its modes in the given order, ready for use."""

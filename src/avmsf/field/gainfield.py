@@ -1,8 +1,9 @@
 """What every gain field is: gains at contacts, their standard deviation, and nothing about time."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float, Float64, Int
@@ -32,25 +33,22 @@ class Gains:
         return self.parts.square().sum(2)
 
 
-@runtime_checkable
-class GainField(Protocol):
-    """Gains at every contact with one object. One contract test holds for all that implement it."""
+class GainField(ABC):
+    """Gains at every contact with one object. One contract test holds for all subclasses."""
 
     kind: ClassVar[str]
     """What a file calls it."""
 
-    @property
-    def points(self) -> Float[Tensor, "points 3"]:
-        """Points of the object's surface, object frame, meters: where pictures and searches look."""
-        ...
+    points: Float[Tensor, "points 3"]
+    """Points of the object's surface, object frame, meters: where pictures and searches look."""
 
+    @abstractmethod
     def at(self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None) -> Gains:
         """Return the gains of impacts at contacts (object frame, meters).
 
         `directions` are the unit vectors along which the hammer moves. Fields that know of directions take an impact
         straight into the surface where none are given; the others ignore them.
         """
-        ...
 
     def point_estimate(
         self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
@@ -60,7 +58,7 @@ class GainField(Protocol):
         Sounds are compared by magnitudes. Where hypotheses agree that a mode is loud but not on its sign, the mean is
         near zero, and the magnitude that they expect serves better.
         """
-        ...
+        return self.at(contacts, directions)
 
     def deviation(
         self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
@@ -69,28 +67,28 @@ class GainField(Protocol):
 
         None for a field without a posterior.
         """
-        ...
+        return None
 
+    @abstractmethod
     def record(self) -> dict[str, Any]:
         """Return what a file holds besides the tensors, as plain values, sizes included, that of `modes` among them."""
-        ...
 
+    @abstractmethod
     def tensors(self) -> dict[str, Tensor]:
         """Return what a file holds, by name."""
-        ...
 
     @classmethod
+    @abstractmethod
     def skeleton(cls, record: Mapping[str, Any]) -> dict[str, Tensor]:
         """Return tensors on the device `meta`, of the names, shapes and dtypes that belong to a record.
 
         Raises RecordError, ValueError, TypeError or KeyError for a record that belongs to no such field.
         """
-        ...
 
     @classmethod
+    @abstractmethod
     def restore(cls, record: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> "GainField":
         """Return the field of a record and the tensors that belong to it."""
-        ...
 
 
 class TrainableGains(nn.Module):

@@ -24,7 +24,7 @@ _INNER = "fitted."
 
 
 @dataclass(frozen=True, eq=False)
-class ScaledGains:
+class ScaledGains(GainField):
     """Gains that differ from a fitted field's by a factor a mode, so that their ratio between places is the same.
 
     Of a field that is scaled already only the factors change: what is held is always a fitted field.

@@ -1,15 +1,13 @@
-"""What the options of all verbs have in common: how they are parsed, shown and checked."""
+"""What the options of all verbs have in common: how they are parsed and checked."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, fields, is_dataclass
-from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, get_type_hints
 
 import tyro
-from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from avmsf.cli.options.helptext import described_fields, one_column, paragraphs
 from avmsf.cli.options.paths import InputError, path_mark
+from avmsf.config import PRESETS, Preset
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -51,22 +49,40 @@ class Printing(Common):
     """Print the results as one JSON object to standard output, and everything else to standard error."""
 
 
-def parse_options(
-    kind: type[T], verb: str, words: Sequence[str], *, description: str | None = None, default: T | None = None
-) -> T:
+def parse_options(kind: Callable[..., T], verb: str, words: Sequence[str], *, default: T | None = None) -> T:
     """Return the options that the words spell; leaves by SystemExit for help and for what cannot be understood.
 
-    The latter is a `UsageExit`. Raises `InputError` for an option that has another name now.
+    `kind` is a dataclass, or a `functools.partial` of one, whose arguments are then the defaults. Raises `InputError`
+    for an option that has another name now.
     """
     for word in words:
         if word in _RENAMED:
             raise InputError.expected(_RENAMED[word], got=word, name=word)
     given: dict[str, Any] = {} if default is None else {"default": default}
-    with one_column():
-        return tyro.cli(
-            kind, prog=f"avmsf {verb}", args=words, description=paragraphs(description or kind.__doc__ or ""),
-            registry=REGISTRY, **given,
-        )  # fmt: skip
+    return tyro.cli(kind, prog=f"avmsf {verb}", args=words, **given)
+
+
+@dataclass(frozen=True)
+class _Preset:
+    preset: Preset = "default"
+
+
+def preset_of(words: Sequence[str]) -> Preset:
+    """Return the preset that the words name; it is read first, since it decides the defaults of all others."""
+    chosen, _ = tyro.cli(_Preset, args=words, add_help=False, return_unknown_args=True)
+    return chosen.preset
+
+
+def preset_values(preset: Preset, **names: str) -> dict[str, Any]:
+    """Return all settings of a preset, and its name, by the names of their options where these are others."""
+    config = PRESETS[preset]
+    values = {names.get(each.name, each.name): getattr(config, each.name) for each in fields(config)}
+    return {**values, "preset": preset}
+
+
+def option_of(name: str) -> str:
+    """Return the option of a field without a prefix."""
+    return f"--{name.replace('_', '-')}"
 
 
 def spelled(options: object, *, without: Collection[str] = (), prefix: str = "") -> dict[str, str]:
@@ -90,56 +106,3 @@ def spelled(options: object, *, without: Collection[str] = (), prefix: str = "")
             text = " ".join(f"{each:g}" if isinstance(each, float) else str(each) for each in several)
             words[f"--{name}"] = f"--{name} {text}"
     return words
-
-
-def _optional(info: PrimitiveTypeInfo) -> Any:
-    """Show `X | None` as X: that an option may be left out needs no word."""
-    if get_origin(info.type) not in (Union, UnionType):
-        return None
-    kinds = [each for each in get_args(info.type) if each is not NoneType]
-    if len(kinds) != 1 or len(get_args(info.type)) != 2:
-        return None
-    inner = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(kinds[0], info.markers))
-    if not isinstance(inner, PrimitiveConstructorSpec):
-        return inner
-
-    def instance(words: list[str]) -> Any:
-        return None if words == ["None"] else inner.instance_from_str(words)
-
-    return PrimitiveConstructorSpec(
-        nargs=inner.nargs,
-        metavar=inner.metavar,
-        instance_from_str=instance,
-        is_instance=lambda value: value is None or inner.is_instance(value),
-        str_from_instance=lambda value: ["None"] if value is None else inner.str_from_instance(value),
-        choices=inner.choices,
-    )
-
-
-class _Words(tuple[str, ...]):
-    """The words of a choice, as an error lists them."""
-
-    def __str__(self) -> str:
-        return ", ".join(self)
-
-
-def _choice(info: PrimitiveTypeInfo) -> Any:
-    """Read one of several words; an error lists them as words."""
-    if get_origin(info.type) is not Literal:
-        return None
-    values = {str(each): each for each in get_args(info.type)}
-    return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar=f"{{{','.join(values)}}}",
-        instance_from_str=lambda words: values[words[0]],
-        is_instance=lambda value: value in values.values(),
-        str_from_instance=lambda value: [str(value)],
-        choices=_Words(values),
-    )
-
-
-REGISTRY = ConstructorRegistry()
-"""How types are read and shown."""
-REGISTRY.primitive_rule(_choice)
-REGISTRY.primitive_rule(_optional)
-REGISTRY.struct_rule(described_fields)

@@ -8,8 +8,7 @@ from typing import Annotated
 import tyro
 
 from avmsf.capture.datasets.signs import expect_signs
-from avmsf.cli.options.common import REGISTRY, Printing
-from avmsf.cli.options.helptext import one_column
+from avmsf.cli.options.common import Printing
 from avmsf.cli.options.paths import Existing
 
 
@@ -40,8 +39,5 @@ class Options(Printing):
 
 def parse(words: Sequence[str]) -> Options:
     """Return the options that the words spell."""
-    with one_column():
-        options: Options = tyro.extras.subcommand_cli_from_dict(
-            {"check": Options}, prog="avmsf dataset", args=words, registry=REGISTRY
-        )
+    options: Options = tyro.extras.subcommand_cli_from_dict({"check": Options}, prog="avmsf dataset", args=words)
     return options

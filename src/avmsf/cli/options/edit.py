@@ -10,8 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from avmsf.cli.options.checks import OutputError, expect_device, expect_writable
-from avmsf.cli.options.common import Printing, Unit, parse_options
-from avmsf.cli.options.helptext import option_of
+from avmsf.cli.options.common import Printing, Unit, option_of, parse_options
 from avmsf.cli.options.paths import NEW_TENSORS, FieldFile, NewFile, PlotsFolder
 from avmsf.errors import EditError
 from avmsf.simulate.material import material_named
@@ -240,7 +239,7 @@ def parse(words: Sequence[str]) -> Options:
 def _changed(options: Any) -> list[str]:
     """Return which options of a dataclass are not at their defaults, as the command line calls them."""
     return [
-        option_of(each)
+        option_of(each.name)
         for each in dataclasses.fields(options)
         if each.default is not dataclasses.MISSING and getattr(options, each.name) != each.default
     ]

@@ -8,8 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from avmsf.cli.options.common import Flag, Printing, Unit, parse_options
-from avmsf.cli.options.helptext import option_of
+from avmsf.cli.options.common import Flag, Printing, Unit, option_of, parse_options
 from avmsf.cli.options.paths import (
     ContactTable,
     Existing,
@@ -157,6 +156,5 @@ def unused_options(options: Options) -> list[str]:
     for each in fields(options):
         if each.name in _OF_SOME and each.name not in used and getattr(options, each.name) != each.default:
             others = ", ".join(name for name, known in _USED.items() if each.name in known) or "the demo's folders"
-            option = option_of(each)
-            sentences.append(f"{option} is not used by --to {options.to}, only by {others}")
+            sentences.append(f"{option_of(each.name)} is not used by --to {options.to}, only by {others}")
     return sentences

@@ -2,14 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from avmsf.cli.options.common import parse_options
+from avmsf.cli.options.common import parse_options, preset_of
 from avmsf.cli.options.paths import NEW_TENSORS
-from avmsf.cli.options.presets import preset_of, with_defaults
 from avmsf.cli.options.scenes import SceneOptions
 from avmsf.config import PRESETS, LiftConfig, Preset, ViewsConfig
 from avmsf.scene.splatconfig import SplatConfig
@@ -40,5 +40,6 @@ class Options(SceneOptions):
 def parse(words: Sequence[str]) -> Options:
     """Return the options that the words spell, with the preset's settings as defaults."""
     preset = preset_of(words)
-    kind = with_defaults(Options, {"config": PRESETS[preset].scene.lift, "preset": preset})
-    return parse_options(kind, "features", words, description=Options.__doc__)
+    scene = PRESETS[preset].scene
+    defaults = partial(Options, preset=preset, views=scene.views, splat=scene.splat, config=scene.lift)
+    return parse_options(defaults, "features", words)

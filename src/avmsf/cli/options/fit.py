@@ -2,15 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
 from avmsf.cli.options.checks import expect_capture, expect_device, expect_modes
-from avmsf.cli.options.common import Printing, parse_options
+from avmsf.cli.options.common import Printing, parse_options, preset_of, preset_values
 from avmsf.cli.options.paths import NEW_TENSORS, Existing, SettingsFile
-from avmsf.cli.options.presets import preset_of, preset_values, with_defaults
 from avmsf.config import BodyConfig, PipelineConfig, Preset, SceneConfig, TimeZero
 from avmsf.errors import EvaluationError, FitError
 from avmsf.field.config import FitConfig, GainModel
@@ -104,7 +104,7 @@ def parse(words: Sequence[str]) -> Options:
     values = preset_values(preset_of(words), fit="config")
     # Views and features are made beforehand.
     del values["scene"]
-    return parse_options(with_defaults(Options, values), "fit", words, description=Options.__doc__)
+    return parse_options(partial(Options, **values), "fit", words)
 
 
 def expect_split(fraction: float | None, count: int | None) -> None:

@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import tyro
 
 from avmsf.cli.options.checks import expect_capture, expect_modes
-from avmsf.cli.options.common import Printing, parse_options
+from avmsf.cli.options.common import Printing, parse_options, preset_of, preset_values
 from avmsf.cli.options.paths import CaptureFolder, PlotsFolder, SettingsFile
-from avmsf.cli.options.presets import preset_of, preset_values, with_defaults
 from avmsf.config import PipelineConfig, Preset, TimeZero
 from avmsf.modal.config import ExtractionMethod
 
@@ -49,4 +49,4 @@ def parse(words: Sequence[str]) -> Options:
     """Return the options that the words spell, with the preset's settings as defaults."""
     values = preset_values(preset_of(words))
     own = {name: values[name] for name in ("extraction", "modes", "time_zero", "preset")}
-    return parse_options(with_defaults(Options, own), "modes", words, description=Options.__doc__)
+    return parse_options(partial(Options, **own), "modes", words)

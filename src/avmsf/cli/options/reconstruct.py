@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -9,10 +10,9 @@ import tyro
 
 from avmsf.capture.settings import CaptureSettings
 from avmsf.cli.options.checks import expect_modes, expect_rows
-from avmsf.cli.options.common import parse_options
+from avmsf.cli.options.common import parse_options, preset_of, preset_values
 from avmsf.cli.options.fit import expect_split, refuse_with_material
 from avmsf.cli.options.paths import NEW_TENSORS
-from avmsf.cli.options.presets import preset_of, preset_values, with_defaults
 from avmsf.cli.options.scenes import SceneOptions, with_seed
 from avmsf.config import (
     BodyConfig,
@@ -102,4 +102,4 @@ def parse(words: Sequence[str]) -> Options:
     values = preset_values(preset_of(words))
     scene = values.pop("scene")
     values |= {each.name: getattr(scene, each.name) for each in fields(scene)}
-    return parse_options(with_defaults(Options, values), "reconstruct", words, description=Options.__doc__)
+    return parse_options(partial(Options, **values), "reconstruct", words)

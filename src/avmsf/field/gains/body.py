@@ -11,13 +11,13 @@ from torch import Tensor
 from avmsf._utils.records import count_of
 from avmsf._utils.summary import short_repr
 from avmsf.fem.modestate import mode_sizes, mode_skeleton, mode_tensors, restored_modes
-from avmsf.field.gainfield import Gains
+from avmsf.field.gainfield import GainField, Gains
 from avmsf.field.gains.family import sites_along
 from avmsf.simulate.elastic import ElasticModes
 
 
 @dataclass(frozen=True, eq=False)
-class BodyGains:
+class BodyGains(GainField):
     """Gains that are the components of mode shapes along the impacts."""
 
     __repr__ = short_repr
@@ -37,17 +37,6 @@ class BodyGains:
         """Return the gains at contacts (meters); without a direction impacts go straight into the body."""
         sites = sites_along(contacts.double(), directions, lambda points: -self.normals(points))
         return Gains(self.body.gains(sites.points, sites.directions).float())
-
-    def point_estimate(
-        self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Gains:
-        """Return what `at` does."""
-        return self.at(contacts, directions)
-
-    def deviation(
-        self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> None:
-        """Return None: how wrong the material, the shape and the listener are is not known."""
 
     def record(self) -> dict[str, Any]:
         """Return the sizes."""

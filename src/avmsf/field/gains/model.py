@@ -15,7 +15,7 @@ from avmsf._utils.records import RecordError, count_of, like
 from avmsf._utils.summary import short_repr
 from avmsf.capture.places import places_of
 from avmsf.fem.modestate import mode_sizes, mode_skeleton, mode_tensors, restored_modes
-from avmsf.field.gainfield import Gains
+from avmsf.field.gainfield import GainField, Gains
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import Family, KernelFamily, Sites, nearest_sites, sites_along
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture, Predictions
@@ -46,7 +46,7 @@ class PlaceCovariance:
 
 
 @dataclass(frozen=True, eq=False)
-class MixtureGains:
+class MixtureGains(GainField):
     """Gains as a Gaussian process over several kernel families, each kernel weighed by its evidence."""
 
     __repr__ = short_repr
