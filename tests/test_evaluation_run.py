@@ -244,7 +244,7 @@ def test_results_of_different_evaluations_are_not_mixed(
     changed = replace(Counting([]), name="knn3")
     with raises(EvaluationError, file=results.path, name="knn3", value=held["methods"]["knn3"]):
         run_objects(planned(plates, changed), ("a",), results)
-    monkeypatch.setattr("avmsf.bench.plan.source_digest", lambda: "of other code")
+    monkeypatch.setattr("avmsf.bench.plan.source_digest", lambda module: "of other code")
     with raises(EvaluationError, file=results.path, name="source", value=held["source"]):
         run_objects(planned(plates, "knn3"), ("a",), results)
     assert (tmp_path / "results" / "objects" / "a.json").read_bytes() == before

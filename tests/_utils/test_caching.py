@@ -8,7 +8,6 @@ import pytest
 import torch
 import trimesh
 
-import avmsf
 from avmsf._utils import caching
 from avmsf.capture.surface import Surface
 from avmsf.cli import main
@@ -69,23 +68,32 @@ def test_a_loop_is_compiled_where_it_cannot_be_kept(monkeypatch: pytest.MonkeyPa
     assert compiled()(thrice)(1.5) == 4.5
 
 
-def test_keys_know_every_source_file_by_name_and_content(tmp_path: Path) -> None:
-    (tmp_path / "inner").mkdir()
-    found = {caching.digest_of_sources(tmp_path)}
-    (tmp_path / "inner" / "one.py").write_text("")
-    found.add(caching.digest_of_sources(tmp_path))
-    (tmp_path / "inner" / "one.py").write_text("x = 1")
-    found.add(caching.digest_of_sources(tmp_path))
-    (tmp_path / "inner" / "one.py").rename(tmp_path / "one.py")
-    found.add(caching.digest_of_sources(tmp_path))
-    assert len(found) == 4
-    (tmp_path / "notes.txt").touch()
-    assert caching.digest_of_sources(tmp_path) in found
+def test_a_digest_knows_the_modules_that_a_module_imports_and_no_others(tmp_path: Path) -> None:
+    sources = {
+        "shop/__init__.py": "",
+        "shop/made.py": "def make():\n    from shop.parts import Bolt\n",
+        "shop/parts/__init__.py": "",
+        "shop/parts/__init__.pyi": "from .bolts import Bolt as Bolt\nfrom .nuts import Nut as Nut\n",
+        "shop/parts/bolts.py": "from shop import steel\n",
+        "shop/parts/nuts.py": "",
+        "shop/steel.py": "",
+    }
+    for name, text in sources.items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
 
+    def digest() -> str:
+        caching.source_digest.cache_clear()
+        return caching.source_digest("shop.made", tmp_path)
 
-def test_the_sources_are_those_of_the_whole_package() -> None:
-    root = Path(avmsf.__file__).parent
-    assert caching.source_digest() == caching.digest_of_sources(root)
+    before = digest()
+    for name, text in sources.items():
+        if name.endswith(".py"):
+            (tmp_path / name).write_text(text + "# changed\n")
+            assert (digest() != before) == (name != "shop/parts/nuts.py"), name
+            (tmp_path / name).write_text(text)
+    assert digest() == before
 
 
 def test_a_file_that_can_be_kept_is_kept_without_a_word(tmp_path: Path) -> None:

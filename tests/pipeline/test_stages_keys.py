@@ -54,7 +54,7 @@ def test_a_stale_stage_of_a_read_only_folder_is_refused_by_a_sentence(
 def test_other_code_makes_a_stage_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = StageFolder(tmp_path)
     folder.keep("cloud.ply", {}, write)
-    monkeypatch.setattr(stages, "source_digest", lambda: "changed")
+    monkeypatch.setattr(stages, "source_digest", lambda module: "changed")
     assert folder.keep("cloud.ply", {}, write).fresh
     assert not folder.keep("cloud.ply", {}, write).fresh
 
@@ -90,7 +90,7 @@ def test_other_code_has_another_key(
 ) -> None:
     before = key()
     assert key() == before
-    monkeypatch.setattr(module, "source_digest", lambda: "changed")
+    monkeypatch.setattr(module, "source_digest", lambda module: "changed")
     assert key() != before
 
 

@@ -1,8 +1,9 @@
 """Files that only save time: where one cannot be written, the work goes on without it."""
 
 import hashlib
+import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cache, wraps
 from pathlib import Path
@@ -12,6 +13,7 @@ from avmsf.errors import AvmsfError, AvmsfWarning
 
 Given = ParamSpec("Given")
 Result = TypeVar("Result")
+_IMPORT = r"^\s*from ({0}(?:\.\w+)*) import (\([^)]*\)|.*)"
 
 
 def keep_if_possible(write: Callable[[], object], path: Path) -> None:
@@ -34,22 +36,44 @@ def discard(path: Path) -> None:
 
 
 @cache
-def source_digest() -> str:
-    """Return a digest of this package's source files, for the keys of what its code has made.
+def source_digest(module: str, root: Path = Path(__file__).parents[2]) -> str:
+    """Return a digest of a module's source and of all modules of its package that it imports, directly or not.
 
-    The version alone changes with a release only, so that results of code that has changed since would be taken for
-    those of the present one. All files count, for what a result depends on is not known file by file.
+    It belongs to the keys of cached results: the version changes with a release only. Imports within functions count
+    too. `root` is the folder that holds the package.
     """
-    return digest_of_sources(Path(__file__).parents[1])
-
-
-def digest_of_sources(root: Path) -> str:
-    """Return a digest of the names and contents of all Python files beneath a folder."""
+    found: dict[Path, bytes] = {}
+    pending = [module]
+    while pending:
+        path = _source_of(pending.pop(), root)
+        if path not in found and path.exists():
+            found[path] = path.read_bytes()
+            pending += _imported(found[path].decode(), module.partition(".")[0], root)
     digest = hashlib.sha256()
-    for path in sorted(root.rglob("*.py")):
-        digest.update(f"{path.relative_to(root).as_posix()}\0".encode())
-        digest.update(path.read_bytes())
+    for path in sorted(found):
+        digest.update(f"{path.relative_to(root).as_posix()}\0".encode() + found[path])
     return digest.hexdigest()
+
+
+def _source_of(module: str, root: Path) -> Path:
+    """Return the file of a module or package."""
+    path = root.joinpath(*module.split("."))
+    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+
+
+def _imported(source: str, package: str, root: Path) -> Iterator[str]:
+    """Yield the modules of a package that a source imports, also where a package's stub passes names on."""
+    for module, names in re.findall(_IMPORT.format(package), source, re.MULTILINE):
+        yield module
+        if not root.joinpath(*module.split(".")).is_dir():
+            continue
+        stub = root.joinpath(*module.split("."), "__init__.pyi")
+        passed = stub.read_text() if stub.exists() else ""
+        for name in re.findall(r"\w+", names):
+            if _source_of(f"{module}.{name}", root).exists():
+                yield f"{module}.{name}"
+            for inner in re.findall(rf"^from \.([\w.]+) import {name}\b", passed, re.MULTILINE):
+                yield f"{module}.{inner}"
 
 
 def once(make: Callable[Given, Result]) -> Callable[Given, Result]:

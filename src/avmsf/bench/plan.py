@@ -91,7 +91,7 @@ class Evaluation:
             self.judging.prepare()
         identity = {
             "version": version("avmsf"),
-            "source": source_digest(),
+            "source": source_digest("avmsf.cli.evaluate"),
             "protocol": self.protocol.name,
             "choosing": repr(self.protocol.choosing),
             "dataset": self.title,

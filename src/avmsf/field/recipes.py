@@ -186,7 +186,7 @@ class Attention(GainRecipe):
 def fingerprint(case: GainCase, recipe: GainRecipe) -> str:
     """Return a digest of all that decides a fit's result, this package's version and code among it."""
     train, modes = case.train, case.modes
-    words = [version("avmsf"), source_digest(), asdict(case.config), recipe.name, recipe.digest()]
+    words = [version("avmsf"), source_digest("avmsf.field.fit"), asdict(case.config), recipe.name, recipe.digest()]
     words += [train.digest(), case.features.digest()]
     digest = hashlib.sha256(json.dumps(words, sort_keys=True).encode())
     tensors = [modes.bank.frequency, modes.bank.damping, modes.residual.magnitude]

@@ -85,7 +85,7 @@ class StageFolder:
         and `CaptureError` where the folder cannot be written.
         """
         path, record = self.path(name), self.folder / f"{name}.stage.json"
-        key = {"version": avmsf.__version__, "source": source_digest(), **recipe}
+        key = {"version": avmsf.__version__, "source": source_digest(make.__module__), **recipe}
         wanted = json.loads(json.dumps(key, sort_keys=True))
         known = _read(record)
         same = known.get("recipe") == wanted

@@ -404,7 +404,7 @@ class _Maker:
         values = {
             "format": _FORMAT,
             "version": version("avmsf"),
-            "source": source_digest(),
+            "source": source_digest(__name__),
             "surface": self._digest,
             "wall": wall,
             "count": self._count,

@@ -193,7 +193,7 @@ class ObjectRecipe:
         """Return what decides the elastic modes, which take most of the time: some of `values`, and the code."""
         values = self.values()
         names = ("version", "kind", "mesh", "thickness", "material", "seed", "size", "up")
-        kept = {"source": source_digest(), **{name: values[name] for name in names}}
+        kept = {"source": source_digest("avmsf.simulate.bodies"), **{name: values[name] for name in names}}
         imperfect = {name: values["imperfections"][name] for name in ("thickness", "stiffness", "density", "support")}
         return {**kept, "modes": self.elastic_modes, "detail": self.detail, "imperfections": imperfect}
 

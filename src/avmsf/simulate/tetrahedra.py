@@ -20,10 +20,11 @@ from jaxtyping import Bool, Float64
 from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
 from avmsf.geometry.closest import Closest, ClosestPoints
+from avmsf.simulate import tetrahedra_worker
 from avmsf.simulate.skin import Skin
 from avmsf.simulate.solid import Solid
 
-WORKER = Path(__file__).with_name("tetrahedra_worker.py")
+WORKER = Path(tetrahedra_worker.__file__)
 _ENVELOPE = 0.04
 """How far the solid's surface may lie from the mesh, over the length of the tetrahedra's edges."""
 _SHORTEST = 0.1

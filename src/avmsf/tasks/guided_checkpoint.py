@@ -22,6 +22,10 @@ def asked(field: SoundField, contacts: Tensor, guide: dict[str, Any], settings: 
     for tensor in (*heard, *(each for each in (known.quadrature, known.damping) if each is not None)):
         digest.update(f"{tensor.dtype} {tuple(tensor.shape)}".encode())
         digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-    words = {"guide": guide, "settings": settings, "version of avmsf": [version("avmsf"), source_digest()]}
+    words = {
+        "guide": guide,
+        "settings": settings,
+        "version of avmsf": [version("avmsf"), source_digest("avmsf.tasks.guided")],
+    }
     plain = {name: json.dumps(each, sort_keys=True).encode() for name, each in words.items()}
     return {"field": digest.hexdigest(), **{name: hashlib.sha256(each).hexdigest() for name, each in plain.items()}}

@@ -94,7 +94,7 @@ def _made(recipe: ObjectRecipe) -> TrainingObject:
 
 
 def _identity(recipe: ObjectRecipe) -> dict[str, str]:
-    return {"recipe": key_of(recipe.values()), "splatting": repr(SPLAT), "source": source_digest()}
+    return {"recipe": key_of(recipe.values()), "splatting": repr(SPLAT), "source": source_digest(__name__)}
 
 
 def _keep(path: Path, recipe: ObjectRecipe, made: TrainingObject) -> None:

@@ -195,7 +195,7 @@ def _read(path: Path, digest: str, train: Impacts) -> Extraction | None:
 
 
 def _digest(train: Impacts, method: ModeFinder) -> str:
-    words = [version("avmsf"), source_digest(), repr(method), train.names, train.sample_rate]
+    words = [version("avmsf"), source_digest(__name__), repr(method), train.names, train.sample_rate]
     digest = hashlib.sha256(json.dumps(words).encode())
     for sounds in (train.sounds, train.before, train.after):
         digest.update(b"none" if sounds is None else sounds.contiguous().numpy().tobytes())
