@@ -1,26 +1,28 @@
-# Every target sets up what it needs by itself, in .venv: the demo the package alone, the others its tools and extras.
+# Every target sets up what it needs by itself, in VENV: the demo the package alone, the others its tools and extras.
+# Another version of Python needs a folder of its own: make test PYTHON=python3.13 VENV=.venv-3.13
 PYTHON ?= python3
-BIN := .venv/bin
+VENV ?= .venv
+BIN := $(VENV)/bin
 
 .PHONY: demo docs example test test-all lint install clean
 
-install: .venv/developed
+install: $(VENV)/developed
 
-.venv/installed: pyproject.toml
-	@echo "Installing avmsf into .venv, once: one to a few minutes, most of it downloads."
-	$(PYTHON) -m venv .venv
+$(VENV)/installed: pyproject.toml
+	@echo "Installing avmsf into $(VENV), once: one to a few minutes, most of it downloads."
+	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --editable .
 	touch $@
 
-.venv/developed: .venv/installed
+$(VENV)/developed: $(VENV)/installed
 	$(BIN)/pip install --quiet --editable '.[dev]'
 	touch $@
 
-demo: .venv/installed
+demo: $(VENV)/installed
 	$(BIN)/avmsf demo demo
 
 # Makes anew what `make demo` starts from, the same to the last bit where numpy and scipy are the same.
-example: .venv/developed
+example: $(VENV)/developed
 	rm -rf src/avmsf/example
 	$(BIN)/avmsf simulate example --output src/avmsf/example
 
@@ -28,14 +30,14 @@ example: .venv/developed
 PYTEST := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal
 
 # The fast tests of every package: 5 minutes at most on two idle cores.
-test: .venv/developed
+test: $(VENV)/developed
 	$(PYTEST)
 
 # All tests: the fast ones, then the slow ones and those of the page (Debian's chromium).
 test-all: test
 	$(PYTEST) -m "slow or page"
 
-lint: .venv/developed
+lint: $(VENV)/developed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
@@ -43,9 +45,9 @@ lint: .venv/developed
 
 # The documentation, into site/. A link or an anchor that leads nowhere is an error, and so is one in the notebook, which
 # is executed for its sounds and pictures.
-docs: .venv/developed
+docs: $(VENV)/developed
 	rm -rf .cache/mkdocs-jupyter
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 clean:
-	rm -rf .venv demo site
+	rm -rf .venv .venv-* demo site

@@ -26,12 +26,6 @@ def test_the_page_of_dataset_has_the_options_of_its_part(pages: dict[str, str]) 
     assert "`--contact-data FOLDER`" in pages["cli/dataset.md"]
 
 
-def test_groups_of_options_are_titled_by_what_they_set(pages: dict[str, str]) -> None:
-    titles = [line for line in pages["cli/reconstruct.md"].splitlines() if line.startswith("## ")]
-    of_options = ["## Options", "## Bodies", "## Views", "## Gaussians", "## Features", "## Fit"]
-    assert titles == ["## Positional arguments", *of_options]
-
-
 def _hooks() -> ModuleType:
     pytest.importorskip("latex2mathml")
     pytest.importorskip("mkdocs")

@@ -81,7 +81,7 @@ def test_no_setting_of_a_preset_is_left_out_by_the_commands(monkeypatch: pytest.
     scene = SceneConfig(ViewsConfig(count=9), SplatConfig(steps=8), LiftConfig(angles=7))
     other = PipelineConfig("smooth", BodyConfig(wall=0.5), scene, FitConfig(steps=6), "short-time", 5, "peak", "cpu")
     assert all(getattr(other, each.name) != getattr(PipelineConfig(), each.name) for each in fields(other))
-    monkeypatch.setattr("avmsf.cli.options.presets.PRESETS", {"default": PipelineConfig(), "paper": other})
+    monkeypatch.setattr("avmsf.cli.options.common.PRESETS", {"default": PipelineConfig(), "paper": other})
     assert parse_reconstruct(["mug", "--preset", "paper"]).pipeline == other
     fitted = parse_fit(["mug", "--output", "mug.safetensors", "--preset", "paper"])
     assert (fitted.pipeline, fitted.preset) == (replace(other, scene=SceneConfig()), "paper")

@@ -130,7 +130,9 @@ def _run(words: list[str]) -> int:
             if ending.code == BAD_INPUT:
                 # Of options that cannot be understood, which the standard error has explained.
                 advice = f"see `avmsf {words[0]} --help`"
-                _report_error(AvmsfError.expected("known options", words[1:], name=words[0], advice=advice), words)
+                _report_error(
+                    AvmsfError.expected("options that can be read", got="others", name=words[0], advice=advice), words
+                )
             raise
         except KeyboardInterrupt:
             print(f"avmsf {words[0]}: interrupted", file=sys.stderr)

@@ -16,6 +16,8 @@ from avmsf.simulate.skin import Skin
 
 _LIDS = 0.25
 """Part of the closed surface that lids over holes may make up, as `fill` has it."""
+_SMALL = 0.02
+"""Part of the closed surface that lids over defects of a scan may make up; the openings of vessels are larger."""
 _LOOSE = 0.1
 """Part of the area that may lie in loose bits, which a wall leaves out."""
 _VESSEL = 0.03
@@ -101,7 +103,7 @@ def checked(surface: Surface, *, tell: Callable[[str], None]) -> CheckedSurface:
     A mesh of very many triangles is thinned first. Raises SimulationError for points without triangles, damaged
     triangles and a mesh without area.
     """
-    skin, turned = _turned(thinned(Skin.of(surface), tell=tell))
+    skin, turned = _turned(thinned(_closed(Skin.of(surface)), tell=tell))
     if turned:
         tell(f"{turned} of {len(skin.faces)} triangles of the mesh faced inwards: reversed")
     before = roughness(skin)
@@ -122,6 +124,20 @@ def checked(surface: Surface, *, tell: Callable[[str], None]) -> CheckedSurface:
         helps = "trying to close the holes" if result.lids <= _LIDS else "give a wall thickness"
         tell(f"the mesh has {skin.open_edges} open edges: {helps}")
     return result
+
+
+def _closed(skin: Skin) -> Skin:
+    """Return a skin whose small holes have straight lids; as it is where they are not small, or the lids would cross.
+
+    Holes as large as openings that an object may have stay.
+    """
+    lids = CheckedSurface(skin).lids
+    if not 0.0 < lids <= _SMALL:
+        return skin
+    corners = np.concatenate([skin.points[skin.faces], _lids(skin)])
+    points, rows = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    closed = Skin(points, rows.reshape(-1, 3))
+    return closed if closed.crowded_edges <= skin.crowded_edges else skin
 
 
 def _turned(skin: Skin) -> tuple[Skin, int]:

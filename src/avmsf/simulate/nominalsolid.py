@@ -3,6 +3,7 @@
 import contextlib
 import math
 from collections.abc import Callable, Iterator
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,13 @@ FEWEST = 1000
 """Degrees of freedom below which no body has 20 modes worth the name."""
 _OVER, _UNDER = 1.2, 0.65
 """Degrees of freedom over those wanted, from `_UNDER` to `_OVER`, that end the search."""
+_PRISMS = 1.5
+"""Degrees of freedom of prisms over those wanted, at most: a few more cost less than tetrahedra."""
+_FILLING_SECONDS = 60.0
+"""Time that one filling with tetrahedra may take; then coarser ones are tried once, and after that there is no body."""
 _TRIES = 4
+_POWER = 1.5
+"""By which degrees of freedom go with the inverse of the detail."""
 _STEP = 2.0
 """Largest factor on the detail from one try to the next. fTetWild's number of tetrahedra is erratic for few triangles:
 17 to 88 thousand degrees of freedom for details of .03 and .04 of a block of twelve."""
@@ -74,13 +81,14 @@ def filled_solid(checked: CheckedSurface, dofs: int, *, wall: float | None = Non
     if sides is not None:
         with contextlib.suppress(SimulationError):
             # Degrees of freedom may be few for prisms along a wall that bends tightly; tetrahedra need not follow it.
-            return _near(lambda detail: sides.solid(detail * sides.size), dofs, first=sides.length(dofs) / sides.size)
+            first = sides.length(dofs) / sides.size
+            return _near(lambda detail: sides.solid(detail * sides.size), dofs, first=first, most=_PRISMS)
     first = _filling_detail(checked, dofs)
 
     def filled(detail: float) -> Solid:
         # Quadrics keep the volume. Edges taken out one by one made the wall of a mug 5 % thinner.
         count = round(TRIANGLES * dofs * (first / detail) ** 2)
-        return fill(_surface(simplified(checked.skin, count)), detail=detail)
+        return fill(_surface(simplified(checked.skin, count)), detail=detail, timeout=_FILLING_SECONDS)
 
     return _near(filled, dofs, first=first)
 
@@ -111,51 +119,52 @@ def wall_solids(checked: CheckedSurface, dofs: int) -> Callable[[float], Solid]:
     return walled
 
 
-def _near(make: Callable[[float], Solid], dofs: int, *, first: float) -> Solid:
+def _near(make: Callable[[float], Solid], dofs: int, *, first: float, most: float = _OVER) -> Solid:
     """Return the solid of the detail, `first` at first, whose degrees of freedom come nearest to those wanted.
 
-    Raises SimulationError where all of them are over by more than `_OVER`, and what `make` raises of the last detail
-    where none was made.
+    Raises SimulationError where all of them are over by more than the factor `most`, and what `make` raises of the
+    last detail where none was made.
     """
     tried: dict[float, int] = {}
-    best: tuple[int, Solid] | None = None
+    found: list[tuple[int, Solid]] = []
     for detail in _details(tried, dofs, first):
         try:
             solid = make(detail)
-        except SimulationError:
-            # Walls too thin for one detail may be thick enough for a finer one.
+        except SimulationError as error:
+            # Walls too thin for one detail may be thick enough for a finer one, and what takes too long may be coarser.
             if tried:
                 break
-            detail *= _FINER
+            detail *= 1.0 / _FINER if error.name == "timeout" else _FINER
             solid = make(detail)
         tried[detail] = count_dofs(solid)
-        if tried[detail] <= _OVER * dofs and (best is None or tried[detail] > best[0]):
-            best = tried[detail], solid
-    if best is None:
-        least = min(tried.values())
+        found.append((tried[detail], solid))
+    allowed = [each for each in found if each[0] <= most * dofs] or [min(found, key=itemgetter(0))]
+    best = min(allowed, key=lambda each: abs(math.log(each[0] / dofs)))
+    if best[0] > most * dofs:
         raise SimulationError(
-            f"expected a mesh of {dofs} degrees of freedom, got {least} at least; allow these (--body.dofs), or "
+            f"expected a mesh of {dofs} degrees of freedom, got {best[0]} at least; allow these (--body.dofs), or "
             "simplify the mesh",
             name="dofs",
-            value=least,
+            value=best[0],
         )
     return best[1]
 
 
 def _details(tried: dict[float, int], dofs: int, first: float) -> Iterator[float]:
-    """Yield details until one of those tried is near the wanted number, each by the power that the last two show."""
-    detail, power = min(max(first, _DETAILS[0]), _DETAILS[1]), 1.5
+    """Yield details until one of those tried is near the wanted number: between two that enclose it once there are."""
+    detail = min(max(first, _DETAILS[0]), _DETAILS[1])
     for _ in range(_TRIES):
         yield detail
         last, found = list(tried.items())[-1]
         if _UNDER * dofs <= found <= _OVER * dofs:
             return
-        if len(tried) > 1:
-            before, other = list(tried.items())[-2]
-            if other != found:
-                power = min(max(-math.log(found / other) / math.log(last / before), 0.8), 3.0)
-        change = (found / (0.95 * dofs)) ** (1.0 / power)
-        detail = min(max(last * min(max(change, 1.0 / _STEP), _STEP), _DETAILS[0]), _DETAILS[1])
+        finer = max((each for each, count in tried.items() if count > dofs), default=None)
+        coarser = min((each for each, count in tried.items() if count <= dofs), default=None)
+        if finer is not None and coarser is not None:
+            detail = math.sqrt(finer * coarser)
+        else:
+            change = (found / (0.95 * dofs)) ** (1.0 / _POWER)
+            detail = min(max(last * min(max(change, 1.0 / _STEP), _STEP), _DETAILS[0]), _DETAILS[1])
         if detail in tried:
             return
 

@@ -1,7 +1,4 @@
-"""A dense mesh thinned before anything slow looks at it: by quadrics, noise first averaged out.
-
-What follows takes a minute or so for each hundred thousand triangles, and bodies have some thousand on their skin.
-"""
+"""A dense mesh simplified before anything slow is done with it: by quadrics, within a tolerance of its thickness."""
 
 import math
 from collections.abc import Callable
@@ -9,28 +6,40 @@ from collections.abc import Callable
 import fast_simplification
 import numpy as np
 
+from avmsf.geometry.closest import ClosestPoints
 from avmsf.simulate.nominalsmooth import ROUGH, averaged, roughness
 from avmsf.simulate.skin import Skin
 
 MOST = 60_000
-"""Triangles beyond which a mesh is thinned."""
+"""Triangles beyond which a mesh is simplified even where that changes its form."""
+ENOUGH = 16_000
+"""Triangles beyond which it is simplified as far as its form stays: finite-element models have some thousand on their
+surface."""
+_TOLERANCE = 0.01
+"""Root mean square distance of the simplified mesh from the given one, over the mean thickness, twice the volume over
+the area. Frequencies of a thin wall go with its thickness. Chosen on a twisted blade."""
 _ROUNDS = 4
 """Averages taken of a noisy mesh over the thinning, so that they reach little farther than an edge that stays."""
 
 
 def thinned(skin: Skin, *, tell: Callable[[str], None]) -> Skin:
-    """Return a skin of at most `MOST` triangles, and tell what was done to a larger one.
+    """Return a skin of at most `MOST` triangles, fewer within the tolerance, and tell what was done to a larger one.
 
     More are left where fewer would open a seam or share an edge among three.
     """
     count = len(skin.faces)
-    if count <= MOST:
+    if count <= ENOUGH:
         return skin
     tell(f"checking a mesh of {count} triangles")
     rough = roughness(skin)
     # Quadrics follow each noisy corner, and tie the skin into knots.
     even = averaged(skin, math.ceil(_ROUNDS * count / MOST)) if rough >= ROUGH else skin
-    found = simplified(even, MOST, like=skin)
+    tolerance, places = _TOLERANCE * 2.0 * abs(even.volume) / float(even.areas.sum()), even.spread()
+    for most in (ENOUGH, 2 * ENOUGH, MOST):
+        found = simplified(even, most, like=skin)
+        distances = ClosestPoints(found.points[found.faces])(places).distances
+        if float(np.sqrt((distances**2).mean())) <= tolerance:
+            break
     if found is even:
         return skin
     noise = "" if even is skin else f", after smoothing its noise of {rough:.0f} degrees"
