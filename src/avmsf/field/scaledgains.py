@@ -1,5 +1,6 @@
 """Gains of an edited object: another field's, times one factor a mode, on a body that may have another size."""
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -38,6 +39,8 @@ class ScaledGains(GainField):
     """Factors on the gains of each mode; 0 mutes one."""
     length: float = 1.0
     """Lengths on this object over those on the fitted one: contacts are divided by it."""
+    points: Float32[Tensor, "points 3"] = dataclasses.field(init=False)
+    """Points of the object's surface, object frame, meters."""
 
     kind: ClassVar[str] = "scaled"
 
@@ -49,11 +52,7 @@ class ScaledGains(GainField):
             object.__setattr__(self, "field", inner.field)
             object.__setattr__(self, "scale", inner.scale * self.scale)
             object.__setattr__(self, "length", inner.length * self.length)
-
-    @property
-    def points(self) -> Float32[Tensor, "points 3"]:
-        """Points of the object's surface, object frame, meters."""
-        return (self.field.points.double() * self.length).float()
+        object.__setattr__(self, "points", (self.field.points.double() * self.length).float())
 
     @property
     def contacts(self) -> Float[Tensor, "contacts 3"]:
