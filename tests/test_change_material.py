@@ -10,16 +10,18 @@ from avmsf.errors import EditError, SimulationError
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.positional import Smooth
-from avmsf.field.soundfield import Origin, SoundField
+from avmsf.field.soundfield import SUPPORTING, Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
 from avmsf.simulate.block import block
 from avmsf.simulate.elastic import elastic_modes
 from avmsf.simulate.material import CERAMIC, GLASS, PLASTIC, STEEL, WOOD, Material
+from avmsf.simulate.nominal import NOMINAL
 from avmsf.simulate.plate import Plate, plate_modes, sample_contacts
 from avmsf.simulate.vibration import rayleigh
 from avmsf.tasks.edits import silenced
+from avmsf.tasks.madeof import made_of
 from avmsf.tasks.material import ACCELERATION, DISPLACEMENT, LAWS, RATIO_ONLY, VELOCITY, change_material
 from avmsf.tasks.materialguess import guess_materials
 from avmsf.tasks.modes import adjust_modes
@@ -61,6 +63,9 @@ def field_of(frequency: torch.Tensor, damping: torch.Tensor, gains: torch.Tensor
     return SoundField(
         ModalBank(frequency, damping), model, phase, Residual(torch.full((9,), 1e-9)), RATE, 2000, Origin("plate")
     )
+
+
+RATIO = {each: each.young / each.density for each in (STEEL, NOMINAL)}
 
 
 def plate_field(material: Material, *, size: float = 1.0, highest: float = 3000.0) -> SoundField:
@@ -279,3 +284,29 @@ def test_the_material_is_guessed_by_its_dampings(material):
     assert best.fits
     assert second.off > best.off
     assert not guess_materials(ModalBank(field.bank.frequency, 30 * field.bank.frequency))[0].fits
+
+
+def test_supporting_poles_say_nothing_about_the_material():
+    field = plate_field(STEEL)
+    damping = field.bank.damping.clone()
+    supporting = list(range(1, len(damping)))
+    damping[supporting] *= 30.0
+    report = {SUPPORTING: supporting}
+    mixed = replace(field, bank=ModalBank(field.bank.frequency, damping), origin=Origin("plate", report=report))
+    assert made_of(mixed, option="--from").material == STEEL
+
+
+def test_a_body_too_stiff_for_a_material_excludes_it():
+    """Wood's dampings on a body that is as stiff for its weight as steel are nobody's."""
+    body = {"body": "solid body", "wall_thickness": None, "frequency_factor": math.sqrt(RATIO[STEEL] / RATIO[NOMINAL])}
+    origin = Origin("plate", report={"credibility": {"credible": True}, "bodies": [body]})
+    steel = replace(plate_field(STEEL), origin=origin)
+    assert made_of(steel, option="--from").material == STEEL
+    with raises(EditError, name="--from"):
+        made_of(replace(plate_field(WOOD), origin=origin), option="--from")
+
+
+def test_a_material_that_is_assumed_and_new_is_said():
+    wooden = plate_field(WOOD)
+    known = [made_of(wooden, option="--from", new=new) for new in (None, STEEL, WOOD)]
+    assert ["changes nothing" in each.words for each in known] == [False, False, True]

@@ -19,9 +19,8 @@ class MaterialChange(MaterialOptions):
 
         Raises `SimulationError` first for an unknown new material.
         """
-        if self.material is not None:
-            material_named(self.material)
-        return old_material(field) if self.old is None else material_named(self.old)
+        new = None if self.material is None else material_named(self.material)
+        return old_material(field, new=new) if self.old is None else material_named(self.old)
 
     def target(self, old: Material) -> Material:
         """Return the new material of an object of `old`."""
@@ -35,8 +34,8 @@ class MaterialChange(MaterialOptions):
         return change_material(field, old, self.target(old), size=self.size, law=LAWS[self.law])
 
 
-def old_material(field: SoundField) -> Material:
+def old_material(field: SoundField, *, new: Material | None = None) -> Material:
     """Return a field's material, and print its source. Raises `EditError` where no material fits."""
-    known = made_of(field, option="--from")
+    known = made_of(field, option="--from", new=new)
     say(known.words)
     return known.material

@@ -32,6 +32,10 @@ class Gains:
         """Squares of the amplitudes whatever their phase, gains and quadrature together."""
         return self.parts.square().sum(2)
 
+    def energy(self, damping: Float64[Tensor, " modes"]) -> Float64[Tensor, " modes"]:
+        """Return each mode's energy over time, gain^2 / (4 d), as the mean over the contacts; damping d in 1/s."""
+        return (self.power / (4.0 * (damping if self.damping is None else damping * self.damping))).mean(0)
+
 
 class GainField(ABC):
     """Gains at every contact with one object. One contract test holds for all subclasses."""

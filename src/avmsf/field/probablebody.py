@@ -9,8 +9,11 @@ from avmsf._utils.records import like
 from avmsf.fem.supports import FREE
 from avmsf.fem.thickness import largest_factor
 from avmsf.field.gains.elastic import FREQUENCY_ERRORS
-from avmsf.simulate.material import STIFFEST
+from avmsf.simulate.material import MATERIALS, STIFFEST, Material
 from avmsf.simulate.nominal import NOMINAL
+
+_MARGIN = 1.3
+"""Factor by which a body's stiffness over density may be off a material's: of a thickness that is 14 % off."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +55,29 @@ class ProbableBody:
             low, high = (1000 * each for each in self.wall_interval)
             interval = f", 90 % interval of the wall {low:.2g} to {high:.2g} mm"
         support = FREE if self.support == FREE else f"held: {self.support}"
-        ratio = f"{self.stiffness_ratio:.2f} times the stiffness-to-density ratio of aluminum"
-        return f"{self.name}{interval}, {support}, with {ratio}"
+        return f"{self.name}{interval}, {support}, {self.specific_stiffness}"
+
+    @property
+    def materials(self) -> tuple[Material, ...]:
+        """Those of the table that may be so stiff for their weight.
+
+        The frequencies of a wall go with its thickness, so that an interval of the thickness is one of the ratio.
+        """
+        low, high = self._ratio / _MARGIN, self._ratio * _MARGIN
+        if self.wall_thickness is not None and self.wall_interval is not None:
+            low *= (self.wall_thickness / self.wall_interval[1]) ** 2
+            high *= (self.wall_thickness / self.wall_interval[0]) ** 2
+        return tuple(each for each in MATERIALS.values() if low <= each.young / each.density <= high)
+
+    @property
+    def specific_stiffness(self) -> str:
+        """Young's modulus over density in words, with the materials that have it."""
+        *most, last = [each.name for each in self.materials] or ["no material of the table"]
+        return f"E/rho {self._ratio / 1e6:.2g} MJ/kg: as {', '.join(most)}{' or ' if most else ''}{last}"
+
+    @property
+    def _ratio(self) -> float:
+        return self.stiffness_ratio * NOMINAL.young / NOMINAL.density
 
     @property
     def warning(self) -> str:
@@ -66,7 +90,7 @@ class ProbableBody:
         step = 1.0 + FREQUENCY_ERRORS[0] if searched else 1.0
         if math.sqrt(self.stiffness_ratio) * step <= largest_factor(searched=searched):
             return ""
-        over = self.stiffness_ratio * (NOMINAL.young / NOMINAL.density) / (STIFFEST.young / STIFFEST.density)
+        over = self._ratio / (STIFFEST.young / STIFFEST.density)
         wrong, measure = "body", "check the unit of the mesh"
         if self.wall_thickness is not None:
             wrong = f"wall of {1000 * self.wall_thickness:.2g} mm"

@@ -124,7 +124,8 @@ class Sliders:
         edited, words = ground, []
         if self.material is not None or self.size != 1.0:
             if self.old is None:
-                known = made_of(ground, option=_OLD_CONTROL)
+                wanted = None if self.material is None else material_named(self.material)
+                known = made_of(ground, option=_OLD_CONTROL, new=wanted)
                 old = known.material
                 words.append(known.words)
             else:

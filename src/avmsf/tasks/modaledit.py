@@ -162,9 +162,8 @@ class Struck:
         return bank.frequency.detach() < self.sample_rate / 2
 
     def energy(self) -> Float64[Tensor, " modes"]:
-        """Return each unedited mode's energy over time, gain^2 / (4 d), as the mean over the contacts."""
-        damping = self.bank.damping if self.known.damping is None else self.bank.damping * self.known.damping
-        return torch.where(self.audible(self.bank), (self.known.power / (4 * damping)).mean(dim=0), 0.0)
+        """Return each unedited mode's energy over time (`Gains.energy`); zero for silent ones."""
+        return torch.where(self.audible(self.bank), self.known.energy(self.bank.damping), 0.0)
 
     def loudest(self, count: int) -> Int[Tensor, " edited"]:
         """Return the indices of the strongest modes, at most `count` of them, ascending."""
