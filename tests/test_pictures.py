@@ -26,10 +26,26 @@ def test_stems_stand_at_the_modes_as_high_as_their_levels_and_decay_times() -> N
         (stems,) = (drawn for drawn in axes.collections if isinstance(drawn, LineCollection))
         assert np.allclose([segment[1] for segment in stems.get_segments()], np.c_[[200.0, 1000.0, 1010.0], heights])
     assert figure.get_suptitle() == "a bowl"
-    assert upper.get_ylabel() == "level (dB re strongest mode)"
+    assert upper.get_ylabel() == "level (dB re strongest pole)"
     assert (lower.get_xlabel(), lower.get_ylabel()) == ("frequency (Hz)", "decay time T60 (s)")
-    # The doublet's labels would overlap: only the stronger is named.
+    # The doublet's labels would overlap: only the one of more energy is named.
     assert [text.get_text() for text in upper.texts] == ["1000", "200"]
+
+
+def test_supporting_poles_have_no_label_and_the_modes_of_most_energy_have() -> None:
+    frequency = torch.linspace(100.0, 2000.0, 12, dtype=torch.float64)
+    damping = torch.full((12,), 1000.0, dtype=torch.float64)
+    damping[:3] = 1.0
+    is_mode = torch.ones(12, dtype=torch.bool)
+    is_mode[[1, 6]] = False
+    level = torch.zeros(12)
+    level[:2], level[2], level[6] = -10.0, -5.0, 3.0
+    figure = draw_modes(ModalBank(frequency, damping), level, is_mode=is_mode, title="a bowl")
+    labels = [text.get_text() for text in figure.axes[0].texts]
+    assert labels[:2] == [f"{frequency[row]:.4g}" for row in (2, 0)]
+    assert not {f"{frequency[row]:.4g}" for row in (1, 6)} & set(labels)
+    gray, colored = (drawn for drawn in figure.axes[0].collections if isinstance(drawn, LineCollection))
+    assert [len(drawn.get_segments()) for drawn in (gray, colored)] == [2, 10]
 
 
 def test_gains_are_colored_symmetrically_about_zero_strongest_modes_first_by_frequency() -> None:
@@ -37,7 +53,7 @@ def test_gains_are_colored_symmetrically_about_zero_strongest_modes_first_by_fre
     points = torch.rand(50, 3, generator=generator)
     gains = torch.randn(50, 3, generator=generator) * torch.tensor([1.0, 0.01, 3.0])
     gains[:, 2] = gains[:, 2].abs()
-    figure = draw_gains(points, gains, BANK.frequency, title="a bowl", most=2)
+    figure = draw_gains(points, gains, BANK, title="a bowl", most=2)
     drawn = [axes for axes in figure.axes if axes.get_title()]
     assert [axes.get_title() for axes in drawn] == ["200 Hz", "1010 Hz"]
     for axes, mode in zip(drawn, (0, 2), strict=True):
@@ -53,7 +69,8 @@ def test_gains_are_colored_symmetrically_about_zero_strongest_modes_first_by_fre
 def test_a_flat_object_is_drawn_in_its_plane_with_crosses_at_the_contacts() -> None:
     points = torch.cartesian_prod(torch.linspace(0, 0.3, 9), torch.zeros(1), torch.linspace(0, 0.1, 5))
     contacts = points[[3, 7]]
-    figure = draw_gains(points, torch.ones(45, 1), BANK.frequency[:1], title="a plate", contacts=contacts)
+    one = ModalBank(BANK.frequency[:1], BANK.damping[:1])
+    figure = draw_gains(points, torch.ones(45, 1), one, title="a plate", contacts=contacts)
     axes = figure.axes[0]
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("x (m)", "z (m)")
     (crosses,) = axes.lines

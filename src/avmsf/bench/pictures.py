@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -47,25 +47,36 @@ def expect_format(path: Path) -> str:
 
 
 @styled
-def draw_modes(bank: ModalBank, level_db: Float[Tensor, " modes"], *, title: str) -> Figure:
-    """Draw each mode's level (dB) and decay time (T60, s) over its frequency as stems."""
+def draw_modes(
+    bank: ModalBank, level_db: Float[Tensor, " modes"], *, title: str, is_mode: Bool[Tensor, " modes"] | None = None
+) -> Figure:
+    """Draw each mode's level (dB) and decay time (T60, s) over its frequency (logarithmic) as stems.
+
+    Those of most energy are labelled. Supporting poles, which are no modes, are gray.
+    """
     figure = Figure(figsize=(9, 5.4), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     frequency, level = bank.frequency.numpy(), level_db.numpy()
     bottom = 10.0 * math.floor(float(level.min()) / 10) - 5.0
-    _stems(upper, frequency, level, bottom=bottom, color=FIRST)
+    kept = np.ones(len(level), dtype=bool) if is_mode is None else is_mode.numpy()
+    t60 = math.log(1000) / bank.damping.numpy()
+    for axes, heights, foot, own in ((upper, level, bottom, FIRST), (lower, t60, 0.0, SECOND)):
+        for rows, color in ((~kept, "lightgray"), (kept, own)):
+            if rows.any():
+                _stems(axes, frequency[rows], heights[rows], bottom=foot, color=color)
     upper.set_ylim(bottom, float(level.max()) + 0.12 * (float(level.max()) - bottom))
-    upper.set_ylabel("level (dB re strongest mode)")
-    for row in _apart(frequency, level, most=8):
+    upper.set_ylabel("level (dB re strongest pole)")
+    for row in _apart(frequency, np.where(kept, level + 10 * np.log10(t60), -np.inf), most=8):
         place = (frequency[row], level[row])
         upper.annotate(
             f"{frequency[row]:.4g}", place, xytext=(0, 5), textcoords="offset points", ha="center", fontsize=8
         )
-    _stems(lower, frequency, math.log(1000) / bank.damping.numpy(), bottom=0.0, color=SECOND)
     lower.set_ylim(bottom=0.0)
     lower.set_ylabel("decay time T60 (s)")
     lower.set_xlabel("frequency (Hz)")
-    lower.set_xlim(0.0, 1.05 * float(frequency.max()))
+    lower.set_xscale("log")
+    lower.set_xlim(0.9 * float(frequency.min()), 1.1 * float(frequency.max()))
+    lower.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     for axes in (upper, lower):
         axes.grid()
     figure.suptitle(title)
@@ -76,17 +87,18 @@ def draw_modes(bank: ModalBank, level_db: Float[Tensor, " modes"], *, title: str
 def draw_gains(
     points: Float[Tensor, "points 3"],
     gains: Float[Tensor, "points modes"],
-    frequency: Float[Tensor, " modes"],
+    bank: ModalBank,
     *,
     title: str,
     contacts: Float[Tensor, "contacts 3"] | None = None,
     most: int = 6,
 ) -> Figure:
-    """Draw the strongest modes' signed gains on the object's points (object frame), each on its own color scale.
+    """Draw the signed gains of the modes of most energy on the object's points (object frame), each on its own scale.
 
     `contacts` are marked by crosses. An object that is flat along an axis is drawn in its plane.
     """
-    strongest = torch.argsort(gains.square().mean(0), descending=True)[:most]
+    frequency = bank.frequency
+    strongest = torch.argsort(gains.square().mean(0) / bank.damping, descending=True)[:most]
     columns = min(3, len(strongest))
     rows = math.ceil(len(strongest) / columns)
     places = points.double().numpy()
@@ -200,11 +212,12 @@ def _stems(axes: Axes, places: np.ndarray, heights: np.ndarray, *, bottom: float
     base.set_visible(False)
 
 
-def _apart(frequency: np.ndarray, level: np.ndarray, *, most: int) -> list[int]:
-    """Return the strongest modes whose labels do not run into one another."""
+def _apart(frequency: np.ndarray, energy: np.ndarray, *, most: int) -> list[int]:
+    """Return the modes of most energy whose labels do not run into one another."""
     chosen: list[int] = []
-    for row in np.argsort(-level).tolist():
-        if len(chosen) < most and all(abs(frequency[row] - frequency[one]) > 0.05 * frequency.max() for one in chosen):
+    places = np.log(frequency)
+    for row in np.argsort(-energy)[: np.isfinite(energy).sum()].tolist():
+        if len(chosen) < most and all(abs(places[row] - places[one]) > 0.05 * np.ptp(places) for one in chosen):
             chosen.append(row)
     return chosen
 

@@ -111,7 +111,9 @@ def _go_all_the_way(
     _write_sounds(folder / "sounds", field, train, heard)
     poles = modes_words(len(field.bank), int((~field.is_mode).sum()))
     pictures = {
-        "modes": draw_modes(made.modes.bank, levels(amplitudes(made.modes)), title=f"{poles} of the mug"),
+        "modes": draw_modes(
+            made.modes.bank, levels(amplitudes(made.modes)), is_mode=field.is_mode, title=f"{poles} of the mug"
+        ),
         "spectrograms": draw_spectrograms(
             heard.sounds,
             field.render(heard.contacts, directions=heard.directions),

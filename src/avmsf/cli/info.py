@@ -16,7 +16,7 @@ from avmsf.capture import CaptureSettings, Impacts, read_capture
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.infoclouds import describe_cloud, describe_features
 from avmsf.cli.modes import mode_table
-from avmsf.cli.modetable import levels, mode_rows
+from avmsf.cli.modetable import levels, listed, mode_rows
 from avmsf.cli.options.info import Options
 from avmsf.cli.printing import console, next_command, print_json, say
 from avmsf.cli.scores import body_warnings, outlier_words, quality_words, score_table, score_values
@@ -27,6 +27,7 @@ from avmsf.field.scaledgains import surface_of
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.field.uncertainty import has_posterior, relative_gain_std, spectrum_band, training_contacts
+from avmsf.modal.bank import ModalBank
 from avmsf.pipeline.record import RECORD, modes_words, recorded
 from avmsf.scene.featureheader import holds_features
 from avmsf.scene.points import farthest_points
@@ -57,10 +58,10 @@ def run(options: Options) -> int:
     values = describe(field)
     screen = console(errors=options.json)
     screen.print(_words(field, values, quality_words(field, options.file)), soft_wrap=True)
-    screen.print(mode_table(f"{counted(len(rows), 'mode')}, levels on average over the object", rows))
-    if supporting:
-        title = f"{counted(len(supporting), 'supporting pole')}: in the model, but not modes"
-        screen.print(mode_table(title, supporting))
+    title, most, rest = listed(", levels on average over the object", rows, len(supporting))
+    screen.print(mode_table(title, most))
+    if rest:
+        screen.print(rest)
     recorded = None
     if options.capture is not None:
         settings = None if options.settings is None else CaptureSettings.read(options.settings)
@@ -119,9 +120,11 @@ def draw_field(
     """Write the figures of a field, with some of the recordings `recorded` next to its sounds."""
     name = field.origin.capture or "field"
     modes = modes_words(len(field.bank), int((~field.is_mode).sum()))
+    kept = field.is_mode
+    bank = ModalBank(field.bank.frequency[kept], field.bank.damping[kept])
     pictures = {
-        "modes": draw_modes(field.bank, level, title=f"{modes} of {name}"),
-        "gains": draw_gains(points, gains, field.bank.frequency, title=f"gains of the strongest modes of {name}"),
+        "modes": draw_modes(field.bank, level, is_mode=field.is_mode, title=f"{modes} of {name}"),
+        "gains": draw_gains(points, gains[:, kept], bank, title=f"gains of the modes of most energy of {name}"),
     }
     if recorded is not None:
         chosen = recorded.take(farthest_points(recorded.contacts, min(_DRAWN_CONTACTS, len(recorded))).tolist())

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from avmsf.bench.pictures import draw_modes, save_picture
 from avmsf.capture import read_capture
 from avmsf.cli.alignment import AlignmentReport
-from avmsf.cli.modetable import ModeRow, QualityRow, amplitudes, levels, mode_rows, quality_rows
+from avmsf.cli.modetable import ModeRow, QualityRow, amplitudes, levels, listed, mode_rows, quality_rows
 from avmsf.cli.options.checks import read_settings
 from avmsf.cli.options.modes import Options
 from avmsf.cli.printing import console, decimals, figure, next_command, print_json, say, table
@@ -16,10 +16,10 @@ from avmsf.modal.extraction.quality import measure_quality
 from avmsf.pipeline.record import capture_settings_of, finder_of
 from avmsf.wording import counted
 
-_EXPLANATION = """\
-±: spread over recordings. energy: share of all. phase: coherence over recordings, 1 if the same in
-all. orders: part of the model orders that find the pole. left out: energy explained by
-leave-one-out, 50 % by chance."""
+_EXPLANATION = (
+    "±: spread over recordings. energy: share of all. phase: coherence over recordings, 1 if the same in all. orders: "
+    "part of the model orders that find the pole. left out: energy explained by leave-one-out, 50 % by chance."
+)
 
 
 def run(options: Options) -> int:
@@ -35,21 +35,18 @@ def run(options: Options) -> int:
     quality = measure_quality(extraction.aligned(impacts).sounds, extraction, sample_rate=impacts.sample_rate)
     every = list(zip(rows, quality_rows(quality), quality.is_mode.tolist(), strict=True))
     modes, supporting = ([(row, how) for row, how, is_mode in every if is_mode is part] for part in (True, False))
-    title = f"{counted(len(modes), 'mode')} of {capture.name}, {counted(len(impacts), 'recording')}"
+    of = f" of {capture.name}, {counted(len(impacts), 'recording')}"
+    title, most, rest = listed(of, [row for row, _ in modes], len(supporting))
     screen = console(errors=options.json)
-    screen.print(quality_table(title, modes))
-    if supporting:
-        screen.print(
-            quality_table(f"{counted(len(supporting), 'supporting pole')}: in the model, but not modes", supporting)
-        )
-    screen.print(_EXPLANATION)
+    screen.print(quality_table(title, [modes[[row for row, _ in modes].index(row)] for row in most]))
+    screen.print(f"{rest}{'. ' if rest else ''}{_EXPLANATION}", soft_wrap=True)
     aligned = AlignmentReport.of(extraction, impacts)
     for sentence in [] if aligned is None else aligned.sentences():
         screen.print(sentence, soft_wrap=True)
     if options.plots is not None:
         picture = options.plots / "modes.png"
         drawn = f"{counted(len(rows), 'pole')} of {capture.name}, of them {counted(len(modes), 'mode')}"
-        save_picture(draw_modes(extraction.bank, level, title=drawn), picture)
+        save_picture(draw_modes(extraction.bank, level, is_mode=quality.is_mode, title=drawn), picture)
         say(f"wrote {picture}")
     if options.json:
         print_json(
@@ -75,13 +72,13 @@ def mode_table(title: str, rows: Sequence[ModeRow]) -> object:
     columns = ["", "frequency Hz", "damping 1/s", "T60 s", "level dB"]
     cells = [
         [
-            str(number),
+            str(row.number),
             decimals(row.frequency_hertz, 2),
             figure(row.damping_per_second),
             figure(row.t60_seconds),
             decimals(row.level_db, 1),
         ]
-        for number, row in enumerate(rows, start=1)
+        for row in rows
     ]
     return table(title, columns, cells)
 
@@ -91,7 +88,7 @@ def quality_table(title: str, rows: Sequence[tuple[ModeRow, QualityRow]]) -> obj
     columns = ["", "frequency Hz", "damping 1/s", "T60 s", "level dB", "energy", "phase", "orders", "left out"]
     cells = [
         [
-            str(number),
+            str(row.number),
             f"{row.frequency_hertz:.2f} ± {figure(how.frequency_spread_hertz, 2)}",
             f"{figure(row.damping_per_second)} ± {figure(how.damping_spread_per_second, 2)}",
             figure(row.t60_seconds),
@@ -101,6 +98,6 @@ def quality_table(title: str, rows: Sequence[tuple[ModeRow, QualityRow]]) -> obj
             f"{100 * how.stable_orders:.0f} %",
             f"{100 * how.explained_left_out:.0f} %",
         ]
-        for number, (row, how) in enumerate(rows, start=1)
+        for row, how in rows
     ]
     return table(title, columns, cells)

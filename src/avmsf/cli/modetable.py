@@ -1,6 +1,7 @@
 """Modes as a table, as `avmsf modes` and `avmsf info` print them."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,18 +11,29 @@ from torch import Tensor
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.quality import ModeQuality
+from avmsf.wording import counted
+
+_LISTED = 20
+"""Modes in a table, those of most energy."""
 
 
 @dataclass(frozen=True)
 class ModeRow:
     """One mode, as plain values."""
 
+    number: int
+    """From 1, by frequency, among all poles of the model."""
     frequency_hertz: float
     damping_per_second: float
     t60_seconds: float
     """Time in which it falls by 60 dB, ln(1000) / damping."""
     level_db: float
-    """Root mean square of its amplitude over recordings or points, against the strongest mode's."""
+    """Root mean square of its amplitude over recordings or points, against the strongest pole's."""
+
+    @property
+    def energy_db(self) -> float:
+        """Its energy over time, which is proportional to the square of its amplitude and to its decay time."""
+        return self.level_db + 10 * math.log10(self.t60_seconds)
 
 
 @dataclass(frozen=True)
@@ -57,13 +69,22 @@ def mode_rows(bank: ModalBank, level_db: Float[Tensor, " modes"]) -> list[ModeRo
     """Return the modes in the bank's order."""
     columns = (bank.frequency.tolist(), bank.damping.tolist(), level_db.tolist())
     return [
-        ModeRow(frequency, damping, math.log(1000) / damping, level)
-        for frequency, damping, level in zip(*columns, strict=True)
+        ModeRow(number, frequency, damping, math.log(1000) / damping, level)
+        for number, (frequency, damping, level) in enumerate(zip(*columns, strict=True), start=1)
     ]
 
 
+def listed(of: str, rows: Sequence[ModeRow], supporting: int) -> tuple[str, list[ModeRow], str]:
+    """Return a table's title, the modes of most energy that it lists, and what is to be said of the other poles."""
+    most = sorted(rows, key=lambda row: row.energy_db, reverse=True)[:_LISTED]
+    which = "by energy" if len(most) == len(rows) else f"the {_LISTED} of most energy"
+    poles = counted(supporting, "supporting pole")
+    title = f"{counted(len(rows), 'mode')}{of}, {which}"
+    return title, most, f"{poles} in the model, but not modes (--json lists all)" if supporting else ""
+
+
 def levels(amplitudes: Float[Tensor, "contacts modes"]) -> Float[Tensor, " modes"]:
-    """Return each mode's root mean square amplitude against the strongest mode's, dB."""
+    """Return each mode's root mean square amplitude against the strongest pole's, dB."""
     size = amplitudes.square().mean(0).sqrt()
     floor = torch.finfo(size.dtype).tiny
     return 20 * torch.log10((size / size.max().clamp_min(floor)).clamp_min(1e-10))

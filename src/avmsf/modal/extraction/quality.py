@@ -17,7 +17,9 @@ contact, whereas two modes of a nearly round object have independent shapes. The
 real shapes over n recordings has a beta distribution with parameters 1/2 and (n - 1) / 2; where a few recordings
 outweigh the others, n is the number of equal ones of which chance would make as much.
 
-Poles that fail either test stay in the model, for held-out sounds are predicted worse without them
+A pole that falls to 1/e within one period has no pitch, whatever it explains: it describes a thud or an onset.
+
+Poles that fail a test stay in the model, for held-out sounds are predicted worse without them
 (docs/decisions/mode-quality.md).
 """
 
@@ -60,7 +62,7 @@ class ModeQuality:
     explains there, both to first order; summed over recordings. One for a mode of unchanging pole, about one half by
     chance."""
     is_mode: Bool[Tensor, " modes"]
-    """Whether it is a mode by both tests; if not, it supports the model of a mode or of the remains near it."""
+    """Whether it is a mode by all tests; if not, it supports the model of a mode or of the remains near it."""
 
 
 def measure_quality(
@@ -79,7 +81,8 @@ def measure_quality(
     # Loud recordings count no more than others for phases and shapes.
     amplitudes = amplitudes[audible] / level[audible, None]
     noise = noise_at(noise_power(scaled, bins=noise_bins(sounds.shape[1])), bank, sample_rate)
-    standing = torch.nonzero(_stands_out(explained, moves.misfit(), noise)).flatten()
+    pitched = bank.damping < bank.frequency
+    standing = torch.nonzero(pitched & _stands_out(explained, moves.misfit(), noise)).flatten()
     # A double of what is no mode itself may be the mode that both are of.
     part = ModalBank(bank.frequency[standing], bank.damping[standing])
     double = _doubles(part, amplitudes[:, standing], explained[:, standing].sum(0), level=_FALSE_MODES / len(bank))

@@ -52,7 +52,7 @@ export function modeTable(studio) {
         const pressed = String(mode === studio.mode);
         const numbers = [frequency.toFixed(1), decay.toPrecision(3), level.toFixed(1)];
         // The button is for keys and for who does not see; a click anywhere in its line presses it.
-        const choose = button(String(mode), () => {}, { className: "small", title, "aria-pressed": pressed });
+        const choose = button(String(mode + 1), () => {}, { className: "small", title, "aria-pressed": pressed });
         choose.setAttribute("aria-label", title);
         return element(
           "tr",
