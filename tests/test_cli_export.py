@@ -1,9 +1,11 @@
 """`avmsf export`: every format from a field file, what it says, and what it refuses."""
 
 import csv
+import itertools
 import json
 import re
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -237,6 +239,29 @@ def test_a_sample_set_names_its_instrument(field_file: Path, tmp_path: Path, cap
     assert following.startswith("next: ")
     assert main([*words, *re.search(r"--forces( [\d.]+)+", following)[0].split()]) == 0
     assert instrument.read_text().count("<region>") == 6
+    layers = [soundfile.read(output / "sounds" / f"001-{number}.wav")[0] for number in (1, 2, 3)]
+    for one, other in itertools.pairwise(layers):
+        assert float(np.corrcoef(one, other)[0, 1]) < 0.999
+
+
+def test_a_contact_that_is_hardly_heard_is_no_key_unless_it_is_asked_for(
+    field_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Streams
+) -> None:
+    sampled = SampledField.of(load(field_file), limit=5)
+    factor = torch.tensor([1.0, 1.0, 1e-3, 1.0, 1.0])[:, None]
+    silent = replace(sampled, sine=factor * sampled.sine, cosine=factor * sampled.cosine)
+    monkeypatch.setattr("avmsf.cli.export._sampled", lambda *_: silent)
+    words = ["export", str(field_file), "--to", "wavs", "--seconds", "0.05"]
+    for given, keys in (([], 4), (["--position", "0", "0", "0"], 5)):
+        output = tmp_path / str(keys)
+        assert main([*words, "--output", str(output), *given]) == 0
+        assert len(list((output / "sounds").iterdir())) == keys
+    assert "1 contact left out" in capsys.readouterr().err
+
+
+def test_sfz_is_refused_with_the_format_that_holds_it(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
+    assert main(["export", str(field_file), "--to", "sfz", "--output", str(tmp_path / "s")]) == 2
+    assert "wavs" in capsys.readouterr().err
 
 
 def test_a_new_parent_folder_is_said_once(field_file: Path, tmp_path: Path, capsys: Streams) -> None:

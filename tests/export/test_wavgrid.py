@@ -13,7 +13,7 @@ import soundfile
 import torch
 
 from avmsf.errors import ExportError
-from avmsf.export.wavgrid import Grid, Layer, write_grid
+from avmsf.export.wavgrid import Grid, Layer, hertz_layers, write_grid
 from avmsf.modal.pulse import ForcePulse
 from made_tables import RATE, SAMPLES, apart, table
 from raising import raises
@@ -180,3 +180,20 @@ def test_bad_settings_are_refused(tmp_path, grid, name, value):
 def test_a_rate_that_no_wav_holds_is_refused(tmp_path):
     with raises(ExportError, name="sample_rate", value=8000.5):
         write_grid(replace(table(), sample_rate=8000.5), tmp_path / "grid")
+
+
+def test_a_harder_impact_is_shorter_in_contact_by_hertzs_law():
+    """The squares of the pulses' widths add: recorded and added one make up the contact time, as force^(-1/6)."""
+    layers = hertz_layers((0.3, 3.0, 1.0))
+    assert [layer.force for layer in layers] == [0.3, 3.0, 1.0]
+    assert layers[1].contact_time == 0.0
+    widths = [1 + (layer.contact_time / layers[0].contact_time) ** 2 * (10 ** (1 / 3) - 1) for layer in layers]
+    assert widths == pytest.approx([(3.0 / force) ** (1 / 3) for force in (0.3, 3.0, 1.0)])
+
+
+def test_layers_of_hertzs_law_become_brighter_with_the_force(tmp_path):
+    write_grid(table(), tmp_path / "grid", Grid(1, hertz_layers((0.3, 1.0, 3.0)), noise=False))
+    files = [tmp_path / "grid" / row["file"] for row in rows(tmp_path / "grid")]
+    spectra = [np.abs(np.fft.rfft(soundfile.read(file)[0])) for file in files]
+    centers = [float((np.arange(len(each)) * each**2).sum() / (each**2).sum()) for each in spectra]
+    assert centers[0] < centers[1] < centers[2]

@@ -26,7 +26,7 @@ from avmsf.export.modaldemo import SCENE, is_demo, read_demo, write_demo
 from avmsf.export.objectfile import holds_gaussians, read_object
 from avmsf.export.sampledfield import SampledField, spread_rows
 from avmsf.export.universal import write_universal
-from avmsf.export.wavgrid import INSTRUMENT, Grid, Layer, write_grid
+from avmsf.export.wavgrid import INSTRUMENT, Grid, Layer, hertz_layers, write_grid
 from avmsf.export.webpage import write_webpage
 from avmsf.export.written import Written, expect_free, write_file
 from avmsf.field.positions import points_on_object
@@ -38,6 +38,9 @@ from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import read_splats
 from avmsf.tasks.edits import EDITS
 from avmsf.wording import counted
+
+_DEAD_DB = 40.0
+"""Energy of a contact below the loudest one's, dB, from which on it is no key of a sample set by default."""
 
 
 def run(options: Options) -> int:
@@ -306,14 +309,27 @@ def _wavs(field: SoundField | SampledField, options: Options) -> Written:
     forces, times = options.forces, options.contact_times
     if len(times) == 1:
         times = times * len(forces)
-    if not forces or len(times) != len(forces):
+    if times and len(times) != len(forces):
         raise ExportError.expected(
             f"one, or one for each of {len(forces)} --forces", len(times), name="--contact-times"
         )
-    layers = tuple(Layer(force, each, options.pulse) for force, each in zip(forces, times, strict=True))
+    layers = tuple(Layer(force, each, options.pulse) for force, each in zip(forces, times, strict=False))
+    layers = layers or hertz_layers(forces, options.pulse)
     sampled = _sampled(field, options)
+    if not options.contacts_given:
+        sampled = _loud(sampled)
     grid = Grid(len(sampled), layers, options.seconds, noise=not options.no_noise)
     return write_grid(sampled, options.output, grid, force=options.overwrite)
+
+
+def _loud(sampled: SampledField) -> SampledField:
+    """Return the field at contacts that are heard beside the loudest; says how many are left out."""
+    level = 10 * torch.log10(sampled.energy.clamp_min(torch.finfo(torch.float64).tiny))
+    loud = torch.nonzero(level >= level.max() - _DEAD_DB).flatten()
+    if len(loud) < len(sampled):
+        left = counted(len(sampled) - len(loud), "contact")
+        say(f"note: {left} left out, {_DEAD_DB:g} dB or more below the loudest; --position writes any")
+    return sampled.take(loud)
 
 
 def _uff(field: SoundField | SampledField, options: Options) -> Written:

@@ -79,13 +79,14 @@ def run(options: Options) -> int:
 
 def _print_table(found: Suggestions, rows: Sequence[dict[str, Any]], screen: Console) -> None:
     """Print the suggested contacts with their errors, and how many positions were left out."""
-    title = f"where to record next: expected error of the field now {figure(found.before)}"
-    headings = {"order": "", "x": "x (m)", "y": "y (m)", "z": "z (m)", "error_after": "error after"}
+    title = f"where to record next: uncertainty of the gains now {figure(found.before)}"
+    headings = {"order": "", "x": "x (m)", "y": "y (m)", "z": "z (m)", "error_after": "after"}
     columns = [headings.get(name, name) for name in rows[0]]
     cells = [[_cell(value) for value in row.values()] for row in rows]
     screen.print(table(title, columns, cells, words=1 + ("recording" in columns)))
     screen.print(
-        "error: by the field's posterior, relative to the energy of the gains; 0 = certain, 1 = the error of silence",
+        "uncertainty: by the field's posterior, relative to the energy of the gains; 0 = "
+        "certain, 1 = silence. How sounds are off is measured by leave-one-out: believe that figure (avmsf info)",
         soft_wrap=True,
     )
     if found.unreachable:

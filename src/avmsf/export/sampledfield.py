@@ -133,6 +133,11 @@ class SampledField:
         """Whether the dampings are the same at all contacts."""
         return self.damping.ndim == 1
 
+    @property
+    def energy(self) -> Float64[Tensor, " points"]:
+        """Energy of the modes over time of an impact of force 1, gain^2 / (4 d) summed."""
+        return ((self.sine.double().square() + self.cosine.double().square()) / (4.0 * self.damping)).sum(1)
+
     def __len__(self) -> int:
         return len(self.points)
 

@@ -27,6 +27,10 @@ HIGHEST_NOTE = 127
 LOWEST_NOTE = 36
 """MIDI note of the first contact: C2, where drum maps begin."""
 
+_CONTACT = 5e-4
+"""Contact time that the recorded impacts are taken to have had, s: that of a small steel tip on plastic, as
+`avmsf.simulate.hammer` computes it; on steel it has a sixth of it."""
+
 
 @dataclass(frozen=True)
 class Layer:
@@ -38,6 +42,18 @@ class Layer:
     """Seconds that hammer and object are in contact; 0 is the impact as recorded."""
     shape: PulseShape = "half-sine"
     """Course of the force over that time."""
+
+
+def hertz_layers(forces: Sequence[float], shape: PulseShape = "half-sine") -> tuple[Layer, ...]:
+    """Return layers of which the hardest is as recorded, and softer ones are longer in contact by Hertz's law.
+
+    A round tip's contact time goes with its speed to the power -1/5 and its force with the speed to the power 6/5
+    (`avmsf.simulate.hammer`), so that the time goes with the force to the power -1/6. The recorded pulse is in the
+    gains already: what is added makes its width, whose squares add, as long as the softer impact's.
+    """
+    hardest = max(forces, default=0.0)
+    ratios = [(hardest / force) ** (1 / 3) - 1.0 if force > 0 else 0.0 for force in forces]
+    return tuple(Layer(force, _CONTACT * math.sqrt(each), shape) for force, each in zip(forces, ratios, strict=True))
 
 
 @dataclass(frozen=True, eq=False)

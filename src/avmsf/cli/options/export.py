@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
@@ -99,8 +100,9 @@ class Options(Printing):
     forces: tuple[float, ...] = (1.0,)
     """wavs: forces of the layers, in newtons if the field knows forces, otherwise relative; written from soft to
     loud."""
-    contact_times: tuple[float, ...] = (0.0,)
-    """wavs: contact time of each layer's hammer in seconds; one for all, or one per force."""
+    contact_times: tuple[float, ...] = ()
+    """wavs: contact time of each layer's hammer in seconds; one for all, or one per force; 0 is the impact as recorded.
+    By default the hardest impact is as recorded, and softer ones are longer in contact by Hertz's law."""
     seconds: float | None = None
     """wavs: length of the sounds; by default that of the training sounds."""
     pulse: PulseShape = "half-sine"
@@ -146,6 +148,8 @@ class Options(Printing):
 
 def parse(words: Sequence[str]) -> Options:
     """Return the options that the words spell."""
+    if ("--to", "sfz") in pairwise(words):
+        raise ExportError.expected("--to wavs, which writes an SFZ instrument too", "sfz", name="--to")
     return parse_options(Options, "export", words)
 
 
