@@ -11,7 +11,9 @@ import soundfile
 
 from avmsf.capture import CaptureSettings, check, read_capture
 from avmsf.capture.measure import shared_problems
+from avmsf.capture.proposals import propose_settings
 from avmsf.errors import CaptureError
+from avmsf.modal.extraction.extract import extract_modes
 from capture_folder import HEADER, RATE, ROWS, fill, ring
 from raising import raises
 
@@ -131,7 +133,9 @@ def test_measured_strikes_pass(shared: Path) -> None:
     for name in ("aircraft", "aircraft_response"):
         report = check(shared / name, CaptureSettings.read(captures / f"{name}.toml"))
         assert report.readable
-        assert report.problems == ()
+        # Two files of this measurement are the same, at contacts 112 mm apart.
+        (problem,) = report.problems
+        assert problem.split(", to")[0].replace("impacts/", "") == "017.wav: the same sound as 016.wav"
         assert len(report.recordings) == 74
         assert [row.problems for row in report.recordings] == [()] * 74
 
@@ -176,3 +180,41 @@ def test_recordings_in_a_subfolder_are_named(tmp_path: Path, names: str) -> None
     assert "write taps/a.wav" in str(caught.value)
     (folder / "impacts.csv").write_text("\n".join([HEADER, *(f"taps/{row}" for row in rows)]))
     assert check(folder).readable
+
+
+def test_recordings_that_were_scaled_to_one_peak_are_named(tmp_path: Path) -> None:
+    rows = [f"{name}.wav,{row / 10},0,0" for row, name in enumerate("abcd")]
+    sounds = {row.partition(",")[0]: ring(seed=seed) * (1 + seed) for seed, row in enumerate(rows)}
+    assert check(fill(tmp_path / "as recorded", rows=rows, replace=sounds)).problems == ()
+    equal = {name: 0.9 * sound / np.abs(sound).max() for name, sound in sounds.items()}
+    (problem,) = check(fill(tmp_path / "scaled", rows=rows, replace=equal)).problems
+    assert "same peak, 0.9" in problem
+
+
+def test_a_copy_of_a_recording_is_named_with_its_source(tmp_path: Path) -> None:
+    (problem,) = check(fill(tmp_path, replace={"b.wav": ring(seed=2)})).problems
+    assert problem.startswith("c.wav: the same sound as b.wav")
+
+
+@pytest.mark.parametrize("offset", [0.01, -0.1, 4.0])
+def test_a_constant_offset_of_the_recorder_changes_nothing(tmp_path: Path, offset: float) -> None:
+    rows = [f"{name}.wav,{row / 10},0,0" for row, name in enumerate("abcdef")]
+    sounds = {row.partition(",")[0]: ring(before=0.1, seed=seed) for seed, row in enumerate(rows)}
+    clean = read_capture(fill(tmp_path / "clean", rows=rows, replace=sounds)).impacts
+    moved = {name: sound + offset for name, sound in sounds.items()}
+    read = read_capture(fill(tmp_path / "moved", rows=rows, replace=moved)).impacts
+    # The offset is estimated from the quietest 40 ms or more, whose noise is 1e-4, and samples are float32.
+    np.testing.assert_allclose(read.sounds, clean.sounds, atol=2e-5)
+
+
+def test_sway_and_rumble_are_proposed_to_be_filtered_whatever_their_onset(tmp_path: Path) -> None:
+    rows = [f"{name}.wav,{row / 10},0,0" for row, name in enumerate("abcd")]
+    rate = 16_000
+    time = np.arange(rate) / rate
+    sway = 0.4 * np.sin(2 * np.pi * 8 * time + 1)
+    sounds = {
+        row.partition(",")[0]: ring(1.0, rate=rate, before=0.3, seed=seed) + sway for seed, row in enumerate(rows)
+    }
+    proposed = {each.key: each.value for each in propose_settings(fill(tmp_path, rows=rows, replace=sounds, rate=rate))}
+    assert proposed == {"highpass": 20.0}
+    assert extract_modes(read_capture(tmp_path).impacts) is not None

@@ -72,11 +72,6 @@ def test_rumble_60_db_under_the_peak_hides_no_decay(tmp_path: Path) -> None:
     assert found(folder_of(tmp_path, rumbling(3e-4, 6.0, noise=1e-6))) == {}
 
 
-def test_a_constant_offset_is_rumble(tmp_path: Path) -> None:
-    folder = folder_of(tmp_path, [each + 0.02 for each in rumbling(0.0, 1.0)])
-    assert found(folder) == {"highpass": 20.0}
-
-
 def test_the_bowl_s_rumble_is_found(shared: Path, tmp_path: Path) -> None:
     rows = []
     for number, path in enumerate(sorted((shared / "bowl_clips").glob("*.wav"))):

@@ -1,6 +1,7 @@
 """Sound files as they lie on disk: every channel, the file's own rate, nothing resampled or scaled."""
 
 import io
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import soundfile
 import torch
 from jaxtyping import Float, Float64, Shaped
+from scipy.special import stdtrit
 from torch import Tensor
 
 from avmsf.capture.filenames import missing_recording
@@ -27,6 +29,8 @@ sound: 40 dB down, less than the noise of a usable recording (`HIGHEST_NOISE_DB`
 _BITS = {"PCM_S8": 8, "PCM_U8": 8, "PCM_16": 16, "PCM_24": 24, "PCM_32": 32}
 FAINT_CHANNEL = 0.1
 """Level of a channel over the loudest one's below which it is not used: a muted or far microphone's, 20 dB down."""
+OFFSET_SIGNIFICANCE = 1e-6
+"""Probability by which noise without an offset would look as if it had one."""
 EIGHT_BIT = frozenset({"PCM_U8", "PCM_S8", "ULAW", "ALAW", "DPCM_8"})
 
 
@@ -101,8 +105,9 @@ class Recording:
     def response(
         self, number: int | None = None, *, force_channel: int | None = None
     ) -> Float64[np.ndarray, " frames"]:
-        """Return the channel that holds the object's sound (see `response_channel`)."""
-        return self.channel(self.response_channel(number, force_channel=force_channel))
+        """Return the channel that holds the object's sound (see `response_channel`), without a constant offset."""
+        sound = self.channel(self.response_channel(number, force_channel=force_channel))
+        return sound - constant_offset(sound, sample_rate=self.sample_rate)
 
     def _agree(self, reference: int, other: int) -> bool:
         """Return whether a channel is the reference times a constant, up to rounding, dither or 1 % of itself.
@@ -119,6 +124,18 @@ class Recording:
         # Rounding with dither has an rms of half a step in each of the two channels.
         step = 0.0 if bits is None else 2.0 ** (1 - bits)
         return float(np.std(rest)) <= max(MAX_CHANNEL_DIFFERENCE * float(np.std(second)), step)
+
+
+def constant_offset(sound: Float64[np.ndarray, " frames"], *, sample_rate: float) -> float:
+    """Return the mean of the quietest tenth of 10 ms blocks; 0 where a t-test of the blocks finds none."""
+    size = max(64, round(0.01 * sample_rate))
+    blocks = sound[: len(sound) // size * size].reshape(-1, size)
+    means = blocks.mean(axis=1)[np.argsort(blocks.std(axis=1), kind="stable")[: len(blocks) // 10]]
+    if len(means) < 3 or np.ptp(sound) < MIN_PEAK:
+        return 0.0
+    offset, error = float(means.mean()), float(means.std(ddof=1)) / math.sqrt(len(means))
+    limit = error * float(stdtrit(len(means) - 1, 1.0 - OFFSET_SIGNIFICANCE))
+    return offset if abs(offset) > limit else 0.0
 
 
 def read_recording(path: Path, name: str | None = None, *, advice: str = "check the path") -> Recording:

@@ -1,5 +1,6 @@
 """Everything that is wrong with a capture folder, found without stopping at the first thing."""
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -56,6 +57,7 @@ class _Sound:
     """From the onset to the end."""
     rate: float
     peak: float
+    digest: bytes
     start: Prepared
     """With no more than the first `margin_length` samples of the sound."""
 
@@ -80,7 +82,8 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
         if prepared is not None:
             rate = report.sample_rate or 0.0
             start = replace(prepared, sound=prepared.sound[: margin_length(rate)].copy())
-            sounds.append(_Sound(report.file, len(prepared.sound), rate, prepared.peak, start))
+            digest = hashlib.sha256(prepared.sound.tobytes()).digest()
+            sounds.append(_Sound(report.file, len(prepared.sound), rate, prepared.peak, digest, start))
     if len(far) > 1:
         # One message for all, with which they are listed together.
         largest = max(far.values())
@@ -99,6 +102,12 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
         reports = [each if each.onset_seconds is None else replace(each, onset_seconds=0.0) for each in reports]
         sounds = [replace(each, samples=each.samples + each.start.onset) for each in sounds]
     refused += _check_sounds(sounds, settings=settings, problems=problems)
+    first = {each.digest: each.file for each in reversed(sounds)}
+    problems += [
+        f"{each.file}: the same sound as {first[each.digest]}, to the last bit: copy the right file, or remove its row"
+        for each in sounds
+        if each.file != first[each.digest]
+    ]
     listed = {report.file for report in reports}
     stray = [name for name in _wav_files(folder) if name not in listed]
     if stray:

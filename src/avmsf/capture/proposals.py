@@ -23,7 +23,7 @@ from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.measure import HIGHEST_NOISE_DB, decibels, noise_level
 from avmsf.capture.onset import SECONDS_BEFORE, find_onset, find_pulse
 from avmsf.capture.placement import judge_placement, surface_points
-from avmsf.capture.prepare import Prepared, prepare
+from avmsf.capture.prepare import Prepared, prepare, remove_rumble
 from avmsf.capture.settings import METRES, SETTINGS, CaptureSettings, settings_of
 from avmsf.capture.starts import shorten, start_with_impact
 from avmsf.capture.surface import find_surface
@@ -44,6 +44,10 @@ MAX_RUMBLE_RISE = 10**0.6
 6 dB. The power of a few periods of noise scatters by 3."""
 MIN_NOISE_SHARE = 1e-6
 """Mean square of noise against the squared peak, -60 dB, below which it does not hide the decay over its T60."""
+AUDIO_RATE = 16_000.0
+"""Sample rate, Hz, from which on recordings are of sound: slower ones are of structures that vibrate below 20 Hz."""
+MAX_LOW_SHARE = 0.1
+"""Share of the energy after the impacts, below the lowest candidate, above which it is no sound of the object."""
 SHORTEST_LEAD_SECONDS = 0.1
 """Two periods of the lowest candidate: less than that before an impact does not show rumble."""
 MIN_COHERENCE = 0.9
@@ -188,6 +192,7 @@ class Evidence:
         self._starts: list[Prepared] = []
         self._struck: list[tuple[Strike, float, float]] = []
         self._noise: list[Float64[np.ndarray, "kinds candidates"]] = []
+        self._low: list[float] = []
         self._squares: Complex128[np.ndarray, " bins"] | float = 0.0
         self._powers: Float64[np.ndarray, " bins"] | float = 0.0
 
@@ -207,10 +212,15 @@ class Evidence:
             self._struck.append((strike, prepared.newtons, prepared.peak * prepared.newtons))
         response = recording.response(settings.response_channel, force_channel=settings.force_channel)
         kept = round(settings.kept_seconds(rate) * rate)
-        lead = response[: max(0, prepared.onset - round(SECONDS_BEFORE * rate))]
+        onset = prepared.onset
+        if prepared.pulse is None and recording.duration * CANDIDATES_HZ[0] >= 1.0:
+            # Sway and drift as loud as the impact hide its onset.
+            onset = find_onset(remove_rumble(response, CANDIDATES_HZ[0], recording), sample_rate=rate)
+        lead = response[: max(0, onset - round(SECONDS_BEFORE * rate))]
+        later = response[onset : onset + kept]
         if len(lead) >= SHORTEST_LEAD_SECONDS * rate:
-            later = response[prepared.onset : prepared.onset + kept]
             self._noise.append(_low_powers(lead, later, rate) / float(np.abs(response).max()) ** 2)
+        self._low.append(_low_power(later, CANDIDATES_HZ[0], rate) / float(np.square(later).mean()))
         spectrum = np.fft.rfft(np.concatenate([prepared.before, prepared.sound])[:kept], kept)
         spectrum /= np.linalg.norm(spectrum)
         self._squares, self._powers = self._squares + spectrum**2, self._powers + np.abs(spectrum) ** 2
@@ -219,7 +229,9 @@ class Evidence:
         """Return what all recordings together show."""
         if len(self._rates) != 1 or len(self._starts) < 2:
             return []
-        found = (self._normalize(), self._highpass(), self._align())
+        highpass = self._highpass()
+        # What is below it decides onsets, levels and phases as well.
+        found = (self._normalize(), self._align()) if highpass is None else (highpass,)
         return [each for each in found if each is not None]
 
     def _normalize(self) -> Proposal | None:
@@ -254,8 +266,20 @@ class Evidence:
         )
 
     def _highpass(self) -> Proposal | None:
-        """Propose the lowest candidate that removes most of the noise and nothing of the object's."""
-        if self.settings.highpass > 0.0 or len(self._noise) < len(self._starts) / 2:
+        """Propose the lowest candidate that removes most of the noise and nothing of the object's.
+
+        Or the lowest where most of what follows the impacts lies below it, as of a sensor that settles.
+        """
+        if self.settings.highpass > 0.0:
+            return None
+        if min(self._rates) >= AUDIO_RATE and (share := float(np.median(self._low))) > MAX_LOW_SHARE:
+            return Proposal(
+                "highpass",
+                CANDIDATES_HZ[0],
+                f"{share:.0%} of the energy after the impacts lies below {CANDIDATES_HZ[0]:g} Hz: drift, sway or a "
+                "sensor that settles. Leave it out if the object itself vibrates there.",
+            )
+        if len(self._noise) < len(self._starts) / 2:
             return None
         before, below, later = np.mean(self._noise, axis=0)
         if before[0] < MIN_NOISE_SHARE:
@@ -374,11 +398,12 @@ def _low_powers(
     lead: Float64[np.ndarray, " lead"], later: Float64[np.ndarray, " samples"], rate: float
 ) -> Float64[np.ndarray, "kinds candidates"]:
     """Return mean squares for each candidate: of all before the impact, of that below the candidate, and after it."""
-    rows = []
-    for signal in (lead, later):
-        power = np.abs(np.fft.rfft(signal) / len(signal)) ** 2
-        power[1:] *= 2.0
-        frequencies = np.fft.rfftfreq(len(signal), 1.0 / rate)
-        rows.append([power.sum(), *(power[frequencies < cutoff].sum() for cutoff in CANDIDATES_HZ)])
-    before, after = rows
-    return np.array([[before[0]] * len(CANDIDATES_HZ), before[1:], after[1:]])
+    rows = [[_low_power(signal, cutoff, rate) for cutoff in CANDIDATES_HZ] for signal in (lead, later)]
+    return np.array([[float(np.square(lead).mean())] * len(CANDIDATES_HZ), *rows])
+
+
+def _low_power(signal: Float64[np.ndarray, " samples"], cutoff: float, rate: float) -> float:
+    """Return the mean square of what lies below a frequency."""
+    power = np.abs(np.fft.rfft(signal) / len(signal)) ** 2
+    power[1:] *= 2.0
+    return float(power[np.fft.rfftfreq(len(signal), 1.0 / rate) < cutoff].sum())

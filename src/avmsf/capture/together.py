@@ -28,6 +28,8 @@ USUAL_SIZE = 0.24
 USUAL_RANGE_DB = 80.0
 """Level between a recording and the median beyond which its scale is doubtful: a contact near the nodes of most modes
 takes 40 dB, a soft impact 30."""
+MIN_EQUAL_PEAKS, SAME_PEAK_DB = 4, 0.05
+"""Recordings, and how far their peaks may differ, that were scaled to one peak: struck ones differ by decibels."""
 USUAL_GAP_DB = 12.0
 """Level between the loudest recording and the next beyond which its scale is doubtful, of six recordings or more: 24
 measured and simulated captures have at most 7. One recording at ten times its level outweighs all others in a fit."""
@@ -54,7 +56,7 @@ def common_rate(rates: Sequence[float], names: Sequence[str]) -> float:
 
 
 def judge_levels(peaks: Sequence[float], names: Sequence[str]) -> list[CaptureWarning]:
-    """Return a warning where a prepared sound is far louder or fainter than the others; of a single one, none.
+    """Return a warning where a prepared sound is far louder or fainter than the others, or all peaks are one.
 
     Raises `CaptureError` where the loudest is more than `MAX_RANGE_DB` above the faintest.
     """
@@ -73,6 +75,12 @@ def judge_levels(peaks: Sequence[float], names: Sequence[str]) -> list[CaptureWa
             name="peak",
             value=peaks[worst],
         )
+    if len(levels) >= MIN_EQUAL_PEAKS and np.ptp(levels) < SAME_PEAK_DB:
+        message = (
+            f"all {len(levels)} recordings have the same peak, {peaks[0]:.3g}: expected the levels as recorded, got "
+            "each scaled to one peak, which loses how strong the modes are at each contact; export them unscaled"
+        )
+        return [CaptureWarning(message, file=names[0], name="peak", value=peaks[0])]
     ascending = np.sort(levels)
     if len(levels) >= 6 and ascending[-1] - ascending[-2] > USUAL_GAP_DB:
         loudest = int(levels.argmax())

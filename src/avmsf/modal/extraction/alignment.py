@@ -247,7 +247,9 @@ def _common_onset(impacts: Impacts, delays: Float64[Tensor, " contacts"], agrees
         [early.delayed(delays - lead + each).sounds[agrees, : 2 * lead].double().square() for each in fractions], dim=2
     ).flatten(1)
     mean = (power / power.sum(1, keepdim=True).clamp_min(1e-300)).mean(0)
-    threshold = max(0.01 * float(mean.max()), 10 * float(mean[: _FRACTIONS * lead // 2].median()))
+    highest = float(mean.max())
+    # Noise within 10 dB of the sounds hides all but their loudest.
+    threshold = min(max(0.01 * highest, 10 * float(mean[: _FRACTIONS * lead // 2].median())), highest)
     return float((mean >= threshold).nonzero()[0, 0]) / _FRACTIONS - lead
 
 
