@@ -12,7 +12,6 @@ import torch
 from avmsf.bench.cdpam import Cdpam
 from avmsf.bench.cdpamnetwork import CdpamNetwork
 from avmsf.bench.cdpamweights import CdpamWeights, find_weights, read_weights
-from avmsf.bench.conventions import OBJECTFOLDER, PAPER, Convention, Together
 from avmsf.bench.convolution import TiledConvolution, Workspace
 from avmsf.errors import EvaluationError
 from raising import raises
@@ -182,27 +181,6 @@ def test_sounds_that_cannot_be_compared_are_refused(cdpam):
     with raises(EvaluationError, name="sounds", row=None) as caught:
         cdpam.embed(1e308 * good, sample_rate=RATE)
     assert 1e307 < caught.value.value <= 1e308
-
-
-@needs_weights
-def test_conventions_can_be_taken_together(cdpam):
-    a, b = strikes(1500), strikes(1500).flip(0)
-    # The paper's and the benchmark's envelope are one and the same.
-    every = Together((PAPER, OBJECTFOLDER, cdpam))
-    assert every.name == "paper + objectfolder + cdpam"
-    keys = {"l1", "l1_log", "envelope", "spectrogram", "cdpam", "cdpam_scaled"}
-    assert set(every.scores(a, b, sample_rate=RATE)) == keys
-
-
-def test_conventions_that_differ_about_a_key_are_not_taken_together():
-    class Louder(Convention):
-        name = "louder"
-
-        def scores(self, predicted, truth, *, sample_rate):
-            return PAPER.scores(2 * predicted, 2 * truth, sample_rate=sample_rate)
-
-    with raises(EvaluationError, name="l1", value="paper + louder"):
-        Together((PAPER, Louder())).scores(strikes(1500), 0 * strikes(1500), sample_rate=RATE)
 
 
 def test_a_missing_package_is_named_with_its_remedy(monkeypatch):

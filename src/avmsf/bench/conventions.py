@@ -11,7 +11,6 @@ squared magnitudes it would be 12 to 15. It remains an inference: compare ratios
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -22,7 +21,6 @@ from avmsf.bench.metrics import (
     objectfolder_distance,
     spectrogram_distance,
 )
-from avmsf.errors import EvaluationError
 from avmsf.modal.config import scaled_fft_size
 
 
@@ -104,38 +102,6 @@ class ObjectFolderConvention(Convention):
             "spectrogram": objectfolder_distance(predicted, truth, sample_rate=sample_rate),
             "envelope": envelope_distance(predicted, truth),
         }
-
-
-@dataclass(frozen=True)
-class Together(Convention):
-    """Several conventions as one, such as the paper's metrics and CDPAM: all their keys."""
-
-    parts: tuple[Convention, ...]
-
-    @property
-    def name(self) -> str:
-        """What a report calls the convention: the parts' names."""
-        return " + ".join(part.name for part in self.parts)
-
-    def scores(
-        self, predicted: Float[Tensor, "..."], truth: Float[Tensor, "..."], *, sample_rate: float
-    ) -> dict[str, PerContact]:
-        """Return what all parts return. Raises as they do, and EvaluationError where two differ about a key.
-
-        They may share one: the paper's `envelope` and the ObjectFolder benchmark's are the same.
-        """
-        values: dict[str, PerContact] = {}
-        for part in self.parts:
-            for key, figures in part.scores(predicted, truth, sample_rate=sample_rate).items():
-                if key in values and not torch.equal(values[key], figures):
-                    raise EvaluationError(
-                        f"{self.name}: expected equal values of the metric {key!r}, got two different ones; evaluate "
-                        "the conventions separately",
-                        name=key,
-                        value=self.name,
-                    )
-                values[key] = figures
-        return values
 
 
 PAPER = PaperConvention()

@@ -1,5 +1,6 @@
 """`avmsf fit`: a capture folder in, a field file out."""
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -26,6 +27,7 @@ from avmsf.cli.scores import (
     score_table,
     score_values,
 )
+from avmsf.cli.visuals import visual_inputs
 from avmsf.errors import FitError
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import save
@@ -83,7 +85,12 @@ def run(options: Options) -> int:
         say(f"not trained on: {shown}")
     print_fitted(screen, fitted, train, test, scores, options.output)
     screen.print(f"wrote {options.output}", soft_wrap=True)
-    next_after_fit(options.output, trial=test is not None)
+    visual = None if features is not None else visual_inputs(options.capture, capture.settings)
+    if visual is not None and visual.reconstructs:
+        say(f"note: {visual.sentence}, which fit did not use")
+        next_command("avmsf reconstruct", options.capture, f"-o {shlex.quote(str(options.output))}")
+    else:
+        next_after_fit(options.output, trial=test is not None)
     if options.json:
         print_json(
             {

@@ -38,7 +38,7 @@ def run(options: Options) -> int:
     of = f" of {capture.name}, {counted(len(impacts), 'recording')}"
     title, most, rest = listed(of, [row for row, _ in modes], len(supporting))
     screen = console(errors=options.json)
-    screen.print(quality_table(title, [modes[[row for row, _ in modes].index(row)] for row in most]))
+    screen.print(quality_table(title, [(row, how) for row in most for other, how in modes if other is row]))
     screen.print(f"{rest}{'. ' if rest else ''}{_EXPLANATION}", soft_wrap=True)
     aligned = AlignmentReport.of(extraction, impacts)
     for sentence in [] if aligned is None else aligned.sentences():

@@ -19,8 +19,6 @@ REALIMPACT_NAMES = (
     "93_GreenGoblet", "94_GlassGoblet", "96_Bowl", "97_PlasticScoop", "100_Frisbee",
 )  # fmt: skip
 """All objects of RealImpact, as its archives and folders are called."""
-UNUSED = (72, 82)
-"""Numbers that no folder of ObjectFolder Real has; of 98 and 99 one is missing as well."""
 _FIRST_WORDS = ("ceramic", "iron", "wood", "glass")
 _LAST_WORDS = ("ceramic", "iron", "wood")
 
