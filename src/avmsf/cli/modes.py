@@ -1,6 +1,6 @@
 """`avmsf modes`: the modes that a capture's recordings have in common."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 
 from avmsf.bench.pictures import draw_modes, save_picture
@@ -38,7 +38,7 @@ def run(options: Options) -> int:
     of = f" of {capture.name}, {counted(len(impacts), 'recording')}"
     title, most, rest = listed(of, [row for row, _ in modes], len(supporting))
     screen = console(errors=options.json)
-    screen.print(quality_table(title, [(row, how) for row in most for other, how in modes if other is row]))
+    screen.print(mode_table(title, most, {row.number: how for row, how in modes}))
     screen.print(f"{rest}{'. ' if rest else ''}{_EXPLANATION}", soft_wrap=True)
     aligned = AlignmentReport.of(extraction, impacts)
     for sentence in [] if aligned is None else aligned.sentences():
@@ -67,37 +67,19 @@ def run(options: Options) -> int:
     return 0
 
 
-def mode_table(title: str, rows: Sequence[ModeRow]) -> object:
-    """Return the modes for printing."""
+def mode_table(title: str, rows: Sequence[ModeRow], quality: Mapping[int, QualityRow] | None = None) -> object:
+    """Return modes for printing, with their quality by their numbers where it is known."""
     columns = ["", "frequency Hz", "damping 1/s", "T60 s", "level dB"]
-    cells = [
-        [
-            str(row.number),
-            decimals(row.frequency_hertz, 2),
-            figure(row.damping_per_second),
-            figure(row.t60_seconds),
-            decimals(row.level_db, 1),
-        ]
-        for row in rows
-    ]
-    return table(title, columns, cells)
-
-
-def quality_table(title: str, rows: Sequence[tuple[ModeRow, QualityRow]]) -> object:
-    """Return modes with their quality for printing."""
-    columns = ["", "frequency Hz", "damping 1/s", "T60 s", "level dB", "energy", "phase", "orders", "left out"]
-    cells = [
-        [
-            str(row.number),
-            f"{row.frequency_hertz:.2f} ± {figure(how.frequency_spread_hertz, 2)}",
-            f"{figure(row.damping_per_second)} ± {figure(how.damping_spread_per_second, 2)}",
-            figure(row.t60_seconds),
-            decimals(row.level_db, 1),
-            f"{100 * how.energy_share:.2f} %",
-            decimals(how.phase_coherence, 2),
-            f"{100 * how.stable_orders:.0f} %",
-            f"{100 * how.explained_left_out:.0f} %",
-        ]
-        for row, how in rows
-    ]
+    columns += [] if quality is None else ["energy", "phase", "orders", "left out"]
+    cells = []
+    for row in rows:
+        frequency, damping = decimals(row.frequency_hertz, 2), figure(row.damping_per_second)
+        cell = [str(row.number), frequency, damping, figure(row.t60_seconds), decimals(row.level_db, 1)]
+        if quality is not None:
+            how = quality[row.number]
+            cell[1] += f" ± {figure(how.frequency_spread_hertz, 2)}"
+            cell[2] += f" ± {figure(how.damping_spread_per_second, 2)}"
+            cell += [f"{100 * how.energy_share:.2f} %", decimals(how.phase_coherence, 2)]
+            cell += [f"{100 * how.stable_orders:.0f} %", f"{100 * how.explained_left_out:.0f} %"]
+        cells.append(cell)
     return table(title, columns, cells)
