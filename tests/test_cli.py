@@ -23,7 +23,6 @@ from avmsf.scene.plyheader import NEEDED
 from avmsf.simulate.plate import plate_modes
 from plate_capture import CONTACT_TIME, HIGHEST, PLATE, RATE, TINY, fill_plate
 from raising import raises
-from views_folder import write_image
 
 Streams = pytest.CaptureFixture[str]
 AT = ("--position", "0.05", "0.06", "0")
@@ -262,16 +261,6 @@ def test_modes_prints_the_plates(capture: Path, tmp_path: Path, capsys: Streams)
     # The table is the verb's output where no JSON is.
     main(["modes", str(capture), "--extraction", "short-time", "--modes", "4"])
     assert " modes of plate" in capsys.readouterr().out
-
-
-def test_photographs_that_fit_does_not_use_are_its_last_words(tmp_path: Path, capsys: Streams) -> None:
-    folder = fill_plate(tmp_path / "plate", surface=False)
-    for number in range(3):
-        write_image(folder / "images" / f"{number}.png")
-    assert main(["fit", str(folder), "-o", str(tmp_path / "f.safetensors"), "--gain-model", "smooth", *TINY]) == 0
-    lines = capsys.readouterr().err.splitlines()
-    assert "3 photographs" in lines[-2]
-    assert lines[-1].startswith("next: avmsf reconstruct")
 
 
 def test_fit_writes_a_field_and_its_scores(capture: Path, tmp_path: Path, capsys: Streams) -> None:

@@ -156,3 +156,52 @@ def test_the_unit_of_contacts_is_found_from_photographs(tmp_path: Path, capsys: 
         assert [each["value"] for each in proposals if each["key"] == "unit"] == found
     if proposed:
         assert CaptureSettings.read(folder / "capture.toml").unit == unit
+
+
+@pytest.mark.parametrize(
+    ("name", "advice"),
+    [
+        ("bowl_scan.obj", 'surface = "bowl_scan.obj"'),
+        ("scan/textured.glb", 'surface = "scan/textured.glb"'),
+        ("surface.usdz", "surface.obj"),
+        ("splats.spz", "splats.ply"),
+        ("point_cloud/iteration_30000/point_cloud.ply", "splats.ply"),
+        ("train/transforms_train.json", "transforms.json"),
+        ("keyframes/0001.jpg", "images"),
+        ("IMG_0001.HEIC", ".jpg"),
+        ("table.xlsx", "impacts.csv"),
+    ],
+)
+def test_a_file_that_looks_like_an_input_and_is_not_used_is_named_and_ends_a_fit(
+    tmp_path: Path, name: str, advice: str, capsys: Streams
+) -> None:
+    folder = fill_plate(tmp_path / "plate")
+    (folder / "surface.obj").unlink(missing_ok=True)
+    (folder / "surface.ply").unlink(missing_ok=True)
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    (folder / name).touch()
+    (sentence,) = found(folder).unused
+    assert sentence.startswith(name.removesuffix("0001.jpg"))
+    assert advice in sentence
+    for verb in ("fit", "reconstruct"):
+        assert main([verb, str(folder), "-o", str(tmp_path / "field.safetensors"), "--json"]) == 2
+        assert json.loads(capsys.readouterr().out)["error"]["value"] == [sentence]
+    assert not (tmp_path / "field.safetensors").exists()
+
+
+def test_every_file_of_a_capture_with_photographs_or_a_mesh_is_used(tmp_path: Path) -> None:
+    write_transforms(fill_plate(tmp_path), frames(ring(4)))
+    assert found(tmp_path).unused == ()
+
+
+def test_a_field_of_positions_has_to_be_asked_for_where_photographs_show_the_object(
+    tmp_path: Path, capsys: Streams
+) -> None:
+    folder = fill_plate(tmp_path / "plate")
+    for path in folder.glob("surface.*"):
+        path.unlink()
+    write_transforms(folder, frames(ring(4)))
+    words = ["fit", str(folder), "-o", str(tmp_path / "f.safetensors"), "--gain-model", "smooth", "--steps", "1"]
+    assert main([*words, "--json"]) == 2
+    assert json.loads(capsys.readouterr().out)["error"]["name"] == "shape"
+    assert main([*words, "--without-shape"]) == 0

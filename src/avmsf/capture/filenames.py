@@ -17,6 +17,14 @@ PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 SPLATS = ("splats.ply", "point_cloud.ply")
 """Names under which a folder may hold Gaussians that were made elsewhere."""
+_READ_SHAPES = (".obj", ".ply", ".glb", ".stl")
+_OTHER_NAMES = {
+    **dict.fromkeys((".gltf", ".usdz", ".usd", ".fbx", ".dae", ".off", ".3mf", ".gz", ".zip"), "export surface.obj"),
+    **dict.fromkeys((".spz", ".splat", ".ksplat", ".sog"), "export the Gaussians as splats.ply"),
+    **dict.fromkeys((".heic", ".heif", ".tif", ".tiff", ".dng"), "export it as .jpg"),
+    **dict.fromkeys((".xlsx", ".xls", ".ods"), "export the table as impacts.csv"),
+}
+"""Endings of shapes, pictures and tables that are not read, and what to do."""
 _MAX_NAMES_COMPARED = 1000
 """File names among which a misspelt one is sought: a tenth of a second."""
 _OF_VIEWS = frozenset(("transforms.json", "images", "sparse", "cameras.bin", "cameras.txt", *SURFACE_FILES, *SPLATS))
@@ -32,6 +40,30 @@ def find_surface_file(folder: Path, settings: CaptureSettings) -> Path | None:
             )
         return folder / named
     return next((folder / name for name in SURFACE_FILES if (folder / name).is_file()), None)
+
+
+def unused_files(folder: Path, settings: CaptureSettings) -> list[str]:
+    """Return a sentence for each file that looks like a shape, pictures, cameras or a table and is not used.
+
+    Hidden folders are left out. Of many pictures in one folder one sentence is made.
+    """
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    files = [path for path in files if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
+    cameras = any(path.name in ("transforms.json", "cameras.bin", "cameras.txt") for path in files)
+    surface, advice = find_surface_file(folder, settings), dict[str, str]()
+    for path in files:
+        name, suffix = path.relative_to(folder).as_posix(), path.suffix.lower()
+        top, within = name.partition("/")[0], "/" in name
+        if suffix in _OTHER_NAMES:
+            advice[name] = _OTHER_NAMES[suffix]
+        elif suffix in _READ_SHAPES and path != surface and top not in ("sparse", *SPLATS):
+            gaussians = path.name in SPLATS
+            advice[name] = "copy it to splats.ply" if gaussians else f'write surface = "{name}" in capture.toml'
+        elif path.name.startswith("transforms_") and suffix == ".json" and not cameras:
+            advice[name] = "call it transforms.json"
+        elif suffix in PICTURE_SUFFIXES and within and top not in ("images", "masks") and not cameras:
+            advice[f"{path.parent.relative_to(folder).as_posix()}/"] = "call the folder of photographs images"
+    return [f"{name} is not used: {what}" for name, what in advice.items()]
 
 
 def expect_views(folder: Path, settings: CaptureSettings) -> None:

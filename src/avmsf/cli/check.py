@@ -48,7 +48,7 @@ def run(options: Options) -> int:
         screen.print(_table(report, str(options.capture), aligned))
     if visual is not None:
         screen.print(visual.sentence, soft_wrap=True)
-    problems = [*problems_of(report), *(() if visual is None else visual.problems)]
+    problems = [*problems_of(report), *(() if visual is None else (*visual.problems, *visual.unused))]
     problems += [] if outside is None else [str(outside)]
     for problem in problems[:MAX_PRINTED]:
         screen.print(problem, soft_wrap=True)

@@ -1,8 +1,7 @@
 """`avmsf fit`: a capture folder in, a field file out."""
 
-import shlex
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,7 @@ from avmsf.cli.scores import (
     score_table,
     score_values,
 )
-from avmsf.cli.visuals import visual_inputs
+from avmsf.cli.visuals import expect_shape
 from avmsf.errors import FitError
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import save
@@ -48,6 +47,10 @@ def run(options: Options) -> int:
     if options.material is not None:
         return _run_guess(options, options.material, known)
     capture = read_capture(options.capture, capture_settings_of(options.pipeline, known))
+    if options.without_shape:
+        capture = replace(capture, surface=None)
+    elif options.features is None:
+        expect_shape(options.capture, capture, views=False, verb="fit")
     train, test = part_contacts(
         capture.impacts, fraction=options.train_fraction, count=options.train_count, start=options.start
     )
@@ -85,12 +88,7 @@ def run(options: Options) -> int:
         say(f"not trained on: {shown}")
     print_fitted(screen, fitted, train, test, scores, options.output)
     screen.print(f"wrote {options.output}", soft_wrap=True)
-    visual = None if features is not None else visual_inputs(options.capture, capture.settings)
-    if visual is not None and visual.reconstructs:
-        say(f"note: {visual.sentence}, which fit did not use")
-        next_command("avmsf reconstruct", options.capture, f"-o {shlex.quote(str(options.output))}")
-    else:
-        next_after_fit(options.output, trial=test is not None)
+    next_after_fit(options.output, trial=test is not None)
     if options.json:
         print_json(
             {

@@ -15,6 +15,7 @@ from avmsf.cli.progress import FitBar
 from avmsf.cli.scenebar import SceneBar
 from avmsf.cli.scenes import features_words
 from avmsf.cli.scores import compare
+from avmsf.cli.visuals import expect_shape
 from avmsf.errors import FitError
 from avmsf.field.fit import Progress
 from avmsf.field.store import load
@@ -31,6 +32,8 @@ def run(options: Options) -> int:
     if options.material is not None:
         return _run_guess(options, options.material, settings)
     capture = read_capture(options.folder, settings)
+    if not options.without_shape:
+        expect_shape(options.folder, capture, views=True, verb="reconstruct")
     train, test = part_contacts(
         capture.impacts, fraction=options.train_fraction, count=options.train_count, start=options.start
     )

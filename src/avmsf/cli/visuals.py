@@ -7,7 +7,9 @@ from pathlib import Path
 
 from PIL import Image
 
-from avmsf.capture.filenames import find_surface_file, pictures_in
+from avmsf.capture.filenames import find_surface_file, pictures_in, unused_files
+from avmsf.capture.folder import Capture
+from avmsf.capture.placement import expect_placed, surface_points
 from avmsf.capture.proposals import contacts_of
 from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.table import read_rows
@@ -15,7 +17,7 @@ from avmsf.capture.views.foreground import find_foreground
 from avmsf.capture.views.read import find_shots, read_views
 from avmsf.capture.views.shots import listed, mask_names
 from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import CaptureError, SceneError
+from avmsf.errors import CaptureError, FitError, SceneError
 from avmsf.pipeline.silhouettes import LONGEST, MAX_VIEWS, expect_contacts_in_outlines
 from avmsf.pipeline.sources import find_source, find_splats
 from avmsf.wording import counted
@@ -35,6 +37,8 @@ class VisualInputs:
     gaussians: str | None
     problems: tuple[str, ...]
     """What is wrong with these, as far as names and camera files show it."""
+    unused: tuple[str, ...] = ()
+    """Sentences on files that look like a shape, pictures or cameras and are not used."""
 
     @property
     def reconstructs(self) -> bool:
@@ -86,7 +90,45 @@ def visual_inputs(folder: Path, settings: CaptureSettings | None) -> VisualInput
         None if surface is None or not surface.is_file() else surface.name,
         None if splats is None else splats.name,
         tuple(problems),
+        tuple(unused_files(folder, settings)),
     )
+
+
+def expect_shape(folder: Path, capture: Capture, *, views: bool, verb: str) -> None:
+    """Raise `SceneError` where the folder was meant to show the object and a field would know positions alone.
+
+    `views` says whether photographs, a video and Gaussians are used.
+    """
+    advice = "; or fit a field of the positions alone by --without-shape"
+    surface, visual = capture.surface, visual_inputs(folder, capture.settings)
+    if surface is not None and not len(surface.faces) and not views:
+        raise SceneError(
+            f"{folder}: expected a mesh, got {len(surface.vertices)} points without triangles; make a mesh of "
+            f"them{advice}",
+            file=folder,
+            name="faces",
+        )
+    if surface is not None:
+        try:
+            expect_placed(capture.impacts.contacts, surface_points(surface), names=capture.impacts.names)
+        except FitError as error:
+            raise FitError(f"{error}{advice}", **error.attributes) from error
+    if surface is not None or visual is None or (views and visual.reconstructs):
+        return
+    if visual.reconstructs:
+        raise SceneError(
+            f"{folder}: expected a mesh for avmsf {verb}, got none; avmsf reconstruct uses what "
+            f"shows the object here ({visual.sentence.partition(': ')[2]}){advice}",
+            file=folder,
+            name="shape",
+        )
+    if visual.unused:
+        raise SceneError(
+            f"{folder}: expected the object's shape, got none; {'; '.join(visual.unused[:3])}{advice}",
+            file=folder,
+            name="shape",
+            value=visual.unused,
+        )
 
 
 def contacts_outside(folder: Path, settings: CaptureSettings | None, visual: VisualInputs) -> CaptureError | None:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from avmsf.cli.options.checks import expect_capture, expect_device, expect_modes
-from avmsf.cli.options.common import Printing, parse_options, preset_of, preset_values
+from avmsf.cli.options.common import Flag, Printing, parse_options, preset_of, preset_values
 from avmsf.cli.options.paths import NEW_TENSORS, Existing, SettingsFile
 from avmsf.config import BodyConfig, PipelineConfig, Preset, SceneConfig, TimeZero
 from avmsf.errors import EvaluationError, FitError
@@ -54,6 +54,8 @@ class Options(Printing):
         Existing("features, as avmsf features writes them", ("features",)),
     ] = None
     """Features written by `avmsf features`, in the frame of the contacts; by default positions on the surface."""
+    without_shape: Flag = False
+    """Fit to the positions of the contacts alone, whatever shows the object's shape."""
     gain_model: GainModel = "auto"
     """How gains vary over the object. auto: a Gaussian process over all kernel families, weighted by evidence; the
     elastic family needs a mesh. network: the paper's attention network on the features. The others: a Gaussian process

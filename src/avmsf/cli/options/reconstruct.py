@@ -10,7 +10,7 @@ import tyro
 
 from avmsf.capture.settings import CaptureSettings
 from avmsf.cli.options.checks import expect_modes, expect_rows
-from avmsf.cli.options.common import parse_options, preset_of, preset_values
+from avmsf.cli.options.common import Flag, parse_options, preset_of, preset_values
 from avmsf.cli.options.fit import expect_split, refuse_with_material
 from avmsf.cli.options.paths import NEW_TENSORS
 from avmsf.cli.options.scenes import SceneOptions, with_seed
@@ -56,6 +56,8 @@ class Options(SceneOptions):
     """Start of the sounds: onset, or peak (paper); by default that of capture.toml."""
     seed: int | None = None
     """Seed of all stages; by default each stage's own."""
+    without_shape: Flag = False
+    """Go on where nothing that shows the object can be used, with the positions of the contacts alone."""
     gain_model: GainModel = "auto"
     """How gains vary over the object; see `avmsf fit --help`."""
     body: BodyConfig = field(default_factory=BodyConfig)
