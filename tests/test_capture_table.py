@@ -39,9 +39,19 @@ def test_rows_keep_their_order_and_contacts_are_meters(tmp_path: Path) -> None:
         " File , X,Y , z\n a.wav , 0.1, 0 ,0\n\nb.wav,0,0.2,0\nc.wav,0,0,0.3",
         "file;x;y;z\na.wav;0,1;0;0\nb.wav;0;0,2;0\nc.wav;0;0;0,3\n",
         "file\tx\ty\tz\na.wav\t0.1\t0\t0\nb.wav\t0\t0.2\t0\nc.wav\t0\t0\t0.3\n",
+        "sep=;\nfile;x;y;z\na.wav;0,1;0;0\nb.wav;0;0,2;0\nc.wav;0;0;0,3\n",
+        "# bowl\n#\nfile,x,y,z\na.wav,0.1,\u22120,0\nb.wav,0,0.2,0\nc.wav,0,0,0.3\n",
         'z,y,x,file\n0,0,0.1,"a.wav"\n0,0.2,0,.\\b.wav\n0.3,0,0,./c.wav\n,,,\n',
     ],
-    ids=["bom and windows", "spaces and case", "semicolons", "tabs", "order, quotes, backslash, empty row"],
+    ids=[
+        "bom and windows",
+        "spaces, case",
+        "semicolons",
+        "tabs",
+        "sep",
+        "comments, minus",
+        "order, quotes, backslash, empty row",
+    ],
 )
 def test_what_spreadsheets_write_is_read(tmp_path: Path, text: str) -> None:
     folder = fill(tmp_path)
@@ -49,6 +59,22 @@ def test_what_spreadsheets_write_is_read(tmp_path: Path, text: str) -> None:
     impacts = read_capture(folder).impacts
     assert impacts.names == ("a.wav", "b.wav", "c.wav")
     assert torch.equal(impacts.contacts, CONTACTS)
+
+
+def test_a_name_is_found_composed_or_decomposed(tmp_path: Path) -> None:
+    folder = fill(tmp_path)
+    (folder / "a.wav").rename(folder / "a\u0308.wav")
+    text = (folder / "impacts.csv").read_text().replace("a.wav", "\u00e4.wav")
+    (folder / "impacts.csv").write_text(text, encoding="utf-8")
+    assert read_capture(folder).impacts.names[0] == "a\u0308.wav"
+
+
+def test_what_git_lfs_leaves_in_place_of_a_table_is_named(tmp_path: Path) -> None:
+    folder = fill(tmp_path)
+    (folder / "impacts.csv").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
+    with raises(CaptureError, file="impacts.csv") as caught:
+        read_capture(folder)
+    assert "git lfs pull" in str(caught.value)
 
 
 def test_units_scale_contacts_and_surface_alike(tmp_path: Path) -> None:

@@ -126,3 +126,12 @@ def test_smoothing_is_told():
     checked(rough, tell=told.append)
     assert len(told) == 1
     assert f"{roughness(Skin.of(rough)):.0f} degrees" in told[0]
+
+
+def test_corners_a_millionth_of_the_size_apart_are_one() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
+    corners = np.array(ball.triangles).reshape(-1, 3)
+    corners += 1e-7 * np.random.default_rng(0).uniform(-1, 1, corners.shape)
+    faces = torch.arange(len(corners)).reshape(-1, 3)
+    skin = Skin.of(Surface(torch.from_numpy(corners), faces))
+    assert (len(skin.points), len(skin.faces)) == (len(ball.vertices), len(ball.faces))

@@ -1,6 +1,7 @@
 """What `load_mesh` returns has indices that exist and finite coordinates; what is beyond its bounds is refused."""
 
 import json
+import logging
 import struct
 from pathlib import Path
 
@@ -133,3 +134,64 @@ def test_an_archive_is_no_mesh(tmp_path: Path) -> None:
     (tmp_path / "surface.zip").write_bytes(b"PK\x03\x04")
     with raises(CaptureError, file="surface.zip", name="suffix", value=".zip"):
         read_surface(tmp_path / "surface.zip")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("v ", "v\t"), ("f ", "f\t"), ("v ", "  v "), ("v ", "\ufeffv ")],
+    ids=["tab after v", "tab after f", "indented", "byte-order mark"],
+)
+def test_white_space_of_an_obj_changes_nothing(tmp_path: Path, old: str, new: str) -> None:
+    text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n"
+    (tmp_path / "a.obj").write_text(text.replace(old, new, 1 if new[0] == "\ufeff" else -1), encoding="utf-8")
+    surface = read_surface(tmp_path / "a.obj")
+    assert surface.faces.tolist() == [[0, 1, 2], [0, 1, 3]]
+    assert surface.vertices[:2].tolist() == [[0, 0, 0], [1, 0, 0]]
+
+
+def test_negative_indices_count_back_from_where_they_stand(tmp_path: Path) -> None:
+    blocks = [f"v {row} 0 0\nv {row} 1 0\nv {row} 0 1\nvt 0 0\nf -3/-1 -2/-1 -1/-1\n" for row in range(3)]
+    (tmp_path / "a.obj").write_text("".join(blocks))
+    surface = read_surface(tmp_path / "a.obj")
+    assert surface.vertices[surface.faces][:, :, 0].tolist() == [[row] * 3 for row in range(3)]
+
+
+def test_normalized_integers_are_from_minus_one_to_one(tmp_path: Path) -> None:
+    record = {
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "scale": [0.5, 0.5, 0.5]}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "mode": 4}]}],
+        "accessors": [{"componentType": 5122, "normalized": True, "count": 3, "type": "VEC3", "bufferView": 0}],
+        "bufferViews": [{"buffer": 0, "byteLength": 24, "byteStride": 8}],
+        "buffers": [{"byteLength": 24}],
+        "extensionsRequired": ["KHR_mesh_quantization"],
+    }
+    corners = np.array([[32767, 0, 0, 7], [0, -32768, 0, 7], [0, 0, 16384, 7]], dtype="<i2")
+    (tmp_path / "a.glb").write_bytes(glb(record, corners.tobytes()))
+    vertices = read_surface(tmp_path / "a.glb").vertices
+    torch.testing.assert_close(vertices, 0.5 * torch.diag(torch.tensor([1.0, -1.0, 0.5])), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "word"),
+    [
+        ("a.glb", glb({"extensionsRequired": ["KHR_draco_mesh_compression"]}), "Draco"),
+        ("a.obj", b"v 0,5 0,1 0,2\nv 1,5 0,1 0,2\nv 0,5 1,1 0,2\nf 1 2 3\n", "decimal commas"),
+        ("a.ply", b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "git lfs pull"),
+    ],
+)
+def test_why_a_mesh_cannot_be_read_is_named(tmp_path: Path, name: str, content: bytes, word: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with raises(CaptureError, file=name) as caught:
+        read_surface(tmp_path / name)
+    assert word in str(caught.value)
+
+
+def test_a_missing_texture_of_a_ply_prints_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(logging.root, "handlers", [])
+    text = PLY.format(x=0, row=2).replace("ascii 1.0\n", "ascii 1.0\ncomment TextureFile lost.png\n")
+    (tmp_path / "a.ply").write_text(text)
+    assert len(read_surface(tmp_path / "a.ply").faces) == 1
+    assert capfd.readouterr() == ("", "")

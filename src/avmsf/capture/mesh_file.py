@@ -3,6 +3,9 @@
 Every reader of meshes goes through `load_mesh`, so that what it returns has indices that exist and finite coordinates.
 """
 
+import io
+import logging
+import re
 import struct
 import warnings
 from pathlib import Path
@@ -13,6 +16,8 @@ import trimesh
 from PIL import Image
 
 from avmsf._utils.text_files import parse_json, read_json
+from avmsf.capture.filenames import is_lfs_pointer
+from avmsf.capture.plainmesh import expect_uncompressed, plain_mesh
 from avmsf.errors import AvmsfError, CaptureError
 
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
@@ -36,6 +41,9 @@ MAX_TEXTURE_PIXELS = 3 * 8192**2
 """Pixels of all textures: three pictures of 8192 x 8192, the largest that graphics cards of all makes take. 0.6 GB."""
 _MAX_VALUES = 12 * MAX_FACES
 """Entries of all accessors of a glb: four vectors (position, normal, color, texture) for each corner."""
+_COMMAS = re.compile(rb"^\s*(v|vertex)\s+-?[0-9]+,[0-9]", re.MULTILINE)
+# Of a missing texture trimesh logs a traceback, which goes to the terminal where nothing else takes it.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
 def load_mesh(path: Path, *, raising: type[AvmsfError] = CaptureError) -> trimesh.Scene:
@@ -49,15 +57,19 @@ def load_mesh(path: Path, *, raising: type[AvmsfError] = CaptureError) -> trimes
         with warnings.catch_warnings():
             # numpy's casts of damaged numbers; the results are checked below.
             warnings.simplefilter("ignore", RuntimeWarning)
-            scene = trimesh.load_scene(path, process=False)
+            plain = plain_mesh(path)
+            source = path if plain is None else io.BytesIO(plain)
+            resolver = trimesh.resolvers.FilePathResolver(str(path))
+            scene = trimesh.load_scene(source, path.suffix.lower()[1:], resolver, process=False)
             _expect_sound(scene)
     except AvmsfError as error:
         raise raising(f"{path}: {error}", file=path, row=error.row, name=error.name, value=error.value) from error
     except Exception as error:  # trimesh's readers raise whatever their format's parsing raises
-        raise raising(
-            f"{path}: expected a mesh or point cloud, got a file that cannot be read ({error}); export it again",
-            file=path,
-        ) from error
+        with open(path, "rb") as file:
+            commas = bool(_COMMAS.search(file.read(1 << 16)))
+        got = "decimal commas" if commas else f"a file that cannot be read ({error})"
+        advice = "export it with decimal points" if commas else "export it again"
+        raise raising.expected("a mesh or point cloud", got=got, file=path, advice=advice) from error
     return scene
 
 
@@ -84,6 +96,8 @@ def _expect_small(path: Path) -> None:
             name="suffix",
             value=path.suffix,
         )
+    if is_lfs_pointer(path):
+        raise CaptureError("expected a mesh, got a Git LFS pointer; run git lfs pull")
     size, most = path.stat().st_size, MAX_GLTF_BYTES if suffix == ".gltf" else MAX_BYTES
     if size > most:
         advice = ", or export it as .glb" if suffix == ".gltf" else ""
@@ -130,6 +144,7 @@ def _expect_small_gltf(record: Any) -> None:
         found = values.get(name, []) if isinstance(values, dict) else []
         return [each for each in found if isinstance(each, dict)] if isinstance(found, list) else []
 
+    expect_uncompressed(record)
     primitives = [len(entries(mesh, "primitives")) for mesh in entries(record, "meshes")]
     used = [node["mesh"] for node in entries(record, "nodes") if isinstance(node.get("mesh"), int)]
     _expect_at_most(MAX_PARTS, len(entries(record, "nodes")), "nodes")

@@ -4,6 +4,8 @@ import csv
 import glob
 import io
 import math
+import re
+import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,7 +13,7 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 
 from avmsf._utils.text_files import read_text
-from avmsf.capture.filenames import missing_recording
+from avmsf.capture.filenames import is_lfs_pointer, missing_recording
 from avmsf.capture.location import Location
 from avmsf.capture.settings import METRES, CaptureSettings
 from avmsf.capture.warning import CaptureWarning
@@ -27,6 +29,8 @@ MIN_FORCE_NEWTONS, MAX_FORCE_NEWTONS = 1e-6, 1e6
 """Peak forces that a row may give: from a grain of dust to the largest impact hammers (2e4 N) and beyond."""
 FARTHEST = 100.0
 """Meters from the origin beyond which a contact must be in another unit."""
+_NO_ROW = re.compile(r"\A\s*sep=.$|\A(^#.*\n)*^#.*$", re.MULTILINE)
+"""What Excel is told the separator by, and comments above the header."""
 HOW_TO_WRITE = (
     f"{TABLE} has the header file,x,y,z (and if known nx,ny,nz,force_newtons) and one row for each recording, "
     "for example: 001.wav,0.12,0.05,0.30. Without recordings, avmsf fit --material NAME computes a field from the shape"
@@ -69,8 +73,11 @@ def read_cells(path: Path) -> tuple[list[tuple[int, list[str]]], str]:
 
     Raises `CaptureError` for a file that is no table of UTF-8 text, or has more than `MAX_ROWS` rows.
     """
+    if is_lfs_pointer(path):
+        raise CaptureError.expected("a table", got="a Git LFS pointer", file=path, advice="run git lfs pull")
     try:
-        text = read_text(path)
+        # Blank in place of what are no rows, so that lines keep their numbers.
+        text = _NO_ROW.sub("", read_text(path))
         first = text.lstrip().split("\n", 1)[0]
         separator = max(",;\t", key=first.count)
         reader = csv.reader(io.StringIO(text), delimiter=separator)
@@ -113,10 +120,24 @@ def read_rows(folder: Path) -> tuple[list[Row], list[CaptureWarning]]:
                 f"expected {len(header)} cells as in the header, got {len(cells)}: {separator.join(cells)}",
                 value=len(cells),
             )
-        rows.append(Row(line, dict(zip(header, cells, strict=True)), separator != ","))
+        named = dict(zip(header, cells, strict=True))
+        named["file"] = _as_on_disk(folder, named["file"])
+        rows.append(Row(line, named, separator != ","))
     if not rows:
         raise CaptureError(f"{path}: expected rows below the header, got none; {HOW_TO_WRITE}", file=path, value=0)
     return rows, remarks
+
+
+def _as_on_disk(folder: Path, file: str) -> str:
+    """Return the name of a file that exists and has the same letters, composed or decomposed; else the name given."""
+    if file.isascii():
+        return file
+    path = folder / file.replace("\\", "/")
+    if is_missing(path) and path.parent.is_dir():
+        wanted = unicodedata.normalize("NFC", path.name)
+        same = [each for each in path.parent.iterdir() if unicodedata.normalize("NFC", each.name) == wanted]
+        return same[0].relative_to(folder).as_posix() if same else file
+    return file
 
 
 def understand(row: Row, settings: CaptureSettings) -> Strike:
@@ -252,8 +273,9 @@ def fitting_units(written: float) -> str:
 def _judge_header(header: Sequence[str], path: Path) -> list[CaptureWarning]:
     missing = [name for name in REQUIRED if name not in header]
     if missing:
+        numbers = "vertex numbers have to become positions: " if any("vert" in name for name in header) else ""
         raise CaptureError(
-            f"{path}: expected the columns {', '.join(missing)}, got only {', '.join(header)}; {HOW_TO_WRITE}",
+            f"{path}: expected the columns {', '.join(missing)}, got only {', '.join(header)}; {numbers}{HOW_TO_WRITE}",
             file=path,
             name=missing[0],
             value=list(header),
@@ -284,11 +306,14 @@ def _judge_header(header: Sequence[str], path: Path) -> list[CaptureWarning]:
 def _number(row: Row, name: str) -> float:
     text = row.cells[name]
     try:
-        value = float(text.replace(",", ".") if row.decimal_comma else text)
+        # Spreadsheets of some languages write the typographic minus.
+        plain = text.replace("\N{MINUS SIGN}", "-")
+        value = float(plain.replace(",", ".") if row.decimal_comma else plain)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise row.location.error(f"expected a number as {name}, got {text!r}", name=name, value=text)
+        advice = "; separate the columns by semicolons where numbers have decimal commas" if "," in text else ""
+        raise row.location.error(f"expected a number as {name}, got {text!r}{advice}", name=name, value=text)
     return value
 
 

@@ -4,6 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
@@ -11,6 +14,9 @@ from avmsf.simulate.coarsening import coarsen
 
 _CREASE = 0.9
 """Cosine of the angle by which a triangle may turn when the skin is made coarser: creases stay."""
+
+_SAME = 2e-6
+"""Distance over the body's size up to which vertices are one: text files round, and STL repeats each corner."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +120,13 @@ class Skin:
                 value=value,
             )
         places, rows = np.unique(points[faces.ravel()], axis=0, return_inverse=True)
+        pairs = cKDTree(places).query_pairs(
+            _SAME * float(np.linalg.norm(np.ptp(places, axis=0))), output_type="ndarray"
+        )
+        if len(pairs):
+            links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(places), len(places)))
+            label = connected_components(links, directed=False)[1]
+            places, rows = places[np.unique(label, return_index=True)[1]], label[rows]
         welded = rows.reshape(-1, 3)
         wide = np.linalg.norm(_doubled(places[welded]), axis=1) > 1e-12 * np.linalg.norm(np.ptp(places, axis=0)) ** 2
         if not wide.any():
