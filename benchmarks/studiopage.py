@@ -29,7 +29,6 @@ from avmsf.scene.ply import write_splats
 from avmsf.scene.start import StartPoints, starting_cloud
 from avmsf.simulate.examplemesh import example_mesh
 from avmsf.simulate.simulationfolder import write_textured
-from avmsf.studio.modules import fetch_modules, find_modules, with_local_modules
 from benchmarks.report import Report, Table
 from benchmarks.studiosound import ARGUMENTS, CHROMIUM
 
@@ -209,10 +208,8 @@ def _site(scratch: Path) -> Path:
     site = scratch / "site"
     write_bundle(table, site, object=scratch / "ball.ply")
     for name, content in page_files().items():
-        (site / name).parent.mkdir(exist_ok=True)
+        (site / name).parent.mkdir(parents=True, exist_ok=True)
         (site / name).write_bytes(content)
-    (site / "index.html").write_text(with_local_modules(page_files()["index.html"].decode()), encoding="utf-8")
-    (site / "modules").symlink_to(find_modules() or fetch_modules())
     return site
 
 
@@ -280,7 +277,7 @@ def _page(browser: Any, address: str, viewport: dict[str, int], **context: Any) 
 def _studio(*words: str) -> Iterator[str]:
     """Run `avmsf studio` and yield its address."""
     command = [*_COMMAND, "studio", *words, "--port", "0", "--no-browser"]
-    environment = {**os.environ, "AVMSF_PAGE_MODULES": str(find_modules() or fetch_modules()), "PYTHONUNBUFFERED": "1"}
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
     ) as process:

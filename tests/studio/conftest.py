@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from page_plate import page_modules
 from plate_page import Open, Serve, plate_site, visiting
 
 if TYPE_CHECKING:
@@ -64,15 +63,9 @@ def serve() -> Iterator[Callable[[Path], str]]:
 
 
 @pytest.fixture(scope="session")
-def modules(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a node_modules with three and spark, or skip where none can be had."""
-    return page_modules(tmp_path_factory.mktemp("npm"))
-
-
-@pytest.fixture(scope="session")
-def site(serve: Callable[[Path], str], modules: Path, tmp_path_factory: pytest.TempPathFactory) -> Serve:
+def site(serve: Callable[[Path], str], tmp_path_factory: pytest.TempPathFactory) -> Serve:
     """Return a function that gives the address of the plate's page."""
-    return plate_site(serve, modules, tmp_path_factory)
+    return plate_site(serve, tmp_path_factory)
 
 
 @pytest.fixture

@@ -1,13 +1,10 @@
 """A plate in closed form and the page that shows it, as a folder to be served."""
 
 import math
-import os
 import shutil
-import subprocess
 from pathlib import Path
 from typing import Any
 
-import pytest
 import torch
 import trimesh
 
@@ -16,7 +13,6 @@ from avmsf.export.bundle import write_bundle
 from avmsf.export.sampledfield import SampledField
 from avmsf.scene.ply import write_splats
 from avmsf.scene.start import StartPoints, starting_cloud
-from avmsf.studio.modules import MODULES_VARIABLE, PINNED, find_modules, with_local_modules
 
 PAGE = Path(__file__).resolve().parents[2] / "src" / "avmsf" / "studio" / "page"
 SIDES = (0.24, 0.16, 0.02)
@@ -84,33 +80,9 @@ def plate_object(kind: str, folder: Path) -> Path | None:
     return path
 
 
-def lay_out(folder: Path, table: SampledField, modules: Path, **bundle: Any) -> Path:
-    """Write the page with a field, and three and spark beside it."""
+def lay_out(folder: Path, table: SampledField, **bundle: Any) -> Path:
+    """Write the page with a field."""
     write_bundle(table, folder, **bundle)
-    page = (PAGE / "index.html").read_text(encoding="utf-8")
-    (folder / "index.html").write_text(with_local_modules(page), encoding="utf-8")
+    shutil.copy(PAGE / "index.html", folder)
     shutil.copytree(PAGE, folder / "page")
-    (folder / "modules").symlink_to(modules)
     return folder
-
-
-def page_modules(cache: Path) -> Path:
-    """Return a node_modules with three and spark: the environment's, the user's, or one that npm brings; or skip."""
-    named = os.environ.get(MODULES_VARIABLE)
-    found = Path(named) if named else find_modules()
-    if found is not None:
-        return found
-    npm = shutil.which("npm")
-    if npm is None:
-        pytest.skip(f"no three and spark: install npm, or name a node_modules in {MODULES_VARIABLE}")
-    wanted = [f"{name}@{version}" for name, version in PINNED.items()]
-    done = subprocess.run(
-        [npm, "install", "--prefix", str(cache), "--ignore-scripts", "--no-audit", "--no-fund", *wanted],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    if done.returncode != 0:
-        pytest.skip(f"no three and spark: npm could not fetch them: {done.stderr.strip()[-200:]}")
-    return cache / "node_modules"

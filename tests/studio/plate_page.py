@@ -22,7 +22,7 @@ Serve = Callable[..., str]
 Open = Callable[..., "Page"]
 
 
-def plate_site(serve: Callable[[Path], str], modules: Path, tmp_path_factory: pytest.TempPathFactory) -> Serve:
+def plate_site(serve: Callable[[Path], str], tmp_path_factory: pytest.TempPathFactory) -> Serve:
     """Return a function that gives the address of the plate's page; the same one twice for the same wishes."""
     known: dict[str, str] = {}
 
@@ -36,7 +36,7 @@ def plate_site(serve: Callable[[Path], str], modules: Path, tmp_path_factory: py
             files = tmp_path_factory.mktemp("object")
             seen = {"object": plate_object(kind, files), "surface": plate_object("surface", files) if surface else None}
             measured = plate_strikes(table) if strikes else None
-            known[name] = serve(lay_out(folder / "site", table, modules, strikes=measured, live=live, **seen))
+            known[name] = serve(lay_out(folder / "site", table, strikes=measured, live=live, **seen))
         return known[name]
 
     return address

@@ -106,7 +106,7 @@ def test_another_sites_page_is_refused(server: Served, origin: str, method: str)
         "page/..%5cguard.py",
         "page/%2fetc/passwd",
         "page//etc/passwd",
-        "modules/../page/main.js",
+        "page/vendor/../../page/main.js",
         "strikes/%2e%2e/field.bin",
         "revisions/1/..%2f..%2fsecret.js",
         "page/main.js%00.html",
@@ -125,7 +125,7 @@ def test_nothing_outside_of_what_is_shown_can_be_read(server: Served, place: str
     assert b"hidden" not in answer.content
 
 
-@pytest.mark.parametrize("place", ["page/", "page", "strikes/", "revisions/1/", "modules/", "capture/strikes/"])
+@pytest.mark.parametrize("place", ["page/", "page", "strikes/", "revisions/1/", "page/vendor/", "capture/strikes/"])
 def test_no_folder_is_listed(server: Served, place: str) -> None:
     assert server.get(place).status in (404, 405)
     assert b"main.js" not in server.get(place).content

@@ -390,7 +390,7 @@ def block_audio(page: "Page") -> None:
     ("before", "said"),
     [
         (block_webgl, "This browser shows no 3D"),
-        (lambda page: page.route("**/modules/**", lambda route: route.abort()), "three and spark"),
+        (lambda page: page.route("**/vendor/**", lambda route: route.abort()), "three.min.js"),
         (block_audio, "No sound"),
     ],
     ids=["webgl", "three", "audio"],

@@ -14,7 +14,6 @@ import torch
 
 from avmsf.export.sampledfield import SampledField
 from avmsf.field.store import load
-from avmsf.studio.modules import MODULES_VARIABLE
 from avmsf.studio.refusal import RefusedError
 from avmsf.studio.session import Session
 from avmsf.studio.worker import Voice
@@ -144,11 +143,11 @@ class EditServer:
 
 
 @pytest.fixture
-def edits(visit: Open, site: Serve, tmp_path: Path, modules: Path) -> Callable[..., tuple["Page", EditServer]]:
+def edits(visit: Open, site: Serve, tmp_path: Path) -> Callable[..., tuple["Page", EditServer]]:
     """Return a function that opens the page's tab of edits, with its server."""
 
     def bundle_of(table: SampledField, name: str) -> dict[str, Any]:
-        folder = lay_out(tmp_path / name, table, modules)
+        folder = lay_out(tmp_path / name, table)
         return {
             "manifest": json.loads((folder / "manifest.json").read_text()),
             "content": (folder / "field.bin").read_bytes(),
@@ -230,10 +229,9 @@ def test_an_edit_is_heard_undone_and_saved(edits: Any) -> None:
 
 
 @contextlib.contextmanager
-def edited_plate(browser: "Browser", modules: Path, home: Path) -> Iterator[tuple["Page", Served]]:
+def edited_plate(browser: "Browser", home: Path) -> Iterator[tuple["Page", Served]]:
     """Yield the page's tab of edits with its real server."""
-    with pytest.MonkeyPatch.context() as patch, contextlib.ExitStack() as opened:
-        patch.setenv(MODULES_VARIABLE, str(modules))
+    with contextlib.ExitStack() as opened:
         server = opened.enter_context(served(open_plate(home / "home"), home / "scratch"))
         # The driver waits by evaluating words in the page, which its policy forbids.
         page = browser.new_context(bypass_csp=True).new_page()
@@ -248,8 +246,8 @@ def visit_edits(page: "Page", server: Served) -> None:
     page.click("#tab-edit")
 
 
-def test_what_a_slider_says_when_save_is_clicked_is_saved(browser: "Browser", modules: Path, tmp_path: Path) -> None:
-    with edited_plate(browser, modules, tmp_path) as (page, server):
+def test_what_a_slider_says_when_save_is_clicked_is_saved(browser: "Browser", tmp_path: Path) -> None:
+    with edited_plate(browser, tmp_path) as (page, server):
         page.fill("#sheet-edit input[aria-label='Name of the new field']", "higher")
         for _ in range(10):
             move(page, "Pitch")
@@ -497,8 +495,8 @@ def test_a_recording_is_heard(visit: Open) -> None:
     assert page.evaluate("avmsf.studio.last === undefined"), "without a blow of the model"
 
 
-def test_the_heading_says_which_field_is_heard(browser: "Browser", modules: Path, tmp_path: Path) -> None:
-    with edited_plate(browser, modules, tmp_path) as (page, server):
+def test_the_heading_says_which_field_is_heard(browser: "Browser", tmp_path: Path) -> None:
+    with edited_plate(browser, tmp_path) as (page, server):
         before = page.inner_text("h1")
         move(page, "Pitch")
         page.wait_for_function("avmsf.studio.last !== undefined")
@@ -519,8 +517,8 @@ def test_the_heading_says_which_field_is_heard(browser: "Browser", modules: Path
         assert before != "higher"
 
 
-def test_remarks_speak_of_the_pages_own_controls(browser: "Browser", modules: Path, tmp_path: Path) -> None:
-    with edited_plate(browser, modules, tmp_path) as (page, server):
+def test_remarks_speak_of_the_pages_own_controls(browser: "Browser", tmp_path: Path) -> None:
+    with edited_plate(browser, tmp_path) as (page, server):
         page.get_by_label("New material").select_option("glass")
         said = page.locator("#words, #sheet-edit [aria-live]", has_text='"Present material"')
         said.first.wait_for()

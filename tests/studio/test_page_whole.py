@@ -13,7 +13,6 @@ from PIL import Image
 
 from avmsf.capture import read_capture
 from avmsf.field.store import load
-from avmsf.studio.modules import MODULES_VARIABLE
 from avmsf.studio.opening import Opened, open_target
 from opened_plate import RATE, open_plate, plate_field, wav
 from page_plate import SIDES, plate_object
@@ -24,8 +23,7 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture
-def home(modules: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv(MODULES_VARIABLE, str(modules))
+def home(tmp_path: Path) -> Path:
     return tmp_path / "home"
 
 

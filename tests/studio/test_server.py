@@ -40,11 +40,9 @@ from avmsf.scene.ply import write_splats
 from avmsf.scene.start import StartPoints, starting_cloud
 from avmsf.scene.symmetrysearch import find_symmetries
 from avmsf.simulate.material import CERAMIC, WOOD
-from avmsf.studio import leading, locating, modules, server, studio, worker
+from avmsf.studio import leading, locating, server, studio, worker
 from avmsf.studio.locating import Finder
-from avmsf.studio.modules import find_modules, with_local_modules
 from avmsf.studio.opening import Opened, find_object, open_target
-from avmsf.studio.routes import PAGE
 from avmsf.studio.server import serve
 from avmsf.studio.studio import StudioConfig
 from avmsf.tasks.material import change_material
@@ -631,34 +629,6 @@ def test_the_browsers_command_line_holds_no_secret(tmp_path: Path, monkeypatch: 
     assert heard == [(tmp_path / "open.html").as_uri()]
     assert 'content="0; url=http://127.0.0.1:8634/secret/"' in (tmp_path / "open.html").read_text()
     assert (tmp_path / "open.html").stat().st_mode & 0o777 == 0o600
-
-
-def test_the_page_takes_its_libraries_from_here_where_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.delenv(modules.MODULES_VARIABLE, raising=False)
-    assert find_modules() is None
-    for name, version in modules.PINNED.items():
-        package = tmp_path / "avmsf" / "page" / "node_modules" / name
-        package.mkdir(parents=True)
-        (package / "package.json").write_text(json.dumps({"version": version}))
-    found = find_modules()
-    assert found == tmp_path / "avmsf" / "page" / "node_modules"
-    page = (PAGE / "index.html").read_text()
-    assert "https://cdn" in page
-    local = with_local_modules(page)
-    assert "https://" not in local.partition("importmap")[2].partition("</script>")[0]
-    assert './modules/three/examples/jsm/"' in local
-    (found / "three" / "package.json").write_text(json.dumps({"version": "0.1.0"}))
-    assert find_modules() is None
-    monkeypatch.setenv(modules.MODULES_VARIABLE, str(found))
-    with raises(StudioError, file=found, name=modules.MODULES_VARIABLE, value=["three"]):
-        find_modules()
-    with raises(StudioError, name="importmap") as caught:
-        with_local_modules(page.replace("three@0.187.0", "three@0.1.0"))
-    assert "three@0.1.0" in caught.value.value
-    monkeypatch.setattr("shutil.which", lambda name: None)
-    with raises(StudioError, name="npm"):
-        modules.fetch_modules()
 
 
 def test_the_command_serves_until_it_is_told_to_end(tmp_path: Path) -> None:

@@ -86,7 +86,7 @@ def _following(options: Options) -> str:
     output = shlex.quote(str(options.output))
     match options.to:
         case "web" if options.output.suffix.lower() in PAGE_SUFFIXES:
-            return f"open {output} in a browser; its picture needs a network, for three.js and spark"
+            return f"open {output} in a browser"
         case "web":
             return f"python -m http.server --directory {output}, then open http://localhost:8000 in a browser"
         case "gltf":

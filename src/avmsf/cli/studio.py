@@ -11,7 +11,6 @@ from avmsf.errors import StudioError
 def run(options: Options) -> int:
     """Serve the page until Ctrl-C."""
     try:
-        from avmsf.studio.modules import fetch_modules, find_modules
         from avmsf.studio.opening import open_target
         from avmsf.studio.server import serve
         from avmsf.studio.studio import StudioConfig
@@ -22,14 +21,8 @@ def run(options: Options) -> int:
             f"expected starlette and uvicorn for the page's server, got no {error.name}; pip install 'avmsf[studio]'",
             name=error.name,
         ) from error
-    if options.fetch_modules:
-        say(f"the page's libraries are in {fetch_modules()}")
-        if options.target is None:
-            return 0
     assert options.target is not None
     opened = open_target(options.target, object=options.object, capture=options.capture)
-    if find_modules() is None:
-        say("the page loads three and spark from cdn.jsdelivr.net; --fetch-modules downloads them once")
     computing = serve(
         opened,
         port=options.port,

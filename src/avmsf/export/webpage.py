@@ -2,7 +2,7 @@
 
 A single file has the page's modules as data: addresses in its import map, and all other files as base64, which the
 modules turn into blobs: a browser does not load other files for a page that was opened from a disk. The libraries three
-and spark are loaded from the public host that the import map names.
+and spark go with it, spark where Gaussians are shown: no network is needed.
 """
 
 import base64
@@ -26,6 +26,8 @@ from avmsf.field.soundfield import SoundField
 
 IMPORT_MAP = re.compile(r'(<script type="importmap"[^>]*>)(.*?)(</script>)', re.DOTALL)
 """The import map, which has the addresses of three and spark."""
+_SPARK = "page/vendor/spark.min.js"
+"""Draws Gaussians alone, and has 2.7 MB."""
 _TITLE = re.compile(r"<title>[^<]*</title>")
 _STYLE = re.compile(r'<link\b[^>]*\bhref="(?:\./)?page/(\w+\.css)"[^>]*>')
 _START = re.compile(r'<script type="module" src="(?:\./)?page/(\w+\.js)"[^>]*></script>')
@@ -69,7 +71,7 @@ def write_webpage(
     bundle = make_bundle(field, object=object, meters=meters, surface=surface, strikes=strikes, limit=limit)
     if output.suffix.lower() in PAGE_SUFFIXES:
         return Written(write_file(output, single_file(bundle).encode(), force=force), bundle.remarks)
-    content = {**page_files(), **bundle.files}
+    content = {**_needed(page_files(), bundle), **bundle.files}
     html = _titled(content["index.html"].decode(), bundle)
     content["index.html"] = with_policy(html, directives_of(html)).encode()
     sizes = write_folder(output, lambda place: write_files(content, place), dict(bundle.manifest), force=force)
@@ -79,18 +81,24 @@ def write_webpage(
 def page_files() -> dict[str, bytes]:
     """Return the files of the studio's page by relative path: index.html, and all others below page/."""
     folder = files("avmsf") / "studio" / "page"
-    found = {each.name: each.read_bytes() for each in folder.iterdir() if each.is_file()}
-    names = sorted(name for name in found if name.endswith((".js", ".css")))
-    return {"index.html": found["index.html"], **{f"page/{name}": found[name] for name in names}}
+    served = (".js", ".css", ".LICENSE")
+    paths = [(f"page/{each.name}", each) for each in folder.iterdir() if each.is_file()]
+    paths += [(f"page/vendor/{each.name}", each) for each in (folder / "vendor").iterdir()]
+    names = {name: each.read_bytes() for name, each in sorted(paths) if name.endswith(served)}
+    return {"index.html": (folder / "index.html").read_bytes(), **names}
+
+
+def _needed(page: Mapping[str, bytes], bundle: Bundle) -> dict[str, bytes]:
+    """Return the page's files without spark where it has nothing to draw."""
+    gaussians = bundle.manifest["object"]["kind"] == "gaussians"
+    return {name: each for name, each in page.items() if gaussians or name != _SPARK}
 
 
 def single_file(bundle: Bundle, page: Mapping[str, bytes] | None = None) -> str:
     """Return the page with bundle, styles and modules in one file. `page` is by default that of `page_files`."""
-    page = page_files() if page is None else page
+    page = _needed(page_files() if page is None else page, bundle)
     html = _titled(page["index.html"].decode(), bundle)
-    modules = {name.removeprefix("page/"): each.decode() for name, each in page.items() if name.endswith(".js")}
-    imports = {f"avmsf/{name}": _data_url(_bare(source)) for name, source in modules.items()}
-    html = _once(IMPORT_MAP, html, lambda found: found[1] + _with_imports(found[2], imports) + found[3], "import map")
+    html = _once(IMPORT_MAP, html, lambda found: found[1] + _carrying(found[2], page) + found[3], "import map")
     html = _STYLE.sub(lambda found: f"<style>\n{page[f'page/{found[1]}'].decode()}</style>", html)
     carried = {"manifest.json": json.dumps(bundle.manifest).encode(), "page/bank.js": page["page/bank.js"]}
     inlined = {name: _carried(name, content) for name, content in {**carried, **bundle.files}.items()}
@@ -115,9 +123,18 @@ def _bare(source: str) -> str:
     return _IMPORTED.sub(r"\1\2avmsf/\3\2", source)
 
 
-def _with_imports(words: str, imports: Mapping[str, str]) -> str:
-    known: dict[str, Any] = json.loads(words)
-    return json.dumps({**known, "imports": {**known.get("imports", {}), **imports}})
+def _carrying(words: str, page: Mapping[str, bytes]) -> str:
+    """Return the import map with the page's modules and libraries as data: addresses, each once."""
+    scripts = {name: each.decode() for name, each in page.items() if name.endswith(".js")}
+    imports, first = dict[str, str](), dict[str, str]()
+    for specifier, address in json.loads(words)["imports"].items():
+        path = address.removeprefix("./")
+        if path in first:
+            imports[specifier] = _data_url(f'export * from "{first[path]}";')
+        elif path in scripts:
+            first[path], imports[specifier] = specifier, _data_url(scripts[path])
+    own = {name.removeprefix("page/"): each for name, each in scripts.items() if name.count("/") == 1}
+    return json.dumps({"imports": imports | {f"avmsf/{name}": _data_url(_bare(each)) for name, each in own.items()}})
 
 
 def _data_url(source: str) -> str:

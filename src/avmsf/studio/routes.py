@@ -17,7 +17,6 @@ from avmsf._utils.memory import lacks_memory
 from avmsf.errors import AvmsfError
 from avmsf.export.webpage import MEDIA_TYPES
 from avmsf.studio.guard import contained, nothing_here, read_words
-from avmsf.studio.modules import find_modules, with_local_modules
 from avmsf.studio.place import Place
 from avmsf.studio.policy import policy_of
 from avmsf.studio.refusal import FORESEEN_ERRORS, Answer, refusal_of, response_to
@@ -32,9 +31,7 @@ Handler = Callable[[Request], Awaitable[Response]]
 
 def make_app(studio: Studio) -> Starlette:
     """Return the application of a studio, which begins and ends with it."""
-    modules = find_modules()
-    page = (PAGE / "index.html").read_text(encoding="utf-8")
-    html = page if modules is None else with_local_modules(page)
+    html = (PAGE / "index.html").read_text(encoding="utf-8")
     policy = {"content-security-policy": policy_of(html)}
 
     @asynccontextmanager
@@ -48,16 +45,10 @@ def make_app(studio: Studio) -> Starlette:
     async def show_page(request: Request) -> Response:
         return HTMLResponse(html, headers=policy)
 
-    async def send_module(request: Request) -> Response:
-        if modules is None:
-            raise nothing_here()
-        return _file(modules, request)
-
     calls = Calls(studio)
     routes = [
         _get("/", show_page),
         _get("/page/{path:path}", partial(_send_from, PAGE)),
-        _get("/modules/{path:path}", send_module),
         _get("/manifest.json", calls.send_manifest),
         _get("/revisions/{number:int}/{path}", calls.send_revision),
         _get("/{path}", calls.send_shown),

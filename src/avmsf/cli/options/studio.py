@@ -51,14 +51,12 @@ class Options(Printing):
     """Maximum number of modes of a reconstruction."""
     preset: Preset = "default"
     """Settings of a reconstruction; paper: everything as published, which takes hours."""
-    fetch_modules: Flag = False
-    """First download the page's libraries with npm, so that it works without a network from then on."""
 
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
         expect_modes(self.modes)
-        if self.target is None and not self.fetch_modules:
+        if self.target is None:
             raise StudioError(
                 "expected a field, a capture folder, a folder of images or a mesh, got none", name="target"
             )

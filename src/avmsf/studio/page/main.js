@@ -129,15 +129,7 @@ async function reload(studio) {
 
 async function showObject(studio, { atPress, struck }, library) {
   try {
-    const { ObjectView } = await library.catch((error) => {
-      const from = studio.live
-        ? "For a page that needs no network, run avmsf studio --fetch-modules once."
-        : "Connect to a network and reload the page.";
-      throw new Error(
-        "The libraries three and spark, which draw the object, could not be loaded from the " +
-          `network (${error.message}). Use the buttons in the panel. ${from}`,
-      );
-    });
+    const { ObjectView } = await library;
     studio.view = await ObjectView.create(at("stage"), at("overlay"), studio.bundle);
   } catch (error) {
     say(error.message, { name: "view", bad: true });
