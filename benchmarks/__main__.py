@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
+from avmsf._utils.device import TRAINABLE
 from avmsf.capture import CaptureWarning
 from avmsf.errors import AvmsfError
 from avmsf.simulate.sim20 import SIM20
@@ -23,6 +24,7 @@ from benchmarks import (
     scene,
     settings,
     speed,
+    step,
     studio,
     suggest,
     surface,
@@ -38,6 +40,7 @@ BENCHMARKS: dict[str, ModuleType] = {
     "gains": gains,
     "extract": extract,
     "speed": speed,
+    "step": step,
     "scene": scene,
     "proof": proof,
     "settings": settings,
@@ -94,6 +97,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="FILE",
         help="baselines: weights of sonicgauss-small, which the part sonicgauss-training makes",
     )
+    parser.add_argument("--device", default="cpu", choices=TRAINABLE, help="step: where (default cpu)")
     chosen = parser.parse_args(arguments)
     benchmark = BENCHMARKS[chosen.name]
     parts = tuple(chosen.parts or benchmark.PARTS)
@@ -110,6 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         tuple(chosen.objects),
         chosen.clouds,
         chosen.weights,
+        chosen.device,
     )
     # Remarks on a capture are `avmsf check`'s business.
     warnings.simplefilter("ignore", CaptureWarning)

@@ -28,6 +28,8 @@ class Options:
     """Folder that keeps Gaussians fitted to these objects; None to fit them again."""
     weights: Path | None = None
     """File of the weights of sonicgauss-small; None to keep none."""
+    device: str = "cpu"
+    """What the steps of `step` are taken on."""
 
 
 @dataclass(frozen=True, eq=False)

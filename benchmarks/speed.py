@@ -55,7 +55,7 @@ def _step(options: Options) -> Report:
     # whether both do the same work.
     for run in (ours, plain):
         pass_warmup(run, targets)
-    losses = [run.advance(targets) for run in (ours, plain)]
+    losses = [float(run.advance(targets)) for run in (ours, plain)]
     apart = abs(losses[0] / losses[1] - 1)
     if not apart < _SAME_LOSS:
         raise RuntimeError(f"the two forms of a step differ: losses {losses[0]:.6f} and {losses[1]:.6f}")

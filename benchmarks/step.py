@@ -1,4 +1,4 @@
-"""A training step of the paper's full setting: ours, the plain form beside it, and the memory that ours takes.
+"""Steps of training and of splatting: their time on a device, a plain form of the first and the memory that ours takes.
 
 `python -m benchmarks.step` takes a few of our steps and prints its own peak memory as JSON.
 """
@@ -9,6 +9,8 @@ import math
 import resource
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,14 +29,16 @@ from avmsf.modal.extraction.least_squares import fit_sine_gains
 from avmsf.modal.residual import Residual, shape_noise
 from avmsf.modal.synthesis import synthesize
 from avmsf.scene.features import FeatureField
+from avmsf.scene.splat import SplatProgress, splat
+from avmsf.scene.splatconfig import SplatConfig
 from avmsf.simulate.plate import sample_contacts
+from benchmarks.look import pictures, shape, speckled
 from benchmarks.material import IMPULSE, REPOSITORY
+from benchmarks.report import Options, Report, Table
 
 STEPS = replace(PAPER, warmup_steps=100, spectral_norm="each", damping="shared")
 """The paper's settings but for a short warm-up, enough for gains of a trained field's size, and relative losses."""
-_RATE = 44100.0
 _MODES = 128
-_CONTACTS = 10
 
 
 class PlainRun(TrainingRun):
@@ -73,19 +77,21 @@ def _distance(sounds: Float[Tensor, "contacts samples"], target: SpectralTarget)
     return loss
 
 
-def full_setting(seconds: float) -> tuple[Impacts, FeatureField, Extraction]:
-    """Return 10 recordings of 128 known modes and noise at 44.1 kHz, with what is fitted to them; seed 0."""
+def full_setting(
+    seconds: float, *, count: int = 10, sample_rate: float = 44100.0
+) -> tuple[Impacts, FeatureField, Extraction]:
+    """Return `count` recordings of 128 known modes and noise, with what is fitted to them; seed 0."""
     generator = torch.Generator().manual_seed(0)
-    samples = round(seconds * _RATE)
-    contacts = sample_contacts(IMPULSE.plate, _CONTACTS, generator=generator)
+    samples = round(seconds * sample_rate)
+    contacts = sample_contacts(IMPULSE.plate, count, generator=generator)
     frequency = 200.0 * 80.0 ** torch.rand(_MODES, generator=generator, dtype=torch.float64).sort().values
     bank = ModalBank(frequency, 5.0 + 1e-3 * frequency)
-    gains = torch.randn(_CONTACTS, _MODES, generator=generator)
+    gains = torch.randn(count, _MODES, generator=generator)
     residual = Residual(torch.full((513,), 0.03))
-    sounds = synthesize(gains, bank.frequency, bank.damping, samples=samples, sample_rate=_RATE)
-    sounds += shape_noise(residual.magnitude, contacts=_CONTACTS, samples=samples, generator=generator)
-    names = tuple(f"{row:02d}" for row in range(_CONTACTS))
-    impacts = Impacts(contacts, sounds, _RATE, names)
+    sounds = synthesize(gains, bank.frequency, bank.damping, samples=samples, sample_rate=sample_rate)
+    sounds += shape_noise(residual.magnitude, contacts=count, samples=samples, generator=generator)
+    names = tuple(f"{row:02d}" for row in range(count))
+    impacts = Impacts(contacts, sounds, sample_rate, names)
     return impacts, IMPULSE.features(), Extraction(bank, gains, residual, torch.zeros_like(gains))
 
 
@@ -97,12 +103,13 @@ def start(
     *,
     spatial_damping: bool = False,
     kind: type[TrainingRun] = TrainingRun,
+    device: str = "cpu",
 ) -> tuple[TrainingRun, Targets]:
     """Return a run before its first step, and what it is to be fitted to."""
-    gains = fit_sine_gains(impacts.sounds, modes.bank, sample_rate=impacts.sample_rate)
+    gains = fit_sine_gains(impacts.sounds, modes.bank, sample_rate=impacts.sample_rate).to(device)
     network = AttentionGains(
         features,
-        gain_scale=gain_scale(gains),
+        gain_scale=gain_scale(gains).cpu(),
         shape=replace(config.shape, spatial_damping=spatial_damping),
         generator=torch.Generator().manual_seed(config.seed),
     )
@@ -144,6 +151,50 @@ def peak_gigabytes() -> float:
         return int(mark.split()[1]) * 1024 / 1e9
     # macOS counts in bytes.
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e9
+
+
+def measure(options: Options) -> Report:
+    """Return the milliseconds of a step of each chosen part."""
+    device = torch.device(options.device)
+    card = torch.cuda.get_device_name(device) if device.type == "cuda" else f"{torch.get_num_threads()} threads"
+    figures = {f"{part}_step_ms": PARTS[part](options) for part in options.parts}
+    conventions = (
+        f"On {options.device} ({card}, torch {torch.__version__}); the mean over many steps after the first ones.",
+        "paper: preset `paper` end to end, 8 recordings x 3 s x 48 kHz x 128 modes, all frames at every step.",
+        "splat: default settings with 15,000 points on the hull of 48 views of 256 x 256; the last nine tenths of the "
+        "steps with all that comes between them, densification too.",
+    )
+    return Report(conventions, (Table("milliseconds a step", ("part", "ms"), list(figures.items())),), figures)
+
+
+def _paper(options: Options) -> float:
+    run, targets = start(
+        *full_setting(0.5 if options.quick_look else 3.0, count=8, sample_rate=48000.0), PAPER, device=options.device
+    )
+    run.step = PAPER.warmup_steps
+    count = 2 if options.quick_look else 100 if run.shift.is_cuda else 8
+    times = []
+    for _ in range(2):
+        # A loss is there when all steps before it are.
+        losses = [run.advance(targets) for _ in range(count)]
+        times.append((float(losses[-1]), time.perf_counter()))
+    return 1e3 * (times[1][1] - times[0][1]) / count
+
+
+def _splat(options: Options) -> float:
+    count, size, steps = (6, 48, 100) if options.quick_look else (48, 256, SplatConfig().steps)
+    views = pictures(speckled(shape("bowl"), seed=0), count=count, size=size)
+    seen: list[tuple[int, float]] = []
+
+    def note(progress: SplatProgress) -> None:
+        seen.append((progress.step, time.perf_counter()))
+
+    splat(views, SplatConfig(steps=steps), device=options.device, progress=note)
+    (first, begun), (last, ended) = next(each for each in seen if each[0] >= steps / 10), seen[-1]
+    return 1e3 * (ended - begun) / (last - first)
+
+
+PARTS: dict[str, Callable[[Options], float]] = {"paper": _paper, "splat": _splat}
 
 
 def _main() -> None:

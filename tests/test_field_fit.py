@@ -189,7 +189,7 @@ def test_a_trial_does_not_learn_from_the_recordings_held_out(monkeypatch):
     looks: list[float] = []
     advance = TrainingRun.advance
 
-    def watched(run: TrainingRun, targets: Targets) -> float:
+    def watched(run: TrainingRun, targets: Targets) -> torch.Tensor:
         loss = advance(run, targets)
         if run.step == run.config.warmup_steps + run.config.steps:
             ends.append({name: each.clone() for name, each in run.network.state_dict().items()})

@@ -152,6 +152,20 @@ def test_the_compiled_loop_does_what_torch_does(dtype, rounding):
     assert distance.dtype == dtype
 
 
+@pytest.mark.parametrize(("dtype", "rounding"), [(torch.float32, 2e-6), (torch.float64, 1e-14)])
+@pytest.mark.parametrize("hop", [3, 16, 40])
+def test_both_ways_to_overlap_frames_add_each_where_it_begins(dtype, rounding, hop):
+    generator = torch.Generator().manual_seed(0)
+    frames, window = (torch.randn(*size, dtype=dtype, generator=generator) for size in ((2, 5, 32), (32,)))
+    expected = torch.full((2, 200), 2.0, dtype=dtype)
+    for frame in range(5):
+        expected[:, frame * hop : frame * hop + 32] += window * frames[:, frame]
+    for add in (losses._overlap_add, losses._overlap_add_torch):
+        found = torch.ones(2, 200, dtype=dtype)
+        add(found, frames.clone(), window, hop, 0.5)
+        torch.testing.assert_close(2 * found, expected, rtol=0, atol=rounding)
+
+
 def test_a_sound_that_is_no_number_has_a_loss_that_is_none():
     made = sounds()
     made[1, 500] = math.nan

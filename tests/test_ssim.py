@@ -48,6 +48,12 @@ def test_the_gradient_is_that_of_finite_differences() -> None:
     assert torch.autograd.gradcheck(lambda image: ssim(image, second), first.requires_grad_())
 
 
+def test_similarity_has_no_second_derivative() -> None:
+    first, second = _images()
+    with pytest.raises(NotImplementedError):
+        torch.autograd.grad(ssim(first.requires_grad_().square(), second), first, create_graph=True)
+
+
 def test_the_gradient_in_single_precision_is_within_a_hundred_thousandth() -> None:
     first, second = _images(40, 50)
     exact = first.clone().requires_grad_()

@@ -1,25 +1,29 @@
 """A fit runs on the device that is asked for, and says where it cannot."""
 
 from dataclasses import fields, replace
+from typing import Any
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
+from avmsf._utils.device import without_denormals
 from avmsf.cli import main
 from avmsf.config import PipelineConfig
 from avmsf.errors import FitError
+from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.losses import SpectralTarget
 from avmsf.field.recipes import Attention, GainRecipe, gain_case
 from avmsf.field.training import Targets, TrainingRun
 from avmsf.pipeline.record import with_record
-from avmsf.scene import features
 from plate_capture import fill_plate
 from plate_field import QUICK, plate_extraction, plate_features, plate_impacts
 from raising import raises
 
 CONFIG = replace(QUICK, warmup_steps=2, steps=2, damping="per-contact", fft_sizes=(256, 128), early=256)
+SHARED_PAPER = replace(PAPER, damping="shared")
 CUDA = torch.cuda.is_available()
 
 
@@ -34,24 +38,26 @@ def on_meta(value: object) -> object:
     return value
 
 
-@pytest.mark.parametrize("recipe", [Attention(), MixtureEstimator()], ids=["network", "mixture"])
-def test_every_tensor_of_a_training_step_is_on_the_device_of_the_gains(
-    recipe: GainRecipe, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # The object's size is a number, which the points on that device do not have.
-    monkeypatch.setattr(features, "_half_diagonal", lambda points: 0.2)
+def started(recipe: GainRecipe, config: FitConfig, device: str) -> tuple[TrainingRun, Targets]:
+    """Return a run before its first step, and what it is fitted to, on a device."""
     impacts = plate_impacts(6, seconds=0.1)
-    case = gain_case(impacts, plate_features(60), plate_extraction(impacts), replace(CONFIG, clusters=4))
+    case = gain_case(impacts, plate_features(60), plate_extraction(impacts), replace(config, clusters=4))
     run = TrainingRun(
-        recipe.start(case, "per-contact"),
+        recipe.start(case, config.damping),
         case.modes,
-        gains=case.gains.to("meta"),
+        gains=case.gains.to(device),
         phase=case.phase,
         sample_rate=impacts.sample_rate,
         samples=impacts.sounds.shape[1],
         config=case.config,
     )
-    targets = on_meta(Targets.of(case.train, case.gains, recipe.rows(case), case.config))
+    targets = Targets.of(case.train, case.gains.to("cpu" if device == "meta" else device), recipe.rows(case), case.config)
+    return run, on_meta(targets) if device == "meta" else targets
+
+
+@pytest.mark.parametrize("recipe", [Attention(), MixtureEstimator()], ids=["network", "mixture"])
+def test_every_tensor_of_a_training_step_is_on_the_device_of_the_gains(recipe: GainRecipe) -> None:
+    run, targets = started(recipe, CONFIG, "meta")
     # Torch refuses to compute with tensors of two devices.
     loss = run.spectral_loss(targets)
     torch.autograd.backward(loss)
@@ -63,6 +69,59 @@ def test_every_tensor_of_a_training_step_is_on_the_device_of_the_gains(
     moved = [[[torch.zeros_like(one, device="cpu") for one in each] for each in group] for group in known]
     run.joint.resume(moved)
     run.joint.step(0.5)
+
+
+class Launches(TorchDispatchMode):
+    """Counts the calls that compute: all but views and empty tensors."""
+
+    count = 0
+
+    def __torch_dispatch__(self, call: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        returned = [each.alias_info for each in call._schema.returns]
+        views = any(each is not None and not each.is_write for each in returned)
+        self.count += not (views or call._schema.name.startswith(("aten::empty", "aten::new_empty")))
+        return call(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("recipe", [Attention(), MixtureEstimator()], ids=["network", "mixture"])
+def test_a_step_of_the_papers_training_has_few_launches_and_waits_for_none(recipe: GainRecipe) -> None:
+    # On the device `meta`, where chunks are a card's and no tensor has a value to wait for.
+    run, targets = started(recipe, SHARED_PAPER, "meta")
+    run.step = PAPER.warmup_steps
+    with Launches() as launches:
+        run.advance(targets)
+    assert 100 < launches.count <= 300
+
+
+@pytest.mark.skipif(not CUDA, reason="needs a CUDA GPU")
+@pytest.mark.parametrize("recipe", [Attention(), MixtureEstimator()], ids=["network", "mixture"])
+def test_a_step_on_a_gpu_waits_for_nothing_and_is_repeatable(recipe: GainRecipe) -> None:
+    results = []
+    for _ in range(2):
+        run, targets = started(recipe, SHARED_PAPER, "cuda")
+        run.step = PAPER.warmup_steps
+        run.advance(targets)
+        torch.cuda.set_sync_debug_mode("error")
+        try:
+            losses = [run.advance(targets) for _ in range(3)]
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+        results.append((losses[-1], run.shift.detach().clone()))
+    for one, other in zip(*results, strict=True):
+        assert torch.equal(one, other)
+
+
+def test_denormal_numbers_are_as_they_were_after_a_step() -> None:
+    tiny, seen = torch.tensor([1e-40]), []
+    for outside in (False, True):
+        torch.set_flush_denormal(outside)
+        try:
+            with without_denormals():
+                seen.append(float(tiny * 0.5))
+            seen.append(float(tiny * 0.5))
+        finally:
+            torch.set_flush_denormal(False)
+    assert [each == 0.0 for each in seen] == [True, False, True, True]
 
 
 def test_the_cpu_is_as_good_as_no_choice() -> None:

@@ -38,7 +38,7 @@ def warmup_loss(config: FitConfig, offset: torch.Tensor) -> float:
     """Return the loss of a network whose gains are off by `offset` at every contact."""
     run, targets = start(config)
     targets = replace(targets, gains=run.network.read(targets.rows).mean.detach() + offset)
-    return run.advance(targets)
+    return float(run.advance(targets))
 
 
 def test_equal_weights_make_equation_13_of_the_warm_up() -> None:

@@ -107,7 +107,9 @@ class AttentionGains(TrainableGains, GainField):
     def read(self, rows: Int[Tensor, " contacts"]) -> Gains:
         """Return what `at` does for the points of the given rows; differentiable in the network's parameters."""
         feature = self.features[rows] * self.shape.feature_scale
-        offsets = (self.points[rows][:, None, :] - self.centers) / self.feature_field.half_diagonal
+        # The object's size as a tensor, since a number of it would wait for the device.
+        half_diagonal = torch.dist(*self.points.aminmax(dim=0)) / 2
+        offsets = (self.points[rows][:, None, :] - self.centers) / half_diagonal
         query = self.query(torch.cat([encode(offsets, self.shape.bands).flatten(1), feature], dim=1))
         descriptors = self.descriptors * self.shape.feature_scale
         key, value = self.key(descriptors), self.value(descriptors)

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from avmsf._utils.device import TRAINABLE, usable_device
+from avmsf._utils.device import TRAINABLE, steps_between_losses, usable_device
 from avmsf._utils.state import read_checkpoint, write_checkpoint
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.places import rows_by_place
@@ -161,7 +161,8 @@ class _Job:
         self.config = case.config if warmup else replace(case.config, warmup_steps=0, steps=max(1, case.config.steps))
         self.steps = case.config.steps
         self.rows = recipe.rows(case)
-        self.identity = {"input, configuration or version": fingerprint(case, recipe)}
+        # Each kind of device draws noise of its own.
+        self.identity = {"input, configuration or version": fingerprint(case, recipe), "device": device.type}
         saved = (
             None
             if checkpoint is None
@@ -220,7 +221,7 @@ class _Job:
             run.resume(self.running["run"])
             if validation is not None:
                 validation.best = self.running["validation"]
-        end = self.config.warmup_steps + plan.steps
+        end, every = self.config.warmup_steps + plan.steps, steps_between_losses(self.device)
         try:
             while True:
                 # First in the loop, so that a run which goes on takes the validation that an interruption may have cut
@@ -228,15 +229,8 @@ class _Job:
                 if (validation is not None and validation.stops(run, end)) or run.step >= end:
                     break
                 loss = run.advance(targets)
-                if not math.isfinite(loss):
-                    raise FitError(
-                        f"{name}: expected a finite loss, got {loss} at step {run.step}; lower learning_rate, "
-                        "warmup_rate or correction_rate",
-                        name=name,
-                        value=loss,
-                    )
-                if self.progress is not None:
-                    self.progress(Progress(name, run.step, end, loss, self.config.warmup_steps))
+                if run.step % every == 0 or run.step in (self.config.warmup_steps, end):
+                    self._note(Progress(name, run.step, end, float(loss), self.config.warmup_steps))
                 if time.monotonic() - self.saved_at > _CHECKPOINT_SECONDS:
                     self._save(name, run, validation)
         except KeyboardInterrupt:
@@ -252,6 +246,17 @@ class _Job:
             self._save(name, run, None)
         run.end()
         return run
+
+    def _note(self, progress: Progress) -> None:
+        if not math.isfinite(progress.loss):
+            raise FitError(
+                f"{progress.stage}: expected a finite loss, got {progress.loss} at step {progress.step}; lower "
+                "learning_rate, warmup_rate or correction_rate",
+                name=progress.stage,
+                value=progress.loss,
+            )
+        if self.progress is not None:
+            self.progress(progress)
 
     def _start(self, learned: list[int], plan: _Plan) -> TrainingRun:
         case = self.case.take(learned)

@@ -3,22 +3,24 @@
 Autograd through a short-time transform with a hop of 64 samples keeps every frame of every resolution alive. The loss
 is piecewise linear in the magnitudes, so its gradient is at hand as soon as a chunk of frames is: transform, take the
 sign, transform back, overlap-add, forget. One autograd function does all of it in the forward pass. Torch takes a dozen
-passes through memory for the comparison, which is most of what a fit does; on processors one compiled loop does it.
+passes through memory for the comparison, which is most of what a fit does; on processors compiled loops compare and
+overlap-add. On graphics cards each call of torch costs more than its arithmetic: there one chunk holds a resolution.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, no_type_check
 
 import numpy as np
 import torch
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Float64
 from torch import Tensor
 
 from avmsf.compiled import compiled
 
-_CHUNK = 1 << 19
-"""Samples of windowed frames held at once: they stay near the processor's cache."""
+_CHUNK, _CARD_CHUNK = 1 << 19, 1 << 27
+"""Samples of windowed frames held at once: near a processor's cache, or all frames in half a gigabyte of a card's."""
 _SILENT = 1e-12
 """Power below which a magnitude counts as zero, over that of the target's largest sample times the window's energy: its
 slope is taken as finite there. Recordings divided by their forces have samples of 1e-5, so the floor has to scale."""
@@ -30,7 +32,7 @@ class SpectralTarget:
 
     magnitudes: tuple[Float[Tensor, "contacts _frames _bins"], ...]
     """One a resolution, each with its own numbers of frames and bins."""
-    norms: tuple[Float[Tensor, " _frames"], ...]
+    norms: tuple[Float64[np.ndarray, " _frames"], ...]
     """What the distances in their frames are divided by: their sums over contacts and bins."""
     hops: tuple[int, ...]
     """Samples between frames, one a resolution."""
@@ -66,10 +68,10 @@ def spectral_target(
     for fft_size, hop, window, floor in zip(fft_sizes, hops, windows, floors, strict=True):
         frames = _padded(cut, fft_size).unfold(1, fft_size, hop)
         target = torch.empty(*frames.shape[:2], fft_size // 2 + 1, dtype=cut.dtype, device=cut.device)
-        for chunk in _chunks(frames.shape[0], frames.shape[1], fft_size):
+        for chunk in _chunks(frames):
             target[chunk] = _magnitude(torch.fft.rfft(frames[chunk] * window), floor)
         magnitudes.append(target)
-    norms = tuple(each.sum((0, 2)) for each in magnitudes)
+    norms = tuple(each.sum((0, 2), dtype=torch.float64).cpu().numpy() for each in magnitudes)
     return SpectralTarget(tuple(magnitudes), norms, tuple(hops), tuple(windows), tuple(floors), cut.shape[1])
 
 
@@ -103,8 +105,7 @@ class _SpectralL1(torch.autograd.Function):
         widest = max(_fft_size(known) for known in target.magnitudes)
         padded = _padded(sounds, widest)
         sought = ctx.needs_input_grad[0]
-        # A hop more than the sound, for the last column of hops that `_overlap_add` fills only in part.
-        slope = padded.new_zeros(len(padded), padded.shape[1] + every * max(target.hops) if sought else 0)
+        slope = torch.zeros_like(padded)
         loss = sounds.new_zeros(())
         resolutions = zip(target.magnitudes, target.norms, target.hops, target.windows, target.floors, strict=True)
         for known, norms, hop, window, floor in resolutions:
@@ -112,18 +113,18 @@ class _SpectralL1(torch.autograd.Function):
             # Short sounds may have fewer frames than are skipped.
             step = min(every, known.shape[1])
             start = first % step
-            norm = norms[start::step].sum().clamp_min(torch.finfo(sounds.dtype).tiny)
-            slope_window = 0.5 * window / norm
+            factor = 1 / max(float(norms[start::step].sum()), torch.finfo(sounds.dtype).tiny)
             before = (widest - fft_size) // 2 + start * hop
             frames = padded[:, before : padded.shape[1] - (widest - fft_size) // 2].unfold(1, fft_size, step * hop)
-            for rows, part in _chunks(*frames.shape):
+            for rows, part in _chunks(frames):
                 spectra = torch.fft.rfft(frames[rows, part] * window)
                 place = start + step * part.start
-                loss += _compare(spectra, known[rows], floor, first=place, every=step) / norm
+                loss.add_(_compare(spectra, known[rows], floor, first=place, every=step), alpha=factor)
                 if sought:
                     # From here on the spectra are the slope's.
-                    slopes = torch.fft.irfft(spectra, fft_size, norm="forward").mul_(slope_window)
-                    _overlap_add(slope[rows], slopes, before + part.start * step * hop, step * hop)
+                    slopes = torch.fft.irfft(spectra, fft_size, norm="forward")
+                    into = slope[rows, before + part.start * step * hop :]
+                    _overlap_add(into, slopes, window, step * hop, 0.5 * factor)
         ctx.save_for_backward(slope[:, widest // 2 : widest // 2 + sounds.shape[1]])
         return loss
 
@@ -137,14 +138,38 @@ class _SpectralL1(torch.autograd.Function):
 
 
 def _overlap_add(
-    into: Float[Tensor, "contacts samples"], frames: Float[Tensor, "contacts frames size"], start: int, hop: int
+    into: Float[Tensor, "contacts samples"],
+    frames: Float[Tensor, "contacts frames size"],
+    window: Float[Tensor, " size"],
+    hop: int,
+    factor: float,
 ) -> None:
-    """Add frames that begin at start, start + hop, ... to signals, in place, one column of hops at a time."""
+    """Add windowed frames times a factor, which begin at 0, hop, 2 hop, ..., to signals, in place."""
+    if frames.device.type == "cpu":
+        values = window.numpy()
+        _overlap_add_compiled(into.numpy(), frames.numpy(), values * values.dtype.type(factor), hop)
+    else:
+        _overlap_add_torch(into, frames, window, hop, factor)
+
+
+def _overlap_add_torch(into: Tensor, frames: Tensor, window: Tensor, hop: int, factor: float) -> None:
     count, size = frames.shape[1:]
-    for offset in range(0, size, hop):
-        width = min(hop, size - offset)
-        column = into[:, start + offset : start + offset + count * hop].view(-1, count, hop)
-        column[..., :width] += frames[..., offset : offset + width]
+    into = into[:, : (count - 1) * hop + size]
+    # The transpose of cutting a signal into frames: one call, whatever the hop.
+    with torch.enable_grad():
+        signal = into.detach().requires_grad_()
+        cut = signal.unfold(1, size, hop)
+    into.add_(torch.autograd.grad(cut, signal, frames.mul_(window))[0], alpha=factor)
+
+
+@compiled()
+@no_type_check
+def _overlap_add_compiled(into, frames, window, hop):
+    for contact in range(len(frames)):
+        for frame in range(frames.shape[1]):
+            start = frame * hop
+            for sample in range(len(window)):
+                into[contact, start + sample] += frames[contact, frame, sample] * window[sample]
 
 
 def _padded(sounds: Float[Tensor, "contacts samples"], fft_size: int) -> Float[Tensor, "contacts padded"]:
@@ -152,14 +177,15 @@ def _padded(sounds: Float[Tensor, "contacts samples"], fft_size: int) -> Float[T
     return torch.nn.functional.pad(sounds, (fft_size // 2, fft_size // 2))
 
 
-def _chunks(contacts: int, frames: int, fft_size: int) -> list[tuple[slice, slice]]:
+def _chunks(frames: Float[Tensor, "contacts frames size"]) -> list[tuple[slice, slice]]:
     """Return contacts and frames that are transformed at once: several contacts, or a part of one's frames."""
-    most = max(1, _CHUNK // fft_size)
-    rows = max(1, most // frames)
+    contacts, count, size = frames.shape
+    most = max(1, (_CHUNK if frames.device.type == "cpu" else _CARD_CHUNK) // size)
+    rows = max(1, most // count)
     return [
-        (slice(row, min(contacts, row + rows)), slice(first, min(frames, first + most)))
+        (slice(row, min(contacts, row + rows)), slice(first, min(count, first + most)))
         for row in range(0, contacts, rows)
-        for first in range(0, frames, most)
+        for first in range(0, count, most)
     ]
 
 
@@ -169,9 +195,7 @@ def _fft_size(magnitudes: Float[Tensor, "contacts frames bins"]) -> int:
 
 def _magnitude(spectra: Complex[Tensor, "contacts frames bins"], floor: float) -> Float[Tensor, "contacts frames bins"]:
     """Return magnitudes of spectra; a power below `floor` counts as `floor`."""
-    # Torch's abs() of a complex tensor guards against overflow at three times the cost.
-    parts = torch.view_as_real(spectra)
-    return torch.addcmul(parts[..., 0].square(), parts[..., 1], parts[..., 1]).clamp_min_(floor).sqrt_()
+    return spectra.abs().clamp_min_(math.sqrt(floor))
 
 
 def _compare(
@@ -202,10 +226,10 @@ def _compare_torch(
 ) -> Float[Tensor, ""]:
     found = _magnitude(spectra, floor)
     difference = found - target[:, first : first + every * spectra.shape[1] : every]
-    distance = difference.abs().sum()
+    distance = torch.linalg.vector_norm(difference, 1)
     spectra *= difference.sign_().div_(found)
-    spectra[..., 0] *= 2.0
-    spectra[..., -1] *= 2.0
+    # The first and the last bin.
+    spectra[..., :: spectra.shape[2] - 1].mul_(2.0)
     return distance
 
 

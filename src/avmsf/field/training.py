@@ -5,11 +5,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor, nn
 from torch.optim.adamw import adamw
 
+from avmsf._utils.device import TRAINABLE, without_denormals
 from avmsf.capture.impacts import Impacts
 from avmsf.field.config import FitConfig
 from avmsf.field.gainfield import TrainableGains
@@ -46,7 +48,7 @@ class Targets:
         early = spectral_target(sounds, fft_sizes=sizes, hops=hops, samples=length)
         if config.spectral_norm == "common":
             mean = sum(float(each.sum()) for each in whole.norms) / len(sizes)
-            norms = [tuple(torch.full_like(each, mean / len(each)) for each in of.norms) for of in (whole, early)]
+            norms = [tuple(np.full_like(each, mean / len(each)) for each in of.norms) for of in (whole, early)]
             whole, early = replace(whole, norms=norms[0]), replace(early, norms=norms[1])
         return cls(rows.to(gains.device), gains, whole, early)
 
@@ -72,7 +74,7 @@ class AdamW:
         self.groups = tuple(groups)
         self.moments = [
             [[torch.zeros_like(each, requires_grad=False) for each in group.parameters] for _ in range(2)]
-            + [[torch.zeros(()) for _ in group.parameters]]
+            + [[torch.zeros((), device=each.device) for each in group.parameters]]
             for group in self.groups
         ]
         """All that changes besides the parameters: means of the gradients and of their squares, and steps."""
@@ -92,7 +94,7 @@ class AdamW:
                 [group.parameters[row] for row in rows],
                 [parameter.grad for parameter in group.parameters if parameter.grad is not None],
                 means, squares, [], steps, lr=factor * group.rate, weight_decay=group.weight_decay, beta1=0.9,
-                beta2=0.999, eps=1e-8, amsgrad=False, maximize=False,
+                beta2=0.999, eps=1e-8, amsgrad=False, maximize=False, fused=True,
             )  # fmt: skip
 
     def resume(self, moments: list[list[list[Tensor]]]) -> None:
@@ -108,7 +110,7 @@ class TrainingRun:
 
     The corrections are measured in what the recordings resolve: frequencies in their modes' widths, dampings and noise
     magnitudes as logarithms. So one learning rate serves all, and dampings and magnitudes stay positive. All tensors
-    are on one device, that of `gains`; chance is drawn on the CPU.
+    are on one device, that of `gains`; a step waits for none of them.
     """
 
     def __init__(
@@ -127,11 +129,15 @@ class TrainingRun:
         self.sample_rate, self.samples = sample_rate, samples
         self.start = _on(modes, device)
         self.weight = _mode_weight(self.start.bank, gains, config)
-        count, bins = len(modes.bank), len(modes.residual.magnitude)
+        bank = self.start.bank
+        self.width = torch.clamp(bank.damping / (2 * math.pi), min=sample_rate / samples)
+        # A correction beyond half the mode's own frequency would mean that another mode is sought.
+        self.bounds = bank.frequency / 2, torch.clamp(bank.frequency * 1.5, max=0.499 * sample_rate)
+        count, bins = len(bank), len(modes.residual.magnitude)
         self.shift = nn.Parameter(torch.zeros(count, dtype=torch.float64, device=device))
         self.decay = nn.Parameter(torch.zeros(count, dtype=torch.float64, device=device))
         self.noise = nn.Parameter(torch.zeros(bins, device=device))
-        self.generator = torch.Generator().manual_seed(config.seed)
+        self.generator = torch.Generator(device if device.type in TRAINABLE else "cpu").manual_seed(config.seed)
         matrices = [parameter for parameter in network.parameters() if parameter.ndim == 2]
         vectors = [parameter for parameter in network.parameters() if parameter.ndim != 2]
 
@@ -151,11 +157,8 @@ class TrainingRun:
     @property
     def bank(self) -> ModalBank:
         """The modes as they stand."""
-        bank = self.start.bank
-        # A correction beyond half the mode's own frequency would mean that another mode is sought.
-        width = torch.clamp(bank.damping / (2 * math.pi), min=self.sample_rate / self.samples)
-        moved = torch.clamp(bank.frequency + width * self.shift, bank.frequency / 2, bank.frequency * 1.5)
-        return ModalBank(torch.clamp(moved, max=0.499 * self.sample_rate), bank.damping * torch.exp(self.decay))
+        moved = torch.clamp(self.start.bank.frequency + self.width * self.shift, *self.bounds)
+        return ModalBank(moved, self.start.bank.damping * torch.exp(self.decay))
 
     @property
     def residual(self) -> Residual:
@@ -182,7 +185,8 @@ class TrainingRun:
             self.residual.magnitude, contacts=len(rows), samples=self.samples, generator=self.generator
         )
 
-    def advance(self, targets: Targets) -> float:
+    @without_denormals()
+    def advance(self, targets: Targets) -> Float[Tensor, ""]:
         """Take one step on all contacts and return the loss before it, of the frames whose turn it is."""
         if self.step < self.config.warmup_steps:
             loss = self._warmup_loss(targets)
@@ -197,7 +201,7 @@ class TrainingRun:
         self.step += 1
         self._chance = self.generator.get_state()
         self.whole = True
-        return float(loss.detach())
+        return loss.detach()
 
     def spectral_loss(self, targets: Targets) -> Float[Tensor, ""]:
         """Return the loss on whole sounds and on their beginnings (paper, eq. 14), and the gain field's penalty.
@@ -209,7 +213,7 @@ class TrainingRun:
             spectral_loss(sounds, target, first=self.step % every, every=every)
             for target in (targets.whole, targets.early)
         )
-        return whole + self.config.early_weight * early + self.network.penalty()
+        return torch.add(whole, early, alpha=self.config.early_weight) + self.network.penalty()
 
     def _warmup_loss(self, targets: Targets) -> Float[Tensor, ""]:
         """Return the squared error of the gains (paper, eq. 13), over their mean square.

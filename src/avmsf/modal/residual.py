@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import scipy.special
 import torch
@@ -45,14 +46,14 @@ def shape_noise(
     """Return white Gaussian noise filtered to `magnitude`, a fresh draw for every contact (paper, eq. 6).
 
     The filters b_i are triangles that sum to one, so the noise's spectrum is a white one times `magnitude`
-    interpolated linearly between its bins. The white noise is drawn as its spectrum, which is white too; it is
-    drawn on the CPU, so that one seed gives one noise on every device. Differentiable in `magnitude`.
+    interpolated linearly between its bins. The white noise is drawn as its spectrum, which is white too, on the
+    generator's device. Differentiable in `magnitude`.
     """
     length = _even_length(samples)
     frequencies = length // 2 + 1
-    white = torch.randn(contacts, frequencies, 2, generator=generator).to(magnitude.device)
-    spectrum = torch.view_as_complex(white) * (_interpolated(magnitude, frequencies) * math.sqrt(length / 2))
-    return torch.fft.irfft(spectrum, n=length)[:, :samples]
+    options: dict[str, Any] = {"dtype": torch.complex64, "device": generator.device}
+    white = torch.randn(contacts, frequencies, generator=generator, **options).to(magnitude.device)
+    return torch.fft.irfft(white * _interpolated(magnitude, frequencies), n=length, norm="ortho")[:, :samples]
 
 
 def low_fluctuation_noise(magnitude: Float[Tensor, " bins"], *, samples: int) -> Float[Tensor, " samples"]:
@@ -71,9 +72,8 @@ def low_fluctuation_noise(magnitude: Float[Tensor, " bins"], *, samples: int) ->
 def _interpolated(magnitude: Float[Tensor, " bins"], frequencies: int) -> Float[Tensor, " frequencies"]:
     """Return the magnitude at evenly spaced frequencies from 0 Hz to half the sample rate, linear between bins."""
     place = torch.linspace(0, len(magnitude) - 1, frequencies, device=magnitude.device)
-    left = place.floor().long().clamp_max(len(magnitude) - 2)
-    share = place - left
-    return (1 - share) * magnitude[left] + share * magnitude[left + 1]
+    left = place.long().clamp_max(len(magnitude) - 2)
+    return torch.lerp(magnitude[left], magnitude[left + 1], (place - left).to(magnitude.dtype))
 
 
 def noise_power(

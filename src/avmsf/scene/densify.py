@@ -46,8 +46,7 @@ class Density:
         slope = rendering.screen.grad
         if slope is None:
             return
-        half_image = slope.new_tensor([camera.width / 2, camera.height / 2])
-        self.pull.add_((slope * half_image).norm(dim=1))
+        self.pull.add_(torch.hypot(slope[:, 0] * (camera.width / 2), slope[:, 1] * (camera.height / 2)))
         self.views.add_((rendering.radii > 0).float())
 
     def grown(

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -40,6 +40,11 @@ class Photograph:
             mask = masks[-1]
             masks.append(None if mask is None else _halved(mask, size))
         return cls(view.name, tuple(cameras), tuple(images), tuple(masks))
+
+    def to(self, device: torch.device) -> "Photograph":
+        """Return the photograph with its images and masks on a device."""
+        masks = tuple(None if mask is None else mask.to(device) for mask in self.masks)
+        return replace(self, images=tuple(image.to(device) for image in self.images), masks=masks)
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ from avmsf.scene.ssim import psnr
 from avmsf.scene.start import StartPoints, photographed_colors, starting_cloud
 
 _TELL_EVERY = 10
-"""Steps between words of progress."""
+"""Least number of steps between reports of progress."""
 _CHECKPOINT_SECONDS = 30.0
 
 
@@ -90,10 +90,10 @@ def splat(
     try:
         while run.step < config.steps:
             loss, rendering, target = run.advance()
-            if progress is not None and (run.step % _TELL_EVERY == 0 or run.step == config.steps):
+            if progress is not None and (run.step % max(_TELL_EVERY, run.losses_every) == 0 or run.step == config.steps):
                 likeness = psnr(rendering.color, target.image)
                 elapsed = time.monotonic() - began
-                progress(SplatProgress(run.step, config.steps, loss, likeness, elapsed, run.cloud))
+                progress(SplatProgress(run.step, config.steps, float(loss), likeness, elapsed, run.cloud))
             keeper.look(run)
     except KeyboardInterrupt:
         # During a step's changes, only the state saved before it is consistent.

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf._utils.device import steps_between_losses
 from avmsf.errors import SceneError
 from avmsf.scene.densify import Density
 from avmsf.scene.gaussians import GaussianCloud
@@ -44,7 +45,10 @@ class SplatRun:
         *,
         rasterizer: Rasterizer,
     ) -> None:
-        self.photographs, self.backdrop, self.config, self.rasterizer = photographs, backdrop, config, rasterizer
+        device = cloud.centers.device
+        self.photographs = [each.to(device) for each in photographs]
+        self.background = None if backdrop.color is None else backdrop.color.to(device)
+        self.config, self.rasterizer, self.losses_every = config, rasterizer, steps_between_losses(device)
         spread = cloud.centers.amax(0) - cloud.centers.amin(0)
         self.half_diagonal = 0.5 * float(spread.norm())
         self.parameters = {name: value.clone() for name, value in _named(cloud).items()}
@@ -62,10 +66,10 @@ class SplatRun:
         """The Gaussians as they are now; they change with the next step."""
         return self._cloud(self.parameters, self.config.degree)
 
-    def advance(self) -> tuple[float, Rendering, Target]:
+    def advance(self) -> tuple[Float[Tensor, ""], Rendering, Target]:
         """Take one step; return the loss before it, and what was compared.
 
-        Raises `SceneError` where the loss is no finite number.
+        Raises `SceneError` where the loss is no finite number, on a graphics card some steps later.
         """
         photograph, level = self.photographs[self._next()], self._level()
         target = self._target(photograph, level)
@@ -81,15 +85,10 @@ class SplatRun:
             thickness = cloud.log_scales.amin(1).exp().mean()
             loss = loss + self.config.flat_weight / self.half_diagonal * thickness
         loss.backward()  # type: ignore[no-untyped-call]
-        value = float(loss.detach())
-        if not math.isfinite(value):
-            raise SceneError(
-                f"expected a finite loss, got {value} at step {self.step}; lower center_rate, scale_rate and "
-                "opacity_rate",
-                row=self.step,
-                name="loss",
-                value=value,
-            )
+        # Before densification too, to which there would seem to be no Gaussians.
+        done = self.step + 1
+        if done == self.config.steps or not done % self.losses_every or not done % self.config.densify_every:
+            self._expect_finite(float(loss.detach()))
         self.whole = False
         if growing:
             self.density.note(rendering, photograph.cameras[level])
@@ -97,7 +96,17 @@ class SplatRun:
         self.step += 1
         self._change_number()
         self.whole = True
-        return value, rendering, target
+        return loss.detach(), rendering, target
+
+    def _expect_finite(self, loss: float) -> None:
+        if not math.isfinite(loss):
+            raise SceneError(
+                f"expected a finite loss, got {loss} at step {self.step}; lower center_rate, scale_rate and "
+                "opacity_rate",
+                row=self.step,
+                name="loss",
+                value=loss,
+            )
 
     def loss(self, rendering: Rendering, target: Target) -> Float[Tensor, ""]:
         """Return the mixture of absolute difference, 1 - SSIM and the mask's error (3DGS, eq. 7, and the mask's)."""
@@ -157,13 +166,13 @@ class SplatRun:
         return self.config.degree if every <= 0 else min(self.config.degree, int(self._part() / every))
 
     def _target(self, photograph: Photograph, level: int) -> Target:
-        device, mask = self.parameters["centers"].device, photograph.masks[level]
-        image = photograph.images[level].to(device).float() / 255
-        coverage = None if mask is None else mask.to(device).float() / 255
-        if self.backdrop.color is not None:
-            return Target(image, coverage, self.backdrop.color.to(device))
+        mask = photograph.masks[level]
+        image = photograph.images[level].float() / 255
+        coverage = None if mask is None else mask.float() / 255
+        if self.background is not None:
+            return Target(image, coverage, self.background)
         assert coverage is not None
-        background = torch.rand(3, generator=self.generator).to(device)
+        background = torch.rand(3, generator=self.generator).to(image, non_blocking=True)
         return Target(torch.lerp(background.expand_as(image), image, coverage[..., None]), coverage, background)
 
     def _rates(self) -> dict[str, float]:
@@ -180,17 +189,18 @@ class SplatRun:
 
     def _descend(self, gradients: dict[str, Tensor | None]) -> None:
         """Take Adam's step (Kingma & Ba 2015); what has no gradient, shades before their degree's time, stays."""
-        count = self.step + 1
-        first_scale, second_scale = 1.0 / (1.0 - _BETAS[0] ** count), 1.0 / (1.0 - _BETAS[1] ** count)
-        for name, rate in self._rates().items():
-            gradient = gradients[name]
-            if gradient is None:
-                continue
-            first, second = self.moments[name]
-            first.lerp_(gradient, 1.0 - _BETAS[0])
-            second.mul_(_BETAS[1]).addcmul_(gradient, gradient, value=1.0 - _BETAS[1])
-            spread = second.mul(second_scale).sqrt_().add_(_EPSILON)
-            self.parameters[name].addcdiv_(first, spread, value=-rate * first_scale)
+        (by_mean, by_square), count, rates = _BETAS, self.step + 1, self._rates()
+        known = {name: gradient for name, gradient in gradients.items() if gradient is not None}
+        slopes = list(known.values())
+        means, squares = ([self.moments[name][place] for name in known] for place in range(2))
+        torch._foreach_lerp_(means, slopes, 1.0 - by_mean)
+        torch._foreach_mul_(squares, by_square)
+        torch._foreach_addcmul_(squares, slopes, slopes, 1.0 - by_square)
+        spreads = torch._foreach_mul(squares, 1.0 / (1.0 - by_square**count))
+        torch._foreach_sqrt_(spreads)
+        torch._foreach_add_(spreads, _EPSILON)
+        steps = [-rates[name] / (1.0 - by_mean**count) for name in known]
+        torch._foreach_addcdiv_([self.parameters[name] for name in known], means, spreads, steps)
 
     def _change_number(self) -> None:
         """Add and remove Gaussians where that is due."""

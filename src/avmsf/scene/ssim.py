@@ -51,7 +51,7 @@ def psnr(
 
 def _plain_similarity(image: Tensor, target: Tensor) -> Tensor:
     """Return the same by convolutions, which graphics cards do best."""
-    window = torch.from_numpy(np.outer(_WINDOW, _WINDOW)).to(image)
+    window = torch.from_numpy(np.outer(_WINDOW, _WINDOW)).to(image, non_blocking=True)
     maps = torch.stack([image, target, image * image, target * target, image * target]).permute(0, 3, 1, 2)
     kernel = window.expand(3, 1, *window.shape)
     x, y, xx, yy, xy = torch.nn.functional.conv2d(maps, kernel, padding=_REACH, groups=3)
@@ -81,6 +81,9 @@ class _Similarity(torch.autograd.Function):
 
     @staticmethod
     def backward(context: Any, *gradients: Any) -> tuple[Tensor | None, None]:
+        # The saved slope would count as a constant. `once_differentiable` raises only where an outer slope has its own.
+        if torch.is_grad_enabled():
+            raise NotImplementedError("ssim has first derivatives only on the CPU: expected create_graph=False")
         (slope,) = context.saved_tensors
         return gradients[0] * slope, None
 
