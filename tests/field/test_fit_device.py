@@ -51,7 +51,8 @@ def started(recipe: GainRecipe, config: FitConfig, device: str) -> tuple[Trainin
         samples=impacts.sounds.shape[1],
         config=case.config,
     )
-    targets = Targets.of(case.train, case.gains.to("cpu" if device == "meta" else device), recipe.rows(case), case.config)
+    gains = case.gains.to("cpu" if device == "meta" else device)
+    targets = Targets.of(case.train, gains, recipe.rows(case), case.config)
     return run, on_meta(targets) if device == "meta" else targets
 
 

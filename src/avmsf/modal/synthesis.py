@@ -64,7 +64,7 @@ def synthesize_phased(
     decay, phase = torch.exp(damping[..., None, :] * -times.abs()), 2 * math.pi * frequency * times
     # Processors take five times as long for torch.polar in float64.
     powers = torch.complex(decay * torch.cos(phase), decay * torch.sin(phase)).to(amplitudes.dtype)
-    starts, steps = powers.split([blocks, _BLOCK], dim=-2)
+    starts, steps = torch.tensor_split(powers, [blocks], dim=-2)
     left, right = (torch.view_as_real(each).flatten(-2) for each in (amplitudes[:, None, :] * starts, steps))
     sounds = left.flatten(0, 1) @ right.mT if damping.ndim == 1 else left @ right.mT
     return sounds.reshape(len(amplitudes), blocks * _BLOCK)[:, :samples]

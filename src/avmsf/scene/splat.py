@@ -90,7 +90,8 @@ def splat(
     try:
         while run.step < config.steps:
             loss, rendering, target = run.advance()
-            if progress is not None and (run.step % max(_TELL_EVERY, run.losses_every) == 0 or run.step == config.steps):
+            last, every = run.step == config.steps, max(_TELL_EVERY, run.losses_every)
+            if progress is not None and (last or run.step % every == 0):
                 likeness = psnr(rendering.color, target.image)
                 elapsed = time.monotonic() - began
                 progress(SplatProgress(run.step, config.steps, float(loss), likeness, elapsed, run.cloud))
