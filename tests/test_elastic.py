@@ -9,11 +9,12 @@ import scipy.optimize
 import scipy.sparse.linalg
 import torch
 from jaxtyping import Float64
+from threadpoolctl import threadpool_info, threadpool_limits
 from torch import Tensor
 
 from avmsf.errors import SimulationError
 from avmsf.simulate.block import block
-from avmsf.simulate.eigen import lowest_vibrations, rigid_motions
+from avmsf.simulate.eigen import lowest_vibrations, one_blas_thread, rigid_motions
 from avmsf.simulate.elastic import ElasticModes, elastic_modes
 from avmsf.simulate.elements import SecondOrder, mass, stiffness
 from avmsf.simulate.material import GLASS, STEEL, Material
@@ -319,3 +320,18 @@ def test_bodies_in_parts_are_refused(bracket):
     apart = torch.cat([bracket.points, bracket.points + 1.0])
     with raises(SimulationError, name="parts", value=2):
         elastic_modes(Solid.build(apart, torch.cat([bracket.cells, bracket.cells + count])), STEEL, count=4)
+
+
+def test_the_limit_on_blas_is_taken_back_whichever_thread_ends_last():
+    def threads() -> set[int]:
+        return {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"}
+
+    with threadpool_limits(limits=2, user_api="blas"):
+        before, (first, second) = threads(), (one_blas_thread(), one_blas_thread())
+        first.__enter__()
+        second.__enter__()
+        assert threads() == {1}
+        first.__exit__(None, None, None)
+        assert threads() == {1}
+        second.__exit__(None, None, None)
+        assert threads() == before == {2}

@@ -1,15 +1,19 @@
 """Loops compiled for the processor, kept from one run to the next where that is possible, and run on several cores."""
 
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numba
 from numba.core import event
 
+_CACHE_BYTES = 50_000_000
+"""Several times what all compiled loops take."""
 MAX_LANES = 8
 """Most threads that one kernel runs on: with more, handing out the work costs what they save (kernels take ms)."""
 
@@ -25,30 +29,20 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         options.setdefault("nogil", True)
         try:
-            made: Any = numba.njit(cache=True, **options)(function)
+            made: Callable[..., Any] = numba.njit(cache=_has_space(), **options)(function)
         except RuntimeError:
             # Numba looks for a folder at once, and raises this where it finds none.
-            return numba.njit(**options)(function)
-        # Numba lets errors of the disk through to the caller. Its cache is not part of its public interface.
-        cache = getattr(made, "_cache", None)
-        for step in ("load_overload", "save_overload"):
-            if hasattr(cache, step):
-                setattr(cache, step, _without_disk_errors(getattr(cache, step)))
+            made = numba.njit(**options)(function)
         return made
 
     return decorate
 
 
-def _without_disk_errors(step: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a step of numba's cache that finds nothing, or keeps nothing, where the system does not let it."""
-
-    def attempt(*arguments: Any) -> Any:
-        try:
-            return step(*arguments)
-        except OSError:
-            return None
-
-    return attempt
+def _has_space() -> bool:
+    """Return whether the disk of the cache has room for all that is compiled: numba raises where it is full."""
+    folder = Path(os.environ.get("NUMBA_CACHE_DIR") or __file__)
+    existing = next(each for each in (folder, *folder.absolute().parents) if each.exists())
+    return shutil.disk_usage(existing).free > _CACHE_BYTES
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import numba.core.caching
 import pytest
@@ -64,6 +65,7 @@ def test_a_loop_is_compiled_where_it_cannot_be_kept(monkeypatch: pytest.MonkeyPa
     def thrice(value: float) -> float:
         return 3 * value
 
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=0))
     monkeypatch.setattr(numba.core.caching.IndexDataCacheFile, "_save_index", a_disk_that_is_full)
     assert compiled()(thrice)(1.5) == 4.5
 

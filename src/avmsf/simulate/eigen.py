@@ -8,8 +8,10 @@ motions become slow vibrations, which are computed like the others and told apar
 their kinetic energy is a rigid motion's.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from threading import Lock
 
 import numpy as np
 import scipy.linalg
@@ -54,9 +56,37 @@ def rigid_motions(nodes: Float64[np.ndarray, "nodes 3"], mass: scipy.sparse.csr_
     return scipy.linalg.solve_triangular(lower, flat.T, lower=True).T
 
 
+class _OneThread:
+    """Limits BLAS to one thread for as long as any thread of the process is within: the limit is the whole process's.
+
+    A limit that each thread set and took back for itself would stay where they end in another order.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._within = Lock(), 0
+        self._limits: threadpool_limits | None = None
+
+    @contextmanager
+    def __call__(self) -> Iterator[None]:
+        with self._lock:
+            self._within += 1
+            if self._within == 1:
+                self._limits = threadpool_limits(limits=1, user_api="blas")
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._within -= 1
+                if self._within == 0 and self._limits is not None:
+                    self._limits.restore_original_limits()
+
+
+one_blas_thread = _OneThread()
+
+
 # The factors' blocks are so small that BLAS threads wait for each other: on two busy cores 80 modes of 20,000 degrees
 # of freedom took 12 s with two threads and 7 s with one, of 64,000 61 s and 35 s.
-@threadpool_limits.wrap(limits=1, user_api="blas")  # type: ignore[untyped-decorator]
+@one_blas_thread()
 def lowest_vibrations(
     stiffness: scipy.sparse.sparray,
     mass: scipy.sparse.csr_array,

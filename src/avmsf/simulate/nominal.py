@@ -13,7 +13,6 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Int
-from threadpoolctl import threadpool_limits
 
 from avmsf._utils.caching import source_digest
 from avmsf.capture.surface import Surface
@@ -313,8 +312,7 @@ class _Maker:
         """Return the bodies with these walls, fine if it is one; `refused` gets the errors of those that fail."""
         bodies = []
         # Most of the time goes to factorizations, which release the interpreter's lock and keep a processor busy each.
-        # The limit on BLAS is the whole process's: set by each thread for itself, it would not be taken back in order.
-        with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(lane_count()) as pool:
+        with ThreadPoolExecutor(lane_count()) as pool:
             pending = {wall: pool.submit(self.body, wall, dofs, fine=len(walls) == 1) for wall in walls}
             try:
                 for wall, body in pending.items():
