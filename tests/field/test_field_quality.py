@@ -150,3 +150,10 @@ def test_the_advice_says_where_and_how_far_away():
     assert "(0.021, -0.013, 0.080) m" in words
     assert "41 mm" in words
     assert FieldQuality(9, 0.3, 0.7).advice == ""
+
+
+@pytest.mark.parametrize(("error", "level"), [(0.5, 0), (0.66, 1), (0.74, 1), (0.76, 2)])
+def test_the_level_of_quality_asks_for_a_standard_error(error, level):
+    found = FieldQuality(9, error, 0.7, standard_error=0.05)
+    assert found.level == level
+    assert found.verdict.startswith("Warning") == (level > 0)

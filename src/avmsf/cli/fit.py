@@ -89,6 +89,7 @@ def run(options: Options) -> int:
     print_fitted(screen, fitted, train, test, scores, options.output)
     screen.print(f"wrote {options.output}", soft_wrap=True)
     next_after_fit(options.output, trial=test is not None)
+    warn_of_quality(fitted)
     if options.json:
         print_json(
             {
@@ -107,11 +108,12 @@ def print_fitted(
     """Print the errors of a field in the file `path` at held-out recordings, the outliers, and its quality."""
     if test is not None:
         screen.print(score_table(f"{parts_words(train, test)}; lower is better", scores))
+    poor = fitted.quality is not None and fitted.quality.level > 0
     for words in (
         *outlier_words(fitted),
         summary(fitted, len(train)),
         *body_warnings(fitted),
-        *quality_words(fitted, path),
+        *(() if poor else quality_words(fitted, path)),
     ):
         screen.print(words, soft_wrap=True)
 
@@ -130,6 +132,7 @@ def fitted_values(
         "report": fitted.origin.report,
         "body": None if fitted.body is None else fitted.body.record(),
         "scores": score_values(scores),
+        "quality": None if fitted.quality is None else fitted.quality.level,
     }
 
 
@@ -158,6 +161,12 @@ def next_after_fit(output: Path, *, trial: bool) -> None:
         next_step("the same command without --train-fraction and --train-count, to fit to all recordings")
     else:
         next_command("avmsf render", output, "--position X Y Z -o impact.wav")
+
+
+def warn_of_quality(fitted: SoundField) -> None:
+    """Print last that a field is not better than averaging recordings, and what to do."""
+    if fitted.quality is not None and fitted.quality.level > 0:
+        say(str(fitted.quality))
 
 
 def show_guess(guessed: SoundField, output: Path, *, json: bool) -> None:

@@ -6,7 +6,7 @@ from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
-from avmsf.cli.fit import fitted_values, next_after_fit, part_contacts, print_fitted, show_guess
+from avmsf.cli.fit import fitted_values, next_after_fit, part_contacts, print_fitted, show_guess, warn_of_quality
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.checks import read_settings
 from avmsf.cli.options.reconstruct import Options
@@ -71,6 +71,7 @@ def run(options: Options) -> int:
     if options.output is not None:
         screen.print(f"wrote {options.output}", soft_wrap=True)
     next_after_fit(options.output or made.field, trial=test is not None)
+    warn_of_quality(fitted)
     if options.json:
         print_json(
             {

@@ -52,7 +52,9 @@ def with_quality(field: SoundField, train: Impacts, *, advise: bool = True) -> S
     field = replace(field, gain_field=replace(gains, spread_share=SHARES[chosen]))
     reached = {kind: float(each[chosen].mean()) for kind, each in errors.items()}
     advice = _next(field, gains) if advise else ()
-    found = FieldQuality(gains.place_count, reached[best], float(error(averaged).mean()), *advice)
+    simple = error(averaged)
+    scatter = float((errors[best][chosen] - simple).std()) / math.sqrt(len(simple))
+    found = FieldQuality(gains.place_count, reached[best], float(simple.mean()), *advice, standard_error=scatter)
     report = {**field.origin.report, "quality": asdict(found), "residual": reached}
     return replace(field, origin=replace(field.origin, report=report))
 

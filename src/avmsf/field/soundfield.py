@@ -77,6 +77,8 @@ class FieldQuality:
     """The contact (object frame, meters) that reduces the field's expected error most; None if there is no other."""
     next_distance: float | None = None
     """From there to the nearest contact that was recorded, meters."""
+    standard_error: float = 0.0
+    """Of the difference of both errors, by its scatter over the positions."""
 
     @classmethod
     def of(cls, record: Mapping[str, Any]) -> "FieldQuality":
@@ -91,16 +93,24 @@ class FieldQuality:
     @property
     def verdict(self) -> str:
         """How good the field is. Leaving out mostly overstates the error: spread contacts are far from each other."""
-        if self.error < self.nearest_mean:
+        if self.level == 0:
             return (
                 f"By leave-one-out, the relative STFT error of the field is about {self.error:.2f}, of the mean of "
                 f"the three nearest recordings {self.nearest_mean:.2f} ({self.positions} positions)."
             )
+        found = "worse than" if self.level == 2 else "hardly better than"
         return (
-            "By leave-one-out, the field is no better than the mean of the three nearest recordings: relative STFT "
-            f"errors of {self.error:.2f} and {self.nearest_mean:.2f} ({self.positions} positions). Record more "
-            "positions; without a mesh, add one, or make the shape from photographs by avmsf reconstruct."
+            f"Warning: by leave-one-out, the field is {found} the mean of the three nearest recordings: relative STFT "
+            f"errors of {self.error:.2f} and {self.nearest_mean:.2f} ({self.positions} positions). Look for mistakes "
+            "by avmsf check: recordings given to other contacts, a mesh in another frame or of another object. Record "
+            "more positions; without a mesh, add one, or make the shape from photographs by avmsf reconstruct."
         )
+
+    @property
+    def level(self) -> int:
+        """0 for a field better than the mean of the three nearest recordings by a standard error, 2 for a worse one."""
+        gained = self.nearest_mean - self.error
+        return 0 if gained > self.standard_error else 1 if gained >= -self.standard_error else 2
 
     @property
     def advice(self) -> str:
