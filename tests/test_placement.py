@@ -124,6 +124,37 @@ def test_unit_axes_and_origin_together() -> None:
     assert float((placement.mistake.undo(1000 * (CONTACTS - shift) @ Y_UP) - CONTACTS).norm(dim=1).max()) < 0.005
 
 
+MOVES = {
+    "upside down": ((1.0, -1.0, -1.0), 1.0, 0.0, True),
+    "mirrored": ((-1.0, 1.0, 1.0), 1.0, 0.0, True),
+    "displaced by 4 %": ((1.0, 1.0, 1.0), 1.0, 0.04, False),
+    "12 % too large": ((1.0, 1.0, 1.0), 1.12, 0.0, False),
+    "7.3 times too large": ((1.0, 1.0, 1.0), 7.3, 0.0, True),
+}
+"""Signs, scale and shift over the size of what befell a mesh, and whether no shape can be used as it lies."""
+
+
+@pytest.mark.parametrize(("signs", "scale", "shift", "misplaced"), MOVES.values(), ids=MOVES)
+def test_the_similarity_that_befell_a_mesh_is_named_and_no_row(
+    signs: tuple[float, ...], scale: float, shift: float, misplaced: bool
+) -> None:
+    moved = scale * CLOUD * torch.tensor(signs) + shift * torch.tensor([0.43, 0, 0], dtype=torch.float64)
+    placement = judge_placement(CONTACTS, moved)
+    assert placement.mistake is not None
+    assert placement.mistake.factor == pytest.approx(scale, rel=0.02)
+    assert placement.mistake.axes.diag().tolist() == list(signs)
+    meant = scale * CONTACTS * torch.tensor(signs) + shift * torch.tensor([0.43, 0, 0], dtype=torch.float64)
+    assert float((placement.mistake.undo(CONTACTS) - meant).norm(dim=1).mean()) < 0.01 * scale
+    assert placement.misplaced == misplaced
+    assert "row" not in placement.describe()
+
+
+def test_contacts_that_are_measured_coarsely_are_no_mistake_of_all() -> None:
+    noise = torch.randn(20, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    for part in (0.005, 0.01, 0.02):
+        assert judge_placement(CONTACTS + part * 0.43 * noise, CLOUD).mistake is None
+
+
 def test_one_wrong_row_is_no_mistake_of_all() -> None:
     contacts = CONTACTS.clone()
     contacts[7] = contacts[7] + torch.tensor([0.0, 1.0, 0.0])

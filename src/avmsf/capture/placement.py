@@ -1,4 +1,4 @@
-"""Whether contacts lie on the object's surface, and where they do not, what mistake would explain it."""
+"""Whether contacts lie on the object's surface, and where they do not, the similarity that brings them onto it."""
 
 import itertools
 import math
@@ -23,8 +23,8 @@ On the aircraft, measured by hand against a nominal surface, the farthest of 74 
 """
 SPREAD = 0.05
 """Diagonal of the contacts over the object's, below which their unit must be another."""
-SMALL_SPREAD = 0.15
-"""The same, below which it may be."""
+OTHER_SIZE = 0.25
+"""Logarithm of a scale beyond which it is another object's: what materials cannot explain either."""
 WRONG_ROWS = 0.1
 """Part of the contacts up to which those that lie off count as single mistakes, not as one made with all of them."""
 LEAST_CLOSE = 5
@@ -32,10 +32,12 @@ LEAST_CLOSE = 5
 LEAST_SPREAD = 0.4
 """Diagonal of the contacts over the object's that the undoing of a mistake must leave: what is shrunk enough fits
 anywhere."""
-GAIN = 3.0
-"""How many times nearer to the surface a mistake mended must bring the contacts to be spoken of."""
+RESOLUTION = 1 / 200
+"""Distance over the diagonal below which contacts lie equally well: points are no surface, nor contacts exact."""
+ODDS = 3.0
+"""Nats of a contact that is a mistake of its own, as one of twenty is."""
 MOST_CONTACTS, MOST_POINTS = 200, 20_000
-"""As many are looked at, evenly taken from all, in search for the mistake."""
+"""As many are compared, evenly taken from all, in search for the similarity."""
 UNITS = {1e-3: "mm", 1e-2: "cm", 0.0254: "inches", 0.3048: "feet"}
 FACTORS = (1.0, *(power for size in (1000.0, 100.0, 10.0, 25.4, 0.0254, 0.3048) for power in (size, 1 / size)))
 
@@ -61,18 +63,31 @@ class Mistake:
         """Whether the unit alone is wrong."""
         return bool(torch.equal(self.axes, torch.eye(3, dtype=torch.float64)) and not self.shift.any())
 
+    @property
+    def turned(self) -> bool:
+        """Whether the axes are others, or mirrored."""
+        return not torch.equal(self.axes, torch.eye(3, dtype=torch.float64))
+
+    @property
+    def unit(self) -> str | None:
+        """Name of the unit that one of the two counts by mistake; None for another factor."""
+        size = min(self.factor, 1 / self.factor)
+        return next((name for meters, name in UNITS.items() if abs(size / meters - 1) < 1e-6), None)
+
     def __str__(self) -> str:
         steps, questions = [], []
         if self.factor != 1:
             ratio = self.factor if self.factor > 1 else 1 / self.factor
             steps.append(f"{'multiplied' if self.factor > 1 else 'divided'} by {ratio:.4g}")
-            size, whose = (self.factor, "their unit") if self.factor < 1 else (1 / self.factor, "the surface's unit")
-            named = [name for meters, name in UNITS.items() if abs(size / meters - 1) < 1e-6]
-            questions.append(f"is {whose} {named[0]}?" if named else "are they and the surface in one unit?")
-        if not torch.equal(self.axes, torch.eye(3, dtype=torch.float64)):
+            whose = "their unit" if self.factor < 1 else "the surface's unit"
+            questions.append(f"is {whose} {self.unit}?" if self.unit else "are they and the surface of one scale?")
+        if self.turned:
             steps.append(f"with (x, y, z) taken as {_written(self.axes)}")
             mirrored = float(torch.linalg.det(self.axes)) < 0
-            questions.append("are the axes mirrored?" if mirrored else "does another axis point up?")
+            upright = float(self.axes[2, 2]) < -0.9
+            questions.append(
+                "are the axes mirrored?" if mirrored else "upside down?" if upright else "does another axis point up?"
+            )
         if self.shift.any():
             steps.append(f"moved by ({', '.join(f'{value:.3g}' for value in self.shift.tolist())}) m")
             questions.append("do the origins differ?")
@@ -112,9 +127,17 @@ class Placement:
         Where they lie on it already, as first impacts near the middle of a plate do, only many that are very close
         together say so.
         """
-        if self.mistake is None or self.mistake.factor == 1:
+        if self.mistake is None or self.mistake.unit is None:
             return False
         return self.mostly_off or (self.shrunken and len(self.distances) >= LEAST_CLOSE)
+
+    @property
+    def misplaced(self) -> bool:
+        """Whether no shape can be used as it lies: turned, mirrored, of another size, or with most contacts off."""
+        mistake = self.mistake
+        if mistake is not None and (mistake.turned or self.mostly_off or abs(math.log(mistake.factor)) > OTHER_SIZE):
+            return True
+        return float(self.distances.median()) > self.tolerance
 
     @property
     def mostly_off(self) -> bool:
@@ -131,7 +154,7 @@ class Placement:
         """Return a message on the contacts off the surface, by these names or else by indices; "" for none."""
         if self.on_surface:
             return ""
-        if self.off:
+        if self.off or not self.shrunken:
             farthest = float(self.distances.max())
             few = self.mistake is None and 2 * len(self.off) < len(self.distances) and not self.shrunken
             which = f"{len(self.off)} of {len(self.distances)} contacts lie" if few else "the contacts lie"
@@ -153,13 +176,12 @@ class Placement:
 
 
 def judge_placement(contacts: Float[Tensor, "contacts 3"], points: Float[Tensor, "points 3"]) -> Placement:
-    """Measure how far contacts lie from a surface given by its points, and seek the mistake where most lie off it.
+    """Measure how far contacts lie from a surface given by its points, and seek the similarity that explains them best.
 
-    Tried are the ratios of usual units, all 48 signed permutations of the axes, a shift, and these together. A mistake
-    is reported where undoing it brings nine of ten contacts within half the tolerance and all of them on average `GAIN`
-    times nearer in relation to their extent: the simplest of those that do about as well. Few contacts fit much by
-    chance: axes are tried from five on, shifts from eight. Raises CaptureError where there are no contacts, or points
-    without an extent.
+    Tried are the ratios of usual units and any scale, all 48 signed permutations of the axes, and a
+    shift. Each has the nats of its parameters and of how far each contact is off (`_Search`); the least is
+    reported unless it leaves the contacts where they are. Few contacts fit much by chance: axes are tried from five on,
+    what is fitted from eight. Raises CaptureError where there are no contacts, or points without an extent.
     """
     places, cloud = contacts.double().numpy(), points.double().numpy()
     if not len(places) or not len(cloud) or not (np.isfinite(places).all() and np.isfinite(cloud).all()):
@@ -183,10 +205,7 @@ def judge_placement(contacts: Float[Tensor, "contacts 3"], points: Float[Tensor,
         spread=_diagonal(places),
         tolerance=max(TOLERANCE * diagonal, 2 * spacing),
     )
-    small = 0 < placement.spread < SMALL_SPREAD * diagonal
-    if not small and not placement.mostly_off:
-        return placement
-    search = _Search(cKDTree(some), _some(places, MOST_CONTACTS), placement)
+    search = _Search(tree, _some(places, MOST_CONTACTS), placement, floor=spacing)
     return replace(placement, mistake=search.find())
 
 
@@ -195,19 +214,19 @@ def expect_placed(
 ) -> None:
     """Raise FitError where contacts are not on a surface, with the transform that would bring them onto it.
 
-    `points` are all over the surface, as `surface_points` has them; both in meters. Contacts are not on it where a
-    mistake made with all of them explains that, of unit, axes or origin, and where half of them lie farther off than
-    `Placement.tolerance`: rough surfaces, glue and single wrong rows pass. `names` are for the message.
+    `points` are all over the surface, as `surface_points` has them; both in meters. Contacts are not on it where
+    `Placement.misplaced` says so: rough surfaces, glue, single wrong rows and small shifts pass. `names` are for the
+    message.
     """
     placement = judge_placement(contacts, points)
-    if placement.mistake is None and float(placement.distances.median()) <= placement.tolerance:
+    if not placement.misplaced:
         return
     if placement.mistake is None:
         advice = "; bring both into one frame, or use a gain model without elastic mode shapes"
     elif placement.mistake.unit_only:
         advice = " State both units, as unit and surface_unit in capture.toml do, or give both in meters"
     else:
-        advice = " Undo this in one of the two, or use a gain model without elastic mode shapes"
+        advice = " Bring both into one frame, or use a gain model without elastic mode shapes"
     raise FitError(
         f"expected contacts on the surface for elastic mode shapes, but {placement.describe(names)}{advice}",
         name="contacts",
@@ -227,75 +246,117 @@ def surface_points(surface: Surface, *, count: int = MOST_POINTS) -> Float[Tenso
 
 
 class _Search:
-    """The mistakes that are tried, each with a price for how much it explains away."""
+    """Similarities compared by description length: nats of the parameters, and of the distances that they leave.
 
-    def __init__(self, tree: cKDTree, contacts: np.ndarray, placement: Placement) -> None:
+    A distance d, or the least that counts where it is less, costs d^2 / (2 s^2) + log(s / scale), as with normal errors
+    of a standard deviation s that is chosen for each similarity, or that of a contact which is a mistake of its own and
+    lies anywhere. The scale makes what is shrunk no better than what it was. A parameter fitted to n contacts costs
+    log(n).
+    """
+
+    def __init__(self, tree: cKDTree, contacts: np.ndarray, placement: Placement, *, floor: float) -> None:
         self.tree, self.contacts, self.placement = tree, contacts, placement
-        cloud = np.asarray(tree.data)
-        self.middle = (cloud.min(axis=0) + cloud.max(axis=0)) / 2
+        self.cloud = np.asarray(tree.data)
+        self.middle = (self.cloud.min(axis=0) + self.cloud.max(axis=0)) / 2
+        self.floor = max(floor, RESOLUTION * placement.diagonal)
+        widest = max(2 * self.floor, float(placement.distances.max()))
+        steps = math.ceil(math.log(widest / self.floor, 1.5)) + 1
+        self.deviations = np.geomspace(self.floor, widest, steps)[:, None]
+        self.parameter = math.log(len(contacts))
 
     def find(self) -> Mistake | None:
-        """Return the cheapest mistake that explains the contacts well, if there is one."""
-        found: list[tuple[float, Mistake]] = []
-        for price, mistake in self._unmoved():
-            self._weigh(price, mistake, found)
+        """Return the similarity of the least description length; None where that changes nothing."""
+        identity = Mistake(1.0, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+        present, least = self._nats(identity), len(self.contacts) * (math.log(self.floor) + 0.5)
+        if present - least < 1:
+            return None
+        found = [(code + self._nats(each), each) for code, each in self._unmoved()]
         if len(self.contacts) >= 8:
-            # A shift can be fitted to anything, so that it has to explain a good deal more.
-            for price, mistake in self._moved():
-                self._weigh(3 * price, mistake, found)
-        return min(found, key=lambda pair: pair[0])[1] if found else None
+            found += self._fitted()
+        for nats, each in sorted(found, key=lambda pair: pair[0]):
+            distances = self.tree.query(each.undo(torch.from_numpy(self.contacts)).numpy())[0]
+            far, spread = float(np.quantile(distances, 0.9)), each.factor * self.placement.spread or math.inf
+            # Beside the size that the contacts have by then: what is shrunk comes nearer to anything.
+            if nats < present and far <= min(max(self.floor, 0.5 * self.placement.tolerance), TOLERANCE * spread):
+                return None if torch.equal(each.undo(identity.axes), identity.axes) else replace(each, distance=far)
+        return None
+
+    def _nats(self, mistake: Mistake) -> float:
+        if not mistake.factor > 0:
+            return math.inf
+        distances = self.tree.query(mistake.undo(torch.from_numpy(self.contacts)).numpy())[0]
+        spread, diagonal = mistake.factor * self.placement.spread, self.placement.diagonal
+        squares = np.square(np.maximum(distances, self.floor) / self.deviations)
+        near = squares / 2 + np.log(self.deviations / min(mistake.factor, 1.0))
+        anywhere = math.log(max(diagonal, self.placement.spread)) + ODDS
+        # Contacts within a spot of an object are as unlikely as the spot is small.
+        spot = max(0.0, math.log(SPREAD * diagonal / spread)) if spread else 0.0
+        return float(np.minimum(near, anywhere).sum(axis=1).min()) + len(distances) * spot
 
     def _unmoved(self) -> Iterator[tuple[float, Mistake]]:
-        """Yield the ratios of units and the axes that give contacts of about the object's size."""
+        """Yield the ratios of units that give contacts of about the object's size, with all axes."""
         spread, diagonal = self.placement.spread, self.placement.diagonal
+        # What is symmetric but for errors of this size does not show which way it lies.
+        off = float(self.placement.distances.max()) > self.placement.tolerance / 2
+        turning = len(self.contacts) >= 5 and off
         for factor in FACTORS:
             if spread and factor != 1 and not LEAST_SPREAD * diagonal <= factor * spread <= 1.2 * diagonal:
                 continue
-            for price, axes in _ways() if len(self.contacts) >= 5 else _ways()[:1]:
-                yield price * (1 if factor == 1 else 1.5), Mistake(factor, axes, torch.zeros(3, dtype=torch.float64))
+            for code, axes in _ways() if turning else _ways()[:1]:
+                unit = 0.0 if factor == 1 else math.log(len(FACTORS))
+                yield unit + code, Mistake(factor, axes, torch.zeros(3, dtype=torch.float64))
 
-    def _moved(self) -> list[tuple[float, Mistake]]:
-        """Return the likeliest of these with a shift, which starts between the middles and moves on to rest."""
-        starts = []
-        for price, mistake in self._unmoved():
-            places = mistake.undo(torch.from_numpy(self.contacts)).numpy()
-            shift = self.middle - (places.min(axis=0) + places.max(axis=0)) / 2
-            starts.append((price * self.tree.query(places + shift)[0].mean(), price, mistake, places, shift))
-        starts.sort(key=lambda start: start[0])
-        moved = []
-        for _, price, mistake, places, shift in starts[:12]:
-            for _ in range(20):
-                nearest = self.tree.query(places + shift)[1]
-                shift = (np.asarray(self.tree.data)[nearest] - places).mean(axis=0)
-            moved.append((price, replace(mistake, shift=torch.from_numpy(shift))))
-        return moved
+    def _fitted(self) -> list[tuple[float, Mistake]]:
+        """Return what iterated closest points make of the likeliest, with a shift, a scale, and a turn."""
+        scale = self.placement.diagonal / (self.placement.spread or math.inf)
+        tried = []
+        for code, each in self._unmoved():
+            tried.append((code, self._centered(each), False, True))
+            if each.factor == 1 and scale:
+                code += math.log(len(FACTORS)) + self.parameter
+                for factor in (1.0, 0.8 * scale, scale):
+                    start = replace(each, factor=factor)
+                    tried += [(code, start, True, False), (code, self._centered(start), True, True)]
+        tried.sort(key=lambda start: start[0] + self._nats(start[1]))
+        found = []
+        for code, start, scaled, shifted in tried[:24]:
+            fitted = self._closest(start, scaled=scaled, shifted=shifted)
+            found.append((code + 3 * self.parameter * shifted + self._nats(fitted), fitted))
+        return found
 
-    def _weigh(self, price: float, mistake: Mistake, found: list[tuple[float, Mistake]]) -> None:
-        """Add the mistake with its price times its mean distance to `found`, if it explains the contacts."""
-        distances = self.tree.query(mistake.undo(torch.from_numpy(self.contacts)).numpy())[0]
-        far, mean = float(np.quantile(distances, 0.9)), float(distances.mean())
-        # Beside the size that the contacts have by then: what is shrunk comes nearer to anything.
-        if far > min(0.5 * self.placement.tolerance, TOLERANCE * (mistake.factor * self.placement.spread or math.inf)):
-            return
-        if mean * GAIN > float(self.placement.distances.mean()) * mistake.factor:
-            return
-        # Differences below a two-hundredth of the object say nothing: points are no surface, nor contacts exact.
-        cost = price * max(mean, self.placement.diagonal / 200) / mistake.factor
-        found.append((cost, replace(mistake, distance=far)))
+    def _centered(self, mistake: Mistake) -> Mistake:
+        places = mistake.undo(torch.from_numpy(self.contacts)).numpy()
+        middle = (places.min(axis=0) + places.max(axis=0)) / 2
+        return replace(mistake, shift=mistake.shift + torch.from_numpy(self.middle - middle))
+
+    def _closest(self, start: Mistake, *, scaled: bool, shifted: bool) -> Mistake:
+        """Return the mistake with the scale and the shift that iterated closest points find from a start."""
+        found, source = start, torch.from_numpy(self.contacts) @ start.axes.T
+        old = source.mean(0) if shifted else torch.zeros(3, dtype=torch.float64)
+        size = float((source - old).square().sum())
+        for _ in range(60):
+            nearest = self.tree.query((found.factor * source + found.shift).numpy())[1]
+            target = torch.from_numpy(self.cloud[nearest])
+            new = target.mean(0) if shifted else old
+            factor = float(((source - old) * (target - new)).sum()) / size if scaled and size else found.factor
+            found = replace(found, factor=factor, shift=new - factor * old)
+        return found
 
 
 def _ways() -> list[tuple[float, Tensor]]:
-    """Return the 48 signed permutations with a price each: none, y-up for z-up or back, other turns, mirrors."""
+    """Return the 48 signed permutations, with the nats of its rarity: none, y-up for z-up, turns, mirrors."""
     ways = []
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
             axes = torch.diag(torch.tensor(signs, dtype=torch.float64)) @ torch.eye(3, dtype=torch.float64)[list(order)]
-            price = 2.0 if float(torch.linalg.det(axes)) > 0 else 2.5
+            rarity = 24 if float(torch.linalg.det(axes)) > 0 else 48
             if (order, signs) == ((0, 1, 2), (1, 1, 1)):
-                price = 1.0
+                rarity = 1
             elif (order, signs) in (((0, 2, 1), (1, -1, 1)), ((0, 2, 1), (1, 1, -1))):
-                price = 1.5
-            ways.append((price, axes))
+                rarity = 4
+            elif rarity == 24 and order == (0, 1, 2):
+                rarity = 6
+            ways.append((math.log(rarity), axes))
     return sorted(ways, key=lambda way: way[0])
 
 

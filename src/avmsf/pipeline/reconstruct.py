@@ -393,7 +393,8 @@ def expect_on_object(impacts: Impacts, points: Float[Tensor, "points 3"], *, str
     """
     placement = judge_placement(impacts.contacts, points)
     words, distance = placement.describe(impacts.names), float(placement.distances.max())
-    if words and (strict or placement.other_unit or distance > placement.diagonal):
+    apart = strict and bool(placement.off or placement.misplaced)
+    if words and (apart or placement.other_unit or distance > placement.diagonal):
         raise CaptureError(words, name="contacts", value=distance)
     if words:
         warnings.warn(CaptureWarning(words, name="contacts", value=distance), stacklevel=2)
