@@ -278,7 +278,7 @@ class _Search:
             far, spread = float(np.quantile(distances, 0.9)), each.factor * self.placement.spread or math.inf
             # Beside the size that the contacts have by then: what is shrunk comes nearer to anything.
             if nats < present and far <= min(max(self.floor, 0.5 * self.placement.tolerance), TOLERANCE * spread):
-                return None if torch.equal(each.undo(identity.axes), identity.axes) else replace(each, distance=far)
+                return replace(each, distance=far)
         return None
 
     def _nats(self, mistake: Mistake) -> float:
