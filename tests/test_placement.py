@@ -8,7 +8,7 @@ import torch
 import trimesh
 
 from avmsf.capture import CaptureSettings, Surface, read_surface
-from avmsf.capture.placement import FACTORS, judge_placement, surface_points
+from avmsf.capture.placement import FACTORS, contacted_part, judge_placement, surface_points
 from avmsf.capture.table import read_rows, understand
 from avmsf.errors import CaptureError
 from raising import raises
@@ -229,3 +229,18 @@ def test_first_impacts_near_the_middle_of_a_plate_are_no_other_unit() -> None:
     assert not judge_placement(patch, plate).other_unit
     assert judge_placement(0.01 * patch, plate).other_unit
     assert judge_placement(1000 * patch, plate).other_unit
+
+
+def test_of_a_scan_with_its_table_the_part_that_the_contacts_lie_on_is_kept() -> None:
+    cup, table = trimesh.creation.icosphere(3, radius=0.05), trimesh.creation.box((0.5, 0.5, 0.02))
+    table.apply_translation((0, 0, -0.07))
+    both = trimesh.util.concatenate([table, cup])
+    scan = Surface(torch.tensor(both.vertices).float(), torch.tensor(both.faces))
+    contacts = torch.from_numpy(np.array(trimesh.sample.sample_surface(cup, 12, seed=0)[0]))
+    kept, areas = contacted_part(scan, contacts)
+    assert len(kept.faces) == len(cup.faces)
+    assert areas == pytest.approx([cup.area, table.area])
+    on_both = torch.cat([contacts, torch.tensor([[0.2, 0.2, -0.06], [-0.2, 0.2, -0.06]])])
+    assert contacted_part(scan, on_both)[1] == []
+    on_table = contacts * torch.tensor([3.0, 3.0, 0.0]) + torch.tensor([0.0, 0.0, -0.06])
+    assert contacted_part(scan, on_table)[1] == []

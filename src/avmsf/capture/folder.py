@@ -17,6 +17,7 @@ from avmsf.capture.audio import read_recording
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.location import expect_free
 from avmsf.capture.measure import RecordingReport, measure, shared_problems
+from avmsf.capture.placement import contacted_part
 from avmsf.capture.prepare import Prepared, prepare
 from avmsf.capture.settings import SETTINGS, CaptureSettings, settings_of
 from avmsf.capture.starts import cut_together, shorten
@@ -89,6 +90,7 @@ def _read_capture(folder: Path, settings: CaptureSettings) -> Capture:
     surface = find_surface(folder, settings)
     if surface is not None:
         remarks += judge_surface(strikes, surface, settings=settings)
+        surface, _ = contacted_part(surface, torch.tensor([strike.contact for strike in strikes]))
     recordings, reports, peaks = [], [], []
     for strike in strikes:
         prepared, report = read_strike(folder, strike, settings=settings)

@@ -10,6 +10,8 @@ import numpy as np
 import torch
 import trimesh
 from jaxtyping import Float
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -243,6 +245,32 @@ def surface_points(surface: Surface, *, count: int = MOST_POINTS) -> Float[Tenso
     if not mesh.area > 0:
         return vertices
     return torch.cat([torch.from_numpy(np.array(trimesh.sample.sample_surface(mesh, count, seed=0)[0])), vertices])
+
+
+def contacted_part(surface: Surface, contacts: Float[Tensor, "contacts 3"]) -> tuple[Surface, list[float]]:
+    """Return a surface without connected parts larger than the one that contacts lie on, such as a table.
+
+    The second value is the areas in square meters, of the part that is kept and of those left out; empty where the
+    contacts lie on the largest or on several.
+    """
+    if not len(surface.faces) or not len(contacts):
+        return surface, []
+    mesh = trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=False)
+    rows = np.unique(mesh.vertices[mesh.faces].reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1, 3)
+    edges = np.concatenate([rows[:, [0, 1]], rows[:, [1, 2]]])
+    links = coo_array((np.ones(len(edges)), edges.T), shape=(rows.max() + 1,) * 2)
+    label = connected_components(links, directed=False)[1][rows[:, 0]]
+    if not label.any() or not mesh.area > 0:
+        return surface, []
+    points, faces = trimesh.sample.sample_surface(mesh, MOST_POINTS, seed=0)
+    parts = label[faces[cKDTree(points).query(contacts.double().numpy())[1]]]
+    part, areas = int(np.bincount(parts).argmax()), np.bincount(label, weights=mesh.area_faces)
+    left = areas > areas[part]
+    if not left.any() or np.mean(parts != part) > WRONG_ROWS:
+        return surface, []
+    kept = surface.faces[torch.from_numpy(~left[label])]
+    used, corners = torch.unique(kept, return_inverse=True)
+    return Surface(surface.vertices[used], corners), [float(areas[part]), *map(float, areas[left])]
 
 
 class _Search:

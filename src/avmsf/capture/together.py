@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from avmsf.capture.location import Location
-from avmsf.capture.placement import Placement, judge_placement, surface_points
+from avmsf.capture.placement import Placement, contacted_part, judge_placement, surface_points
 from avmsf.capture.prepare import shortest_allowed
 from avmsf.capture.settings import METRES, CaptureSettings
 from avmsf.capture.surface import Surface, find_surface
@@ -163,7 +163,12 @@ def judge_surface(strikes: Sequence[Strike], surface: Surface, *, settings: Capt
     surface is large.
     """
     contacts = torch.tensor([strike.contact for strike in strikes], dtype=torch.float64)
+    surface, areas = contacted_part(surface, contacts)
     placement = judge_placement(contacts, surface_points(surface))
+    if areas:
+        sizes = " and ".join(f"{1e4 * area:.3g} cm2" for area in areas[1:3])
+        message = f"the contacts lie on a part of {1e4 * areas[0]:.3g} cm2; larger ones ({sizes}) are left out"
+        return [CaptureWarning(message, name="surface", value=areas)]
     if placement.on_surface:
         return []
     found = placement.describe([f"row {strike.line}" for strike in strikes]) + _advice(placement, settings)

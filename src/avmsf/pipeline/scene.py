@@ -7,6 +7,10 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
 from avmsf.capture.cameras import View
 from avmsf.capture.filenames import no_views
 from avmsf.capture.settings import CaptureSettings
@@ -219,7 +223,10 @@ class SceneStages:
 
         def make(path: Path) -> None:
             self.listener.tell(f"splat: the Gaussians of {splats.name}, unchanged")
-            cloud = scaled(read_splats(splats), self.settings.views_meters)
+            read = scaled(read_splats(splats), self.settings.views_meters)
+            cloud = without_far(read)
+            if len(cloud) < len(read):
+                self.listener.tell(f"splat: {len(read) - len(cloud)} Gaussians far from the object are left out")
             if views is not None:
                 cloud = keep_object(cloud, read_views(views.path), rasterizer=choose_rasterizer(cloud.centers.device))
             write_splats(cloud, path)
@@ -239,6 +246,20 @@ class SceneStages:
 
         recipe = {"cloud": self.cloud.digest, "rendered": self.config.views.rendered}
         return self.stages.keep(VIEWS, recipe, make)
+
+
+def without_far(cloud: GaussianCloud) -> GaussianCloud:
+    """Return the Gaussians that are neither far outside of the middle half of all nor alone, as floaters are.
+
+    Far is three times the longest side of the box of the middle half, as of Tukey's outer fences, and alone is one
+    whose fourth neighbor is that side away.
+    """
+    centers = cloud.centers.double().numpy()
+    low, high = np.quantile(centers, (0.25, 0.75), axis=0)
+    side = float((high - low).max())
+    near = ((centers >= low - 3 * side) & (centers <= high + 3 * side)).all(axis=1)
+    near &= cKDTree(centers).query(centers, k=min(5, len(centers)))[0].reshape(len(centers), -1)[:, -1] <= side
+    return cloud.take(torch.from_numpy(near))
 
 
 def scaled(cloud: GaussianCloud, factor: float) -> GaussianCloud:
