@@ -95,7 +95,11 @@ def test_photographs_alone_need_structure_from_motion(
 def test_a_mesh_video_and_gaussians_are_named(tmp_path: Path) -> None:
     (tmp_path / "splats.ply").touch()
     (tmp_path / "turn.mp4").touch()
-    assert found(tmp_path) == VisualInputs(0, None, 0, "turn.mp4", None, "splats.ply", ())
+    visual = found(tmp_path)
+    assert visual == VisualInputs(0, None, 0, "turn.mp4", None, "splats.ply", visual.problems)
+    # An empty file is opened, and is none of Gaussians.
+    (problem,) = visual.problems
+    assert "splats.ply" in problem
     assert found(tmp_path).reconstructs
     write_surface_file(tmp_path)
     # Pictures next to a mesh may be its textures.

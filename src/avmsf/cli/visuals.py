@@ -7,6 +7,7 @@ from pathlib import Path
 
 from PIL import Image
 
+from avmsf._utils.text_files import read_json
 from avmsf.capture.filenames import find_surface_file, pictures_in, unused_files
 from avmsf.capture.folder import Capture
 from avmsf.capture.placement import expect_placed, surface_points
@@ -20,6 +21,7 @@ from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError, FitError, SceneError
 from avmsf.pipeline.silhouettes import LONGEST, MAX_VIEWS, expect_contacts_in_outlines
 from avmsf.pipeline.sources import find_source, find_splats
+from avmsf.scene.ply import read_splats
 from avmsf.wording import counted
 
 
@@ -82,6 +84,11 @@ def visual_inputs(folder: Path, settings: CaptureSettings | None) -> VisualInput
             "the photographs have no cameras, and the package that finds them is missing: pip install 'avmsf[sfm]'"
         )
     splats = find_splats(folder)
+    if splats is not None:
+        try:
+            read_splats(splats)
+        except SceneError as error:
+            problems.append(str(error))
     return VisualInputs(
         len(names),
         cameras,
@@ -92,6 +99,23 @@ def visual_inputs(folder: Path, settings: CaptureSettings | None) -> VisualInput
         tuple(problems),
         tuple(unused_files(folder, settings)),
     )
+
+
+def _other_frame(folder: Path) -> str:
+    """Return advice on a transformation by which nerfstudio moved cameras, of which contacts know nothing; "" for none.
+
+    It is in transforms.json or beside it.
+    """
+    for name in ("transforms.json", "dataparser_transforms.json"):
+        try:
+            record = read_json(folder / name)
+        except (OSError, ValueError):
+            continue
+        keys = [key for key in ("applied_transform", "applied_scale", "transform", "scale") if key in record]
+        if keys:
+            found = ", ".join(f"{key} = {record[key]}" for key in keys)
+            return f"; or move the contacts as {name} says that the cameras were: {found}"
+    return ""
 
 
 def expect_shape(folder: Path, capture: Capture, *, views: bool, verb: str) -> None:
@@ -150,7 +174,7 @@ def contacts_outside(folder: Path, settings: CaptureSettings | None, visual: Vis
     try:
         expect_contacts_in_outlines(contacts, views, settings)
     except CaptureError as error:
-        return error
+        return CaptureError(f"{error}{_other_frame(folder)}", **error.attributes)
     return None
 
 

@@ -388,13 +388,13 @@ def keep_surface(stages: StageFolder, make: Callable[[], Surface | ObjectShape],
 def expect_on_object(impacts: Impacts, points: Float[Tensor, "points 3"], *, strict: bool = False) -> None:
     """Warn with `CaptureWarning` of contacts off the object's points, with the mistake that may explain it.
 
-    Raises `CaptureError` for contacts in another unit, for one farther off than the object is large, and, if `strict`,
+    Raises `CaptureError` for contacts in another frame, for one farther off than the object is large, and, if `strict`,
     for any off it. The `value` of both is the largest distance, meters.
     """
     placement = judge_placement(impacts.contacts, points)
     words, distance = placement.describe(impacts.names), float(placement.distances.max())
-    apart = strict and bool(placement.off or placement.misplaced)
-    if words and (apart or placement.other_unit or distance > placement.diagonal):
+    apart = placement.misplaced or placement.other_unit or distance > placement.diagonal
+    if words and (apart or (strict and placement.off)):
         raise CaptureError(words, name="contacts", value=distance)
     if words:
         warnings.warn(CaptureWarning(words, name="contacts", value=distance), stacklevel=2)
