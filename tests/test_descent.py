@@ -32,7 +32,8 @@ def test_steps_are_those_of_torch() -> None:
         [
             {"params": theirs[:1], "weight_decay": 0.3, "rate": 0.1},
             {"params": theirs[1:], "weight_decay": 0.0, "rate": 0.02},
-        ]
+        ],
+        fused=True,
     )
     for step in range(20):
         for group in optimizer.param_groups:

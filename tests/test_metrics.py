@@ -20,7 +20,7 @@ from avmsf.bench.metrics import (
     spectrogram_distance,
     validate,
 )
-from avmsf.errors import EvaluationError
+from avmsf.errors import ArrayError, EvaluationError
 from avmsf.modal.config import scaled_fft_size
 from avmsf.modal.spectra import magnitude_stft
 from corpus import make as corpus
@@ -284,5 +284,5 @@ def test_nothing_is_relative_to_silence():
 def test_rates_without_sense_are_refused():
     with raises(EvaluationError, name="sample_rate", value=400.0):
         objectfolder_distance(clips(), clips(), sample_rate=400.0)
-    with pytest.raises(ValueError):
+    with raises(ArrayError, name="sample_rate", value=-1.0):
         scaled_fft_size(1024, sample_rate=-1.0)

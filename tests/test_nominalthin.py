@@ -37,7 +37,8 @@ def test_a_dense_mesh_vibrates_as_a_coarse_one_of_the_same_shape(
     dense: Skin, coarse: Skin, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Those that the wall is made of are far fewer.
-    monkeypatch.setattr(nominalthin, "MOST", 6000)
+    for name in ("MOST", "ENOUGH"):
+        monkeypatch.setattr(nominalthin, name, 6000)
     told: list[str] = []
     found, known = (
         nominal_bodies(surface_of(skin), walls=[0.002], count=4, dofs=8000, tell=told.append).bodies[0].elastic
@@ -55,7 +56,8 @@ def test_a_noisy_mesh_is_thinned_without_its_noise_and_stays_a_skin(monkeypatch:
     clean = ellipsoid(5)
     noise = 0.01 * clean.size * np.random.default_rng(0).standard_normal(clean.points.shape) / 3**0.5
     told: list[str] = []
-    monkeypatch.setattr(nominalthin, "MOST", 4000)
+    for name in ("MOST", "ENOUGH"):
+        monkeypatch.setattr(nominalthin, name, 4000)
     found = thinned(Skin(clean.points + noise, clean.faces), tell=told.append)
     assert len(found.faces) == 4000
     assert (found.open_edges, found.crowded_edges) == (0, 0)
@@ -72,7 +74,8 @@ def test_a_thinned_sheet_keeps_its_rim(monkeypatch: pytest.MonkeyPatch) -> None:
     a, b, c, d = (part.ravel() for part in (rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:]))
     points = np.stack([*(each.ravel() for each in np.meshgrid(side, side, indexing="ij")), np.zeros(61 * 61)], axis=1)
     sheet = Skin(points, np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]))
-    monkeypatch.setattr(nominalthin, "MOST", 1000)
+    for name in ("MOST", "ENOUGH"):
+        monkeypatch.setattr(nominalthin, name, 1000)
     found = thinned(sheet, tell=lambda words: None)
     assert len(found.faces) <= 1000
     # Each corner may lose a triangle, with sides of about .045 now.
@@ -88,10 +91,12 @@ def test_more_triangles_are_left_where_fewer_would_tear_the_skin(monkeypatch: py
         return points, faces if target_count >= 4000 else faces[:target_count]
 
     monkeypatch.setattr(fast_simplification, "simplify", tearing)
-    monkeypatch.setattr(nominalthin, "MOST", 1000)
+    for name in ("MOST", "ENOUGH"):
+        monkeypatch.setattr(nominalthin, name, 1000)
     found = thinned(ball, tell=lambda words: None)
     assert np.array_equal(found.faces, ball.faces)
-    monkeypatch.setattr(nominalthin, "MOST", 3000)
+    for name in ("MOST", "ENOUGH"):
+        monkeypatch.setattr(nominalthin, name, 3000)
     assert thinned(ball, tell=lambda words: None) is ball
 
 

@@ -19,9 +19,9 @@ from collections.abc import Callable, Sequence
 from fractions import Fraction
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Float, Float64
-from scipy.signal import resample_poly
 from torch import Tensor
 
 from avmsf.errors import EvaluationError
@@ -96,7 +96,7 @@ def resampled(sounds: Float64[Tensor, "contacts samples"], *, sample_rate: float
     if sample_rate == wanted:
         return sounds
     ratio = (Fraction(wanted) / Fraction(sample_rate)).limit_denominator(20000)
-    return torch.from_numpy(resample_poly(sounds.numpy(), ratio.numerator, ratio.denominator, axis=1))
+    return torch.from_numpy(scipy.signal.resample_poly(sounds.numpy(), ratio.numerator, ratio.denominator, axis=1))
 
 
 def default_fft_sizes(sample_rate: float) -> tuple[int, ...]:

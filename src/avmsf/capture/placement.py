@@ -8,7 +8,6 @@ from functools import cached_property
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Float
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -241,6 +240,9 @@ def surface_points(surface: Surface, *, count: int = MOST_POINTS) -> Float[Tenso
     vertices = surface.vertices.double()
     if not len(surface.faces):
         return vertices
+    # Takes half a second to import, which what reads no mesh does without.
+    import trimesh
+
     mesh = trimesh.Trimesh(vertices.numpy(), surface.faces.numpy(), process=False)
     if not mesh.area > 0:
         return vertices

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.signal
+import scipy
 from jaxtyping import Float, Float64
 from scipy.fft import irfft, next_fast_len, rfft
 

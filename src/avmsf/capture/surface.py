@@ -5,13 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_vectors
 from avmsf.capture.filenames import SurfaceKind, find_surface_file
-from avmsf.capture.mesh_file import load_parts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import ArrayError, CaptureError
 
@@ -64,6 +62,9 @@ def read_surface(path: str | Path, *, meters: float = 1.0) -> Surface:
 
     A scene of several parts becomes one surface. `CaptureError` as `load_mesh`, and where it holds no points.
     """
+    # Imports trimesh, which takes half a second and what reads no mesh does without.
+    from avmsf.capture.mesh_file import load_parts
+
     path = Path(path)
     vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
     for part in load_parts(path):
@@ -87,5 +88,7 @@ def write_surface(surface: Surface, path: Path, *, kind: SurfaceKind = "ply") ->
     """Write a surface in meters: as a binary PLY, which holds float32 coordinates to the last bit, as OBJ or as GLB."""
     vertices, faces = surface.vertices.numpy(), surface.faces.numpy()
     cloud = not len(faces)
+    import trimesh
+
     shape = trimesh.PointCloud(vertices) if cloud else trimesh.Trimesh(vertices, faces, process=False)  # type: ignore[no-untyped-call]
     shape.export(path, file_type=kind)

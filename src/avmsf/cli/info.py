@@ -8,13 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.bench.doubtpictures import draw_band, draw_doubt
 from avmsf.bench.evaluation import evaluate
-from avmsf.bench.pictures import draw_gains, draw_modes, draw_spectrograms, save_picture
-from avmsf.bench.surfacepictures import draw_surface
 from avmsf.capture import CaptureSettings, Impacts, read_capture
 from avmsf.cli.heartbeat import doing
-from avmsf.cli.infoclouds import describe_cloud, describe_features
 from avmsf.cli.modes import mode_table
 from avmsf.cli.modetable import levels, listed, mode_rows
 from avmsf.cli.options.info import Options
@@ -33,7 +29,8 @@ from avmsf.scene.featureheader import holds_features
 from avmsf.scene.points import farthest_points
 from avmsf.wording import counted
 
-_DRAWN_POINTS = 4000
+_DRAWN_POINTS, _LISTED_POINTS = 4000, 500
+"""Of the surface: for pictures, and for the mean levels in a table."""
 _DRAWN_CONTACTS = 4
 _BATCH = 1024
 """Points whose gains are taken at once: the encoding of their offsets to many clusters is large."""
@@ -43,6 +40,8 @@ def run(options: Options) -> int:
     """Describe and draw a file, whose kind its content shows."""
     suffix = options.file.suffix.lower()
     if suffix == ".ply" or (suffix == ".safetensors" and holds_features(options.file)):
+        from avmsf.cli.infoclouds import describe_cloud, describe_features
+
         values = describe_cloud(options) if suffix == ".ply" else describe_features(options)
         if options.json:
             print_json(values)
@@ -50,7 +49,7 @@ def run(options: Options) -> int:
             next_command("avmsf info", options.file, "--plots plots")
         return 0
     field = load(options.file)
-    points = _some(field.gain_field.points)
+    points = _some(field.gain_field.points, _LISTED_POINTS if options.plots is None else _DRAWN_POINTS)
     gains = gains_at(field, points)
     level = levels(gains)
     every = list(zip(mode_rows(field.bank, level), field.is_mode.tolist(), strict=True))
@@ -118,6 +117,11 @@ def draw_field(
     recorded: Impacts | None,
 ) -> None:
     """Write the figures of a field, with some of the recordings `recorded` next to its sounds."""
+    # Drawing imports matplotlib, which text does without.
+    from avmsf.bench.doubtpictures import draw_band, draw_doubt
+    from avmsf.bench.pictures import draw_gains, draw_modes, draw_spectrograms, save_picture
+    from avmsf.bench.surfacepictures import draw_surface
+
     name = field.origin.capture or "field"
     modes = modes_words(len(field.bank), int((~field.is_mode).sum()))
     kept = field.is_mode
@@ -151,8 +155,8 @@ def draw_field(
         say(f"wrote {path}")
 
 
-def _some(points: Float[Tensor, "points 3"]) -> Float[Tensor, "chosen 3"]:
-    step = max(1, len(points) // _DRAWN_POINTS)
+def _some(points: Float[Tensor, "points 3"], most: int) -> Float[Tensor, "chosen 3"]:
+    step = max(1, len(points) // most)
     return points[::step]
 
 

@@ -12,8 +12,6 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from avmsf.bench.contactpictures import draw_contact, write_contact_cloud
-from avmsf.bench.pictures import save_picture
 from avmsf.capture import CaptureSettings
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.settings import METRES
@@ -227,6 +225,10 @@ def _name(path: Path, taken: set[str]) -> str:
 def _draw(
     contact: ContactMap, folder: Path, name: str, values: dict[str, Any], truth: Float64[Tensor, " 3"] | None
 ) -> dict[str, str]:
+    # Drawing imports matplotlib, which text does without.
+    from avmsf.bench.contactpictures import draw_contact, write_contact_cloud
+    from avmsf.bench.pictures import save_picture
+
     picture, cloud = folder / f"{name}.png", folder / f"{name}.ply"
     others = [other["position"] for other in values["equivalent_points"]]
     marks = torch.tensor(others) if others else None

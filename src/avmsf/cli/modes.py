@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 
-from avmsf.bench.pictures import draw_modes, save_picture
 from avmsf.capture import read_capture
 from avmsf.cli.alignment import AlignmentReport
 from avmsf.cli.modetable import ModeRow, QualityRow, amplitudes, levels, listed, mode_rows, quality_rows
@@ -44,6 +43,8 @@ def run(options: Options) -> int:
     for sentence in [] if aligned is None else aligned.sentences():
         screen.print(sentence, soft_wrap=True)
     if options.plots is not None:
+        from avmsf.bench.pictures import draw_modes, save_picture
+
         picture = options.plots / "modes.png"
         drawn = f"{counted(len(rows), 'pole')} of {capture.name}, of them {counted(len(modes), 'mode')}"
         save_picture(draw_modes(extraction.bank, level, is_mode=quality.is_mode, title=drawn), picture)

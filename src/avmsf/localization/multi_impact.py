@@ -4,8 +4,8 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import scipy
 import scipy.linalg
-import scipy.signal
 import torch
 from jaxtyping import Float64
 from scipy.fft import irfft, next_fast_len, rfft

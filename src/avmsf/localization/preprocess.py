@@ -6,7 +6,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
-import scipy.signal
+import scipy
 import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor

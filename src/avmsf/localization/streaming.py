@@ -10,9 +10,9 @@ on the lengths of the blocks: samples are processed hop by hop.
 import time
 from dataclasses import dataclass, replace
 
+import scipy
 import torch
 from jaxtyping import Complex128, Float, Float64
-from scipy.signal import butter, sosfilt
 from torch import Tensor
 
 from avmsf.capture.onset import find_onset
@@ -161,7 +161,7 @@ class StreamingLocalizer:
         self.window = min(round(window * rate), field.samples)
         last = 0 if later is None else min(round(later * rate), field.samples)
         self.later = last if last > self.window else None
-        self.filter = butter(2, cut, "highpass", fs=rate, output="sos") if cut > 0.0 else None
+        self.filter = scipy.signal.butter(2, cut, "highpass", fs=rate, output="sos") if cut > 0.0 else None
         strength = locator.gains[:, audible].abs().square().mean(0).sqrt()
         bank = ModalBank(field.bank.frequency[audible], field.bank.damping[audible])
         self._modes = Ringing.of(bank, strength, sample_rate=rate, hop=self.hop, window=self.window)
@@ -301,5 +301,5 @@ class StreamingLocalizer:
     ) -> tuple[Float64[Tensor, " samples"], Float64[Tensor, "sections 2"]]:
         if self.filter is None or not len(block):
             return block, state
-        passed, after = sosfilt(self.filter, block.numpy(), zi=state.numpy())
+        passed, after = scipy.signal.sosfilt(self.filter, block.numpy(), zi=state.numpy())
         return torch.from_numpy(passed), torch.from_numpy(after)

@@ -11,7 +11,6 @@ from typing import no_type_check
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
@@ -140,6 +139,9 @@ def sample_surface(
 
     Raises CaptureError for a surface without area, from which no point can be drawn.
     """
+    # Takes half a second to import, which what reads no mesh does without.
+    import trimesh
+
     mesh = trimesh.Trimesh(vertices.double().cpu().numpy(), faces.cpu().numpy(), process=False)
     if not (math.isfinite(mesh.area) and mesh.area > 0.0):
         raise CaptureError(

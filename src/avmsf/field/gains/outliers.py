@@ -33,9 +33,9 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
+import scipy
 import torch
 from jaxtyping import Complex128, Float, Float64, Int
-from scipy.stats import wilcoxon
 from torch import Tensor
 
 from avmsf.capture.places import places_of
@@ -320,7 +320,7 @@ def predicts_better(
     power = energy(measured.values)
     less, more = ((energy(each - measured.values) / (power + energy(each))).sqrt() for each in (new, old))
     fall = (more - less)[power > 0].numpy()
-    return bool(fall.any()) and float(wilcoxon(fall, alternative="greater").pvalue) < _CHANCE / candidates
+    return bool(fall.any()) and float(scipy.stats.wilcoxon(fall, alternative="greater").pvalue) < _CHANCE / candidates
 
 
 def _search(fit: Fit, sites: Sites, measured: MeasuredGains) -> _Search:
