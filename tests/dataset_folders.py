@@ -1,6 +1,5 @@
 """Folders in the layouts of published datasets, with their names, types, shapes and quirks, as the tests need them."""
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -65,7 +64,7 @@ def write_raw(folder: Path, objects: Mapping[str, Sequence[str]], *, contacts: b
 
 
 def write_contacts(folder: Path, identifier: str, names: Sequence[str]) -> None:
-    """Write contacts as the compact layout has them."""
+    """Write contacts, an array each."""
     (folder / "contacts" / identifier).mkdir(parents=True, exist_ok=True)
     for contact in names:
         np.save(folder / "contacts" / identifier / f"{contact}.npy", place(identifier, contact))
@@ -83,29 +82,6 @@ def records(identifier: str, names: Sequence[str]) -> list[dict[str, object]]:
         }
         for contact in names
     ]
-
-
-def write_compact(folder: Path, objects: Mapping[str, Sequence[str]]) -> Path:
-    """Write a compact copy whose split gives each object's last contact to the test."""
-    split: dict[str, list[list[object]]] = {"train": [], "val": [], "test": []}
-    for identifier, names in objects.items():
-        (folder / "audio" / identifier).mkdir(parents=True)
-        (folder / "global_gt_points").mkdir(exist_ok=True)
-        write_contacts(folder, identifier, names)
-        points = np.random.default_rng(int(identifier)).standard_normal((1024, 3))
-        np.save(
-            folder / "global_gt_points" / f"{identifier}.npy", 0.1 * points / np.linalg.norm(points, axis=1)[:, None]
-        )
-        for contact in names:
-            sound = np.zeros(FRAMES)
-            sound[ONSET:] = 8 * transfer(int(contact))
-            sound += 1e-4 * np.random.default_rng(int(contact)).standard_normal(FRAMES)
-            samples = np.rint(sound * 32767).astype(np.int16)
-            soundfile.write(folder / "audio" / identifier / f"{contact}.wav", samples, RATE, subtype="PCM_16")
-            split["test" if contact == names[-1] else "train"].append([int(identifier), int(contact)])
-    (folder / "split.json").write_text(json.dumps(split))
-    (folder / "scale.json").write_text(json.dumps(dict.fromkeys(objects, 0.29946)))
-    return folder
 
 
 def write_mesh(path: Path, *, radius: float = 0.1, middle: tuple[float, float, float] = (0, 0, 0)) -> trimesh.Trimesh:

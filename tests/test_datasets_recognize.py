@@ -1,6 +1,5 @@
 """Which dataset a folder holds, captures read as one, and what is said to who names the wrong folder."""
 
-import shutil
 from pathlib import Path
 
 import pytest
@@ -10,7 +9,6 @@ from avmsf.capture import read_capture
 from avmsf.capture.datasets import (
     CaptureCollection,
     Dataset,
-    ObjectFolderCompact,
     ObjectFolderRaw,
     RealImpact,
     open_dataset,
@@ -19,7 +17,7 @@ from avmsf.cli import dataset as verb
 from avmsf.cli.options import dataset as options
 from avmsf.errors import DatasetError
 from capture_folder import fill
-from dataset_folders import write_compact, write_contacts, write_mesh, write_raw, write_realimpact
+from dataset_folders import write_mesh, write_raw, write_realimpact
 from raising import raises
 
 
@@ -28,7 +26,6 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with one dataset of each kind; nobody changes it."""
     home = tmp_path_factory.mktemp("place")
     write_raw(home / "raw/of", {"2": ("0", "1")})
-    write_compact(home / "compact/DATA", {"51": ("0", "1")})
     write_realimpact(home / "impact/RI", "22_Cup")
     fill(home / "own/captures/bowl")
     fill(home / "own/captures/10_plate")
@@ -43,7 +40,6 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("path", "kind", "objects"),
     [
         ("raw/of", ObjectFolderRaw, ("2",)),
-        ("compact/DATA", ObjectFolderCompact, ("51",)),
         ("impact/RI", RealImpact, ("22_Cup",)),
         ("own/captures", CaptureCollection, ("2_cup", "10_plate", "bowl")),
         ("own/captures/bowl", CaptureCollection, ("bowl",)),
@@ -56,7 +52,7 @@ def test_each_kind_is_recognized(place: Path, path: str, kind: type[Dataset], ob
     assert [report.facts for report in dataset.check().objects] == [dataset.facts(name) for name in objects]
 
 
-@pytest.mark.parametrize("path", ["raw/of", "compact/DATA", "impact/RI", "own/captures"])
+@pytest.mark.parametrize("path", ["raw/of", "impact/RI", "own/captures"])
 def test_sounds_of_every_dataset_start_where_they_are_asked_to(place: Path, path: str) -> None:
     own, peak = (open_dataset(place / path, time_zero=each) for each in (None, "peak"))
     name = own.objects()[0]
@@ -69,7 +65,7 @@ def test_sounds_of_every_dataset_start_where_they_are_asked_to(place: Path, path
     )
 
 
-@pytest.mark.parametrize("path", ["raw/of", "compact/DATA", "impact/RI", "own/captures"])
+@pytest.mark.parametrize("path", ["raw/of", "impact/RI", "own/captures"])
 def test_every_dataset_answers_alike(place: Path, path: str) -> None:
     dataset = open_dataset(place / path)
     for report in dataset.check().objects:
@@ -82,20 +78,11 @@ def test_every_dataset_answers_alike(place: Path, path: str) -> None:
             ask("teapot")
 
 
-def test_raw_goes_before_compact_where_both_are_in_one_folder(place: Path, tmp_path: Path) -> None:
-    shutil.copytree(place / "compact/DATA", tmp_path, dirs_exist_ok=True)
-    write_raw(tmp_path, {"2": ("0", "1")}, contacts=False)
-    write_contacts(tmp_path, "2", ("0", "1"))
-    assert isinstance(open_dataset(tmp_path), ObjectFolderRaw)
-
-
 WRONG = {
     "raw": ("raw/of",),
     "raw/of/2": "raw/of",
     "raw/of/2/audio": "raw/of",
     "raw/of/2/audio/0": "raw/of",
-    "compact/DATA/audio": "compact/DATA",
-    "compact/DATA/audio/51": "compact/DATA",
     "impact/RI/22_Cup": "impact/RI",
     "impact/RI/22_Cup/preprocessed": "impact/RI",
     "own": ("own/captures",),
@@ -132,7 +119,6 @@ def test_a_folder_that_is_empty_or_none_is_refused(place: Path, path: str, value
         (["43_IronMortar/preprocessed/"], "preprocessed/", "RealImpact"),
         (["1/vision/a.mp4", "2/vision/b.mp4"], ("1", "2"), "audio_data_1_10.tar.gz"),
         (["1/audio/0/"], "audio/", "audio archives"),
-        (["contacts/", "split.json"], ("contacts", "split.json"), "audio, global_gt_points, scale.json"),
         (["readme.txt", "model.pth"], ("model.pth", "readme.txt"), "model.pth"),
     ],
 )

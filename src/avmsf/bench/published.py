@@ -32,11 +32,6 @@ class PublishedTable:
     protocol: str
     rows: tuple[PublishedRow, ...] = field(default=())
 
-    @property
-    def titles(self) -> tuple[str, str]:
-        """Titles of an evaluation of the dataset or of its compact copy; a folder of captures has none of them."""
-        return self.dataset, f"{self.dataset} (compact)"
-
 
 def _row(title: str, method: str | None, *figures: float, label: str | None = None) -> PublishedRow:
     return PublishedRow(title, dict(zip(_METRICS, figures, strict=False)), method, label)
@@ -146,7 +141,7 @@ COMPUTATION = (
 
 def published(protocol: str, dataset: str) -> PublishedTable | None:
     """Return the paper's table of this experiment on this dataset; None where it has none."""
-    return next((each for each in PUBLISHED if each.protocol == protocol and dataset in each.titles), None)
+    return next((each for each in PUBLISHED if each.protocol == protocol and dataset == each.dataset), None)
 
 
 def published_ratios(protocol: str, metrics: tuple[str, ...] = _METRICS) -> dict[str, dict[str, dict[str, float]]]:

@@ -257,6 +257,8 @@ def contacted_part(surface: Surface, contacts: Float[Tensor, "contacts 3"]) -> t
     """
     if not len(surface.faces) or not len(contacts):
         return surface, []
+    import trimesh
+
     mesh = trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=False)
     rows = np.unique(mesh.vertices[mesh.faces].reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1, 3)
     edges = np.concatenate([rows[:, [0, 1]], rows[:, [1, 2]]])

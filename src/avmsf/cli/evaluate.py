@@ -269,7 +269,7 @@ def title_of(dataset: Dataset, folder: Path) -> str:
     if not isinstance(dataset, CaptureCollection):
         return dataset.name
     name = folder.resolve().name
-    return f"{name} (captures)" if any(name in each.titles for each in PUBLISHED) else name
+    return f"{name} (captures)" if any(name == each.dataset for each in PUBLISHED) else name
 
 
 def _print(part: Section, screen: Console) -> None:

@@ -5,7 +5,6 @@ from .dataset import Look as Look
 from .dataset import ObjectFacts as ObjectFacts
 from .dataset import ObjectReport as ObjectReport
 from .numbering import shared_objects as shared_objects
-from .objectfolder_compact import ObjectFolderCompact as ObjectFolderCompact
 from .objectfolder_raw import ObjectFolderRaw as ObjectFolderRaw
 from .realimpact import RealImpact as RealImpact
 from .recognize import open_dataset as open_dataset

@@ -22,7 +22,7 @@ _RECORDING = re.compile(r"(?:^|/)(\d+)_(\d+)_[^/]*\.wav$")
 
 @dataclass(frozen=True, eq=False)
 class ContactFolder:
-    """Contacts as the compact copy has them: `<object>/<contact>.npy` below one folder."""
+    """Contacts as arrays: `<object>/<contact>.npy` below one folder."""
 
     folder: Path
 

@@ -4,16 +4,14 @@ from pathlib import Path
 
 from avmsf.capture.datasets.collection import CaptureCollection
 from avmsf.capture.datasets.dataset import Dataset
-from avmsf.capture.datasets.objectfolder_compact import ObjectFolderCompact
 from avmsf.capture.datasets.objectfolder_raw import ObjectFolderRaw
 from avmsf.capture.datasets.realimpact import RealImpact
 from avmsf.capture.datasets.signs import Kind, expect_signs
 from avmsf.errors import DatasetError
 
-_CLASSES: dict[Kind, type[CaptureCollection] | type[ObjectFolderRaw] | type[ObjectFolderCompact] | type[RealImpact]] = {
+_CLASSES: dict[Kind, type[CaptureCollection] | type[ObjectFolderRaw] | type[RealImpact]] = {
     "captures": CaptureCollection,
     "ObjectFolder Real": ObjectFolderRaw,
-    "ObjectFolder Real (compact)": ObjectFolderCompact,
     "RealImpact": RealImpact,
 }
 
@@ -28,22 +26,16 @@ def open_dataset(
     """Return the dataset that a folder holds, recognized by its files.
 
     `contacts` is the path of ObjectFolder Real's contacts, `table` that of its objects' names (`ObjectFolderRaw`).
-    `time_zero` is where sounds start, `onset` or `peak`; None leaves that to the dataset or the captures. Of the raw
-    and the compact form in one folder the raw one is taken, which has the forces. Raises DatasetError for a folder that
-    holds none and for options that the dataset does not take.
+    `time_zero` is where sounds start, `onset` or `peak`; None leaves that to the dataset or the captures. Raises
+    DatasetError for a folder that holds none and for options that the dataset does not take.
     """
     folder = Path(path)
     kind = _CLASSES[expect_signs(folder)]
-    for name, given, takers in (
-        ("contacts", contacts, (ObjectFolderRaw,)),
-        ("table", table, (ObjectFolderRaw, ObjectFolderCompact)),
-    ):
-        if given is not None and kind not in takers:
+    for name, given in (("contacts", contacts), ("table", table)):
+        if given is not None and kind is not ObjectFolderRaw:
             raise DatasetError.expected(
                 f"no `{name}` with {kind.name}", str(given), got=str(given), file=folder, name=name, advice="omit it"
             )
     if kind is ObjectFolderRaw:
         return ObjectFolderRaw(folder, contacts=contacts, table=table, time_zero=time_zero)
-    if kind is ObjectFolderCompact:
-        return ObjectFolderCompact(folder, table=table, time_zero=time_zero)
     return kind(folder, time_zero=time_zero)

@@ -8,16 +8,14 @@ from typing import Literal, NamedTuple
 from avmsf.capture.table import TABLE
 from avmsf.errors import DatasetError
 
-Kind = Literal["captures", "ObjectFolder Real", "ObjectFolder Real (compact)", "RealImpact"]
+Kind = Literal["captures", "ObjectFolder Real", "RealImpact"]
 """What reports call the datasets."""
-PARTS = ("audio", "contacts", "global_gt_points", "split.json", "scale.json")
-"""Parts of the compact copy of ObjectFolder Real."""
 FOLDER, SOUNDS = "preprocessed", "deconvolved_0db.npy"
 """RealImpact's folder of an object's arrays, and its sounds."""
 ARCHIVES = (".zip", ".gz", ".tgz", ".tar", ".7z")
 SOUGHT = (
-    f"a capture folder or a folder of them ({TABLE}), ObjectFolder Real (OBJECT/audio/CONTACT/mic.wav), its compact "
-    f"copy (audio/OBJECT/CONTACT.wav and contacts/), or RealImpact (NUMBER_NAME/{FOLDER}/{SOUNDS})"
+    f"a capture folder or a folder of them ({TABLE}), ObjectFolder Real (OBJECT/audio/CONTACT/mic.wav), or "
+    f"RealImpact (NUMBER_NAME/{FOLDER}/{SOUNDS})"
 )
 
 
@@ -38,7 +36,6 @@ def _kind(folder: Path) -> Kind | None:
     signs: Sequence[tuple[Kind, str]] = (
         ("captures", TABLE),
         ("ObjectFolder Real", "[0-9]*/audio/[0-9]*/*.wav"),
-        ("ObjectFolder Real (compact)", "audio/[0-9]*/[0-9]*.wav"),
         ("RealImpact", f"[!.]*/{FOLDER}/*.npy"),
         ("captures", f"[!.]*/{TABLE}"),
     )
@@ -60,7 +57,6 @@ def _guess(folder: Path) -> _Guess:
     guesses: Sequence[Callable[[Path], _Guess | None]] = (
         _too_low,
         _too_high,
-        _half_compact,
         _half_raw,
         _half_realimpact,
         _packed,
@@ -87,10 +83,6 @@ def _too_low(folder: Path) -> _Guess | None:
         if _any(folder, pattern):
             parent = folder.resolve().parents[levels - 1]
             return _Guess(f"got {what}; name the folder {parent}", str(parent))
-    for levels, pattern in enumerate(("[0-9]*/[0-9]*.wav", "[0-9]*.wav")):
-        place = [folder.resolve(), *folder.resolve().parents][levels]
-        if place.name == "audio" and _any(folder, pattern):
-            return _Guess(f"got recordings of the compact copy; name the folder {place.parent}", str(place.parent))
     return None
 
 
@@ -102,17 +94,6 @@ def _too_high(folder: Path) -> _Guess | None:
         return None
     shown = " or ".join(f"{path} ({kind})" for path, kind in found[:4])
     return _Guess(f"name the folder {shown}", tuple(str(path) for path, _ in found))
-
-
-def _half_compact(folder: Path) -> _Guess | None:
-    there = [part for part in PARTS if (folder / part).exists()]
-    if len(there) < 2 and "split.json" not in there:
-        return None
-    lacking = [f"{part}{_archive_of(folder, part)}" for part in PARTS if part not in there]
-    if "audio" in there:
-        lacking.append("recordings in audio/")
-    message = f"got part of the compact copy ({', '.join(there)}); {', '.join(lacking)} missing"
-    return _Guess(message, tuple(there))
 
 
 def _half_raw(folder: Path) -> _Guess | None:
@@ -143,11 +124,6 @@ def _packed(folder: Path) -> _Guess | None:
     more = f" and {len(archives) - 4} more" if len(archives) > 4 else ""
     message = f"got archives, {', '.join(archives[:4])}{more}; unpack them, `{command} {archives[0]}` in {folder}"
     return _Guess(message, tuple(archives))
-
-
-def _archive_of(folder: Path, part: str) -> str:
-    packed = folder / f"{part}.tar.gz"
-    return f" (unpack {packed.name})" if packed.is_file() else ""
 
 
 def _no_folder(path: Path) -> DatasetError:

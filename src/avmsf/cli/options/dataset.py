@@ -16,8 +16,8 @@ from avmsf.cli.options.paths import Existing
 class Options(Printing):
     """List the objects of a published dataset: what can be read, and what is missing.
 
-    Supported are ObjectFolder Real (as published, or its compact copy), RealImpact, and folders of captures. Sounds are
-    not read. The exit code is 0 if at least one object can be read, and 2 otherwise.
+    Supported are ObjectFolder Real, RealImpact, and folders of captures. Sounds are not read. The exit code is 0 if at
+    least one object can be read, and 2 otherwise.
     """
 
     dataset: tyro.conf.Positional[
