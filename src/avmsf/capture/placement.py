@@ -224,7 +224,7 @@ def expect_placed(
         return
     if placement.mistake is None:
         advice = "; bring both into one frame, or use a gain model without elastic mode shapes"
-    elif placement.mistake.unit_only:
+    elif placement.mistake.unit_only and placement.other_unit:
         advice = " State both units, as unit and surface_unit in capture.toml do, or give both in meters"
     else:
         advice = " Bring both into one frame, or use a gain model without elastic mode shapes"
