@@ -95,6 +95,8 @@ def test_a_step_of_the_papers_training_has_few_launches_and_waits_for_none(recip
 
 
 @pytest.mark.skipif(not CUDA, reason="needs a CUDA GPU")
+# What torch says whenever this mode is set.
+@pytest.mark.filterwarnings("ignore:Synchronization debug mode")
 @pytest.mark.parametrize("recipe", [Attention(), MixtureEstimator()], ids=["network", "mixture"])
 def test_a_step_on_a_gpu_waits_for_nothing_and_is_repeatable(recipe: GainRecipe) -> None:
     results = []
