@@ -114,6 +114,25 @@ def test_eight_bits_are_read_with_a_warning(tmp_path: Path) -> None:
     assert [(report.coding, report.clipped, len(report.problems)) for report in reports] == [("PCM_U8", 0, 1)] * 3
 
 
+@pytest.mark.parametrize(
+    ("container", "subtype", "problems"),
+    [
+        ("WAV", "IMA_ADPCM", 1),
+        ("WAV", "MS_ADPCM", 1),
+        ("OGG", "VORBIS", 1),
+        ("MP3", "MPEG_LAYER_III", 1),
+        ("FLAC", "PCM_16", 0),
+        ("WAV", "PCM_24", 0),
+        ("CAF", "ALAC_16", 0),
+    ],
+)
+def test_compression_with_loss_is_reported(tmp_path: Path, container: str, subtype: str, problems: int) -> None:
+    fill(tmp_path)
+    soundfile.write(tmp_path / "b.wav", ring(), RATE, format=container, subtype=subtype)
+    report = check(tmp_path).recordings[1]
+    assert (report.coding, len(report.problems)) == (subtype, problems)
+
+
 def test_a_clipped_recording_is_read_with_a_warning(tmp_path: Path) -> None:
     with warns(CaptureWarning, file=tmp_path, value=["b.wav"]):
         read_capture(fill(tmp_path, replace={"b.wav": np.clip(8 * ring(), -1, 1)}))

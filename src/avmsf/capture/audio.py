@@ -32,6 +32,8 @@ FAINT_CHANNEL = 0.1
 OFFSET_SIGNIFICANCE = 1e-6
 """Probability by which noise without an offset would look as if it had one."""
 EIGHT_BIT = frozenset({"PCM_U8", "PCM_S8", "ULAW", "ALAW", "DPCM_8"})
+LOSSLESS = ("PCM_", "FLOAT", "DOUBLE", "ALAC_", "DWVW_", "DPCM_")
+"""What libsndfile's names of formats without loss begin with; FLAC's is that of its samples, PCM_16 or PCM_24."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from avmsf.capture.audio import EIGHT_BIT, Recording, clipped_samples
+from avmsf.capture.audio import EIGHT_BIT, LOSSLESS, Recording, clipped_samples
 from avmsf.capture.onset import SECONDS_BEFORE, find_second_impact, find_second_push
 from avmsf.capture.prepare import Prepared, remove_rumble
 from avmsf.capture.settings import CaptureSettings
@@ -83,6 +83,8 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
         )
     if recording.subtype in EIGHT_BIT:
         problems.append(f"only 8 bits a sample ({recording.subtype}): its noise hides the decay; record 16 or more")
+    elif not recording.subtype.startswith(LOSSLESS):
+        problems.append(f"compressed with loss ({recording.subtype}): soft parts of the decay are altered; record wav")
     elif recording.subtype.startswith("PCM") and decibels(peak) < LOWEST_PEAK_DB:
         problems.append(f"its peak is {-decibels(peak):.0f} dB below full scale: turn the gain up")
     return RecordingReport(
