@@ -82,6 +82,14 @@ def test_any_rate_from_100_hz_to_192_khz_is_kept(tmp_path: Path, rate: int) -> N
     assert torch.equal(impacts.sounds[1], torch.from_numpy(sounds["b.wav"].astype(np.float32)))
 
 
+def test_what_git_lfs_leaves_in_place_of_a_recording_is_named(tmp_path: Path) -> None:
+    folder = fill(tmp_path)
+    (folder / "b.wav").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
+    with raises(CaptureError, file="b.wav") as caught:
+        read_capture(folder)
+    assert "git lfs pull" in str(caught.value)
+
+
 @pytest.mark.parametrize(("rate", "speed"), [(99, 1.0), (192_001, 1.0), (8000, 30.0), (8000, 0.01)])
 def test_other_rates_are_refused(tmp_path: Path, rate: int, speed: float) -> None:
     folder = fill(tmp_path, rate=rate)

@@ -12,7 +12,7 @@ from jaxtyping import Float, Float64, Shaped
 from scipy.special import stdtrit
 from torch import Tensor
 
-from avmsf.capture.filenames import missing_recording
+from avmsf.capture.filenames import is_lfs_pointer, missing_recording
 from avmsf.errors import CaptureError, RecordingLengthError
 
 LOWEST_RATE = 100.0
@@ -158,6 +158,8 @@ def read_recording(path: Path, name: str | None = None, *, advice: str = "check 
         raise CaptureError(f"{name}: expected a sound file, got a folder; name a file in it", file=path)
     if missing:
         raise missing_recording(path, name, advice=advice)
+    if is_lfs_pointer(path):
+        raise CaptureError(f"{name}: expected a sound file, got a Git LFS pointer; run git lfs pull", file=name)
     return decode_recording(path, name)
 
 
