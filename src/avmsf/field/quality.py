@@ -51,10 +51,10 @@ def with_quality(field: SoundField, train: Impacts, *, advise: bool = True) -> S
     chosen = smallest_within_error(errors[best])
     field = replace(field, gain_field=replace(gains, spread_share=SHARES[chosen]))
     reached = {kind: float(each[chosen].mean()) for kind, each in errors.items()}
-    advice = _next(field, gains) if advise else ()
+    contact, distance = (_next(field, gains) if advise else ()) or (None, None)
     simple = error(averaged)
     scatter = float((errors[best][chosen] - simple).std()) / math.sqrt(len(simple))
-    found = FieldQuality(gains.place_count, reached[best], float(simple.mean()), *advice, standard_error=scatter)
+    found = FieldQuality(gains.place_count, reached[best], float(simple.mean()), contact, distance, scatter)
     report = {**field.origin.report, "quality": asdict(found), "residual": reached}
     return replace(field, origin=replace(field.origin, report=report))
 
