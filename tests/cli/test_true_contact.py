@@ -57,7 +57,7 @@ def test_the_true_contact_is_red_at_its_place_and_the_found_one_blue(
 ) -> None:
     field, recording, points = hit
     figures: list[Figure] = []
-    monkeypatch.setattr(verb, "save_picture", lambda figure, path: figures.append(figure))
+    monkeypatch.setattr("avmsf.bench.pictures.save_picture", lambda figure, path: figures.append(figure))
     true = [f"{value:.9g}" for value in points[OTHER].tolist()]
     assert run(parse([field, recording, "--output", str(tmp_path), "--true-contact", *true, "--json"])) == 0
     results = json.loads(capsys.readouterr().out)

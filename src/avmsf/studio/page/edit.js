@@ -65,7 +65,7 @@ export function editSheet(studio, load) {
     from.value = there.material?.from ?? "";
     to.value = there.material?.to ?? "";
     single.clear();
-    for (const { mode, ...values } of there.modes ?? []) single.set(mode, { ...values, db: values.db ?? -40 });
+    for (const { mode, ...values } of there.modes ?? []) single.set(mode, values);
     showMode();
   };
   const changes = new Changes(studio, {
@@ -146,7 +146,10 @@ export function editSheet(studio, load) {
         ? "Choose a mode in the tab Modes."
         : `Mode ${studio.bank}, now at ${studio.modes.frequency(mode).toFixed(1)} Hz.`) + others;
     const values = single.get(studio.bank) ?? {};
-    for (const [which, slider] of Object.entries(modeSliders)) slider.set(values[which] ?? slider.rest);
+    for (const [which, slider] of Object.entries(modeSliders)) {
+      // A muted mode has no level: null.
+      slider.set(values[which] === null ? SINGLE[which][1].low : (values[which] ?? slider.rest));
+    }
   };
   studio.on("mode", showMode);
   studio.on("bundle", () => {
