@@ -12,7 +12,6 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from avmsf.bench.sides import ALL_SIDES, view_from
-from avmsf.cli import locate as verb
 from avmsf.cli.contacts import Contacts, rows_of
 from avmsf.cli.locate import run
 from avmsf.cli.options.checks import OutputError
