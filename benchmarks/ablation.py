@@ -18,6 +18,7 @@ from avmsf.fem.supports import supports_of
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import FAMILIES, POSITIONAL, MixtureEstimator
+from avmsf.field.gains.model import MixtureGains
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.recipes import GainCase
 from avmsf.modal.bank import ModalBank
@@ -31,7 +32,6 @@ from avmsf.simulate.elements import SecondOrder
 from avmsf.simulate.material import CERAMIC, STEEL
 from avmsf.simulate.shapes import make_shape
 from avmsf.simulate.sim20 import ABLATED
-from benchmarks.fewimpacts import with_means
 from benchmarks.report import Options, Report, Table, tell
 from benchmarks.splitcases import COUNTS, ROUGH, SplitCase, bodies_of, measured, simulated, split_case, splits_of
 
@@ -104,7 +104,11 @@ def _variants(case: SplitCase, options: Options) -> Iterator[tuple[str, float]]:
     yield "stationary noise alone", case.error(replace(field, residual=Residual(field.residual.magnitude)))
     origin = replace(field.origin, config=replace(field.origin.config, residual_noise="gaussian"))
     yield "Gaussian noise", case.error(replace(field, origin=origin))
-    yield "mean gains rendered", case.error(with_means(field))
+    assert isinstance(field.gain_field, MixtureGains)
+    yield (
+        "no spread within hypotheses",
+        case.error(replace(field, gain_field=replace(field.gain_field, spread_share=0.0))),
+    )
     if case.bodies is not None:
         yield "no updating", case.error(case.fit(MixtureEstimator(bodies=case.bodies, update=False), quick=False))
     for kind, label in zip(FAMILIES, _ALONE, strict=True):

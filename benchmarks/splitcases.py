@@ -31,7 +31,10 @@ from benchmarks.material import shared_data, surface_features
 from benchmarks.report import Options, tell
 
 STARTS = (0, 18, 37)
-COUNTS = {"aircraft_response": (8, 15, 28), "ruler10": (5, 7), "tree43": (12, 20, 40)}
+COUNTS = {
+    "aircraft_response": (8, 15, 28), "ruler10": (5, 7), "tree43": (12, 20, 40),
+    "strip30": (6, 10, 15), "strip30_shaker": (6, 10, 15),
+}  # fmt: skip
 """Training places of each measured capture."""
 ROUGH = 0.003
 """Standard deviation of a noisy mesh's vertices along each axis, over the object's size."""
