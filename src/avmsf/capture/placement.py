@@ -338,7 +338,10 @@ class _Search:
                 unit = 0.0 if factor == 1 else math.log(len(FACTORS))
                 # Nothing in meters takes two mistakes.
                 both = factor != 1 and not any(math.isclose(min(factor, 1 / factor), each) for each in UNITS)
-                yield unit + both * math.log(len(FACTORS)) + code, Mistake(factor, axes, torch.zeros(3, dtype=torch.float64))
+                yield (
+                    unit + both * math.log(len(FACTORS)) + code,
+                    Mistake(factor, axes, torch.zeros(3, dtype=torch.float64)),
+                )
 
     def _fitted(self) -> list[tuple[float, Mistake]]:
         """Return what iterated closest points make of the likeliest, with a shift, a scale, and a turn."""
