@@ -350,7 +350,7 @@ class _Search:
         for code, each in self._unmoved():
             tried.append((code, self._centered(each), False, True))
             if each.factor == 1 and scale:
-                code += math.log(len(FACTORS)) + self.parameter
+                code += 2 * math.log(len(FACTORS)) + self.parameter
                 for factor in (1.0, 0.8 * scale, scale):
                     start = replace(each, factor=factor)
                     tried += [(code, start, True, False), (code, self._centered(start), True, True)]
