@@ -220,7 +220,9 @@ class Evidence:
         later = response[onset : onset + kept]
         if len(lead) >= SHORTEST_LEAD_SECONDS * rate:
             self._noise.append(_low_powers(lead, later, rate) / float(np.abs(response).max()) ** 2)
-        self._low.append(_low_power(later, CANDIDATES_HZ[0], rate) / float(np.square(later).mean()))
+        # Digital silence, as after a click at the start, has no rumble.
+        power = float(np.square(later).mean())
+        self._low.append(_low_power(later, CANDIDATES_HZ[0], rate) / power if power else 0.0)
         spectrum = np.fft.rfft(np.concatenate([prepared.before, prepared.sound])[:kept], kept)
         spectrum /= np.linalg.norm(spectrum)
         self._squares, self._powers = self._squares + spectrum**2, self._powers + np.abs(spectrum) ** 2
