@@ -29,13 +29,14 @@ example: $(VENV)/developed
 # Neighbors stay on one worker where possible (worksteal), so that a module's fixtures are made once.
 PYTEST := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal
 
-# The fast tests of every package: 5 minutes at most on two idle cores.
+# The fast tests of every package: 6 minutes at most on two idle cores.
 test: $(VENV)/developed
 	$(PYTEST)
 
-# All tests: the fast ones, then the slow ones and those of the page (Debian's chromium).
-test-all: test
-	$(PYTEST) -m "slow or page"
+# All tests: the fast ones, the slow ones and those of the page (Debian's chromium), with the types and shapes of all
+# arguments checked, which doubles their time.
+test-all: $(VENV)/developed
+	$(PYTEST) -m "" --jaxtyping-packages=avmsf,beartype.beartype
 
 lint: $(VENV)/developed
 	$(BIN)/ruff check .

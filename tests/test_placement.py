@@ -89,6 +89,7 @@ def test_y_up_for_z_up_is_told_either_way() -> None:
         assert "mirrored" not in placement.describe()
 
 
+@pytest.mark.slow
 def test_other_names_of_the_axes_are_undone() -> None:
     missed = []
     # Two of the eight signs for each order: a turn and a mirror.
@@ -168,6 +169,7 @@ def test_one_wrong_row_is_no_mistake_of_all() -> None:
     assert placement.describe(names).endswith("check impact 9")
 
 
+@pytest.mark.slow
 def test_contacts_of_another_object_are_not_explained() -> None:
     generator = torch.Generator().manual_seed(0)
     explained = 0

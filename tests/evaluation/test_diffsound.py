@@ -130,6 +130,7 @@ def test_the_damping_curve_is_the_lower_envelope_of_slow_modes():
     torch.testing.assert_close(between, torch.tensor([5.0, 12.5, 20.0], dtype=torch.float64))
 
 
+@pytest.mark.slow
 def test_it_recovers_the_material_of_a_body_that_sounds_as_it_assumes():
     spectra = clip_spectra(struck(torch.ones(2, 12)))
     found = fit_material(spectra, curve(), family(), DiffSoundConfig(transport_steps=2, difference_steps=2))

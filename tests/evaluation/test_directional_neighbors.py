@@ -81,6 +81,7 @@ def test_without_directions_that_differ_it_is_the_papers(known: str) -> None:
     assert not torch.equal(sounds["plain"], train.sounds[:1].expand_as(test.sounds))
 
 
+@pytest.mark.slow
 def test_directions_lower_the_error_of_a_tree_struck_in_two(shared: Path) -> None:
     """43 places of a measured tree, each struck in two perpendicular directions; learnt from 20 places."""
     with warnings.catch_warnings():

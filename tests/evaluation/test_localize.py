@@ -120,6 +120,7 @@ def test_diffsound_searches_the_vertices_of_the_mesh(monkeypatch: pytest.MonkeyP
     assert len(searched[2].unique(dim=0)) == MAX_VERTICES
 
 
+@pytest.mark.slow
 def test_heat_maps_have_the_true_contacts_and_the_papers_methods_their_own_distance(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -24,6 +24,7 @@ def test_the_pyramid_above_a_flat_top_is_removed() -> None:
     assert _hull(block, taut=True).bounds[1, 2] - 0.02 < 0.35 * above
 
 
+@pytest.mark.slow
 def test_a_ball_stays_as_large_as_its_hull() -> None:
     before, after = (_hull(ball(0.05), taut=taut).volume for taut in (False, True))
     assert after == pytest.approx(before, rel=0.01)

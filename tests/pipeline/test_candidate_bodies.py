@@ -88,6 +88,7 @@ def case(count: int = 12, **changes: torch.Tensor | None) -> GainCase:
     return gain_case(replace(impacts, **changes), features(), modes, CONFIG)
 
 
+@pytest.mark.slow
 def test_bodies_halve_the_error_between_impacts() -> None:
     impacts, modes = recorded(10)
     others, _ = recorded(40, seed=3)

@@ -28,6 +28,7 @@ def _discs(points: torch.Tensor, normals: torch.Tensor, *, opacity: float = 0.95
     return starting_cloud(start, degree=0, scale=1.0, opacity=opacity, flatness=0.1)
 
 
+@pytest.mark.slow
 def test_a_ball_of_gaussians_is_a_closed_ball() -> None:
     surface = shape_of_cloud(_ball(), cells=CELLS).as_seen()
     mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy(), process=False)
@@ -36,6 +37,7 @@ def test_a_ball_of_gaussians_is_a_closed_ball() -> None:
     assert np.median(off) < 0.03 * RADIUS
 
 
+@pytest.mark.slow
 def test_a_slender_bar_is_kept_from_end_to_end() -> None:
     sides = (0.2, 0.015, 0.003)
     bar = trimesh.creation.box(sides)
@@ -47,6 +49,7 @@ def test_a_slender_bar_is_kept_from_end_to_end() -> None:
     assert mesh.body_count == 1
 
 
+@pytest.mark.slow
 def test_faint_gaussians_around_the_object_change_nothing() -> None:
     ball = _ball()
     haze = replace(ball, centers=torch.tensor(MIDDLE) + 2 * (ball.centers - torch.tensor(MIDDLE)))

@@ -43,6 +43,7 @@ class Cup:
         return difference(self.as_seen(), box(thickness, above=0.01))
 
 
+@pytest.mark.slow
 def test_walls_cover_the_range_and_thicker_ones_are_stiffer() -> None:
     filled, *walls = nominal_bodies(Cup(), count=6, dofs=4000).bodies
     assert filled.wall is None
@@ -61,6 +62,7 @@ def test_walls_that_cannot_be_had_are_left_out() -> None:
     assert with_wall(Cup(most=0.01), 0.011, count=6, dofs=4000) is None
 
 
+@pytest.mark.slow
 def test_the_thickness_is_searched_for_unless_it_is_known_or_there_is_no_cavity() -> None:
     config = BodyConfig(shapes=6, dofs=4000)
     searched = candidate_bodies(Cup(), config)
@@ -74,6 +76,7 @@ def test_the_thickness_is_searched_for_unless_it_is_known_or_there_is_no_cavity(
     assert (solid.thicken, [each.wall for each in solid.bodies.bodies]) == (None, [None])
 
 
+@pytest.mark.slow
 def test_bodies_of_a_shape_are_read_again_and_those_of_another_shape_are_not(tmp_path: Path) -> None:
     said: list[str] = []
 

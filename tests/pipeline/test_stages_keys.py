@@ -94,6 +94,7 @@ def test_other_code_has_another_key(
     assert key() != before
 
 
+@pytest.mark.slow
 def test_a_field_does_not_depend_on_free_memory_and_is_made_again_once_there_are_bodies(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

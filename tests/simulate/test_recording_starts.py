@@ -67,6 +67,7 @@ def test_starts_have_the_asked_mean_and_spread_and_any_fraction_of_a_sample() ->
     assert still.tolist() == pytest.approx([0.0415 * 48000.0] * 5)
 
 
+@pytest.mark.slow
 def test_without_these_imperfections_recordings_start_with_their_impacts(recipe: ObjectRecipe, cache: Path) -> None:
     made = simulate_object(replace(recipe, imperfections=Imperfections.none(), noise_db=None), cache=cache)
     truth, rate = made.truth, float(recipe.sample_rate)
@@ -78,6 +79,7 @@ def test_without_these_imperfections_recordings_start_with_their_impacts(recipe:
     assert not made.capture.settings.align
 
 
+@pytest.mark.slow
 def test_a_recording_holds_room_noise_alone_before_its_impact(simulation: Simulation) -> None:
     starts = simulation.truth.starts
     assert starts is not None

@@ -85,6 +85,7 @@ def test_the_longest_idle_of_too_many_connections_end(hasty: Served, monkeypatch
         assert made[-1].recv(1 << 16).startswith(b"HTTP/1.1 403")
 
 
+@pytest.mark.slow
 def test_at_the_limit_of_files_the_studio_answers_and_its_terminal_stays_quiet(tmp_path: Path) -> None:
     if resource.getrlimit(resource.RLIMIT_NOFILE)[0] < 600:
         pytest.skip("this test itself needs more open files")
