@@ -108,7 +108,7 @@ def _captures(options: Options) -> Report:
             "after": coherence_of(modes),
             "shortest": float(delays.min()),
             "longest": float(delays.max()),
-            "refused": float((~modes.alignment.agrees).sum()),
+            "refused": float((modes.alignment.agreement < 0.5).sum()),
         }
         tell(f"{name}: {values}")
         rows.append([name, float(len(after)), *values.values()])
@@ -362,8 +362,8 @@ def _wide(folder: Path, starts: Float64[Tensor, " contacts"]) -> Impacts:
 def _rms(found: Alignment | None, starts: Float64[Tensor, " contacts"]) -> tuple[float, float]:
     """Return the error of the delays of aligned recordings, and how many are not."""
     assert found is not None
-    away = (found.delays - starts)[found.agrees]
-    return float((away - away.median()).square().mean().sqrt()), float((~found.agrees).sum())
+    away = (found.delays - starts)[found.agreement >= 0.5]
+    return float((away - away.median()).square().mean().sqrt()), float((found.agreement < 0.5).sum())
 
 
 def _read(name: str) -> Capture:

@@ -28,7 +28,7 @@ class AlignmentReport:
         found = modes.alignment
         if found is None:
             return None
-        left = [name for name, agrees in zip(found.names, found.agrees.tolist(), strict=True) if not agrees]
+        left = [name for name, likely in zip(found.names, found.agreement.tolist(), strict=True) if likely < 0.5]
         delays = dict(zip(found.names, found.delays.tolist(), strict=True))
         inverted = list(inverted_recordings(modes, impacts))
         return cls(found.coherence_before, found.coherence_after, delays, left, inverted)

@@ -16,7 +16,7 @@ from avmsf.modal.extraction import alignment
 from avmsf.modal.extraction.alignment import align, coherence, strongest_modes
 from avmsf.modal.extraction.extract import extract_modes, extract_once
 from avmsf.modal.extraction.finders import HighResolution
-from avmsf.modal.extraction.phase_likelihood import MeasuredPhases, background_power
+from avmsf.modal.extraction.phase_likelihood import DelayPrior, MeasuredPhases, background_power
 
 RATE, SAMPLES, LEAD = 16000.0, 6000, 320
 FREQUENCY = torch.tensor([431.0, 902.5, 1370.0, 2204.0, 3317.0, 4750.0], dtype=torch.float64)
@@ -66,7 +66,7 @@ def test_delays_are_recovered(deviation: float, modes: int, noise_db: float) -> 
     starts = jitter(12, deviation)
     found = align(damped(gains(12, modes), starts, noise_db=noise_db))
     assert found is not None
-    assert found.agrees.all()
+    assert (found.agreement > 0.9).all()
     assert error(found.delays, starts) < 0.05
     assert found.coherence_after > max(0.98, found.coherence_before)
 
@@ -108,27 +108,45 @@ def test_another_recording_is_aligned_by_the_phases_of_the_first() -> None:
     assert torch.equal(found.apply(known).sounds, known.delayed(found.delays).sounds)
 
 
-def test_a_recording_with_phases_of_its_own_is_named_and_keeps_its_start() -> None:
+def test_a_recording_with_phases_of_its_own_is_named_and_moved_as_most_are() -> None:
     starts = jitter(10, 1.0)
     phase = PHASE.repeat(10, 1)
     phase[4] = torch.tensor([2.1, 0.2, 1.0, 0.8, 1.5, 0.4])
     found = align(damped(gains(10, 6), starts, phase=phase, noise_db=-50.0))
     assert found is not None
-    assert found.agrees.tolist() == [row != 4 for row in range(10)]
-    assert found.delays[4] == 0
-    kept = found.agrees
+    kept = found.agreement > 0.5
+    assert kept.tolist() == [row != 4 for row in range(10)]
+    assert abs(found.delays[4] - found.phases.start) < found.phases.jitter
     assert error(found.delays[kept], starts[kept]) < 0.05
 
 
-def test_phases_without_anything_in_common_leave_all_starts() -> None:
+def test_what_the_phases_leave_open_moves_a_delay_gradually() -> None:
+    prior, delays = DelayPrior(torch.tensor([1.0], dtype=torch.float64), 0.5), torch.full((4,), 9.0).double()
+    # A quarter of certainty leaves three quarters of a Cauchy distribution, whose
+    # upper third begins at its scale over the root of 3.
+    found = prior.median(delays, torch.tensor([0.0, 0.25, 0.499, 0.6], dtype=torch.float64))
+    assert torch.allclose(found, torch.tensor([1.0, 1.0 + 0.5 / 3**0.5, 9.0, 9.0], dtype=torch.float64))
+
+
+def test_phases_without_anything_in_common_hardly_move_starts() -> None:
     phase = 2 * math.pi * torch.rand(8, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
     impacts = damped(1 + gains(8, 6).abs(), torch.zeros(8, dtype=torch.float64), phase=phase, noise_db=-50.0)
     found = align(impacts)
     assert found is not None
-    assert not found.agrees.any()
-    assert torch.equal(found.delays, torch.zeros(8, dtype=torch.float64))
-    assert found.coherence_after == pytest.approx(found.coherence_before)
-    assert found.coherence_before < 0.7
+    assert found.agreement.mean() < 0.6
+    assert found.delays.std() < 1.0
+    assert max(found.coherence_before, found.coherence_after) < 0.7
+
+
+def test_a_recording_agrees_the_less_the_farther_its_phases_are_off() -> None:
+    agreement, starts = [], jitter(10, 1.0)
+    for size in (0.05, 0.2, 0.4):
+        phase = PHASE.repeat(10, 1)
+        phase[4] += size * torch.tensor([1.0, -0.8, 1.0, -1.0, 0.8, -0.9])
+        found = align(damped(gains(10, 6), starts, phase=phase, noise_db=-50.0))
+        assert found is not None
+        agreement.append(float(found.agreement[4]))
+    assert agreement[0] > 0.95 > agreement[1] > 0.05 > agreement[2]
 
 
 def test_the_common_start_does_not_depend_on_where_between_samples_impacts_fall() -> None:

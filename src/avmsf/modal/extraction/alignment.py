@@ -15,7 +15,9 @@ the posterior of the delays is
 which is climbed one recording at a time: given the others' z_m, a recording's delay is searched on a grid and refined
 by Newton's method. The concentration is that of a Gaussian error across the phase: k = |c|^2 / (4 v), where the
 variance v adds the noise, a part that grows with the mode's amplitude at this contact and at all contacts alike
-(neighboring modes leak into each other), estimated from the median error of each mode, and a small relative part. Of
+(neighboring modes leak into each other), estimated from the median error of each mode, and a small relative part; a
+few recordings have wider errors than most. A recording whose phases agree with the others' at no delay is moved as
+most are: its delay is the median of a posterior that mixes both, by the probability of agreement. Of
 several starting recordings, each of which the others are first aligned with, the one of highest posterior counts.
 """
 
@@ -24,7 +26,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Complex128, Float64
+from jaxtyping import Complex128, Float64
 from torch import Tensor
 
 from avmsf._utils.summary import short_repr
@@ -32,7 +34,13 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.prepare import margin_length
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.finders import HighResolution
-from avmsf.modal.extraction.phase_likelihood import DelayPrior, MeasuredPhases, background_power, occam_factor
+from avmsf.modal.extraction.phase_likelihood import (
+    FIRST_SPREAD,
+    DelayPrior,
+    MeasuredPhases,
+    background_power,
+    occam_factor,
+)
 
 _MODES = 32
 """Modes to align by, the strongest: more cost time and hardly narrow the posterior."""
@@ -53,8 +61,6 @@ _EXACT = 3.0
 """Log odds, per recording, of no delays at all where every file starts with its impact, as impulse responses do. The
 aircraft's and the ruler's, whose modes have no exact phases, seem to have delays by up to 2.5 in 4 of 49 splits; files
 of 20 modes that were trimmed 1 to 2 samples apart gain 6 to 25."""
-_FIRST_SPREAD = 0.25
-"""The spread of a mode before anything is known of it: half of what phases without a mean would have."""
 _VAGUE = 2.0
 """Recordings of the usual spread that a mode's own is mixed with: of few, some modes agree by chance."""
 _LEAST_JITTER = 0.5
@@ -94,9 +100,9 @@ class Alignment:
 
     names: tuple[str, ...]
     delays: Float64[Tensor, " contacts"]
-    """Samples by which each sound starts later in its file than it was read; zero for what cannot be aligned."""
-    agrees: Bool[Tensor, " contacts"]
-    """Whether a recording's phases agree with the others' at some delay, rather than with none."""
+    """Samples by which each sound starts later in its file than it was read."""
+    agreement: Float64[Tensor, " contacts"]
+    """Probability that a recording's phases agree with the others' at some delay, rather than with none."""
     coherence_before: float
     """Coherence of the phases as read, from 0 to 1 (`coherence`)."""
     coherence_after: float
@@ -109,8 +115,8 @@ class Alignment:
         """Return recordings cut anew at the common start: known ones by their delays, others by their phases.
 
         A recording that was not among those aligned is aligned alone, its phases with theirs; where they do not agree
-        it keeps its own start, as all do where those aligned have kept theirs. Recordings that are final already are
-        returned as they are.
+        it is moved as most are, and no recording is where those aligned have kept their starts. Recordings that are
+        final already are returned as they are.
         """
         if impacts.before is None:
             return impacts
@@ -127,12 +133,12 @@ class Alignment:
         return impacts.delayed(delays)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return what a file holds besides the names and keys, by name."""
+        """Return what a file holds besides the names and keys, by name; of the agreement whether it is likely."""
         phases = self.phases
         numbers = [self.coherence_before, self.coherence_after, phases.jitter, phases.start]
         return {
             "delays": self.delays,
-            "agrees": self.agrees,
+            "agrees": self.agreement > 0.5,
             "numbers": torch.tensor(numbers, dtype=torch.float64),
             "frequency": phases.bank.frequency,
             "damping": phases.bank.damping,
@@ -158,7 +164,7 @@ class Alignment:
         bank = ModalBank(tensors["frequency"], tensors["damping"])
         doubled = torch.view_as_complex(tensors["doubled"].contiguous())
         phases = Phases(bank, doubled, tensors["power"], tensors["spread"], jitter, start)
-        return cls(tuple(names), tensors["delays"], tensors["agrees"], before, after, phases, tuple(keys))
+        return cls(tuple(names), tensors["delays"], tensors["agrees"].double(), before, after, phases, tuple(keys))
 
 
 def align(impacts: Impacts) -> Alignment | None:
@@ -176,25 +182,25 @@ def align(impacts: Impacts) -> Alignment | None:
     reach, background = _reach(impacts), background_power(impacts, bank)
     measured = MeasuredPhases.of(impacts, bank, reach=reach, background=background)
     before = after = coherence(measured.amplitude, bank.damping)
-    delays, agrees, phases = _estimate(measured, exact=0.0 if _has_lead(impacts) else _EXACT)
+    delays, agreement, phases = _estimate(measured, exact=0.0 if _has_lead(impacts) else _EXACT)
     if bool((delays != 0).any()):
         # Once more, from sounds that start where the first estimate says; then closely, with the spreads found.
         measured = MeasuredPhases.of(impacts.delayed(delays), bank, reach=reach, background=background)
-        further, agrees, phases = _estimate(measured, earlier=delays)
-        delays = torch.where(agrees, delays + further, 0.0)
+        further, _, _ = _estimate(measured, earlier=delays)
+        delays = delays + further
         measured = MeasuredPhases.of(impacts.delayed(delays), bank, reach=_CLOSE, background=background)
-        further, agrees, phases = _estimate(measured, earlier=delays, agreeing=agrees)
+        further, agreement, phases = _estimate(measured, earlier=delays, vague=0.0)
         # The phases are those at the recordings' common start, which moves with the offset.
-        offset = _offset(torch.where(agrees, delays + further, 0.0), agrees, impacts)
-        further = torch.where(agrees, further + offset, 0.0)
+        offset = _offset(delays + further, agreement, impacts)
+        further = further + offset
         delays = delays + further
         phases = replace(
             phases,
-            start=float(delays[agrees].median()) if bool(agrees.any()) else 0.0,
+            start=_weighted_median(delays, agreement),
             doubled=phases.doubled * torch.exp(1j * offset * measured.turn),
         )
         after = coherence(measured.turned(further), bank.damping)
-    return Alignment(impacts.names, delays, agrees, before, after, phases, recording_keys(impacts))
+    return Alignment(impacts.names, delays, agreement, before, after, phases, recording_keys(impacts))
 
 
 def strongest_modes(impacts: Impacts) -> ModalBank:
@@ -222,21 +228,27 @@ def coherence(amplitude: Complex128[Tensor, "contacts modes"], damping: Float64[
     return float(summed / energy.sum().clamp_min(torch.finfo(torch.float64).tiny))
 
 
-def _offset(delays: Float64[Tensor, " contacts"], agrees: Bool[Tensor, " contacts"], impacts: Impacts) -> float:
+def _offset(delays: Float64[Tensor, " contacts"], agreement: Float64[Tensor, " contacts"], impacts: Impacts) -> float:
     """Return what is added to all delays: the common start is a matter of choice."""
-    if not bool(agrees.any()):
-        return 0.0
     if impacts.before is None:
-        return -float(delays[agrees].median())
-    return _common_onset(impacts, delays, agrees) if _has_lead(impacts) else -float(delays[agrees].min())
+        return -_weighted_median(delays, agreement)
+    return _common_onset(impacts, delays, agreement) if _has_lead(impacts) else -float(delays.min())
 
 
-def _common_onset(impacts: Impacts, delays: Float64[Tensor, " contacts"], agrees: Bool[Tensor, " contacts"]) -> float:
+def _weighted_median(values: Float64[Tensor, " contacts"], weights: Float64[Tensor, " contacts"]) -> float:
+    order = torch.argsort(values)
+    total = weights[order].cumsum(0)
+    return float(values[order][int(torch.searchsorted(total, total[-1] / 2))])
+
+
+def _common_onset(
+    impacts: Impacts, delays: Float64[Tensor, " contacts"], agreement: Float64[Tensor, " contacts"]
+) -> float:
     """Return how much later than their common start aligned recordings leave the noise, all together, samples.
 
-    That is where the mean power of sounds of equal energy first reaches a hundredth of its maximum, and ten times the
-    noise before. The median of single onsets is off by what these are, over the square root of their number. Between
-    samples, too: else it would depend on where between two samples the impacts fall.
+    That is where the mean power of sounds of equal energy, each counting by its agreement, first reaches a hundredth of
+    its maximum, and ten times the noise before. The median of single onsets is off by what these are, over the square
+    root of their number. Between samples, too: else it would depend on where between two samples the impacts fall.
     """
     assert impacts.before is not None
     assert impacts.after is not None
@@ -244,9 +256,9 @@ def _common_onset(impacts: Impacts, delays: Float64[Tensor, " contacts"], agrees
     early = replace(impacts, sounds=impacts.sounds[:, : 3 * lead], after=impacts.after[:, :0])
     fractions = torch.arange(_FRACTIONS, dtype=torch.float64) / _FRACTIONS
     power = torch.stack(
-        [early.delayed(delays - lead + each).sounds[agrees, : 2 * lead].double().square() for each in fractions], dim=2
+        [early.delayed(delays - lead + each).sounds[:, : 2 * lead].double().square() for each in fractions], dim=2
     ).flatten(1)
-    mean = (power / power.sum(1, keepdim=True).clamp_min(1e-300)).mean(0)
+    mean = agreement @ (power / power.sum(1, keepdim=True).clamp_min(1e-300)) / agreement.sum()
     highest = float(mean.max())
     # Noise within 10 dB of the sounds hides all but their loudest.
     threshold = min(max(0.01 * highest, 10 * float(mean[: _FRACTIONS * lead // 2].median())), highest)
@@ -264,14 +276,13 @@ def _reach(impacts: Impacts) -> float:
 
 
 def _delays_alone(impacts: Impacts, phases: Phases, *, usual: float, reach: float) -> Float64[Tensor, " contacts"]:
-    """Return the delays, near `usual`, by which recordings agree with known phases; zero for one that does not."""
+    """Return the delays by which recordings agree with known phases; `usual` for one that surely does not."""
     background = background_power(impacts, phases.bank)
     measured = MeasuredPhases.of(impacts, phases.bank, reach=reach, background=background)
-    weights = measured.concentration(phases.power, phases.spread)
     doubled = phases.doubled.expand(len(impacts), -1)
     prior = DelayPrior(torch.tensor([usual], dtype=torch.float64), phases.jitter)
-    delays, odds = measured.search(weights, doubled, prior)
-    return torch.where(odds > 0, delays, 0.0)
+    delays, odds, _ = measured.search(phases.power, phases.spread, doubled, prior)
+    return prior.median(delays, odds.sigmoid())
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,15 +302,15 @@ def _estimate(
     measured: MeasuredPhases,
     *,
     earlier: Float64[Tensor, " contacts"] | None = None,
-    agreeing: Bool[Tensor, " contacts"] | None = None,
+    vague: float = _VAGUE,
     exact: float = 0.0,
-) -> tuple[Float64[Tensor, " contacts"], Bool[Tensor, " contacts"], Phases]:
-    """Return the delays, which recordings agree, and the phases at the delayed starts.
+) -> tuple[Float64[Tensor, " contacts"], Float64[Tensor, " contacts"], Phases]:
+    """Return the delays' medians, the probabilities that recordings agree, and the phases at the delayed starts.
 
     `earlier` are the delays that the sounds have been moved by already: the prior is of the sum. Without them, all
     delays are zero where the recordings are likelier to be aligned as they are, which `exact` favors, log odds a
-    recording. With `agreeing`, which recordings agree is known, and the modes' spreads are those found, however few the
-    recordings.
+    recording. `vague` is how many recordings of the usual spread each mode's own is mixed with. The share of recordings
+    that agree is learned from all: a capture without common phases may have single ones that agree by chance.
     """
     if earlier is None:
         prior = DelayPrior(torch.zeros(1, dtype=torch.float64), _FIRST_JITTER)
@@ -312,13 +323,16 @@ def _estimate(
         fits += [_climb(measured, prior), replace(still, log_posterior=still.log_posterior + exact * len(still.delays))]
         fit = max(fits, key=lambda each: each.log_posterior)
     else:
-        fit = _climb(measured, DelayPrior(-earlier, _FIRST_JITTER), vague=_VAGUE if agreeing is None else 0.0)
+        fit = _climb(measured, DelayPrior(-earlier, _FIRST_JITTER), vague=vague)
     turned = fit.weights * measured.doubled(fit.delays)
-    _, odds = measured.search(fit.weights, turned.sum(0) - turned, fit.prior)
-    # A capture without common phases may have single recordings that agree by chance.
-    agrees = (odds > 0) & (odds.sum() > 0) if agreeing is None else agreeing
-    phases = Phases(measured.bank, turned[agrees].sum(0), measured.power, fit.spread, fit.prior.scale, 0.0)
-    return torch.where(agrees, fit.delays, 0.0), agrees, phases
+    _, odds, _ = measured.search(measured.power, fit.spread, turned.sum(0) - turned, fit.prior)
+    agreement = odds.sigmoid()
+    for _ in range(_ROUNDS):
+        share = (agreement.sum() + 1) / (len(odds) + 2)
+        agreement = (odds + share.logit()).sigmoid()
+    doubled = (agreement[:, None] * turned).sum(0)
+    delays = fit.prior.median(fit.delays, agreement)
+    return delays, agreement, Phases(measured.bank, doubled, measured.power, fit.spread, fit.prior.scale, 0.0)
 
 
 def _climb(
@@ -333,15 +347,15 @@ def _climb(
 
     One of `known` as soon as no delay is farther from it than a step of the grid: the climb would end there as well.
     """
-    power, spread = measured.power, torch.full_like(measured.power, _FIRST_SPREAD)
+    power, spread = measured.power, torch.full_like(measured.power, FIRST_SPREAD)
     weights = measured.concentration(power, spread)
     delays = torch.zeros(len(weights), dtype=torch.float64)
     if reference is not None:
         alone = (weights[reference] * measured.doubled(delays)[reference]).expand(len(weights), -1)
-        delays, _ = measured.search(weights, alone, prior)
+        delays, _, _ = measured.search(power, spread, alone, prior)
     for turn in range(_ROUNDS):
         turned = weights * measured.doubled(delays)
-        found, _ = measured.search(weights, turned.sum(0) - turned, prior)
+        found, _, spreads = measured.search(power, spread, turned.sum(0) - turned, prior)
         if reference is not None:
             found = found - found.median()
         for fit in known:
@@ -349,7 +363,7 @@ def _climb(
                 return fit
         moved = float((found - delays).abs().max())
         delays, spread = found, measured.spread(weights, found, vague=vague)
-        weights = measured.concentration(power, spread)
+        weights = measured.concentration(power, spreads)
         if turn >= _SETTLING:
             scale = float((delays - prior.middle).abs().median())
             prior = replace(prior, scale=min(max(_LEAST_JITTER, scale), _FIRST_JITTER))
@@ -359,13 +373,13 @@ def _climb(
     total = turned.sum(0)
     bend = (measured.turn.square() * (turned * total.conj()).real / total.abs().clamp_min(1e-300)).sum(1)
     share = float(occam_factor(prior, delays, bend).sum())
-    return _Fit(delays, weights, spread, prior, measured.log_likelihood(weights, spread, total) + share)
+    return _Fit(delays, weights, spread, prior, measured.log_likelihood(weights, spreads, total) + share)
 
 
 def _unmoved(measured: MeasuredPhases) -> _Fit:
     """Return the fit without any delay."""
     delays = torch.zeros(len(measured.scaled), dtype=torch.float64)
-    weights = measured.concentration(measured.power, torch.full_like(measured.power, _FIRST_SPREAD))
+    weights = measured.concentration(measured.power, torch.full_like(measured.power, FIRST_SPREAD))
     for _ in range(_SETTLING):
         spread = measured.spread(weights, delays, vague=_VAGUE)
         weights = measured.concentration(measured.power, spread)

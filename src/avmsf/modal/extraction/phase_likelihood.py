@@ -24,9 +24,15 @@ _GRID_PER_PERIOD = 10
 _RELATIVE = 0.05
 """Error across the phase of any amplitude, over the amplitude: frequencies and dampings are never exact."""
 _OUTLIER_SHARE = 0.2
-"""Part of the phases that lie anywhere: of modes that are hardly excited, or that two close modes are taken for."""
+"""Part of the phases that lie anywhere: of modes that are hardly excited, or that two close modes are taken for. And of
+the recordings with wide spreads."""
 _USUAL_SPREAD = 0.05
 """Spread of a mode of which little is known: phases to .2 rad."""
+FIRST_SPREAD = 0.25
+"""The spread of a mode before anything is known of it: half of what phases without a mean would have."""
+_WIDE = 4.0
+"""A recording's own spread over that of most, if it is one of the part that is wide: of close modes that a contact
+excites differently the phases are others there."""
 _MEDIAN_OF_SQUARE = 0.455
 """Median of the square of a standard normal number."""
 
@@ -48,6 +54,16 @@ class DelayPrior:
         """Return the derivative of the log density."""
         away = delays - self.middle
         return -2 * away / (self.scale**2 + away.square())
+
+    def median(
+        self, delays: Float64[Tensor, " contacts"], probability: Float64[Tensor, " contacts"]
+    ) -> Float64[Tensor, " contacts"]:
+        """Return the median of what are these delays with a probability, and else distributed as here."""
+        away = delays - self.middle
+        # The quantile of a Cauchy distribution; its tangent has a pole where the probability is a half.
+        part = (probability / (1 - probability)).nan_to_num(1.0).clamp_max(1.0)
+        farthest = self.scale * torch.tan(0.5 * math.pi * part).abs()
+        return self.middle + torch.where(part < 1, away.sign() * torch.minimum(away.abs(), farthest), away)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +120,7 @@ class MeasuredPhases:
         return self.scaled.abs().square().mean(0)
 
     def variance(
-        self, power: Float64[Tensor, " modes"], spread: Float64[Tensor, " modes"]
+        self, power: Float64[Tensor, " modes"], spread: Float64[Tensor, "*#contacts modes"]
     ) -> Float64[Tensor, "contacts modes"]:
         """Return the variance across the phase."""
         own = self.scaled.abs().square()
@@ -112,7 +128,7 @@ class MeasuredPhases:
         return (self.noise + shared + _RELATIVE**2 * own).clamp_min(torch.finfo(torch.float64).tiny)
 
     def concentration(
-        self, power: Float64[Tensor, " modes"], spread: Float64[Tensor, " modes"]
+        self, power: Float64[Tensor, " modes"], spread: Float64[Tensor, "*#contacts modes"]
     ) -> Float64[Tensor, "contacts modes"]:
         """Return the concentrations of the doubled phases."""
         return self.scaled.abs().square() / (4 * self.variance(power, spread))
@@ -144,7 +160,7 @@ class MeasuredPhases:
     def log_likelihood(
         self,
         weights: Float64[Tensor, "contacts modes"],
-        spread: Float64[Tensor, " modes"],
+        spread: Float64[Tensor, "*#contacts modes"],
         doubled: Complex128[Tensor, " modes"],
     ) -> float:
         """Return the log likelihood of the amplitudes' parts across their phases, all mean phases alike."""
@@ -153,15 +169,30 @@ class MeasuredPhases:
 
     def search(
         self,
+        power: Float64[Tensor, " modes"],
+        spread: Float64[Tensor, " modes"],
+        doubled: Complex128[Tensor, "contacts modes"],
+        prior: DelayPrior,
+    ) -> tuple[Float64[Tensor, " contacts"], Float64[Tensor, " contacts"], Float64[Tensor, "contacts modes"]]:
+        """Return each recording's likeliest delay, the log odds that its phases agree with `doubled`, and its spread.
+
+        `doubled` is the sum of the others' weights times exp(2 i phase), for each recording. The odds compare phases
+        about these, over all delays of the prior and both spreads, with phases that are anything.
+        """
+        wide = torch.maximum(spread, (_WIDE * spread).clamp_max(FIRST_SPREAD))
+        spreads = torch.stack([spread, wide])
+        found = [self._search(self.concentration(power, each), doubled, prior) for each in spreads]
+        delays, odds = (torch.stack(each) for each in zip(*found, strict=True))
+        odds = odds + torch.tensor([[1 - _OUTLIER_SHARE], [_OUTLIER_SHARE]], dtype=torch.float64).log()
+        best = odds.argmax(0)
+        return delays.gather(0, best[None])[0], odds.logsumexp(0), spreads[best]
+
+    def _search(
+        self,
         weights: Float64[Tensor, "contacts modes"],
         doubled: Complex128[Tensor, "contacts modes"],
         prior: DelayPrior,
     ) -> tuple[Float64[Tensor, " contacts"], Float64[Tensor, " contacts"]]:
-        """Return each recording's likeliest delay, and the log odds that its phases agree with `doubled` at all.
-
-        `doubled` is the sum of the others' weights times exp(2 i phase), for each recording. The odds compare phases
-        about these, over all delays of the prior, with phases that are anything.
-        """
         strength = doubled.abs()
         # The others' mean phase is not known exactly: two von Mises laws in a row have about the product of the means'
         # lengths.

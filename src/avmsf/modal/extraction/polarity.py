@@ -38,8 +38,8 @@ def inverted_recordings(modes: Extraction, impacts: Impacts) -> tuple[str, ...]:
     Empty where contacts lie so far apart that neighbors do not determine a gain's sign. Recordings that could not be
     aligned are not judged.
     """
-    if modes.alignment is not None and not bool(modes.alignment.agrees.all()):
-        rows = torch.nonzero(modes.alignment.agrees).flatten().tolist()
+    if modes.alignment is not None and len(left := torch.nonzero(modes.alignment.agreement < 0.5)):
+        rows = [row for row in range(len(impacts)) if row not in left]
         impacts = impacts.take(rows)
         modes = replace(modes, gains=modes.gains[rows], quadrature=modes.quadrature[rows], alignment=None)
     signs, found = torch.ones(len(impacts), 1, dtype=torch.float64), list[int]()
