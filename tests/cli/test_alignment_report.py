@@ -50,3 +50,14 @@ def test_a_recording_that_cannot_be_aligned_is_counted_as_a_warning(
     assert alignment(capsys, "check", str(folder))["not_aligned"] == ["3.wav"]
     assert main(["check", str(folder)]) == 0
     assert "no problem found" not in capsys.readouterr().out
+
+
+def test_a_fade_out_of_all_recordings_is_a_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = fill(tmp_path / "five")
+    for path in folder.glob("*.wav"):
+        sound, rate = soundfile.read(path)
+        soundfile.write(path, sound * np.minimum(1.0, np.linspace(2.0, 0.0, len(sound))), rate, subtype="FLOAT")
+    assert main(["check", str(folder)]) == 0
+    printed = capsys.readouterr().out
+    assert "fade-out" in printed
+    assert "no problem found" not in printed

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from avmsf.capture import Impacts
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.polarity import inverted_recordings
+from avmsf.modal.extraction.recorder_faults import noise_drop, rate_factors, uneven_decay
 
 _SHOWN = 8
 """Recordings that a sentence names."""
@@ -21,6 +22,12 @@ class AlignmentReport:
     not_aligned: list[str]
     inverted: list[str]
     """Recordings of the opposite sign."""
+    rate_factors: dict[str, float]
+    """Recordings of another sample rate than their files give, and by how much their modes are higher."""
+    uneven_decay_db: float | None
+    """By how much a slice sounds fall more than vibrations do; None where they do not."""
+    noise_drop_db: float | None
+    """By how much noise is louder before the impacts than after; None where it is not."""
 
     @classmethod
     def of(cls, modes: Extraction, impacts: Impacts) -> "AlignmentReport | None":
@@ -31,9 +38,36 @@ class AlignmentReport:
         left = [name for name, likely in zip(found.names, found.agreement.tolist(), strict=True) if likely < 0.5]
         delays = dict(zip(found.names, found.delays.tolist(), strict=True))
         inverted = list(inverted_recordings(modes, impacts))
-        return cls(found.coherence_before, found.coherence_after, delays, left, inverted)
+        faults = rate_factors(modes, modes.aligned(impacts)), uneven_decay(modes, modes.aligned(impacts))
+        return cls(
+            found.coherence_before, found.coherence_after, delays, left, inverted, *faults, noise_drop(modes, impacts)
+        )
 
     def sentences(self) -> list[str]:
+        """Return the faults of recordings, and how coherent the modes' phases are."""
+        return [*self.faults(), *self._coherence()]
+
+    def faults(self) -> list[str]:
+        """Return a sentence for each fault that recorders and editors make."""
+        sentences = [
+            f"{name}: all its modes are {factor:.4g} times the others': it was recorded at {1 / factor:.4g} times the "
+            "sample rate that its file gives; convert it from that rate, or remove its row"
+            for name, factor in self.rate_factors.items()
+        ]
+        if self.uneven_decay_db is not None:
+            sentences.append(
+                f"the sounds fall by {self.uneven_decay_db:.0f} dB more, within a twelfth of their length, than "
+                "vibrations do: a fade-out or a noise gate; export them without it, or write fewer seconds in "
+                "capture.toml"
+            )
+        if self.noise_drop_db is not None:
+            sentences.append(
+                f"the noise is {self.noise_drop_db:.0f} dB louder before the impacts than after: an automatic gain "
+                "changes levels and decays; turn it off and record again"
+            )
+        return sentences
+
+    def _coherence(self) -> list[str]:
         """Return how coherent the modes' phases are, and which recordings are not aligned or have the opposite sign."""
         moved = [delay for name, delay in self.delays.items() if name not in self.not_aligned]
         if not moved:

@@ -80,7 +80,7 @@ def run(options: Options) -> int:
         screen.print("no mode was found to align the recordings: noisy or too short (see avmsf modes)")
     wrong = len(problems) + (modes is None)
     if aligned is not None:
-        wrong += bool(aligned.not_aligned) + bool(aligned.inverted)
+        wrong += bool(aligned.not_aligned) + bool(aligned.inverted) + len(aligned.faults())
     screen.print("no problem found" if not wrong else f"readable, with {counted(wrong, 'warning')}", soft_wrap=True)
     if visual is not None and visual.reconstructs:
         next_command("avmsf reconstruct", options.capture, "-o field.safetensors")
@@ -126,7 +126,7 @@ def problems_of(report: CaptureReport) -> list[str]:
 def _table(report: CaptureReport, title: str, aligned: AlignmentReport | None) -> object:
     delays = {} if aligned is None else aligned.delays
     left = [] if aligned is None else aligned.not_aligned
-    doubtful = [] if aligned is None else [*left, *aligned.inverted]
+    doubtful = [] if aligned is None else [*left, *aligned.inverted, *aligned.rate_factors]
     levels = ["peak dBFS", "noise dB re peak"]
     columns = ["recording", "state", "length s", "rate Hz", *levels, "clipped", "onset s", "2nd impact s"]
     rows = [

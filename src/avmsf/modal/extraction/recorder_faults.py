@@ -1,0 +1,124 @@
+"""Faults of recorders and editors that the modes of all recordings show: other rates, fades, gates, automatic gain."""
+
+import math
+from functools import partial
+from itertools import product
+
+import torch
+from jaxtyping import Float64
+from scipy.special import stdtr
+from torch import Tensor
+
+from avmsf.capture.impacts import Impacts
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.extraction.least_squares import fit_gains
+from avmsf.modal.synthesis import synthesize
+
+_RATES_HZ = (8000, 11025, 12000, 16000, 22050, 24000, 32000, 44100, 48000, 88200, 96000, 176400, 192000)
+"""Sample rates of recorders and files."""
+_OTHERS_SHARE = 0.01
+"""Least part of the others' energy that a mode of theirs has, mean over them."""
+_SLICES = 12
+"""Of each sound, in which levels are compared."""
+_SURROGATES = 8
+"""Sounds of the same modes and other noise that each recording is compared with."""
+_FALSE_ALARM = 1e-3
+"""Probability that a capture without the fault is said to have it."""
+
+
+def rate_factors(modes: Extraction, impacts: Impacts) -> dict[str, float]:
+    """Return by how much all modes of a recording are higher than the others', for each in which they are.
+
+    `modes` are those of all the aligned `impacts`. A recording is one of them where the modes of the others explain
+    less than half of its energy, and explain half of it or more with all frequencies and dampings times the ratio of
+    two usual sample rates, the best of these: its file gives another rate than it was recorded at.
+    """
+    power = (modes.gains.double().square() + modes.quadrature.double().square()) / modes.bank.damping
+    power = power / power.sum(1, keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
+    ratios = sorted({one / other for one, other in product(_RATES_HZ, _RATES_HZ)} - {1.0})
+    found = {}
+    for row, name in enumerate(impacts.names):
+        theirs = (power.sum(0) - power[row]) / max(1, len(power) - 1) >= _OTHERS_SHARE
+        bank = ModalBank(modes.bank.frequency[theirs], modes.bank.damping[theirs])
+        explained = partial(_explained, impacts.sounds[row : row + 1].double(), bank, impacts.sample_rate)
+        if len(bank) == 0 or explained(1.0) >= 0.5:
+            continue
+        best = max(ratios, key=explained)
+        if explained(best) >= 0.5:
+            found[name] = best
+    return found
+
+
+def uneven_decay(modes: Extraction, impacts: Impacts) -> float | None:
+    """Return by how many dB a slice sounds fall more than decaying modes with noise do; None where they do not.
+
+    The energy of damped modes and stationary noise falls ever slower, apart from beats and the noise's chance. So for
+    each recording the largest growth of the fall between slices is compared with that of its own modes with noise of
+    its residual's spectrum in random phases (surrogate data: Theiler et al., Physica D 58, 1992): Student's test over
+    recordings. A fade-out or a noise gate makes sounds fall faster, which no object does. `modes` are those of all the
+    aligned `impacts`.
+    """
+    size = impacts.sounds.shape[1] // _SLICES
+    sounds = impacts.sounds[:, : _SLICES * size].double()
+    modal = _modal(sounds, modes.bank, impacts.sample_rate)
+    half = (sounds - modal)[:, -(_SLICES // 2) * size :]
+    spectrum, generator = torch.fft.rfft(half).abs(), torch.Generator().manual_seed(0)
+    usual = torch.zeros(len(sounds), dtype=torch.float64)
+    for _ in range(_SURROGATES):
+        phase = 2 * math.pi * torch.rand(spectrum.shape, generator=generator, dtype=torch.float64)
+        noise = torch.fft.irfft(torch.polar(spectrum, phase), half.shape[1]).repeat(1, 2)
+        usual += _fall_growth(modal + noise) / _SURROGATES
+    return _surely_positive(_fall_growth(sounds) - usual)
+
+
+def noise_drop(modes: Extraction, impacts: Impacts) -> float | None:
+    """Return by how many dB noise is louder before the impacts than what modes leave after them; None where it is not.
+
+    What modes leave is the noise, and more where they do not explain all. It is less where an automatic gain turns
+    itself down at the impact. Compared are the first half of what is kept before the onset and the second to sixth
+    twelfth of the sounds: Student's test over recordings. `impacts` are not yet aligned.
+    """
+    if impacts.before is None or not bool(torch.isfinite(impacts.before[:, : impacts.before.shape[1] // 2]).all()):
+        return None
+    before = impacts.before[:, : impacts.before.shape[1] // 2].double().square().mean(1)
+    sounds = modes.aligned(impacts).sounds.double()
+    left = (sounds - _modal(sounds, modes.bank, impacts.sample_rate)).square()
+    part = left.shape[1] // _SLICES
+    after = left[:, part : _SLICES // 2 * part].mean(1)
+    silent = torch.minimum(before, after) <= 1e-14 * sounds.square().amax(1)
+    return None if bool(silent.any()) else _surely_positive(10 * torch.log10(before / after))
+
+
+def _surely_positive(values: Float64[Tensor, " contacts"]) -> float | None:
+    """Return the mean over recordings where it is above zero by more than chance, else None."""
+    mean, error = float(values.mean()), float(values.std()) / math.sqrt(len(values))
+    return mean if stdtr(len(values) - 1, -mean / max(error, 1e-9)) < _FALSE_ALARM else None
+
+
+def _explained(
+    sounds: Float64[Tensor, "contacts samples"], bank: ModalBank, sample_rate: float, factor: float
+) -> float:
+    """Return the part of the energy that modes explain with frequencies and dampings times a factor."""
+    kept = factor * bank.frequency < sample_rate / 2
+    scaled = ModalBank(factor * bank.frequency[kept], factor * bank.damping[kept])
+    return 1.0 - float((sounds - _modal(sounds, scaled, sample_rate)).square().sum() / sounds.square().sum())
+
+
+def _fall_growth(sounds: Float64[Tensor, "contacts samples"]) -> Float64[Tensor, " contacts"]:
+    """Return by how many dB a slice each sound falls at most more than before."""
+    power = sounds.reshape(len(sounds), _SLICES, -1).square().mean(2)
+    # Digital silence is taken for a rounding error of single precision.
+    level = 10 * torch.log10(power.clamp_min(1e-14 * power.amax(1, keepdim=True)))
+    fall = -level.diff(dim=1)
+    return (fall - fall.cummin(1).values).amax(1)
+
+
+def _modal(
+    sounds: Float64[Tensor, "contacts samples"], bank: ModalBank, sample_rate: float
+) -> Float64[Tensor, "contacts samples"]:
+    """Return what modes explain of sounds, by least squares."""
+    gains, quadrature = fit_gains(sounds, bank, sample_rate=sample_rate)
+    return synthesize(
+        gains, bank.frequency, bank.damping, samples=sounds.shape[1], sample_rate=sample_rate, quadrature=quadrature
+    )

@@ -1,0 +1,86 @@
+"""Faults of recorders and editors are found in recordings that have them, and not in those that beat and hiss."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from avmsf.capture.impacts import Impacts
+from avmsf.modal.extraction.extract import Extraction, extract_modes
+from avmsf.modal.extraction.finders import HighResolution
+from avmsf.modal.extraction.recorder_faults import noise_drop, rate_factors, uneven_decay
+
+RATE, SAMPLES, LEAD, COUNT = 16000.0, 6000, 320, 10
+# The first two beat within the sounds.
+FREQUENCY = torch.tensor([431.0, 436.0, 902.5, 1370.0, 2204.0, 3317.0], dtype=torch.float64)
+DAMPING = torch.tensor([12.0, 13.0, 18.0, 15.0, 30.0, 40.0], dtype=torch.float64)
+
+
+def files(factors: Tensor) -> Tensor:
+    """Return recordings with noise, impacts after `LEAD` samples, each one's frequencies and dampings by its factor."""
+    generator = torch.Generator().manual_seed(4)
+    gains = torch.randn(COUNT, 6, dtype=torch.float64, generator=generator)
+    time = torch.arange(-LEAD, SAMPLES, dtype=torch.float64)[None, :, None] / RATE * factors[:, None, None]
+    waves = torch.exp(-DAMPING * time.clamp(min=0)) * (2 * math.pi * FREQUENCY * time).sin() * (time >= 0)
+    return waves @ gains[:, :, None] + 0.003 * torch.randn(
+        COUNT, LEAD + SAMPLES, 1, dtype=torch.float64, generator=generator
+    )
+
+
+def recorded(sounds: Tensor) -> tuple[Extraction, Impacts]:
+    sounds = sounds[:, :, 0].float()
+    impacts = Impacts(
+        contacts=torch.zeros(COUNT, 3),
+        sounds=sounds[:, LEAD:].contiguous(),
+        sample_rate=RATE,
+        names=tuple(f"{row:03d}.wav" for row in range(COUNT)),
+        before=sounds[:, :LEAD].contiguous(),
+        after=torch.zeros(COUNT, 0),
+    )
+    return extract_modes(impacts, HighResolution(modes=32)), impacts
+
+
+ONES, TIME = torch.ones(COUNT, dtype=torch.float64), torch.arange(-LEAD, SAMPLES)[:, None] / SAMPLES
+
+
+def gained_automatically(sounds: Tensor) -> Tensor:
+    """Turn the gain down by 26 dB at the impact, and up again within .1 s."""
+    return sounds * torch.where(TIME < 0, 1.0, 1 - 0.95 * torch.exp(-TIME.clamp(min=0) * SAMPLES / RATE / 0.1))
+
+
+def test_right_recordings_have_no_fault() -> None:
+    modes, impacts = recorded(files(ONES))
+    aligned = modes.aligned(impacts)
+    assert rate_factors(modes, aligned) == {}
+    assert uneven_decay(modes, aligned) is None
+    assert noise_drop(modes, impacts) is None
+
+
+@pytest.mark.parametrize("factor", [48 / 44.1, 0.5])
+def test_a_recording_of_another_rate_is_named_with_the_ratio(factor: float) -> None:
+    factors = ONES.clone()
+    factors[3] = factor
+    modes, impacts = recorded(files(factors))
+    assert rate_factors(modes, modes.aligned(impacts)) == {"003.wav": pytest.approx(factor)}
+
+
+def test_a_fade_out_and_a_noise_gate_are_no_decays() -> None:
+    fade = (2 * (1 - TIME)).clamp(max=1.0)
+    gate = (TIME < 0.4).double()
+    for envelope in (fade, gate):
+        modes, impacts = recorded(files(ONES) * envelope)
+        found = uneven_decay(modes, modes.aligned(impacts))
+        assert found is not None
+        assert found > 3.0
+
+
+def test_an_automatic_gain_leaves_less_noise_after_the_impact_than_before() -> None:
+    modes, impacts = recorded(gained_automatically(files(ONES)))
+    found = noise_drop(modes, impacts)
+    assert found is not None
+    assert 3.0 < found < 26.0
+    # What is not known before the impact cannot be compared.
+    assert impacts.before is not None
+    assert noise_drop(modes, replace(impacts, before=torch.full_like(impacts.before, torch.nan))) is None
