@@ -12,7 +12,7 @@ from avmsf.cli.demofolder import RECORD, replaced_whole
 from avmsf.config import CACHE
 from avmsf.errors import AvmsfError, DatasetError, EvaluationError, ExportError
 from avmsf.export.packedarrays import read_manifest
-from avmsf.export.written import MANIFEST, write_folder
+from avmsf.export.written import MANIFEST
 from avmsf.pipeline.stages import StageFolder
 from avmsf.studio.strikefiles import JOURNAL, StrikeFiles
 
@@ -24,10 +24,6 @@ def read_lines(path: Path) -> None:
     read_contacts(path)
 
 
-def write_over(path: Path) -> None:
-    write_folder(path.parent, lambda folder: None, {})
-
-
 @pytest.mark.parametrize(
     ("name", "read", "kind"),
     [
@@ -36,7 +32,6 @@ def write_over(path: Path) -> None:
         ("space.json", MaterialSpace.load, EvaluationError),
         (IDENTITY, lambda path: ResultsFolder(path.parent).identity(), EvaluationError),
         (MANIFEST, lambda path: read_manifest(path.parent), ExportError),
-        (MANIFEST, write_over, ExportError),
     ],
 )
 def test_a_nested_file_is_refused(

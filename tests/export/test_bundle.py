@@ -100,19 +100,6 @@ def test_strikes_of_another_rate_are_refused() -> None:
         make_bundle(struck_table(shared=True), strikes=strikes)
 
 
-def test_a_bundle_is_replaced_and_nothing_else_is(tmp_path: Path) -> None:
-    folder = tmp_path / "page"
-    write_bundle(struck_table(shared=True), folder, object=ball_surface())
-    write_bundle(struck_table(shared=False), folder)
-    assert sorted(path.name for path in folder.iterdir()) == ["field.bin", "manifest.json"]
-    assert tensors(folder)["damping"].ndim == 2
-    (folder / "mine.txt").write_text("kept")
-    with raises(ExportError, file=folder, name="--overwrite"):
-        write_bundle(struck_table(shared=True), folder)
-    assert (folder / "mine.txt").read_text() == "kept"
-    assert [path.name for path in tmp_path.iterdir()] == ["page"]
-
-
 def test_a_field_of_which_nothing_is_heard_is_refused() -> None:
     table = struck_table(shared=True)
     silent = replace(

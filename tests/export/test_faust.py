@@ -140,9 +140,7 @@ def test_the_table_has_each_contacts_place(tmp_path):
         rows = list(csv.DictReader(file))
     assert [int(row["contact"]) for row in rows] == list(range(POINTS))
     assert torch.equal(torch.tensor([[float(row[axis]) for axis in "xyz"] for row in rows]), field.points)
-    # Its own is replaced, also by one of other contacts; another's is not, and then the program is not written either.
-    write_faust(field.take(torch.tensor([3, 1])), path)
-    assert len(place.read_text().splitlines()) == 3
+    # Where a table exists, the program is not written either.
     path.unlink()
     place.write_text("contact,who\n")
     with raises(ExportError, file=place, name="--overwrite"):

@@ -77,7 +77,7 @@ def run(options: Options) -> int:
     print_result(text, values, json=options.json)
     next_step(_following(options))
     if options.to == "wavs" and len(options.forces) == 1:
-        next_step("the same command with --forces 0.3 1 3, for a layer at each force")
+        next_step("the same command with --overwrite --forces 0.3 1 3, for a layer at each force")
     return 0
 
 
@@ -249,7 +249,7 @@ def _gltf(field: SoundField | SampledField, options: Options) -> Written:
     cloud = _gaussians(source, meters, sampled)
     if cloud is not None and isinstance(source, Path):
         beside, content = options.output.with_suffix(".gaussians.ply"), source.read_bytes()
-        expect_free(beside, content, force=options.overwrite)
+        expect_free(beside, force=options.overwrite)
         seen = Look.of_gaussians(cloud, sampled)
         written = write_gltf(sampled, options.output, look=seen, up=options.up, force=options.overwrite)
         copied = write_file(beside, content, force=options.overwrite)

@@ -101,7 +101,7 @@ def write_bundle(
 ) -> Written:
     """Write a field's bundle as a folder, atomically; the arguments are those of `make_bundle`.
 
-    An earlier bundle is replaced. Raises `ExportError` for another folder that is not empty, unless `force` is set.
+    Raises `ExportError` for a folder that is not empty, unless `force` is set.
     """
     bundle = make_bundle(
         field, object=object, meters=meters, surface=surface, strikes=strikes, limit=limit, live=live, mute=mute

@@ -45,7 +45,7 @@ def write_faust(field: SampledField, path: str | Path, *, noise: bool = True, fo
     elif field.noise.any():
         remarks.append("the residual noise is left out")
     table, contacts = contacts_path(path), _contacts(field).encode()
-    expect_free(table, contacts, force=force)
+    expect_free(table, force=force)
     sizes = write_file(path, text.encode(), force=force) | write_file(table, contacts, force=force)
     return Written(sizes, tuple(remarks))
 

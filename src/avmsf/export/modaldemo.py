@@ -18,7 +18,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.errors import ExportError
-from avmsf.export.bundle import write_files
 from avmsf.export.discs import discs
 from avmsf.export.formats import Precision
 from avmsf.export.normals import outward_normals
@@ -62,8 +61,8 @@ def write_demo(
 ) -> Written:
     """Write the demo's folder; where there is no `cloud` whose centers are the field's points, with a disc at each.
 
-    Modes have the field's level and start as cosines, whatever their phase is in the field. Other variants of the same
-    Gaussians stay in the folder. Raises `ExportError`, also where it holds variants of others.
+    Modes have the field's level and start as cosines, whatever their phase is in the field. With `force`, other
+    variants of the same Gaussians stay in the folder. Raises `ExportError`, also where it holds variants of others.
     """
     folder = Path(folder)
     shown = discs(field) if cloud is None else cloud
@@ -79,20 +78,16 @@ def write_demo(
     gains = _gains(field, precision)
     picking, places = _picking(field, shown)
     modal, tensors = _modal(field, gains)
-    others = _other_variants(folder, variant)
-    stay = bool(others) and _content(folder / PICKING) == picking
-    if others and not stay and not force:
+    others = sorted({path.parent.name for path in folder.glob(f"*/{MODAL}")} - {variant})
+    if others and _content(folder / PICKING) != picking:
         raise ExportError(
             f"{folder}: expected a free name, or variants of the same Gaussians, got {', '.join(others)} of others; "
-            "choose another folder, or add --overwrite to replace them",
+            "choose another folder",
             file=folder,
-            value=sorted(others),
+            value=others,
         )
-    kept = others if stay else {}
 
     def fill(place: Path) -> None:
-        for name, files in kept.items():
-            write_files(files, place / name)
         (place / PICKING).write_bytes(picking)
         write_splats(shown, place / SCENE)
         (place / variant).mkdir()
@@ -102,10 +97,10 @@ def write_demo(
         (place / variant / MANIFEST).write_text(json.dumps(sound, indent=1) + "\n")
 
     manifest = {"name": field.name, "count": len(field), "file": PICKING, "arrays": places, "scene": SCENE}
-    sizes = write_folder(folder, fill, {**manifest, "variants": sorted([variant, *kept])}, force=force)
+    sizes = write_folder(folder, fill, {**manifest, "variants": sorted([variant, *others])}, force=force)
     written = torch.from_numpy(gains.astype(np.float32))
     error = deviation(field, sine=None, cosine=written, damping=field.damping)
-    return Written(sizes, tuple(_remarks(field, kept, others)), error.waveform, error.spectrum_db)
+    return Written(sizes, tuple(_remarks(field, others)), error.waveform, error.spectrum_db)
 
 
 def _gains(field: SampledField, precision: Precision) -> Float[np.ndarray, "points modes"]:
@@ -137,15 +132,13 @@ def _modal(field: SampledField, gains: Float[np.ndarray, "points modes"]) -> tup
     return pack({"frequencies": frequency, "gains": gains, "dampings": damping})
 
 
-def _remarks(field: SampledField, kept: Collection[str], others: Collection[str]) -> list[str]:
+def _remarks(field: SampledField, others: Collection[str]) -> list[str]:
     """Return notes on the sound, and on the folder's other variants."""
     remarks = ["every mode starts as a cosine in the demo, with the field's level"]
     if field.noise.any():
         remarks.append("the residual noise is left out, since the demo has none")
-    if kept:
-        remarks.append(f"the folder's other variants are unchanged: {', '.join(kept)}")
-    elif others:
-        remarks.append(f"variants of other Gaussians cannot be used any more: {', '.join(others)}")
+    if others:
+        remarks.append(f"the folder's other variants are unchanged: {', '.join(others)}")
     return remarks
 
 
@@ -251,14 +244,6 @@ def _only_variant(folder: Path) -> str:
             value=found,
         )
     return found[0]
-
-
-def _other_variants(folder: Path, variant: str) -> dict[str, dict[str, bytes]]:
-    """Return the content of each variant's files in a folder, but for the one named."""
-    names = sorted(path.parent.name for path in folder.glob(f"*/{MODAL}"))
-    return {
-        name: {each: _content(folder / name / each) for each in (MANIFEST, MODAL)} for name in names if name != variant
-    }
 
 
 def _content(path: Path) -> bytes:

@@ -64,8 +64,7 @@ def write_webpage(
 ) -> Written:
     """Write a page that plays the field: one file if `output` ends in .html, otherwise a folder.
 
-    The arguments are those of `make_bundle`, whose errors are raised. Files that are not of an earlier export are
-    overwritten only with `force`.
+    The arguments are those of `make_bundle`, whose errors are raised. What exists is replaced only with `force`.
     """
     output = Path(output)
     bundle = make_bundle(field, object=object, meters=meters, surface=surface, strikes=strikes, limit=limit)

@@ -1,32 +1,17 @@
-"""Output of exports: atomic files and folders that do not overwrite other files, and notes on losses."""
+"""Output of exports: atomic files, and folders, that replace others only if asked to, and notes on losses."""
 
 import json
 import os
-import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from avmsf._utils.text_files import read_json
 from avmsf.errors import ExportError
 from avmsf.files import temporary_path, way_out, write_whole
 
 MANIFEST = "manifest.json"
-_READ = 4096
-"""Bytes at the beginning of a file that are searched for its generator."""
-_MADE_HERE = re.compile(
-    rb"""
-      ^//\ .*\ as\ exported\ by\ avmsf\ \d    # Faust
-    | \Acontact,x,y,z\r?\n0,             # contacts of Faust
-    | "asset":\{[^{}]*"generator":"avmsf\ \d   # glTF
-    | ^\ *151\ *\r?\n(.*\r?\n){5}avmsf\ \d           # universal, in its header
-    | ^<!--\ avmsf\ \d[^\ ]*\ -->$            # a page
-    """,
-    re.MULTILINE | re.VERBOSE,
-)
-"""Marks of files that an export wrote, by format."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,24 +58,29 @@ def no_modes(path: Path | None = None) -> ExportError:
 
 
 def write_file(path: Path, content: bytes, *, force: bool = False) -> dict[Path, int]:
-    """Write one file atomically and return its size. Raises `ExportError` if another program's file exists there.
-
-    A file counts as an export's if its first kilobytes contain the mark of its format, or if it has this content
-    already.
-    """
-    expect_free(path, content, force=force)
+    """Write one file atomically and return its size. Raises `ExportError` if it exists, unless `force` is set."""
+    expect_free(path, force=force)
     write_whole(path, lambda place: place.write_bytes(content), raising=ExportError)
     return {path: len(content)}
 
 
-def expect_free(path: Path, content: bytes, *, force: bool = False) -> None:
-    """Raise `ExportError` if `write_file` would."""
-    if path.is_dir():
+def expect_free(path: Path, *, folder: bool = False, force: bool = False) -> None:
+    """Raise `ExportError` if `write_file`, or `write_folder`, would for what exists there."""
+    if not path.exists():
+        return
+    if path.is_dir() != folder:
+        wanted, found = ("folder", "file") if folder else ("file", "folder")
         raise ExportError(
-            f"{path}: expected the name of a file, got a folder; name a file in it", file=path, value="folder"
+            f"{path}: expected a free name, or a {wanted}, got a {found}; choose another name", file=path, value=found
         )
-    if path.exists() and not force and not _made_here(path) and path.read_bytes() != content:
-        raise _foreign(path, "a file")
+    if not force and not (folder and not any(path.iterdir())):
+        found = "a folder with files" if folder else "a file"
+        raise ExportError(
+            f"{path}: expected a free name, got {found}; choose another, or add --overwrite to replace it",
+            file=path,
+            name="--overwrite",
+            value=found,
+        )
 
 
 def write_folder(
@@ -98,79 +88,25 @@ def write_folder(
 ) -> dict[Path, int]:
     """Let `fill` write files into a temporary folder, add the manifest, and move all to `folder`; return the sizes.
 
-    The manifest lists the files. A folder with no other files than its manifest lists is replaced as a whole. Other
-    folders that are not empty are written to only with `force`, file by file, and nothing in them is removed. A link is
-    followed. Raises `ExportError`.
+    The manifest lists the files. With `force` they replace those of the same names, and others stay. Raises
+    `ExportError` for a folder with files, unless `force` is set.
     """
-    place = folder.resolve()
-    if folder.exists() and not folder.is_dir():
-        raise ExportError(
-            f"{folder}: expected a folder, or a free name, got a file; choose another", file=folder, value="file"
-        )
-    ours = not folder.exists() or not any(folder.iterdir()) or _folder_made_here(folder)
-    if not ours and not force:
-        raise _foreign(folder, "a folder with files")
+    expect_free(folder, folder=True, force=force)
     try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        temporary = temporary_path(place)
-        temporary.mkdir()
+        temporary = temporary_path(folder.resolve())
+        temporary.mkdir(parents=True)
         try:
             fill(temporary)
             names = sorted(str(path.relative_to(temporary)) for path in temporary.rglob("*") if path.is_file())
             content = {"generator": generator(), **manifest, "files": [*names, MANIFEST]}
             (temporary / MANIFEST).write_text(json.dumps(content, indent=1) + "\n")
             sizes = {folder / name: (temporary / name).stat().st_size for name in [*names, MANIFEST]}
-            _place(temporary, place, whole=ours)
+            for path in sizes:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                os.replace(temporary / path.relative_to(folder), path)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
     except OSError as error:
         reason = error.strerror or str(error)
         raise ExportError.expected("a writable folder", reason, file=folder, advice=way_out(error)) from error
     return sizes
-
-
-def _place(temporary: Path, folder: Path, *, whole: bool) -> None:
-    if not whole:
-        for path in sorted(temporary.rglob("*")):
-            if path.is_file():
-                place = folder / path.relative_to(temporary)
-                place.parent.mkdir(parents=True, exist_ok=True)
-                os.replace(path, place)
-        return
-    if folder.exists():
-        # A folder cannot be replaced atomically: the old one is renamed until the new one is in place.
-        aside = temporary.with_suffix(".old")
-        os.replace(folder, aside)
-        try:
-            os.replace(temporary, folder)
-        except OSError:
-            os.replace(aside, folder)
-            raise
-        shutil.rmtree(aside, ignore_errors=True)
-    else:
-        os.replace(temporary, folder)
-
-
-def _made_here(path: Path) -> bool:
-    with path.open("rb") as file:
-        return _MADE_HERE.search(file.read(_READ)) is not None
-
-
-def _folder_made_here(folder: Path) -> bool:
-    """Return whether a folder has only files that the manifest of an export lists."""
-    try:
-        manifest = read_json(folder / MANIFEST)
-        listed = set(manifest["files"]) if manifest["generator"].startswith("avmsf ") else set()
-    except (OSError, ValueError, TypeError, KeyError, AttributeError):
-        return False
-    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()} <= listed
-
-
-def _foreign(path: Path, what: str) -> ExportError:
-    return ExportError(
-        f"{path}: expected a free name or an earlier export, got {what} that no export wrote; choose another name, or "
-        "add --overwrite to replace files of the same names",
-        file=path,
-        name="--overwrite",
-        value=what,
-    )

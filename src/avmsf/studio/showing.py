@@ -88,7 +88,14 @@ class Showcase:
             mute = revision.field is None
             surface = self._surface(revision.field) if fresh else None
             remarks += write_bundle(
-                sampled, path, object=shown, meters=self.meters, surface=surface, strikes=strikes, mute=mute
+                sampled,
+                path,
+                object=shown,
+                meters=self.meters,
+                surface=surface,
+                strikes=strikes,
+                mute=mute,
+                force=True,
             ).remarks
             manifest = json.loads((path / "manifest.json").read_text(encoding="utf-8"))
             manifest["name"] = revision.name or manifest["name"] or self.opened.name

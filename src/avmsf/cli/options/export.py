@@ -96,7 +96,7 @@ class Options(Printing):
     unit: Unit = "m"
     """Unit of --position and --contact-table."""
     overwrite: Flag = False
-    """Replace files that no export wrote. Files of other names are not changed."""
+    """Replace files that exist. Files of other names in a folder are not changed."""
     forces: tuple[float, ...] = (1.0,)
     """wavs: forces of the layers, in newtons if the field knows forces, otherwise relative; written from soft to
     loud."""
