@@ -3,6 +3,7 @@
 import asyncio
 import gc
 import json
+import subprocess
 import sys
 import time
 from collections.abc import Awaitable, Callable, Iterator
@@ -197,20 +198,32 @@ def alive(process: int) -> bool:
     return state != "Z"
 
 
-CHILDREN = (
-    "child = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'])\n"
-    "say(processes=[os.getpid(), child.pid])\n"
-)
+def gone(processes: list[int]) -> bool:
+    deadline = time.monotonic() + 10
+    while any(map(alive, processes)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return not any(map(alive, processes))
+
+
+LIFELINE = """
+import threading
+from avmsf._utils.children import end_with_parent, start_child
+threading.Thread(target=end_with_parent, daemon=True).start()
+"""
+WAITS = f"{LIFELINE}import time; time.sleep(60)"
+PAIR = f"child = start_child([sys.executable, '-c', {WAITS!r}])\nsay(processes=[os.getpid(), child.pid])\n"
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="processes are looked up in /proc")
-@pytest.mark.parametrize("stubborn", ["", "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"])
-def test_cancelling_ends_all_processes(stubborn: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("begin", [LIFELINE, "from avmsf._utils.children import start_child\n"])
+def test_cancelling_ends_all_processes_also_of_one_that_does_not_end_itself(
+    begin: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("avmsf.studio.jobs._GRACE", 0.3)
 
     async def cancel() -> list[Any]:
         jobs = Jobs()
-        job = jobs.start("test", {}, same, script(f"{stubborn}{CHILDREN}time.sleep(60)"))
+        job = jobs.start("test", {}, same, script(f"{begin}{PAIR}time.sleep(60)"))
         async for _ in job.listen():
             break
         await job.cancel()
@@ -220,15 +233,14 @@ def test_cancelling_ends_all_processes(stubborn: str, monkeypatch: pytest.Monkey
     first, last = run_async(cancel())
     assert time.monotonic() - begun < 5
     assert last == {"stage": "cancelled", "words": "stopped"}
-    time.sleep(0.05)
-    assert not any(alive(process) for process in first["processes"])
+    assert gone(first["processes"])
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="processes are looked up in /proc")
 def test_closing_ends_what_runs() -> None:
     async def close() -> list[Any]:
         jobs = Jobs()
-        job = jobs.start("test", {}, same, script(f"{CHILDREN}time.sleep(60)"))
+        job = jobs.start("test", {}, same, script(f"{LIFELINE}{PAIR}time.sleep(60)"))
         async for _ in job.listen():
             break
         await jobs.close()
@@ -236,8 +248,7 @@ def test_closing_ends_what_runs() -> None:
 
     first, last = run_async(close())
     assert last["stage"] == "cancelled"
-    time.sleep(0.05)
-    assert not any(alive(process) for process in first["processes"])
+    assert gone(first["processes"])
 
 
 def test_one_job_runs_at_a_time() -> None:
@@ -259,30 +270,17 @@ def test_one_job_runs_at_a_time() -> None:
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="processes are looked up in /proc")
-def test_a_worker_ends_where_its_server_was_killed() -> None:
-    source = "from avmsf.studio.lifeline import end_with_server\nimport os, time, threading\n"
-    source += "threading.Thread(target=end_with_server).start()\nprint(os.getpid(), flush=True)\ntime.sleep(60)"
-    command = [sys.executable, "-c", source]
-
-    async def orphan() -> int:
-        process = await asyncio.create_subprocess_exec(
-            *command, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, start_new_session=True
-        )
-        assert process.stdin is not None
+def test_a_worker_and_its_processes_end_where_its_server_was_killed() -> None:
+    worker = [*script(f"{LIFELINE}{PAIR}time.sleep(60)")]
+    server = f"import subprocess, time\nsubprocess.Popen({worker!r}, stdin=subprocess.PIPE)\ntime.sleep(60)"
+    with subprocess.Popen([sys.executable, "-c", server], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
-        number = int(await process.stdout.readline())
-        # As long as the server lives nothing happens to it.
-        with pytest.raises(TimeoutError):
-            await asyncio.wait_for(asyncio.shield(ending := asyncio.ensure_future(process.wait())), 0.3)
-        assert alive(number)
-        process.stdin.close()
-        status = await asyncio.wait_for(ending, 10)
-        # The loop must not end before the pipes have.
-        await process.communicate()
-        await asyncio.sleep(0.05)
-        return status
-
-    assert run_async(orphan()) == -9
+        processes = json.loads(process.stdout.readline())["processes"]
+        # As long as the server lives nothing happens to them.
+        time.sleep(0.3)
+        assert all(map(alive, processes))
+        process.kill()
+    assert gone(processes)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ import json
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -20,6 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from avmsf._utils.children import end_child, ending_of, start_child
 from avmsf.capture.filenames import PICTURE_SUFFIXES, pictures_in
 from avmsf.capture.views.pictures import Picture, PictureSizeError, read_mask, read_picture
 from avmsf.capture.warning import Remark
@@ -246,9 +246,7 @@ def _run_worker(begun: Path, *, timeout: float, progress: Callable[[MotionProgre
     command = [sys.executable, "-P", str(WORKER), str(begun / "job.json")]
     with open(log, "wb") as output:
         try:
-            worker = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
-            )
+            worker = start_child(command, stdout=output, stderr=subprocess.STDOUT)
         except OSError as error:
             raise CaptureError.expected(
                 "a process for structure from motion", error.strerror, name="starting"
@@ -269,9 +267,9 @@ def _run_worker(begun: Path, *, timeout: float, progress: Callable[[MotionProgre
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     worker.wait(POLL)
         finally:
-            _end(worker)
+            end_child(worker)
     if worker.returncode != 0 or not (begun / "result.json").is_file():
-        stage, ending = _progress(log, 0.0).stage, _ending(worker.returncode)
+        stage, ending = _progress(log, 0.0).stage, ending_of(worker.returncode)
         advice = "where memory ran out, lower `features` or `longest`; " if ending == "SIGKILL" else ""
         raise CaptureError.expected(
             "structure from motion to end without an error",
@@ -282,28 +280,12 @@ def _run_worker(begun: Path, *, timeout: float, progress: Callable[[MotionProgre
         )
 
 
-def _end(worker: "subprocess.Popen[bytes]") -> None:
-    """Kill the worker and whatever it started."""
-    # A group outlives its leader, so it is asked to end even after that has.
-    with contextlib.suppress(ProcessLookupError, PermissionError):
-        os.killpg(worker.pid, signal.SIGKILL)
-    worker.wait()
-    if worker.stdin is not None:
-        worker.stdin.close()
-
-
 def _progress(log: Path, seconds: float) -> MotionProgress:
     text = log.read_text(encoding="utf-8", errors="replace")
     stage, _, rest = text.rpartition("stage ")[2].partition("\n")
     steps = re.findall(r"\[(\d+)/(\d+)", rest)
     done, total = (int(number) for number in steps[-1]) if steps else (0, 0)
     return MotionProgress(stage if "stage " in text else "starting", done, total, seconds)
-
-
-def _ending(code: int) -> str:
-    if code >= 0:
-        return f"exit status {code}"
-    return signal.Signals(-code).name
 
 
 def _last_lines(log: Path, count: int = 6) -> str:

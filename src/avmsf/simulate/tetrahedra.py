@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float64
 
+from avmsf._utils.children import end_child, start_child
 from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
 from avmsf.geometry.closest import Closest, ClosestPoints
@@ -86,9 +87,11 @@ def _tetrahedralize(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarr
         # -P keeps this folder, whose modules have common names, from where the worker looks for libraries.
         command = [sys.executable, "-P", str(WORKER), str(job), str(result)]
         single = os.environ | {"OMP_NUM_THREADS": "1"}
-        try:
+        with open(Path(name) / "log", "wb") as log:
             # fTetWild leaves a file of its own where it runs.
-            ended = subprocess.run(command, capture_output=True, timeout=timeout, env=single, cwd=name, check=False)
+            ended = start_child(command, stdout=log, stderr=log, env=single, cwd=name)
+        try:
+            ended.wait(timeout)
         except subprocess.TimeoutExpired as error:
             raise SimulationError(
                 f"expected tetrahedra of {len(skin.faces)} triangles within {timeout:g} s, got none; simplify the "
@@ -96,8 +99,11 @@ def _tetrahedralize(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarr
                 name="timeout",
                 value=timeout,
             ) from error
+        finally:
+            end_child(ended)
         if ended.returncode != 0 or not result.is_file():
-            last = ended.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["no message"]
+            words = (Path(name) / "log").read_text(encoding="utf-8", errors="replace")
+            last = words.strip().splitlines()[-1:] or ["no message"]
             raise SimulationError(
                 f"pytetwild: expected exit status 0, got {ended.returncode} ({last[0][:200]}); simplify the mesh, or "
                 "change detail or the degrees of freedom",

@@ -7,14 +7,13 @@ standard input stays open as long as the server lives, so that the process ends 
 import asyncio
 import contextlib
 import json
-import os
 import secrets
-import signal
 import sys
 import traceback
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from typing import Any
 
+from avmsf._utils.children import ending_of
 from avmsf._utils.text import printable
 from avmsf.errors import AvmsfError
 from avmsf.studio.refusal import RefusedError
@@ -28,7 +27,7 @@ WORKER = (sys.executable, "-m", "avmsf.studio.worker")
 _LINE = 1 << 22
 """Bytes of one line, at most."""
 _GRACE = 3.0
-"""Seconds that a process has to end by itself."""
+"""Seconds that a process has to end once its standard input is closed."""
 _LAST_WORDS = 4000
 """Characters of the process's standard error that are kept."""
 
@@ -44,11 +43,11 @@ class Job:
         self.ended = False
         self._cancelled = self._finishing = False
         self._heard = asyncio.Condition()
-        self._process: asyncio.subprocess.Process | None = None
+        self._task: asyncio.Task[Any] | None = None
 
     async def run(self) -> None:
         """Run to the end; the last event has the outcome."""
-        last = _STOPPED
+        last, self._task = _STOPPED, asyncio.current_task()
         try:
             last = await self._work()
         except AvmsfError as error:
@@ -60,7 +59,6 @@ class Job:
             words = " ".join(f"{type(error).__name__}: {error}".split())[:_LAST_WORDS]
             last = {"error": f"{self.kind} failed ({words}); see the server's terminal, and start it again"}
         finally:
-            self._end_process(signal.SIGKILL)
             await self._tell(last, last=True)
 
     async def cancel(self) -> bool:
@@ -70,14 +68,10 @@ class Job:
         """
         if self.ended:
             return False
-        if not self._finishing:
+        if not self._finishing and not self._cancelled:
             self._cancelled = True
-            self._end_process(signal.SIGTERM)
-            for _ in range(round(_GRACE / 0.05)):
-                if self._process is None or self._process.returncode is not None:
-                    break
-                await asyncio.sleep(0.05)
-            self._end_process(signal.SIGKILL)
+            if self._task is not None:
+                self._task.cancel()
         async with self._heard:
             await self._heard.wait_for(lambda: self.ended)
         return self._cancelled
@@ -96,20 +90,13 @@ class Job:
                 return
 
     async def _work(self) -> Event:
-        self._process = process = await asyncio.create_subprocess_exec(
-            *self.command,
-            stdin=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.PIPE,
-            limit=_LINE,
-            # A group of its own, so that what it starts in turn ends with it, and Ctrl-C reaches the server alone.
-            start_new_session=True,
-        )
+        if self._cancelled:
+            return _STOPPED
+        pipe = asyncio.subprocess.PIPE
+        process = await asyncio.create_subprocess_exec(*self.command, stdin=pipe, stdout=pipe, stderr=pipe, limit=_LINE)
         assert process.stdin is not None
         assert process.stdout is not None
         assert process.stderr is not None
-        if self._cancelled:
-            self._end_process(signal.SIGKILL)
         said = asyncio.create_task(_last_words(process.stderr))
         result: Event | None = None
         try:
@@ -125,23 +112,20 @@ class Job:
                     result = event
                 else:
                     await self._tell(event)
-            status = await process.wait()
-        except BaseException:
-            self._end_process(signal.SIGKILL)
-            # A process is not over for the loop before what it wrote is read.
-            while await process.stdout.read(1 << 16):
-                pass
-            await said
-            raise
+            await process.wait()
         finally:
+            # The process ends with what it has started when its standard input closes.
             process.stdin.close()
-        words = await said
-        if self._cancelled:
-            return _STOPPED
+            try:
+                await asyncio.wait_for(_last_words(process.stdout), _GRACE)
+            except TimeoutError:
+                with contextlib.suppress(ProcessLookupError):
+                    process.kill()
+            words, status = await said, await process.wait()
         if result is None and status < 0:
             print(printable(words), end="", file=sys.stderr)
             return {
-                "error": f"{self.kind} was stopped by the system or crashed ({_signal_name(-status)}); close other "
+                "error": f"{self.kind} was stopped by the system or crashed ({ending_of(status)}); close other "
                 "programs if memory is short, and start it again"
             }
         if result is None:
@@ -157,14 +141,6 @@ class Job:
             self.events.append(event)
             self.ended = last
             self._heard.notify_all()
-
-    def _end_process(self, how: signal.Signals) -> None:
-        process = self._process
-        if process is not None and process.returncode is None:
-            try:
-                os.killpg(process.pid, how)
-            except ProcessLookupError:
-                return
 
 
 class Jobs:
@@ -218,13 +194,6 @@ class Jobs:
             await self.current.cancel()
         if self._running is not None:
             await asyncio.gather(self._running, return_exceptions=True)
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:  # a real-time signal has no name
-        return f"signal {number}"
 
 
 def _understand(line: bytes) -> Event | None:

@@ -8,6 +8,7 @@ with all that it has started, when its standard input is closed.
 import json
 import math
 import os
+import signal
 import sys
 import threading
 import warnings
@@ -16,6 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TextIO
 
+from avmsf._utils.children import end_with_parent
 from avmsf._utils.memory import NO_MEMORY, lacks_memory
 from avmsf.capture import read_capture
 from avmsf.capture.settings import settings_of
@@ -31,7 +33,6 @@ from avmsf.pipeline.scene import ProgressListener, SceneStages
 from avmsf.pipeline.stages import StageFolder
 from avmsf.scene.lift import LiftProgress
 from avmsf.scene.splat import SplatProgress
-from avmsf.studio.lifeline import end_with_server
 from avmsf.studio.strikefiles import COMMAND
 from avmsf.tasks.config import GuidedEditConfig
 from avmsf.tasks.distillation import DecoderDistillation
@@ -156,7 +157,9 @@ def main() -> int:
     # What libraries print is no event.
     os.dup2(2, 1)
     task = json.loads(sys.stdin.readline())
-    threading.Thread(target=end_with_server, daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    # Ctrl-C is the server's, which ends this process.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     with warnings.catch_warnings():
         warnings.simplefilter("always", CaptureWarning)
         warnings.showwarning = lambda message, *rest, **more: voice.say({"stage": "note", "words": str(message)})
