@@ -23,8 +23,8 @@ from avmsf.field.uncertainty import coverage
 from avmsf.modal.extraction.extract import extract_modes
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.simulate.bodies import make_body
-from avmsf.simulate.material import material_named
-from avmsf.simulate.nominal import NOMINAL, nominal_bodies
+from avmsf.simulate.material import NOMINAL, material_named
+from avmsf.simulate.nominal import nominal_bodies
 from avmsf.simulate.sim20 import SIM20, sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from benchmarks.field import measured_parts

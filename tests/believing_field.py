@@ -16,7 +16,7 @@ from avmsf.field.soundfield import Origin, SoundField
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
 from avmsf.simulate.elastic import ElasticModes
-from avmsf.simulate.nominal import NOMINAL
+from avmsf.simulate.material import NOMINAL
 
 LENGTH, WIDTH = 0.4, 0.1
 SIZE = (LENGTH**2 + WIDTH**2) ** 0.5

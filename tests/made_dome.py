@@ -9,7 +9,8 @@ import torch
 from avmsf.capture.surface import Surface
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.elastic import ElasticModes, elastic_modes
-from avmsf.simulate.nominal import NOMINAL, NominalBody
+from avmsf.simulate.material import NOMINAL
+from avmsf.simulate.nominal import NominalBody
 from avmsf.simulate.shell import shell
 
 WALLS = (0.0015, 0.004, 0.01)

@@ -16,8 +16,7 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
 from avmsf.simulate.block import block
 from avmsf.simulate.elastic import elastic_modes
-from avmsf.simulate.material import CERAMIC, GLASS, PLASTIC, STEEL, WOOD, Material
-from avmsf.simulate.nominal import NOMINAL
+from avmsf.simulate.material import CERAMIC, GLASS, NOMINAL, PLASTIC, STEEL, WOOD, Material
 from avmsf.simulate.plate import Plate, plate_modes, sample_contacts
 from avmsf.simulate.vibration import rayleigh
 from avmsf.tasks.edits import silenced

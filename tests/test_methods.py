@@ -35,7 +35,8 @@ from avmsf.modal.synthesis import synthesize
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.block import block
 from avmsf.simulate.elastic import elastic_modes
-from avmsf.simulate.nominal import NOMINAL, NominalBodies, NominalBody
+from avmsf.simulate.material import NOMINAL
+from avmsf.simulate.nominal import NominalBodies, NominalBody
 from avmsf.simulate.shell import shell
 from plate_field import PLATE, QUICK, RATE, plate_extraction, plate_features, plate_impacts
 from raising import raises

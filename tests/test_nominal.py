@@ -13,7 +13,8 @@ from avmsf.errors import SimulationError
 from avmsf.simulate import nominal, nominalsolid
 from avmsf.simulate.block import block
 from avmsf.simulate.elastic import elastic_modes
-from avmsf.simulate.nominal import NOMINAL, NominalBody, nominal_bodies, refined
+from avmsf.simulate.material import NOMINAL
+from avmsf.simulate.nominal import NominalBody, nominal_bodies, refined
 from raising import raises
 
 

@@ -30,7 +30,7 @@ from avmsf.scene.features import FeatureField
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import write_splats
 from avmsf.simulate.elastic import elastic_modes
-from avmsf.simulate.nominal import NOMINAL
+from avmsf.simulate.material import NOMINAL
 from avmsf.simulate.shell import shell
 
 RATE = 8000

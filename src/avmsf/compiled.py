@@ -2,18 +2,18 @@
 
 import os
 import shutil
+import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from functools import cache
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
-import numba
-from numba.core import event
-
 _CACHE_BYTES = 50_000_000
 """Several times what all compiled loops take."""
+_BEFORE_THE_FIRST: list[Callable[[], None]] = []
+"""Called once numba is imported."""
 MAX_LANES = 8
 """Most threads that one kernel runs on: with more, handing out the work costs what they save (kernels take ms)."""
 
@@ -26,16 +26,35 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any
     `NUMBA_CACHE_DIR` names another.
     """
 
-    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        options.setdefault("nogil", True)
+    options.setdefault("nogil", True)
+    return lambda function: _Compiled(function, options)
+
+
+class _Compiled:
+    """A function that numba compiles; importing numba takes as long as much of what needs no loop."""
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        self.function, self.options = function, options
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.made(*arguments)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what numba's own function has, by which other compiled functions call it."""
+        return getattr(self.made, name)
+
+    @cached_property
+    def made(self) -> Callable[..., Any]:
+        import numba
+
+        while _BEFORE_THE_FIRST:
+            _BEFORE_THE_FIRST.pop()()
         try:
-            made: Callable[..., Any] = numba.njit(cache=_has_space(), **options)(function)
+            made: Callable[..., Any] = numba.njit(cache=_has_space(), **self.options)(self.function)
         except RuntimeError:
             # Numba looks for a folder at once, and raises this where it finds none.
-            made = numba.njit(**options)(function)
+            made = numba.njit(**self.options)(self.function)
         return made
-
-    return decorate
 
 
 def _has_space() -> bool:
@@ -51,17 +70,37 @@ def announced(tell: Callable[[str], None], meanwhile: Callable[[str], AbstractCo
 
     Nothing is reported where all is cached.
     """
-    with event.install_listener("numba:compile", _Announcer(tell, meanwhile)):
-        yield
+    with ExitStack() as stack:
+
+        def listen() -> None:
+            from numba.core import event
+
+            event.Listener.register(_Announcer)
+            stack.enter_context(event.install_listener("numba:compile", _Announcer(tell, meanwhile)))
+
+        if "numba" in sys.modules:
+            listen()
+        else:
+            _BEFORE_THE_FIRST.append(listen)
+        try:
+            yield
+        finally:
+            _BEFORE_THE_FIRST.clear()
 
 
-class _Announcer(event.Listener):
+class _Announcer:
     def __init__(self, tell: Callable[[str], None], meanwhile: Callable[[str], AbstractContextManager[None]]) -> None:
         self.tell, self.meanwhile, self.told = tell, meanwhile, set[str]()
         # A function is compiled within another that calls it; numba compiles in one thread at a time.
         self.running: list[AbstractContextManager[None]] = []
 
-    def on_start(self, event: event.Event) -> None:
+    def notify(self, event: Any) -> None:
+        if event.is_start:
+            self.on_start(event)
+        else:
+            self.running.pop().__exit__(None, None, None)
+
+    def on_start(self, event: Any) -> None:
         package, _, rest = event.data["dispatcher"].py_func.__module__.partition(".")
         part, ours = rest.partition(".")[0], package == __package__
         words = f"compiling {_PARTS.get(part, part)} for this processor (once; the result is cached)"
@@ -71,15 +110,14 @@ class _Announcer(event.Listener):
             self.told.add(part)
             self.tell(words)
 
-    def on_end(self, event: event.Event) -> None:
-        self.running.pop().__exit__(None, None, None)
-
 
 _PARTS = {"field": "the fit", "geometry": "distances", "modal": "the search for modes", "scene": "the rasterizer"}
 
 
 def lane_count() -> int:
     """Return how many threads a kernel runs on: as many as numba is given, `NUMBA_NUM_THREADS`, up to `MAX_LANES`."""
+    import numba
+
     return min(numba.get_num_threads(), MAX_LANES)
 
 

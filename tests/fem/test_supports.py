@@ -10,7 +10,7 @@ from avmsf.fem.supports import supports_of
 from avmsf.simulate.block import block
 from avmsf.simulate.elastic import elastic_modes
 from avmsf.simulate.elements import SecondOrder
-from avmsf.simulate.nominal import NOMINAL
+from avmsf.simulate.material import NOMINAL
 from avmsf.simulate.solid import Solid
 
 

@@ -8,9 +8,9 @@ from functools import partial
 import numpy as np
 import pytest
 
-from avmsf.fem.thickness import DISCREPANCY, largest_factor, search_thickness
-from avmsf.simulate.material import MATERIALS
-from avmsf.simulate.nominal import NOMINAL, NominalBody
+from avmsf.fem.thickness import search_thickness
+from avmsf.simulate.material import DISCREPANCY, MATERIALS, NOMINAL, largest_factor
+from avmsf.simulate.nominal import NominalBody
 from made_dome import bodies
 
 

@@ -17,7 +17,7 @@ from avmsf.field.gains.positional import Smooth, Unstructured
 from avmsf.simulate.block import block
 from avmsf.simulate.elastic import ElasticModes, elastic_modes
 from avmsf.simulate.elements import SecondOrder, elements_of
-from avmsf.simulate.nominal import NOMINAL
+from avmsf.simulate.material import NOMINAL
 from avmsf.simulate.solid import Solid
 
 MODES = 14

@@ -10,8 +10,8 @@ from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
 from avmsf.fem.walls import wall_of
 from avmsf.simulate.elastic import ElasticModes, elastic_modes
-from avmsf.simulate.material import STEEL
-from avmsf.simulate.nominal import NOMINAL, nominal_bodies
+from avmsf.simulate.material import NOMINAL, STEEL
+from avmsf.simulate.nominal import nominal_bodies
 from avmsf.simulate.nominalcheck import checked
 from avmsf.simulate.nominalsolid import count_dofs, filled_solid
 from avmsf.simulate.shapes import make_shape

@@ -11,8 +11,7 @@ from torch import Tensor
 from avmsf.bench.evaluation import evaluate
 from avmsf.capture import CaptureSettings, Impacts, read_capture
 from avmsf.cli.heartbeat import doing
-from avmsf.cli.modes import mode_table
-from avmsf.cli.modetable import levels, listed, mode_rows
+from avmsf.cli.modetable import levels, listed, mode_rows, mode_table
 from avmsf.cli.options.info import Options
 from avmsf.cli.printing import console, next_command, print_json, say
 from avmsf.cli.scores import body_warnings, outlier_words, quality_words, score_table, score_values

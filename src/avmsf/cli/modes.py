@@ -1,14 +1,13 @@
 """`avmsf modes`: the modes that a capture's recordings have in common."""
 
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 
 from avmsf.capture import read_capture
 from avmsf.cli.alignment import AlignmentReport
-from avmsf.cli.modetable import ModeRow, QualityRow, amplitudes, levels, listed, mode_rows, quality_rows
+from avmsf.cli.modetable import amplitudes, levels, listed, mode_rows, mode_table, quality_rows
 from avmsf.cli.options.checks import read_settings
 from avmsf.cli.options.modes import Options
-from avmsf.cli.printing import console, decimals, figure, next_command, print_json, say, table
+from avmsf.cli.printing import console, next_command, print_json, say
 from avmsf.cli.visuals import visual_inputs
 from avmsf.modal.extraction.extract import extract_modes
 from avmsf.modal.extraction.quality import measure_quality
@@ -66,21 +65,3 @@ def run(options: Options) -> int:
     verb = "reconstruct" if visual is not None and visual.reconstructs else "fit"
     next_command(f"avmsf {verb}", options.capture, "-o field.safetensors")
     return 0
-
-
-def mode_table(title: str, rows: Sequence[ModeRow], quality: Mapping[int, QualityRow] | None = None) -> object:
-    """Return modes for printing, with their quality by their numbers where it is known."""
-    columns = ["", "frequency Hz", "damping 1/s", "T60 s", "level dB"]
-    columns += [] if quality is None else ["energy", "phase", "orders", "left out"]
-    cells = []
-    for row in rows:
-        frequency, damping = decimals(row.frequency_hertz, 2), figure(row.damping_per_second)
-        cell = [str(row.number), frequency, damping, figure(row.t60_seconds), decimals(row.level_db, 1)]
-        if quality is not None:
-            how = quality[row.number]
-            cell[1] += f" ± {figure(how.frequency_spread_hertz, 2)}"
-            cell[2] += f" ± {figure(how.damping_spread_per_second, 2)}"
-            cell += [f"{100 * how.energy_share:.2f} %", decimals(how.phase_coherence, 2)]
-            cell += [f"{100 * how.stable_orders:.0f} %", f"{100 * how.explained_left_out:.0f} %"]
-        cells.append(cell)
-    return table(title, columns, cells)

@@ -1,13 +1,14 @@
 """Modes as a table, as `avmsf modes` and `avmsf info` print them."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf.cli.printing import decimals, figure, table
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.quality import ModeQuality
@@ -93,3 +94,21 @@ def levels(amplitudes: Float[Tensor, "contacts modes"]) -> Float[Tensor, " modes
 def amplitudes(extraction: Extraction) -> Float[Tensor, "contacts modes"]:
     """Return the modes' amplitudes in each recording, whatever their phase."""
     return torch.hypot(extraction.gains, extraction.quadrature)
+
+
+def mode_table(title: str, rows: Sequence[ModeRow], quality: Mapping[int, QualityRow] | None = None) -> object:
+    """Return modes for printing, with their quality by their numbers where it is known."""
+    columns = ["", "frequency Hz", "damping 1/s", "T60 s", "level dB"]
+    columns += [] if quality is None else ["energy", "phase", "orders", "left out"]
+    cells = []
+    for row in rows:
+        frequency, damping = decimals(row.frequency_hertz, 2), figure(row.damping_per_second)
+        cell = [str(row.number), frequency, damping, figure(row.t60_seconds), decimals(row.level_db, 1)]
+        if quality is not None:
+            how = quality[row.number]
+            cell[1] += f" ± {figure(how.frequency_spread_hertz, 2)}"
+            cell[2] += f" ± {figure(how.damping_spread_per_second, 2)}"
+            cell += [f"{100 * how.energy_share:.2f} %", decimals(how.phase_coherence, 2)]
+            cell += [f"{100 * how.stable_orders:.0f} %", f"{100 * how.explained_left_out:.0f} %"]
+        cells.append(cell)
+    return table(title, columns, cells)

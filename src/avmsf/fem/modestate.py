@@ -8,7 +8,7 @@ from torch import Tensor
 
 from avmsf._utils.records import count_of
 from avmsf.simulate.elastic import ElasticModes
-from avmsf.simulate.nominal import NOMINAL
+from avmsf.simulate.material import NOMINAL
 
 
 def mode_sizes(modes: ElasticModes) -> dict[str, int]:

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from avmsf.simulate.material import STIFFEST
-from avmsf.simulate.nominal import LARGEST_ERROR, NOMINAL, NominalBody
+from avmsf.simulate.material import DISCREPANCY
+from avmsf.simulate.nominal import NominalBody
 
 _RESOLUTION = 0.06
 """Difference of log thickness below which no body is computed between two: real walls vary by 3 to 5 %."""
@@ -28,26 +28,8 @@ _UNLIKELY = math.log(100.0)
 _BELOW = math.log(4.0)
 """How far the log thickness is searched below the first range, whose lower end is a guess; with no end, gains that no
 wall explains made it ever thinner (from 1 to .06 mm)."""
-DISCREPANCY = 0.2
-"""Standard deviation of the log thickness that errors of the shape leave, which the evidence takes for right: the root
-mean square log ratio to the truth over 11 simulated walls from photographs (most are .82 to .94, one is 1.4)."""
 _STEPS = 2000
 """Thicknesses on which the posterior is summed up."""
-
-
-def largest_factor(*, searched: bool) -> float:
-    """Return the largest factor on the frequencies of a body of the material `NOMINAL` that can be a material's.
-
-    That of the stiffest material of the table, relative to its density, times what makes frequencies of real bodies
-    differ from those of even ones (`LARGEST_ERROR`). Where the thickness of its wall is `searched`, one too thin by the
-    `DISCREPANCY` needs frequencies higher by up to as much.
-    """
-    uncertain = 1.0 + (DISCREPANCY if searched else 0.0)
-    return (
-        (1.0 + LARGEST_ERROR)
-        * uncertain
-        * math.sqrt(STIFFEST.young / STIFFEST.density * NOMINAL.density / NOMINAL.young)
-    )
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,8 @@ from typing import Any
 
 from avmsf._utils.records import like
 from avmsf.fem.supports import FREE
-from avmsf.fem.thickness import largest_factor
 from avmsf.field.gains.elastic import FREQUENCY_ERRORS
-from avmsf.simulate.material import MATERIALS, STIFFEST, Material
-from avmsf.simulate.nominal import NOMINAL
+from avmsf.simulate.material import MATERIALS, NOMINAL, STIFFEST, Material, largest_factor
 
 _MARGIN = 1.3
 """Factor by which a body's stiffness over density may be off a material's: of a thickness that is 14 % off."""

@@ -1,6 +1,5 @@
 """The shape of an object from photographs: its outer side, its cavities, and the bodies that it may be."""
 
-from avmsf.geometry.outer import DepthMap, object_surface
-from avmsf.geometry.shape import Cavity, ObjectShape, ShapeReport
+import lazy_loader
 
-__all__ = ["Cavity", "DepthMap", "ObjectShape", "ShapeReport", "object_surface"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

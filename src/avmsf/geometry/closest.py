@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass
 from itertools import chain
-from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float64, Int
 from scipy.spatial import cKDTree
 
-from avmsf.compiled import compiled
+_BATCH = 4096
+"""Places that are sought at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,84 +34,51 @@ class ClosestPoints:
         size = np.floor(np.log2(self._reach)).astype(int)
         self._groups = [np.flatnonzero(size == each) for each in np.unique(size)]
         self._trees = [cKDTree(middles[group]) for group in self._groups]
+        self._last = np.empty((0, 3)), Closest(np.empty(0, np.int64), np.empty((0, 3)), np.empty(0))
 
     def __call__(self, places: Float64[np.ndarray, "places 3"]) -> Closest:
-        """Return the closest points."""
-        bound = np.min([tree.query(places)[0] for tree in self._trees], axis=0)
-        closest = Closest(
-            np.zeros(len(places), dtype=np.int64), np.zeros((len(places), 3)), np.full(len(places), np.inf)
-        )
+        """Return the closest points; those of the places of the last call are kept."""
+        if not np.array_equal(places, self._last[0]):
+            parts = [self._search(some) for some in np.array_split(places, 1 + len(places) // _BATCH)]
+            rows, weights, distances = (np.concatenate(each) for each in zip(*parts, strict=True))
+            self._last = places.copy(), Closest(rows, weights, distances)
+        return self._last[1]
+
+    def _search(self, places: Float64[np.ndarray, "places 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        near = [group[tree.query(places)[1]] for group, tree in zip(self._groups, self._trees, strict=True)]
+        bound = np.min([_on_triangles(self._triangles[rows], places)[1] for rows in near], axis=0)
+        pairs = []
         for group, tree in zip(self._groups, self._trees, strict=True):
-            found = tree.query_ball_point(places, bound * (1 + 1e-9) + self._reach[group].max())
-            ends = np.cumsum([len(each) for each in found], dtype=np.int64)
-            among = group[np.fromiter(chain.from_iterable(found), dtype=np.int64, count=sum(map(len, found)))]
-            _take_closer(self._triangles, places, among, ends, closest.rows, closest.weights, closest.distances)
-        return closest
+            found = tree.query_ball_point(places, (1 + 1e-9) * (bound + self._reach[group].max()))
+            counts = np.fromiter(map(len, found), dtype=np.int64, count=len(found))
+            among = np.fromiter(chain.from_iterable(found), dtype=np.int64, count=int(counts.sum()))
+            pairs.append((np.repeat(np.arange(len(places)), counts), group[among]))
+        place, triangle = (np.concatenate(each) for each in zip(*pairs, strict=True))
+        weights, apart = _on_triangles(self._triangles[triangle], places[place])
+        order = np.lexsort((triangle, apart, place))
+        first = order[np.searchsorted(place[order], np.arange(len(places)))]
+        return triangle[first], weights[first], apart[first]
 
 
-@compiled(error_model="numpy", nogil=True)
-@no_type_check
-def _take_closer(triangles, places, among, ends, rows, weights, distances):
-    """Where one of the triangles `among`, up to `ends` of them for each place, is closer, write it down."""
-    begin = 0
-    for place in range(len(places)):
-        for triangle in among[begin : ends[place]]:
-            one, other, apart = _on_triangle(triangles[triangle], places[place])
-            if apart < distances[place] or (apart == distances[place] and triangle < rows[place]):
-                rows[place], distances[place] = triangle, apart
-                weights[place, 0], weights[place, 1], weights[place, 2] = 1.0 - one - other, one, other
-        begin = ends[place]
-
-
-@compiled(error_model="numpy", nogil=True)
-@no_type_check
-def _on_triangle(corners, place):
-    """Return the second and third barycentric coordinate of a triangle's point closest to a place, and how far it is.
+def _on_triangles(
+    corners: Float64[np.ndarray, "pairs 3 3"], places: Float64[np.ndarray, "pairs 3"]
+) -> tuple[Float64[np.ndarray, "pairs 3"], Float64[np.ndarray, " pairs"]]:
+    """Return the barycentric coordinates of each triangle's point closest to a place, and how far it is.
 
     That is the foot of the perpendicular where it falls inside, and the closest point of the three sides elsewhere.
     """
-    first, second, third = corners[0], corners[1], corners[2]
-    a, b, c, p, q = 0.0, 0.0, 0.0, 0.0, 0.0
-    for axis in range(3):
-        one, other, toward = second[axis] - first[axis], third[axis] - first[axis], place[axis] - first[axis]
-        a, b, c = a + one * one, b + one * other, c + other * other
-        p, q = p + one * toward, q + other * toward
-    area = a * c - b * b
+    sides = corners[:, [1, 2, 2]] - corners[:, [0, 0, 1]]
+    toward = places[:, None] - corners[:, [0, 0, 1]]
+    squares, products = (sides * sides).sum(2), (sides * toward).sum(2)
+    (a, c, _), (p, q, _), b = squares.T, products.T, (sides[:, 0] * sides[:, 1]).sum(1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        v, w = np.stack([c * p - b * q, a * q - b * p]) / (a * c - b * b)
+        one, other, third = np.where(squares > 0.0, np.clip(products / squares, 0.0, 1.0), 0.0).T
     # A triangle without area has only sides.
-    if area > 0.0:
-        v, w = (c * p - b * q) / area, (a * q - b * p) / area
-        if v >= 0.0 and w >= 0.0 and v + w <= 1.0:
-            return v, w, _apart(corners, place, v, w)
-    part = _along(first, second, place)
-    v, w, least = part, 0.0, _apart(corners, place, part, 0.0)
-    part = _along(first, third, place)
-    apart = _apart(corners, place, 0.0, part)
-    if apart < least:
-        v, w, least = 0.0, part, apart
-    part = _along(second, third, place)
-    apart = _apart(corners, place, 1.0 - part, part)
-    if apart < least:
-        v, w, least = 1.0 - part, part, apart
-    return v, w, least
-
-
-@compiled(error_model="numpy", nogil=True)
-@no_type_check
-def _along(start, end, place):
-    """Return which part of the way from start to end is closest to a place."""
-    product, square = 0.0, 0.0
-    for axis in range(3):
-        side = end[axis] - start[axis]
-        product, square = product + side * (place[axis] - start[axis]), square + side * side
-    return min(max(product / square, 0.0), 1.0) if square > 0.0 else 0.0
-
-
-@compiled(error_model="numpy", nogil=True)
-@no_type_check
-def _apart(corners, place, v, w):
-    """Return how far a place is from the point of a triangle with these coordinates."""
-    square = 0.0
-    for axis in range(3):
-        there = (1.0 - v - w) * corners[0, axis] + v * corners[1, axis] + w * corners[2, axis]
-        square += (there - place[axis]) ** 2
-    return np.sqrt(square)
+    inside = (v >= 0.0) & (w >= 0.0) & (v + w <= 1.0) & (a * c > b * b)
+    none = np.zeros_like(one)
+    v, w = np.where(inside, v, one), np.where(inside, w, none)
+    tried = np.stack([[1.0 - v - w, v, w], [1.0 - other, none, other], [none, 1.0 - third, third]]).transpose(0, 2, 1)
+    apart = np.linalg.norm(np.einsum("tpc,pcx->tpx", tried, corners) - places, axis=2)
+    best, pairs = apart.argmin(0), np.arange(len(places))
+    return tried[best, pairs], apart[best, pairs]

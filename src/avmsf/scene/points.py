@@ -7,7 +7,6 @@ in decimals is broken by the rounding of float32, and then another split or anot
 
 import math
 from dataclasses import dataclass
-from typing import no_type_check
 
 import numpy as np
 import torch
@@ -15,7 +14,6 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avmsf.compiled import compiled
 from avmsf.errors import CaptureError, EvaluationError, FitError
 
 
@@ -46,31 +44,17 @@ def farthest_points(points: Float[Tensor, "points 3"], count: int, *, start: int
     do not have.
     """
     _expect_rows(points, count, start)
-    places = points.double().cpu().contiguous().numpy()
-    chosen = np.empty(count, dtype=np.int64)
-    _farthest(places, start, np.full(len(places), np.inf), chosen)
-    return torch.from_numpy(chosen)
-
-
-@compiled(error_model="numpy", nogil=True)
-@no_type_check
-def _farthest(places, start, apart, chosen):
-    """Write what `farthest_points` returns; `apart` comes as infinities and becomes distances from all chosen."""
+    x, y, z = points.double().cpu().T.contiguous().numpy()
+    apart, chosen = np.full(len(x), np.inf), np.empty(count, dtype=np.int64)
     last = start
-    for turn in range(len(chosen)):
+    for turn in range(count):
         chosen[turn] = last
         # Chosen rows are barred rather than at distance zero, where they would tie with points that coincide.
         apart[last] = -np.inf
-        x, y, z = places[last, 0], places[last, 1], places[last, 2]
-        farthest = 0
-        for row in range(len(places)):
-            # The root, for it makes ties of what rounding of the squares would tell apart.
-            away = math.sqrt((places[row, 0] - x) ** 2 + (places[row, 1] - y) ** 2 + (places[row, 2] - z) ** 2)
-            if away < apart[row]:
-                apart[row] = away
-            if apart[row] > apart[farthest]:
-                farthest = row
-        last = farthest
+        # The root, for it makes ties of what rounding of the squares would tell apart.
+        np.minimum(apart, np.sqrt((x - x[last]) ** 2 + (y - y[last]) ** 2 + (z - z[last]) ** 2), out=apart)
+        last = int(apart.argmax())
+    return torch.from_numpy(chosen)
 
 
 def closest_points(points: Float[Tensor, "points 3"], count: int, *, start: int = 0) -> Int[Tensor, " chosen"]:

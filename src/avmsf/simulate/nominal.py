@@ -22,15 +22,12 @@ from avmsf.fem.supports import Support, supports_of
 from avmsf.simulate.elastic import ElasticModes, elastic_modes
 from avmsf.simulate.elasticstore import modes_once
 from avmsf.simulate.elements import SecondOrder
-from avmsf.simulate.material import Material
+from avmsf.simulate.material import LARGEST_ERROR, NOMINAL, Material
 from avmsf.simulate.nominalcheck import CheckedSurface, checked
 from avmsf.simulate.nominalsolid import FEWEST, TRIANGLES, count_dofs, expect_memory, filled_solid, wall_solids
 from avmsf.simulate.recipe import key_of
 from avmsf.simulate.solid import Solid
 
-NOMINAL = Material("nominal", 2700.0, 7e10, 0.3, 0.0, 0.0)
-"""What bodies are taken to be made of: near aluminium. Frequencies are to be scaled by one common factor, and shapes
-depend on Poisson's ratio alone, weakly."""
 WALLS = tuple(float(part) for part in np.geomspace(0.003, 0.05, 6))
 """Thickness of walls that are tried, over the diagonal of the box around the surface."""
 TRIAL = 12_000
@@ -38,9 +35,6 @@ TRIAL = 12_000
 WALL_TRIAL = 22_000
 """Degrees of freedom at most of each of several walls of a shape: with 12,000 the log evidence of one thickness
 scatters by 15 nats from one mesh to the next, with 22,000 by about 3 (a mug)."""
-LARGEST_ERROR = 0.05
-"""Relative error of the lowest frequencies beyond which a body is made finer: about that by which frequencies of real
-walls differ from those of even ones (imperfections of 3 to 5 % in the simulated objects)."""
 _LOWEST = 8
 """Frequencies that are compared."""
 _FORMAT = 3

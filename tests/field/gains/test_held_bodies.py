@@ -15,8 +15,7 @@ from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.simulate.block import block
 from avmsf.simulate.elastic import ElasticModes, elastic_modes
 from avmsf.simulate.elements import SecondOrder
-from avmsf.simulate.material import STEEL
-from avmsf.simulate.nominal import NOMINAL
+from avmsf.simulate.material import NOMINAL, STEEL
 from gain_cases import draw
 
 SIDES = (0.24, 0.16, 0.003)

@@ -15,7 +15,7 @@ from torch import Tensor
 from avmsf.capture.placement import expect_placed
 from avmsf.errors import AvmsfError, FitError
 from avmsf.fem.supports import FREE, FREE_PRIOR
-from avmsf.fem.thickness import largest_factor, search_thickness
+from avmsf.fem.thickness import search_thickness
 from avmsf.fem.updating import update
 from avmsf.field.config import AUTO, NETWORK, GainModel
 from avmsf.field.gains.bodies import CandidateBodies
@@ -34,6 +34,7 @@ from avmsf.scene.points import farthest_points
 from avmsf.scene.symmetry import Symmetries
 from avmsf.scene.symmetrycharacters import Group, groups_of
 from avmsf.simulate.elastic import ElasticModes
+from avmsf.simulate.material import largest_factor
 from avmsf.simulate.nominal import NominalBody, body_name
 
 POSITIONAL: dict[str, type[KernelFamily]] = {Smooth.kind: Smooth, ThinPlate.kind: ThinPlate}
