@@ -20,7 +20,7 @@ from avmsf.localization.contact_map import ContactMap
 from avmsf.localization.cosine_distance import cosine_distance
 from avmsf.localization.detuning import DetunedModes
 from avmsf.localization.likelihood import Force, LikelihoodResult, PredictedGains, evaluate_likelihood
-from avmsf.localization.prediction import calibration_factor, local_variance, predict, predictive_variance
+from avmsf.localization.prediction import calibration_factor, local_variance, predict
 from avmsf.localization.preprocess import not_finite, silent, too_short
 from avmsf.localization.smoothing import distinct_contacts, smoothing_matrix
 from avmsf.localization.tempering import calibrate_tempering
@@ -84,13 +84,12 @@ class Locator:
         ways = None if directions is None else as_floats(directions, "directions")
         parts = None if areas is None else as_floats(areas, "areas")
         _expect_points(positions, ways, parts)
-        gains, dampings = predict(field, positions, ways)
-        variance = predictive_variance(field, positions, ways, factor=calibration_factor(field))
+        gains, variance, dampings = predict(field, positions, ways, factor=calibration_factor(field))
         return cls(
             field,
             positions.float(),
             gains,
-            variance + local_variance(positions, gains),
+            variance + local_variance(positions, gains.__getitem__),
             dampings,
             torch.ones(len(positions), dtype=torch.float64) if parts is None else parts.double(),
             smoothing_matrix(positions, contacts=distinct_contacts(field)),

@@ -1,9 +1,10 @@
 """Predicted gains of impacts at points, mode by mode, and the variance of their errors."""
 
+from collections.abc import Callable
 from statistics import NormalDist
 
 import torch
-from jaxtyping import Complex64, Float, Float32
+from jaxtyping import Complex64, Float, Float32, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -40,49 +41,53 @@ def calibration_factor(field: SoundField) -> float:
 
 
 def predict(
-    sound_field: SoundField, points: Float[Tensor, "points 3"], directions: Float[Tensor, "points 3"] | None
-) -> tuple[Complex64[Tensor, "points modes"], Float32[Tensor, "points modes"] | None]:
-    """Return gains, amplitudes of sines and of cosines as imaginary part, and the factors on dampings."""
+    sound_field: SoundField,
+    points: Float[Tensor, "points 3"],
+    directions: Float[Tensor, "points 3"] | None = None,
+    *,
+    factor: float | None = None,
+) -> tuple[Complex64[Tensor, "points modes"], Float32[Tensor, "points modes"], Float32[Tensor, "points modes"] | None]:
+    """Return gains, their posterior variance, and the factors on dampings.
+
+    Gains are amplitudes of sines, and of cosines as imaginary part. The deviations are multiplied by `factor`; the
+    variance is zero without it and without a posterior.
+    """
     turned = torch.polar(torch.ones_like(sound_field.phase), sound_field.phase).to(torch.complex64)
-    gains, dampings = [], []
+    gains, variances, dampings = [], [], []
     for rows in torch.split(torch.arange(len(points)), _BATCH):
+        place = points[rows], None if directions is None else directions[rows]
         with torch.no_grad():
-            known = sound_field.gain_field.at(points[rows], None if directions is None else directions[rows])
+            known = sound_field.gain_field.at(*place)
+            deviation = None if factor is None else sound_field.gain_field.deviation(*place)
+        if factor is None or deviation is None:
+            variances.append(torch.zeros(known.mean.shape))
+        else:
+            variances.append((factor * deviation).square().sum(2).float())
         ahead = torch.zeros_like(known.mean) if known.quadrature is None else known.quadrature
         gains.append(torch.complex(known.mean.float(), ahead.float()) * turned)
         if known.damping is not None:
             dampings.append(known.damping.float())
-    return torch.cat(gains), torch.cat(dampings) if dampings else None
-
-
-def predictive_variance(
-    sound_field: SoundField,
-    points: Float[Tensor, "points 3"],
-    directions: Float[Tensor, "points 3"] | None,
-    *,
-    factor: float,
-) -> Float32[Tensor, "points modes"]:
-    """Return the posterior variance of the gains, the deviations multiplied by `factor`; zero without a posterior."""
-    variances = []
-    for rows in torch.split(torch.arange(len(points)), _BATCH):
-        with torch.no_grad():
-            deviation = sound_field.gain_field.deviation(points[rows], None if directions is None else directions[rows])
-        if deviation is None:
-            return torch.zeros(len(points), len(sound_field.bank))
-        variances.append((factor * deviation).square().sum(2).float())
-    return torch.cat(variances)
+    return torch.cat(gains), torch.cat(variances), torch.cat(dampings) if dampings else None
 
 
 def local_variance(
-    points: Float[Tensor, "points 3"], gains: Complex64[Tensor, "points modes"]
-) -> Float32[Tensor, "points modes"]:
-    """Return the variance of gains over the patch of surface that each point represents."""
+    points: Float[Tensor, "points 3"],
+    gains: Callable[[Int[Tensor, " some"]], Complex64[Tensor, "some modes"]],
+    rows: Int[Tensor, " rows"] | None = None,
+) -> Float32[Tensor, "rows modes"]:
+    """Return the variance of gains over the patch of surface that each point, or each of some, represents.
+
+    `gains` returns those of points of given rows.
+    """
+    chosen = torch.arange(len(points)) if rows is None else rows
     count = min(_NEIGHBORS, len(points) - 1)
-    total = torch.zeros(gains.shape)
     if count < 1:
-        return total
+        return torch.zeros(gains(chosen).shape)
     places = points.double().numpy()
-    _, rows = cKDTree(places).query(places, k=count + 1)
-    for near in torch.from_numpy(rows[:, 1:].T.copy()):
-        total += (gains[near] - gains).abs().square()
+    near = torch.from_numpy(cKDTree(places).query(places[chosen.numpy()], k=count + 1)[1][:, 1:])
+    needed, of = torch.unique(torch.cat([chosen[:, None], near], dim=1), return_inverse=True)
+    known = gains(needed)
+    total = torch.zeros(len(chosen), known.shape[1])
+    for other in of[:, 1:].T:
+        total += (known[other] - known[of[:, 0]]).abs().square()
     return total * (_PATCH / count)

@@ -24,7 +24,6 @@ from avmsf.localization.prediction import (
     can_self_calibrate,
     local_variance,
     predict,
-    predictive_variance,
 )
 from avmsf.localization.smoothing import distinct_contacts, point_areas, smoothing_matrix
 from avmsf.scene.points import farthest_points
@@ -58,7 +57,7 @@ def calibrate_tempering(field: SoundField) -> float:
     rows = torch.unique(torch.cat([spread, near]))
     truths = torch.searchsorted(rows, near)
     places, factor = gains.points[rows], calibration_factor(fitted)
-    about = local_variance(gains.points, predict(fitted, gains.points, None)[0])[rows]
+    about = local_variance(gains.points, lambda some: predict(fitted, gains.points[some])[0], rows)
     prior = point_areas(places).clamp_min(1e-300).log() if len(places) > 2 else torch.zeros(len(places)).double()
     smoothing = smoothing_matrix(places, contacts=distinct_contacts(fitted))
     # A locator leaves the others out, too.
@@ -110,12 +109,12 @@ def _predicted(
     factor: float,
 ) -> PredictedGains:
     """Return the predicted gains of some modes at places; `about` is their variance around each."""
-    gains = predict(field, places, None)[0][:, kept]
+    predicted, variance, _ = predict(field, places, factor=factor)
+    gains = predicted[:, kept]
     power = gains.abs().square()
     usual = power.mean(0)
     usual = usual.clamp_min(max(1e-8 * float(usual.max()), torch.finfo(torch.float32).tiny))
-    variance = (predictive_variance(field, places, None, factor=factor) + about)[:, kept]
-    return PredictedGains(gains, power, variance, usual, field.bank.frequency[kept].double())
+    return PredictedGains(gains, power, (variance + about)[:, kept], usual, field.bank.frequency[kept].double())
 
 
 def _explained_energy(predicted: Tensor, measured: Tensor, weights: Float64[Tensor, " modes"]) -> float:

@@ -30,6 +30,8 @@ _MEMORY = 16_000_000
 """Covariances between places and contacts that are held at once, over all kernels."""
 _FORM_ENTRIES = 16_000_000
 """Largest number of entries of one family's matrices for the variance, which are kept: 128 MB."""
+_PRODUCTS = 512
+"""Sites whose products of factors are held at once."""
 _POSITIONAL: dict[str, type[KernelFamily]] = {each.kind: each for each in (Unstructured, Smooth, ThinPlate)}
 _OF_OBJECT = {Elastic.kind: "bodies", Symmetric.kind: "symmetries", Visual.kind: "features"}
 """Families that know something of the object, and the entry of the record with its size."""
@@ -359,13 +361,16 @@ class MixtureGains(GainField):
                 explained += self.mixture.explained(family.between(sites, self.training, kept), first)
             else:
                 factors = family.factors(sites, self.training)
-                explained += torch.stack([((factors @ form) * factors).sum(1) for form in forms], dim=1)
+                # Products of two factors, each pair once: half of what the matrices times the factors would take.
+                first_of, second_of = torch.triu_indices(factors.shape[1], factors.shape[1])
+                parts = torch.split(factors, _PRODUCTS)
+                explained += torch.cat([(part[:, first_of] * part[:, second_of]) @ forms for part in parts])
             first += len(kept)
         return self.mixture.spread(torch.cat(own), self._mean(sites), explained)
 
     @cached_property
-    def _forms(self) -> list[Float64[Tensor, "series _factors _factors"] | None]:
-        """`KernelMixture.explained_forms` of each family.
+    def _forms(self) -> list[Float64[Tensor, "_pairs series"] | None]:
+        """`KernelMixture.explained_forms` of each family: by pairs of factors, those of two different ones doubled.
 
         None for a family that has fewer kernels than factors, or whose matrices would exceed `_FORM_ENTRIES`: its
         covariances with the training impacts, kernel by kernel, are cheaper.
@@ -375,12 +380,14 @@ class MixtureGains(GainField):
 
     def _form(
         self, family: KernelFamily, kept: Int[Tensor, " kept"], first: int
-    ) -> Float64[Tensor, "series factors factors"] | None:
+    ) -> Float64[Tensor, "pairs series"] | None:
         count = family.loadings(self.training, kept[:1]).shape[2]
         if count >= len(kept) or self.mixture.values.shape[1] * count**2 > _FORM_ENTRIES:
             return None
         kernels = range(first, first + len(kept))
-        return self.mixture.explained_forms(kernels, lambda rows: family.loadings(self.training, kept[rows]))
+        forms = self.mixture.explained_forms(kernels, lambda rows: family.loadings(self.training, kept[rows]))
+        row, column = torch.triu_indices(count, count)
+        return (forms[:, row, column] * torch.where(row == column, 1.0, 2.0)).T.contiguous()
 
     def _mean(self, sites: Sites) -> Float64[Tensor, "sites series"]:
         pairs = zip(self.families, self._coefficients, strict=True)
