@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from avmsf.capture import CaptureSettings, Surface, read_surface
-from avmsf.capture.placement import FACTORS, contacted_part, judge_placement, surface_points
+from avmsf.capture.placement import FACTORS, Mistake, contacted_part, judge_placement, surface_points
 from avmsf.capture.table import read_rows, understand
 from avmsf.errors import CaptureError
 from raising import raises
@@ -246,3 +247,19 @@ def test_of_a_scan_with_its_table_the_part_that_the_contacts_lie_on_is_kept() ->
     assert contacted_part(scan, on_both)[1] == []
     on_table = contacts * torch.tensor([3.0, 3.0, 0.0]) + torch.tensor([0.0, 0.0, -0.06])
     assert contacted_part(scan, on_table)[1] == []
+
+
+def test_what_a_file_states_goes_before_what_is_fitted_and_an_arbitrary_frame_is_called_one() -> None:
+    turn = torch.from_numpy(Rotation.from_euler("zyx", [28, 15, -40], degrees=True).as_matrix())
+    shift = torch.tensor([0.3, 0.1, -0.2], dtype=torch.float64)
+    moved = 2.9 * CLOUD @ turn.T + shift
+    stated = Mistake(2.9, turn, shift, stated="transforms.json (applied_scale = 2.9)")
+    for contacts in (CONTACTS, CONTACTS + 0.004 * torch.randn(CONTACTS.shape, dtype=torch.float64)):
+        placement = judge_placement(contacts, moved, stated=[stated])
+        assert placement.misplaced
+        assert "once moved as transforms.json (applied_scale = 2.9)" in placement.describe()
+    placement = judge_placement(CONTACTS, moved)
+    assert placement.misplaced
+    assert "different frames" in placement.describe(what="Gaussians")
+    # What is stated of contacts that lie where they should is not believed.
+    assert judge_placement(CONTACTS, CLOUD, stated=[stated]).on_surface

@@ -2,23 +2,31 @@
 
 import importlib.util
 import json
+import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from avmsf.capture import CaptureSettings
 from avmsf.capture.filenames import pictures_in
+from avmsf.capture.placement import surface_points
 from avmsf.capture.settings import METRES
 from avmsf.capture.views.read import find_shots
 from avmsf.capture.views.shots import without_camera
 from avmsf.capture.views.write import write_views
 from avmsf.cli import main
 from avmsf.cli.visuals import VisualInputs, visual_inputs
+from avmsf.scene.ply import write_splats
+from avmsf.scene.start import StartPoints, starting_cloud
 from capture_folder import fill
 from plate_capture import fill_plate
-from small_scene import slab_views, write_surface_file
+from small_scene import slab, slab_views, write_surface_file
 from views_folder import frames, ring, write_image, write_transforms
 
 Streams = pytest.CaptureFixture[str]
@@ -96,10 +104,7 @@ def test_a_mesh_video_and_gaussians_are_named(tmp_path: Path) -> None:
     (tmp_path / "splats.ply").touch()
     (tmp_path / "turn.mp4").touch()
     visual = found(tmp_path)
-    assert visual == VisualInputs(0, None, 0, "turn.mp4", None, "splats.ply", visual.problems)
-    # An empty file is opened, and is none of Gaussians.
-    (problem,) = visual.problems
-    assert "splats.ply" in problem
+    assert visual == VisualInputs(0, None, 0, "turn.mp4", None, "splats.ply", ())
     assert found(tmp_path).reconstructs
     write_surface_file(tmp_path)
     # Pictures next to a mesh may be its textures.
@@ -133,20 +138,107 @@ def test_the_report_has_them_and_leads_to_the_command_that_uses_them(
     assert main(["modes", str(folder)]) == 0
     following = "reconstruct" if pictured else "fit"
     assert capsys.readouterr().err.splitlines()[-1].startswith(f"next: avmsf {following} ")
-    # The mask without a photograph counts as a warning.
-    assert out.splitlines()[-1] == ("readable, with 1 warning" if pictured else "no problem found")
+    # The mask without a photograph is one; nor has noise a plain background, from which masks are found.
+    assert out.splitlines()[-1] == ("readable, with 2 warnings" if pictured else "no problem found")
     assert main(["check", str(folder), "--json"]) == 0
     report: dict[str, Any] = json.loads(capsys.readouterr().out)
     assert report["visual_inputs"]["photographs"] == 4 * pictured
     assert len(report["visual_inputs"]["problems"]) == pictured
 
 
+def pictured_slab(folder: Path) -> Path:
+    """A struck plate that is the upper side of a slab in photographs with cameras and masks."""
+    fill_plate(folder, surface=False)
+    write_views(slab_views(64), folder.parent / "views")
+    for each in (folder.parent / "views").iterdir():
+        each.rename(folder / each.name)
+    return folder
+
+
+Y_UP = np.array([[1.0, 0, 0, 0.3], [0, 0, 1, 0.1], [0, -1, 0, -0.2], [0, 0, 0, 1]])
+SCALES = np.array([[1.0, 1, 1, 7.3]] * 3 + [[1.0, 1, 1, 1]])
+CAMERAS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], dict[str, Any], str]] = {
+    "as they are": (lambda pose: pose, {}, ""),
+    "moved": (lambda pose: Y_UP @ pose, {"applied_transform": Y_UP[:3].tolist()}, "applied_transform"),
+    "moved and scaled": (
+        lambda pose: (Y_UP @ pose) * SCALES,
+        {"applied_transform": Y_UP[:3].tolist(), "applied_scale": 7.3},
+        "applied_scale = 7.3",
+    ),
+    "stated, not done": (lambda pose: pose, {"applied_scale": 7.3, "applied_transform": Y_UP[:3].tolist()}, ""),
+    "world to camera": (np.linalg.inv, {}, "once each pose is inverted (world to camera"),
+    "OpenCV's axes": (lambda pose: pose @ np.diag([1.0, -1, -1, 1]), {}, "third column of each pose are negated"),
+    "transposed": (lambda pose: pose.T, {}, "perhaps the matrix is transposed"),
+}
+
+
+@pytest.mark.parametrize("case", CAMERAS)
+def test_what_is_wrong_with_cameras_is_named_by_check_as_by_reconstruct(
+    tmp_path: Path, case: str, capsys: Streams
+) -> None:
+    folder, (change, extra, words) = pictured_slab(tmp_path / "slab"), CAMERAS[case]
+    record = json.loads((folder / "transforms.json").read_text()) | extra
+    for frame in record["frames"]:
+        frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
+    (folder / "transforms.json").write_text(json.dumps(record))
+    assert main(["check", str(folder)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1] == ("readable, with 1 warning" if words else "no problem found")
+    if words:
+        (line,) = [line for line in lines if words in line]
+        assert main(["reconstruct", str(folder), "--lift.encoder", "descriptors"]) == 2
+        assert not (folder / ".avmsf" / "cloud.ply").exists()
+        # The views that are compared are others, and so is the number of the cameras.
+        assert line.partition(words)[2] in capsys.readouterr().err
+
+
+TURN = Rotation.from_euler("zyx", [28, 15, -40], degrees=True)
+
+
+@pytest.mark.parametrize(
+    ("case", "words"),
+    [
+        ("as they are", ""),
+        ("nan", "vertex 7: expected a finite float32 number as y, got nan"),
+        ("colors", "got Gaussians without f_dc_0, f_dc_1, f_dc_2"),
+        ("y down", "(x, y, z) taken as (x, -y, -z)"),
+        ("moved", "the Gaussians and the contacts are in different frames"),
+        ("moved as stated", "once moved as dataparser_transforms.json"),
+    ],
+)
+def test_check_opens_gaussians_and_tells_another_frame_which_reconstruct_refuses(
+    tmp_path: Path, case: str, words: str, capsys: Streams
+) -> None:
+    folder = fill_plate(tmp_path / "plate", surface=False)
+    centers = surface_points(slab(), count=2000)
+    if case.startswith("moved"):
+        centers = 2.9 * (centers @ torch.from_numpy(TURN.as_matrix()).T + torch.tensor([0.3, 0.1, -0.2]))
+    if case == "moved as stated":
+        matrix = np.c_[TURN.as_matrix(), [0.3, 0.1, -0.2]].tolist()
+        (folder / "dataparser_transforms.json").write_text(json.dumps({"transform": matrix, "scale": 2.9}))
+    if case == "y down":
+        centers = centers * torch.tensor([1.0, -1.0, -1.0])
+    cloud = starting_cloud(StartPoints(centers, torch.rand(len(centers), 3)), degree=0, scale=1.0, opacity=0.9)
+    if case == "nan":
+        cloud.centers[7, 1] = math.nan
+    write_splats(cloud, folder / "splats.ply")
+    if case == "colors":
+        content = (folder / "splats.ply").read_bytes()
+        (folder / "splats.ply").write_bytes(content.replace(b"property float f_dc_", b"property float color"))
+    assert main(["check", str(folder)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1] == ("readable, with 1 warning" if words else "no problem found")
+    if words:
+        (line,) = [line for line in lines if words in line]
+        assert "feet" not in line
+        assert main(["reconstruct", str(folder), "--lift.encoder", "descriptors"]) == 2
+        assert words in capsys.readouterr().err
+        assert not (folder / ".avmsf" / "features.safetensors").exists()
+
+
 @pytest.mark.parametrize("unit", ["m", "mm", "in"])
 def test_the_unit_of_contacts_is_found_from_photographs(tmp_path: Path, capsys: Streams, unit: str) -> None:
-    folder = fill_plate(tmp_path / "slab", surface=False)
-    write_views(slab_views(64), tmp_path / "views")
-    for each in (tmp_path / "views").iterdir():
-        each.rename(folder / each.name)
+    folder = pictured_slab(tmp_path / "slab")
     header, *rows = (folder / "impacts.csv").read_text().split()
     cells = [row.split(",") for row in rows]
     for row in cells:

@@ -15,7 +15,7 @@ from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.capture.views.write import write_views
 from avmsf.cli import main
 from avmsf.errors import CaptureError
-from avmsf.pipeline.silhouettes import compare_outlines, expect_contacts_in_outlines, judge_outlines
+from avmsf.pipeline.silhouettes import compare_outlines, expect_contacts_in_views, judge_outlines
 from plate_capture import fill_plate
 from raising import raises
 from small_scene import slab, slab_views
@@ -78,10 +78,10 @@ def test_cameras_in_another_unit_are_refused_with_it(unit: str) -> None:
 @pytest.mark.parametrize("unit", ["mm", "cm", "in"])
 def test_contacts_in_another_unit_than_the_cameras_are_refused_with_it(unit: str) -> None:
     contacts, settings = slab().vertices, CaptureSettings()
-    expect_contacts_in_outlines(contacts, VIEWS, settings)
-    expect_contacts_in_outlines(contacts / METRES[unit], [replace(view, mask=None) for view in VIEWS], settings)
+    expect_contacts_in_views(contacts, VIEWS, settings)
+    expect_contacts_in_views(contacts / METRES[unit], [replace(view, mask=None) for view in VIEWS], settings)
     with raises(CaptureError, name="unit", value=pytest.approx(METRES[unit])) as caught:
-        expect_contacts_in_outlines(contacts / METRES[unit], VIEWS, settings)
+        expect_contacts_in_views(contacts / METRES[unit], VIEWS, settings)
     assert f'unit = "{unit}"' in str(caught.value)
 
 

@@ -54,6 +54,8 @@ class Mistake:
     """Meters; float64."""
     distance: float = 0.0
     """Meters within which nine of ten contacts lie off the surface once it is undone."""
+    stated: str = ""
+    """Words of a file that says so; then `axes` is any rotation."""
 
     def undo(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts 3"]:
         """Return where the contacts were meant, float64."""
@@ -76,6 +78,9 @@ class Mistake:
         return next((name for meters, name in UNITS.items() if abs(size / meters - 1) < 1e-6), None)
 
     def __str__(self) -> str:
+        within = f"they lie within {_length(self.distance)} of it"
+        if self.stated:
+            return f"{within} once moved as {self.stated} says that the object was: give both in one frame"
         steps, questions = [], []
         if self.factor != 1:
             ratio = self.factor if self.factor > 1 else 1 / self.factor
@@ -93,7 +98,9 @@ class Mistake:
             steps.append(f"moved by ({', '.join(f'{value:.3g}' for value in self.shift.tolist())}) m")
             questions.append("do the origins differ?")
         undone = ", ".join(steps) + "," * (len(steps) > 1)
-        return f"{undone} they lie within {_length(self.distance)} of it: {' '.join(questions)}"
+        if self.factor != 1 and self.unit is None and self.shift.any():
+            questions = ["are they in another frame?"]
+        return f"{undone} {within}: {' '.join(questions)}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,8 +158,8 @@ class Placement:
         rows = torch.argsort(self.distances, descending=True)
         return tuple(row for row in rows.tolist() if float(self.distances[row]) > self.tolerance)
 
-    def describe(self, names: Sequence[str] = ()) -> str:
-        """Return a message on the contacts off the surface, by these names or else by indices; "" for none."""
+    def describe(self, names: Sequence[str] = (), *, what: str = "surface") -> str:
+        """Return a message on the contacts off `what` there is, by these names or else by indices; "" for none."""
         if self.on_surface:
             return ""
         if self.off or not self.shrunken:
@@ -160,7 +167,7 @@ class Placement:
             few = self.mistake is None and 2 * len(self.off) < len(self.distances) and not self.shrunken
             which = f"{len(self.off)} of {len(self.distances)} contacts lie" if few else "the contacts lie"
             relative = _ratio(farthest / self.diagonal)
-            found = f"{which} up to {_length(farthest)} ({relative} object diagonals) off the surface"
+            found = f"{which} up to {_length(farthest)} ({relative} object diagonals) off the {what}"
             if few:
                 shown = ", ".join(names[row] if names else f"row {row}" for row in self.off[:8])
                 return f"{found}, the others on it; check {shown}{', …' * (len(self.off) > 8)}"
@@ -171,16 +178,19 @@ class Placement:
         if not self.off:
             return f"{found}; check that both are in one frame and unit"
         return (
-            f"{found}, and no change of unit, axes or origin explains it; give both in one frame (structure from "
-            "motion chooses its own: see `align_similarity`)"
+            f"{found}, and no change of unit, axes or origin explains it: the {what} and the contacts are in different "
+            "frames; give both in one (structure from motion chooses its own: see `align_similarity`; nerfstudio "
+            "writes how it moved the object to dataparser_transforms.json, to be laid beside)"
         )
 
 
-def judge_placement(contacts: Float[Tensor, "contacts 3"], points: Float[Tensor, "points 3"]) -> Placement:
+def judge_placement(
+    contacts: Float[Tensor, "contacts 3"], points: Float[Tensor, "points 3"], *, stated: Sequence[Mistake] = ()
+) -> Placement:
     """Measure how far contacts lie from a surface given by its points, and seek the similarity that explains them best.
 
-    Tried are the ratios of usual units and any scale, all 48 signed permutations of the axes, and a
-    shift. Each has the nats of its parameters and of how far each contact is off (`_Search`); the least is
+    Tried are what files have `stated`, the ratios of usual units and any scale, all 48 signed permutations of the axes,
+    and a shift. Each has the nats of its parameters and of how far each contact is off (`_Search`); the least is
     reported unless it leaves the contacts where they are. Few contacts fit much by chance: axes are tried from five on,
     what is fitted from eight. Raises CaptureError where there are no contacts, or points without an extent.
     """
@@ -207,7 +217,7 @@ def judge_placement(contacts: Float[Tensor, "contacts 3"], points: Float[Tensor,
         tolerance=max(TOLERANCE * diagonal, 2 * spacing),
     )
     search = _Search(tree, _some(places, MOST_CONTACTS), placement, floor=spacing)
-    return replace(placement, mistake=search.find())
+    return replace(placement, mistake=search.find(stated))
 
 
 def expect_placed(
@@ -296,27 +306,40 @@ class _Search:
         self.deviations = np.geomspace(self.floor, widest, steps)[:, None]
         self.parameter = math.log(len(contacts))
 
-    def find(self) -> Mistake | None:
-        """Return the similarity of the least description length; None where that changes nothing."""
+    def find(self, stated: Sequence[Mistake] = ()) -> Mistake | None:
+        """Return the similarity of the least description length; None where that changes nothing.
+
+        What is `stated` goes first where it leaves most contacts near: what is fitted to few contacts and coarse points
+        describes these better by chance.
+        """
         identity = Mistake(1.0, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
         present, least = self._nats(identity), len(self.contacts) * (math.log(self.floor) + 0.5)
         if present - least < 1:
             return None
+        for each in stated:
+            near, far = np.quantile(self._distances(each), (0.5, 0.9)).tolist()
+            if near <= self.placement.tolerance and math.log(2) + self._nats(each) < present:
+                return replace(each, distance=far)
         found = [(code + self._nats(each), each) for code, each in self._unmoved()]
         if len(self.contacts) >= 8:
             found += self._fitted()
         for nats, each in sorted(found, key=lambda pair: pair[0]):
-            distances = self.tree.query(each.undo(torch.from_numpy(self.contacts)).numpy())[0]
-            far, spread = float(np.quantile(distances, 0.9)), each.factor * self.placement.spread or math.inf
+            far, spread = (
+                float(np.quantile(self._distances(each), 0.9)),
+                each.factor * self.placement.spread or math.inf,
+            )
             # Beside the size that the contacts have by then: what is shrunk comes nearer to anything.
             if nats < present and far <= min(max(self.floor, 0.5 * self.placement.tolerance), TOLERANCE * spread):
                 return replace(each, distance=far)
         return None
 
+    def _distances(self, mistake: Mistake) -> Float[np.ndarray, " contacts"]:
+        return self.tree.query(mistake.undo(torch.from_numpy(self.contacts)).numpy())[0]
+
     def _nats(self, mistake: Mistake) -> float:
         if not mistake.factor > 0:
             return math.inf
-        distances = self.tree.query(mistake.undo(torch.from_numpy(self.contacts)).numpy())[0]
+        distances = self._distances(mistake)
         spread, diagonal = mistake.factor * self.placement.spread, self.placement.diagonal
         squares = np.square(np.maximum(distances, self.floor) / self.deviations)
         near = squares / 2 + np.log(self.deviations / min(mistake.factor, 1.0))

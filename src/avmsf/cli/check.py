@@ -15,7 +15,7 @@ from avmsf.cli.alignment import AlignmentReport
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.check import Options
 from avmsf.cli.printing import console, decimals, next_command, print_json, say, table
-from avmsf.cli.visuals import contacts_outside, visual_inputs
+from avmsf.cli.visuals import misplaced, visual_inputs
 from avmsf.errors import CaptureError, ExtractionError
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.extraction.finders import HighResolution
@@ -34,12 +34,13 @@ def run(options: Options) -> int:
     screen = console(errors=options.json)
     doing(f"reading {options.capture}")
     visual = visual_inputs(options.capture, settings)
-    outside = None if visual is None else contacts_outside(options.capture, settings, visual)
-    proposals = propose_settings(options.capture, settings, factor=None if outside is None else outside.value)
+    outside = [] if visual is None else misplaced(options.capture, settings, visual)
+    factor = next((each.value for each in outside if each.name == "unit"), None)
+    proposals = propose_settings(options.capture, settings, factor=factor)
     if proposals and options.write_settings:
         _write(options, proposals, screen)
         if any(each.key == "unit" for each in proposals):
-            outside = None
+            outside = [each for each in outside if each.name != "unit"]
     report = check(options.capture, settings)
     doing("finding the modes that align the recordings")
     modes = _modes(options.capture, settings) if report.readable else None
@@ -49,7 +50,7 @@ def run(options: Options) -> int:
     if visual is not None:
         screen.print(visual.sentence, soft_wrap=True)
     problems = [*problems_of(report), *(() if visual is None else (*visual.problems, *visual.unused))]
-    problems += [] if outside is None else [str(outside)]
+    problems += map(str, outside)
     for problem in problems[:MAX_PRINTED]:
         screen.print(problem, soft_wrap=True)
     if len(problems) > MAX_PRINTED:

@@ -1,4 +1,4 @@
-"""What shows the object in a capture folder: found by names and camera files, without reading pictures or shapes."""
+"""What shows the object in a capture folder, by names and camera files, and whether it fits the contacts."""
 
 import importlib.util
 import warnings
@@ -7,19 +7,27 @@ from pathlib import Path
 
 from PIL import Image
 
-from avmsf._utils.text_files import read_json
 from avmsf.capture.filenames import find_surface_file, pictures_in, unused_files
 from avmsf.capture.folder import Capture
 from avmsf.capture.placement import expect_placed, surface_points
 from avmsf.capture.proposals import contacts_of
 from avmsf.capture.settings import CaptureSettings, settings_of
+from avmsf.capture.surface import find_surface
 from avmsf.capture.table import read_rows
 from avmsf.capture.views.foreground import find_foreground
 from avmsf.capture.views.read import find_shots, read_views
 from avmsf.capture.views.shots import listed, mask_names
+from avmsf.capture.views.transforms import stated_moves
 from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import CaptureError, FitError, SceneError
-from avmsf.pipeline.silhouettes import LONGEST, MAX_VIEWS, expect_contacts_in_outlines
+from avmsf.errors import AvmsfError, AvmsfWarning, CaptureError, FitError, SceneError
+from avmsf.pipeline.scene import scaled, without_far
+from avmsf.pipeline.silhouettes import (
+    LONGEST,
+    MAX_VIEWS,
+    expect_contacts_in_views,
+    expect_on_object,
+    judge_outlines,
+)
 from avmsf.pipeline.sources import find_source, find_splats
 from avmsf.scene.ply import read_splats
 from avmsf.wording import counted
@@ -84,11 +92,6 @@ def visual_inputs(folder: Path, settings: CaptureSettings | None) -> VisualInput
             "the photographs have no cameras, and the package that finds them is missing: pip install 'avmsf[sfm]'"
         )
     splats = find_splats(folder)
-    if splats is not None:
-        try:
-            read_splats(splats)
-        except SceneError as error:
-            problems.append(str(error))
     return VisualInputs(
         len(names),
         cameras,
@@ -99,23 +102,6 @@ def visual_inputs(folder: Path, settings: CaptureSettings | None) -> VisualInput
         tuple(problems),
         tuple(unused_files(folder, settings)),
     )
-
-
-def _other_frame(folder: Path) -> str:
-    """Return advice on a transformation by which nerfstudio moved cameras, of which contacts know nothing; "" for none.
-
-    It is in transforms.json or beside it.
-    """
-    for name in ("transforms.json", "dataparser_transforms.json"):
-        try:
-            record = read_json(folder / name)
-        except (OSError, ValueError):
-            continue
-        keys = [key for key in ("applied_transform", "applied_scale", "transform", "scale") if key in record]
-        if keys:
-            found = ", ".join(f"{key} = {record[key]}" for key in keys)
-            return f"; or move the contacts as {name} says that the cameras were: {found}"
-    return ""
 
 
 def expect_shape(folder: Path, capture: Capture, *, views: bool, verb: str) -> None:
@@ -155,27 +141,41 @@ def expect_shape(folder: Path, capture: Capture, *, views: bool, verb: str) -> N
         )
 
 
-def contacts_outside(folder: Path, settings: CaptureSettings | None, visual: VisualInputs) -> CaptureError | None:
-    """Return the error of contacts in another unit than the cameras of photographs, as `avmsf reconstruct` raises it.
+def misplaced(folder: Path, settings: CaptureSettings | None, visual: VisualInputs) -> list[AvmsfWarning | AvmsfError]:
+    """Return what `avmsf reconstruct` would warn of or raise of cameras, masks, Gaussians and contacts together.
 
-    It compares some of the photographs, at a low resolution. None where there is a mesh, or nothing to compare.
+    It opens some of the photographs, at a low resolution.
     """
-    if visual.cameras is None or visual.mesh is not None:
-        return None
     try:
         settings = settings or settings_of(folder)
-        contacts = contacts_of(read_rows(folder)[0], settings)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", CaptureWarning)
-            views = read_views(folder, longest=LONGEST, max_views=MAX_VIEWS, meters=settings.views_meters)
-            views = find_foreground(views)
+        rows = read_rows(folder)[0]
+        contacts = contacts_of(rows, settings)
     except CaptureError:
-        return None
-    try:
-        expect_contacts_in_outlines(contacts, views, settings)
-    except CaptureError as error:
-        return CaptureError(f"{error}{_other_frame(folder)}", **error.attributes)
-    return None
+        return []
+    if not len(contacts):
+        return []
+    names = [row.cells["file"] for row in rows] if len(rows) == len(contacts) else []
+    stated = stated_moves(folder, meters=settings.views_meters)
+    found = list[AvmsfWarning | AvmsfError]()
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", CaptureWarning)
+        try:
+            if visual.cameras is not None:
+                views = read_views(folder, longest=LONGEST, max_views=MAX_VIEWS, meters=settings.views_meters)
+                views = find_foreground(views)
+                surface = None if visual.mesh is None else find_surface(folder, settings)
+                outlines = None if surface is None else judge_outlines(surface, views, settings)
+                found += [] if outlines is None else [outlines]
+                expect_contacts_in_views(contacts, views, settings, stated=stated)
+            if visual.gaussians is not None:
+                cloud = without_far(scaled(read_splats(folder / visual.gaussians), settings.views_meters))
+                expect_on_object(contacts, cloud.centers, names=names, what="Gaussians", stated=stated)
+        except (CaptureError, SceneError) as error:
+            found.append(error)
+    # The error says what the cameras' axes show, and which photographs are missing the camera file's check.
+    left_out = ("missing images", "cameras", *(["axes"] if found else []))
+    warned = [each.message for each in told if isinstance(each.message, CaptureWarning)]
+    return [*(each for each in warned if each.name not in left_out), *found]
 
 
 def _photographs(
@@ -190,7 +190,7 @@ def _photographs(
             _, found = find_shots(folder)
         except CaptureError as error:
             problems.append(str(error))
-            return {}, None, {}
+            return _photographs(folder, "photographs", problems)
         missing = [shot.name for shot in found.shots if not shot.image.is_file()]
         if missing:
             lacks = counted(len(missing), "missing photograph")

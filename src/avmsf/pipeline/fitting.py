@@ -23,8 +23,8 @@ from avmsf.field.gains.estimator import estimator_for
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.extract import Extraction, extract_modes, extract_once
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.pipeline.reconstruct import expect_on_object
 from avmsf.pipeline.record import finder_of, modes_words, supporting_poles, with_record
+from avmsf.pipeline.silhouettes import expect_on_object
 from avmsf.scene.features import FeatureField
 from avmsf.scene.symmetry import Symmetries
 from avmsf.scene.symmetrysearch import find_symmetries
@@ -177,14 +177,14 @@ def _points_of(
 ) -> FeatureField:
     """Return the object's points: the described ones, else of its surface, else those that fill the contacts' box."""
     if features is not None:
-        expect_on_object(capture.impacts, features.points)
+        expect_on_object(capture.impacts.contacts, features.points, names=capture.impacts.names)
         return features
     if config.gain_model == "network":
         log("no visual features were given: the network reads positions alone")
     if capture.surface is None:
         log(_no_shape(config))
         return FeatureField.from_contacts(capture.impacts.contacts)
-    expect_on_object(capture.impacts, surface_points(capture.surface))
+    expect_on_object(capture.impacts.contacts, surface_points(capture.surface), names=capture.impacts.names)
     return FeatureField.from_mesh(capture.surface, seed=config.fit.seed)
 
 

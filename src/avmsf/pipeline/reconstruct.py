@@ -9,18 +9,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from avmsf._utils.caching import once
 from avmsf.capture import Capture, Impacts, Surface
-from avmsf.capture.placement import judge_placement
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.surface import find_surface, read_surface, write_surface
 from avmsf.capture.views import read_views
-from avmsf.capture.warning import CaptureWarning
+from avmsf.capture.views.transforms import stated_moves
 from avmsf.config import CACHED_FIELD, PipelineConfig
-from avmsf.errors import AvmsfError, CaptureError, SceneError
+from avmsf.errors import AvmsfError, SceneError
 from avmsf.field.config import NETWORK
 from avmsf.field.fit import Progress, fit
 from avmsf.field.gains.bodies import CandidateBodies
@@ -36,10 +33,11 @@ from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.guess import expect_no_recordings, guess_field
 from avmsf.pipeline.record import finder_of, modes_words, supporting_poles, with_record
 from avmsf.pipeline.scene import ProgressListener, SceneStages
-from avmsf.pipeline.silhouettes import expect_contacts_in_outlines, judge_outlines
+from avmsf.pipeline.silhouettes import expect_contacts_in_views, expect_on_object, judge_outlines
 from avmsf.pipeline.stages import Kept, StageFolder
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features, read_report
+from avmsf.scene.ply import read_splats
 from avmsf.scene.symmetry import Symmetries
 from avmsf.wording import counted
 
@@ -291,13 +289,17 @@ def _shape(
         surface, digest = object_shape(capture.surface, None)
         made = _surface_stage(stages, config, surface, digest, listener)
         return _Shape({"positions": features}, made, {}, surface, digest)
+    impacts, stated = capture.impacts, stated_moves(folder, meters=settings.views_meters)
     if scene.source is not None and scene.source.kind == "cameras":
         # Before Gaussians, which take minutes.
         views = read_views(scene.views.path)
         warning = None if capture.surface is None else judge_outlines(capture.surface, views, settings)
         if warning is not None:
             warnings.warn(warning, stacklevel=2)
-        expect_contacts_in_outlines(capture.impacts.contacts, views, settings)
+        expect_contacts_in_views(impacts.contacts, views, settings, stated=stated)
+    if scene.splats is not None:
+        points = read_splats(scene.cloud.path).centers
+        expect_on_object(impacts.contacts, points, names=impacts.names, what="Gaussians", stated=stated)
     features = load_features(scene.features.path)
     surface, digest = object_shape(capture.surface, scene)
     made = scene.made() | _surface_stage(stages, config, surface, digest, listener)
@@ -314,7 +316,8 @@ def _shape(
     candidates["visual"] = features
     # Structure from motion knows nothing of the frame that the contacts are in.
     found_frame = scene.source is not None and scene.source.kind in ("photographs", "video")
-    expect_on_object(capture.impacts, features.points, strict=found_frame)
+    if scene.splats is None:
+        expect_on_object(impacts.contacts, features.points, names=impacts.names, stated=stated, strict=found_frame)
     report = read_report(scene.features.path)
     return _Shape(candidates, made, report, surface, digest)
 
@@ -383,18 +386,3 @@ def keep_surface(stages: StageFolder, make: Callable[[], Surface | ObjectShape],
         write_whole(path, lambda place: write_surface(surface, place), raising=SceneError)
 
     return stages.keep(SURFACE, {"of": digest}, write)
-
-
-def expect_on_object(impacts: Impacts, points: Float[Tensor, "points 3"], *, strict: bool = False) -> None:
-    """Warn with `CaptureWarning` of contacts off the object's points, with the mistake that may explain it.
-
-    Raises `CaptureError` for contacts in another frame, for one farther off than the object is large, and, if `strict`,
-    for any off it. The `value` of both is the largest distance, meters.
-    """
-    placement = judge_placement(impacts.contacts, points)
-    words, distance = placement.describe(impacts.names), float(placement.distances.max())
-    apart = placement.misplaced or placement.other_unit or distance > placement.diagonal
-    if words and (apart or (strict and placement.off)):
-        raise CaptureError(words, name="contacts", value=distance)
-    if words:
-        warnings.warn(CaptureWarning(words, name="contacts", value=distance), stacklevel=2)

@@ -1,21 +1,25 @@
-"""Whether a mesh and photographs show one object in one frame: the mesh's outlines and the photographs' masks."""
+"""Whether contacts, mesh, photographs and Gaussians show one object in one frame."""
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy import ndimage
 from torch import Tensor
 
 from avmsf.capture.cameras import Camera, View
 from avmsf.capture.meshviews import MeshTracer
-from avmsf.capture.placement import FACTORS, WRONG_ROWS
+from avmsf.capture.placement import FACTORS, WRONG_ROWS, Mistake, judge_placement
 from avmsf.capture.proposals import unit_named
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.surface import Surface
 from avmsf.capture.texturedmesh import TexturedMesh
+from avmsf.capture.views.hull import Hull, carve
+from avmsf.capture.views.poses import judge_cameras
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError
 from avmsf.scene.points import farthest_points
@@ -100,30 +104,112 @@ def judge_outlines(surface: Surface, views: Sequence[View], settings: CaptureSet
     )
 
 
-def expect_contacts_in_outlines(
-    contacts: Float[Tensor, "contacts 3"], views: Sequence[View], settings: CaptureSettings
+def expect_contacts_in_views(
+    contacts: Float[Tensor, "contacts 3"],
+    views: Sequence[View],
+    settings: CaptureSettings,
+    *,
+    stated: Sequence[Mistake] = (),
 ) -> None:
-    """Raise CaptureError where contacts in another unit would lie inside the outlines of views, and as they are do not.
+    """Raise CaptureError where cameras do not see one object, or see it elsewhere than the contacts (m) lie.
 
-    Contacts (m) on an object lie inside its mask in every view. A factor is the mistake where at most half of them do
-    in the median view, but nearly all once it is undone; of several the largest, for contacts that are shrunk enough
-    lie inside whatever they were.
+    Masks of one object have a common volume, the hull, and contacts on it lie inside its mask in every view. Where most
+    do not in the median view, a unit is the mistake if nearly all do once it is undone; of several the largest, for
+    contacts that are shrunk enough lie inside whatever they were. What files have `stated` is it where its undoing
+    explains the contacts' distances to the hull. Views without masks say nothing.
     """
     chosen = _masked(views)
-    if not chosen or 2 * _share_inside(contacts, chosen) > 1:
+    if not chosen:
         return
-    fitting = [each for each in FACTORS if _share_inside(each * contacts, chosen) >= 1 - WRONG_ROWS]
-    if not fitting:
+    hull = _hull(chosen)
+    if hull is None:
+        shares = {
+            words: _share_inside(contacts, mended) * bool(_hull(mended)) for words, mended in _conventions(chosen)
+        }
+        likely = max(shares, key=shares.__getitem__)
+        found = [remark.message for remark in judge_cameras([view.camera for view in chosen])]
+        found += [f"they show the contacts once {likely}"] if 2 * shares[likely] > 1 else []
+        # Cubes may miss what is thin: by itself that says nothing.
+        if found:
+            raise CaptureError(
+                f"expected cameras that look at one object, got masks without a common volume: {'; '.join(found)}",
+                name="cameras",
+                value=len(chosen),
+            )
+    inside = 2 * _share_inside(contacts, chosen) > 1
+    if inside and not (stated and hull):
         return
-    factor = max(fitting)
+    factor = max((each for each in FACTORS if _share_inside(each * contacts, chosen) >= 1 - WRONG_ROWS), default=1.0)
+    placement = None if hull is None else judge_placement(contacts, _surface_of(hull), stated=stated)
+    if placement is not None and placement.mistake is not None and placement.mistake.stated:
+        raise CaptureError(
+            f"expected contacts on the object in the photographs: {placement.mistake}",
+            name="frame",
+            value=float(placement.distances.max()),
+        )
+    if inside:
+        return
     name = unit_named(factor * settings.meters)
     mended = f'write unit = "{name}" in capture.toml' if name else "scale the contacts or the cameras"
+    reason = f"and inside when multiplied by {factor:.4g}; {mended}"
+    if factor == 1:
+        reason = "and no change of unit explains it" if placement is None else placement.describe(what="masks' hull")
     raise CaptureError(
-        f"unit: expected contacts on the object in the photographs, got most outside of its outlines, and inside when "
-        f"multiplied by {factor:.4g}; {mended}",
-        name="unit",
+        f"expected contacts on the object in the photographs, got most outside of its outlines, {reason}",
+        name="unit" if factor != 1 else "frame",
         value=factor,
     )
+
+
+def expect_on_object(
+    contacts: Float[Tensor, "contacts 3"],
+    points: Float[Tensor, "points 3"],
+    *,
+    names: Sequence[str],
+    what: str = "surface",
+    stated: Sequence[Mistake] = (),
+    strict: bool = False,
+) -> None:
+    """Warn with `CaptureWarning` of contacts off `what` the object's points are, with the mistake that may explain it.
+
+    Raises `CaptureError` for contacts in another frame, for one farther off than the object is large, and, if `strict`,
+    for any off it. The `value` of both is the largest distance, meters.
+    """
+    placement = judge_placement(contacts, points, stated=stated)
+    words, distance = placement.describe(names, what=what), float(placement.distances.max())
+    apart = placement.misplaced or placement.other_unit or distance > placement.diagonal
+    if words and (apart or (strict and placement.off)):
+        raise CaptureError(words, name="contacts", value=distance)
+    if words:
+        warnings.warn(CaptureWarning(words, name="contacts", value=distance), stacklevel=2)
+
+
+def _hull(views: Sequence[View]) -> Hull | None:
+    masks = [view.mask.numpy() > 127 for view in views if view.mask is not None]
+    return carve(masks, [view.camera for view in views])
+
+
+def _conventions(views: Sequence[View]) -> Iterator[tuple[str, list[View]]]:
+    """Yield views with cameras as they would be were their poses of another convention, and what would mend these."""
+    turn = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    ways: dict[str, Callable[[Tensor], Tensor]] = {
+        "the second and third column of each pose are negated (OpenCV's axes for OpenGL's)": lambda pose: turn @ pose,
+        "each pose is inverted (world to camera for camera to world)": lambda pose: turn @ pose.inverse() @ turn,
+        "each pose is inverted, its second and third column then negated": lambda pose: pose.inverse() @ turn,
+    }
+    for words, way in ways.items():
+        cameras = [replace(view.camera, world_to_camera=way(view.camera.world_to_camera.double())) for view in views]
+        yield words, [replace(view, camera=camera) for view, camera in zip(views, cameras, strict=True)]
+
+
+def _surface_of(hull: Hull) -> Float[Tensor, "places 3"]:
+    """Return the middles of the outermost cubes that are object, float64."""
+    rows = np.round((hull.centers - hull.centers.min(axis=0)) / hull.edge).astype(int)
+    occupied = hull.occupied(missing=hull.views // 6)
+    grid = np.zeros(rows.max(axis=0) + 3, dtype=bool)
+    grid[tuple(rows[occupied].T + 1)] = True
+    edge = grid & ~ndimage.binary_erosion(grid)
+    return torch.from_numpy(hull.centers[occupied & edge[tuple(rows.T + 1)]])
 
 
 def _masked(views: Sequence[View]) -> list[View]:

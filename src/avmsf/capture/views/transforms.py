@@ -9,10 +9,12 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
+import torch
 
 from avmsf._utils.text_files import read_json
 from avmsf.capture.filenames import PICTURE_SUFFIXES
 from avmsf.capture.location import Location
+from avmsf.capture.placement import Mistake
 from avmsf.capture.views.lenses import Lens
 from avmsf.capture.views.poses import TOLERANCE, opencv_from_opengl, rigid
 from avmsf.capture.views.shots import Shot, Shots, listed, refuse_many
@@ -55,6 +57,34 @@ def read_transforms(path: Path) -> Shots:
         shots.append(Shot(name, image, opencv_from_opengl(pose), partial(_lens, settings, where), mask))
     message = f"poses have a scaled rotation; the scale was removed: {listed(scaled)}"
     return Shots(path, tuple(shots), (Remark(message, name="transform_matrix", value=scaled),) if scaled else ())
+
+
+def stated_moves(folder: Path, *, meters: float = 1.0) -> list[Mistake]:
+    """Return how nerfstudio says that it moved an object, in transforms.json or beside it; none where it does not.
+
+    A place x became scale * (transform x), in units of so many `meters`. What cannot be read is passed over.
+    """
+    found = []
+    for name, keys in (
+        ("transforms.json", ("applied_transform", "applied_scale")),
+        ("dataparser_transforms.json", ("transform", "scale")),
+    ):
+        try:
+            record = read_json(folder / name)
+            matrix = np.array(record.get(keys[0], np.eye(4)), dtype=np.float64)[:3].reshape(3, 4)
+            scale = float(record.get(keys[1], 1.0))
+        except (OSError, ValueError, TypeError, AttributeError):
+            continue
+        stretch = float(np.linalg.det(matrix[:, :3])) ** (1 / 3) if np.linalg.det(matrix[:, :3]) > 0 else math.nan
+        factor, shift = scale * stretch * meters, torch.from_numpy(scale * meters * matrix[:, 3])
+        if (
+            0 < factor < math.inf
+            and np.isfinite(matrix).all()
+            and not (factor == 1 and np.allclose(matrix, np.eye(4)[:3]))
+        ):
+            words = ", ".join(f"{key} = {np.round(record[key], 4).tolist()}" for key in keys if key in record)
+            found.append(Mistake(factor, torch.from_numpy(matrix[:, :3] / stretch), shift, stated=f"{name} ({words})"))
+    return found
 
 
 def load_record(path: Path) -> dict[str, Any]:
