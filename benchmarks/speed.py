@@ -1,9 +1,15 @@
 """How long a training step, a whole fit and a rendered sound take, in seconds and against the plain way."""
 
 import os
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from statistics import median
 from typing import Literal, TypeVar
 
@@ -18,7 +24,7 @@ from avmsf.field.soundfield import SoundField
 from avmsf.field.training import Targets, TrainingRun
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.scene.features import FeatureField
-from benchmarks.material import IMPULSE, STRUCK
+from benchmarks.material import IMPULSE, STRUCK, shared_data
 from benchmarks.report import Options, Report, Table, tell
 from benchmarks.step import STEPS, PlainRun, full_setting, memory_of_step, pass_warmup, start
 
@@ -140,7 +146,36 @@ def _render(options: Options) -> Report:
     return Report(conventions, (_table("render", figures),), figures)
 
 
-PARTS: dict[str, Callable[[Options], Report]] = {"step": _step, "render": _render, "quick": _quick}
+def _commands(options: Options) -> Report:
+    with tempfile.TemporaryDirectory() as name:
+        capture, field = shared_data() / "ruler10", f"{name}/ruler.safetensors"
+        shutil.copytree(capture, f"{name}/ruler10")
+        avmsf = [str(Path(sys.executable).with_name("avmsf"))]
+        quick = ["--gain-model", "smooth"] if options.quick_look else []
+        _processor_seconds([*avmsf, "fit", f"{name}/ruler10", "-o", field, *quick])
+        commands = {
+            "import": [sys.executable, "-c", "import torch"],
+            "info": [*avmsf, "info", field],
+            "locate": [*avmsf, "locate", field, str(capture / "impacts" / "001.wav")],
+        }
+        figures = {
+            f"{each}_processor_seconds": min(_processor_seconds(command) for _ in range(1 if options.quick_look else 3))
+            for each, command in commands.items()
+        }
+    figures |= {
+        f"{each}_over_import": figures[f"{each}_processor_seconds"] / figures["import_processor_seconds"]
+        for each in ("info", "locate")
+    }
+    conventions = (
+        "commands: user and system time of avmsf info, and of avmsf locate for one recording, on the field of the "
+        "ruler (10 contacts), each a process, least of 3; over that of importing torch, which machines share.",
+    )
+    return Report(conventions, (_table("commands", figures),), figures)
+
+
+PARTS: dict[str, Callable[[Options], Report]] = {
+    "step": _step, "render": _render, "quick": _quick, "commands": _commands,
+}  # fmt: skip
 
 
 def _paper_seconds(task: Task, spatial: bool, config: FitConfig, repeats: int) -> tuple[float, float]:
@@ -188,6 +223,14 @@ def _timed(work: Callable[[], _Result]) -> tuple[_Result, float]:
     begun = time.perf_counter()
     result = work()
     return result, time.perf_counter() - begun
+
+
+def _processor_seconds(command: list[str]) -> float:
+    """Run a command and return the processor time that it took."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run(command, check=True, capture_output=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def _table(title: str, figures: dict[str, float]) -> Table:
