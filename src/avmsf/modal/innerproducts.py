@@ -6,13 +6,12 @@ sounds with the modes do. All on the processor and without gradients.
 """
 
 import math
-from typing import no_type_check
 
+import numpy as np
 import torch
 from jaxtyping import Complex128, Float, Float64
 from torch import Tensor
 
-from avmsf.compiled import compiled
 from avmsf.modal.bank import ModalBank
 
 _BLOCK = 512
@@ -27,90 +26,56 @@ def poles_of(bank: ModalBank, sample_rate: float) -> Complex128[Tensor, " modes"
 
 def gram(poles: Complex128[Tensor, " modes"], samples: int, *, power: int) -> Float64[Tensor, "two_modes two_modes"]:
     """Return inner products over time, weighted by n^power (0, 1 or 2), of all sines and cosines with each other."""
-    products = torch.empty(2 * len(poles), 2 * len(poles), dtype=torch.float64)
-    _gram(poles.numpy(), (poles**samples).numpy(), samples, power, products.numpy())
-    return products
+    own, last = poles.numpy(), (poles**samples).numpy()
+    straight = _power_sum(own[:, None] * own, last[:, None] * last, samples, power)
+    crossed = _power_sum(own[:, None] * own.conj(), last[:, None] * last.conj(), samples, power)
+    mixed = straight.imag + crossed.imag
+    parts = np.block([[crossed.real - straight.real, mixed], [mixed.T, crossed.real + straight.real]])
+    return torch.from_numpy(0.5 * parts)
 
 
 def own_gram(poles: Complex128[Tensor, " modes"], samples: int) -> Float64[Tensor, "modes 2 2"]:
     """Return the inner products over time of each mode's own sine and cosine: the two by two blocks of `gram`."""
-    blocks = torch.empty(len(poles), 2, 2, dtype=torch.float64)
-    _own_gram(poles.numpy(), (poles**samples).numpy(), samples, 0, blocks.numpy())
-    return blocks
+    own, last = poles.numpy(), (poles**samples).numpy()
+    straight = _power_sum(own * own, last * last, samples, 0)
+    crossed = _power_sum(own * own.conj(), last * last.conj(), samples, 0)
+    parts = [crossed.real - straight.real, straight.imag, straight.imag, crossed.real + straight.real]
+    return torch.from_numpy(0.5 * np.stack(parts, axis=1).reshape(-1, 2, 2))
 
 
-@compiled(error_model="numpy", nogil=True)
-@no_type_check
-def _power_sum(ratio, last, samples, power):
+def _power_sum(
+    ratio: Complex128[np.ndarray, "*shape"], last: Complex128[np.ndarray, "*shape"], samples: int, power: int
+) -> Complex128[np.ndarray, "*shape"]:
     """Return the sum over n < samples of n^power ratio^n, in closed form; `last` is ratio^samples."""
     rest = 1.0 - ratio
-    if (rest.real**2 + rest.imag**2) * samples**2 < 1.0:
-        # The fractions lose their digits where hardly anything decays or turns over the whole sound.
-        return _steady_sum(ratio, samples, power)
-    plain = (1.0 - last) / rest
-    if power == 0:
-        return plain
-    first = (ratio * plain - samples * last) / rest
-    if power == 1:
-        return first
-    return (ratio * (2.0 * first + plain) - float(samples) * samples * last) / rest
+    # The fractions lose their digits where hardly anything decays or turns over the whole sound.
+    steady = np.abs(rest) * samples < 1.0
+    rest[steady] = 1.0
+    found = (1.0 - last) / rest
+    if power:
+        plain, found = found, (ratio * found - samples * last) / rest
+        if power == 2:
+            found = (ratio * (2.0 * found + plain) - float(samples) ** 2 * last) / rest
+    if steady.any():
+        found[steady] = _steady_sum(ratio[steady], samples, power)
+    return found
 
 
-@compiled(error_model="numpy", nogil=True)
-@no_type_check
-def _steady_sum(ratio, samples, power):
-    """Return the sum over n < samples of n^power ratio^n for a ratio near one, doubling its length again and again."""
-    plain, first, second = 0.0j, 0.0j, 0.0j
-    length, bit = 0.0, 1
-    while 2 * bit <= samples:
-        bit *= 2
-    while bit > 0:
+def _steady_sum(ratio: Complex128[np.ndarray, " some"], samples: int, power: int) -> Complex128[np.ndarray, " some"]:
+    """Return the sum over n < samples of n^power ratio^n for ratios near one, doubling its length again and again."""
+    plain = first = second = np.zeros_like(ratio)
+    length = 0.0
+    for bit in f"{samples:b}":
         turned = ratio**length
-        second += turned * (second + 2.0 * length * first + length * length * plain)
-        first += turned * (first + length * plain)
-        plain += turned * plain
+        second = second + turned * (second + 2.0 * length * first + length * length * plain)
+        first = first + turned * (first + length * plain)
+        plain = plain + turned * plain
         length *= 2.0
-        if samples & bit:
+        if bit == "1":
             turned = ratio**length
             plain, first, second = plain + turned, first + length * turned, second + length * length * turned
             length += 1.0
-        bit //= 2
-    if power == 0:
-        return plain
-    return first if power == 1 else second
-
-
-@compiled(error_model="numpy", nogil=True)
-@no_type_check
-def _gram(poles, last, samples, power, products):
-    """Write what `gram` returns; symmetric, so that half of the sums are enough."""
-    modes = len(poles)
-    for row in range(modes):
-        for column in range(row, modes):
-            straight = _power_sum(poles[row] * poles[column], last[row] * last[column], samples, power)
-            mirrored, last_mirrored = poles[column].conjugate(), last[column].conjugate()
-            crossed = _power_sum(poles[row] * mirrored, last[row] * last_mirrored, samples, power)
-            sines, cosines = 0.5 * (crossed.real - straight.real), 0.5 * (crossed.real + straight.real)
-            sine_cosine, cosine_sine = 0.5 * (straight.imag + crossed.imag), 0.5 * (straight.imag - crossed.imag)
-            products[row, column] = products[column, row] = sines
-            products[row, modes + column] = products[modes + column, row] = sine_cosine
-            products[modes + row, column] = products[column, modes + row] = cosine_sine
-            products[modes + row, modes + column] = products[modes + column, modes + row] = cosines
-
-
-@compiled(error_model="numpy", nogil=True)
-@no_type_check
-def _own_gram(poles, last, samples, power, blocks):
-    """Write what `own_gram` returns, where `power` is 0: a literal would have the sums compiled once more."""
-    for mode in range(len(poles)):
-        pole, end = poles[mode], last[mode]
-        straight = _power_sum(pole * pole, end * end, samples, power)
-        crossed = _power_sum(pole * pole.conjugate(), end * end.conjugate(), samples, power)
-        blocks[mode, 0, 0], blocks[mode, 1, 1] = (
-            0.5 * (crossed.real - straight.real),
-            0.5 * (crossed.real + straight.real),
-        )
-        blocks[mode, 0, 1] = blocks[mode, 1, 0] = 0.5 * straight.imag
+    return (plain, first, second)[power]
 
 
 def project(
@@ -159,33 +124,14 @@ def _project(
     if rest:
         summed = torch.cat([summed, (sounds[:, whole * _BLOCK :] @ table[:rest])[:, None]], dim=1)
     starts = _powers(poles**_BLOCK, summed.shape[1])
-    plain = torch.zeros(2, len(sounds), len(poles), dtype=torch.float64)
-    outer = torch.zeros_like(plain)
-    _over_blocks(
-        summed.numpy(), starts.real.contiguous().numpy(), starts.imag.contiguous().numpy(), plain.numpy(), outer.numpy()
-    )
-    return torch.complex(*plain), torch.complex(*outer)
-
-
-@compiled(fastmath={"contract"}, error_model="numpy", nogil=True)
-@no_type_check
-def _over_blocks(summed, real, imaginary, plain, outer):
-    """Add up the blocks' sums, each turned and shrunk to where its block starts; real and imaginary parts apart."""
-    contacts, blocks, columns = summed.shape
-    modes = real.shape[1]
-    for contact in range(contacts):
-        for block in range(blocks):
-            part, turn, turned, offset = summed[contact, block], real[block], imaginary[block], float(block * _BLOCK)
-            for mode in range(modes):
-                one, other = part[mode], part[modes + mode]
-                plain[0, contact, mode] += turn[mode] * one - turned[mode] * other
-                plain[1, contact, mode] += turn[mode] * other + turned[mode] * one
-            if columns > 2 * modes:
-                for mode in range(modes):
-                    one = part[2 * modes + mode] + offset * part[mode]
-                    other = part[3 * modes + mode] + offset * part[modes + mode]
-                    outer[0, contact, mode] += turn[mode] * one - turned[mode] * other
-                    outer[1, contact, mode] += turn[mode] * other + turned[mode] * one
+    count = len(poles)
+    plain = torch.complex(summed[..., :count], summed[..., count : 2 * count])
+    inner = (starts * plain).sum(1)
+    if not weighted:
+        return inner, torch.zeros_like(inner)
+    offset = _BLOCK * torch.arange(len(starts), dtype=torch.float64)[:, None]
+    outer = torch.complex(summed[..., 2 * count : 3 * count], summed[..., 3 * count :]) + offset * plain
+    return inner, (starts * outer).sum(1)
 
 
 def _powers(poles: Complex128[Tensor, " modes"], count: int) -> Complex128[Tensor, "count modes"]:
