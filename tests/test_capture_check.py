@@ -218,3 +218,12 @@ def test_sway_and_rumble_are_proposed_to_be_filtered_whatever_their_onset(tmp_pa
     proposed = {each.key: each.value for each in propose_settings(fill(tmp_path, rows=rows, replace=sounds, rate=rate))}
     assert proposed == {"highpass": 20.0}
     assert extract_modes(read_capture(tmp_path).impacts) is not None
+
+
+def test_rows_in_the_order_of_text_and_not_of_numbers_are_remarked_on(tmp_path: Path) -> None:
+    names = [f"{number}.wav" for number in range(1, 11)]
+    sounds = {name: ring(1.0, before=0.25, seed=row) for row, name in enumerate(names)}
+    for way, remarked in ((sorted(names), True), (names, False), (names[::-1], False)):
+        rows = tuple(f"{name},{row / 100},0,0" for row, name in enumerate(way))
+        report = check(fill(tmp_path / f"{way[1]}{way[2]}", rows=rows, replace=sounds))
+        assert any("order of text" in each for each in report.remarks) is remarked

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from avmsf.capture.filenames import number_key
 from avmsf.capture.folder import read_strike
 from avmsf.capture.measure import RecordingReport
 from avmsf.capture.prepare import Prepared, margin_length
@@ -114,7 +115,14 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
         lack = f"{counted(len(stray), 'wav file')} {'has' if len(stray) == 1 else 'have'} no row in {TABLE}"
         problems.append(f"{lack}: {', '.join(stray[:5])}{', …' * (len(stray) > 5)}")
     readable = not refused and all(report.readable for report in reports)
-    return CaptureReport(readable, tuple(reports), tuple(refused + problems), (UNCUT,) if uncut else ())
+    remarks = [UNCUT] if uncut else []
+    names = [report.file for report in reports]
+    if names == sorted(names) != sorted(names, key=number_key):
+        remarks.append(
+            f"the rows of {TABLE} have the files in the order of text (1, 10, 2), not of numbers (1, 2, 10): make sure "
+            "that the contacts are in this order, too"
+        )
+    return CaptureReport(readable, tuple(reports), tuple(refused + problems), tuple(remarks))
 
 
 def _wav_files(folder: Path) -> list[str]:

@@ -31,6 +31,12 @@ _MAX_NAMES_COMPARED = 1000
 _OF_VIEWS = frozenset(("transforms.json", "images", "sparse", "cameras.bin", "cameras.txt", *SURFACE_FILES, *SPLATS))
 
 
+def number_key(name: str) -> list[tuple[bool, int, str]]:
+    """Return what sorts names by the numbers in them: 2.wav before 10.wav."""
+    parts = re.findall(r"\d+|\D+", name)
+    return [(False, int(each), "") if each.isdecimal() else (True, 0, each) for each in parts]
+
+
 def find_surface_file(folder: Path, settings: CaptureSettings) -> Path | None:
     """Return the surface file that the settings name, or the first of the usual names; None where there is none."""
     if settings.surface is not None:

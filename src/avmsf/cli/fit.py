@@ -20,6 +20,7 @@ from avmsf.cli.progress import FitBar
 from avmsf.cli.scores import (
     body_warnings,
     compare,
+    order_words,
     outlier_words,
     parts_words,
     quality_words,
@@ -77,7 +78,7 @@ def run(options: Options) -> int:
         say(f"avmsf fit: interrupted; repeat the command to continue {where}")
         return INTERRUPTED
     screen = console(errors=options.json)
-    for sentence in describe_alignment(modes, train):
+    for sentence in (*order_words(fitted), *describe_alignment(modes, train)):
         screen.print(sentence, soft_wrap=True)
     save(fitted, options.output)
     discard_unfinished(options.output)

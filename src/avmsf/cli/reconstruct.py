@@ -14,7 +14,7 @@ from avmsf.cli.printing import console, figure, print_json, say, table
 from avmsf.cli.progress import FitBar
 from avmsf.cli.scenebar import SceneBar
 from avmsf.cli.scenes import features_words
-from avmsf.cli.scores import compare
+from avmsf.cli.scores import compare, order_words
 from avmsf.cli.visuals import expect_shape
 from avmsf.errors import FitError
 from avmsf.field.fit import Progress
@@ -58,7 +58,7 @@ def run(options: Options) -> int:
     doing("comparing the field with the recordings that it was not fitted to")
     scores = {} if test is None else compare(fitted, train, test, made.modes)
     screen = console(errors=options.json)
-    for sentence in describe_alignment(made.modes, train):
+    for sentence in (*order_words(fitted), *describe_alignment(made.modes, train)):
         screen.print(sentence, soft_wrap=True)
     if made.report:
         screen.print(features_words(made.report), soft_wrap=True)

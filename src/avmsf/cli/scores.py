@@ -71,6 +71,11 @@ def body_warnings(field: SoundField) -> list[str]:
     return [f"warning: {field.body.warning}"] if field.body is not None and field.body.warning else []
 
 
+def order_words(field: SoundField) -> list[str]:
+    """Return the other order in which the recordings agree with the contacts; empty where there is none."""
+    return [field.origin.report["order"]] if field.origin.report.get("order") else []
+
+
 def outlier_words(field: SoundField) -> list[str]:
     """Return a line for each recording that contradicts the others: what was done, why it may be; --verbose figures."""
     report = field.origin.report

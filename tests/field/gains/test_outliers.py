@@ -18,6 +18,7 @@ from avmsf.field.gains.outliers import (
     Fit,
     Outlier,
     PredictiveRatios,
+    better_order,
     judge_contacts,
     predicts_better,
     set_aside,
@@ -162,6 +163,36 @@ def test_exchanged_labels_are_found_with_the_places_exchanged() -> None:
     assert found[9].figures()["place_ratio"] == found[9].place_ratio
 
 
+def test_recordings_given_to_rows_in_another_order_are_found_with_the_order() -> None:
+    true, rows = _sites(), _every(_sites())
+    text = sorted(range(CONTACTS), key=lambda row: str(row + 1))
+    for given, order in (
+        ([f"{row + 1}.wav" for row in text], torch.tensor(text).argsort()),
+        ([f"{(row + 2) % CONTACTS:03d}.wav" for row in range(CONTACTS)], rows.roll(2)),
+        ([f"{row:03d}.wav" for row in range(CONTACTS)], rows.flip(0)),
+    ):
+        # Contact r has the recording that is wanted there, `order[r]`; the table gives it the r-th.
+        gains = _gains(true)
+        moved = replace(gains, values=gains.values[order.argsort()])
+        families = [kind(true, 1.4) for kind in (Unstructured, Smooth, ThinPlate)]
+        found = better_order(given, families, rows, moved, true.points.float(), directional=True)
+        assert found is not None
+        assert torch.equal(found[1], order)
+        assert better_order(given, families, rows, gains, true.points.float(), directional=True) is None
+
+
+def test_a_recording_of_another_gain_is_named_as_such() -> None:
+    true, gains = _sites(), _gains(_sites())
+    gains.values[6] *= 0.1
+    (found,) = _found(true, gains)
+    assert found.row == 6
+    assert abs(found.level_db + 20.0) < 2.0
+    names = [f"hit{row}" for row in range(CONTACTS)]
+    text = found.describe(names, true.points.float(), directed=True, with_body=False)
+    assert "dB lower than the others'" in text
+    assert "exchanged" not in text
+
+
 def test_a_reversed_direction_is_found_at_its_own_place() -> None:
     true = _sites()
     directions = true.directions.clone()
@@ -180,7 +211,10 @@ def test_noise_accuses_nobody() -> None:
         # Steps of a factor of ten between contacts: some fit badly wherever they are.
         size = 10.0 ** torch.randint(0, 2, (CONTACTS, 1), generator=generator)
         noise = torch.randn(CONTACTS, MODES, dtype=torch.complex128, generator=generator) * size
-        assert _found(sites, MeasuredGains(noise, measured.variance, measured.frequency, measured.damping)) == ()
+        gains = MeasuredGains(noise, measured.variance, measured.frequency, measured.damping)
+        judgment = judge_contacts(_fit(sites, gains), None, sites, _places(), gains)
+        assert judgment.outliers == ()
+        assert not judgment.informative
 
 
 def test_few_places_accuse_nobody() -> None:

@@ -13,6 +13,7 @@ from jaxtyping import Float64, Int
 from torch import Tensor
 
 from avmsf.capture.placement import expect_placed
+from avmsf.capture.table import TABLE
 from avmsf.errors import AvmsfError, FitError
 from avmsf.fem.supports import FREE, FREE_PRIOR
 from avmsf.fem.thickness import search_thickness
@@ -24,7 +25,7 @@ from avmsf.field.gains.family import KernelFamily, Sites, sites_along
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, matched, total_evidence
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.model import MixtureGains
-from avmsf.field.gains.outliers import Fit, Judgment, judge_contacts, predicts_better
+from avmsf.field.gains.outliers import Fit, Judgment, better_order, judge_contacts, predicts_better
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.gains.symmetry import Symmetric
@@ -45,10 +46,12 @@ KNOWN = (*FAMILIES, Visual.kind)
 """All families. Looks must be asked for by name: with the built-in descriptors of four simulated objects they made the
 errors between 0.4 % smaller and 1.7 % larger without a body, and changed nothing with one."""
 _UPDATED = 64
-"""Contacts that a body is updated from, at most."""
+"""Contacts that a body is updated from, or orders are compared at, at most."""
 _PREDICTS = 1.4
 """Nats per mode that a free body has to add, below which supports are tried. A plate clamped at an edge and taken for
 free adds .5, a free one 2.3; mugs add 1.1 (held at the base) and 1.5, an aircraft .8 to 1.3."""
+_SHOWN = 4
+"""Changes that a message lists, at most."""
 _PLACES = 500
 """Points of the surface where the contacts that contradict the others may have been."""
 
@@ -152,6 +155,7 @@ class MixtureEstimator(GainRecipe):
         weights = _body_weights(model, families, fit.measured)
         report = _report(bodies, families, weights, missing) | _judgment_report(judgment, case, used)
         report["thickness"] = None if thickness is None else asdict(thickness)
+        report["order"] = None if judgment.informative else _better_order(fit, bodies)
         return replace(model, report=report), used
 
     def _expect_inputs(self, case: GainCase, groups: Sequence[Group]) -> None:
@@ -351,6 +355,22 @@ def _judged(fit: _Fit, model: MixtureGains, body: NominalBody | None) -> Judgmen
 
     elastic = None if body is None else fitted([body])
     return judge_contacts(fitted([]), elastic, fit.sites, model.sites(points), fit.measured)
+
+
+def _better_order(fit: _Fit, bodies: Sequence[NominalBody]) -> str | None:
+    """Return in which order the recordings agree with the contacts far better, and what to change; None for none."""
+    names = fit.case.train.names
+    rows = farthest_points(fit.sites.points, min(_UPDATED, len(names))).sort().values
+    points, directional = fit.case.features.points, fit.directional
+    found = better_order(names, fit.families(rows, bodies), rows, fit.measured, points, directional=directional)
+    if found is None:
+        return None
+    best, order = found
+    changed = [f"{names[new]} for {names[row]}" for row, new in enumerate(order.tolist()) if new != row]
+    return (
+        f"the recordings do not agree with the contacts, but would far better in another order, {best}: in "
+        f"{TABLE} write {', '.join(changed[:_SHOWN])}{', ...' * (len(changed) > _SHOWN)} and fit again"
+    )
 
 
 def _without(rows: Int[Tensor, " rows"], judgment: Judgment) -> Int[Tensor, " kept"]:

@@ -25,24 +25,28 @@ The contacts S that are set aside maximize
 
 found by adding, removing or exchanging one contact; the kernels are weighed again without S. A contact of S is an
 outlier if its own label is refuted, L_i < -1.5, and if another site or the opposite direction explains it. Where places
-say little of the gains nothing is an outlier.
+say little of the gains nothing is an outlier, but all labels may be in another order: of the `candidate_orders` the one
+of the highest evidence is named if it makes the sum of all L_i surely higher.
 """
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import scipy
 import torch
-from jaxtyping import Complex128, Float, Float64, Int
+from jaxtyping import Complex128, Float, Float32, Float64, Int
 from torch import Tensor
 
+from avmsf.capture.filenames import number_key
 from avmsf.capture.places import places_of
 from avmsf.field.gains.family import KernelFamily, Sites
-from avmsf.field.gains.fitting import MeasuredGains
+from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, total_evidence
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.model import MixtureGains, series_of
+from avmsf.wording import counted
 
 WIDE_NOISE_SHARES = (*NOISE_SHARES, 0.1, 0.3, 1.0, 3.0)
 """A wrong label may look like noise: the hypotheses that contacts are judged by have to allow for it."""
@@ -64,6 +68,10 @@ _REFUTED = -1.5
 """Nats below which a contact's own label is refuted."""
 _EXPLAINED = 0.4
 """Part of the others' mean ratio that a contact has to reach at another place."""
+_GAINS = tuple(10 ** (db / 20) for db in range(-60, 61))
+"""Factors by which one recording may be off: of an amplifier, a scale or a force."""
+_SHIFTS = 5
+"""Rows by which recordings may be off: takes left out or repeated before the first."""
 _CHANCE = 0.0228
 """Probability that errors fall as much by chance: that of two standard errors of a normal distribution."""
 _TINY = torch.finfo(torch.float64).tiny
@@ -120,20 +128,28 @@ class PredictiveRatios:
         found[rows[:, None], rows] = pairs
         return found[:, -1], found[:, :-1]
 
-    def elsewhere(self, row: int, aside: frozenset[int], places: Sites) -> Float64[Tensor, "2 places"]:
-        """Return the ratio of a contact if it had another site, and if it had the opposite direction there."""
+    def elsewhere(
+        self, row: int, aside: frozenset[int], places: Sites, factors: Sequence[float] = (1.0, -1.0)
+    ) -> Float64[Tensor, "factors places"]:
+        """Return the ratio of a contact if it had another site, and its recording were what is true times a factor.
+
+        A factor of -1 is the opposite direction. Without places the recording has the best of the factors, too.
+        """
         rows = self._rest(aside | {row})
         values, inverse, solved, quadratic = self._solved(rows)
         cross, gain = self._kernels(places, self.sites.take(rows)), self.values[row][:, None]
         mean = (cross @ solved[..., None])[..., 0]
         variance = self._own(places) + self._noise[:, None] - ((cross @ inverse) * cross).sum(2)
         power = values.square().sum(1, keepdim=True)
-        nowhere = _log_student(gain, torch.ones(()), power + gain.square(), len(rows) + 1)
-        found = []
-        for error in (gain - mean, gain + mean):
+        found, nowhere = [], []
+        for factor in factors:
+            scaled, jacobian = gain / factor, self.weight.sum() * math.log(abs(factor))
+            error = scaled - mean
             whole = quadratic[:, None] + error.square() / variance
-            found.append(self.weight @ (_log_student(error, variance, whole, len(rows) + 1) - nowhere))
-        return torch.stack(found)
+            found.append(self.weight @ _log_student(error, variance, whole, len(rows) + 1) - jacobian)
+            unplaced = _log_student(scaled, torch.ones(()), power + scaled.square(), len(rows) + 1)
+            nowhere.append(self.weight @ unplaced - jacobian)
+        return torch.stack(found) - torch.stack(nowhere).amax(0)
 
     def _rest(self, aside: frozenset[int]) -> Int[Tensor, " rows"]:
         return torch.tensor([row for row in range(len(self.sites)) if row not in aside])
@@ -211,6 +227,8 @@ class Outlier:
     """From its own place, meters."""
     reversed: bool
     """Whether the opposite direction explains it at its own place."""
+    level_db: float = 0.0
+    """By how much its level is too high at its own place, where that explains it better than any place does."""
 
     def describe(
         self, names: Sequence[str], contacts: Float[Tensor, "contacts 3"], *, directed: bool, with_body: bool
@@ -225,13 +243,17 @@ class Outlier:
         apart = (contacts.double() - place).norm(dim=1)
         own, apart[self.row] = float(apart[self.row]), torch.inf
         other = int(apart.argmin())
-        if float(apart[other]) < own:
+        if self.level_db:
+            causes.append(
+                f"a gain {abs(self.level_db):.0f} dB {'higher' if self.level_db > 0 else 'lower'} than the others'"
+            )
+        elif float(apart[other]) < own:
             causes.append(f"its label was exchanged with that of {names[other]}")
         if self.reversed:
             causes.append("a reversed direction or polarity" if directed else "a reversed polarity")
-        elif directed and self.distance == 0.0:
+        elif directed and self.distance == 0.0 and not self.level_db:
             causes.append("a wrong direction")
-        if self.distance > 0.0:
+        if self.distance > 0.0 and not self.level_db:
             causes.append("a wrong position")
         if with_body:
             causes.append("a body that does not fit")
@@ -252,6 +274,8 @@ class Judgment:
     """By ratio, the lowest first."""
     credibility: Credibility | None
     """None without a body."""
+    informative: bool
+    """Whether places say enough of the gains to accuse a contact; else all labels may be wrong, or places too far."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,12 +297,13 @@ def judge_contacts(plain: Fit, elastic: Fit | None, sites: Sites, places: Sites,
     judged without the body unless it is credible. `sites` are all contacts, `places` impacts all over the object.
     """
     if elastic is None:
-        return Judgment(_outliers(_search(plain, sites, measured), places), None)
+        used = _search(plain, sites, measured)
+        return Judgment(_outliers(used, places), None, used.mean() >= _INFORMATIVE)
     found = _search(elastic, sites, measured)
     without = PredictiveRatios(plain(_others(sites, found.aside), WIDE_NOISE_SHARES), sites, measured)
     credibility = Credibility(found.mean(), _Search(without, found.aside).mean())
     used = found if credibility.credible else _search(plain, sites, measured)
-    return Judgment(_outliers(used, places), credibility)
+    return Judgment(_outliers(used, places), credibility, used.mean() >= _INFORMATIVE)
 
 
 def set_aside(ratios: PredictiveRatios, start: frozenset[int] = frozenset()) -> frozenset[int]:
@@ -297,6 +322,62 @@ def set_aside(ratios: PredictiveRatios, start: frozenset[int] = frozenset()) -> 
         if best <= score + _MIN_STEP:
             return current
         score, current = best, found
+
+
+def candidate_orders(names: Sequence[str]) -> dict[str, Int[Tensor, " rows"]]:
+    """Return orders in which the recordings of these names may belong to the rows of a table, and what they are.
+
+    Sorted by the numbers in their names or as text, all reversed, or all moved by some rows; only such as differ from
+    the present one and from each other. Row r has the recording `order[r]`.
+    """
+    rows = list(range(len(names)))
+    found = {
+        "the files sorted by number (1, 2, 10)": sorted(rows, key=lambda row: number_key(names[row])),
+        "the files sorted as text (1, 10, 2)": sorted(rows, key=names.__getitem__),
+        "the files in reverse order": rows[::-1],
+    }
+    for by in rows[1 : _SHIFTS + 1]:
+        found[f"each file {counted(by, 'row')} earlier"] = rows[by:] + rows[:by]
+        found[f"each file {counted(by, 'row')} later"] = rows[-by:] + rows[:-by]
+    distinct = {tuple(order): words for words, order in reversed(found.items()) if order != rows}
+    return {words: torch.tensor(order) for order, words in reversed(distinct.items())}
+
+
+def better_order(
+    names: Sequence[str],
+    families: Sequence[KernelFamily],
+    rows: Int[Tensor, " rows"],
+    measured: MeasuredGains,
+    points: Float32[Tensor, "points 3"],
+    *,
+    directional: bool,
+) -> tuple[str, Int[Tensor, " contacts"]] | None:
+    """Return the candidate order of highest evidence if it surely predicts contacts better, and what it is.
+
+    Student's test of the log predictive ratios' differences over contacts, with Bonferroni's correction. `families` are
+    of the contacts `rows`; `names` and `measured` are all recordings', `points` the object's.
+    """
+
+    def at(order: Int[Tensor, " contacts"]) -> MeasuredGains:
+        return replace(measured, values=measured.values[order[rows]])
+
+    def evidence(words: str) -> float:
+        moved = at(orders[words])
+        return total_evidence([WeighedFamily.of(each, moved, NOISE_SHARES) for each in families], moved)
+
+    def ratios(order: Int[Tensor, " contacts"]) -> Float64[Tensor, " rows"]:
+        moved = at(order)
+        model = fit_mixture(families, moved, points, directional=directional, noise_shares=WIDE_NOISE_SHARES)
+        return PredictiveRatios(model, families[0].reference, moved).without(frozenset())[0]
+
+    orders = candidate_orders(names)
+    best = max(orders, key=evidence, default=None)
+    if best is None:
+        return None
+    more = ratios(orders[best]) - ratios(torch.arange(len(names)))
+    mean, error = float(more.mean()), float(more.std()) / math.sqrt(len(more))
+    chance = float(scipy.special.stdtr(len(more) - 1, -mean / max(error, _TINY)))
+    return (best, orders[best]) if chance < _CHANCE / len(orders) else None
 
 
 def predicts_better(
@@ -353,11 +434,17 @@ def _located(search: _Search, row: int, places: Sites, mean: float) -> Outlier |
     ratios = search.ratios.elsewhere(row, search.aside, Sites(points, directions))
     own, best = float(ratios[0, row]), int(ratios.amax(0).argmax())
     ratio, needed = float(ratios[:, best].max()), _EXPLAINED * mean
-    if own >= _REFUTED or ratio < needed:
+    here = search.ratios.elsewhere(row, search.aside, contacts.take(torch.tensor([row])), _GAINS)[:, 0]
+    level_db, leveled = 20 * math.log10(_GAINS[int(here.argmax())]), float(here.max())
+    # Both over the probability without places of the gain as it is.
+    better = leveled >= needed and leveled + own - float(here[_GAINS.index(1.0)]) > ratio
+    if own >= _REFUTED or (ratio < needed and not better):
         return None
+    if better:
+        best, ratio = row, leveled
     x, y, z = points[best].tolist()
     distance = float((points[best] - contacts.points[row]).norm())
-    return Outlier(row, own, (x, y, z), ratio, distance, float(ratios[1, row]) >= needed)
+    return Outlier(row, own, (x, y, z), ratio, distance, float(ratios[1, row]) >= needed, level_db if better else 0.0)
 
 
 def _others(sites: Sites, aside: frozenset[int]) -> Int[Tensor, " rows"]:
