@@ -5,13 +5,16 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy import ndimage
 
+from avmsf.capture.levelset import enclose
 from avmsf.capture.surface import Surface
 from avmsf.geometry.closest import ClosestPoints
 from avmsf.simulate import nominalthin
 from avmsf.simulate.nominal import nominal_bodies
 from avmsf.simulate.nominalthin import simplified, thinned
 from avmsf.simulate.skin import Skin
+from avmsf.simulate.tetrahedra import fill
 
 
 def ellipsoid(subdivisions: int) -> Skin:
@@ -110,3 +113,18 @@ def test_fewer_triangles_of_a_thin_shell_keep_its_volume() -> None:
     assert 1000 < len(found.faces) <= 1200
     assert found.open_edges == 0
     assert found.volume == pytest.approx(shell.volume, rel=0.05)
+
+
+def test_a_knotted_skin_shares_a_few_edges_rather_than_keep_its_triangles_and_is_filled() -> None:
+    values = ndimage.gaussian_filter(np.random.default_rng(0).standard_normal((40, 40, 40)), 2.0)
+    values /= values.std()
+    radius = np.linalg.norm(np.meshgrid(*[np.linspace(-1, 1, 40)] * 3), axis=0)
+    sponge = np.minimum(values + 0.5, 4 * (0.85 - radius)).astype(np.float32)
+    skin = Skin.of(enclose(sponge, 0.0, lowest=np.zeros(3), spacing=0.01))
+    assert len(simplified(skin, 1000).faces) > 10_000
+    found = simplified(skin, 1000, most=4000)
+    assert len(found.faces) <= 1000
+    assert found.open_edges == 0
+    assert found.volume == pytest.approx(skin.volume, rel=0.02)
+    filled = fill(surface_of(found), detail=0.1)
+    assert float(filled.volumes.sum()) == pytest.approx(skin.volume, rel=0.05)

@@ -41,6 +41,9 @@ _DETAILS = (0.002, 0.4)
 TRIANGLES = 0.1
 """Triangles that fill gets, over the degrees of freedom: fTetWild keeps their corners, so more of them make more
 tetrahedra, and its time goes with them."""
+_KNOTTED = 4.0
+"""More triangles than that, over those that fill gets, only so that none share an edge among three, take more time than
+the few that do harm the form: fTetWild allows them."""
 _SHELL = 36.0
 """Degrees of freedom of a wall over the vertices of the skin that it follows."""
 _PEAK = 377e6, 40_000, 1.1
@@ -88,7 +91,8 @@ def filled_solid(checked: CheckedSurface, dofs: int, *, wall: float | None = Non
     def filled(detail: float) -> Solid:
         # Quadrics keep the volume. Edges taken out one by one made the wall of a mug 5 % thinner.
         count = round(TRIANGLES * dofs * (first / detail) ** 2)
-        return fill(_surface(simplified(checked.skin, count)), detail=detail, timeout=_FILLING_SECONDS)
+        skin = simplified(checked.skin, count, most=_KNOTTED * count)
+        return fill(_surface(skin), detail=detail, timeout=_FILLING_SECONDS)
 
     return _near(filled, dofs, first=first)
 

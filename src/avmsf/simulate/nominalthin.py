@@ -47,17 +47,22 @@ def thinned(skin: Skin, *, tell: Callable[[str], None]) -> Skin:
     return found
 
 
-def simplified(skin: Skin, count: int, *, like: Skin | None = None) -> Skin:
+def simplified(skin: Skin, count: int, *, like: Skin | None = None, most: float = math.inf) -> Skin:
     """Return a skin of about `count` triangles by quadrics, its volume about the same; as it is if it has no more.
 
-    More are left where fewer would open a seam or share an edge among three, compared with the skin that it is `like`.
+    More, up to `most`, are left where fewer would open a seam or share an edge among three, compared with the skin that
+    it is `like`. Where more than `most` would be, it has about `count` that share some.
     """
     reference = skin if like is None else like
     opened, crowded, count = reference.open_edges, reference.crowded_edges, max(count, 4)
+    knotted = None
     while count < len(skin.faces):
         points, faces = fast_simplification.simplify(skin.points, skin.faces, target_count=count)
         found = Skin.compact(points.astype(np.float64), faces.astype(np.int64))
         if len(found.faces) >= 4 and found.open_edges <= opened and found.crowded_edges <= crowded:
             return found
+        knotted = found if knotted is None and found.open_edges <= opened else knotted
         count *= 2
+        if knotted is not None and min(count, len(skin.faces)) > most:
+            return knotted
     return skin
