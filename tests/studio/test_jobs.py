@@ -210,20 +210,27 @@ import threading
 from avmsf._utils.children import end_with_parent, start_child
 threading.Thread(target=end_with_parent, daemon=True).start()
 """
-WAITS = f"{LIFELINE}import time; time.sleep(60)"
-PAIR = f"child = start_child([sys.executable, '-c', {WAITS!r}])\nsay(processes=[os.getpid(), child.pid])\n"
+WAITS = "import time; time.sleep(60)"
+
+
+def pair(begin: str, child: str = WAITS) -> tuple[str, ...]:
+    """Return a worker that starts a process, says which both are, and waits."""
+    start = f"child = start_child([sys.executable, '-c', {child!r}])\nsay(processes=[os.getpid(), child.pid])\n"
+    return script(f"{begin}{start}{WAITS}")
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="processes are looked up in /proc")
-@pytest.mark.parametrize("begin", [LIFELINE, "from avmsf._utils.children import start_child\n"])
-def test_cancelling_ends_all_processes_also_of_one_that_does_not_end_itself(
-    begin: str, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    "worker", [pair(LIFELINE), pair("from avmsf._utils.children import start_child\n", LIFELINE + WAITS)]
+)
+def test_cancelling_ends_all_processes_also_of_a_worker_that_does_not_end_itself(
+    worker: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("avmsf.studio.jobs._GRACE", 0.3)
 
     async def cancel() -> list[Any]:
         jobs = Jobs()
-        job = jobs.start("test", {}, same, script(f"{begin}{PAIR}time.sleep(60)"))
+        job = jobs.start("test", {}, same, worker)
         async for _ in job.listen():
             break
         await job.cancel()
@@ -240,7 +247,7 @@ def test_cancelling_ends_all_processes_also_of_one_that_does_not_end_itself(
 def test_closing_ends_what_runs() -> None:
     async def close() -> list[Any]:
         jobs = Jobs()
-        job = jobs.start("test", {}, same, script(f"{LIFELINE}{PAIR}time.sleep(60)"))
+        job = jobs.start("test", {}, same, pair(LIFELINE))
         async for _ in job.listen():
             break
         await jobs.close()
@@ -271,8 +278,7 @@ def test_one_job_runs_at_a_time() -> None:
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="processes are looked up in /proc")
 def test_a_worker_and_its_processes_end_where_its_server_was_killed() -> None:
-    worker = [*script(f"{LIFELINE}{PAIR}time.sleep(60)")]
-    server = f"import subprocess, time\nsubprocess.Popen({worker!r}, stdin=subprocess.PIPE)\ntime.sleep(60)"
+    server = f"import subprocess, time\nsubprocess.Popen({pair(LIFELINE)!r}, stdin=subprocess.PIPE)\ntime.sleep(60)"
     with subprocess.Popen([sys.executable, "-c", server], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         processes = json.loads(process.stdout.readline())["processes"]
