@@ -30,7 +30,7 @@ _MEMORY = 16_000_000
 """Covariances between places and contacts that are held at once, over all kernels."""
 _FORM_ENTRIES = 16_000_000
 """Largest number of entries of one family's matrices for the variance, which are kept: 128 MB."""
-_PRODUCTS = 512
+_PRODUCTS = 64
 """Sites whose products of factors are held at once."""
 _POSITIONAL: dict[str, type[KernelFamily]] = {each.kind: each for each in (Unstructured, Smooth, ThinPlate)}
 _OF_OBJECT = {Elastic.kind: "bodies", Symmetric.kind: "symmetries", Visual.kind: "features"}
