@@ -123,6 +123,15 @@ def test_a_coarser_skin_keeps_its_volume_and_stays_closed():
     np.testing.assert_allclose(np.linalg.norm(coarse.points, axis=1), 0.05, rtol=1e-5)
 
 
+@pytest.mark.parametrize("length", [0.0085, 0.009, 0.0095])
+def test_strips_of_long_triangles_become_even(length):
+    grid = block((0.128, 0.129, 0.1), (10, 50, 1))
+    flat = grid.boundary[(grid.points[grid.boundary][:, :, 2] == 0).all(dim=1)]
+    even = Skin.of(Surface(grid.points.float(), flat)).remeshed(length)
+    # Equilateral triangles of this length would be 2.3 for each square of its side.
+    assert len(even.faces) < 3.5 * 0.128 * 0.129 / length**2
+
+
 def test_a_coarser_sheet_keeps_its_hole():
     grid = block((0.1, 0.1, 0.1), (4, 4, 4))
     flat = grid.boundary[(grid.points[grid.boundary][:, :, 2] == 0).all(dim=1)]

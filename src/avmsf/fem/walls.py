@@ -43,7 +43,7 @@ _ASTRAY = 0.02
 where that is known."""
 _INSIDE = 1e-5
 """How far behind a triangle rays start, in diagonals of the box around the mesh."""
-_TRIANGLE = 1.0
+_TRIANGLE = 1.2
 """Squared length of the sides over the sheet's area for each vertex, by trial; 1.15 for regular triangles."""
 _MOST = 50
 """Layers at most."""

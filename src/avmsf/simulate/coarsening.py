@@ -9,6 +9,8 @@ _FACING = 0.4
 """Least cosine of the angle between a triangle and the surface's normals at its corners; a box's corner has .58."""
 _SLIVER = 0.1
 """Doubled area of a triangle over the square of its longest side, below which it may turn as it likes."""
+_FLAT = 1e-3
+"""The same, below which no triangle may come to lie: its prism would have no volume."""
 
 
 def coarsen(
@@ -85,8 +87,9 @@ class _Collapse:
             alike = sum(p * q for p, q in zip(before, after, strict=True))
             area, later = sum(p * p for p in before) ** 0.5, sum(q * q for q in after) ** 0.5
             # A sliver's normal says little of the form, and slivers shall go.
-            sliver = area < _SLIVER * max(self._length(*pair) for pair in _pairs(face)) ** 2
-            if later == 0.0 or (alike < self._turn * area * later and not sliver):
+            sliver = area < _SLIVER * self._longest(face) ** 2
+            flat = later < _FLAT * self._longest(moved) ** 2
+            if flat or (alike < self._turn * area * later and not sliver):
                 return False
             # Small turns add up; the normals of the surface as it was do not.
             if self._facing(after, moved) < min(_FACING * later, self._facing(before, face) * later / (area or 1.0)):
@@ -121,6 +124,9 @@ class _Collapse:
         start, middle, end = (self._points[vertex] for vertex in (stays, gone, onward[0]))
         along = sum((q - p) * (r - q) for p, q, r in zip(start, middle, end, strict=True))
         return along >= self._turn * self._length(stays, gone) * self._length(gone, onward[0])
+
+    def _longest(self, face: tuple[int, ...]) -> float:
+        return max(self._length(*pair) for pair in _pairs(face))
 
     def _length(self, one: int, other: int) -> float:
         return float(sum((p - q) ** 2 for p, q in zip(self._points[one], self._points[other], strict=True)) ** 0.5)

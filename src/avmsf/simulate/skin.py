@@ -163,8 +163,9 @@ class Skin:
 
     def remeshed(self, length: float) -> "Skin":
         """Return the skin with edges of about `length` meters, shorter ones only where the skin bends sharply."""
-        # In this order, for what is coarsened next to long edges would keep them.
-        return self._refined(1.5 * length).coarsened(0.75 * length, turn=_CREASE)
+        # In this order, for what is coarsened next to long edges would keep them. A right-angled triangle with sides of
+        # 1.2 and .75 lengths has none longer than the 1.5 lengths that coarsening allows, so short edges can go.
+        return self._refined(1.2 * length).coarsened(0.75 * length, turn=_CREASE)
 
     def _refined(self, longest: float) -> "Skin":
         """Return the skin with all longer edges halved, again and again."""
