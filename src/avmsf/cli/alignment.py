@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from avmsf.capture import Impacts
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.polarity import inverted_recordings
-from avmsf.modal.extraction.recorder_faults import noise_drop, rate_factors, uneven_decay
+from avmsf.modal.extraction.recorder_faults import gain_changes, noise_drop, rate_factors, uneven_decay
 
 _SHOWN = 8
 """Recordings that a sentence names."""
@@ -28,6 +28,8 @@ class AlignmentReport:
     """By how much a slice sounds fall more than vibrations do; None where they do not."""
     noise_drop_db: float | None
     """By how much noise is louder before the impacts than after; None where it is not."""
+    gain_changes_db: dict[str, float]
+    """Recordings of another gain, and by how much it is higher."""
 
     @classmethod
     def of(cls, modes: Extraction, impacts: Impacts) -> "AlignmentReport | None":
@@ -39,9 +41,8 @@ class AlignmentReport:
         delays = dict(zip(found.names, found.delays.tolist(), strict=True))
         inverted = list(inverted_recordings(modes, impacts))
         faults = rate_factors(modes, modes.aligned(impacts)), uneven_decay(modes, modes.aligned(impacts))
-        return cls(
-            found.coherence_before, found.coherence_after, delays, left, inverted, *faults, noise_drop(modes, impacts)
-        )
+        levels = noise_drop(modes, impacts), gain_changes(impacts)
+        return cls(found.coherence_before, found.coherence_after, delays, left, inverted, *faults, *levels)
 
     def sentences(self) -> list[str]:
         """Return the faults of recordings, and how coherent the modes' phases are."""
@@ -53,6 +54,11 @@ class AlignmentReport:
             f"{name}: all its modes are {factor:.4g} times the others': it was recorded at {1 / factor:.4g} times the "
             "sample rate that its file gives; convert it from that rate, or remove its row"
             for name, factor in self.rate_factors.items()
+        ]
+        sentences += [
+            f"{name}: its noise and its sound are both about {abs(change):.0f} dB {'above' if change > 0 else 'below'} "
+            "the others': another gain or scale; export it as the others, or record it again"
+            for name, change in self.gain_changes_db.items()
         ]
         if self.uneven_decay_db is not None:
             sentences.append(

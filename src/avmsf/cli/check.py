@@ -127,7 +127,7 @@ def problems_of(report: CaptureReport) -> list[str]:
 def _table(report: CaptureReport, title: str, aligned: AlignmentReport | None) -> object:
     delays = {} if aligned is None else aligned.delays
     left = [] if aligned is None else aligned.not_aligned
-    doubtful = [] if aligned is None else [*left, *aligned.inverted, *aligned.rate_factors]
+    doubtful = [] if aligned is None else [*left, *aligned.inverted, *aligned.rate_factors, *aligned.gain_changes_db]
     levels = ["peak dBFS", "noise dB re peak"]
     columns = ["recording", "state", "length s", "rate Hz", *levels, "clipped", "onset s", "2nd impact s"]
     rows = [
