@@ -51,7 +51,8 @@ def rate_factors(modes: Extraction, impacts: Impacts) -> dict[str, float]:
         best = max(ratios, key=explained)
         if explained(best) >= 0.5:
             found[name] = best
-    return found
+    # Where most are named, the modes found are none of the object's.
+    return found if 2 * len(found) < len(impacts) else {}
 
 
 def uneven_decay(modes: Extraction, impacts: Impacts) -> float | None:
