@@ -9,7 +9,8 @@ BIN := $(VENV)/bin
 install: $(VENV)/developed
 
 $(VENV)/installed: pyproject.toml
-	@echo "Installing avmsf into $(VENV), once: one to a few minutes, most of it downloads."
+	@echo "Installing avmsf into $(VENV), once: one to a few minutes, most of it downloads. Where pip takes PyTorch with"
+	@echo "CUDA libraries (Linux), PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu saves 4 GB."
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --editable .
 	touch $@

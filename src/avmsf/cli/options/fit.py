@@ -30,7 +30,7 @@ class Options(Printing):
         Annotated[
             Path,
             tyro.conf.arg(metavar="CAPTURE"),
-            Existing("a capture folder, with impacts.csv", ("a folder", "a mesh or Gaussians")),
+            Existing("a capture folder, or a mesh with --material", ("a folder", "a mesh or Gaussians")),
         ]
     ]
     """Folder with impacts.csv and the recordings that it names; with --material, a folder with a mesh, or a mesh."""
