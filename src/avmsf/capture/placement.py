@@ -216,9 +216,7 @@ def judge_placement(
         spread=_diagonal(places),
         tolerance=max(TOLERANCE * diagonal, 2 * spacing),
     )
-    # Squared distances to random points are exponentially distributed: this is their root mean square.
-    floor = spacing / math.sqrt(math.log(20))
-    search = _Search(tree, _some(places, MOST_CONTACTS), placement, floor=floor)
+    search = _Search(tree, _some(places, MOST_CONTACTS), placement, floor=spacing)
     return replace(placement, mistake=search.find(stated))
 
 
