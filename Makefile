@@ -34,10 +34,10 @@ PYTEST := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/pytest -n auto --dist wor
 test: $(VENV)/developed
 	$(PYTEST)
 
-# All tests: the fast ones, the slow ones and those of the page (Debian's chromium), with the types and shapes of all
-# arguments checked, which doubles their time.
-test-all: $(VENV)/developed
-	$(PYTEST) -m "" --jaxtyping-packages=avmsf,beartype.beartype
+# All tests: the fast ones, then the slow ones and those of the page (Debian's chromium), with the types and shapes of
+# all arguments checked at run time.
+test-all: test
+	$(PYTEST) -m "slow or page" --jaxtyping-packages=avmsf,beartype.beartype
 
 lint: $(VENV)/developed
 	$(BIN)/ruff check .
