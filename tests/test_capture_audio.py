@@ -8,7 +8,7 @@ import soundfile
 import torch
 
 from avmsf.capture import CaptureSettings, CaptureWarning, check, read_capture, read_sound
-from avmsf.capture.audio import clipped_samples
+from avmsf.capture.audio import clipped_samples, constant_offset
 from avmsf.errors import CaptureError
 from capture_folder import RATE, fill, ring
 from raising import raises, warns
@@ -165,6 +165,16 @@ def test_a_recording_far_too_soft_is_warned_of(tmp_path: Path) -> None:
     assert report.peak_db is not None
     assert -70 < report.peak_db < -60
     assert len(report.problems) == 1
+
+
+@pytest.mark.parametrize("frequency", [20.0, 25.0, 33.0, 33.3, 50.0, 66.6])
+def test_a_slow_vibration_is_no_offset_and_hides_none(frequency: float) -> None:
+    time = np.arange(48_000) / 48_000
+    noise = 1e-4 * np.random.default_rng(0).standard_normal(48_000)
+    sound = np.exp(-time) * np.sin(2 * np.pi * frequency * time) + noise
+    assert constant_offset(sound, sample_rate=48_000) == 0.0
+    quiet = np.concatenate([noise, sound]) + 0.01
+    assert constant_offset(quiet, sample_rate=48_000) == pytest.approx(0.01, abs=1e-4)
 
 
 def test_flat_tops_count_and_smooth_ones_do_not() -> None:

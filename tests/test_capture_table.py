@@ -40,6 +40,7 @@ def test_rows_keep_their_order_and_contacts_are_meters(tmp_path: Path) -> None:
         "file;x;y;z\na.wav;0,1;0;0\nb.wav;0;0,2;0\nc.wav;0;0;0,3\n",
         "file\tx\ty\tz\na.wav\t0.1\t0\t0\nb.wav\t0\t0.2\t0\nc.wav\t0\t0\t0.3\n",
         "sep=;\nfile;x;y;z\na.wav;0,1;0;0\nb.wav;0;0,2;0\nc.wav;0;0;0,3\n",
+        "sep=,\n# a, b\nfile,x,y,z\na.wav,0.1,0,0\nb.wav,0,0.2,0\nc.wav,0,0,0.3\n",
         "# bowl\n#\nfile,x,y,z\na.wav,0.1,\u22120,0\nb.wav,0,0.2,0\nc.wav,0,0,0.3\n",
         'z,y,x,file\n0,0,0.1,"a.wav"\n0,0.2,0,.\\b.wav\n0.3,0,0,./c.wav\n,,,\n',
     ],
@@ -49,6 +50,7 @@ def test_rows_keep_their_order_and_contacts_are_meters(tmp_path: Path) -> None:
         "semicolons",
         "tabs",
         "sep",
+        "sep, comment",
         "comments, minus",
         "order, quotes, backslash, empty row",
     ],
@@ -59,6 +61,13 @@ def test_what_spreadsheets_write_is_read(tmp_path: Path, text: str) -> None:
     impacts = read_capture(folder).impacts
     assert impacts.names == ("a.wav", "b.wav", "c.wav")
     assert torch.equal(impacts.contacts, CONTACTS)
+
+
+def test_rows_keep_their_numbers_below_comments(tmp_path: Path) -> None:
+    folder = fill(tmp_path)
+    (folder / "impacts.csv").write_text("# a bowl\n# in meters\nfile,x,y,z\na.wav,0.1,0,0\nb.wav,0,0.2,?\n")
+    with raises(CaptureError, file="impacts.csv", row=5, name="z", value="?"):
+        read_capture(folder)
 
 
 def test_a_name_is_found_composed_or_decomposed(tmp_path: Path) -> None:

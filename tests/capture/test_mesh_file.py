@@ -138,8 +138,8 @@ def test_an_archive_is_no_mesh(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("old", "new"),
-    [("v ", "v\t"), ("f ", "f\t"), ("v ", "  v "), ("v ", "\ufeffv ")],
-    ids=["tab after v", "tab after f", "indented", "byte-order mark"],
+    [("v ", "v\t"), ("f ", "f\t"), ("v ", "  v "), ("v ", "\ufeffv "), (" 3\n", " 3 # -x -y\n")],
+    ids=["tab after v", "tab after f", "indented", "byte-order mark", "comment"],
 )
 def test_white_space_of_an_obj_changes_nothing(tmp_path: Path, old: str, new: str) -> None:
     text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n"
@@ -154,6 +154,12 @@ def test_negative_indices_count_back_from_where_they_stand(tmp_path: Path) -> No
     (tmp_path / "a.obj").write_text("".join(blocks))
     surface = read_surface(tmp_path / "a.obj")
     assert surface.vertices[surface.faces][:, :, 0].tolist() == [[row] * 3 for row in range(3)]
+
+
+def test_a_negative_index_before_the_first_vertex_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 -5\n")
+    with raises(CaptureError, file="a.obj", value=-5):
+        read_surface(tmp_path / "a.obj")
 
 
 def test_normalized_integers_are_from_minus_one_to_one(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ def _plain_obj(content: bytes) -> bytes:
     counts, lines = {b"v": 0, b"vt": 0, b"vn": 0}, []
     content = content.removeprefix(b"\xef\xbb\xbf").replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
     for line in content.splitlines():
-        words = line.split()
+        words = line.partition(b"#")[0].split()
         if words and words[0] in counts:
             counts[words[0]] += 1
         elif words and words[0] == b"f":
@@ -47,8 +47,12 @@ def _plain_obj(content: bytes) -> bytes:
 
 def _counted(corner: bytes, counts: tuple[int, ...]) -> bytes:
     """Return one corner of a face, such as -3/-3, with indices from 1; negative ones count back from the last."""
-    pairs = zip(corner.split(b"/"), counts, strict=False)
-    return b"/".join(b"%d" % (count + 1 + int(index)) if index.startswith(b"-") else index for index, count in pairs)
+    found = []
+    for index, count in zip(corner.split(b"/"), counts, strict=False):
+        if index.startswith(b"-") and count + int(index) < 0:
+            raise CaptureError.expected(f"an index from -{count} to -1", int(index), name="f")
+        found.append(b"%d" % (count + 1 + int(index)) if index.startswith(b"-") else index)
+    return b"/".join(found)
 
 
 def expect_uncompressed(record: Any) -> None:

@@ -29,7 +29,7 @@ MIN_FORCE_NEWTONS, MAX_FORCE_NEWTONS = 1e-6, 1e6
 """Peak forces that a row may give: from a grain of dust to the largest impact hammers (2e4 N) and beyond."""
 FARTHEST = 100.0
 """Meters from the origin beyond which a contact must be in another unit."""
-_NO_ROW = re.compile(r"\A\s*sep=.$|\A(^#.*\n)*^#.*$", re.MULTILINE)
+_NO_ROW = re.compile(r"\A(\s*sep=.(\n|\Z))?(#.*(\n|\Z))*")
 """What Excel is told the separator by, and comments above the header."""
 HOW_TO_WRITE = (
     f"{TABLE} has the header file,x,y,z (and if known nx,ny,nz,force_newtons) and one row for each recording, "
@@ -76,8 +76,8 @@ def read_cells(path: Path) -> tuple[list[tuple[int, list[str]]], str]:
     if is_lfs_pointer(path):
         raise CaptureError.expected("a table", got="a Git LFS pointer", file=path, advice="run git lfs pull")
     try:
-        # Blank in place of what are no rows, so that lines keep their numbers.
-        text = _NO_ROW.sub("", read_text(path))
+        # Blank lines in place of what are no rows, so that lines keep their numbers.
+        text = _NO_ROW.sub(lambda found: "\n" * found[0].count("\n"), read_text(path))
         first = text.lstrip().split("\n", 1)[0]
         separator = max(",;\t", key=first.count)
         reader = csv.reader(io.StringIO(text), delimiter=separator)
