@@ -34,7 +34,11 @@ _OF_VIEWS = frozenset(("transforms.json", "images", "sparse", "cameras.bin", "ca
 def number_key(name: str) -> list[tuple[bool, int, str]]:
     """Return what sorts names by the numbers in them: 2.wav before 10.wav."""
     parts = re.findall(r"\d+|\D+", name)
-    return [(False, int(each), "") if each.isdecimal() else (True, 0, each) for each in parts]
+    # By their length first: numbers of thousands of digits are not for int.
+    digits = [each.lstrip("0") if each.isdecimal() else None for each in parts]
+    return [
+        (True, 0, part) if each is None else (False, len(each), each) for each, part in zip(digits, parts, strict=True)
+    ]
 
 
 def find_surface_file(folder: Path, settings: CaptureSettings) -> Path | None:
