@@ -19,9 +19,17 @@ from avmsf._utils.arrays import as_directions
 from avmsf.bench import score
 from avmsf.capture import Impacts
 from avmsf.capture.cameras import Camera, View
-from avmsf.capture.warning import CaptureWarning
 from avmsf.cli import main
-from avmsf.errors import ArrayError, AvmsfError, CaptureError, EvaluationError, FitError, PositionError, PositionWarning
+from avmsf.errors import (
+    ArrayError,
+    AvmsfError,
+    CaptureError,
+    CaptureWarning,
+    EvaluationError,
+    FitError,
+    PositionError,
+    PositionWarning,
+)
 from avmsf.field import FitConfig, SoundField
 from avmsf.pipeline import PRESETS, PipelineConfig
 from avmsf.simulate.material import CERAMIC, WOOD

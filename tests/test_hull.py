@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from avmsf.capture.cameras import View
-from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import SceneError
+from avmsf.errors import CaptureWarning, SceneError
 from avmsf.scene.hull import Hull, visual_hull
 from ball_views import MIDDLE, RADIUS, ball_cameras, ball_view, ball_views
 from raising import raises, warns

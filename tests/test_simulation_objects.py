@@ -11,6 +11,7 @@ import torch
 import trimesh
 
 import avmsf.simulate.simulationset as simulationset
+from avmsf._utils.caching import key_of
 from avmsf.capture import read_capture
 from avmsf.capture.surface import Surface
 from avmsf.capture.texturedmesh import TexturedMesh, read_textured_mesh
@@ -18,7 +19,7 @@ from avmsf.capture.views.read import read_views
 from avmsf.cli import simulate
 from avmsf.cli.options import simulate as options
 from avmsf.errors import AvmsfError, SimulationError
-from avmsf.simulate.recipe import Imperfections, ObjectRecipe, key_of
+from avmsf.simulate.recipe import Imperfections, ObjectRecipe
 from avmsf.simulate.sim20 import sim20_recipe
 from avmsf.simulate.simulation import Simulation, simulate_object
 from avmsf.simulate.simulationfolder import is_written, write_simulation, write_textured

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from avmsf.capture.cameras import View
-from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import AvmsfWarning, SceneError
+from avmsf.errors import AvmsfWarning, CaptureWarning, SceneError
 from avmsf.scene.cpu import NumbaRasterizer
 from avmsf.scene.densify import rotation_matrices
 from avmsf.scene.gaussians import GaussianCloud

@@ -13,8 +13,7 @@ import trimesh
 from avmsf.capture.cameras import Camera, View
 from avmsf.capture.views import background_color, find_foreground
 from avmsf.capture.views.hull import carve
-from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, CaptureWarning
 from raising import raises, warns
 
 WIDTH, HEIGHT = 120, 90

@@ -11,8 +11,7 @@ from PIL import Image
 
 from avmsf.capture.views import read_views
 from avmsf.capture.views.pictures import read_mask, read_picture
-from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, CaptureWarning
 from raising import raises, warns
 from views_folder import HEIGHT, WIDTH, frames, ring, write_image, write_transforms
 

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from avmsf.capture.views import read_views
-from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, CaptureWarning
 from raising import raises, warns
 from views_folder import WIDTH, frames, opengl_pose, ring, write_transforms
 

@@ -12,8 +12,7 @@ import torch
 
 from avmsf.capture.views import read_sparse_points, read_views
 from avmsf.capture.views.transforms import read_transforms
-from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, CaptureWarning
 from raising import raises, warns
 from views_folder import HEIGHT, WIDTH, frames, ring, write_image, write_transforms
 

@@ -4,6 +4,7 @@ And one of warnings, `AvmsfWarning`: what goes on all the same, and the user sho
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -103,6 +104,23 @@ class PositionError(ArrayError):
 
 class PositionWarning(AvmsfWarning):
     """A position is nearer to the object than this is large, and not on it."""
+
+
+class CaptureWarning(AvmsfWarning):
+    """A capture was read, but a recording or a contact in it is probably wrong; the message says what to do."""
+
+
+@dataclass(frozen=True)
+class Remark:
+    """What looks wrong in a file, before the file's name is known."""
+
+    message: str
+    name: str | None = None
+    value: Any = None
+
+    def about(self, file: Path) -> CaptureWarning:
+        """Return the warning, whose message begins with the file."""
+        return CaptureWarning(f"{file}: {self.message}", file=file, name=self.name, value=self.value)
 
 
 class CaptureError(AvmsfError):

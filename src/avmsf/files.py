@@ -9,6 +9,7 @@ from pathlib import Path
 
 from avmsf.errors import AvmsfError, FieldFileError
 
+_LFS = b"version https://git-lfs.github.com/spec/"
 _WAYS_OUT: Mapping[int | None, str] = {
     errno.ENOSPC: "free some space or choose another folder",
     errno.EDQUOT: "free some space or choose another folder",
@@ -34,6 +35,15 @@ def unwritable(path: Path, error: Exception, *, raising: type[AvmsfError], uncha
     advice = way_out(error) if isinstance(error, OSError) else "choose another folder"
     reason = getattr(error, "strerror", None) or str(error)
     return raising.expected("a writable path", reason, file=path, advice=unchanged + advice)
+
+
+def is_lfs_pointer(path: Path) -> bool:
+    """Return whether a file is what Git LFS leaves where its content was not fetched; False where none can be read."""
+    try:
+        with open(path, "rb") as file:
+            return file.read(len(_LFS)) == _LFS
+    except OSError:
+        return False
 
 
 def temporary_path(path: Path) -> Path:

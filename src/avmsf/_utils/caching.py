@@ -1,13 +1,14 @@
 """Files that only save time: where one cannot be written, the work goes on without it."""
 
 import hashlib
+import json
 import re
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cache, wraps
 from pathlib import Path
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from avmsf.errors import AvmsfError, AvmsfWarning
 
@@ -109,3 +110,8 @@ def _warn_once(folder: Path, reason: str) -> None:
         ),
         stacklevel=3,
     )
+
+
+def key_of(values: dict[str, Any]) -> str:
+    """Return a short digest of plain values."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:24]

@@ -15,7 +15,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 from torch import Tensor
 
-from avmsf.bench.evaluation import Scores
 from avmsf.errors import EvaluationError
 from avmsf.files import write_whole
 from avmsf.modal.bank import ModalBank
@@ -176,10 +175,8 @@ def draw_spectrograms(
 
 
 @styled
-def draw_scores(scores: Mapping[str, Scores], *, metric: str = "relative_stft", title: str) -> Figure:
+def draw_scores(means: Mapping[str, float], errors: Mapping[str, float], *, title: str) -> Figure:
     """Draw each method's mean error as a bar with its standard error, best on top, on a logarithmic axis."""
-    means = {method: each.mean()[metric] for method, each in scores.items()}
-    errors = {method: each.standard_error()[metric] for method, each in scores.items()}
     order = sorted(means, key=lambda method: -means[method])
     figure = Figure(figsize=(8, 0.5 * len(order) + 1.6), layout="constrained")
     axes = figure.subplots()

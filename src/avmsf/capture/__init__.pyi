@@ -1,3 +1,4 @@
+from ..errors import CaptureWarning as CaptureWarning
 from .audio import Recording as Recording
 from .audio import read_recording as read_recording
 from .audio import read_sound as read_sound
@@ -17,4 +18,3 @@ from .surface import write_surface as write_surface
 from .views import find_foreground as find_foreground
 from .views import read_views as read_views
 from .views.write import write_views as write_views
-from .warning import CaptureWarning as CaptureWarning

@@ -13,8 +13,9 @@ from scipy.ndimage import uniform_filter1d
 from scipy.special import stdtrit
 from torch import Tensor
 
-from avmsf.capture.filenames import is_lfs_pointer, missing_recording
+from avmsf.capture.filenames import missing_recording
 from avmsf.errors import CaptureError, RecordingLengthError
+from avmsf.files import is_lfs_pointer
 
 LOWEST_RATE = 100.0
 HIGHEST_RATE = 192_000.0

@@ -11,7 +11,6 @@ from avmsf.capture.measure import RecordingReport
 from avmsf.capture.prepare import Prepared, margin_length
 from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.starts import stay_uncut
-from avmsf.capture.surface import find_surface
 from avmsf.capture.table import (
     FARTHEST,
     TABLE,
@@ -25,9 +24,8 @@ from avmsf.capture.table import (
     refuse_repeated_files,
     understand,
 )
-from avmsf.capture.together import common_length, common_rate, judge_contacts, judge_levels, judge_surface
-from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import CaptureError
+from avmsf.capture.together import common_length, common_rate, find_surface, judge_contacts, judge_levels, judge_surface
+from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.wording import counted
 
 MAX_SUGGESTIONS = 3

@@ -5,13 +5,10 @@ import re
 from collections.abc import Collection
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Literal
 
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError, SceneError
 
-SurfaceKind = Literal["ply", "obj", "glb"]
-"""Formats that surfaces are written in."""
 SURFACE_FILES = ("surface.obj", "surface.ply", "surface.glb", "surface.stl")
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
@@ -25,7 +22,6 @@ _OTHER_NAMES = {
     **dict.fromkeys((".xlsx", ".xls", ".ods"), "export the table as impacts.csv"),
 }
 """Endings of shapes, pictures and tables that are not read, and what to do."""
-_LFS = b"version https://git-lfs.github.com/spec/"
 _MAX_NAMES_COMPARED = 1000
 """File names among which a misspelt one is sought: a tenth of a second."""
 _OF_VIEWS = frozenset(("transforms.json", "images", "sparse", "cameras.bin", "cameras.txt", *SURFACE_FILES, *SPLATS))
@@ -75,15 +71,6 @@ def unused_files(folder: Path, settings: CaptureSettings) -> list[str]:
         elif suffix in PICTURE_SUFFIXES and within and top not in ("images", "masks") and not cameras:
             advice[f"{path.parent.relative_to(folder).as_posix()}/"] = "call the folder of photographs images"
     return [f"{name} is not used: {what}" for name, what in advice.items()]
-
-
-def is_lfs_pointer(path: Path) -> bool:
-    """Return whether a file is what Git LFS leaves where its content was not fetched; False where none can be read."""
-    try:
-        with open(path, "rb") as file:
-            return file.read(len(_LFS)) == _LFS
-    except OSError:
-        return False
 
 
 def expect_views(folder: Path, settings: CaptureSettings) -> None:

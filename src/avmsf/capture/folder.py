@@ -21,11 +21,10 @@ from avmsf.capture.placement import contacted_part
 from avmsf.capture.prepare import Prepared, prepare
 from avmsf.capture.settings import SETTINGS, CaptureSettings, settings_of
 from avmsf.capture.starts import cut_together, shorten
-from avmsf.capture.surface import Surface, find_surface, write_surface
+from avmsf.capture.surface import Surface, write_surface
 from avmsf.capture.table import DIRECTION, FORCE, REQUIRED, TABLE, Strike, in_folder, read_strikes
-from avmsf.capture.together import common_rate, judge_contacts, judge_levels, judge_surface
-from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import CaptureError
+from avmsf.capture.together import common_rate, find_surface, judge_contacts, judge_levels, judge_surface
+from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.files import unwritable
 
 

@@ -16,9 +16,9 @@ import trimesh
 from PIL import Image
 
 from avmsf._utils.text_files import parse_json, read_json
-from avmsf.capture.filenames import is_lfs_pointer
 from avmsf.capture.plainmesh import expect_uncompressed, plain_mesh
 from avmsf.errors import AvmsfError, CaptureError
+from avmsf.files import is_lfs_pointer
 
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
 MAX_BYTES = 1 << 30

@@ -26,9 +26,8 @@ from avmsf.capture.placement import judge_placement, surface_points
 from avmsf.capture.prepare import Prepared, prepare, remove_rumble
 from avmsf.capture.settings import METRES, SETTINGS, CaptureSettings, settings_of
 from avmsf.capture.starts import shorten, start_with_impact
-from avmsf.capture.surface import find_surface
 from avmsf.capture.table import Row, Strike, read_rows, understand
-from avmsf.capture.together import NARROWEST, WIDEST, fitting_units_of
+from avmsf.capture.together import NARROWEST, WIDEST, find_surface, fitting_units_of
 from avmsf.errors import CaptureError
 from avmsf.files import unwritable
 

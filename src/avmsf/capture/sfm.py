@@ -22,8 +22,7 @@ import numpy as np
 from avmsf._utils.children import end_child, ending_of, start_child
 from avmsf.capture.filenames import PICTURE_SUFFIXES, pictures_in
 from avmsf.capture.views.pictures import Picture, PictureSizeError, read_mask, read_picture
-from avmsf.capture.warning import Remark
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, Remark
 from avmsf.files import unwritable
 from avmsf.wording import counted
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from avmsf.capture.prepare import MIN_MARGIN, Prepared, margin_length
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.together import common_length
-from avmsf.capture.warning import CaptureWarning
+from avmsf.errors import CaptureWarning
 
 START_LEVEL = 10**-2.0
 """Share of the largest mean square in the first 20 ms that a response must have at its start: -20 dB, the

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -9,9 +10,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_vectors
-from avmsf.capture.filenames import SurfaceKind, find_surface_file
-from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import ArrayError, CaptureError
+
+SurfaceKind = Literal["ply", "obj", "glb"]
+"""Formats that surfaces are written in."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,12 +78,6 @@ def read_surface(path: str | Path, *, meters: float = 1.0) -> Surface:
     if not len(joined):
         raise CaptureError(f"{path}: expected points, got none; export the surface again", file=path, value=0)
     return Surface(torch.from_numpy((joined * meters).astype(np.float32)), torch.from_numpy(np.concatenate(faces)))
-
-
-def find_surface(folder: Path, settings: CaptureSettings) -> Surface | None:
-    """Read what `find_surface_file` finds; None where it finds nothing."""
-    path = find_surface_file(folder, settings)
-    return None if path is None else read_surface(path, meters=settings.surface_meters)
 
 
 def write_surface(surface: Surface, path: Path, *, kind: SurfaceKind = "ply") -> None:

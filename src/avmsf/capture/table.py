@@ -13,11 +13,11 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 
 from avmsf._utils.text_files import read_text
-from avmsf.capture.filenames import is_lfs_pointer, missing_recording
+from avmsf.capture.filenames import missing_recording
 from avmsf.capture.location import Location
 from avmsf.capture.settings import METRES, CaptureSettings
-from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, CaptureWarning
+from avmsf.files import is_lfs_pointer
 
 TABLE = "impacts.csv"
 REQUIRED = ("file", "x", "y", "z")

@@ -17,8 +17,7 @@ from torch import Tensor
 
 from avmsf.capture.mesh_file import expect_corners, expect_finite_vertices, load_parts
 from avmsf.capture.surface import Surface
-from avmsf.capture.warning import Remark
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, Remark
 
 GRAY = 0.7
 """Brightness of what has no color, 0 to 1."""

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from avmsf.capture.filenames import find_surface_file
 from avmsf.capture.location import Location
 from avmsf.capture.placement import Placement, contacted_part, judge_placement, surface_points
 from avmsf.capture.prepare import shortest_allowed
 from avmsf.capture.settings import METRES, CaptureSettings
-from avmsf.capture.surface import Surface, find_surface
+from avmsf.capture.surface import Surface, read_surface
 from avmsf.capture.table import TABLE, Strike, fitting_units, read_rows, understand
-from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.wording import counted
 
 WIDEST = 10.0
@@ -243,3 +243,9 @@ def _advice(placement: Placement, settings: CaptureSettings) -> str:
 
 def _diagonal(points: Sequence[Sequence[float]]) -> float:
     return math.dist(*(tuple(edge(axis) for axis in zip(*points, strict=True)) for edge in (min, max)))
+
+
+def find_surface(folder: Path, settings: CaptureSettings) -> Surface | None:
+    """Read what `find_surface_file` finds; None where it finds nothing."""
+    path = find_surface_file(folder, settings)
+    return None if path is None else read_surface(path, meters=settings.surface_meters)

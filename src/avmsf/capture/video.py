@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 
 from avmsf.capture.location import expect_free
-from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.files import unwritable
 
 JUDGED = 480

@@ -121,7 +121,11 @@ def _go_all_the_way(
             names=[f"impact {row + 1}" for row in range(len(heard))],
             title="held-out impacts",
         ),
-        "scores": draw_scores(scores, title="errors of rendered sounds"),
+        "scores": draw_scores(
+            {method: each.mean()["relative_stft"] for method, each in scores.items()},
+            {method: each.standard_error()["relative_stft"] for method, each in scores.items()},
+            title="errors of rendered sounds",
+        ),
     }
     for stem, picture in pictures.items():
         save_picture(picture, folder / "pictures" / f"{stem}.png")

@@ -10,8 +10,9 @@ from torch import Tensor
 from avmsf.bench.pictures import save_picture
 from avmsf.bench.surfacepictures import draw_surface
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.surface import Surface, find_surface, read_surface, write_surface
+from avmsf.capture.surface import Surface, read_surface, write_surface
 from avmsf.capture.table import TABLE, in_folder, read_rows, understand
+from avmsf.capture.together import find_surface
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.scenes import with_seed

@@ -12,14 +12,13 @@ from avmsf.capture.folder import Capture
 from avmsf.capture.placement import expect_placed, surface_points
 from avmsf.capture.proposals import contacts_of
 from avmsf.capture.settings import CaptureSettings, settings_of
-from avmsf.capture.surface import find_surface
 from avmsf.capture.table import read_rows
+from avmsf.capture.together import find_surface
 from avmsf.capture.views.foreground import find_foreground
 from avmsf.capture.views.read import find_shots, read_views
 from avmsf.capture.views.shots import listed, mask_names
 from avmsf.capture.views.transforms import stated_moves
-from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import AvmsfError, AvmsfWarning, CaptureError, FitError, SceneError
+from avmsf.errors import AvmsfError, AvmsfWarning, CaptureError, CaptureWarning, FitError, SceneError
 from avmsf.pipeline.scene import scaled, without_far
 from avmsf.pipeline.silhouettes import (
     LONGEST,

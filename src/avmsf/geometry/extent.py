@@ -6,8 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from avmsf.capture.cameras import View
-from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import SceneError
+from avmsf.errors import CaptureWarning, SceneError
 
 
 def masked_views(views: Sequence[View]) -> list[View]:

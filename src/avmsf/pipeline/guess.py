@@ -10,9 +10,9 @@ from torch import Tensor
 
 from avmsf.capture.filenames import SURFACE_FILES
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.surface import Surface, find_surface, read_surface
+from avmsf.capture.surface import Surface, read_surface
 from avmsf.capture.table import TABLE, read_cells
-from avmsf.capture.together import NARROWEST, WIDEST
+from avmsf.capture.together import NARROWEST, WIDEST, find_surface
 from avmsf.config import BodyConfig
 from avmsf.errors import FitError, SimulationError
 from avmsf.fem.radiation import radiated_pressure

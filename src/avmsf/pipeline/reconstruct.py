@@ -13,7 +13,8 @@ import torch
 from avmsf._utils.caching import once
 from avmsf.capture import Capture, Impacts, Surface
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.surface import find_surface, read_surface, write_surface
+from avmsf.capture.surface import read_surface, write_surface
+from avmsf.capture.together import find_surface
 from avmsf.capture.views import read_views
 from avmsf.capture.views.transforms import stated_moves
 from avmsf.config import CACHED_FIELD, PipelineConfig

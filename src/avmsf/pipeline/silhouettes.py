@@ -20,8 +20,7 @@ from avmsf.capture.surface import Surface
 from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.capture.views.hull import Hull, carve
 from avmsf.capture.views.poses import judge_cameras
-from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.scene.points import farthest_points
 
 MAX_VIEWS = 12

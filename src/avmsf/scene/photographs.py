@@ -11,8 +11,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from avmsf.capture.cameras import Camera, View
-from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import SceneError
+from avmsf.errors import CaptureWarning, SceneError
 from avmsf.scene.splatconfig import SplatConfig
 
 _PLAIN_STEP, _PLAIN_PART = 24, 0.9

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from avmsf._utils.caching import key_of
 from avmsf.capture.surface import Surface
 from avmsf.capture.texturedmesh import TexturedMesh, read_textured_mesh
 from avmsf.errors import SimulationError
@@ -15,7 +16,7 @@ from avmsf.simulate.elastic import ElasticModes, elastic_modes
 from avmsf.simulate.elasticstore import modes_once
 from avmsf.simulate.imperfections import smooth_field, stream, support_places, support_springs
 from avmsf.simulate.material import material_named
-from avmsf.simulate.recipe import AXES, ObjectRecipe, key_of
+from avmsf.simulate.recipe import AXES, ObjectRecipe
 from avmsf.simulate.shapes import make_shape, textured, vary_thickness
 from avmsf.simulate.shell import shell
 from avmsf.simulate.solid import Solid

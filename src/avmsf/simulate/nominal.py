@@ -14,7 +14,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Int
 
-from avmsf._utils.caching import source_digest
+from avmsf._utils.caching import key_of, source_digest
 from avmsf.capture.surface import Surface
 from avmsf.compiled import lane_count
 from avmsf.errors import SceneError, SimulationError
@@ -25,7 +25,6 @@ from avmsf.simulate.elements import SecondOrder
 from avmsf.simulate.material import LARGEST_ERROR, NOMINAL, Material
 from avmsf.simulate.nominalcheck import CheckedSurface, checked
 from avmsf.simulate.nominalsolid import FEWEST, TRIANGLES, count_dofs, expect_memory, filled_solid, wall_solids
-from avmsf.simulate.recipe import key_of
 from avmsf.simulate.solid import Solid
 
 WALLS = tuple(float(part) for part in np.geomspace(0.003, 0.05, 6))

@@ -198,11 +198,6 @@ class ObjectRecipe:
         return {**kept, "modes": self.elastic_modes, "detail": self.detail, "imperfections": imperfect}
 
 
-def key_of(values: dict[str, Any]) -> str:
-    """Return a short digest of plain values."""
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:24]
-
-
 def _unfit(name: str, expected: str, value: float | int) -> SimulationError:
     return SimulationError(f"{name}: expected {expected}, got {value:g}", name=name, value=value)
 

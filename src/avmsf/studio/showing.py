@@ -18,8 +18,7 @@ from torch import Tensor
 from avmsf.capture.folder import read_capture
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.surface import Surface, read_surface
-from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import CaptureError, StudioError
+from avmsf.errors import CaptureError, CaptureWarning, StudioError
 from avmsf.export.bundle import write_bundle
 from avmsf.export.formats import MOST_POINTS
 from avmsf.export.normals import outward_normals

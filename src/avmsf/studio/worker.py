@@ -21,9 +21,8 @@ from avmsf._utils.children import end_with_parent
 from avmsf._utils.memory import NO_MEMORY, lacks_memory
 from avmsf.capture import read_capture
 from avmsf.capture.settings import settings_of
-from avmsf.capture.warning import CaptureWarning
 from avmsf.config import CACHE, PRESETS, SceneConfig
-from avmsf.errors import AvmsfError
+from avmsf.errors import AvmsfError, CaptureWarning
 from avmsf.field.fit import Progress
 from avmsf.field.store import load, save
 from avmsf.files import copy_whole

@@ -20,8 +20,7 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.starts import cut_together, shorten
 from avmsf.capture.surface import Surface
 from avmsf.capture.together import common_rate
-from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import CaptureError, DatasetError
+from avmsf.errors import CaptureError, CaptureWarning, DatasetError
 
 FEWEST = 2
 _SHOWN = 5

@@ -18,7 +18,7 @@ from avmsf.capture.datasets.names import facts_of, read_names
 from avmsf.capture.datasets.numbering import in_order, number_of, refuse_unknown, shared_remarks
 from avmsf.capture.folder import Capture
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.surface import find_surface
+from avmsf.capture.together import find_surface
 from avmsf.errors import CaptureError, DatasetError
 
 RATE = 48_000.0

@@ -14,8 +14,7 @@ from avmsf.capture.cameras import Camera, View
 from avmsf.capture.views.backdrop import distances_from_background, threshold
 from avmsf.capture.views.hull import carve, silhouette
 from avmsf.capture.views.shots import listed
-from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.wording import counted
 
 FEWEST = 3

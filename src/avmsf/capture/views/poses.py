@@ -9,7 +9,7 @@ from torch import Tensor
 
 from avmsf.capture.cameras import Camera
 from avmsf.capture.location import Location
-from avmsf.capture.warning import Remark
+from avmsf.errors import Remark
 
 # Poses written with four digits and rotations that drifted by rounding pass; shears and scales do not.
 TOLERANCE = 1e-3

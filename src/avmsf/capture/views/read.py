@@ -12,8 +12,7 @@ from avmsf.capture.views.poses import judge_cameras
 from avmsf.capture.views.shots import Shot, Shots, listed, without_camera
 from avmsf.capture.views.single import Findings, read_view
 from avmsf.capture.views.transforms import read_transforms
-from avmsf.capture.warning import Remark
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, Remark
 from avmsf.wording import counted
 
 FEWEST = 3

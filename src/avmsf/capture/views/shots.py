@@ -9,8 +9,7 @@ from torch import Tensor
 
 from avmsf.capture.filenames import pictures_in
 from avmsf.capture.views.lenses import Lens
-from avmsf.capture.warning import Remark
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, Remark
 
 MAX_SHOTS = 10_000
 """Photographs of one object: a video of five minutes, frame by frame. Splatting uses some hundreds."""

@@ -9,8 +9,7 @@ from avmsf.capture.cameras import View
 from avmsf.capture.views.lenses import Lens, straighten
 from avmsf.capture.views.pictures import Picture, PictureSizeError, read_mask, read_picture, read_upright, scale
 from avmsf.capture.views.shots import Shot, listed, mask_places
-from avmsf.capture.warning import Remark
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, Remark
 from avmsf.wording import counted
 
 

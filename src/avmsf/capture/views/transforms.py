@@ -18,8 +18,7 @@ from avmsf.capture.placement import Mistake
 from avmsf.capture.views.lenses import Lens
 from avmsf.capture.views.poses import TOLERANCE, opencv_from_opengl, rigid
 from avmsf.capture.views.shots import Shot, Shots, listed, refuse_many
-from avmsf.capture.warning import Remark
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, Remark
 
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")

@@ -7,7 +7,7 @@ from typing import Annotated, get_args
 
 import tyro
 
-from avmsf.capture.filenames import SurfaceKind
+from avmsf.capture.surface import SurfaceKind
 from avmsf.cli.options.common import parse_options
 from avmsf.cli.options.paths import NewFile, PlotsFolder
 from avmsf.cli.options.scenes import SceneOptions

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf._utils.caching import source_digest
+from avmsf._utils.caching import key_of, source_digest
 from avmsf._utils.state import read_checkpoint, write_checkpoint
 from avmsf.capture.meshviews import orbit_cameras, render_views
 from avmsf.errors import EvaluationError, SceneError, SimulationError
@@ -17,7 +17,7 @@ from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.splat import splat
 from avmsf.scene.splatconfig import SplatConfig
 from avmsf.simulate.material import MATERIALS
-from avmsf.simulate.recipe import ObjectRecipe, key_of
+from avmsf.simulate.recipe import ObjectRecipe
 from avmsf.simulate.shapes.kinds import KINDS
 from avmsf.simulate.sim20 import SIM20
 from avmsf.simulate.simulation import simulate_object
