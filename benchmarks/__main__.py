@@ -8,8 +8,7 @@ from pathlib import Path
 from types import ModuleType
 
 from avmsf._utils.device import TRAINABLE
-from avmsf.capture import CaptureWarning
-from avmsf.errors import AvmsfError
+from avmsf.errors import AvmsfError, CaptureWarning
 from avmsf.simulate.sim20 import SIM20
 from benchmarks import (
     align,

@@ -14,12 +14,13 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf.bench.evaluation import evaluate, split
-from avmsf.capture import Capture, CaptureSettings, CaptureWarning, Impacts, read_capture
+from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.capture.audio import read_recording
 from avmsf.capture.folder import read_strike
 from avmsf.capture.prepare import margin_length, prepare
 from avmsf.capture.table import read_rows, understand
 from avmsf.config import BodyConfig
+from avmsf.errors import CaptureWarning
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator

@@ -15,7 +15,7 @@ from benchmarks.report import Options, Report, Table, tell
 NAME = "43_IronMortar"
 _CHILD = """
 import json, resource, sys, time, warnings
-from avmsf.capture import CaptureWarning
+from avmsf.errors import CaptureWarning
 from avmsf.capture.datasets import open_dataset
 from benchmarks.step import peak_gigabytes
 

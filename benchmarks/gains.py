@@ -15,7 +15,8 @@ import torch
 from avmsf.bench.baselines import MeanWaveform
 from avmsf.bench.evaluation import evaluate, score, split
 from avmsf.bench.knowntruth import truth_at, truth_from_first_sample
-from avmsf.capture import CaptureWarning, Impacts, Surface
+from avmsf.capture import Impacts, Surface
+from avmsf.errors import CaptureWarning
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import FAMILIES, MixtureEstimator

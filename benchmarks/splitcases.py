@@ -7,8 +7,9 @@ from functools import cached_property
 from pathlib import Path
 
 from avmsf.bench.evaluation import evaluate, split
-from avmsf.capture import Capture, CaptureSettings, CaptureWarning, Impacts, Surface, read_capture
+from avmsf.capture import Capture, CaptureSettings, Impacts, Surface, read_capture
 from avmsf.config import BodyConfig
+from avmsf.errors import CaptureWarning
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.bodies import CandidateBodies

@@ -7,9 +7,9 @@ import pytest
 import soundfile
 import torch
 
-from avmsf.capture import CaptureSettings, CaptureWarning, check, read_capture, read_sound
+from avmsf.capture import CaptureSettings, check, read_capture, read_sound
 from avmsf.capture.audio import clipped_samples, constant_offset
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, CaptureWarning
 from capture_folder import RATE, fill, ring
 from raising import raises, warns
 

@@ -12,10 +12,10 @@ import soundfile
 import torch
 import trimesh
 
-from avmsf.capture import CaptureWarning, read_capture
+from avmsf.capture import read_capture
 from avmsf.capture.settings import METRES
 from avmsf.capture.table import HOW_TO_WRITE, fitting_units
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, CaptureWarning
 from capture_folder import HEADER, ROWS, fill
 from raising import raises, warns
 

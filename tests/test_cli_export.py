@@ -14,11 +14,10 @@ import soundfile
 import torch
 import trimesh
 
-from avmsf.capture import CaptureWarning
 from avmsf.cli import main
 from avmsf.cli.export import run
 from avmsf.cli.options.export import parse
-from avmsf.errors import AvmsfError
+from avmsf.errors import AvmsfError, CaptureWarning
 from avmsf.export.modaldemo import read_demo
 from avmsf.export.sampledfield import SampledField
 from avmsf.field.config import FitConfig

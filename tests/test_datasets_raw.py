@@ -9,11 +9,11 @@ import pytest
 import soundfile
 import torch
 
-from avmsf.capture import Capture, CaptureWarning
+from avmsf.capture import Capture
 from avmsf.capture.datasets import ObjectFolderRaw
 from avmsf.capture.datasets.annotations import Gains, read_gains, read_newtons
 from avmsf.capture.datasets.contactlists import read_contacts
-from avmsf.errors import DatasetError
+from avmsf.errors import CaptureWarning, DatasetError
 from dataset_folders import AUDIO_CONTACTS, RATE, place, records, transfer, write_mesh, write_raw, write_strike
 from raising import raises
 

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from avmsf.capture import CaptureWarning
 from avmsf.capture.datasets import RealImpact, shared_objects
 from avmsf.capture.datasets.listeners import closest_rows
 from avmsf.capture.datasets.numbering import REALIMPACT_NAMES, number_of
-from avmsf.errors import DatasetError
+from avmsf.errors import CaptureWarning, DatasetError
 from dataset_folders import ROWS, microphones, write_realimpact
 from raising import raises, warns
 

@@ -10,11 +10,11 @@ import torch
 import trimesh
 from PIL import Image
 
-from avmsf.capture import CaptureWarning, Surface
+from avmsf.capture import Surface
 from avmsf.capture.cameras import Camera
 from avmsf.capture.meshviews import FOCAL, UNLIT, Lighting, MeshTracer, orbit_cameras, render_views
 from avmsf.capture.texturedmesh import GRAY, TexturedMesh, read_textured_mesh
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, CaptureWarning
 from raising import raises, warns
 
 RADIUS, DISTANCE = 0.1, 0.5

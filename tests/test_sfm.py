@@ -14,14 +14,13 @@ import numpy as np
 import pytest
 import torch
 
-from avmsf.capture import CaptureWarning
 from avmsf.capture.cameras import Camera, View
 from avmsf.capture.meshviews import render_views
 from avmsf.capture.sfm import WORKER, EstimatedCameras, MotionProgress, estimate_cameras
 from avmsf.capture.similarity import align_similarity, move_views
 from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.capture.views import read_views
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, CaptureWarning
 from raising import raises
 
 VIEWS, SIZE = 10, 256

@@ -7,9 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from avmsf.capture import CaptureWarning
 from avmsf.capture.video import pick_frames, sharpness
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, CaptureWarning
 from raising import raises, warns
 
 SHARP = (2, 11, 13, 21, 28, 30)

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avmsf.capture import CaptureSettings, CaptureWarning, check, read_capture
+from avmsf.capture import CaptureSettings, check, read_capture
 from avmsf.capture.measure import shared_problems
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, CaptureWarning
 from capture_folder import fill, ring
 
 NAMES = ("a.wav", "b.wav", "c.wav")

@@ -114,7 +114,7 @@ def test_a_deconvolved_response_is_known_before_the_push_too() -> None:
     assert np.abs(found.before[: 19 - early]).max() < 1e-3 * np.abs(response).max()
 
 
-@pytest.mark.filterwarnings("ignore::avmsf.capture.CaptureWarning")  # the tree was struck twice at each point
+@pytest.mark.filterwarnings("ignore::avmsf.errors.CaptureWarning")  # the tree was struck twice at each point
 @pytest.mark.parametrize("name", ["aircraft_response", "ruler10", "tree43"])
 def test_measured_impulse_responses_are_not_cut(shared: Path, name: str) -> None:
     folder = shared / name

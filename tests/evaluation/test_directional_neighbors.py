@@ -11,8 +11,9 @@ from torch.nn.functional import normalize
 
 from avmsf.bench.baselines import MeanWaveform
 from avmsf.bench.evaluation import evaluate, split
-from avmsf.capture import CaptureSettings, CaptureWarning, read_capture
+from avmsf.capture import CaptureSettings, read_capture
 from avmsf.capture.impacts import Impacts
+from avmsf.errors import CaptureWarning
 from plate_field import plate_impacts
 
 X, Y = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]

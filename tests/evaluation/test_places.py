@@ -9,10 +9,10 @@ import torch
 
 from avmsf.bench.cases import Choosing, Closest, Farthest, Growing, LeaveOneOut, Places, Shots
 from avmsf.bench.evaluation import split
-from avmsf.capture import CaptureSettings, CaptureWarning, read_capture
+from avmsf.capture import CaptureSettings, read_capture
 from avmsf.capture.impacts import Impacts
 from avmsf.cli.scores import parts_words
-from avmsf.errors import EvaluationError
+from avmsf.errors import CaptureWarning, EvaluationError
 from raising import raises
 
 COUNT = 20

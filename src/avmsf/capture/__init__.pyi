@@ -1,4 +1,3 @@
-from ..errors import CaptureWarning as CaptureWarning
 from .audio import Recording as Recording
 from .audio import read_recording as read_recording
 from .audio import read_sound as read_sound

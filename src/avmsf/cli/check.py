@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from avmsf.capture import CaptureReport, CaptureSettings, CaptureWarning, Impacts, check, read_capture
+from avmsf.capture import CaptureReport, CaptureSettings, Impacts, check, read_capture
 from avmsf.capture.measure import shared_problems
 from avmsf.capture.proposals import Proposal, propose_settings, settings_text, write_settings
 from avmsf.capture.settings import SETTINGS
@@ -16,7 +16,7 @@ from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.check import Options
 from avmsf.cli.printing import console, decimals, next_command, print_json, say, table
 from avmsf.cli.visuals import misplaced, visual_inputs
-from avmsf.errors import CaptureError, ExtractionError
+from avmsf.errors import CaptureError, CaptureWarning, ExtractionError
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.extraction.finders import HighResolution
 from avmsf.wording import counted
