@@ -11,9 +11,13 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from avmsf.bench.evaluation import split
 from avmsf.capture import Impacts
-from avmsf.config import BodyConfig
+from avmsf.evaluation.splits import split
+from avmsf.features.feature_field import FeatureField
+from avmsf.fem.block import block
+from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
+from avmsf.fem.elements import SecondOrder
+from avmsf.fem.material import CERAMIC, STEEL
 from avmsf.fem.supports import supports_of
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.elastic import Elastic
@@ -23,13 +27,9 @@ from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.recipes import GainCase
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
-from avmsf.modal.residual import Residual
+from avmsf.modal.residual_noise import Residual
 from avmsf.pipeline.bodies import candidate_bodies, roughened
-from avmsf.scene.features import FeatureField
-from avmsf.simulate.block import block
-from avmsf.simulate.elastic import ElasticModes, elastic_modes
-from avmsf.simulate.elements import SecondOrder
-from avmsf.simulate.material import CERAMIC, STEEL
+from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.shapes import make_shape
 from avmsf.simulate.sim20 import ABLATED
 from benchmarks.report import Options, Report, Table, tell

@@ -13,14 +13,14 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from avmsf.bench.evaluation import evaluate, split
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.capture.audio import read_recording
 from avmsf.capture.folder import read_strike
 from avmsf.capture.prepare import margin_length, prepare
 from avmsf.capture.table import read_rows, understand
-from avmsf.config import BodyConfig
 from avmsf.errors import CaptureWarning
+from avmsf.evaluation.splits import evaluate, split
+from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
@@ -29,9 +29,9 @@ from avmsf.modal.extraction.alignment import Alignment, align, coherence, strong
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.extraction.quality import measure_quality
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.scene.features import FeatureField
+from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.example import EXAMPLE_FOLDER
-from avmsf.simulate.truth import read_truth
+from avmsf.simulate.ground_truth import read_truth
 from benchmarks.field import QUICK_LOOK, filled_estimator
 from benchmarks.look import slab
 from benchmarks.material import STRUCK, example_capture, shared_data, surface_features

@@ -10,38 +10,39 @@ from pathlib import Path
 
 import torch
 
-from avmsf.bench.evaluation import split
-from avmsf.bench.judging import Judging
-from avmsf.bench.locating import judge_locating
-from avmsf.bench.methods import method_named
-from avmsf.bench.plan import Evaluation
-from avmsf.bench.protocols import PROTOCOLS
-from avmsf.bench.results import ObjectRecord, ResultsFolder
-from avmsf.bench.run import run_object
-from avmsf.bench.summary import figures_of, labels_of, means
-from avmsf.capture import Capture, Surface, read_capture
-from avmsf.capture.datasets import CaptureCollection
+from avmsf.baselines.diffsound.locator import DiffSoundLocator
+from avmsf.baselines.diffsound.material_fit import MODES, DampingCurve, DiffSoundConfig, clip_spectra, fit_material
+from avmsf.baselines.diffsound.renderer import fit_diffsound
+from avmsf.capture import Capture, read_capture
 from avmsf.capture.impacts import Impacts
 from avmsf.cli.heartbeat import beating
+from avmsf.datasets import CaptureCollection
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.diffsound import fit_diffsound
-from avmsf.evaluation.diffsound_locator import DiffSoundLocator
-from avmsf.evaluation.material_fit import MODES, DampingCurve, DiffSoundConfig, clip_spectra, fit_material
-from avmsf.fem.family import BodyFamily, body_family
+from avmsf.evaluation.localization import judge_locating
+from avmsf.evaluation.methods import method_named
+from avmsf.evaluation.object_bodies import ObjectBodies
+from avmsf.evaluation.object_features import ObjectLooks
+from avmsf.evaluation.plan import Evaluation
+from avmsf.evaluation.protocols import PROTOCOLS
+from avmsf.evaluation.results import ObjectRecord, ResultsFolder
+from avmsf.evaluation.run import run_object
+from avmsf.evaluation.sound_metrics import Judging
+from avmsf.evaluation.splits import split
+from avmsf.evaluation.summary import figures_of, labels_of, means
+from avmsf.fem.body_family import BodyFamily, body_family
+from avmsf.fem.material import Material, material_named
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
+from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.localization.locator import Locator
+from avmsf.mesh import Surface
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import extract_modes
 from avmsf.modal.synthesis import synthesize
-from avmsf.pipeline.objectbodies import ObjectBodies
-from avmsf.pipeline.objectlooks import ObjectLooks
-from avmsf.scene.gaussians import GaussianCloud
-from avmsf.simulate.material import Material, material_named
 from avmsf.simulate.sim20 import sim20_recipe
 from avmsf.simulate.simulation import simulate_object
-from avmsf.simulate.simulationfolder import write_simulation
+from avmsf.simulate.simulation_folder import write_simulation
 from benchmarks.costs import method_costs
 from benchmarks.material import surface_features
 from benchmarks.paperrun import paper_runs

@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from avmsf.bench.cdpam import SAMPLE_RATE, Cdpam, Scaling
-from avmsf.bench.cdpamnetwork import CdpamNetwork
-from avmsf.bench.cdpamweights import LAYERS, CdpamWeights, find_weights, read_weights
-from avmsf.bench.convolution import Workspace
+from avmsf.evaluation.cdpam import SAMPLE_RATE, Cdpam, Scaling
+from avmsf.evaluation.cdpam_network import CdpamNetwork
+from avmsf.evaluation.cdpam_weights import LAYERS, CdpamWeights, find_weights, read_weights
+from avmsf.evaluation.convolution import Workspace
 from benchmarks.report import Options, Report, Table, tell
 
 

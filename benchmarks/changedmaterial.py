@@ -12,19 +12,19 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from avmsf.editing.material import change_material
+from avmsf.fem.damping import rayleigh
+from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
+from avmsf.fem.material import CERAMIC, GLASS, IRON, PLASTIC, STEEL, WOOD, Material
+from avmsf.fem.solid import Solid
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
 from avmsf.field.gains.model import MixtureGains, series_of
 from avmsf.field.gains.positional import Smooth
-from avmsf.field.soundfield import Origin, SoundField
+from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.residual import Residual
-from avmsf.simulate.elastic import ElasticModes, elastic_modes
-from avmsf.simulate.material import CERAMIC, GLASS, IRON, PLASTIC, STEEL, WOOD, Material
-from avmsf.simulate.solid import Solid
-from avmsf.simulate.vibration import rayleigh
-from avmsf.tasks.material import change_material
+from avmsf.modal.residual_noise import Residual
 from benchmarks.fem import bowl
 from benchmarks.report import Options, Report, Table, tell
 

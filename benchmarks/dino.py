@@ -14,15 +14,15 @@ from typing import Any
 
 import torch
 
-from avmsf.capture.cameras import View
-from avmsf.capture.views import find_foreground, read_views
-from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.photographs import Photograph
-from avmsf.scene.rasterizer import Rasterizer, choose_rasterizer
-from avmsf.scene.splat import SplatProgress, splat
-from avmsf.scene.splatconfig import SplatConfig
-from avmsf.scene.ssim import psnr, ssim
-from avmsf.scene.symmetrysearch import find_symmetries
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.config import SplatConfig
+from avmsf.gaussians.fit import SplatProgress, splat
+from avmsf.gaussians.rasterizer.protocol import Rasterizer, choose_rasterizer
+from avmsf.gaussians.ssim import psnr, ssim
+from avmsf.gaussians.targets import Photograph
+from avmsf.photographs import find_foreground, read_views
+from avmsf.photographs.cameras import View
+from avmsf.symmetry.find import find_symmetries
 from benchmarks.material import REPOSITORY, shared_data
 from benchmarks.report import Options, Report, Table, tell
 from benchmarks.step import peak_gigabytes

@@ -9,14 +9,14 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from statistics import mean
 
-from avmsf.bench.editing import EditScore, judge, write_scores
-from avmsf.bench.editingobjects import SHAPES, STRANGERS, KnownObject, SolvedShape, drawn_size, simulated_objects
-from avmsf.bench.editmethods import towards_reference
-from avmsf.bench.edittasks import SIMULATED_TRANSITIONS, EditTask, Transition
-from avmsf.bench.modefeatures import Pitches, PitchesAndRings
-from avmsf.bench.modespace import MaterialSpace, UmapSettings
-from avmsf.simulate.material import MATERIALS
-from avmsf.tasks.reference import Reference
+from avmsf.editing.reference import Reference
+from avmsf.evaluation.editing import EditScore, judge, write_scores
+from avmsf.evaluation.editing_methods import towards_reference
+from avmsf.evaluation.editing_objects import SHAPES, STRANGERS, KnownObject, SolvedShape, drawn_size, simulated_objects
+from avmsf.evaluation.editing_tasks import SIMULATED_TRANSITIONS, EditTask, Transition
+from avmsf.evaluation.mode_embedding import MaterialSpace, UmapSettings
+from avmsf.evaluation.mode_features import Pitches, PitchesAndRings
+from avmsf.fem.material import MATERIALS
 from benchmarks.report import Options, Report, Table, tell
 from benchmarks.step import peak_gigabytes
 

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from avmsf._utils.text_files import read_json
-from avmsf.bench.pictures import save_picture
 from avmsf.errors import AvmsfError, EvaluationError
 from avmsf.plotting.edits import Move, draw_clap_curves, draw_embedding
+from avmsf.plotting.pictures import save_picture
 
 BEFORE = "before"
 """Method of the protocol that leaves an object as it was."""

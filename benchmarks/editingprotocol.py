@@ -14,9 +14,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean
 
-from avmsf.bench.clap import Clap
-from avmsf.bench.editing import EditScore, judge, write_scores
-from avmsf.bench.editingobjects import (
+from avmsf.datasets.dataset import Dataset
+from avmsf.datasets.recognize import open_dataset
+from avmsf.editing.config import GuidedEditConfig
+from avmsf.editing.reference import Reference
+from avmsf.editing.stable_audio import StableAudio
+from avmsf.errors import AvmsfError, EvaluationError
+from avmsf.evaluation.clap import Clap
+from avmsf.evaluation.editing import EditScore, judge, write_scores
+from avmsf.evaluation.editing_methods import GENERATED, EditMethod, Recast, towards_reference, towards_words
+from avmsf.evaluation.editing_objects import (
     PUBLISHED,
     REALIMPACT_26,
     SHAPES,
@@ -25,18 +32,11 @@ from avmsf.bench.editingobjects import (
     PaperFields,
     recorded_objects,
 )
-from avmsf.bench.editmethods import GENERATED, EditMethod, Recast, towards_reference, towards_words
-from avmsf.bench.edittasks import RECORDED_TRANSITIONS, SEVEN_TRANSITIONS, EditTask, prompted_tasks
-from avmsf.bench.published import EDITING_UMAP
-from avmsf.capture.datasets.dataset import Dataset
-from avmsf.capture.datasets.recognize import open_dataset
-from avmsf.config import DINO, PRESETS
-from avmsf.errors import AvmsfError, EvaluationError
+from avmsf.evaluation.editing_tasks import RECORDED_TRANSITIONS, SEVEN_TRANSITIONS, EditTask, prompted_tasks
+from avmsf.evaluation.object_features import ObjectLooks
+from avmsf.evaluation.published import EDITING_UMAP
+from avmsf.pipeline.config import DINO, PRESETS
 from avmsf.pipeline.features import choose_encoder
-from avmsf.pipeline.objectlooks import ObjectLooks
-from avmsf.tasks.config import GuidedEditConfig
-from avmsf.tasks.reference import Reference
-from avmsf.tasks.stableaudio import StableAudio
 from benchmarks.editing import labelled_objects, referred_task, spaces_of, strange_shapes, stranger
 from benchmarks.editingfigures import write_figures
 from benchmarks.report import Options, Report, Table, show, tell

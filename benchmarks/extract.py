@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.bench.baselines import floor
-from avmsf.bench.metrics import default_fft_sizes, relative_stft_error
 from avmsf.capture import Impacts
 from avmsf.errors import ExtractionError
+from avmsf.evaluation.metrics import default_fft_sizes, relative_stft_error
+from avmsf.evaluation.simple_methods import floor
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import extract_modes, extract_sounds
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder, ShortTime

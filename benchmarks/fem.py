@@ -13,11 +13,11 @@ import scipy.linalg
 import scipy.optimize
 import torch
 
-from avmsf.simulate.block import block
-from avmsf.simulate.elastic import elastic_modes
-from avmsf.simulate.elements import SecondOrder
-from avmsf.simulate.material import CERAMIC, STEEL, Material
-from avmsf.simulate.solid import Solid
+from avmsf.fem.block import block
+from avmsf.fem.elastic_modes import elastic_modes
+from avmsf.fem.elements import SecondOrder
+from avmsf.fem.material import CERAMIC, STEEL, Material
+from avmsf.fem.solid import Solid
 from benchmarks.report import Options, Report, Table, tell
 from benchmarks.step import peak_gigabytes
 

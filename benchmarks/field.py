@@ -10,23 +10,24 @@ import trimesh
 from jaxtyping import Float64
 from torch import Tensor
 
-from avmsf.bench.baselines import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor, sine_floor
-from avmsf.bench.conventions import PAPER
-from avmsf.bench.evaluation import Scores, evaluate, score, split
-from avmsf.bench.renderer import Renderer
-from avmsf.capture import Impacts, Surface
-from avmsf.capture.texturedmesh import TexturedMesh
+from avmsf.capture import Impacts
+from avmsf.evaluation.conventions import PAPER
+from avmsf.evaluation.renderer import Renderer
+from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor, sine_floor
+from avmsf.evaluation.splits import Scores, evaluate, score, split
+from avmsf.features.feature_field import FeatureField
+from avmsf.fem.candidate_bodies import nominal_bodies
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import Attention
-from avmsf.field.soundfield import SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.field.uncertainty import coverage
+from avmsf.mesh import Surface
+from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.modal.extraction.extract import extract_modes
 from avmsf.modal.extraction.least_squares import fit_gains
-from avmsf.scene.features import FeatureField
-from avmsf.simulate.nominal import nominal_bodies
 from benchmarks.look import finish, lift_pictures, pictures, slab, speckled
 from benchmarks.material import IMPULSE, STRUCK, PlateCase, capture_in_place, surface_features
 from benchmarks.report import Options, Report, Table, tell
@@ -54,7 +55,7 @@ CONVENTIONS = (
     "error: relative STFT error at held-out contacts, that is sums over bins and frames of absolute differences of "
     "magnitudes over the truth's sums; mean over FFT 2048/1024/512/256 at 44.1 kHz, 512/256/128/64 at 400 Hz; hop a "
     "quarter.",
-    f"l1, l1_log, envelope: convention '{PAPER.name}' of avmsf.bench.conventions, mean over held-out contacts.",
+    f"l1, l1_log, envelope: convention '{PAPER.name}' of avmsf.evaluation.conventions, mean over held-out contacts.",
     "knn3: of the 3 nearest contacts. warmup: the network after its warm-up alone. field: the network after training, "
     "quick recipe; auto: the same with the Gaussian process over all kernel families, no_body: without elastic mode "
     "shapes.",

@@ -12,30 +12,31 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from avmsf.bench.baselines import MeanWaveform
-from avmsf.bench.evaluation import evaluate, score, split
-from avmsf.bench.knowntruth import truth_at, truth_from_first_sample
-from avmsf.capture import Impacts, Surface
+from avmsf.capture import Impacts
 from avmsf.errors import CaptureWarning
+from avmsf.evaluation.ground_truth import truth_at, truth_from_first_sample
+from avmsf.evaluation.simple_methods import MeanWaveform
+from avmsf.evaluation.splits import evaluate, score, split
+from avmsf.features.feature_field import FeatureField
+from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import FAMILIES, MixtureEstimator
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.recipes import GainCase
-from avmsf.field.soundfield import SoundField
-from avmsf.geometry import ObjectShape
+from avmsf.field.sound_field import SoundField
+from avmsf.gaussians.points import farthest_points
 from avmsf.localization.locator import Locator
+from avmsf.mesh import Surface
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
-from avmsf.modal.residual import Residual
+from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
 from avmsf.pipeline.bodies import roughened
-from avmsf.pipeline.cloudshape import shape_of_cloud
-from avmsf.scene.features import FeatureField
-from avmsf.scene.points import farthest_points
-from avmsf.simulate.elastic import ElasticModes
+from avmsf.pipeline.cloud_shape import shape_of_cloud
+from avmsf.reconstruction import ObjectShape
+from avmsf.simulate.ground_truth import Truth
 from avmsf.simulate.sim20 import SIM20
-from avmsf.simulate.truth import Truth
 from benchmarks.ablation import ablation, outliers, supports
 from benchmarks.material import MissingDataError, example_capture
 from benchmarks.report import Options, Report, Table, tell

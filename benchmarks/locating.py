@@ -16,32 +16,33 @@ from statistics import mean, median
 
 import torch
 
-from avmsf.bench.evaluation import split
-from avmsf.bench.locating import METHODS, LocatingScores, judge_locating
-from avmsf.bench.locatingimages import Images, symmetries_of
-from avmsf.capture import Capture, Surface, read_capture
+from avmsf.capture import Capture, read_capture
 from avmsf.capture.audio import read_recording
 from avmsf.capture.impacts import Impacts
-from avmsf.config import BodyConfig
 from avmsf.errors import LocationError
+from avmsf.evaluation.localization import METHODS, LocatingScores, judge_locating
+from avmsf.evaluation.splits import split
+from avmsf.evaluation.symmetric_contacts import Images, symmetries_of
+from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import Attention, GainRecipe
-from avmsf.field.soundfield import SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.localization.locate import locate
 from avmsf.localization.locator import Locator
 from avmsf.localization.streaming import LocatedImpact, StreamingLocalizer
+from avmsf.mesh import Surface
 from avmsf.modal.extraction.extract import Extraction, extract_modes
-from avmsf.modal.residual import Residual
+from avmsf.modal.residual_noise import Residual
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.scene.features import FeatureField
+from avmsf.pipeline.config import BodyConfig
+from avmsf.simulate.ground_truth import Truth, read_truth
 from avmsf.simulate.plate import Plate, plate_surface_points
 from avmsf.simulate.shapes import make_shape
 from avmsf.simulate.shapes.shape import Symmetry
 from avmsf.simulate.sim20 import NON_SYMMETRIC, SIM20, sim20_recipe
 from avmsf.simulate.simulation import simulate_object
-from avmsf.simulate.truth import Truth, read_truth
 from benchmarks.look import slab
 from benchmarks.material import STRUCK, capture_in_place, shared_data, surface_features
 from benchmarks.report import Options, Report, Table, show, tell

@@ -8,14 +8,14 @@ import trimesh
 from jaxtyping import UInt8
 from torch import Tensor
 
-from avmsf.capture import Surface
-from avmsf.capture.cameras import View
-from avmsf.capture.meshviews import Lighting, orbit_cameras, render_views
-from avmsf.capture.texturedmesh import TexturedMesh
-from avmsf.config import LiftConfig
+from avmsf.features.descriptors import ImageDescriptors
+from avmsf.features.lift import Lifted
+from avmsf.mesh import Surface
+from avmsf.mesh.textured_mesh import TexturedMesh
+from avmsf.photographs.cameras import View
+from avmsf.photographs.mesh_views import Lighting, orbit_cameras, render_views
+from avmsf.pipeline.config import LiftConfig
 from avmsf.pipeline.features import MadeFeatures, finish_features, lift_to_surface
-from avmsf.scene.descriptors import ImageDescriptors
-from avmsf.scene.lift import Lifted
 from avmsf.simulate.plate import Plate
 
 LIGHT = Lighting(ambient=0.3, sky=0.7, direction=(0.5, 0.3, 0.8))

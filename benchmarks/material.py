@@ -12,9 +12,9 @@ from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.capture.audio import read_recording
 from avmsf.capture.onset import find_second_push
 from avmsf.capture.prepare import prepare
-from avmsf.scene.features import FeatureField
+from avmsf.features.feature_field import FeatureField
 from avmsf.simulate.example import EXAMPLE_FOLDER
-from avmsf.simulate.examplemesh import example_mesh
+from avmsf.simulate.example_mesh import example_mesh
 from avmsf.simulate.plate import Plate, plate_surface_points, sample_contacts, strike
 
 REPOSITORY = Path(__file__).resolve().parents[1]

@@ -9,21 +9,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.bench.baselines import MeanWaveform
-from avmsf.bench.evaluation import evaluate, split
-from avmsf.capture.datasets import CaptureCollection
 from avmsf.capture.impacts import Impacts
-from avmsf.config import DESCRIPTORS, PRESETS
+from avmsf.datasets import CaptureCollection
+from avmsf.evaluation.object_features import ObjectLooks
+from avmsf.evaluation.simple_methods import MeanWaveform
+from avmsf.evaluation.splits import evaluate, split
+from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.recipes import SHARED, Attention, gain_case
 from avmsf.field.training import Targets, TrainingRun
 from avmsf.modal.extraction.extract import extract_sounds
 from avmsf.modal.extraction.finders import ShortTime
-from avmsf.pipeline.objectlooks import ObjectLooks
-from avmsf.scene.features import FeatureField
+from avmsf.pipeline.config import DESCRIPTORS, PRESETS
 from avmsf.simulate.sim20 import sim20_recipe
 from avmsf.simulate.simulation import simulate_object
-from avmsf.simulate.simulationfolder import write_simulation
+from avmsf.simulate.simulation_folder import write_simulation
 from benchmarks.material import shared_data
 from benchmarks.report import Options, Report, Table, tell
 

@@ -13,18 +13,18 @@ from typing import Any
 
 import torch
 
-from avmsf.bench.evaluation import evaluate, split
 from avmsf.capture import read_capture, write_capture
-from avmsf.config import BodyConfig
+from avmsf.evaluation.splits import evaluate, split
+from avmsf.fem.candidate_bodies import nominal_bodies
+from avmsf.fem.material import NOMINAL, material_named
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.uncertainty import coverage
 from avmsf.modal.extraction.extract import extract_modes
 from avmsf.pipeline.bodies import candidate_bodies
+from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.bodies import make_body
-from avmsf.simulate.material import NOMINAL, material_named
-from avmsf.simulate.nominal import nominal_bodies
 from avmsf.simulate.sim20 import SIM20, sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from benchmarks.field import measured_parts

@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.capture.cameras import Camera
-from avmsf.scene.cpu import NumbaRasterizer
-from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.rasterizer import Rendering
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.rasterizer.cpu import NumbaRasterizer
+from avmsf.gaussians.rasterizer.protocol import Rendering
+from avmsf.photographs.cameras import Camera
 from benchmarks.rasterizers import render_everywhere, render_padded
 from benchmarks.report import Options, Report, Table, tell
 

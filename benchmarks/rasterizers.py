@@ -13,9 +13,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from avmsf.capture.cameras import Camera
-from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.rasterizer import Rendering
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.rasterizer.protocol import Rendering
+from avmsf.photographs.cameras import Camera
 
 _NEAR, _BLUR, _MARGIN = 0.01, 0.3, 0.3
 _FAINTEST, _OPAQUE, _LEAST = 1 / 255, 0.999, 1e-4

@@ -7,15 +7,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.bench.evaluation import score, split
 from avmsf.capture import Impacts, read_capture
+from avmsf.evaluation.splits import score, split
+from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
-from avmsf.field.soundfield import SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.modal.extraction.extract import extract_modes
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.scene.features import FeatureField
 from avmsf.simulate.sim20 import SIM20, sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from benchmarks.field import QUICK_LOOK, filled_estimator

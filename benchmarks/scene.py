@@ -8,18 +8,18 @@ from pathlib import Path
 
 import torch
 
-from avmsf.bench.evaluation import evaluate, split
 from avmsf.capture import Capture, read_capture, write_capture
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.texturedmesh import TexturedMesh
-from avmsf.capture.views.write import write_views
-from avmsf.config import LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
+from avmsf.evaluation.splits import evaluate, split
+from avmsf.features.pooling import orbit_spread, refine
 from avmsf.field.config import FitConfig
 from avmsf.field.store import load
+from avmsf.gaussians.config import SplatConfig
+from avmsf.mesh.textured_mesh import TexturedMesh
+from avmsf.photographs.write import write_views
+from avmsf.pipeline.config import LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
 from avmsf.pipeline.reconstruct import reconstruct
 from avmsf.pipeline.scene import ProgressListener
-from avmsf.scene.refine import orbit_spread, refine
-from avmsf.scene.splatconfig import SplatConfig
 from benchmarks.dino import measure_dino
 from benchmarks.look import SHAPES, finish, lift_pictures, pictures, shape, slab, speckled
 from benchmarks.material import STRUCK

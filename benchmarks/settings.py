@@ -6,14 +6,14 @@ split once more; what is held out here trains there. The warm-up alone is run, w
 
 from dataclasses import replace
 
-from avmsf.bench.baselines import MeanWaveform
-from avmsf.bench.evaluation import evaluate, split
 from avmsf.capture import Impacts
+from avmsf.evaluation.simple_methods import MeanWaveform
+from avmsf.evaluation.splits import evaluate, split
+from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.recipes import Attention
 from avmsf.modal.extraction.extract import Extraction, extract_modes
-from avmsf.scene.features import FeatureField
 from avmsf.simulate.plate import Plate
 from benchmarks.material import PlateCase, capture_in_place, surface_features
 from benchmarks.report import Options, Report, Table, tell

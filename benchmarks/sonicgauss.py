@@ -3,11 +3,11 @@
 import time
 from pathlib import Path
 
-from avmsf.bench.sonicgaussmethod import SmallSonicGaussMethod
-from avmsf.evaluation.sonicgauss.objects import training_objects, training_recipes
-from avmsf.evaluation.sonicgauss.pretraining import PretrainingConfig, pretrain
-from avmsf.evaluation.sonicgauss.small import SmallConfig
-from avmsf.evaluation.sonicgauss.tuning import TrainingConfig
+from avmsf.baselines.sonicgauss.objects import training_objects, training_recipes
+from avmsf.baselines.sonicgauss.pretraining import PretrainingConfig, pretrain
+from avmsf.baselines.sonicgauss.small import SmallConfig
+from avmsf.baselines.sonicgauss.tuning import TrainingConfig
+from avmsf.evaluation.sonicgauss_method import SmallSonicGaussMethod
 from benchmarks.report import Report, Table, tell
 
 OBJECTS = 40

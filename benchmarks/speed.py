@@ -15,15 +15,15 @@ from typing import Literal, TypeVar
 
 import torch
 
-from avmsf.bench.evaluation import evaluate, split
 from avmsf.capture import Impacts
+from avmsf.evaluation.splits import evaluate, split
+from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import Progress, fit
 from avmsf.field.recipes import Attention
-from avmsf.field.soundfield import SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.field.training import Targets, TrainingRun
 from avmsf.modal.extraction.extract import Extraction, extract_modes
-from avmsf.scene.features import FeatureField
 from benchmarks.material import IMPULSE, STRUCK, shared_data
 from benchmarks.report import Options, Report, Table, tell
 from benchmarks.step import STEPS, PlainRun, full_setting, memory_of_step, pass_warmup, start

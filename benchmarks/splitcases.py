@@ -6,28 +6,29 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from avmsf.bench.evaluation import evaluate, split
-from avmsf.capture import Capture, CaptureSettings, Impacts, Surface, read_capture
-from avmsf.config import BodyConfig
+from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.errors import CaptureWarning
+from avmsf.evaluation.splits import evaluate, split
+from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import along_phase
-from avmsf.field.soundfield import SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.field.uncertainty import coverage
-from avmsf.geometry import ObjectShape
+from avmsf.mesh import Surface
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.scene.features import FeatureField
-from avmsf.scene.symmetry import Symmetries
-from avmsf.scene.symmetrycharacters import groups_of
-from avmsf.scene.symmetrysearch import find_symmetries
+from avmsf.pipeline.config import BodyConfig
+from avmsf.reconstruction import ObjectShape
+from avmsf.simulate.ground_truth import Truth, read_truth
 from avmsf.simulate.sim20 import sim20_recipe
 from avmsf.simulate.simulation import simulate_object
-from avmsf.simulate.truth import Truth, read_truth
+from avmsf.symmetry.characters import groups_of
+from avmsf.symmetry.find import find_symmetries
+from avmsf.symmetry.symmetries import Symmetries
 from benchmarks.material import shared_data, surface_features
 from benchmarks.report import Options, tell
 

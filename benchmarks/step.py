@@ -19,18 +19,18 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from avmsf.capture import Impacts
+from avmsf.features.feature_field import FeatureField
 from avmsf.field.attention import AttentionGains
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.losses import SpectralTarget
 from avmsf.field.training import Targets, TrainingRun, gain_scale
+from avmsf.gaussians.config import SplatConfig
+from avmsf.gaussians.fit import SplatProgress, splat
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
-from avmsf.modal.residual import Residual, shape_noise
+from avmsf.modal.residual_noise import Residual, shape_noise
 from avmsf.modal.synthesis import synthesize
-from avmsf.scene.features import FeatureField
-from avmsf.scene.splat import SplatProgress, splat
-from avmsf.scene.splatconfig import SplatConfig
 from avmsf.simulate.plate import sample_contacts
 from benchmarks.look import pictures, shape, speckled
 from benchmarks.material import IMPULSE, REPOSITORY

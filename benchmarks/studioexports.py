@@ -17,10 +17,10 @@ import torch
 
 from avmsf.export.faust import write_faust
 from avmsf.export.gltf import write_gltf
-from avmsf.export.modaldemo import write_demo
-from avmsf.export.sampledfield import SampledField
-from avmsf.export.universal import write_universal
-from avmsf.export.wavgrid import Grid, write_grid
+from avmsf.export.paper_demo import write_demo
+from avmsf.export.sampled_field import SampledField
+from avmsf.export.samples import Grid, write_grid
+from avmsf.export.uff import write_universal
 from benchmarks.report import Options, Report, Table, tell
 
 DRIVER = Path(__file__).resolve().parents[1] / "tests" / "export" / "faust_driver.c"

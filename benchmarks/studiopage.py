@@ -23,12 +23,12 @@ import soundfile
 import torch
 
 from avmsf.export.bundle import write_bundle
-from avmsf.export.sampledfield import SampledField
-from avmsf.export.webpage import page_files
-from avmsf.scene.ply import write_splats
-from avmsf.scene.start import StartPoints, starting_cloud
-from avmsf.simulate.examplemesh import example_mesh
-from avmsf.simulate.simulationfolder import write_textured
+from avmsf.export.sampled_field import SampledField
+from avmsf.export.web import page_files
+from avmsf.gaussians.initialize import StartPoints, starting_cloud
+from avmsf.gaussians.ply import write_splats
+from avmsf.simulate.example_mesh import example_mesh
+from avmsf.simulate.simulation_folder import write_textured
 from benchmarks.report import Report, Table
 from benchmarks.studiosound import ARGUMENTS, CHROMIUM
 

@@ -17,10 +17,10 @@ import numpy as np
 import torch
 
 from avmsf.export.bundle import write_bundle
-from avmsf.export.sampledfield import SampledField
-from avmsf.export.webpage import page_files
+from avmsf.export.sampled_field import SampledField
+from avmsf.export.web import page_files
 from avmsf.modal.pulse import ForcePulse
-from avmsf.modal.residual import shape_noise
+from avmsf.modal.residual_noise import shape_noise
 from benchmarks.report import Options, Report, Table, show
 
 CHROMIUM = "/usr/bin/chromium"

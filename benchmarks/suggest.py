@@ -6,19 +6,19 @@ from pathlib import Path
 
 import torch
 
-from avmsf.bench.evaluation import evaluate
 from avmsf.capture import Capture, Impacts
-from avmsf.config import BodyConfig
+from avmsf.evaluation.splits import evaluate
+from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
-from avmsf.field.soundfield import SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.field.suggest import suggest
+from avmsf.gaussians.points import farthest_points
 from avmsf.modal.extraction.alignment import align
 from avmsf.modal.extraction.extract import extract_modes
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.scene.features import FeatureField
-from avmsf.scene.points import farthest_points
+from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.sim20 import sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from benchmarks.material import capture_in_place, surface_features

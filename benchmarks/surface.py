@@ -14,18 +14,18 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float64
 
-from avmsf.capture.cameras import View
-from avmsf.capture.surface import Surface, read_surface
-from avmsf.capture.views import find_foreground, read_views
 from avmsf.errors import SceneError
-from avmsf.geometry import ObjectShape, object_surface
-from avmsf.geometry.closest import ClosestPoints
-from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.ply import read_splats, write_splats
-from avmsf.scene.rasterizer import choose_rasterizer
-from avmsf.scene.splat import splat
-from avmsf.scene.splatconfig import SplatConfig
-from avmsf.scene.visibility import depth_of_cloud
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.config import SplatConfig
+from avmsf.gaussians.fit import splat
+from avmsf.gaussians.ply import read_splats, write_splats
+from avmsf.gaussians.rasterizer.protocol import choose_rasterizer
+from avmsf.gaussians.visibility import depth_of_cloud
+from avmsf.mesh.closest_point import ClosestPoints
+from avmsf.mesh.surface import Surface, read_surface
+from avmsf.photographs import find_foreground, read_views
+from avmsf.photographs.cameras import View
+from avmsf.reconstruction import ObjectShape, object_surface
 from avmsf.simulate.sim20 import SIM20
 from benchmarks.material import MissingDataError
 from benchmarks.report import Options, Report, Table, tell

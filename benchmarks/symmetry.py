@@ -11,9 +11,9 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from avmsf.capture.surface import read_surface
-from avmsf.scene.symmetry import Symmetries
-from avmsf.scene.symmetrysearch import find_symmetries
+from avmsf.mesh.surface import read_surface
+from avmsf.symmetry.find import find_symmetries
+from avmsf.symmetry.symmetries import Symmetries
 from benchmarks.material import shared_data
 from benchmarks.report import Options, Report, Table, tell
 

@@ -24,10 +24,10 @@ from pathlib import Path
 from safetensors.torch import load as from_bytes
 from safetensors.torch import save as to_bytes
 
-from avmsf.capture.texturedmesh import read_textured_mesh
-from avmsf.capture.views import read_sparse_points, read_views
 from avmsf.errors import AvmsfError
-from avmsf.scene.ply import read_splats
+from avmsf.gaussians.ply import read_splats
+from avmsf.mesh.textured_mesh import read_textured_mesh
+from avmsf.photographs import read_sparse_points, read_views
 from benchmarks.report import Options, Report, Table, tell
 from benchmarks.robustness.bombs import BOMBS
 from benchmarks.robustness.mutations import damage_bytes, damage_json, damage_text

@@ -14,7 +14,10 @@ import torch
 import trimesh
 from torch import Tensor
 
-from avmsf.capture import Surface
+from avmsf.features.feature_field import FeatureField
+from avmsf.fem.elastic_modes import elastic_modes
+from avmsf.fem.material import NOMINAL
+from avmsf.fem.shell import shell
 from avmsf.field.attention import AttentionGains
 from avmsf.field.config import AttentionShape
 from avmsf.field.gains.elastic import Elastic
@@ -22,16 +25,13 @@ from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
-from avmsf.field.soundfield import Origin, SoundField
+from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.ply import write_splats
+from avmsf.mesh import Surface
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.residual import Residual
-from avmsf.scene.features import FeatureField
-from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.ply import write_splats
-from avmsf.simulate.elastic import elastic_modes
-from avmsf.simulate.material import NOMINAL
-from avmsf.simulate.shell import shell
+from avmsf.modal.residual_noise import Residual
 
 RATE = 8000
 CONTACTS = ((0.1, 0.0, 0.0), (0.0, 0.1, 0.0), (0.0, 0.0, 0.1))

@@ -20,10 +20,10 @@ import numpy as np
 import soundfile
 import torch
 
-from avmsf.field.soundfield import Origin, SoundField
+from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.residual import Residual
+from avmsf.modal.residual_noise import Residual
 from benchmarks.robustness.seeds import mixture_gains
 
 RATE = 8000

@@ -12,7 +12,7 @@ import torch
 from matplotlib.figure import Figure
 
 import avmsf
-from avmsf.bench.baselines import MeanWaveform
+from avmsf.evaluation.simple_methods import MeanWaveform
 from avmsf.modal.spectra import magnitude_stft
 from avmsf.plotting.style import SEQUENTIAL, styled
 

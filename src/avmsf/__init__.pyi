@@ -1,24 +1,29 @@
-from . import bench as bench
+from . import baselines as baselines
 from . import capture as capture
+from . import datasets as datasets
+from . import editing as editing
 from . import errors as errors
 from . import evaluation as evaluation
 from . import export as export
+from . import features as features
 from . import fem as fem
 from . import field as field
-from . import geometry as geometry
+from . import gaussians as gaussians
 from . import localization as localization
+from . import mesh as mesh
 from . import modal as modal
+from . import photographs as photographs
 from . import pipeline as pipeline
 from . import plotting as plotting
-from . import scene as scene
+from . import reconstruction as reconstruction
 from . import simulate as simulate
 from . import studio as studio
-from . import tasks as tasks
-from .bench.evaluation import evaluate as evaluate
+from . import symmetry as symmetry
 from .capture import Capture as Capture
-from .capture import Surface as Surface
-from .field.soundfield import SoundField as SoundField
+from .evaluation.splits import evaluate as evaluate
+from .field.sound_field import SoundField as SoundField
 from .localization.locate import locate as locate
+from .mesh import Surface as Surface
 from .modal.extraction.extract import extract_modes as extract_modes
 
 __version__: str

@@ -10,16 +10,16 @@ import torch
 import trimesh
 
 from avmsf._utils import caching
-from avmsf.capture.surface import Surface
+from avmsf._utils.compiled import compiled
+from avmsf._utils.files import write_whole
 from avmsf.cli import main
-from avmsf.compiled import compiled
-from avmsf.config import BodyConfig
 from avmsf.errors import AvmsfWarning, FieldFileError, FitError
 from avmsf.field.store import load
-from avmsf.files import write_whole
+from avmsf.mesh.surface import Surface
 from avmsf.pipeline.bodies import candidate_bodies
-from plate_capture import TINY, fill_plate
-from raising import raises, warns
+from avmsf.pipeline.config import BodyConfig
+from factories.plate_capture import TINY, fill_plate
+from factories.raising import raises, warns
 
 Streams = pytest.CaptureFixture[str]
 

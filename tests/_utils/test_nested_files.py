@@ -5,16 +5,16 @@ from pathlib import Path
 
 import pytest
 
-from avmsf.bench.modespace import MaterialSpace
-from avmsf.bench.results import IDENTITY, ResultsFolder
-from avmsf.capture.datasets.contactlists import LISTS, read_contacts
-from avmsf.cli.demofolder import RECORD, replaced_whole
-from avmsf.config import CACHE
+from avmsf.cli.demo_folder import RECORD, replaced_whole
+from avmsf.datasets.contact_lists import LISTS, read_contacts
 from avmsf.errors import AvmsfError, DatasetError, EvaluationError, ExportError
-from avmsf.export.packedarrays import read_manifest
-from avmsf.export.written import MANIFEST
+from avmsf.evaluation.mode_embedding import MaterialSpace
+from avmsf.evaluation.results import IDENTITY, ResultsFolder
+from avmsf.export.packed_arrays import read_manifest
+from avmsf.export.writing import MANIFEST
+from avmsf.pipeline.config import CACHE
 from avmsf.pipeline.stages import StageFolder
-from avmsf.studio.strikefiles import JOURNAL, StrikeFiles
+from avmsf.studio.strike_files import JOURNAL, StrikeFiles
 
 NESTED = "[" * 100_000
 

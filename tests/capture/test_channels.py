@@ -9,7 +9,7 @@ import pytest
 from avmsf.capture import CaptureSettings, check, read_capture
 from avmsf.capture.measure import shared_problems
 from avmsf.errors import CaptureError, CaptureWarning
-from capture_folder import fill, ring
+from factories.capture_folder import fill, ring
 
 NAMES = ("a.wav", "b.wav", "c.wav")
 

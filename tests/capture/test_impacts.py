@@ -6,7 +6,7 @@ import torch
 
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import ArrayError
-from raising import raises
+from factories.raising import raises
 
 RATE = 8000.0
 

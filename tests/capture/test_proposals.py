@@ -13,7 +13,7 @@ from avmsf.capture import CaptureSettings, check, read_capture
 from avmsf.capture.proposals import Proposal, propose_settings, settings_text, write_settings
 from avmsf.capture.settings import METRES
 from avmsf.errors import CaptureError
-from capture_folder import RATE, fill, ring
+from factories.capture_folder import RATE, fill, ring
 
 SECONDS = 1.0
 TIME = np.arange(round(SECONDS * RATE)) / RATE

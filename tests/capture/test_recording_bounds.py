@@ -10,8 +10,8 @@ from avmsf.capture import audio, check, filenames, read_capture, read_sound
 from avmsf.capture.audio import MAX_PEAK, MAX_SAMPLES, MIN_PEAK
 from avmsf.capture.table import MAX_ROWS
 from avmsf.errors import CaptureError
-from capture_folder import HEADER, RATE, ROWS, fill, ring
-from raising import raises
+from factories.capture_folder import HEADER, RATE, ROWS, fill, ring
+from factories.raising import raises
 
 
 def click(height: float = 1.0) -> np.ndarray:

@@ -11,11 +11,11 @@ from scipy.signal import fftconvolve
 
 from avmsf.capture import CaptureSettings, check, read_capture
 from avmsf.capture.audio import Recording, read_recording
-from avmsf.capture.datasets.blows import Blow, gather
 from avmsf.capture.prepare import margin_length, prepare
 from avmsf.capture.starts import start_with_impact
+from avmsf.datasets.recordings import Blow, gather
 from avmsf.simulate.plate import Plate, sample_contacts, strike
-from capture_folder import RATE, fill, ring
+from factories.capture_folder import RATE, fill, ring
 
 MARGIN = 160
 """20 ms at 8 kHz."""

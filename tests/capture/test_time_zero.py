@@ -9,8 +9,8 @@ from avmsf.capture import CaptureSettings, read_capture
 from avmsf.capture.audio import Recording
 from avmsf.capture.prepare import prepare
 from avmsf.errors import CaptureError
-from plate_capture import fill_plate
-from raising import raises
+from factories.plate_capture import fill_plate
+from factories.raising import raises
 
 RATE = 8000.0
 

@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import pytest
 
-from avmsf.cli.objectbar import ObjectBar
-from avmsf.cli.overallbar import OverallBar
-from avmsf.cli.scenebar import SceneBar
-from avmsf.scene.lift import LiftProgress
+from avmsf.cli.object_bar import ObjectBar
+from avmsf.cli.overall_bar import OverallBar
+from avmsf.cli.scene_bar import SceneBar
+from avmsf.features.lift import LiftProgress
 
 EVIL = "\x1b]0;title\x07[/b].png"
 

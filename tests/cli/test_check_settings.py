@@ -8,7 +8,7 @@ import pytest
 
 from avmsf.capture import CaptureSettings
 from avmsf.cli import main
-from capture_folder import RATE, fill, ring
+from factories.capture_folder import RATE, fill, ring
 
 
 @pytest.fixture

@@ -17,17 +17,17 @@ from avmsf.capture import CaptureSettings
 from avmsf.capture.filenames import pictures_in
 from avmsf.capture.placement import surface_points
 from avmsf.capture.settings import METRES
-from avmsf.capture.views.read import find_shots
-from avmsf.capture.views.shots import without_camera
-from avmsf.capture.views.write import write_views
 from avmsf.cli import main
 from avmsf.cli.visuals import VisualInputs, visual_inputs
-from avmsf.scene.ply import write_splats
-from avmsf.scene.start import StartPoints, starting_cloud
-from capture_folder import fill
-from plate_capture import fill_plate
-from small_scene import slab, slab_views, write_surface_file
-from views_folder import frames, ring, write_image, write_transforms
+from avmsf.gaussians.initialize import StartPoints, starting_cloud
+from avmsf.gaussians.ply import write_splats
+from avmsf.photographs.folder import find_shots
+from avmsf.photographs.shots import without_camera
+from avmsf.photographs.write import write_views
+from factories.capture_folder import fill
+from factories.plate_capture import fill_plate
+from factories.small_scene import slab, slab_views, write_surface_file
+from factories.views_folder import frames, ring, write_image, write_transforms
 
 Streams = pytest.CaptureFixture[str]
 

@@ -9,19 +9,19 @@ import pytest
 import soundfile
 import torch
 
-from avmsf.bench.evaluation import Scores
-from avmsf.capture import read_surface
 from avmsf.cli import demo, main
 from avmsf.cli.demo import verdict, wall_words
-from avmsf.cli.overallbar import REFINEMENT, OverallBar
-from avmsf.config import LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
+from avmsf.cli.overall_bar import REFINEMENT, OverallBar
+from avmsf.evaluation.splits import Scores
 from avmsf.field.fit import Progress
 from avmsf.field.store import load
-from avmsf.scene.ply import read_splats
-from avmsf.scene.splatconfig import SplatConfig
+from avmsf.gaussians.config import SplatConfig
+from avmsf.gaussians.ply import read_splats
+from avmsf.mesh import read_surface
+from avmsf.pipeline.config import LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
 from avmsf.simulate.example import EXAMPLE
-from avmsf.simulate.examplemesh import example_mesh
-from plate_field import QUICK
+from avmsf.simulate.example_mesh import example_mesh
+from factories.plate_field import QUICK
 
 METHODS = {
     "field": "the model",

@@ -8,21 +8,21 @@ import soundfile
 import torch
 from torch import Tensor
 
-from avmsf.bench.baselines import MeanWaveform
-from avmsf.bench.evaluation import split
 from avmsf.capture import Impacts, read_capture
 from avmsf.cli import demo
-from avmsf.cli.overallbar import OverallBar
+from avmsf.cli.overall_bar import OverallBar
+from avmsf.evaluation.simple_methods import MeanWaveform
+from avmsf.evaluation.splits import split
+from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.store import save
+from avmsf.gaussians.points import farthest_points
 from avmsf.modal.extraction.extract import extract_modes
 from avmsf.pipeline.reconstruct import Reconstruction
 from avmsf.pipeline.scene import CLOUD
-from avmsf.scene.features import FeatureField
-from avmsf.scene.points import farthest_points
-from delayed_plate import ALIGNED, delays, distance, strikes, without_delays
+from factories.delayed_plate import ALIGNED, delays, distance, strikes, without_delays
 
 COUNT = 16
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from avmsf.cli.demofolder import RECORD, record, replaced_whole
+from avmsf.cli.demo_folder import RECORD, record, replaced_whole
 from avmsf.cli.options.checks import OutputError
 from avmsf.errors import FolderInUseError
-from raising import raises
+from factories.raising import raises
 
 
 def fill(folder: Path, names: dict[str, str]) -> None:

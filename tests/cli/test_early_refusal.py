@@ -8,17 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from avmsf.bench.methods import METHODS
-from avmsf.bench.names import METHOD_NAMES, PROTOCOL_NAMES
-from avmsf.bench.protocols import PROTOCOLS
 from avmsf.cli.options.paths import ExistingField, InputError
-from avmsf.config import CACHE, CACHED_FIELD
 from avmsf.errors import SimulationError
-from avmsf.scene.plyheader import NEEDED
-from avmsf.simulate.material import material_named
-from raising import raises
+from avmsf.evaluation.methods import METHODS
+from avmsf.evaluation.names import METHOD_NAMES, PROTOCOL_NAMES
+from avmsf.evaluation.protocols import PROTOCOLS
+from avmsf.fem.material import material_named
+from avmsf.gaussians.ply_header import NEEDED
+from avmsf.pipeline.config import CACHE, CACHED_FIELD
+from factories.raising import raises
 
-STORED = Path(__file__).parents[1] / "data" / "format-8" / "mixture.safetensors"
+STORED = Path(__file__).parents[1] / "field" / "data" / "format-8" / "mixture.safetensors"
 REFUSED = (
     "fit cells -o f.safetensors",
     "fit empty -o f.safetensors",

@@ -5,18 +5,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from test_cli_edit import PLACES, RATE, Echo, ceramic
 
-from avmsf.bench.clap import Clap
 from avmsf.cli import edit, main, steering
 from avmsf.cli.edit import run
 from avmsf.cli.options.edit import parse
+from avmsf.editing.edits import EDITS
+from avmsf.editing.modes import adjust_modes
 from avmsf.errors import AvmsfError
+from avmsf.evaluation.clap import Clap
 from avmsf.field.store import load, save
-from avmsf.tasks.edits import EDITS
-from avmsf.tasks.modes import adjust_modes
-from made_clap import save_clap
-from raising import raises
-from test_cli_edit import PLACES, RATE, Echo, ceramic
+from factories.made_clap import save_clap
+from factories.raising import raises
 
 PROMPT = "a bell"
 QUICK = ("--prompt", PROMPT, "--model", "here", "--steps", "5", "--contacts-per-step", "2", "--preview-every", "2")

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from avmsf.bench import report
-from avmsf.bench.results import ResultsFolder
 from avmsf.cli.evaluate import run
 from avmsf.cli.options.evaluate import parse
-from plate_set import RATE, fill_plates
+from avmsf.evaluation import report
+from avmsf.evaluation.results import ResultsFolder
+from factories.plate_set import RATE, fill_plates
 
 CHEAP = ("--methods", "knn3,nearest", "--no-cdpam")
 
@@ -28,7 +28,9 @@ def test_stored_results_are_drawn_without_evaluating(tmp_path: Path, monkeypatch
         save(figure, path)
 
     monkeypatch.setattr(report, "save_picture", keep)
-    monkeypatch.setattr("avmsf.bench.caserun.CaseRun.outcome", lambda *_, **__: pytest.fail("a method was run again"))
+    monkeypatch.setattr(
+        "avmsf.evaluation.case_run.CaseRun.outcome", lambda *_, **__: pytest.fail("a method was run again")
+    )
     assert run(parse([*words, "--figures"])) == 0
     assert list(drawn) == ["a.png", "b.png"]
     for name, figure in drawn.items():

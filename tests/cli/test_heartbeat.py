@@ -80,7 +80,7 @@ def test_what_goes_on_is_told_again_after_a_compilation(monkeypatch: pytest.Monk
     def twice(value: float) -> float:
         return 2 * value
 
-    twice.__module__ = "avmsf.scene.tiles"
+    twice.__module__ = "avmsf.gaussians.rasterizer.tiles"
 
     def work() -> None:
         doing("sorting")

@@ -9,7 +9,7 @@ from avmsf.cli.options.edit import parse as parse_edit
 from avmsf.cli.options.features import parse as parse_features
 from avmsf.cli.options.simulate import parse as parse_simulate
 from avmsf.errors import AvmsfError
-from raising import raises
+from factories.raising import raises
 
 Streams = pytest.CaptureFixture[str]
 

@@ -7,8 +7,8 @@ import pytest
 
 from avmsf.capture.settings import METRES
 from avmsf.cli import main
-from plate_capture import fill_plate
-from small_scene import write_surface_file
+from factories.plate_capture import fill_plate
+from factories.small_scene import write_surface_file
 
 Streams = pytest.CaptureFixture[str]
 VERBS = {

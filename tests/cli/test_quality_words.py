@@ -14,10 +14,10 @@ from avmsf.cli.heartbeat import verbosity
 from avmsf.cli.options import suggest
 from avmsf.cli.scores import body_warnings, order_words, outlier_words, quality_words
 from avmsf.errors import FieldFileError
-from avmsf.field.soundfield import Origin, SoundField
+from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
-from avmsf.modal.residual import Residual
-from made_fields import BANK, positional
+from avmsf.modal.residual_noise import Residual
+from factories.made_fields import BANK, positional
 
 FOUND = {"positions": 9, "error": 0.3, "nearest_mean": 0.7, "next_contact": [0.02, -0.01, 0.08], "next_distance": 0.041}
 

@@ -8,7 +8,7 @@ import soundfile
 import torch
 
 from avmsf.cli import main
-from made_fields import directional, saved, sounding
+from factories.made_fields import directional, saved, sounding
 
 PLACES = torch.tensor([[0.05, 0.03, 0.002], [0.05, 0.03, 0.002], [-0.04, 0.01, 0.002]], dtype=torch.float64)
 DIRECTIONS = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]], dtype=torch.float64)

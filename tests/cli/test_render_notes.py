@@ -10,7 +10,7 @@ import torch
 
 from avmsf.cli import main
 from avmsf.cli.contacts import read_contacts
-from made_fields import positional, saved, sounding
+from factories.made_fields import positional, saved, sounding
 
 AT = ("--position", "0.05", "0.03", "0.002")
 PLACE = torch.tensor([[0.05, 0.03, 0.002]], dtype=torch.float64)

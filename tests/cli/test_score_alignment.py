@@ -4,12 +4,12 @@ import pytest
 
 from avmsf.capture.impacts import Impacts
 from avmsf.cli.scores import compare
+from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.modal.extraction.extract import extract_modes
-from avmsf.scene.features import FeatureField
-from delayed_plate import ALIGNED, delays, strikes, without_delays
+from factories.delayed_plate import ALIGNED, delays, strikes, without_delays
 
 COUNT, TRAIN = 16, 12
 

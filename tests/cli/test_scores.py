@@ -5,15 +5,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from avmsf.bench.baselines import MeanWaveform
-from avmsf.bench.evaluation import evaluate, split
 from avmsf.capture.impacts import Impacts
 from avmsf.cli.scores import compare
+from avmsf.evaluation.simple_methods import MeanWaveform
+from avmsf.evaluation.splits import evaluate, split
+from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.modal.extraction.extract import extract_modes
-from avmsf.scene.features import FeatureField
 from avmsf.simulate.plate import Plate, sample_contacts, strike
 
 MARGIN = 64

@@ -9,19 +9,19 @@ import pytest
 import torch
 import trimesh
 
-from avmsf.bench.surfacepictures import draw_surface
-from avmsf.capture import Surface, read_surface
-from avmsf.capture.views.write import write_views
 from avmsf.cli import main
 from avmsf.cli.info import gains_at
 from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.surface import parse
 from avmsf.errors import EvaluationError
 from avmsf.field.store import save
-from believing_field import bar_contacts, drawn_gains, elastic_field, positional_field, sound_field
-from plate_capture import PLATE, TINY, fill_plate
-from raising import raises
-from small_scene import SMALL_SPLAT, THICKNESS, slab, slab_views, write_surface_file
+from avmsf.mesh import Surface, read_surface
+from avmsf.photographs.write import write_views
+from avmsf.plotting.surfaces import draw_surface
+from factories.believing_field import bar_contacts, drawn_gains, elastic_field, positional_field, sound_field
+from factories.plate_capture import PLATE, TINY, fill_plate
+from factories.raising import raises
+from factories.small_scene import SMALL_SPLAT, THICKNESS, slab, slab_views, write_surface_file
 
 Streams = pytest.CaptureFixture[str]
 FIT = tuple(f"--fit.{word[2:]}" if word.startswith("--") else word for word in TINY[:-2])

@@ -11,20 +11,20 @@ import torch
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from avmsf.bench.sides import ALL_SIDES, view_from
 from avmsf.cli.contacts import Contacts, rows_of
 from avmsf.cli.locate import run
 from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.locate import parse
 from avmsf.errors import CaptureError
-from avmsf.field.soundfield import Origin, SoundField
+from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
 from avmsf.localization.locator import Locator
-from avmsf.modal.residual import Residual
+from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
+from avmsf.plotting.sides import ALL_SIDES, view_from
 from avmsf.plotting.style import FIRST, SECOND
-from made_fields import BANK, positional
-from raising import raises
+from factories.made_fields import BANK, positional
+from factories.raising import raises
 
 RATE, SAMPLES, STRUCK, OTHER = 8000, 4000, 68, 102
 
@@ -56,7 +56,7 @@ def test_the_true_contact_is_red_at_its_place_and_the_found_one_blue(
 ) -> None:
     field, recording, points = hit
     figures: list[Figure] = []
-    monkeypatch.setattr("avmsf.bench.pictures.save_picture", lambda figure, path: figures.append(figure))
+    monkeypatch.setattr("avmsf.plotting.pictures.save_picture", lambda figure, path: figures.append(figure))
     true = [f"{value:.9g}" for value in points[OTHER].tolist()]
     assert run(parse([field, recording, "--output", str(tmp_path), "--true-contact", *true, "--json"])) == 0
     results = json.loads(capsys.readouterr().out)

@@ -7,20 +7,20 @@ import pytest
 import torch
 from torch import Tensor
 
-from avmsf.bench import align_split, evaluate
-from avmsf.bench.baselines import NearestRecording
-from avmsf.bench.caserun import CaseRun
-from avmsf.bench.cases import Case
-from avmsf.bench.fieldmethods import FieldMethod
-from avmsf.bench.judging import Judging
-from avmsf.bench.methods import method_named
-from avmsf.bench.plan import Evaluation
-from avmsf.bench.protocols import PROTOCOLS
-from avmsf.bench.task import Task
-from avmsf.capture.datasets import CaptureCollection
 from avmsf.capture.impacts import Impacts
-from delayed_plate import ALIGNED, delays, distance, strikes, without_delays
-from plate_set import NoBodies, PlateLooks
+from avmsf.datasets import CaptureCollection
+from avmsf.evaluation import align_split, evaluate
+from avmsf.evaluation.case_run import CaseRun
+from avmsf.evaluation.cases import Case
+from avmsf.evaluation.field_methods import FieldMethod
+from avmsf.evaluation.methods import method_named
+from avmsf.evaluation.plan import Evaluation
+from avmsf.evaluation.protocols import PROTOCOLS
+from avmsf.evaluation.simple_methods import NearestRecording
+from avmsf.evaluation.sound_metrics import Judging
+from avmsf.evaluation.task import Task
+from factories.delayed_plate import ALIGNED, delays, distance, strikes, without_delays
+from factories.plate_set import NoBodies, PlateLooks
 
 COUNT, TRAIN = 16, 12
 METHODS = ("nearest", "knn3", "knn-gains")

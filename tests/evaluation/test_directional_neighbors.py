@@ -9,12 +9,12 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from avmsf.bench.baselines import MeanWaveform
-from avmsf.bench.evaluation import evaluate, split
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import CaptureWarning
-from plate_field import plate_impacts
+from avmsf.evaluation.simple_methods import MeanWaveform
+from avmsf.evaluation.splits import evaluate, split
+from factories.plate_field import plate_impacts
 
 X, Y = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
 OPPOSITE = [-1.0, 0.0, 0.0]

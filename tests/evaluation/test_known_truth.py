@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 
-from avmsf.bench.knowntruth import common_delay, truth_from_first_sample
-from avmsf.bench.physical import judge_modes
 from avmsf.capture.impacts import Impacts
+from avmsf.evaluation.ground_truth import common_delay, truth_from_first_sample
+from avmsf.evaluation.modal_metrics import judge_modes
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.least_squares import fit_gains
+from avmsf.simulate.ground_truth import Truth
 from avmsf.simulate.ringing import recorded
-from avmsf.simulate.truth import Truth
 
 RATE, COUNT = 8000.0, 10
 FREQUENCY = torch.tensor([310.0, 742.0, 880.0, 1630.0, 2900.0], dtype=torch.float64)

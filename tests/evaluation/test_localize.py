@@ -11,29 +11,30 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
-from avmsf.bench import locatingmethods, report
-from avmsf.bench.baselines import NearestRecording, WhiteNoise
-from avmsf.bench.fieldmethods import FieldMethod
-from avmsf.bench.gridfield import GridField
-from avmsf.bench.locatingbaselines import random_distance
-from avmsf.bench.locatingmethods import MAX_VERTICES, located
-from avmsf.bench.results import ResultsFolder
-from avmsf.bench.task import Task
+from avmsf.baselines.diffsound.renderer import DiffSound
 from avmsf.capture import Impacts, read_capture
 from avmsf.cli import main
 from avmsf.errors import LocationError
-from avmsf.evaluation.diffsound import DiffSound
+from avmsf.evaluation import localization_methods as locatingmethods
+from avmsf.evaluation import report
+from avmsf.evaluation.field_methods import FieldMethod
+from avmsf.evaluation.grid_field import GridField
+from avmsf.evaluation.localization_baselines import random_distance
+from avmsf.evaluation.localization_methods import MAX_VERTICES, located
+from avmsf.evaluation.object_features import ObjectLooks
+from avmsf.evaluation.results import ResultsFolder
+from avmsf.evaluation.simple_methods import NearestRecording, WhiteNoise
+from avmsf.evaluation.task import Task
+from avmsf.features.feature_field import FeatureField
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
-from avmsf.field.soundfield import SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.localization.contact_map import ContactMap
 from avmsf.localization.published import PublishedLocator
 from avmsf.modal.extraction.finders import ShortTime
-from avmsf.pipeline.objectlooks import ObjectLooks
-from avmsf.scene.features import FeatureField
-from plate_field import QUICK, plate_extraction, plate_features, plate_impacts
-from plate_set import PlateLooks, fill_plates
-from raising import raises
+from factories.plate_field import QUICK, plate_extraction, plate_features, plate_impacts
+from factories.plate_set import PlateLooks, fill_plates
+from factories.raising import raises
 
 
 def test_the_nearest_recording_finds_itself_and_noise_counts_as_a_random_point() -> None:
@@ -142,7 +143,7 @@ def test_heat_maps_have_the_true_contacts_and_the_papers_methods_their_own_dista
 
     monkeypatch.setattr(ObjectLooks, "__call__", lambda looks, *given, **named: PlateLooks()(*given, **named))
     monkeypatch.setattr(FieldMethod, "fit", quick)
-    monkeypatch.setattr("avmsf.bench.caserun.located", watched)
+    monkeypatch.setattr("avmsf.evaluation.case_run.located", watched)
     monkeypatch.setattr(report, "draw_contact", draw)
     words = ["evaluate", "localize", str(data), "--objects", "a", "--methods", "field-auto,paper-grid,paper,nearest"]
     words += ["--lift.encoder", "descriptors", "--output", str(results), "--figures"]

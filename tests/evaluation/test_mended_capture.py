@@ -3,15 +3,15 @@
 from dataclasses import replace
 from pathlib import Path
 
-from avmsf.bench.judging import Judging
-from avmsf.bench.methods import method_named
-from avmsf.bench.parallel import run_objects
-from avmsf.bench.plan import Evaluation
-from avmsf.bench.protocols import PROTOCOLS
-from avmsf.bench.results import ResultsFolder
-from avmsf.capture.datasets import CaptureCollection
-from avmsf.simulate.truth import TRUTH, read_truth, write_truth
-from plate_set import NoBodies, PlateLooks, fill_plates
+from avmsf.datasets import CaptureCollection
+from avmsf.evaluation.methods import method_named
+from avmsf.evaluation.parallel import run_objects
+from avmsf.evaluation.plan import Evaluation
+from avmsf.evaluation.protocols import PROTOCOLS
+from avmsf.evaluation.results import ResultsFolder
+from avmsf.evaluation.sound_metrics import Judging
+from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
+from factories.plate_set import NoBodies, PlateLooks, fill_plates
 
 
 def test_a_truth_of_other_recordings_costs_neither_the_other_objects_nor_the_folder(tmp_path: Path) -> None:

@@ -7,25 +7,25 @@ from typing import Any
 import pytest
 import torch
 
-from avmsf.bench.fieldmethods import NETWORK, FieldMethod
-from avmsf.bench.gridfield import GridField
-from avmsf.bench.judging import Judging
-from avmsf.bench.methods import METHODS
-from avmsf.bench.plan import Evaluation
-from avmsf.bench.protocols import PROTOCOLS
-from avmsf.bench.results import ResultsFolder
-from avmsf.bench.task import Task
-from avmsf.capture.datasets import CaptureCollection
 from avmsf.cli.evaluate import looks_of, settled_lifts
-from avmsf.config import DESCRIPTORS, DINO, PRESETS, LiftConfig
+from avmsf.datasets import CaptureCollection
 from avmsf.errors import EvaluationError, SceneError
+from avmsf.evaluation.field_methods import NETWORK, FieldMethod
+from avmsf.evaluation.grid_field import GridField
+from avmsf.evaluation.methods import METHODS
+from avmsf.evaluation.plan import Evaluation
+from avmsf.evaluation.protocols import PROTOCOLS
+from avmsf.evaluation.results import ResultsFolder
+from avmsf.evaluation.sound_metrics import Judging
+from avmsf.evaluation.task import Task
+from avmsf.features.descriptors import ImageDescriptors
+from avmsf.features.encoder import Encoder
 from avmsf.modal.extraction.finders import ShortTime
+from avmsf.pipeline.config import DESCRIPTORS, DINO, PRESETS, LiftConfig
 from avmsf.pipeline.features import DinoEncoder
-from avmsf.scene.descriptors import ImageDescriptors
-from avmsf.scene.encode import Encoder
-from plate_field import QUICK, plate_features, plate_impacts
-from plate_set import NoBodies, PlateLooks
-from raising import raises
+from factories.plate_field import QUICK, plate_features, plate_impacts
+from factories.plate_set import NoBodies, PlateLooks
+from factories.raising import raises
 
 
 @pytest.mark.parametrize(

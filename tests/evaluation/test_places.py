@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from avmsf.bench.cases import Choosing, Closest, Farthest, Growing, LeaveOneOut, Places, Shots
-from avmsf.bench.evaluation import split
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.capture.impacts import Impacts
 from avmsf.cli.scores import parts_words
 from avmsf.errors import CaptureWarning, EvaluationError
-from raising import raises
+from avmsf.evaluation.cases import Choosing, Closest, Farthest, Growing, LeaveOneOut, Places, Shots
+from avmsf.evaluation.splits import split
+from factories.raising import raises
 
 COUNT = 20
 

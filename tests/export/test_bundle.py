@@ -13,16 +13,16 @@ import torch
 import trimesh
 
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.surface import Surface
 from avmsf.errors import AvmsfError, ExportError
 from avmsf.export.bundle import make_bundle, write_bundle
-from avmsf.export.objectfile import read_object
-from avmsf.export.sampledfield import SampledField
-from avmsf.export.webpage import write_webpage
-from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.ply import write_splats
-from raising import raises
-from struck_table import RATE, struck_table
+from avmsf.export.object_file import read_object
+from avmsf.export.sampled_field import SampledField
+from avmsf.export.web import write_webpage
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.ply import write_splats
+from avmsf.mesh.surface import Surface
+from factories.raising import raises
+from factories.struck_table import RATE, struck_table
 
 
 def tensors(folder: Path) -> dict[str, np.ndarray]:
@@ -221,6 +221,6 @@ def test_objects_that_are_none_are_refused(tmp_path: Path, monkeypatch: pytest.M
     with raises(ExportError, name="center", value=pytest.approx(5.0, rel=1e-2)):
         read_object(replace(ball_surface(), vertices=ball_surface().vertices + torch.tensor([5.0, 0, 0])), points)
     (tmp_path / "huge.stl").touch()
-    monkeypatch.setattr("avmsf.export.objectfile.MAX_BYTES", -1)
+    monkeypatch.setattr("avmsf.export.object_file.MAX_BYTES", -1)
     with raises(ExportError, file=tmp_path / "huge.stl", name="size", value=0):
         read_object(tmp_path / "huge.stl", points)

@@ -12,10 +12,10 @@ import torch
 
 from avmsf.errors import ExportError
 from avmsf.export.faust import contacts_path, faust_library, write_faust
-from avmsf.export.sampledfield import SampledField
+from avmsf.export.sampled_field import SampledField
 from avmsf.modal.pulse import ForcePulse
-from made_tables import POINTS, RATE, SAMPLES, apart, table
-from raising import raises
+from factories.made_tables import POINTS, RATE, SAMPLES, apart, table
+from factories.raising import raises
 
 DRIVER = Path(__file__).with_name("faust_driver.c")
 BLOCK = 64

@@ -10,13 +10,13 @@ import pytest
 import torch
 import trimesh
 
-from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.errors import CaptureError, ExportError
 from avmsf.export.gltf import write_gltf
 from avmsf.export.look import Look, read_look
-from avmsf.export.onephase import deviation
-from made_tables import MODES, POINTS, apart, summed, table
-from raising import raises
+from avmsf.export.one_phase import deviation
+from avmsf.mesh.textured_mesh import TexturedMesh
+from factories.made_tables import MODES, POINTS, apart, summed, table
+from factories.raising import raises
 
 KINDS = {5126: "<f4", 5125: "<u4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3}
@@ -208,7 +208,7 @@ def test_a_mesh_too_fine_for_viewers_is_reduced_and_keeps_its_colors(tmp_path, m
     np.testing.assert_allclose(few.vertices.norm(dim=1), 0.6, atol=0.02)
     high = few.vertices[:, 2] > 0.05
     np.testing.assert_allclose(few.colors[high], torch.tensor([[1.0, 0.0, 0.0]]).expand(int(high.sum()), 3), atol=0.01)
-    monkeypatch.setattr("avmsf.capture.mesh_file.MAX_FACES", 5000)
+    monkeypatch.setattr("avmsf.mesh.io.MAX_FACES", 5000)
     with raises(CaptureError, file="ball.ply", value=5120):
         read_look(tmp_path / "ball.ply", table())
 

@@ -12,11 +12,11 @@ import torch
 
 from avmsf.errors import ExportError
 from avmsf.export.discs import discs
-from avmsf.export.modaldemo import Demo, is_demo, read_demo, write_demo
-from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.ply import read_splats
-from made_tables import MODES, POINTS, RATE, SAMPLES, apart, summed, table
-from raising import raises
+from avmsf.export.paper_demo import Demo, is_demo, read_demo, write_demo
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.ply import read_splats
+from factories.made_tables import MODES, POINTS, RATE, SAMPLES, apart, summed, table
+from factories.raising import raises
 
 
 def cosines(**settings):

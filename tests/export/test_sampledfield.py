@@ -9,15 +9,15 @@ import torch
 from avmsf.errors import ExportError
 from avmsf.export.bundle import write_bundle
 from avmsf.export.normals import outward_normals
-from avmsf.export.sampledfield import SampledField
+from avmsf.export.sampled_field import SampledField
 from avmsf.field.config import FitConfig
-from avmsf.field.scaledgains import ScaledGains
-from avmsf.field.soundfield import SUPPORTING, Origin, SoundField
+from avmsf.field.scaled_gains import ScaledGains
+from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.pulse import ForcePulse
-from avmsf.modal.residual import Residual
-from made_fields import BANK, FIELDS, elastic, places, plate, positional
-from raising import raises
+from avmsf.modal.residual_noise import Residual
+from factories.made_fields import BANK, FIELDS, elastic, places, plate, positional
+from factories.raising import raises
 
 RATE, SAMPLES = 8000.0, 3000
 

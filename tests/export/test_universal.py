@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from avmsf.errors import ExportError
-from avmsf.export.universal import response, response_frequencies, write_universal
-from made_tables import MODES, POINTS, RATE, SAMPLES, apart, summed, table
-from raising import raises
+from avmsf.export.uff import response, response_frequencies, write_universal
+from factories.made_tables import MODES, POINTS, RATE, SAMPLES, apart, summed, table
+from factories.raising import raises
 
 pyuff = pytest.importorskip("pyuff", reason="needs pip install 'avmsf[uff]'")
 

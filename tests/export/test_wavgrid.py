@@ -13,10 +13,10 @@ import soundfile
 import torch
 
 from avmsf.errors import ExportError
-from avmsf.export.wavgrid import Grid, Layer, hertz_layers, write_grid
+from avmsf.export.samples import Grid, Layer, hertz_layers, write_grid
 from avmsf.modal.pulse import ForcePulse
-from made_tables import RATE, SAMPLES, apart, table
-from raising import raises
+from factories.made_tables import RATE, SAMPLES, apart, table
+from factories.raising import raises
 
 LAYERS = (Layer(0.25, 0.002), Layer(1.0, 0.0005), Layer(3.0))
 

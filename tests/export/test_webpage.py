@@ -10,9 +10,9 @@ import pytest
 
 from avmsf.errors import ExportError
 from avmsf.export.bundle import make_bundle
-from avmsf.export.webpage import page_files, single_file, write_webpage
-from raising import raises
-from struck_table import struck_table
+from avmsf.export.web import page_files, single_file, write_webpage
+from factories.raising import raises
+from factories.struck_table import struck_table
 
 PAGE = {
     "index.html": b"""<head><title>studio</title><link rel="stylesheet" href="page/style.css">

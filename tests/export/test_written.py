@@ -4,8 +4,8 @@ import json
 import os
 
 from avmsf.errors import ExportError
-from avmsf.export.written import Written, write_file, write_folder
-from raising import raises
+from avmsf.export.writing import Written, write_file, write_folder
+from factories.raising import raises
 
 
 def fill(*names):

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
-from avmsf.fem.family import BodyFamily, body_family
+from avmsf.fem.block import block
+from avmsf.fem.body_family import BodyFamily, body_family
+from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.isotropic import IsotropicModes, isotropic_modes
-from avmsf.simulate.block import block
-from avmsf.simulate.elastic import ElasticModes, elastic_modes
-from avmsf.simulate.material import STEEL, WOOD, Material
-from avmsf.simulate.solid import Solid
+from avmsf.fem.material import STEEL, WOOD, Material
+from avmsf.fem.solid import Solid
+from avmsf.mesh.surface import Surface
 
 
 @cache

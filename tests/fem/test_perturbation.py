@@ -6,12 +6,12 @@ from functools import cache
 import numpy as np
 import torch
 
+from avmsf.fem.block import block
+from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
+from avmsf.fem.elements import SecondOrder, elements_of
+from avmsf.fem.material import STEEL
 from avmsf.fem.perturbation import Perturbations, smooth_fields
-from avmsf.simulate.block import block
-from avmsf.simulate.elastic import ElasticModes, elastic_modes
-from avmsf.simulate.elements import SecondOrder, elements_of
-from avmsf.simulate.material import STEEL
-from avmsf.simulate.solid import Solid
+from avmsf.fem.solid import Solid
 
 STEP = 1e-4
 

@@ -8,10 +8,10 @@ from functools import partial
 import numpy as np
 import pytest
 
+from avmsf.fem.candidate_bodies import NominalBody
+from avmsf.fem.material import DISCREPANCY, MATERIALS, NOMINAL, largest_factor
 from avmsf.fem.thickness import search_thickness
-from avmsf.simulate.material import DISCREPANCY, MATERIALS, NOMINAL, largest_factor
-from avmsf.simulate.nominal import NominalBody
-from made_dome import bodies
+from factories.made_dome import bodies
 
 
 def evidence(known: Sequence[NominalBody], *, of: Callable[[float], float], filled: float) -> list[float]:

@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 import torch
 
+from avmsf.fem.block import block
+from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
+from avmsf.fem.elements import SecondOrder, elements_of
+from avmsf.fem.material import NOMINAL
 from avmsf.fem.perturbation import smooth_fields
+from avmsf.fem.solid import Solid
 from avmsf.fem.updating import DENSITY, STIFFNESS, Matched, update
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, matched
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.positional import Smooth, Unstructured
-from avmsf.simulate.block import block
-from avmsf.simulate.elastic import ElasticModes, elastic_modes
-from avmsf.simulate.elements import SecondOrder, elements_of
-from avmsf.simulate.material import NOMINAL
-from avmsf.simulate.solid import Solid
 
 MODES = 14
 

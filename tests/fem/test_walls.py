@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
+from avmsf.fem.candidate_bodies import nominal_bodies
+from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
+from avmsf.fem.material import NOMINAL, STEEL
+from avmsf.fem.mesh_check import checked
+from avmsf.fem.mesh_filling import count_dofs, filled_solid
+from avmsf.fem.skin import Skin
 from avmsf.fem.walls import wall_of
-from avmsf.simulate.elastic import ElasticModes, elastic_modes
-from avmsf.simulate.material import NOMINAL, STEEL
-from avmsf.simulate.nominal import nominal_bodies
-from avmsf.simulate.nominalcheck import checked
-from avmsf.simulate.nominalsolid import count_dofs, filled_solid
+from avmsf.mesh.surface import Surface
 from avmsf.simulate.shapes import make_shape
-from avmsf.simulate.skin import Skin
 
 
 def box(*sides: float) -> Surface:
@@ -133,7 +133,7 @@ def test_a_body_of_too_coarse_elements_is_made_finer_and_its_error_told(monkeypa
             asked.append(dofs)
             return modes(dofs, error)
 
-        monkeypatch.setattr("avmsf.simulate.nominal._Maker._modes", found)
+        monkeypatch.setattr("avmsf.fem.candidate_bodies._Maker._modes", found)
         nominal_bodies(box(0.1, 0.1, 0.1), walls=[None], count=8, dofs=40_000, tell=heard.append)
         return asked, heard
 

@@ -15,11 +15,11 @@ from avmsf.cli import main
 from avmsf.cli.options.checks import OutputError
 from avmsf.cli.writing import write_sound
 from avmsf.errors import FieldFileError
-from avmsf.field.soundfield import Origin, SoundField
+from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save
-from avmsf.modal.residual import Residual
-from made_fields import BANK, FIELDS
-from raising import raises
+from avmsf.modal.residual_noise import Residual
+from factories.made_fields import BANK, FIELDS
+from factories.raising import raises
 
 
 def field() -> SoundField:

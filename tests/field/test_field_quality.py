@@ -5,17 +5,17 @@ from dataclasses import replace
 import pytest
 import torch
 
-from avmsf.bench.baselines import MeanWaveform
-from avmsf.bench.evaluation import evaluate
+from avmsf.evaluation.simple_methods import MeanWaveform
+from avmsf.evaluation.splits import evaluate
+from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.quality import smallest_within_error
-from avmsf.field.soundfield import FieldQuality
+from avmsf.field.sound_field import FieldQuality
 from avmsf.field.store import load, save
 from avmsf.field.suggest import suggest
 from avmsf.modal.extraction.extract import extract_modes
-from avmsf.scene.features import FeatureField
-from delayed_plate import SAMPLES, strikes
+from factories.delayed_plate import SAMPLES, strikes
 
 CONFIG = FitConfig(warmup_steps=0, steps=3)
 

@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from avmsf.capture.impacts import Impacts
+from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.recipes import gain_case
 from avmsf.modal.extraction.extract import Extraction, extract_modes
-from avmsf.scene.features import FeatureField
-from delayed_plate import ALIGNED, delays, distance, strikes, without_delays
+from factories.delayed_plate import ALIGNED, delays, distance, strikes, without_delays
 
 COUNT = 12
 FEATURES = FeatureField.from_contacts(strikes(COUNT).contacts)

@@ -9,7 +9,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from avmsf._utils.device import without_denormals
 from avmsf.cli import main
-from avmsf.config import PipelineConfig
 from avmsf.errors import FitError
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import fit
@@ -17,10 +16,11 @@ from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.losses import SpectralTarget
 from avmsf.field.recipes import Attention, GainRecipe, gain_case
 from avmsf.field.training import Targets, TrainingRun
+from avmsf.pipeline.config import PipelineConfig
 from avmsf.pipeline.record import with_record
-from plate_capture import fill_plate
-from plate_field import QUICK, plate_extraction, plate_features, plate_impacts
-from raising import raises
+from factories.plate_capture import fill_plate
+from factories.plate_field import QUICK, plate_extraction, plate_features, plate_impacts
+from factories.raising import raises
 
 CONFIG = replace(QUICK, warmup_steps=2, steps=2, damping="per-contact", fft_sizes=(256, 128), early=256)
 SHARED_PAPER = replace(PAPER, damping="shared")

@@ -6,13 +6,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
-from avmsf.simulate.elastic import ElasticModes
-from made_fields import BANK, DIAGONAL, blows, places, plate, struck
+from factories.made_fields import BANK, DIAGONAL, blows, places, plate, struck
 
 PLACES = places(60, seed=8)
 BLOWS = blows(PLACES, seed=9)

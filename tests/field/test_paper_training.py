@@ -11,9 +11,9 @@ from avmsf.field.fit import fit
 from avmsf.field.recipes import Attention, gain_case
 from avmsf.field.store import load, save
 from avmsf.field.training import Targets, TrainingRun
-from avmsf.modal.residual import noise_power
+from avmsf.modal.residual_noise import noise_power
 from avmsf.modal.spectra import magnitude_stft
-from plate_field import QUICK, plate_extraction, plate_features, plate_impacts
+from factories.plate_field import QUICK, plate_extraction, plate_features, plate_impacts
 
 SHORT = replace(QUICK, warmup_steps=2, steps=2)
 

@@ -4,9 +4,9 @@ import torch
 
 from avmsf.field.gains.body import BodyGains
 from avmsf.field.positions import off_surface, off_surface_gains, points_on_object
-from avmsf.field.scaledgains import ScaledGains, surface_of
-from believing_field import LENGTH, bar, bar_points
-from made_fields import positional
+from avmsf.field.scaled_gains import ScaledGains, surface_of
+from factories.believing_field import LENGTH, bar, bar_points
+from factories.made_fields import positional
 
 HEIGHT = 0.05
 """Of a false floor above the bar's sheet, meters: an eighth of the length, more than the tolerance."""

@@ -7,10 +7,10 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
-from avmsf.bench.doubtpictures import draw_band, draw_doubt
+from avmsf.editing.modes import adjust_modes
 from avmsf.errors import FitError
 from avmsf.field.gains.model import MixtureGains
-from avmsf.field.scaledgains import ScaledGains
+from avmsf.field.scaled_gains import ScaledGains
 from avmsf.field.uncertainty import (
     coverage,
     fitted_mixture,
@@ -23,9 +23,9 @@ from avmsf.field.uncertainty import (
 )
 from avmsf.localization.locator import Locator
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.residual import Residual
-from avmsf.tasks.modes import adjust_modes
-from believing_field import (
+from avmsf.modal.residual_noise import Residual
+from avmsf.plotting.uncertainty import draw_band, draw_doubt
+from factories.believing_field import (
     BANK,
     DOWN,
     LENGTH,
@@ -37,7 +37,7 @@ from believing_field import (
     positional_field,
     sound_field,
 )
-from raising import raises
+from factories.raising import raises
 
 both_models = pytest.mark.parametrize("made", [elastic_field, positional_field])
 

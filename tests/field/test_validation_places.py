@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from avmsf.capture.places import rows_by_place
+from avmsf.features.feature_field import FeatureField
 from avmsf.field.fit import fit, held_out
 from avmsf.field.recipes import Attention
-from avmsf.scene.features import FeatureField
-from avmsf.scene.points import farthest_points
-from plate_field import QUICK, plate_extraction, plate_impacts
+from avmsf.gaussians.points import farthest_points
+from factories.plate_field import QUICK, plate_extraction, plate_impacts
 
 COUNT = 12
 

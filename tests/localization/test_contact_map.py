@@ -7,10 +7,10 @@ import torch
 from avmsf.errors import ArrayError, LocationError
 from avmsf.localization.contact_map import ContactMap, EquivalentPoint
 from avmsf.localization.locator import Locator
-from avmsf.scene.symmetry import MirrorSymmetry, RotationalSymmetry, Symmetries
 from avmsf.simulate.plate import plate_surface_points
-from located_plate import PLATE, TrueGains, field_of, struck
-from raising import raises
+from avmsf.symmetry.symmetries import MirrorSymmetry, RotationalSymmetry, Symmetries
+from factories.located_plate import PLATE, TrueGains, field_of, struck
+from factories.raising import raises
 
 
 def middle() -> torch.Tensor:

@@ -5,9 +5,10 @@ from typing import ClassVar
 import pytest
 import torch
 
+from avmsf.editing.modes import adjust_modes
 from avmsf.errors import LocationError
-from avmsf.field.gainfield import Gains
-from avmsf.field.soundfield import Origin
+from avmsf.field.gain_field import Gains
+from avmsf.field.sound_field import Origin
 from avmsf.localization.likelihood import Force
 from avmsf.localization.locate import MIN_EXPLAINED, REJECT_ABOVE, WARN_ABOVE, assess_match, locate
 from avmsf.localization.locator import Locator
@@ -15,9 +16,8 @@ from avmsf.localization.smoothing import distinct_contacts
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.synthesis import synthesize_phased
 from avmsf.simulate.plate import plate_surface_points
-from avmsf.tasks.modes import adjust_modes
-from believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
-from located_plate import (
+from factories.believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
+from factories.located_plate import (
     DIAGONAL,
     PLATE,
     RATE,
@@ -31,8 +31,8 @@ from located_plate import (
     struck,
     true_field,
 )
-from raising import raises
-from unsaved_gains import Unsaved
+from factories.raising import raises
+from factories.unsaved_gains import Unsaved
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
 from avmsf.localization.locator import Locator
 from avmsf.localization.multi_impact import detect_onsets, locate_impacts, predict_ringing
-from located_plate import PLATE, RATE, locator_of, missed, struck, true_field
-from raising import raises
+from factories.located_plate import PLATE, RATE, locator_of, missed, struck, true_field
+from factories.raising import raises
 
 
 @pytest.fixture

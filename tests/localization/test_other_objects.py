@@ -7,7 +7,7 @@ from avmsf.localization.amplitudes import Extractor
 from avmsf.localization.locate import REJECT_ABOVE, WARN_ABOVE, locate
 from avmsf.localization.multi_impact import locate_impacts
 from avmsf.localization.streaming import StreamingLocalizer
-from damped_plates import RATE, damped_blows, damped_field, damped_locator
+from factories.damped_plates import RATE, damped_blows, damped_field, damped_locator
 
 FOREIGN = [("wood", "wood", 0.2), ("wood", "wood", 0.33), ("plastic", "wood", 0.2), ("plastic", "plastic", 0.2)]
 """Material of the field, and material and length of the plate that is struck; the fields' own are .24 m long."""

@@ -13,8 +13,8 @@ from avmsf.errors import LocationError
 from avmsf.localization.locate import locate
 from avmsf.localization.locator import Locator
 from avmsf.localization.preprocess import at_field_rate, preprocess_recording
-from located_plate import RATE, locator_of, missed, struck, true_field
-from raising import raises
+from factories.located_plate import RATE, locator_of, missed, struck, true_field
+from factories.raising import raises
 
 
 def recorded(sound: torch.Tensor, *, before: float = 0.1, rate: float = RATE, seed: int = 0) -> Recording:

@@ -10,16 +10,16 @@ import torch
 from scipy.signal import sosfreqz
 from torch import Tensor
 
+from avmsf.editing.modes import adjust_modes
 from avmsf.errors import LocationError
-from avmsf.field.soundfield import Origin, SoundField
+from avmsf.field.sound_field import Origin, SoundField
 from avmsf.localization.locator import Locator
 from avmsf.localization.ringing import Ringing
 from avmsf.localization.streaming import WINDOW_SECONDS, LocatedImpact, StreamingLocalizer
-from avmsf.modal.residual import Residual
+from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
-from avmsf.tasks.modes import adjust_modes
-from made_fields import BANK, positional
-from raising import raises
+from factories.made_fields import BANK, positional
+from factories.raising import raises
 
 RATE = 8000.0
 STRUCK = (68, 60, 102, 8, 107)

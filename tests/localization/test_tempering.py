@@ -9,12 +9,12 @@ import torch
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
-from avmsf.field.scaledgains import ScaledGains
-from avmsf.field.soundfield import Origin, SoundField
+from avmsf.field.scaled_gains import ScaledGains
+from avmsf.field.sound_field import Origin, SoundField
 from avmsf.localization.locator import Locator
 from avmsf.localization.tempering import calibrate_tempering
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.residual import Residual
+from avmsf.modal.residual_noise import Residual
 from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts
 
 PLATE = Plate()

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from avmsf.modal.low_fluctuation import PERIOD, fluctuation, generate, white_sequence
-from avmsf.modal.residual import low_fluctuation_noise, shape_noise
+from avmsf.modal.residual_noise import low_fluctuation_noise, shape_noise
 
 
 def seeded(seed: int = 0) -> torch.Generator:

@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from avmsf.errors import SimulationError
 from avmsf.modal.pulse import ForcePulse
 from avmsf.modal.synthesis import synthesize
-from raising import raises
+from factories.raising import raises
 
 RATE = 8000.0
 SHAPES = ("half-sine", "hertz")

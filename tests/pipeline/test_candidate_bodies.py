@@ -8,25 +8,25 @@ import pytest
 import torch
 
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.surface import Surface
-from avmsf.config import BodyConfig
 from avmsf.errors import FitError, SimulationError
+from avmsf.features.feature_field import FeatureField
+from avmsf.fem.candidate_bodies import NominalBodies, NominalBody
 from avmsf.fem.supports import Support
 from avmsf.field.config import FitConfig, GainModel
 from avmsf.field.fit import fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.estimator import MixtureEstimator, estimator_for, gain_variance
 from avmsf.field.recipes import GainCase, gain_case
+from avmsf.mesh.surface import Surface
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
-from avmsf.modal.residual import Residual
+from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize_phased
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.scene.features import FeatureField
-from avmsf.simulate.nominal import NominalBodies, NominalBody
-from made_dome import STIFFER, WALLS, bodies, dome, points, truth
-from raising import raises
+from avmsf.pipeline.config import BodyConfig
+from factories.made_dome import STIFFER, WALLS, bodies, dome, points, truth
+from factories.raising import raises
 
 RATE, SAMPLES, LEVEL = 12000.0, 2400, 0.01
 CONFIG = FitConfig(warmup_steps=0, steps=6, fft_sizes=(1024, 256), early=1024, damping="shared")
@@ -252,7 +252,7 @@ def test_stated_settings_that_leave_no_body_are_refused(config: BodyConfig, name
 
 
 def test_a_stated_wall_is_not_blamed_for_too_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("avmsf.simulate.nominalsolid._free_memory", lambda: 1000.0)
+    monkeypatch.setattr("avmsf.fem.mesh_filling._free_memory", lambda: 1000.0)
     with raises(SimulationError, name="memory"):
         candidate_bodies(dome(), BodyConfig(wall=0.004))
 

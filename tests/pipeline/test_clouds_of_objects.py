@@ -5,21 +5,21 @@ from pathlib import Path
 import pytest
 import torch
 
-from avmsf.bench.baselines import NearestRecording
-from avmsf.bench.judging import Judging
-from avmsf.bench.plan import Evaluation
-from avmsf.bench.protocols import PROTOCOLS
-from avmsf.bench.results import ResultsFolder
-from avmsf.bench.run import run_object
-from avmsf.bench.task import Task
-from avmsf.capture.datasets import CaptureCollection
+from avmsf.datasets import CaptureCollection
 from avmsf.errors import SceneError
-from avmsf.pipeline.objectlooks import ObjectLooks
-from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.ply import write_splats
-from plate_capture import fill_plate
-from plate_set import NoBodies, PlateLooks, fill_plates
-from sonicgauss_cases import cloud
+from avmsf.evaluation.object_features import ObjectLooks
+from avmsf.evaluation.plan import Evaluation
+from avmsf.evaluation.protocols import PROTOCOLS
+from avmsf.evaluation.results import ResultsFolder
+from avmsf.evaluation.run import run_object
+from avmsf.evaluation.simple_methods import NearestRecording
+from avmsf.evaluation.sound_metrics import Judging
+from avmsf.evaluation.task import Task
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.ply import write_splats
+from factories.plate_capture import fill_plate
+from factories.plate_set import NoBodies, PlateLooks, fill_plates
+from factories.sonicgauss_cases import cloud
 
 
 def test_given_gaussians_are_read_and_an_object_that_nothing_shows_is_refused(tmp_path: Path) -> None:

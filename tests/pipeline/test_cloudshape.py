@@ -8,11 +8,11 @@ import torch
 import trimesh
 
 from avmsf.errors import SceneError
-from avmsf.pipeline.cloudshape import shape_of_cloud
-from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.start import StartPoints, starting_cloud
-from ball_views import MIDDLE, RADIUS
-from raising import raises
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.initialize import StartPoints, starting_cloud
+from avmsf.pipeline.cloud_shape import shape_of_cloud
+from factories.ball_views import MIDDLE, RADIUS
+from factories.raising import raises
 
 CELLS = 48
 

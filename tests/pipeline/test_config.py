@@ -12,16 +12,16 @@ from avmsf.cli.options.fit import parse as parse_fit
 from avmsf.cli.options.modes import parse as parse_modes
 from avmsf.cli.options.reconstruct import parse as parse_reconstruct
 from avmsf.cli.options.splat import parse as parse_splat
-from avmsf.config import PRESETS, BodyConfig, LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
 from avmsf.errors import FitError
 from avmsf.field.config import FitConfig
-from avmsf.field.soundfield import SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
+from avmsf.gaussians.config import SplatConfig
 from avmsf.modal.extraction.finders import ShortTime
+from avmsf.pipeline.config import PRESETS, BodyConfig, LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
 from avmsf.pipeline.record import capture_settings_of, finder_of, recorded, with_record
-from avmsf.scene.splatconfig import SplatConfig
-from plate_field import plate_impacts
-from raising import raises
+from factories.plate_field import plate_impacts
+from factories.raising import raises
 
 PUBLISHED = ("warmup_gains", "warmup_weights", "spectral_norm", "residual_start", "projection")
 """Settings that were made for the paper's values."""
@@ -116,7 +116,7 @@ def test_a_capture_with_another_start_of_sounds_than_the_presets_is_refused() ->
 
 
 def test_settings_in_earlier_files_have_the_names_of_today() -> None:
-    field = load(Path(__file__).parents[1] / "data" / "format-8" / "mixture.safetensors")
+    field = load(Path(__file__).parents[1] / "field" / "data" / "format-8" / "mixture.safetensors")
     assert recorded(field) == {}
     scene = {"splat": {"dissent": 0.1, "background": "found"}, "lift": {"background": "kept", "size": 0.3}}
     report = {"pipeline": {"method": "short-time", "body": {"freedoms": 5000}, "scene": scene}}

@@ -2,8 +2,8 @@
 
 import torch
 
+from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.pipeline.scene import without_far
-from avmsf.scene.gaussians import GaussianCloud
 
 
 def cloud_of(centers: torch.Tensor) -> GaussianCloud:

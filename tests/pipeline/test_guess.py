@@ -10,21 +10,21 @@ import torch
 import trimesh
 
 from avmsf.capture import CaptureSettings
-from avmsf.capture.surface import Surface, write_surface
 from avmsf.cli import main
-from avmsf.config import BodyConfig
+from avmsf.editing.material_before import made_of
 from avmsf.errors import FitError, SimulationError
 from avmsf.export import SampledField
+from avmsf.fem.damping import Vibration
+from avmsf.fem.elastic_modes import ElasticModes
+from avmsf.fem.material import STEEL
+from avmsf.fem.radiated_sound import AIR_DENSITY, SOUND_SPEED
 from avmsf.fem.radiation import radiated_pressure
-from avmsf.field.soundfield import SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
+from avmsf.mesh.surface import Surface, write_surface
+from avmsf.pipeline.config import BodyConfig
 from avmsf.pipeline.guess import guess_field, known_surface
-from avmsf.simulate.elastic import ElasticModes
-from avmsf.simulate.material import STEEL
-from avmsf.simulate.radiation import AIR_DENSITY, SOUND_SPEED
-from avmsf.simulate.vibration import Vibration
-from avmsf.tasks.madeof import made_of
-from raising import raises
+from factories.raising import raises
 
 LENGTH, WIDTH, HEIGHT = 0.3, 0.02, 0.012
 QUICK = BodyConfig(dofs=6000)

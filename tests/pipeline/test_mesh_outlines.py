@@ -7,18 +7,19 @@ from pathlib import Path
 import pytest
 import torch
 
-from avmsf.capture import CaptureSettings, Surface
-from avmsf.capture.meshviews import MeshTracer
+from avmsf.capture import CaptureSettings
 from avmsf.capture.settings import METRES
-from avmsf.capture.surface import write_surface
-from avmsf.capture.texturedmesh import TexturedMesh
-from avmsf.capture.views.write import write_views
 from avmsf.cli import main
 from avmsf.errors import CaptureError
-from avmsf.pipeline.silhouettes import compare_outlines, expect_contacts_in_views, judge_outlines
-from plate_capture import fill_plate
-from raising import raises
-from small_scene import slab, slab_views
+from avmsf.mesh import Surface
+from avmsf.mesh.surface import write_surface
+from avmsf.mesh.textured_mesh import TexturedMesh
+from avmsf.photographs.mesh_views import MeshTracer
+from avmsf.photographs.write import write_views
+from avmsf.pipeline.frame_check import compare_outlines, expect_contacts_in_views, judge_outlines
+from factories.plate_capture import fill_plate
+from factories.raising import raises
+from factories.small_scene import slab, slab_views
 
 Streams = pytest.CaptureFixture[str]
 VIEWS = slab_views(192)

@@ -6,18 +6,18 @@ from pathlib import Path
 
 import pytest
 
-from avmsf.capture import read_surface
-from avmsf.capture.views.write import write_views
 from avmsf.cli import main
 from avmsf.cli.fit import summary
-from avmsf.config import CACHE
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.store import load
-from avmsf.geometry.closest import ClosestPoints
+from avmsf.mesh import read_surface
+from avmsf.mesh.closest_point import ClosestPoints
+from avmsf.photographs.write import write_views
+from avmsf.pipeline.config import CACHE
 from avmsf.pipeline.reconstruct import SURFACE
 from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER
-from plate_capture import TINY, fill_plate
-from small_scene import SMALL_SPLAT, slab_views
+from factories.plate_capture import TINY, fill_plate
+from factories.small_scene import SMALL_SPLAT, slab_views
 
 Streams = pytest.CaptureFixture[str]
 SMALL = (

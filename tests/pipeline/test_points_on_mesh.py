@@ -3,9 +3,9 @@
 import torch
 import trimesh
 
-from avmsf.capture import Surface
+from avmsf.features.feature_field import FeatureField
+from avmsf.mesh import Surface
 from avmsf.pipeline.reconstruct import OFF_MESH, moved_onto
-from avmsf.scene.features import FeatureField
 
 BALL = trimesh.creation.icosphere(4, 0.1)
 SURFACE = Surface(torch.from_numpy(BALL.vertices).float(), torch.from_numpy(BALL.faces))

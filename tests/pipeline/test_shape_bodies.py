@@ -7,12 +7,12 @@ import pytest
 import torch
 import trimesh
 
-from avmsf.capture.surface import Surface
-from avmsf.config import BodyConfig
 from avmsf.errors import SceneError
-from avmsf.geometry.boolean import difference
+from avmsf.fem.candidate_bodies import nominal_bodies, with_wall
+from avmsf.mesh.boolean import difference
+from avmsf.mesh.surface import Surface
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.simulate.nominal import nominal_bodies, with_wall
+from avmsf.pipeline.config import BodyConfig
 
 SIDES = (0.08, 0.06, 0.05)
 

@@ -10,12 +10,12 @@ import trimesh
 
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli import main
-from avmsf.config import CACHE, PipelineConfig
 from avmsf.errors import FolderInUseError
+from avmsf.pipeline.config import CACHE, PipelineConfig
 from avmsf.pipeline.reconstruct import reconstruct
 from avmsf.pipeline.scene import ProgressListener
 from avmsf.pipeline.stages import StageFolder
-from plate_capture import fill_plate
+from factories.plate_capture import fill_plate
 
 Streams = pytest.CaptureFixture[str]
 

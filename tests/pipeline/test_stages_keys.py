@@ -11,25 +11,26 @@ import pytest
 import torch
 
 from avmsf.capture import CaptureSettings, read_capture
-from avmsf.capture.surface import Surface
-from avmsf.config import BodyConfig, PipelineConfig
+from avmsf.editing import guided_checkpoint
 from avmsf.errors import CaptureError, SimulationError
+from avmsf.fem import candidate_bodies as nominal
 from avmsf.field import recipes
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import fingerprint, gain_case
 from avmsf.field.store import load
+from avmsf.mesh.surface import Surface
 from avmsf.pipeline import reconstruct as module
 from avmsf.pipeline import stages
 from avmsf.pipeline.bodies import candidate_bodies
+from avmsf.pipeline.config import BodyConfig, PipelineConfig
 from avmsf.pipeline.scene import ProgressListener
 from avmsf.pipeline.stages import StageFolder
-from avmsf.simulate import nominal, recipe
-from avmsf.tasks import guided_checkpoint
-from plate_capture import fill_plate
-from plate_field import plate_extraction, plate_features, plate_impacts
-from ringing_field import ringing_field
+from avmsf.simulate import recipe
+from factories.plate_capture import fill_plate
+from factories.plate_field import plate_extraction, plate_features, plate_impacts
+from factories.ringing_field import ringing_field
 
 
 def write(path: Path) -> None:

@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-
-from avmsf.bench.clap import Clap
-from avmsf.bench.editing import EditScore, judge, write_scores
-from avmsf.bench.editmethods import towards_words
-from avmsf.bench.edittasks import EditTask
-from avmsf.bench.modefeatures import Pitches
-from avmsf.bench.modespace import MaterialSpace
-from avmsf.tasks.config import DistillationConfig
-from made_clap import save_clap
 from test_editing import QUICK, Speaker, flat_space, struck
+
+from avmsf.editing.config import DistillationConfig
+from avmsf.evaluation.clap import Clap
+from avmsf.evaluation.editing import EditScore, judge, write_scores
+from avmsf.evaluation.editing_methods import towards_words
+from avmsf.evaluation.editing_tasks import EditTask
+from avmsf.evaluation.mode_embedding import MaterialSpace
+from avmsf.evaluation.mode_features import Pitches
+from factories.made_clap import save_clap
 
 # The benchmarks are no part of the package.
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))

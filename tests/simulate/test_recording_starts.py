@@ -12,16 +12,16 @@ import torch
 from avmsf.capture import read_capture
 from avmsf.capture.audio import read_sound
 from avmsf.capture.onset import find_onset
+from avmsf.fem.material import CERAMIC
+from avmsf.fem.radiated_sound import SOUND_SPEED, travel_time
+from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
 from avmsf.simulate.hammer import contact_times, pulse_spectrum
 from avmsf.simulate.imperfections import recording_starts, stream
-from avmsf.simulate.material import CERAMIC
-from avmsf.simulate.radiation import SOUND_SPEED, travel_time
 from avmsf.simulate.recipe import Hammer, Imperfections, ObjectRecipe
 from avmsf.simulate.ringing import recorded, ring
 from avmsf.simulate.simulation import Simulation, simulate_object
-from avmsf.simulate.simulationfolder import write_simulation
-from avmsf.simulate.truth import TRUTH, read_truth, write_truth
-from made_modes import breathing_sphere
+from avmsf.simulate.simulation_folder import write_simulation
+from factories.made_modes import breathing_sphere
 
 POLES = torch.tensor([-40.0 + 2j * math.pi * 523.0, -90.0 + 2j * math.pi * 3217.0], dtype=torch.complex128)
 

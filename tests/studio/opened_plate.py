@@ -8,12 +8,12 @@ import numpy as np
 import soundfile
 import torch
 
-from avmsf.field.soundfield import Origin, SoundField
+from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
-from avmsf.modal.residual import Residual
+from avmsf.modal.residual_noise import Residual
 from avmsf.studio.opening import Opened
-from capture_folder import ring
-from made_fields import BANK, FIELDS
+from factories.capture_folder import ring
+from factories.made_fields import BANK, FIELDS
 
 RATE = 8000
 

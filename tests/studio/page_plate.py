@@ -10,9 +10,9 @@ import trimesh
 
 from avmsf.capture.impacts import Impacts
 from avmsf.export.bundle import write_bundle
-from avmsf.export.sampledfield import SampledField
-from avmsf.scene.ply import write_splats
-from avmsf.scene.start import StartPoints, starting_cloud
+from avmsf.export.sampled_field import SampledField
+from avmsf.gaussians.initialize import StartPoints, starting_cloud
+from avmsf.gaussians.ply import write_splats
 
 PAGE = Path(__file__).resolve().parents[2] / "src" / "avmsf" / "studio" / "page"
 SIDES = (0.24, 0.16, 0.02)

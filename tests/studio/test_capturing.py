@@ -15,15 +15,16 @@ import torch
 
 from avmsf.capture import check, read_capture
 from avmsf.errors import CaptureError
-from avmsf.studio import judgements, strikefiles
+from avmsf.studio import judgements
+from avmsf.studio import strike_files as strikefiles
 from avmsf.studio.capturing import StrikeBook
 from avmsf.studio.place import Place
 from avmsf.studio.refusal import RefusedError
-from avmsf.studio.strikefiles import StrikeFiles
-from avmsf.studio.striketable import StrikeTable
-from capture_folder import fill, ring
+from avmsf.studio.strike_files import StrikeFiles
+from avmsf.studio.strike_table import StrikeTable
+from factories.capture_folder import fill, ring
+from factories.raising import raises
 from opened_plate import blow, wav
-from raising import raises
 
 DOWN = (0.0, 0.0, -2.0)
 

@@ -7,11 +7,11 @@ import pytest
 
 from avmsf.errors import AvmsfError, CaptureError, StudioError
 from avmsf.field.store import load
-from avmsf.studio import striketable
+from avmsf.studio import strike_table as striketable
 from avmsf.studio.capturing import StrikeBook
 from avmsf.studio.place import Place
 from avmsf.studio.session import Revision, Session
-from avmsf.studio.strikefiles import StrikeFiles
+from avmsf.studio.strike_files import StrikeFiles
 from opened_plate import blow, plate_field
 
 FULL = OSError(28, os.strerror(28))

@@ -17,7 +17,7 @@ from avmsf.studio.jobs import Job, Jobs
 from avmsf.studio.refusal import RefusedError
 from avmsf.studio.worker import Voice
 from event_loop import run_async
-from raising import raises
+from factories.raising import raises
 
 # A loop that a test closes right after a process was killed leaves pipes for the collector, which warns of them.
 pytestmark = [

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 from PIL import Image
 
-from avmsf.export.webpage import write_webpage
+from avmsf.export.web import write_webpage
 from page_plate import plate_object, plate_table
 from plate_page import words_on
 

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 import torch
 
-from avmsf.export.sampledfield import SampledField
+from avmsf.editing.guided import GuidedEditProgress
+from avmsf.export.sampled_field import SampledField
 from avmsf.field.store import load
 from avmsf.studio.refusal import RefusedError
 from avmsf.studio.session import Session
 from avmsf.studio.worker import Voice
-from avmsf.tasks.guided import GuidedEditProgress
+from factories.raising import raises
 from opened_plate import open_plate, plate_field
 from page_plate import lay_out, plate_table
 from plate_page import LIVE, Open, Serve, answer, upload, words_on
-from raising import raises
 from served import Served, served
 
 if TYPE_CHECKING:

@@ -8,12 +8,12 @@ import pytest
 import torch
 import trimesh
 
-from avmsf.config import CACHE
 from avmsf.field.store import save
+from avmsf.gaussians.initialize import StartPoints, starting_cloud
+from avmsf.gaussians.ply import write_splats
+from avmsf.pipeline.config import CACHE
 from avmsf.pipeline.reconstruct import FIELD, SURFACE
 from avmsf.pipeline.scene import CLOUD
-from avmsf.scene.ply import write_splats
-from avmsf.scene.start import StartPoints, starting_cloud
 from avmsf.studio.opening import find_reconstructed, open_target
 from opened_plate import plate_field
 from served import served

@@ -16,9 +16,9 @@ from avmsf.studio.locating import Finder, read_upload
 from avmsf.studio.opening import open_target
 from avmsf.studio.refusal import echo
 from avmsf.studio.server import serve
-from capture_folder import fill
+from factories.capture_folder import fill
+from factories.raising import raises
 from opened_plate import blow, open_plate, wav
-from raising import raises
 from served import Answer, Served, served
 
 KEY = {"Idempotency-Key": "k" * 16}

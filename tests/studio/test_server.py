@@ -26,32 +26,32 @@ import torch
 import trimesh
 from filelock import FileLock
 
+from avmsf._utils.files import copy_whole
 from avmsf.capture.filenames import SPLATS
 from avmsf.cli import main
-from avmsf.config import CACHE, PRESETS
+from avmsf.editing.material import change_material
+from avmsf.editing.modes import adjust_modes
 from avmsf.errors import AvmsfError, StudioError
-from avmsf.field.soundfield import SoundField
+from avmsf.fem.material import CERAMIC, WOOD
+from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
-from avmsf.files import copy_whole
+from avmsf.gaussians.initialize import StartPoints, starting_cloud
+from avmsf.gaussians.ply import write_splats
 from avmsf.localization.contact_map import enlarged
 from avmsf.localization.locator import Locator
 from avmsf.localization.multi_impact import locate_impacts
-from avmsf.scene.ply import write_splats
-from avmsf.scene.start import StartPoints, starting_cloud
-from avmsf.scene.symmetrysearch import find_symmetries
-from avmsf.simulate.material import CERAMIC, WOOD
+from avmsf.pipeline.config import CACHE, PRESETS
 from avmsf.studio import leading, locating, server, studio, worker
 from avmsf.studio.locating import Finder
 from avmsf.studio.opening import Opened, find_object, open_target
 from avmsf.studio.server import serve
 from avmsf.studio.studio import StudioConfig
-from avmsf.tasks.material import change_material
-from avmsf.tasks.modes import adjust_modes
-from capture_folder import fill, ring
+from avmsf.symmetry.find import find_symmetries
+from factories.capture_folder import fill, ring
+from factories.plate_capture import fill_plate
+from factories.raising import raises
+from factories.ringing_field import SameGains
 from opened_plate import RATE, blow, open_plate, plate_field, wav
-from plate_capture import fill_plate
-from raising import raises
-from ringing_field import SameGains
 from served import Served, served
 
 

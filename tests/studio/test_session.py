@@ -9,22 +9,22 @@ from typing import Any
 import pytest
 import torch
 
+from avmsf._utils.files import way_out
+from avmsf.editing.material import change_material
+from avmsf.editing.modes import adjust_modes
 from avmsf.errors import EditError, FieldFileError, SimulationError, StudioError
-from avmsf.export.sampledfield import SampledField
-from avmsf.field.scaledgains import length_of
-from avmsf.field.soundfield import SoundField
+from avmsf.export.sampled_field import SampledField
+from avmsf.fem.material import CERAMIC, WOOD
+from avmsf.field.scaled_gains import length_of
+from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
-from avmsf.files import way_out
-from avmsf.simulate.material import CERAMIC, WOOD
 from avmsf.studio.editing import REST, Sliders
 from avmsf.studio.refusal import RefusedError
 from avmsf.studio.sampling import resample, sample
 from avmsf.studio.session import Revision, Session, file_name
-from avmsf.tasks.material import change_material
-from avmsf.tasks.modes import adjust_modes
-from made_fields import FIELDS
+from factories.made_fields import FIELDS
+from factories.raising import raises
 from opened_plate import plate_field
-from raising import raises
 
 WOODEN = {"material": {"from": "ceramic", "to": "wood"}, "size": 1.5, "pitch": 0.8, "decay": 2.0, "brightness": 1.0}
 

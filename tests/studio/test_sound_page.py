@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from avmsf.export.bundle import make_bundle, write_bundle
-from avmsf.export.sampledfield import SampledField
-from avmsf.export.webpage import single_file
+from avmsf.export.sampled_field import SampledField
+from avmsf.export.web import single_file
 from avmsf.modal.pulse import ForcePulse
 from avmsf.modal.synthesis import synthesize
-from struck_table import RATE, struck_table
+from factories.struck_table import RATE, struck_table
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from avmsf._utils.locks import write_lock
-from avmsf.config import CACHE
-from avmsf.studio import strikefiles
+from avmsf.pipeline.config import CACHE
+from avmsf.studio import strike_files as strikefiles
 from avmsf.studio.capturing import StrikeBook
 from avmsf.studio.place import Place
 from avmsf.studio.refusal import RefusedError
-from avmsf.studio.strikefiles import StrikeFiles
+from avmsf.studio.strike_files import StrikeFiles
 from opened_plate import blow
 
 PLACE = Place((0.1, 0.2, 0.0), None)

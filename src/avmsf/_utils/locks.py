@@ -14,9 +14,9 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+from avmsf._utils.files import way_out, write_whole
 from avmsf._utils.text_files import read_json
 from avmsf.errors import AvmsfError, FolderInUseError
-from avmsf.files import way_out, write_whole
 
 WAIT = 3.0
 """Seconds that a command waits for another writer: longer than a page's change to a capture, shorter than a stage."""

@@ -9,9 +9,9 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from avmsf._utils.files import write_whole
 from avmsf._utils.headers import read_header_text, unreadable
 from avmsf.errors import AvmsfError
-from avmsf.files import write_whole
 
 
 def read_tensors(

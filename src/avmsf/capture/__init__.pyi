@@ -1,8 +1,6 @@
 from .audio import Recording as Recording
 from .audio import read_recording as read_recording
 from .audio import read_sound as read_sound
-from .cameras import Camera as Camera
-from .cameras import View as View
 from .check import CaptureReport as CaptureReport
 from .check import check as check
 from .folder import Capture as Capture
@@ -11,9 +9,3 @@ from .folder import write_capture as write_capture
 from .impacts import Impacts as Impacts
 from .measure import RecordingReport as RecordingReport
 from .settings import CaptureSettings as CaptureSettings
-from .surface import Surface as Surface
-from .surface import read_surface as read_surface
-from .surface import write_surface as write_surface
-from .views import find_foreground as find_foreground
-from .views import read_views as read_views
-from .views.write import write_views as write_views

@@ -13,9 +13,9 @@ from scipy.ndimage import uniform_filter1d
 from scipy.special import stdtrit
 from torch import Tensor
 
+from avmsf._utils.files import is_lfs_pointer
 from avmsf.capture.filenames import missing_recording
 from avmsf.errors import CaptureError, RecordingLengthError
-from avmsf.files import is_lfs_pointer
 
 LOWEST_RATE = 100.0
 HIGHEST_RATE = 192_000.0

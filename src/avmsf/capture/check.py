@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from avmsf._utils.wording import counted
 from avmsf.capture.filenames import number_key
 from avmsf.capture.folder import read_strike
 from avmsf.capture.measure import RecordingReport
@@ -26,7 +27,6 @@ from avmsf.capture.table import (
 )
 from avmsf.capture.together import common_length, common_rate, find_surface, judge_contacts, judge_levels, judge_surface
 from avmsf.errors import CaptureError, CaptureWarning
-from avmsf.wording import counted
 
 MAX_SUGGESTIONS = 3
 """Missing files for which a similar name is sought: each search compares up to a thousand names."""

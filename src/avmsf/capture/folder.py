@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath
 import soundfile
 import torch
 
+from avmsf._utils.files import unwritable
 from avmsf.capture.audio import read_recording
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.location import expect_free
@@ -21,11 +22,10 @@ from avmsf.capture.placement import contacted_part
 from avmsf.capture.prepare import Prepared, prepare
 from avmsf.capture.settings import SETTINGS, CaptureSettings, settings_of
 from avmsf.capture.starts import cut_together, shorten
-from avmsf.capture.surface import Surface, write_surface
 from avmsf.capture.table import DIRECTION, FORCE, REQUIRED, TABLE, Strike, in_folder, read_strikes
 from avmsf.capture.together import common_rate, find_surface, judge_contacts, judge_levels, judge_surface
 from avmsf.errors import CaptureError, CaptureWarning
-from avmsf.files import unwritable
+from avmsf.mesh.surface import Surface, write_surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class Capture:
         position, also repeated ones, are on one side. The choice starts from the first recording's position, or with a
         `seed` from one drawn at random. Raises EvaluationError for a size that leaves no position to train or to test.
         """
-        from avmsf.bench.evaluation import split
+        from avmsf.evaluation.splits import split
 
         start = 0 if seed is None else random.Random(seed).randrange(len(self.impacts))
         if isinstance(train_size, float):

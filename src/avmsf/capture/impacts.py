@@ -12,8 +12,8 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_numbers, as_rate, as_rows, as_vectors
+from avmsf._utils.compiled import compiled
 from avmsf.capture.places import rows_by_place
-from avmsf.compiled import compiled
 from avmsf.errors import ArrayError
 
 _SINC_HALF_WIDTH = 32

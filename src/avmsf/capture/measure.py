@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from avmsf._utils.wording import counted
 from avmsf.capture.audio import EIGHT_BIT, LOSSLESS, Recording, clipped_samples
 from avmsf.capture.onset import SECONDS_BEFORE, find_second_impact, find_second_push
 from avmsf.capture.prepare import Prepared, remove_rumble
 from avmsf.capture.settings import CaptureSettings
-from avmsf.wording import counted
 
 HIGHEST_NOISE_DB = -20.0
 """Noise above this, against the peak, leaves too little of the decay to measure."""

@@ -14,8 +14,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avmsf.capture.surface import Surface
 from avmsf.errors import CaptureError, FitError
+from avmsf.mesh.surface import Surface
 
 TOLERANCE = 0.05
 """Distance from the surface, over the object's diagonal, up to which a contact lies on it.

@@ -18,6 +18,7 @@ from jaxtyping import Complex128, Float64
 from scipy.special import stdtrit
 from torch import Tensor
 
+from avmsf._utils.files import unwritable
 from avmsf._utils.text_files import read_toml
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.measure import HIGHEST_NOISE_DB, decibels, noise_level
@@ -29,7 +30,6 @@ from avmsf.capture.starts import shorten, start_with_impact
 from avmsf.capture.table import Row, Strike, read_rows, understand
 from avmsf.capture.together import NARROWEST, WIDEST, find_surface, fitting_units_of
 from avmsf.errors import CaptureError
-from avmsf.files import unwritable
 
 MIN_PUSH_SHARE = 0.5
 """Share of its energy that a hammer's channel has within its push and one width on either side: most of it. The

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from avmsf._utils.wording import counted
 from avmsf.capture.filenames import find_surface_file
 from avmsf.capture.location import Location
 from avmsf.capture.placement import Placement, contacted_part, judge_placement, surface_points
 from avmsf.capture.prepare import shortest_allowed
 from avmsf.capture.settings import METRES, CaptureSettings
-from avmsf.capture.surface import Surface, read_surface
 from avmsf.capture.table import TABLE, Strike, fitting_units, read_rows, understand
 from avmsf.errors import CaptureError, CaptureWarning
-from avmsf.wording import counted
+from avmsf.mesh.surface import Surface, read_surface
 
 WIDEST = 10.0
 """Meters across beyond which contacts are more likely in another unit."""

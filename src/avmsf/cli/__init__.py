@@ -217,7 +217,7 @@ def _loading(*, quiet: bool) -> Iterator[None]:
 
 def _compilation_announced() -> AbstractContextManager[None]:
     """Let the standard error say what is compiled, for it takes seconds; verbs that compile nothing import nothing."""
-    module = sys.modules.get("avmsf.compiled")
+    module = sys.modules.get("avmsf._utils.compiled")
     if module is None:
         return nullcontext()
     # Imports rich, which help on the whole does not need.

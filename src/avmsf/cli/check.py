@@ -7,6 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from avmsf._utils.wording import counted
 from avmsf.capture import CaptureReport, CaptureSettings, Impacts, check, read_capture
 from avmsf.capture.measure import shared_problems
 from avmsf.capture.proposals import Proposal, propose_settings, settings_text, write_settings
@@ -19,7 +20,6 @@ from avmsf.cli.visuals import misplaced, visual_inputs
 from avmsf.errors import CaptureError, CaptureWarning, ExtractionError
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.extraction.finders import HighResolution
-from avmsf.wording import counted
 
 UNREADABLE = 2
 _STRONGEST = 32

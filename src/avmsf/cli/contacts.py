@@ -16,7 +16,7 @@ from avmsf.cli.options.common import Unit
 from avmsf.cli.printing import say
 from avmsf.errors import CaptureError, PositionError
 from avmsf.field.positions import expect_near, off_surface, off_surface_gains
-from avmsf.field.soundfield import SoundField
+from avmsf.field.sound_field import SoundField
 
 _COLUMNS = ("x", "y", "z")
 _NORMALS = ("nx", "ny", "nz")

@@ -2,10 +2,10 @@
 
 from dataclasses import asdict
 
-from avmsf.capture.datasets import DatasetReport, ObjectReport, open_dataset
+from avmsf._utils.wording import counted
 from avmsf.cli.options.dataset import Options
 from avmsf.cli.printing import console, next_command, print_json, say, table
-from avmsf.wording import counted
+from avmsf.datasets import DatasetReport, ObjectReport, open_dataset
 
 UNREADABLE = 2
 

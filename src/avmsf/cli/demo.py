@@ -11,28 +11,28 @@ from typing import Any
 
 import torch
 
-from avmsf.bench.baselines import MeanWaveform
-from avmsf.bench.evaluation import Scores, split
-from avmsf.bench.pictures import draw_modes, draw_scores, draw_spectrograms, save_picture
 from avmsf.capture import CaptureSettings, Impacts, check, read_capture
-from avmsf.cli.demofolder import RECORD, record, replaced_whole
-from avmsf.cli.modetable import amplitudes, levels
+from avmsf.cli.demo_folder import RECORD, record, replaced_whole
+from avmsf.cli.mode_table import amplitudes, levels
 from avmsf.cli.options.demo import Options
-from avmsf.cli.overallbar import REFINEMENT, OverallBar
+from avmsf.cli.overall_bar import REFINEMENT, OverallBar
 from avmsf.cli.printing import console, figure, json_text, print_json, print_text, say
 from avmsf.cli.scores import compare, parts_words, score_markdown, score_table, score_values
 from avmsf.cli.writing import Level, write_sound, write_text
-from avmsf.config import CACHE, DESCRIPTORS, LiftConfig, PipelineConfig, SceneConfig
-from avmsf.export.webpage import write_webpage
+from avmsf.evaluation.simple_methods import MeanWaveform
+from avmsf.evaluation.splits import Scores, split
+from avmsf.export.web import write_webpage
 from avmsf.field.config import FitConfig
-from avmsf.field.scaledgains import surface_of
-from avmsf.field.soundfield import SoundField
+from avmsf.field.scaled_gains import surface_of
+from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
+from avmsf.gaussians.config import SplatConfig
+from avmsf.gaussians.points import farthest_points
+from avmsf.pipeline.config import CACHE, DESCRIPTORS, LiftConfig, PipelineConfig, SceneConfig
 from avmsf.pipeline.reconstruct import reconstruct
 from avmsf.pipeline.record import modes_words
 from avmsf.pipeline.scene import CLOUD
-from avmsf.scene.points import farthest_points
-from avmsf.scene.splatconfig import SplatConfig
+from avmsf.plotting.pictures import draw_modes, draw_scores, draw_spectrograms, save_picture
 from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER
 
 TRAIN = 12

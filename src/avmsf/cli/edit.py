@@ -10,25 +10,25 @@ from jaxtyping import Float
 from rich.table import Table
 from torch import Tensor
 
-from avmsf.bench.editpictures import HeardModes, draw_edit, draw_sound_change
-from avmsf.bench.pictures import save_picture
+from avmsf._utils.wording import counted
 from avmsf.capture.settings import METRES
 from avmsf.cli import INTERRUPTED
-from avmsf.cli.clapcurve import CLAP
+from avmsf.cli.clap_curve import CLAP
 from avmsf.cli.contacts import contacts_at, refuse_far
-from avmsf.cli.editmaterial import MaterialChange
+from avmsf.cli.edit_material import MaterialChange
 from avmsf.cli.options.common import Unit
 from avmsf.cli.options.edit import AFTER, BEFORE, CURVE, MODES, SPECTROGRAMS, ModeOptions, Options
 from avmsf.cli.printing import console, decimals, figure, next_command, print_json, say, table
 from avmsf.cli.steering import Steering, beside
 from avmsf.cli.writing import Level, write_sound
+from avmsf.editing.edits import EDITS, remarks, silenced
+from avmsf.editing.modes import adjust_modes
 from avmsf.errors import EditError
-from avmsf.field.soundfield import SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
+from avmsf.plotting.edit_spectra import HeardModes, draw_edit, draw_sound_change
 from avmsf.plotting.edits import draw_clap_curves
-from avmsf.tasks.edits import EDITS, remarks, silenced
-from avmsf.tasks.modes import adjust_modes
-from avmsf.wording import counted
+from avmsf.plotting.pictures import save_picture
 
 _LISTED = 20
 """Modes in the table, those of most energy."""

@@ -10,35 +10,35 @@ from typing import Any
 from rich.console import Console
 
 from avmsf._utils.device import TRAINABLE, usable_device
-from avmsf.bench.cases import Growing, Predefined
-from avmsf.bench.fieldmethods import configured
-from avmsf.bench.judging import Judging
-from avmsf.bench.learningcurve import curves, draw_learning_curve
-from avmsf.bench.methods import RecordedMethod, method_named
-from avmsf.bench.parallel import RunProgress, Workers, run_objects
-from avmsf.bench.pictures import save_picture
-from avmsf.bench.plan import Evaluation
-from avmsf.bench.protocols import LEARNING_CURVE, PREDEFINED, EvaluationProtocol, protocol_named
-from avmsf.bench.published import PUBLISHED
-from avmsf.bench.report import PAGE, SUMMARY, TABLES, write_figures, write_page, write_summary
-from avmsf.bench.reporttables import Section
-from avmsf.bench.results import IDENTITY, ResultsFolder, write_json
-from avmsf.bench.subsets import SUBSETS, choose_objects, members
-from avmsf.bench.task import Look, Looking, Method
-from avmsf.capture.datasets import CaptureCollection, open_dataset
-from avmsf.capture.datasets.dataset import Dataset
+from avmsf._utils.wording import counted
 from avmsf.cli import INTERRUPTED
-from avmsf.cli.objectbar import ObjectBar
+from avmsf.cli.object_bar import ObjectBar
 from avmsf.cli.options.common import spelled
 from avmsf.cli.options.evaluate import Options, deciding, words_of
 from avmsf.cli.printing import console, decimals, next_command, next_step, print_json, say, table
-from avmsf.config import AUTO, PRESETS, LiftConfig, SceneConfig, TimeZero, ViewsConfig
+from avmsf.datasets import CaptureCollection, open_dataset
+from avmsf.datasets.dataset import Dataset
 from avmsf.errors import EvaluationError
+from avmsf.evaluation.cases import Growing, Predefined
+from avmsf.evaluation.field_methods import configured
+from avmsf.evaluation.learning_curve import curves, draw_learning_curve
+from avmsf.evaluation.methods import RecordedMethod, method_named
+from avmsf.evaluation.object_bodies import ObjectBodies
+from avmsf.evaluation.object_features import ObjectLooks
+from avmsf.evaluation.parallel import RunProgress, Workers, run_objects
+from avmsf.evaluation.plan import Evaluation
+from avmsf.evaluation.protocols import LEARNING_CURVE, PREDEFINED, EvaluationProtocol, protocol_named
+from avmsf.evaluation.published import PUBLISHED
+from avmsf.evaluation.report import PAGE, SUMMARY, TABLES, write_figures, write_page, write_summary
+from avmsf.evaluation.report_tables import Section
+from avmsf.evaluation.results import IDENTITY, ResultsFolder, write_json
+from avmsf.evaluation.sound_metrics import Judging
+from avmsf.evaluation.subsets import SUBSETS, choose_objects, members
+from avmsf.evaluation.task import Look, Looking, Method
 from avmsf.modal.extraction.finders import finder_named
+from avmsf.pipeline.config import AUTO, PRESETS, LiftConfig, SceneConfig, TimeZero, ViewsConfig
 from avmsf.pipeline.features import choose_encoder, settled
-from avmsf.pipeline.objectbodies import ObjectBodies
-from avmsf.pipeline.objectlooks import ObjectLooks
-from avmsf.wording import counted
+from avmsf.plotting.pictures import save_picture
 
 OPTIONS = {PREDEFINED: ("--test",), LEARNING_CURVE: ("--counts", "--starts", "--metric")}
 """Options of one protocol alone."""

@@ -8,36 +8,36 @@ from typing import Any
 
 import torch
 
+from avmsf._utils.wording import counted
 from avmsf.capture.filenames import find_surface_file
 from avmsf.capture.folder import read_capture
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import METRES, settings_of
-from avmsf.capture.surface import Surface
 from avmsf.cli.contacts import given_contacts, note_off, refuse_far
 from avmsf.cli.options.export import Options, unused_options
 from avmsf.cli.printing import figure, next_step, print_result, say
-from avmsf.config import CACHE
+from avmsf.editing.edits import EDITS
 from avmsf.errors import ExportError
 from avmsf.export.faust import contacts_path, fitted, write_faust
 from avmsf.export.formats import PAGE_SUFFIXES, POINTS
 from avmsf.export.gltf import write_gltf
 from avmsf.export.look import Look, read_look
-from avmsf.export.modaldemo import SCENE, is_demo, read_demo, write_demo
-from avmsf.export.objectfile import holds_gaussians, read_object
-from avmsf.export.sampledfield import SampledField, spread_rows
-from avmsf.export.universal import write_universal
-from avmsf.export.wavgrid import INSTRUMENT, Grid, Layer, hertz_layers, write_grid
-from avmsf.export.webpage import write_webpage
-from avmsf.export.written import Written, expect_free, write_file
+from avmsf.export.object_file import holds_gaussians, read_object
+from avmsf.export.paper_demo import SCENE, is_demo, read_demo, write_demo
+from avmsf.export.sampled_field import SampledField, spread_rows
+from avmsf.export.samples import INSTRUMENT, Grid, Layer, hertz_layers, write_grid
+from avmsf.export.uff import write_universal
+from avmsf.export.web import write_webpage
+from avmsf.export.writing import Written, expect_free, write_file
 from avmsf.field.positions import points_on_object
-from avmsf.field.scaledgains import length_of, surface_of
-from avmsf.field.soundfield import SoundField
+from avmsf.field.scaled_gains import length_of, surface_of
+from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.ply import read_splats
+from avmsf.mesh.surface import Surface
+from avmsf.pipeline.config import CACHE
 from avmsf.pipeline.reconstruct import SURFACE
-from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.ply import read_splats
-from avmsf.tasks.edits import EDITS
-from avmsf.wording import counted
 
 _DEAD_DB = 40.0
 """Energy of a contact below the loudest one's, dB, from which on it is no key of a sample set by default."""

@@ -2,14 +2,14 @@
 
 import shlex
 
+from avmsf._utils.files import copy_whole
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.options.features import Options
 from avmsf.cli.options.scenes import with_seed
 from avmsf.cli.printing import console, next_command, print_json, say
 from avmsf.cli.scenes import features_words, opened_scene, stage_line
-from avmsf.config import SceneConfig
-from avmsf.files import copy_whole
-from avmsf.scene.featurestore import read_report
+from avmsf.features.store import read_report
+from avmsf.pipeline.config import SceneConfig
 
 
 def run(options: Options) -> int:

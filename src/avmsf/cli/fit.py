@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Console
 
 from avmsf._utils.device import TRAINABLE, usable_device
-from avmsf.bench.evaluation import Scores, split
+from avmsf._utils.wording import counted
 from avmsf.capture import CaptureSettings, Impacts, read_capture
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
@@ -29,13 +29,13 @@ from avmsf.cli.scores import (
 )
 from avmsf.cli.visuals import expect_shape
 from avmsf.errors import FitError
-from avmsf.field.soundfield import SoundField
+from avmsf.evaluation.splits import Scores, split
+from avmsf.features.store import load_features, read_report
+from avmsf.field.sound_field import SoundField
 from avmsf.field.store import save
 from avmsf.pipeline.fitting import discard_unfinished, fit_capture, unfinished
 from avmsf.pipeline.guess import guess_field, known_surface
 from avmsf.pipeline.record import capture_settings_of, modes_words, with_record
-from avmsf.scene.featurestore import load_features, read_report
-from avmsf.wording import counted
 
 _SHOWN = 8
 """Names of recordings in a line, at most."""

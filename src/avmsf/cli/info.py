@@ -8,25 +8,25 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.bench.evaluation import evaluate
+from avmsf._utils.wording import counted
 from avmsf.capture import CaptureSettings, Impacts, read_capture
 from avmsf.cli.heartbeat import doing
-from avmsf.cli.modetable import levels, listed, mode_rows, mode_table
+from avmsf.cli.mode_table import levels, listed, mode_rows, mode_table
 from avmsf.cli.options.info import Options
 from avmsf.cli.printing import console, next_command, print_json, say
 from avmsf.cli.scores import body_warnings, outlier_words, quality_words, score_table, score_values
+from avmsf.evaluation.splits import evaluate
+from avmsf.features.header import holds_features
 from avmsf.field.attention import AttentionGains
 from avmsf.field.config import NETWORK
 from avmsf.field.gains.body import BodyGains
-from avmsf.field.scaledgains import surface_of
-from avmsf.field.soundfield import SoundField
+from avmsf.field.scaled_gains import surface_of
+from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
 from avmsf.field.uncertainty import has_posterior, relative_gain_std, spectrum_band, training_contacts
+from avmsf.gaussians.points import farthest_points
 from avmsf.modal.bank import ModalBank
 from avmsf.pipeline.record import RECORD, modes_words, recorded
-from avmsf.scene.featureheader import holds_features
-from avmsf.scene.points import farthest_points
-from avmsf.wording import counted
 
 _DRAWN_POINTS, _LISTED_POINTS = 4000, 500
 """Of the surface: for pictures, and for the mean levels in a table."""
@@ -39,7 +39,7 @@ def run(options: Options) -> int:
     """Describe and draw a file, whose kind its content shows."""
     suffix = options.file.suffix.lower()
     if suffix == ".ply" or (suffix == ".safetensors" and holds_features(options.file)):
-        from avmsf.cli.infoclouds import describe_cloud, describe_features
+        from avmsf.cli.info_clouds import describe_cloud, describe_features
 
         values = describe_cloud(options) if suffix == ".ply" else describe_features(options)
         if options.json:
@@ -117,9 +117,9 @@ def draw_field(
 ) -> None:
     """Write the figures of a field, with some of the recordings `recorded` next to its sounds."""
     # Drawing imports matplotlib, which text does without.
-    from avmsf.bench.doubtpictures import draw_band, draw_doubt
-    from avmsf.bench.pictures import draw_gains, draw_modes, draw_spectrograms, save_picture
-    from avmsf.bench.surfacepictures import draw_surface
+    from avmsf.plotting.pictures import draw_gains, draw_modes, draw_spectrograms, save_picture
+    from avmsf.plotting.surfaces import draw_surface
+    from avmsf.plotting.uncertainty import draw_band, draw_doubt
 
     name = field.origin.capture or "field"
     modes = modes_words(len(field.bank), int((~field.is_mode).sum()))

@@ -20,14 +20,14 @@ from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.locate import RECORDING, Options
 from avmsf.cli.printing import console, figure, next_command, print_json, say
 from avmsf.errors import AvmsfError, LocationError
-from avmsf.field.soundfield import SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
 from avmsf.localization.contact_map import ContactMap, not_located, symmetries_of
 from avmsf.localization.likelihood import Force
 from avmsf.localization.locate import locate
 from avmsf.localization.locator import Locator
 from avmsf.localization.multi_impact import locate_impacts
-from avmsf.scene.symmetry import Symmetries
+from avmsf.symmetry.symmetries import Symmetries
 
 UNLOCATED = 2
 """The exit code where a recording could not be located."""
@@ -226,8 +226,8 @@ def _draw(
     contact: ContactMap, folder: Path, name: str, values: dict[str, Any], truth: Float64[Tensor, " 3"] | None
 ) -> dict[str, str]:
     # Drawing imports matplotlib, which text does without.
-    from avmsf.bench.contactpictures import draw_contact, write_contact_cloud
-    from avmsf.bench.pictures import save_picture
+    from avmsf.plotting.contacts import draw_contact, write_contact_cloud
+    from avmsf.plotting.pictures import save_picture
 
     picture, cloud = folder / f"{name}.png", folder / f"{name}.ply"
     others = [other["position"] for other in values["equivalent_points"]]

@@ -2,9 +2,10 @@
 
 from dataclasses import asdict
 
+from avmsf._utils.wording import counted
 from avmsf.capture import read_capture
 from avmsf.cli.alignment import AlignmentReport
-from avmsf.cli.modetable import amplitudes, levels, listed, mode_rows, mode_table, quality_rows
+from avmsf.cli.mode_table import amplitudes, levels, listed, mode_rows, mode_table, quality_rows
 from avmsf.cli.options.checks import read_settings
 from avmsf.cli.options.modes import Options
 from avmsf.cli.printing import console, next_command, print_json, say
@@ -12,7 +13,6 @@ from avmsf.cli.visuals import visual_inputs
 from avmsf.modal.extraction.extract import extract_modes
 from avmsf.modal.extraction.quality import measure_quality
 from avmsf.pipeline.record import capture_settings_of, finder_of
-from avmsf.wording import counted
 
 _EXPLANATION = (
     "±: spread over recordings. energy: share of all. phase: coherence over recordings, 1 if the same in all. orders: "
@@ -42,7 +42,7 @@ def run(options: Options) -> int:
     for sentence in [] if aligned is None else aligned.sentences():
         screen.print(sentence, soft_wrap=True)
     if options.plots is not None:
-        from avmsf.bench.pictures import draw_modes, save_picture
+        from avmsf.plotting.pictures import draw_modes, save_picture
 
         picture = options.plots / "modes.png"
         drawn = f"{counted(len(rows), 'pole')} of {capture.name}, of them {counted(len(modes), 'mode')}"

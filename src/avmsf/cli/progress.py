@@ -5,10 +5,10 @@ from types import TracebackType
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from avmsf._utils.wording import counted
 from avmsf.cli.heartbeat import doing, verbosity
 from avmsf.cli.printing import console, figure, say
 from avmsf.field.fit import Progress as FitProgress
-from avmsf.wording import counted
 
 
 class FitBar:

@@ -3,6 +3,7 @@
 from dataclasses import asdict
 
 from avmsf._utils.device import TRAINABLE, usable_device
+from avmsf._utils.files import copy_whole
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
@@ -12,14 +13,13 @@ from avmsf.cli.options.checks import read_settings
 from avmsf.cli.options.reconstruct import Options
 from avmsf.cli.printing import console, figure, print_json, say, table
 from avmsf.cli.progress import FitBar
-from avmsf.cli.scenebar import SceneBar
+from avmsf.cli.scene_bar import SceneBar
 from avmsf.cli.scenes import features_words
 from avmsf.cli.scores import compare, order_words
 from avmsf.cli.visuals import expect_shape
 from avmsf.errors import FitError
 from avmsf.field.fit import Progress
 from avmsf.field.store import load
-from avmsf.files import copy_whole
 from avmsf.pipeline.reconstruct import reconstruct, reconstruct_guess
 from avmsf.pipeline.record import capture_settings_of
 from avmsf.pipeline.stages import StageFolder

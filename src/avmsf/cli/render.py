@@ -16,7 +16,7 @@ from avmsf.cli.options.render import Options
 from avmsf.cli.printing import next_command, print_result, say
 from avmsf.cli.writing import Level, write_sound
 from avmsf.errors import PositionWarning
-from avmsf.field.soundfield import SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
 from avmsf.modal.pulse import ForcePulse
 

@@ -4,15 +4,15 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+from avmsf._utils.wording import counted
 from avmsf.capture.together import expect_one_unit
 from avmsf.cli.options.checks import read_settings
 from avmsf.cli.options.scenes import SceneOptions
-from avmsf.cli.scenebar import SceneBar
-from avmsf.config import SceneConfig
+from avmsf.cli.scene_bar import SceneBar
+from avmsf.pipeline.config import SceneConfig
 from avmsf.pipeline.scene import SceneStages
 from avmsf.pipeline.stages import Kept, StageFolder
-from avmsf.scene.symmetry import Symmetries
-from avmsf.wording import counted
+from avmsf.symmetry.symmetries import Symmetries
 
 
 @contextmanager

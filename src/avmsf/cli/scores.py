@@ -8,16 +8,16 @@ from typing import Any
 import torch
 from rich.table import Table
 
-from avmsf.bench.baselines import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor
-from avmsf.bench.evaluation import Scores, evaluate, score
-from avmsf.bench.renderer import Renderer
+from avmsf._utils.wording import counted
 from avmsf.capture import Impacts
 from avmsf.capture.places import places_of
 from avmsf.cli.heartbeat import verbosity
 from avmsf.cli.printing import figure, table
-from avmsf.field.soundfield import SoundField
+from avmsf.evaluation.renderer import Renderer
+from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor
+from avmsf.evaluation.splits import Scores, evaluate, score
+from avmsf.field.sound_field import SoundField
 from avmsf.modal.extraction.extract import Extraction
-from avmsf.wording import counted
 
 HEADINGS = {
     "relative_stft": "relative STFT error",

@@ -4,14 +4,14 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 from avmsf.cli import INTERRUPTED
-from avmsf.cli.objectbar import ObjectBar
+from avmsf.cli.object_bar import ObjectBar
 from avmsf.cli.options.simulate import Options
 from avmsf.cli.printing import console, next_command, print_json, print_result, say, table
-from avmsf.simulate.material import MATERIALS
+from avmsf.fem.material import MATERIALS
 from avmsf.simulate.recipe import ObjectRecipe
 from avmsf.simulate.shapes import KINDS
 from avmsf.simulate.sim20 import NON_SYMMETRIC, SET, SIM20
-from avmsf.simulate.simulationset import SetProgress, simulate_set
+from avmsf.simulate.simulation_set import SetProgress, simulate_set
 
 
 def run(options: Options) -> int:

@@ -1,14 +1,14 @@
 """`avmsf splat`: a folder's photographs, video or mesh in, Gaussians out."""
 
+from avmsf._utils.files import copy_whole
+from avmsf._utils.wording import counted
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.options.scenes import with_seed
 from avmsf.cli.options.splat import Options
 from avmsf.cli.printing import next_command, print_result, say
 from avmsf.cli.scenes import opened_scene, stage_line
-from avmsf.config import SceneConfig
-from avmsf.files import copy_whole
-from avmsf.scene.ply import read_splats
-from avmsf.wording import counted
+from avmsf.gaussians.ply import read_splats
+from avmsf.pipeline.config import SceneConfig
 
 
 def run(options: Options) -> int:

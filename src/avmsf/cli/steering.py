@@ -8,21 +8,21 @@ from types import TracebackType
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from avmsf.bench.clap import Clap
-from avmsf.cli.clapcurve import CLAP, ClapCurve
+from avmsf.cli.clap_curve import CLAP, ClapCurve
 from avmsf.cli.heartbeat import doing, verbosity
 from avmsf.cli.options.edit import GuideOptions
 from avmsf.cli.printing import console, figure, say
 from avmsf.cli.writing import Level, write_sound
-from avmsf.field.soundfield import SoundField
-from avmsf.simulate.material import Material, material_named
-from avmsf.tasks.distillation import DecoderDistillation
-from avmsf.tasks.edits import EDITS
-from avmsf.tasks.guided import Guide, GuidedEditProgress, edit_towards
-from avmsf.tasks.materialstatistics import MaterialStatistics
-from avmsf.tasks.parameters import PARAMETERISATIONS
-from avmsf.tasks.reference import Reference
-from avmsf.tasks.stableaudio import StableAudio
+from avmsf.editing.distillation import DecoderDistillation
+from avmsf.editing.edits import EDITS
+from avmsf.editing.guided import Guide, GuidedEditProgress, edit_towards
+from avmsf.editing.material_statistics import MaterialStatistics
+from avmsf.editing.parameters import PARAMETERISATIONS
+from avmsf.editing.reference import Reference
+from avmsf.editing.stable_audio import StableAudio
+from avmsf.evaluation.clap import Clap
+from avmsf.fem.material import Material, material_named
+from avmsf.field.sound_field import SoundField
 
 _PREVIEW = Level("peak", -1.0)
 _GENERATED_SECONDS = 3.0

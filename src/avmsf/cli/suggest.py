@@ -8,8 +8,7 @@ from typing import Any
 
 from rich.console import Console
 
-from avmsf.bench.doubtpictures import draw_doubt
-from avmsf.bench.pictures import save_picture
+from avmsf._utils.wording import counted
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.suggest import PICTURE, TABLE, Options
@@ -19,7 +18,8 @@ from avmsf.field.store import load
 from avmsf.field.suggest import Suggestions, suggest
 from avmsf.field.uncertainty import relative_gain_std, unedited_mixture
 from avmsf.pipeline.record import recorded
-from avmsf.wording import counted
+from avmsf.plotting.pictures import save_picture
+from avmsf.plotting.uncertainty import draw_doubt
 
 _DRAWN_POINTS = 4000
 

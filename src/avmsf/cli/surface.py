@@ -7,10 +7,9 @@ import trimesh
 from jaxtyping import Float64
 from torch import Tensor
 
-from avmsf.bench.pictures import save_picture
-from avmsf.bench.surfacepictures import draw_surface
+from avmsf._utils.files import write_whole
+from avmsf._utils.wording import counted
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.surface import Surface, read_surface, write_surface
 from avmsf.capture.table import TABLE, in_folder, read_rows, understand
 from avmsf.capture.together import find_surface
 from avmsf.cli import INTERRUPTED
@@ -19,10 +18,11 @@ from avmsf.cli.options.scenes import with_seed
 from avmsf.cli.options.surface import Options
 from avmsf.cli.printing import next_command, print_result, say
 from avmsf.cli.scenes import opened_scene, stage_line
-from avmsf.config import SceneConfig
-from avmsf.files import write_whole
+from avmsf.mesh.surface import Surface, read_surface, write_surface
+from avmsf.pipeline.config import SceneConfig
 from avmsf.pipeline.reconstruct import keep_surface, object_shape
-from avmsf.wording import counted
+from avmsf.plotting.pictures import save_picture
+from avmsf.plotting.surfaces import draw_surface
 
 
 def run(options: Options) -> int:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from PIL import Image
 
+from avmsf._utils.wording import counted
 from avmsf.capture.filenames import find_surface_file, pictures_in, unused_files
 from avmsf.capture.folder import Capture
 from avmsf.capture.placement import expect_placed, surface_points
@@ -14,22 +15,15 @@ from avmsf.capture.proposals import contacts_of
 from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.table import read_rows
 from avmsf.capture.together import find_surface
-from avmsf.capture.views.foreground import find_foreground
-from avmsf.capture.views.read import find_shots, read_views
-from avmsf.capture.views.shots import listed, mask_names
-from avmsf.capture.views.transforms import stated_moves
 from avmsf.errors import AvmsfError, AvmsfWarning, CaptureError, CaptureWarning, FitError, SceneError
+from avmsf.gaussians.ply import read_splats
+from avmsf.photographs.folder import find_shots, read_views
+from avmsf.photographs.nerf_json import stated_moves
+from avmsf.photographs.segmentation import find_foreground
+from avmsf.photographs.shots import listed, mask_names
+from avmsf.pipeline.frame_check import LONGEST, MAX_VIEWS, expect_contacts_in_views, expect_on_object, judge_outlines
 from avmsf.pipeline.scene import scaled, without_far
-from avmsf.pipeline.silhouettes import (
-    LONGEST,
-    MAX_VIEWS,
-    expect_contacts_in_views,
-    expect_on_object,
-    judge_outlines,
-)
 from avmsf.pipeline.sources import find_source, find_splats
-from avmsf.scene.ply import read_splats
-from avmsf.wording import counted
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf._utils.files import write_whole
 from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.render import Coding
-from avmsf.files import write_whole
 
 SUBTYPES = {"float32": "FLOAT", "int16": "PCM_16"}
 _LARGEST_INT16 = 2**15 - 1

@@ -1,9 +1,9 @@
 from .bundle import write_bundle as write_bundle
 from .faust import write_faust as write_faust
 from .gltf import write_gltf as write_gltf
-from .modaldemo import read_demo as read_demo
-from .modaldemo import write_demo as write_demo
-from .sampledfield import SampledField as SampledField
-from .universal import write_universal as write_universal
-from .wavgrid import write_grid as write_grid
-from .webpage import write_webpage as write_webpage
+from .paper_demo import read_demo as read_demo
+from .paper_demo import write_demo as write_demo
+from .sampled_field import SampledField as SampledField
+from .samples import write_grid as write_grid
+from .uff import write_universal as write_universal
+from .web import write_webpage as write_webpage

@@ -18,14 +18,14 @@ import soundfile
 from jaxtyping import Shaped
 
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.surface import Surface
 from avmsf.errors import ExportError
 from avmsf.export.formats import MOST_POINTS
-from avmsf.export.objectfile import ObjectFile, read_object
-from avmsf.export.sampledfield import SampledField
-from avmsf.export.written import Written, no_modes, write_folder
+from avmsf.export.object_file import ObjectFile, read_object
+from avmsf.export.sampled_field import SampledField
+from avmsf.export.writing import Written, no_modes, write_folder
 from avmsf.field.positions import points_on_object
-from avmsf.field.soundfield import SoundField
+from avmsf.field.sound_field import SoundField
+from avmsf.mesh.surface import Surface
 
 FORMAT = 1
 """Version of this format, increased by every change that older pages cannot read."""

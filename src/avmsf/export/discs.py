@@ -4,9 +4,9 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from avmsf.export.sampledfield import SampledField
-from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.start import ZEROTH
+from avmsf.export.sampled_field import SampledField
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.initialize import ZEROTH
 
 _GRAY = 0.7
 

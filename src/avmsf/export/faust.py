@@ -13,8 +13,8 @@ from torch import Tensor
 
 from avmsf.errors import ExportError
 from avmsf.export.formats import FAUST_SUFFIXES
-from avmsf.export.sampledfield import SampledField
-from avmsf.export.written import Written, expect_ending, expect_free, generator, write_file
+from avmsf.export.sampled_field import SampledField
+from avmsf.export.writing import Written, expect_ending, expect_free, generator, write_file
 
 _FEWEST = 16
 """Number of points below which the noise is left out so that more points fit."""

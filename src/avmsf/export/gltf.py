@@ -21,9 +21,9 @@ from torch import Tensor
 
 from avmsf.export.formats import GLTF_SUFFIXES, Axis
 from avmsf.export.look import Look
-from avmsf.export.onephase import deviation, importance, shared_dampings, signed_amplitudes
-from avmsf.export.sampledfield import SampledField
-from avmsf.export.written import Written, expect_ending, generator, no_modes, write_file
+from avmsf.export.one_phase import deviation, importance, shared_dampings, signed_amplitudes
+from avmsf.export.sampled_field import SampledField
+from avmsf.export.writing import Written, expect_ending, generator, no_modes, write_file
 
 EXTENSION = "KHR_audio_rigid_bodies"
 _FLOAT, _UNSIGNED = 5126, 5125

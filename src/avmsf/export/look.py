@@ -10,12 +10,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from trimesh.visual import ColorVisuals
 
-from avmsf.capture.surface import Surface
-from avmsf.capture.texturedmesh import TexturedMesh, read_textured_mesh
-from avmsf.export.objectfile import MOST_FACES, expect_alike, expect_readable, reduced
-from avmsf.export.sampledfield import SampledField
-from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.start import ZEROTH
+from avmsf.export.object_file import MOST_FACES, expect_alike, expect_readable, reduced
+from avmsf.export.sampled_field import SampledField
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.initialize import ZEROTH
+from avmsf.mesh.surface import Surface
+from avmsf.mesh.textured_mesh import TexturedMesh, read_textured_mesh
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avmsf.scene.neighborhoods import read_neighborhoods
+from avmsf.gaussians.neighborhoods import read_neighborhoods
 
 _NEIGHBORS = 12
 """Neighbors in the graph along which the orientation is propagated."""

@@ -20,11 +20,11 @@ from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from avmsf.errors import SimulationError
-from avmsf.simulate.eigen import lowest_vibrations, rigid_motions
-from avmsf.simulate.elastic import ElasticModes, expect_whole
-from avmsf.simulate.elements import SecondOrder, mass, stiffness
-from avmsf.simulate.material import Material
-from avmsf.simulate.solid import Solid
+from avmsf.fem.eigen import lowest_vibrations, rigid_motions
+from avmsf.fem.elastic_modes import ElasticModes, expect_whole
+from avmsf.fem.elements import SecondOrder, mass, stiffness
+from avmsf.fem.material import Material
+from avmsf.fem.solid import Solid
 
 SAMPLED_POISSON = (0.05, 0.33, 0.485)
 """Values of Poisson's ratio whose mode shapes span the reduced basis."""

@@ -1,6 +1,6 @@
 """How loud a vibrating body is where the listener's place is not known: mean square pressures over all directions.
 
-The pressure in one direction is that of `avmsf.simulate.radiation`: Kirchhoff's and Helmholtz's integral, with the
+The pressure in one direction is that of `avmsf.fem.radiated_sound`: Kirchhoff's and Helmholtz's integral, with the
 pressure on the surface that a plane wave would have. A pulsating sphere of the same area, which is often taken (Fahy
 and Gardonio, *Sound and Structural Vibration*, 2007, chapter 3), makes the lowest modes of vessels and pans 8 to 26 dB
 too loud: their parts move against each other, and cancel.
@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from avmsf.simulate.elastic import ElasticModes
-from avmsf.simulate.radiation import radiated
-from avmsf.simulate.vibration import Vibration
+from avmsf.fem.damping import Vibration
+from avmsf.fem.elastic_modes import ElasticModes
+from avmsf.fem.radiated_sound import radiated
 
 DISTANCE = 1.0
 """Meters that pressures are stated for."""

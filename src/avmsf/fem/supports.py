@@ -10,7 +10,7 @@ from jaxtyping import Float64, Int
 from scipy.spatial import ConvexHull, QhullError
 
 from avmsf.errors import SimulationError
-from avmsf.simulate.elements import SecondOrder
+from avmsf.fem.elements import SecondOrder
 
 FREE = "free"
 FREE_PRIOR = 0.7

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from avmsf.simulate.material import DISCREPANCY
-from avmsf.simulate.nominal import NominalBody
+from avmsf.fem.candidate_bodies import NominalBody
+from avmsf.fem.material import DISCREPANCY
 
 _RESOLUTION = 0.06
 """Difference of log thickness below which no body is computed between two: real walls vary by 3 to 5 %."""

@@ -26,8 +26,8 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
+from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.perturbation import Perturbations
-from avmsf.simulate.elastic import ElasticModes
 
 STIFFNESS, DENSITY, POISSON, FACTOR = 0.10, 0.04, 1.0, 0.5
 """Prior standard deviations of the coefficients: of Young's modulus and density over their nominal values, of Poisson's

@@ -17,10 +17,10 @@ from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float64, Int
 
 from avmsf.errors import SimulationError
-from avmsf.geometry.closest import ClosestPoints
-from avmsf.simulate.shell import prisms
-from avmsf.simulate.skin import Skin, unit
-from avmsf.simulate.solid import Solid
+from avmsf.fem.shell import prisms
+from avmsf.fem.skin import Skin, unit
+from avmsf.fem.solid import Solid
+from avmsf.mesh.closest_point import ClosestPoints
 
 _OPPOSITE = -0.8
 """Largest cosine between the normals of the two sides."""

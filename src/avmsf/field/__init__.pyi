@@ -4,8 +4,8 @@ from .config import GainModel as GainModel
 from .gains.bodies import CandidateBodies as CandidateBodies
 from .gains.estimator import MixtureEstimator as MixtureEstimator
 from .recipes import Attention as Attention
-from .soundfield import FieldQuality as FieldQuality
-from .soundfield import GainPosterior as GainPosterior
-from .soundfield import Origin as Origin
-from .soundfield import SoundField as SoundField
+from .sound_field import FieldQuality as FieldQuality
+from .sound_field import GainPosterior as GainPosterior
+from .sound_field import Origin as Origin
+from .sound_field import SoundField as SoundField
 from .suggest import Suggestions as Suggestions

@@ -11,9 +11,9 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from avmsf._utils.records import RecordError, count_of, like, record_of
+from avmsf.features.feature_field import FeatureField, Regions
 from avmsf.field.config import AttentionShape
-from avmsf.field.gainfield import GainField, Gains, TrainableGains
-from avmsf.scene.features import FeatureField, Regions
+from avmsf.field.gain_field import GainField, Gains, TrainableGains
 
 _MAX_LAYERS = 64
 """Hidden layers, or bands of frequency, of a network in a file: thirty times those of the paper's. Each takes time

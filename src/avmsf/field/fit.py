@@ -18,22 +18,22 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.places import rows_by_place
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import AvmsfWarning, FieldFileError, FitError
+from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
-from avmsf.field.gainfield import GainField, TrainableGains
+from avmsf.field.gain_field import GainField, TrainableGains
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.losses import spectral_loss
 from avmsf.field.quality import with_quality
 from avmsf.field.recipes import GainCase, GainRecipe, along_phase, fingerprint, gain_case
-from avmsf.field.soundfield import SUPPORTING, Origin, SoundField
+from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
 from avmsf.field.training import Targets, TrainingRun
+from avmsf.gaussians.points import farthest_points
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_gains
-from avmsf.modal.residual import Residual, estimate_residual
+from avmsf.modal.residual_noise import Residual, estimate_residual
 from avmsf.modal.spectra import envelope
-from avmsf.scene.features import FeatureField
-from avmsf.scene.points import farthest_points
 
 _MIN_PLACES = 6
 _CHECKPOINT_SECONDS = 30.0

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Complex, Float, Float64
 from torch import Tensor
 
-from avmsf.compiled import compiled
+from avmsf._utils.compiled import compiled
 
 _CHUNK, _CARD_CHUNK = 1 << 19, 1 << 27
 """Samples of windowed frames held at once: near a processor's cache, or all frames in half a gigabyte of a card's."""

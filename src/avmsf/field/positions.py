@@ -9,8 +9,8 @@ from torch import Tensor
 
 from avmsf.capture.placement import TOLERANCE
 from avmsf.errors import PositionError
-from avmsf.field.gainfield import GainField
-from avmsf.field.scaledgains import body_of, length_of
+from avmsf.field.gain_field import GainField
+from avmsf.field.scaled_gains import body_of, length_of
 
 _FEW = 16
 """Positions up to which all distances take less time than a tree of the points."""

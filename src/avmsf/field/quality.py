@@ -9,12 +9,12 @@ from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import FitError
-from avmsf.field.gainfield import Gains
+from avmsf.field.gain_field import Gains
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.losses import spectral_loss, spectral_target
-from avmsf.field.soundfield import FieldQuality, SoundField
+from avmsf.field.sound_field import FieldQuality, SoundField
 from avmsf.field.suggest import suggest
-from avmsf.modal.residual import Residual
+from avmsf.modal.residual_noise import Residual
 
 MIN_PLACES = 4
 """Places below which leaving one out says nothing of the field of all."""

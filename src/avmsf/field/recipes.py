@@ -17,16 +17,16 @@ from torch import Tensor
 from avmsf._utils.caching import source_digest
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import FitError
+from avmsf.features.feature_field import FeatureField
 from avmsf.field.attention import AttentionGains
 from avmsf.field.config import FitConfig
-from avmsf.field.gainfield import TrainableGains
+from avmsf.field.gain_field import TrainableGains
 from avmsf.field.training import gain_scale
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.finders import ShortTime
 from avmsf.modal.extraction.least_squares import fit_sine_gains
 from avmsf.modal.phase import common_phase
-from avmsf.modal.residual import Residual, noise_power
-from avmsf.scene.features import FeatureField
+from avmsf.modal.residual_noise import Residual, noise_power
 
 SHARED, PER_CONTACT = "shared", "per-contact"
 """Dampings that are the same everywhere, and those that vary with the contact."""

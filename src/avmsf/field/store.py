@@ -23,21 +23,21 @@ import torch
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
+from avmsf._utils.files import write_whole
 from avmsf._utils.records import RecordError, count_of, like, record_of
 from avmsf._utils.state import read_tensors
 from avmsf.capture.audio import HIGHEST_RATE, LOWEST_RATE, MAX_PEAK, MAX_SAMPLES
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import FieldFileError
 from avmsf.field.config import FitConfig
-from avmsf.field.gainfield import GainField
+from avmsf.field.gain_field import GainField
 from avmsf.field.header import ADVICE, FORMAT, KEY, UNREADABLE, WHAT, damaged, key_of, record_of_text, value_of
-from avmsf.field.probablebody import ProbableBody
-from avmsf.field.scaledgains import FITTED, ScaledGains
-from avmsf.field.soundfield import SUPPORTING, FieldQuality, Origin, SoundField
-from avmsf.files import write_whole
+from avmsf.field.probable_body import ProbableBody
+from avmsf.field.scaled_gains import FITTED, ScaledGains
+from avmsf.field.sound_field import SUPPORTING, FieldQuality, Origin, SoundField
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.alignment import Alignment
-from avmsf.modal.residual import Residual
+from avmsf.modal.residual_noise import Residual
 
 _GAINS, _ALIGNMENT = "gains.", "alignment."
 _POSITIVE = ("bank.frequency", "bank.damping")

@@ -14,10 +14,10 @@ from avmsf._utils.summary import short_repr
 from avmsf.errors import FitError
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.model import MixtureGains
-from avmsf.field.soundfield import SoundField
+from avmsf.field.hammer_access import HAMMER_DIAMETER, MeshAccess, PointAccess
+from avmsf.field.sound_field import SoundField
 from avmsf.field.uncertainty import energy_of, parts_of, unedited_mixture
-from avmsf.geometry.hammer_access import HAMMER_DIAMETER, MeshAccess, PointAccess
-from avmsf.scene.points import farthest_points
+from avmsf.gaussians.points import farthest_points
 
 PLACES = 400
 """Points of the surface that the expected error is summed over, and that are candidates unless others are given."""

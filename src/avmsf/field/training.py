@@ -14,11 +14,11 @@ from torch.optim.adamw import adamw
 from avmsf._utils.device import TRAINABLE, without_denormals
 from avmsf.capture.impacts import Impacts
 from avmsf.field.config import FitConfig
-from avmsf.field.gainfield import TrainableGains
+from avmsf.field.gain_field import TrainableGains
 from avmsf.field.losses import SpectralTarget, spectral_loss, spectral_target
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
-from avmsf.modal.residual import Residual, shape_noise
+from avmsf.modal.residual_noise import Residual, shape_noise
 from avmsf.modal.synthesis import synthesize_phased
 
 

@@ -15,8 +15,8 @@ from avmsf._utils.arrays import Seed, generator_of
 from avmsf.errors import FitError
 from avmsf.field.gains.body import BodyGains
 from avmsf.field.gains.model import MixtureGains
-from avmsf.field.scaledgains import ScaledGains, fitted_gains
-from avmsf.field.soundfield import SoundField
+from avmsf.field.scaled_gains import ScaledGains, fitted_gains
+from avmsf.field.sound_field import SoundField
 from avmsf.modal.phase import turned_like
 from avmsf.modal.synthesis import synthesize_phased
 

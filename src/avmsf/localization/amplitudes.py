@@ -2,7 +2,7 @@
 
 With B the modes' sines and cosines, sampled, the amplitudes that fit a sound y best are c = G^-1 B' y, G = B' B, and
 noise of variance s^2 in every sample errs them by the covariance s^2 G^-1. Both matrices are known in closed form
-(`avmsf.modal.innerproducts`), so that an answer costs the products B' y alone. A mode's two amplitudes are one complex
+(`avmsf.modal.inner_products`), so that an answer costs the products B' y alone. A mode's two amplitudes are one complex
 number, sine + i cosine. Modes that the sound is too short to tell apart err together, and strongly: `mixing` turns
 them into mixtures whose errors have nothing to do with one another.
 """
@@ -15,8 +15,8 @@ from jaxtyping import Complex128, Float, Float64, Int64
 from torch import Tensor
 
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.innerproducts import gram, poles_of, project
-from avmsf.modal.residual import Residual
+from avmsf.modal.inner_products import gram, poles_of, project
+from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
 
 _RIDGE = 1e-10

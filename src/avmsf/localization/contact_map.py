@@ -16,11 +16,11 @@ from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_floats, as_vectors
 from avmsf._utils.summary import short_repr
+from avmsf._utils.wording import counted
 from avmsf.errors import AvmsfError, LocationError
-from avmsf.field.soundfield import SoundField
-from avmsf.scene.symmetry import MirrorSymmetry, RotationalSymmetry, Symmetries
-from avmsf.scene.symmetrysearch import find_symmetries
-from avmsf.wording import counted
+from avmsf.field.sound_field import SoundField
+from avmsf.symmetry.find import find_symmetries
+from avmsf.symmetry.symmetries import MirrorSymmetry, RotationalSymmetry, Symmetries
 
 LEVEL = 0.9
 """Probability of a credible region by default."""

@@ -7,7 +7,7 @@ from avmsf._utils.arrays import ArrayLike
 from avmsf._utils.progress import working
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
-from avmsf.field.soundfield import SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.localization.contact_map import ContactMap
 from avmsf.localization.likelihood import Force
 from avmsf.localization.locator import Locator

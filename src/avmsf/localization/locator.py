@@ -14,7 +14,7 @@ from avmsf._utils.arrays import ArrayLike, as_floats
 from avmsf._utils.summary import short_repr
 from avmsf.capture.prepare import shortest_allowed
 from avmsf.errors import LocationError
-from avmsf.field.soundfield import SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.localization.amplitudes import Amplitudes, Extractor
 from avmsf.localization.contact_map import ContactMap
 from avmsf.localization.cosine_distance import cosine_distance

@@ -12,12 +12,13 @@ from scipy.fft import irfft, next_fast_len, rfft
 from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike
+from avmsf._utils.wording import counted
 from avmsf.capture.audio import Recording, refuse_silence
 from avmsf.capture.onset import find_onset, find_pulse
 from avmsf.capture.prepare import remove_rumble, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError, LocationError
-from avmsf.field.soundfield import SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.localization.amplitudes import Extractor
 from avmsf.localization.contact_map import ContactMap
 from avmsf.localization.likelihood import Force
@@ -35,7 +36,6 @@ from avmsf.localization.preprocess import (
 )
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.synthesis import synthesize
-from avmsf.wording import counted
 
 _GUARD_SECONDS = 0.005
 """Before an impact, left out of the fit of earlier impacts: it may begin a little earlier than its detected onset."""

@@ -8,7 +8,7 @@ from jaxtyping import Complex64, Float, Float32, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avmsf.field.soundfield import SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.field.uncertainty import fitted_mixture, has_posterior
 
 _BATCH = 2048

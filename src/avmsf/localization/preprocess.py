@@ -12,6 +12,7 @@ from jaxtyping import Float32, Float64
 from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_floats, as_rate
+from avmsf._utils.wording import counted
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.impulse_checks import check_impulsive, find_clipping
 from avmsf.capture.onset import Pulse, find_second_impact, find_second_push
@@ -19,8 +20,7 @@ from avmsf.capture.prepare import prepare, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.starts import latest_start
 from avmsf.errors import ArrayError, AvmsfError, CaptureError, LocationError
-from avmsf.field.soundfield import SoundField
-from avmsf.wording import counted
+from avmsf.field.sound_field import SoundField
 
 Sound = str | Path | Recording | ArrayLike
 """The path of a sound file, a recording, or samples alone: [samples]."""

@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf.field.gains.model import MixtureGains
-from avmsf.field.scaledgains import fitted_gains
-from avmsf.field.soundfield import SoundField
+from avmsf.field.scaled_gains import fitted_gains
+from avmsf.field.sound_field import SoundField
 
 POSITION_STD_PER_SPACING = 0.06
 """Standard deviation of a place over the distance between contacts, along each direction: measured on plates."""

@@ -16,17 +16,12 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf.field.gains.model import MixtureGains
-from avmsf.field.soundfield import SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.field.uncertainty import fitted_mixture, scale_of
+from avmsf.gaussians.points import farthest_points
 from avmsf.localization.likelihood import PredictedGains, evaluate_likelihood
-from avmsf.localization.prediction import (
-    calibration_factor,
-    can_self_calibrate,
-    local_variance,
-    predict,
-)
+from avmsf.localization.prediction import calibration_factor, can_self_calibrate, local_variance, predict
 from avmsf.localization.smoothing import distinct_contacts, point_areas, smoothing_matrix
-from avmsf.scene.points import farthest_points
 
 _MAX_HOLDOUT = 12
 """Contacts that are left out, at most: those farthest apart."""

@@ -2,11 +2,4 @@
 
 import lazy_loader
 
-from avmsf.config import PRESETS, BodyConfig, PipelineConfig
-
-__getattr__, _, _names = lazy_loader.attach_stub(__name__, __file__)
-__all__ = ["PRESETS", "BodyConfig", "PipelineConfig", *_names]
-
-
-def __dir__() -> list[str]:
-    return __all__
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

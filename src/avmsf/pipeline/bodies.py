@@ -9,12 +9,12 @@ import torch
 
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.placement import expect_placed, surface_points
-from avmsf.capture.surface import Surface
-from avmsf.config import BodyConfig
 from avmsf.errors import SimulationError
+from avmsf.fem.candidate_bodies import NominalBody, Shape, nominal_bodies, refined, supported, with_wall
 from avmsf.fem.supports import Support
 from avmsf.field.gains.bodies import CandidateBodies
-from avmsf.simulate.nominal import NominalBody, Shape, nominal_bodies, refined, supported, with_wall
+from avmsf.mesh.surface import Surface
+from avmsf.pipeline.config import BodyConfig
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,23 +7,23 @@ from typing import Any
 import torch
 
 from avmsf._utils.device import usable_device
-from avmsf.capture.cameras import View
-from avmsf.capture.surface import Surface
-from avmsf.config import AUTO, DESCRIPTORS, DINO, LiftConfig
 from avmsf.errors import SceneError
-from avmsf.scene.descriptors import ImageDescriptors
-from avmsf.scene.dino import DinoEncoder
-from avmsf.scene.encode import Encoder
-from avmsf.scene.features import FeatureField
-from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.lift import Lifted, LiftProgress, by_presence, by_visibility, lift, lift_points, supported
-from avmsf.scene.points import sample_surface
-from avmsf.scene.rasterizer import Rasterizer
-from avmsf.scene.reduction import reduce, resize, with_positions
-from avmsf.scene.refine import orbit_spread, refine
-from avmsf.scene.symmetry import Symmetries
-from avmsf.scene.symmetrysearch import find_symmetries
-from avmsf.scene.visibility import depth_of_surface
+from avmsf.features.descriptors import ImageDescriptors
+from avmsf.features.dino import DinoEncoder
+from avmsf.features.encoder import Encoder
+from avmsf.features.feature_field import FeatureField
+from avmsf.features.lift import Lifted, LiftProgress, by_presence, by_visibility, lift, lift_points, supported
+from avmsf.features.pca import reduce, resize, with_positions
+from avmsf.features.pooling import orbit_spread, refine
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.points import sample_surface
+from avmsf.gaussians.rasterizer.protocol import Rasterizer
+from avmsf.gaussians.visibility import depth_of_surface
+from avmsf.mesh.surface import Surface
+from avmsf.photographs.cameras import View
+from avmsf.pipeline.config import AUTO, DESCRIPTORS, DINO, LiftConfig
+from avmsf.symmetry.find import find_symmetries
+from avmsf.symmetry.symmetries import Symmetries
 
 _WEIGHTINGS = {"plain": by_presence, "visibility": by_visibility}
 

@@ -12,23 +12,23 @@ from rich.progress import Progress as Bar
 
 from avmsf._utils.caching import discard
 from avmsf._utils.progress import is_live, repeated
+from avmsf._utils.wording import counted
 from avmsf.capture import Capture, Impacts
 from avmsf.capture.placement import surface_points
-from avmsf.config import PipelineConfig
 from avmsf.errors import FitError
+from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import AUTO, GainModel
 from avmsf.field.fit import Progress, fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.estimator import estimator_for
-from avmsf.field.soundfield import SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.modal.extraction.extract import Extraction, extract_modes, extract_once
 from avmsf.pipeline.bodies import candidate_bodies
+from avmsf.pipeline.config import PipelineConfig
+from avmsf.pipeline.frame_check import expect_on_object
 from avmsf.pipeline.record import finder_of, modes_words, supporting_poles, with_record
-from avmsf.pipeline.silhouettes import expect_on_object
-from avmsf.scene.features import FeatureField
-from avmsf.scene.symmetry import Symmetries
-from avmsf.scene.symmetrysearch import find_symmetries
-from avmsf.wording import counted
+from avmsf.symmetry.find import find_symmetries
+from avmsf.symmetry.symmetries import Symmetries
 
 _FEW = 8
 """Recordings below which little is known of the gains between contacts."""

@@ -10,25 +10,25 @@ from torch import Tensor
 
 from avmsf.capture.filenames import SURFACE_FILES
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.surface import Surface, read_surface
 from avmsf.capture.table import TABLE, read_cells
 from avmsf.capture.together import NARROWEST, WIDEST, find_surface
-from avmsf.config import BodyConfig
 from avmsf.errors import FitError, SimulationError
+from avmsf.features.feature_field import FeatureField
+from avmsf.fem.candidate_bodies import NominalBody, Shape, nominal_bodies
+from avmsf.fem.damping import damped, rayleigh
+from avmsf.fem.elastic_modes import ElasticModes
+from avmsf.fem.material import Material, material_named
 from avmsf.fem.radiation import radiated_pressure
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.body import BodyGains
-from avmsf.field.soundfield import Origin, SoundField
+from avmsf.field.sound_field import Origin, SoundField
+from avmsf.mesh.surface import Surface, read_surface
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.residual import Residual
+from avmsf.modal.residual_noise import Residual
 from avmsf.pipeline.bodies import wall_error
-from avmsf.scene.features import FeatureField
-from avmsf.simulate.elastic import ElasticModes
+from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.hammer import contact_times, pulse_spectrum
-from avmsf.simulate.material import Material, material_named
-from avmsf.simulate.nominal import NominalBody, Shape, nominal_bodies
 from avmsf.simulate.recipe import Hammer
-from avmsf.simulate.vibration import damped, rayleigh
 
 SAMPLE_RATE = 44_100.0
 """Hz: that of most recordings."""

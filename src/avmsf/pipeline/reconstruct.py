@@ -11,14 +11,14 @@ import numpy as np
 import torch
 
 from avmsf._utils.caching import once
-from avmsf.capture import Capture, Impacts, Surface
+from avmsf._utils.files import write_whole
+from avmsf._utils.wording import counted
+from avmsf.capture import Capture, Impacts
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.surface import read_surface, write_surface
 from avmsf.capture.together import find_surface
-from avmsf.capture.views import read_views
-from avmsf.capture.views.transforms import stated_moves
-from avmsf.config import CACHED_FIELD, PipelineConfig
 from avmsf.errors import AvmsfError, SceneError
+from avmsf.features.feature_field import FeatureField
+from avmsf.features.store import load_features, read_report
 from avmsf.field.config import NETWORK
 from avmsf.field.fit import Progress, fit
 from avmsf.field.gains.bodies import CandidateBodies
@@ -26,21 +26,22 @@ from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import estimator_for
 from avmsf.field.gains.positional import Visual
 from avmsf.field.store import load, save
-from avmsf.files import write_whole
-from avmsf.geometry import ObjectShape
-from avmsf.geometry.closest import ClosestPoints
+from avmsf.gaussians.ply import read_splats
+from avmsf.mesh import Surface
+from avmsf.mesh.closest_point import ClosestPoints
+from avmsf.mesh.surface import read_surface, write_surface
 from avmsf.modal.extraction.extract import Extraction, extract_once
+from avmsf.photographs import read_views
+from avmsf.photographs.nerf_json import stated_moves
 from avmsf.pipeline.bodies import candidate_bodies
+from avmsf.pipeline.config import CACHED_FIELD, PipelineConfig
+from avmsf.pipeline.frame_check import expect_contacts_in_views, expect_on_object, judge_outlines
 from avmsf.pipeline.guess import expect_no_recordings, guess_field
 from avmsf.pipeline.record import finder_of, modes_words, supporting_poles, with_record
 from avmsf.pipeline.scene import ProgressListener, SceneStages
-from avmsf.pipeline.silhouettes import expect_contacts_in_views, expect_on_object, judge_outlines
 from avmsf.pipeline.stages import Kept, StageFolder
-from avmsf.scene.features import FeatureField
-from avmsf.scene.featurestore import load_features, read_report
-from avmsf.scene.ply import read_splats
-from avmsf.scene.symmetry import Symmetries
-from avmsf.wording import counted
+from avmsf.reconstruction import ObjectShape
+from avmsf.symmetry.symmetries import Symmetries
 
 SURFACE = "surface.ply"
 """What the stage of the object's surface calls its output, in meters."""

@@ -6,14 +6,14 @@ from typing import Any
 
 import torch
 
+from avmsf._utils.wording import counted
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
-from avmsf.config import PipelineConfig
-from avmsf.field.soundfield import SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.finders import ModeFinder, finder_named
 from avmsf.modal.extraction.quality import measure_quality
-from avmsf.wording import counted
+from avmsf.pipeline.config import PipelineConfig
 
 RECORD = "pipeline"
 """What a field's report calls the configuration that made it."""

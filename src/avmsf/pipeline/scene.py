@@ -11,28 +11,28 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from avmsf.capture.cameras import View
+from avmsf._utils.wording import counted
 from avmsf.capture.filenames import no_views
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.surface import read_surface
-from avmsf.capture.views import read_sparse_points, read_views
-from avmsf.config import SceneConfig
 from avmsf.errors import SceneError
-from avmsf.geometry import ObjectShape
-from avmsf.pipeline.cloudshape import masks_suffice, shape_of_cloud, views_of_cloud
+from avmsf.features.encoder import Encoder
+from avmsf.features.lift import Lifted, LiftProgress
+from avmsf.features.store import save_features
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.fit import SplatProgress, splat
+from avmsf.gaussians.initialize import StartPoints
+from avmsf.gaussians.ply import read_splats, write_splats
+from avmsf.gaussians.prune import keep_object
+from avmsf.gaussians.rasterizer.protocol import choose_rasterizer
+from avmsf.mesh.surface import read_surface
+from avmsf.photographs import read_sparse_points, read_views
+from avmsf.photographs.cameras import View
+from avmsf.pipeline.cloud_shape import masks_suffice, shape_of_cloud, views_of_cloud
+from avmsf.pipeline.config import SceneConfig
 from avmsf.pipeline.features import choose_encoder, finish_features, lift_to_cloud, lift_to_surface
 from avmsf.pipeline.sources import Source, find_source, find_splats, keep_views, replace_views
 from avmsf.pipeline.stages import Kept, StageFolder, digest_of
-from avmsf.scene.encode import Encoder
-from avmsf.scene.featurestore import save_features
-from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.keep import keep_object
-from avmsf.scene.lift import Lifted, LiftProgress
-from avmsf.scene.ply import read_splats, write_splats
-from avmsf.scene.rasterizer import choose_rasterizer
-from avmsf.scene.splat import SplatProgress, splat
-from avmsf.scene.start import StartPoints
-from avmsf.wording import counted
+from avmsf.reconstruction import ObjectShape
 
 VIEWS, CLOUD, FEATURES = "views", "cloud.ply", "features.safetensors"
 """What the stages call their outputs."""

@@ -8,20 +8,20 @@ from typing import Literal
 
 import torch
 
-from avmsf.capture.cameras import View
 from avmsf.capture.filenames import SPLATS, VIDEO_SUFFIXES, find_surface_file, pictures_in
-from avmsf.capture.meshviews import orbit_cameras, render_views
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.sfm import FEWEST, estimate_cameras
-from avmsf.capture.texturedmesh import read_textured_mesh
-from avmsf.capture.video import pick_frames
-from avmsf.capture.views import find_foreground, read_views
-from avmsf.capture.views.colmap import find_model
-from avmsf.capture.views.write import write_views
-from avmsf.config import ViewsConfig
 from avmsf.errors import SceneError
+from avmsf.gaussians.points import farthest_points
+from avmsf.mesh.textured_mesh import read_textured_mesh
+from avmsf.photographs import find_foreground, read_views
+from avmsf.photographs.cameras import View
+from avmsf.photographs.colmap import find_model
+from avmsf.photographs.mesh_views import orbit_cameras, render_views
+from avmsf.photographs.sfm import FEWEST, estimate_cameras
+from avmsf.photographs.video import pick_frames
+from avmsf.photographs.write import write_views
+from avmsf.pipeline.config import ViewsConfig
 from avmsf.pipeline.stages import Kept, StageFolder, digest_files
-from avmsf.scene.points import farthest_points
 
 Kind = Literal["cameras", "photographs", "video", "mesh"]
 Tell = Callable[[str], None]

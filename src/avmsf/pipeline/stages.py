@@ -11,10 +11,10 @@ from typing import Any
 
 import avmsf
 from avmsf._utils.caching import discard, source_digest
+from avmsf._utils.files import way_out, write_whole
 from avmsf._utils.locks import WAIT, write_lock
 from avmsf._utils.text_files import read_json
 from avmsf.errors import CaptureError
-from avmsf.files import way_out, write_whole
 
 _BLOCK = 1 << 20
 

@@ -9,18 +9,18 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf._utils.caching import key_of
-from avmsf.capture.surface import Surface
-from avmsf.capture.texturedmesh import TexturedMesh, read_textured_mesh
 from avmsf.errors import SimulationError
-from avmsf.simulate.elastic import ElasticModes, elastic_modes
-from avmsf.simulate.elasticstore import modes_once
+from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
+from avmsf.fem.elastic_store import modes_once
+from avmsf.fem.material import material_named
+from avmsf.fem.shell import shell
+from avmsf.fem.solid import Solid
+from avmsf.fem.tetrahedra import fill
+from avmsf.mesh.surface import Surface
+from avmsf.mesh.textured_mesh import TexturedMesh, read_textured_mesh
 from avmsf.simulate.imperfections import smooth_field, stream, support_places, support_springs
-from avmsf.simulate.material import material_named
 from avmsf.simulate.recipe import AXES, ObjectRecipe
 from avmsf.simulate.shapes import make_shape, textured, vary_thickness
-from avmsf.simulate.shell import shell
-from avmsf.simulate.solid import Solid
-from avmsf.simulate.tetrahedra import fill
 
 Tell = Callable[[str], None]
 

@@ -22,7 +22,7 @@ from scipy.special import loggamma
 from torch import Tensor
 
 from avmsf.errors import SimulationError
-from avmsf.simulate.material import Material
+from avmsf.fem.material import Material
 from avmsf.simulate.recipe import LONGEST, Hammer
 
 _HERTZ_SCALE = 2.868

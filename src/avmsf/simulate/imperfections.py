@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from avmsf.simulate.elastic import ElasticModes
+from avmsf.fem.damping import rayleigh
+from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.simulate.recipe import Imperfections
-from avmsf.simulate.vibration import rayleigh
 
 _LEGS = 3
 _PATCHES = 16

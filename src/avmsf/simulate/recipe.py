@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from avmsf._utils.caching import source_digest
 from avmsf.errors import SimulationError
-from avmsf.simulate.material import material_named
+from avmsf.fem.material import material_named
 
 LONGEST = 0.02
 """Longest contact of an impact, seconds."""

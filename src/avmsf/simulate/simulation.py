@@ -15,18 +15,18 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.prepare import prepare
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.starts import cut_together, shorten
-from avmsf.capture.surface import Surface
-from avmsf.capture.texturedmesh import TexturedMesh
+from avmsf.fem.damping import damped
+from avmsf.fem.radiated_sound import radiated, travel_time
+from avmsf.mesh.surface import Surface
+from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.simulate.bodies import Body, make_body, up_of
+from avmsf.simulate.ground_truth import Truth
 from avmsf.simulate.imperfections import damping_matrix, recording_starts, stream
-from avmsf.simulate.radiation import radiated, travel_time
 from avmsf.simulate.recipe import ObjectRecipe
 from avmsf.simulate.ringing import recorded
-from avmsf.simulate.roomnoise import room_noise
-from avmsf.simulate.soundingbody import SoundingBody
+from avmsf.simulate.room_noise import room_noise
+from avmsf.simulate.sounding_body import SoundingBody
 from avmsf.simulate.strikes import Strikes, draw_strikes
-from avmsf.simulate.truth import Truth
-from avmsf.simulate.vibration import damped
 
 HIGHEST = 0.45
 """Frequency over the sample rate up to which modes sound: what an ordinary recorder's filter lets pass."""

@@ -11,9 +11,9 @@ from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float64, Int
 from torch import Tensor
 
-from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
-from avmsf.geometry.closest import ClosestPoints
+from avmsf.mesh.closest_point import ClosestPoints
+from avmsf.mesh.surface import Surface
 from avmsf.simulate.imperfections import stream
 from avmsf.simulate.recipe import Imperfections
 

@@ -16,6 +16,7 @@ from typing import Any
 
 import soundfile
 
+from avmsf._utils.wording import counted
 from avmsf.capture.audio import Recording
 from avmsf.capture.measure import RecordingReport, measure
 from avmsf.capture.prepare import prepare
@@ -26,9 +27,8 @@ from avmsf.studio.judgements import Judgements, plain
 from avmsf.studio.locating import read_upload
 from avmsf.studio.place import Place
 from avmsf.studio.refusal import RefusedError, bad_request
-from avmsf.studio.strikefiles import WAV, StrikeFiles
-from avmsf.studio.striketable import StrikeTable, file_of
-from avmsf.wording import counted
+from avmsf.studio.strike_files import WAV, StrikeFiles
+from avmsf.studio.strike_table import StrikeTable, file_of
 
 _KEY = re.compile(r"[\x21-\x7e]{8,128}")
 

@@ -9,14 +9,14 @@ from typing import Any
 
 import torch
 
+from avmsf.editing.edits import EDITS, remarks
+from avmsf.editing.material import LAWS, change_material
+from avmsf.editing.material_before import made_of
+from avmsf.editing.modes import adjust_modes
 from avmsf.errors import EditError
-from avmsf.field.soundfield import SoundField
-from avmsf.simulate.material import MATERIALS, material_named
+from avmsf.fem.material import MATERIALS, material_named
+from avmsf.field.sound_field import SoundField
 from avmsf.studio.refusal import RefusedError, bad_request, echo
-from avmsf.tasks.edits import EDITS, remarks
-from avmsf.tasks.madeof import made_of
-from avmsf.tasks.material import LAWS, change_material
-from avmsf.tasks.modes import adjust_modes
 
 _MATERIAL, _MODE = ("from", "to"), ("mode", "db", "pitch", "decay")
 _OLD_CONTROL = '"Present material"'

@@ -11,7 +11,7 @@ from avmsf.capture.measure import RecordingReport, measure
 from avmsf.capture.prepare import prepare
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.table import Strike
-from avmsf.studio.strikefiles import StrikeFiles
+from avmsf.studio.strike_files import StrikeFiles
 
 
 class Judgements:

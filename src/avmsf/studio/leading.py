@@ -6,9 +6,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from avmsf.editing.config import STABLE_AUDIO
 from avmsf.errors import EditError
 from avmsf.studio.refusal import RefusedError, bad_request, echo
-from avmsf.tasks.config import STABLE_AUDIO
 
 _KEYS = ("base", "prompt")
 _MAX_PROMPT = 2000

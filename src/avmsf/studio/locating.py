@@ -15,12 +15,12 @@ from torch import Tensor
 from avmsf.capture.audio import Recording, SoundBytes, decode_recording
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import RecordingLengthError
-from avmsf.field.soundfield import SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.localization.contact_map import LEVEL, ContactMap, enlarged, symmetries_of
 from avmsf.localization.locator import Locator
 from avmsf.localization.multi_impact import locate_impacts
-from avmsf.scene.symmetry import Symmetries
 from avmsf.studio.refusal import RefusedError
+from avmsf.symmetry.symmetries import Symmetries
 
 
 class Likeness:

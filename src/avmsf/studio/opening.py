@@ -6,13 +6,13 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from avmsf._utils.files import copy_whole
 from avmsf.capture.filenames import SPLATS, find_surface_file
 from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.table import TABLE
-from avmsf.config import CACHE
 from avmsf.errors import StudioError
-from avmsf.export.objectfile import holds_gaussians
-from avmsf.files import copy_whole
+from avmsf.export.object_file import holds_gaussians
+from avmsf.pipeline.config import CACHE
 from avmsf.pipeline.reconstruct import FIELD, SURFACE
 from avmsf.pipeline.scene import CLOUD
 from avmsf.pipeline.sources import find_source, find_splats

@@ -15,7 +15,7 @@ from starlette.routing import Route
 
 from avmsf._utils.memory import lacks_memory
 from avmsf.errors import AvmsfError
-from avmsf.export.webpage import MEDIA_TYPES
+from avmsf.export.web import MEDIA_TYPES
 from avmsf.studio.guard import contained, nothing_here, read_words
 from avmsf.studio.place import Place
 from avmsf.studio.policy import policy_of

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.export.sampledfield import SampledField, supporting_columns
-from avmsf.field.scaledgains import fitted_gains, length_of
-from avmsf.field.soundfield import SoundField
+from avmsf.export.sampled_field import SampledField, supporting_columns
+from avmsf.field.scaled_gains import fitted_gains, length_of
+from avmsf.field.sound_field import SoundField
 from avmsf.field.uncertainty import scale_of
 
 

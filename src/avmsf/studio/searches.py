@@ -7,7 +7,7 @@ from collections import defaultdict
 
 from avmsf._utils.text import printable
 from avmsf.errors import AvmsfError
-from avmsf.field.scaledgains import length_of
+from avmsf.field.scaled_gains import length_of
 from avmsf.studio.capturing import StrikeBook
 from avmsf.studio.locating import Finder, Likeness
 from avmsf.studio.refusal import FORESEEN_ERRORS

@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import RLock
 
+from avmsf._utils.files import way_out
 from avmsf.errors import StudioError
-from avmsf.field.soundfield import SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.field.store import save
-from avmsf.files import way_out
 from avmsf.studio.editing import REST, Sliders
 from avmsf.studio.refusal import RefusedError, bad_request
 

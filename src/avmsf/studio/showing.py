@@ -17,17 +17,17 @@ from torch import Tensor
 
 from avmsf.capture.folder import read_capture
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.surface import Surface, read_surface
 from avmsf.errors import CaptureError, CaptureWarning, StudioError
 from avmsf.export.bundle import write_bundle
 from avmsf.export.formats import MOST_POINTS
 from avmsf.export.normals import outward_normals
-from avmsf.export.sampledfield import SampledField
+from avmsf.export.sampled_field import SampledField
+from avmsf.features.feature_field import FeatureField
 from avmsf.field.positions import points_on_object
-from avmsf.field.scaledgains import fitted_gains, length_of, surface_of
-from avmsf.field.soundfield import SoundField
-from avmsf.scene.features import FeatureField
-from avmsf.scene.ply import read_splats
+from avmsf.field.scaled_gains import fitted_gains, length_of, surface_of
+from avmsf.field.sound_field import SoundField
+from avmsf.gaussians.ply import read_splats
+from avmsf.mesh.surface import Surface, read_surface
 from avmsf.studio.capturing import StrikeBook
 from avmsf.studio.opening import Opened, find_object, find_reconstructed, is_gaussians
 from avmsf.studio.sampling import resample, sample

@@ -9,8 +9,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from avmsf.config import Preset
+from avmsf.editing.edits import EDITS, remarks
 from avmsf.field.store import load, save
+from avmsf.pipeline.config import Preset
 from avmsf.studio.capturing import StrikeBook
 from avmsf.studio.editing import MATERIAL_NAMES, Sliders
 from avmsf.studio.jobs import Event, Job, Jobs
@@ -22,7 +23,6 @@ from avmsf.studio.searches import Searches
 from avmsf.studio.session import Revision, Session
 from avmsf.studio.showing import Showcase
 from avmsf.studio.threads import Result, Threads
-from avmsf.tasks.edits import EDITS, remarks
 
 MODES = 128
 STEER_STEPS = 150

@@ -18,26 +18,26 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from avmsf._utils.children import end_with_parent
+from avmsf._utils.files import copy_whole
 from avmsf._utils.memory import NO_MEMORY, lacks_memory
 from avmsf.capture import read_capture
 from avmsf.capture.settings import settings_of
-from avmsf.config import CACHE, PRESETS, SceneConfig
+from avmsf.editing.config import GuidedEditConfig
+from avmsf.editing.distillation import DecoderDistillation
+from avmsf.editing.guided import Guide, GuidedEditProgress, edit_towards
+from avmsf.editing.reference import Reference
+from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import AvmsfError, CaptureWarning
+from avmsf.features.lift import LiftProgress
 from avmsf.field.fit import Progress
 from avmsf.field.store import load, save
-from avmsf.files import copy_whole
+from avmsf.gaussians.fit import SplatProgress
+from avmsf.pipeline.config import CACHE, PRESETS, SceneConfig
 from avmsf.pipeline.reconstruct import reconstruct
 from avmsf.pipeline.record import capture_settings_of
 from avmsf.pipeline.scene import ProgressListener, SceneStages
 from avmsf.pipeline.stages import StageFolder
-from avmsf.scene.lift import LiftProgress
-from avmsf.scene.splat import SplatProgress
-from avmsf.studio.strikefiles import COMMAND
-from avmsf.tasks.config import GuidedEditConfig
-from avmsf.tasks.distillation import DecoderDistillation
-from avmsf.tasks.guided import Guide, GuidedEditProgress, edit_towards
-from avmsf.tasks.reference import Reference
-from avmsf.tasks.stableaudio import StableAudio
+from avmsf.studio.strike_files import COMMAND
 
 Values = Mapping[str, Any]
 _RARELY = 10

@@ -25,7 +25,7 @@ from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, hypotheses_of, weigh_factors
 from avmsf.field.gains.mixture import NOISE_SHARES, log_evidence
 from avmsf.field.gains.model import MixtureGains, series_of
-from gain_cases import SIZE, families, impacts, measured, plate
+from factories.gain_cases import SIZE, families, impacts, measured, plate
 
 SHAPES = 6
 UNCHANGED = len(FACTORS) // 2 * len(FREQUENCY_ERRORS)

@@ -7,7 +7,7 @@ import torch
 
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.modal.bank import ModalBank
-from gain_cases import draw, impacts, model
+from factories.gain_cases import draw, impacts, model
 
 CONTACTS, MODES, RECORDINGS = 14, 5, 17
 USED = torch.tensor([3, 0, 16, 5, 4, 6, 7, 8, 9, 10, 11, 12, 13, 14])

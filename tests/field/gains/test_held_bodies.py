@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 import torch
 
+from avmsf.fem.block import block
+from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
+from avmsf.fem.elements import SecondOrder
+from avmsf.fem.material import NOMINAL, STEEL
 from avmsf.fem.supports import FREE, supports_of
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, total_evidence
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
-from avmsf.simulate.block import block
-from avmsf.simulate.elastic import ElasticModes, elastic_modes
-from avmsf.simulate.elements import SecondOrder
-from avmsf.simulate.material import NOMINAL, STEEL
-from gain_cases import draw
+from factories.gain_cases import draw
 
 SIDES = (0.24, 0.16, 0.003)
 CLAMPED = "held along lower edge 3"

@@ -11,7 +11,7 @@ from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import KernelFamily, Sites
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
-from gain_cases import POSITIONAL, SIZE, draw, impacts, plate
+from factories.gain_cases import POSITIONAL, SIZE, draw, impacts, plate
 
 KINDS = [*POSITIONAL, Elastic]
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)

@@ -12,7 +12,7 @@ from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import fit_mixture
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.model import MixtureGains, series_of
-from gain_cases import draw, families, impacts, measured, model
+from factories.gain_cases import draw, families, impacts, measured, model
 
 ASKED = impacts(9, seed=5)
 MODES = 5

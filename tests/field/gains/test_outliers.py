@@ -24,7 +24,7 @@ from avmsf.field.gains.outliers import (
     set_aside,
 )
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
-from gain_cases import draw
+from factories.gain_cases import draw
 
 CONTACTS, MODES = 20, 12
 

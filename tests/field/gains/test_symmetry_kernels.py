@@ -11,8 +11,8 @@ from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.symmetry import Symmetric
-from avmsf.scene.symmetry import MirrorSymmetry, RotationalSymmetry, Symmetries
-from avmsf.scene.symmetrycharacters import groups_of
+from avmsf.symmetry.characters import groups_of
+from avmsf.symmetry.symmetries import MirrorSymmetry, RotationalSymmetry, Symmetries
 
 SIZE = 1.0
 

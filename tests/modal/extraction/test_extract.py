@@ -21,7 +21,7 @@ from avmsf.modal.extraction.extract import extract_modes, extract_once, extract_
 from avmsf.modal.extraction.finders import HighResolution, ShortTime, lowest_frequency
 from avmsf.modal.synthesis import synthesize
 from avmsf.simulate.plate import Plate, PlateModes, plate_modes, sample_contacts, strike
-from raising import raises
+from factories.raising import raises
 
 RATE = 16000.0
 PLATE = Plate(alpha=20.0)

@@ -6,7 +6,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.polarity import inverted_recordings
-from avmsf.modal.residual import Residual
+from avmsf.modal.residual_noise import Residual
 
 
 def beam(contacts: int, *, seed: int = 0) -> tuple[Extraction, Impacts]:

@@ -11,7 +11,7 @@ from avmsf.modal.extraction.esprit import stable_orders
 from avmsf.modal.extraction.extract import Extraction, extract_sounds
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.extraction.quality import ModeQuality, measure_quality
-from avmsf.modal.residual import Residual
+from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
 
 RATE = 8000.0

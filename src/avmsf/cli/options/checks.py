@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
+from avmsf._utils.files import temporary_path, unwritable
 from avmsf.capture.filenames import find_surface_file
 from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.table import read_strikes
 from avmsf.errors import AvmsfError, CaptureError, ExtractionError
-from avmsf.files import temporary_path, unwritable
 
 DEVICES = ("cpu", "cuda")
 """Kinds of devices that commands compute on."""

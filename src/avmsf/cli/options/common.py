@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, get_type_hints
 import tyro
 
 from avmsf.cli.options.paths import InputError, path_mark
-from avmsf.config import PRESETS, Preset
+from avmsf.pipeline.config import PRESETS, Preset
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import tyro
 
-from avmsf.capture.datasets.signs import expect_signs
 from avmsf.cli.options.common import Printing
 from avmsf.cli.options.paths import Existing
+from avmsf.datasets.detect import expect_signs
 
 
 @dataclass(frozen=True)

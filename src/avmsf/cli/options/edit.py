@@ -12,9 +12,9 @@ import tyro
 from avmsf.cli.options.checks import OutputError, expect_device, expect_writable
 from avmsf.cli.options.common import Printing, Unit, option_of, parse_options
 from avmsf.cli.options.paths import NEW_TENSORS, FieldFile, NewFile, PlotsFolder
+from avmsf.editing.config import STABLE_AUDIO, DistillationConfig, GuidedEditConfig, expect_prompt
 from avmsf.errors import EditError
-from avmsf.simulate.material import material_named
-from avmsf.tasks.config import STABLE_AUDIO, DistillationConfig, GuidedEditConfig, expect_prompt
+from avmsf.fem.material import material_named
 
 _Pairs = tyro.conf.UseAppendAction[tuple[tuple[float, float], ...]]
 

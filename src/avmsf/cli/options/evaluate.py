@@ -7,15 +7,15 @@ from typing import Annotated, Literal
 
 import tyro
 
-from avmsf.bench.names import expect_method, expect_protocol, expect_suited
-from avmsf.capture.datasets.signs import expect_signs
 from avmsf.cli.options.checks import expect_device, expect_modes
 from avmsf.cli.options.common import Flag, Printing, parse_options, spelled
 from avmsf.cli.options.paths import CacheFolder, Existing, OutputFolder
-from avmsf.config import BodyConfig, Geometry, LiftConfig, TimeZero
+from avmsf.datasets.detect import expect_signs
 from avmsf.errors import EvaluationError
+from avmsf.evaluation.names import expect_method, expect_protocol, expect_suited
+from avmsf.gaussians.config import SplatConfig
 from avmsf.modal.config import ExtractionMethod
-from avmsf.scene.splatconfig import SplatConfig
+from avmsf.pipeline.config import BodyConfig, Geometry, LiftConfig, TimeZero
 
 
 @dataclass(frozen=True)

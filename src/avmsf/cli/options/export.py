@@ -10,15 +10,7 @@ from typing import Annotated
 import tyro
 
 from avmsf.cli.options.common import Flag, Printing, Unit, option_of, parse_options
-from avmsf.cli.options.paths import (
-    ContactTable,
-    Existing,
-    NewFile,
-    NewFolder,
-    OtherCapture,
-    PositionList,
-    ShapeFile,
-)
+from avmsf.cli.options.paths import ContactTable, Existing, NewFile, NewFolder, OtherCapture, PositionList, ShapeFile
 from avmsf.errors import ExportError
 from avmsf.export.formats import (
     FAUST_SUFFIXES,

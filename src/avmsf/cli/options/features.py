@@ -11,8 +11,8 @@ import tyro
 from avmsf.cli.options.common import parse_options, preset_of
 from avmsf.cli.options.paths import NEW_TENSORS
 from avmsf.cli.options.scenes import SceneOptions
-from avmsf.config import PRESETS, LiftConfig, Preset, ViewsConfig
-from avmsf.scene.splatconfig import SplatConfig
+from avmsf.gaussians.config import SplatConfig
+from avmsf.pipeline.config import PRESETS, LiftConfig, Preset, ViewsConfig
 
 
 @dataclass(frozen=True)

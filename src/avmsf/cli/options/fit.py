@@ -11,11 +11,11 @@ import tyro
 from avmsf.cli.options.checks import expect_capture, expect_device, expect_modes
 from avmsf.cli.options.common import Flag, Printing, parse_options, preset_of, preset_values
 from avmsf.cli.options.paths import NEW_TENSORS, Existing, SettingsFile
-from avmsf.config import BodyConfig, PipelineConfig, Preset, SceneConfig, TimeZero
 from avmsf.errors import EvaluationError, FitError
+from avmsf.fem.material import material_named
 from avmsf.field.config import FitConfig, GainModel
 from avmsf.modal.config import ExtractionMethod
-from avmsf.simulate.material import material_named
+from avmsf.pipeline.config import BodyConfig, PipelineConfig, Preset, SceneConfig, TimeZero
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ import tyro
 from avmsf.cli.options.checks import expect_capture
 from avmsf.cli.options.common import Printing, parse_options
 from avmsf.cli.options.paths import Existing, OtherCapture, PlotsFolder, SettingsFile
+from avmsf.features.header import holds_features
 from avmsf.field.header import read_record
-from avmsf.scene.featureheader import holds_features
-from avmsf.scene.plyheader import expect_splats
+from avmsf.gaussians.ply_header import expect_splats
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ import tyro
 from avmsf.cli.options.checks import expect_capture, expect_modes
 from avmsf.cli.options.common import Printing, parse_options, preset_of, preset_values
 from avmsf.cli.options.paths import CaptureFolder, PlotsFolder, SettingsFile
-from avmsf.config import PipelineConfig, Preset, TimeZero
 from avmsf.modal.config import ExtractionMethod
+from avmsf.pipeline.config import PipelineConfig, Preset, TimeZero
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ import tyro
 from avmsf._utils.headers import read_metadata
 from avmsf.capture.filenames import PICTURE_SUFFIXES, VIDEO_SUFFIXES
 from avmsf.cli.options.checks import OutputError, expect_writable, is_folder
-from avmsf.config import CACHE, CACHED_FIELD
 from avmsf.errors import AvmsfError
+from avmsf.features import header as featureheader
 from avmsf.field import header as field_header
-from avmsf.scene import featureheader
+from avmsf.pipeline.config import CACHE, CACHED_FIELD
 
 FileKind = Literal[
     "a sound field", "features", "a recording", "a mesh or Gaussians", "a picture", "a video", "a folder"

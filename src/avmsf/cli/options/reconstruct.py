@@ -14,19 +14,11 @@ from avmsf.cli.options.common import Flag, parse_options, preset_of, preset_valu
 from avmsf.cli.options.fit import expect_split, refuse_with_material
 from avmsf.cli.options.paths import NEW_TENSORS
 from avmsf.cli.options.scenes import SceneOptions, with_seed
-from avmsf.config import (
-    BodyConfig,
-    LiftConfig,
-    PipelineConfig,
-    Preset,
-    SceneConfig,
-    TimeZero,
-    ViewsConfig,
-)
+from avmsf.fem.material import material_named
 from avmsf.field.config import FitConfig, GainModel
+from avmsf.gaussians.config import SplatConfig
 from avmsf.modal.config import ExtractionMethod
-from avmsf.scene.splatconfig import SplatConfig
-from avmsf.simulate.material import material_named
+from avmsf.pipeline.config import BodyConfig, LiftConfig, PipelineConfig, Preset, SceneConfig, TimeZero, ViewsConfig
 
 
 @dataclass(frozen=True)

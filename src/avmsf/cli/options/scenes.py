@@ -11,8 +11,8 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.cli.options.checks import expect_device, read_settings
 from avmsf.cli.options.common import Printing
 from avmsf.cli.options.paths import CacheFolder, Existing, SettingsFile
-from avmsf.config import CACHE, SceneConfig
 from avmsf.errors import SceneError
+from avmsf.pipeline.config import CACHE, SceneConfig
 
 
 @dataclass(frozen=True)

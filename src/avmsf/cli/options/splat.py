@@ -10,8 +10,8 @@ import tyro
 from avmsf.cli.options.common import parse_options
 from avmsf.cli.options.paths import NewFile
 from avmsf.cli.options.scenes import SceneOptions
-from avmsf.config import ViewsConfig
-from avmsf.scene.splatconfig import SplatConfig
+from avmsf.gaussians.config import SplatConfig
+from avmsf.pipeline.config import ViewsConfig
 
 
 @dataclass(frozen=True)

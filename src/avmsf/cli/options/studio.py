@@ -10,8 +10,8 @@ import tyro
 from avmsf.cli.options.checks import expect_modes
 from avmsf.cli.options.common import Flag, Printing, parse_options
 from avmsf.cli.options.paths import Existing, ShapeFile
-from avmsf.config import Preset
 from avmsf.errors import StudioError
+from avmsf.pipeline.config import Preset
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,12 @@ from typing import Annotated, get_args
 
 import tyro
 
-from avmsf.capture.surface import SurfaceKind
 from avmsf.cli.options.common import parse_options
 from avmsf.cli.options.paths import NewFile, PlotsFolder
 from avmsf.cli.options.scenes import SceneOptions
-from avmsf.config import ViewsConfig
-from avmsf.scene.splatconfig import SplatConfig
+from avmsf.gaussians.config import SplatConfig
+from avmsf.mesh.surface import SurfaceKind
+from avmsf.pipeline.config import ViewsConfig
 
 _KINDS: tuple[SurfaceKind, ...] = get_args(SurfaceKind)
 _SUFFIXES = tuple(f".{kind}" for kind in _KINDS)

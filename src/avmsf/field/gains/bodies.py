@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar, runtime_checkable
 
-from avmsf.simulate.nominal import NominalBodies, NominalBody
+from avmsf.fem.candidate_bodies import NominalBodies, NominalBody
 
 Given = TypeVar("Given", contravariant=True)
 Made = TypeVar("Made", covariant=True)

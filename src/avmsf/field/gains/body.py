@@ -10,10 +10,10 @@ from torch import Tensor
 
 from avmsf._utils.records import count_of
 from avmsf._utils.summary import short_repr
-from avmsf.fem.modestate import mode_sizes, mode_skeleton, mode_tensors, restored_modes
-from avmsf.field.gainfield import GainField, Gains
+from avmsf.fem.elastic_modes import ElasticModes
+from avmsf.fem.mode_tensors import mode_sizes, mode_skeleton, mode_tensors, restored_modes
+from avmsf.field.gain_field import GainField, Gains
 from avmsf.field.gains.family import sites_along
-from avmsf.simulate.elastic import ElasticModes
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,8 +26,8 @@ import torch
 from jaxtyping import Float64, Int
 from torch import Tensor
 
+from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.field.gains.family import KernelFamily, Sites, scaled, squared_exponential
-from avmsf.simulate.elastic import ElasticModes
 
 PERTURBATIONS = (0.003, 0.01, 0.03, 0.1, 0.3)
 """Relative perturbations tau of stiffness and mass."""

@@ -15,6 +15,10 @@ from torch import Tensor
 from avmsf.capture.placement import expect_placed
 from avmsf.capture.table import TABLE
 from avmsf.errors import AvmsfError, FitError
+from avmsf.features.feature_field import GEOMETRY, FeatureField
+from avmsf.fem.candidate_bodies import NominalBody, body_name
+from avmsf.fem.elastic_modes import ElasticModes
+from avmsf.fem.material import largest_factor
 from avmsf.fem.supports import FREE, FREE_PRIOR
 from avmsf.fem.thickness import search_thickness
 from avmsf.fem.updating import update
@@ -30,13 +34,9 @@ from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.recipes import Attention, GainCase, GainRecipe
-from avmsf.scene.features import GEOMETRY, FeatureField
-from avmsf.scene.points import farthest_points
-from avmsf.scene.symmetry import Symmetries
-from avmsf.scene.symmetrycharacters import Group, groups_of
-from avmsf.simulate.elastic import ElasticModes
-from avmsf.simulate.material import largest_factor
-from avmsf.simulate.nominal import NominalBody, body_name
+from avmsf.gaussians.points import farthest_points
+from avmsf.symmetry.characters import Group, groups_of
+from avmsf.symmetry.symmetries import Symmetries
 
 POSITIONAL: dict[str, type[KernelFamily]] = {Smooth.kind: Smooth, ThinPlate.kind: ThinPlate}
 """Families that need nothing but the contacts, by name."""

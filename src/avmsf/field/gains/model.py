@@ -14,15 +14,15 @@ from torch import Tensor
 from avmsf._utils.records import RecordError, count_of, like
 from avmsf._utils.summary import short_repr
 from avmsf.capture.places import places_of
-from avmsf.fem.modestate import mode_sizes, mode_skeleton, mode_tensors, restored_modes
-from avmsf.field.gainfield import GainField, Gains
+from avmsf.fem.elastic_modes import ElasticModes
+from avmsf.fem.mode_tensors import mode_sizes, mode_skeleton, mode_tensors, restored_modes
+from avmsf.field.gain_field import GainField, Gains
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import Family, KernelFamily, Sites, nearest_sites, sites_along
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture, Predictions
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.symmetry import Symmetric
-from avmsf.scene.symmetrycharacters import Group
-from avmsf.simulate.elastic import ElasticModes
+from avmsf.symmetry.characters import Group
 
 NEIGHBORS = 3
 """Nearest recordings that are averaged, as in the paper's baseline."""

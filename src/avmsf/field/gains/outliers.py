@@ -40,13 +40,13 @@ import torch
 from jaxtyping import Complex128, Float, Float32, Float64, Int
 from torch import Tensor
 
+from avmsf._utils.wording import counted
 from avmsf.capture.filenames import number_key
 from avmsf.capture.places import places_of
 from avmsf.field.gains.family import KernelFamily, Sites
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, total_evidence
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.model import MixtureGains, series_of
-from avmsf.wording import counted
 
 WIDE_NOISE_SHARES = (*NOISE_SHARES, 0.1, 0.3, 1.0, 3.0)
 """A wrong label may look like noise: the hypotheses that contacts are judged by have to allow for it."""

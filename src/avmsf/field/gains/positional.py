@@ -8,7 +8,7 @@ from jaxtyping import Float32, Float64
 from torch import Tensor
 
 from avmsf.field.gains.family import KernelFamily, Sites, scaled, squared_exponential
-from avmsf.scene.points import nearest_points
+from avmsf.gaussians.points import nearest_points
 
 LENGTHS = (0.05, 0.1, 0.2, 0.4, 0.8)
 """Lengths of the smooth kernels over the object's size, the diagonal of the box around it."""

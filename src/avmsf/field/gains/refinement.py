@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Complex128, Float, Float32, Float64, Int
 from torch import Tensor, nn
 
-from avmsf.field.gainfield import Gains, TrainableGains
+from avmsf.field.gain_field import Gains, TrainableGains
 from avmsf.field.gains.model import MixtureGains
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.phase import turned_like

@@ -7,7 +7,7 @@ the direction. Over a group of motions it is
 
     K_chi(x, x') = sum_g chi(g) k(x, g x') / |G|,
 
-one for each real character chi (`avmsf.scene.symmetrycharacters`). Which sign a mode has is left to the evidence. No
+one for each real character chi (`avmsf.symmetry.characters`). Which sign a mode has is left to the evidence. No
 object is exactly symmetric: a share p of k itself is added, (1 - p) K_chi + p k.
 """
 
@@ -20,7 +20,7 @@ from torch import Tensor
 
 from avmsf.field.gains.family import KernelFamily, Sites
 from avmsf.field.gains.positional import ThinPlate
-from avmsf.scene.symmetrycharacters import Group
+from avmsf.symmetry.characters import Group
 
 REMAINDERS = (0.1, 0.3)
 """Shares p of what is not symmetric."""

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Complex, Complex128, Float, Float64
 from torch import Tensor
 
-from avmsf.compiled import compiled
+from avmsf._utils.compiled import compiled
 from avmsf.modal.bank import ModalBank
 
 _DEPTH = 512

@@ -15,7 +15,7 @@ from avmsf.modal.extraction.esprit import SHORTEST, candidates
 from avmsf.modal.extraction.least_squares import refine
 from avmsf.modal.extraction.selection import Candidates, chance_ratio, merge, prune, select
 from avmsf.modal.extraction.stft import Lines
-from avmsf.modal.residual import noise_power
+from avmsf.modal.residual_noise import noise_power
 
 _EMPTY = ModalBank(torch.zeros(0, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
 _QUIET = 1e-12

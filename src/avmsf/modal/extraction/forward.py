@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from avmsf.compiled import compiled
+from avmsf._utils.compiled import compiled
 
 _DISTINCT = 1e-6
 """Part of a candidate's (sine, cosine) area that the chosen ones must leave for it to count as another mode."""

@@ -11,7 +11,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.finders import noise_at, noise_bins
 from avmsf.modal.extraction.least_squares import fit_gains
-from avmsf.modal.residual import noise_power
+from avmsf.modal.residual_noise import noise_power
 
 _CANDIDATES = 8
 """Highest peaks of the density among which a delay is chosen."""

@@ -36,8 +36,8 @@ from avmsf.modal.extraction.esprit import stable_orders
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.finders import noise_at, noise_bins
 from avmsf.modal.extraction.least_squares import NormalEquations
-from avmsf.modal.innerproducts import poles_of
-from avmsf.modal.residual import noise_power
+from avmsf.modal.inner_products import poles_of
+from avmsf.modal.residual_noise import noise_power
 
 _FALSE_MODES = 0.1
 """Expected number of wrong decisions in a capture, by each of the two tests: as for selection (`chance_ratio`)."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.forward import choose
 from avmsf.modal.extraction.least_squares import NormalEquations
-from avmsf.modal.innerproducts import gram, own_gram, poles_of, project
+from avmsf.modal.inner_products import gram, own_gram, poles_of, project
 
 _CHUNK, _SHARED = 120, 30
 """Candidates judged together, in order of frequency, and how many of them the next chunk judges again."""

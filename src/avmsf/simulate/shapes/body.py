@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float64, Int
 
 from avmsf.errors import SimulationError
+from avmsf.fem.solid import FLATTEST, Solid
 from avmsf.simulate.shapes.sheet import Sheet
-from avmsf.simulate.solid import FLATTEST, Solid
 
 
 class Body:

@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int
 
-from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
+from avmsf.fem.solid import Solid
+from avmsf.mesh.surface import Surface
 from avmsf.simulate.shapes.decor import glaze
 from avmsf.simulate.shapes.freeform import blob, dish
 from avmsf.simulate.shapes.handled import jug, mug, skillet
@@ -17,7 +18,6 @@ from avmsf.simulate.shapes.maker import Draft, Maker
 from avmsf.simulate.shapes.shape import Shape
 from avmsf.simulate.shapes.strips import bracket, platter, spoon, tray
 from avmsf.simulate.shapes.vessels import bell, bowl, fluted, goblet, plate, pot, tube
-from avmsf.simulate.solid import Solid
 
 _MAKERS: tuple[Maker, ...] = (
     bell, blob, bowl, bracket, dish, fluted, goblet, jug, mug, plate, platter, pot, skillet, spoon, tray, tube,

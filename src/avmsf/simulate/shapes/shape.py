@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from avmsf.capture.surface import Surface
-from avmsf.capture.texturedmesh import TexturedMesh
-from avmsf.simulate.solid import Solid
+from avmsf.fem.solid import Solid
+from avmsf.mesh.surface import Surface
+from avmsf.mesh.textured_mesh import TexturedMesh
 
 
 def _origin() -> Tensor:
@@ -60,6 +60,6 @@ class Shape:
 
 
 def textured(shape: Shape) -> TexturedMesh:
-    """Return a shape's surface in its colors, to render it with `avmsf.capture.meshviews.render_views`."""
+    """Return a shape's surface in its colors, to render it with `avmsf.photographs.mesh_views.render_views`."""
     faces = shape.surface.faces
     return TexturedMesh.build(shape.surface.vertices, faces, colors=shape.colors[faces])

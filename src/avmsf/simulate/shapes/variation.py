@@ -9,9 +9,9 @@ from jaxtyping import Float64, Int
 from scipy.sparse.linalg import splu
 
 from avmsf.errors import SimulationError
+from avmsf.fem.solid import Solid
 from avmsf.simulate.imperfections import smooth_field
 from avmsf.simulate.shapes.sheet import mitred_normals
-from avmsf.simulate.solid import Solid
 
 MOST = 0.5
 """Largest variation."""

@@ -1,0 +1,1 @@
+"""What fields are compared with: other systems' methods."""

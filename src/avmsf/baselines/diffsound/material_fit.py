@@ -1,0 +1,330 @@
+"""DiffSound's inverse problem: material and wall thickness from recorded clips.
+
+Jin et al. (DiffSound, SIGGRAPH 2024) predict one sound for all clips, the lowest 16 modes with the same amplitude, and
+move Young's modulus and Poisson's ratio by Adam until its spectra are those of the clips: first by optimal transport,
+then by differences (`avmsf.baselines.diffsound.losses`). Frequencies determine E / rho alone, not E.
+
+What is ours: `BodyFamily` in place of an eigenvalue problem every 15 steps; the thickness of walls; the parameters are
+log(E / rho), Poisson's ratio and log(thickness); steps are fewer and longer; differential evolution (Storn and Price,
+1997) then searches the whole range for a smaller difference; dampings are those of extracted modes.
+"""
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.optimize
+import torch
+from jaxtyping import Float, Float64
+from scipy.signal import butter, resample_poly, sosfilt
+from torch import Tensor
+
+from avmsf.baselines.diffsound.losses import ClipSpectra
+from avmsf.capture.impacts import Impacts
+from avmsf.errors import EvaluationError
+from avmsf.fem.body_family import BodyFamily
+from avmsf.fem.elastic_modes import ElasticModes
+from avmsf.fem.isotropic import IsotropicModes
+from avmsf.fem.material import MATERIALS, Material, material_named
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.synthesis import synthesize
+
+MODES = 16
+RATE = 32_000.0
+"""Sample rate at which clips are compared, Hz."""
+SAMPLES = 8_000
+CLIPS = 8
+"""Recordings that are compared at most, the first of them."""
+HIGH_PASS = 100.0
+"""Hz."""
+BAND = 20.0, 16_000.0
+"""Frequencies that are synthesized, Hz."""
+POISSON = 0.01, 0.499
+"""Range of Poisson's ratio."""
+_STIFFER = 10.0
+"""Largest factor on the stiffness of the material at the start, and its inverse."""
+_TRANSPORT_RATE, _DIFFERENCE_RATE = 1e-3, 2e-3
+_TRANSPORT_DECAY, _DIFFERENCE_DECAY = 0.9, 0.95
+"""Adam's rates, and their factor after each tenth and each twentieth of a stage."""
+_PUBLISHED_STEPS = 1000, 2000
+_LONGEST = 0.005
+"""Longest steps of a descent by differences: longer ones leave the basin that they start in."""
+_FASTEST_DECAY = 300.0
+"""Largest damping of modes that the damping curve is made of, 1/s."""
+_CURVE_STEP, _CURVE_END = 500.0, 20_000.0
+"""Width of the damping curve's bins, and the highest frequency, Hz."""
+_POPULATION = 20
+"""Places of the search for each parameter. By trial on a bent sheet: 40 places find the same."""
+_INSIDE = 1e-9
+"""Distance of a search's start from its bounds, over the distance between these."""
+_NEAR = 0.3, 0.1, 0.1
+"""Reach of the search around a thickness that was found: of log(E / rho), Poisson's ratio and log(thickness). Between
+two thicknesses that are computed, thickness is off by up to 9 % (the same sheet)."""
+_ROUNDS = 2
+"""Thicknesses that are computed as they are found, to search again near them."""
+
+
+@dataclass(frozen=True)
+class DiffSoundConfig:
+    """Settings of the fit of a material."""
+
+    material: str | None = None
+    """Initial material, by its name in the table of materials; None tries all."""
+    transport_steps: int = 12
+    """Steps by optimal transport, each with one clip; 1000, with all clips, in the published program."""
+    difference_steps: int = 100
+    """Steps by differences of spectra; 2000 in the published program."""
+    search: int = 60
+    """Generations of the following global search for a smaller difference, and half as many near a thickness that was
+    found; none in the published program."""
+
+    def __post_init__(self) -> None:
+        if self.material is not None:
+            material_named(self.material)
+        for name in ("transport_steps", "difference_steps", "search"):
+            if getattr(self, name) < 0:
+                raise EvaluationError.expected("0 or more", getattr(self, name), name=name)
+
+
+@dataclass(frozen=True)
+class MaterialFit:
+    """Fitted material and wall thickness of a body."""
+
+    stiffness: float
+    """E / rho, m2/s2."""
+    poisson: float
+    thickness: float | None
+    """Mean wall thickness, meters; None for a solid body."""
+    difference: float
+    """Value of the objective: the mean difference of spectra."""
+    body: IsotropicModes
+    """The body of that thickness."""
+
+    def modes(self) -> ElasticModes:
+        """Return the body's modes, of the fitted material with a density of 1 kg/m3, which sounds do not determine."""
+        return self.body.modes(Material("fitted", 1.0, self.stiffness, self.poisson, 0.0, 0.0))
+
+
+@dataclass(frozen=True)
+class DampingCurve:
+    """The lower envelope of dampings of free modes, by frequency."""
+
+    frequency: tuple[float, ...]
+    """Middles of the bins that hold a mode, Hz, ascending."""
+    damping: tuple[float, ...]
+    """Least damping in each, 1/s."""
+
+    @classmethod
+    def of(cls, bank: ModalBank) -> "DampingCurve":
+        """Return the curve of extracted modes. Raises EvaluationError where all die away in a few milliseconds."""
+        frequency, damping = (
+            bank.frequency.detach().cpu().double().numpy(),
+            bank.damping.detach().cpu().double().numpy(),
+        )
+        slow = (damping > 0.0) & (damping < _FASTEST_DECAY) & (frequency > BAND[0]) & (frequency < _CURVE_END)
+        if not slow.any():
+            raise EvaluationError(
+                f"expected a mode with a damping below {_FASTEST_DECAY:g} 1/s for DiffSound, got none of {len(bank)}",
+                name="damping",
+                value=len(bank),
+            )
+        bins = ((frequency[slow] - BAND[0]) // _CURVE_STEP).astype(int)
+        kept = np.unique(bins)
+        least = [float(damping[slow][bins == each].min()) for each in kept]
+        return cls(tuple(float(BAND[0] + (each + 0.5) * _CURVE_STEP) for each in kept), tuple(least))
+
+    def __call__(self, frequency: Float64[Tensor, " modes"]) -> Float64[Tensor, " modes"]:
+        """Return dampings, 1/s: linear between the bins, constant beyond the first and the last."""
+        found = np.interp(frequency.detach().cpu().numpy(), self.frequency, self.damping)
+        return torch.from_numpy(found).to(frequency)
+
+
+def clip_spectra(impacts: Impacts) -> ClipSpectra:
+    """Return the recordings as DiffSound compares them: .25 s at 32 kHz, without what is below 100 Hz, of peak 1.
+
+    Silent recordings are left out, and those after the first `CLIPS`. Raises EvaluationError where all are silent.
+    """
+    sounds = impacts.sounds.detach().cpu().double().numpy()
+    rates = int(RATE), round(impacts.sample_rate)
+    common = math.gcd(*rates)
+    kept = resample_poly(sounds, rates[0] // common, rates[1] // common, axis=1)[:, :SAMPLES]
+    kept = sosfilt(butter(2, HIGH_PASS, "highpass", fs=RATE, output="sos"), kept, axis=1)
+    kept = np.pad(kept, ((0, 0), (0, SAMPLES - kept.shape[1])))
+    peaks = np.abs(kept).max(axis=1)
+    if not (peaks > 0.0).any():
+        raise EvaluationError(
+            f"expected a recording with a sound, got {len(impacts)} silent ones ({', '.join(impacts.names[:3])}); "
+            "record the impacts again",
+            name="sounds",
+            value=0.0,
+        )
+    loud = peaks > 0.0
+    return ClipSpectra(torch.from_numpy((kept[loud] / peaks[loud, None])[:CLIPS]).float(), RATE)
+
+
+def predicted_sound(
+    frequency: Float64[Tensor, " modes"], damping: Float64[Tensor, " modes"]
+) -> tuple[Float[Tensor, " samples"], Float64[Tensor, " heard"]]:
+    """Return the sum of the modes with equal amplitudes, of peak 1, and the damped frequencies of those in the band.
+
+    `frequency` is undamped, Hz. Raises EvaluationError where no mode is in the band.
+    """
+    heard = damped_frequency(frequency, damping)
+    inside = (heard > BAND[0]) & (heard < BAND[1])
+    if not bool(inside.any()):
+        raise EvaluationError(f"expected modes from {BAND[0]:g} to {BAND[1]:g} Hz, got none", name="frequency", value=0)
+    ones = torch.ones(1, int(inside.sum()))
+    sound = synthesize(ones, heard[inside], damping[inside], samples=SAMPLES, sample_rate=RATE)[0]
+    return sound / sound.detach().abs().max(), heard[inside]
+
+
+def damped_frequency(
+    frequency: Float64[Tensor, " modes"], damping: Float64[Tensor, " modes"]
+) -> Float64[Tensor, " modes"]:
+    """Return what is heard of modes with undamped frequencies, Hz; 0 for those that do not oscillate."""
+    return (frequency.square() - (damping / (2.0 * math.pi)).square()).clamp_min(1e-12).sqrt()
+
+
+def fit_material(
+    spectra: ClipSpectra, curve: DampingCurve, family: BodyFamily, config: DiffSoundConfig | None = None
+) -> MaterialFit:
+    """Return the material and thickness whose modes sound most like the clips.
+
+    Raises EvaluationError for a body that has no mode in the band with any of the materials, as one whose mesh is in
+    another unit.
+    """
+    config = DiffSoundConfig() if config is None else config
+    starts = [material_named(config.material)] if config.material is not None else list(MATERIALS.values())
+    _expect_audible(family, starts)
+    problem = _Problem(spectra, curve, family, _bounds(starts, family))
+    tried = [_point(each, problem.bounds[:, 2].mean()) for each in starts]
+    best = problem.transported(min(tried, key=problem.loss), config.transport_steps)
+    best = problem.descended(best, config.difference_steps)
+    if config.search:
+        best = problem.searched(best, config.search)
+        for _ in range(_ROUNDS if family.walled else 0):
+            # Between thicknesses frequencies are interpolated; at one that is computed they are exact.
+            family = family.including(float(best[2].exp()))
+            problem = replace(problem, family=family, bounds=_around(best, problem.bounds))
+            best = problem.searched(best, config.search // 2)
+    thickness = float(best[2].exp()) if family.walled else family.thickness[0] if family.thickness else None
+    return MaterialFit(float(best[0].exp()), float(best[1]), thickness, problem.loss(best), family.at(thickness))
+
+
+def _point(material: Material, log_thickness: Float64[Tensor, ""]) -> Float64[Tensor, "3"]:
+    return torch.tensor(
+        [math.log(material.young / material.density), material.poisson, float(log_thickness)], dtype=torch.float64
+    )
+
+
+def _bounds(materials: Iterable[Material], family: BodyFamily) -> Float64[Tensor, "2 3"]:
+    """Return the least and the largest log(E / rho), Poisson's ratio and log(thickness)."""
+    stiffness = [each.young / each.density for each in materials]
+    walls = family.thickness if family.walled else (1.0, 1.0)
+    low = [math.log(min(stiffness) / _STIFFER), POISSON[0], math.log(walls[0])]
+    high = [math.log(max(stiffness) * _STIFFER), POISSON[1], math.log(walls[-1])]
+    return torch.tensor([low, high], dtype=torch.float64)
+
+
+def _around(point: Float64[Tensor, "3"], bounds: Float64[Tensor, "2 3"]) -> Float64[Tensor, "2 3"]:
+    reach = torch.tensor(_NEAR, dtype=torch.float64)
+    return torch.stack([torch.maximum(point - reach, bounds[0]), torch.minimum(point + reach, bounds[1])])
+
+
+_Loss = Callable[[Float64[Tensor, "3"], int], Float[Tensor, ""]]
+"""Of a point, at a step."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Clips, dampings and bodies. A point is log(E / rho), Poisson's ratio and log(thickness)."""
+
+    spectra: ClipSpectra
+    curve: DampingCurve
+    family: BodyFamily
+    bounds: Float64[Tensor, "2 3"]
+    """The least and the largest point."""
+
+    def sound(self, point: Float64[Tensor, "3"]) -> tuple[Float[Tensor, " samples"], Float64[Tensor, " heard"]]:
+        frequency = (point[0].exp() * self.family.squares(point[1], point[2])).sqrt() / (2.0 * math.pi)
+        return predicted_sound(frequency, self.curve(frequency))
+
+    def loss(self, point: Float64[Tensor, "3"]) -> float:
+        """Return the mean difference of spectra; infinite where nothing is heard."""
+        with torch.no_grad():
+            try:
+                return float(self.spectra.difference(self.sound(point)[0]))
+            except EvaluationError:
+                return math.inf
+
+    def transported(self, start: Float64[Tensor, "3"], steps: int) -> Float64[Tensor, "3"]:
+        """Return where a descent by optimal transport ends."""
+
+        def loss(point: Float64[Tensor, "3"], step: int) -> Float[Tensor, ""]:
+            sound, heard = self.sound(point)
+            return self.spectra.transport(sound, heard, row=step % len(self.spectra.clips))
+
+        rate = _TRANSPORT_RATE * _PUBLISHED_STEPS[0] / max(steps, 1)
+        return self._descend(start, loss, steps, rate=rate, decay=_TRANSPORT_DECAY ** (10.0 / max(steps, 1)))[0]
+
+    def descended(self, start: Float64[Tensor, "3"], steps: int) -> Float64[Tensor, "3"]:
+        """Return the best place on a descent by differences of spectra."""
+
+        def loss(point: Float64[Tensor, "3"], step: int) -> Float[Tensor, ""]:
+            return self.spectra.difference(self.sound(point)[0])
+
+        rate = min(_DIFFERENCE_RATE * _PUBLISHED_STEPS[1] / max(steps, 1), _LONGEST)
+        return self._descend(start, loss, steps, rate=rate, decay=_DIFFERENCE_DECAY ** (20.0 / max(steps, 1)))[1]
+
+    def searched(self, start: Float64[Tensor, "3"], generations: int) -> Float64[Tensor, "3"]:
+        """Return the place of the least difference within the bounds, as far as differential evolution finds it."""
+        # Just inside: scipy refuses a start on a bound that rounding puts outside.
+        low, high = self.bounds
+        inside = start.clamp(low + _INSIDE * (high - low), high - _INSIDE * (high - low))
+        found = scipy.optimize.differential_evolution(
+            lambda values: self.loss(torch.from_numpy(values)), self.bounds.T.numpy(), x0=inside.numpy(),
+            popsize=_POPULATION, maxiter=generations, polish=False, rng=0,
+        )  # fmt: skip
+        return torch.from_numpy(found.x)
+
+    def _descend(
+        self, start: Float64[Tensor, "3"], loss: _Loss, steps: int, *, rate: float, decay: float
+    ) -> tuple[Float64[Tensor, "3"], Float64[Tensor, "3"]]:
+        """Return where Adam ends, and the place on the way where the loss was least."""
+        point = start.clone().requires_grad_()
+        optimizer = torch.optim.Adam([point], lr=rate)
+        schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, decay)
+        least, kept = math.inf, start
+        for step in range(steps):
+            optimizer.zero_grad()
+            try:
+                value = loss(point, step)
+            except EvaluationError:
+                # All modes have left the band: the best place on the way remains.
+                return kept, kept
+            if float(value.detach()) < least:
+                least, kept = float(value.detach()), point.detach().clone()
+            torch.autograd.backward(value)
+            optimizer.step()
+            schedule.step()
+            with torch.no_grad():
+                point.clamp_(*self.bounds)
+        return point.detach(), kept
+
+
+def _expect_audible(family: BodyFamily, materials: Iterable[Material]) -> None:
+    """Raise EvaluationError where no material of the table gives the body a mode in the band."""
+    bodies = family.bodies
+    for material in materials:
+        for body in bodies:
+            frequency = body.modes(material).frequency
+            if bool(((frequency > BAND[0]) & (frequency < BAND[1])).any()):
+                return
+    lowest = float(bodies[0].modes(next(iter(materials))).frequency[0])
+    raise EvaluationError(
+        f"expected an object with modes from {BAND[0]:g} to {BAND[1]:g} Hz, got a lowest mode at {lowest:.3g} Hz; give "
+        "the mesh's unit",
+        name="frequency",
+        value=lowest,
+    )

@@ -1,0 +1,227 @@
+"""SonicGauss (Wang et al. 2025) as published, from a user's copy of its weights; needs the extra `text` (diffusers).
+
+The folder is the one that the project's download makes: `model.safetensors` (Oobleck autoencoder), `model_1` (Flux
+transformer with its pooled projection and duration), `model_2` (encoder of Gaussians), `model_3` (contact) and
+`model_4` (fusion). The text encoder and the decoder of Gaussians in these files are not used and not read.
+"""
+
+import hashlib
+import math
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from jaxtyping import Float
+from safetensors import SafetensorError, safe_open
+from torch import Tensor, nn
+
+from avmsf.baselines.sonicgauss.conditioning import CHANNELS, ContactEncoding, Fusion, Normalized
+from avmsf.baselines.sonicgauss.point_transformer import EncoderSizes, PointEncoder
+from avmsf.baselines.sonicgauss.tensors import expect_tensors
+from avmsf.errors import EvaluationError
+
+FRAMES: Final = 64
+"""Of latents, and tokens of Gaussians."""
+LONGEST = 2.98
+"""Seconds of the longest clip that the weights were trained on."""
+_UNUSED = ("text_encoder.", "feature_predictor.backbone.backbone.dec.", "feature_predictor.features_outputhead.")
+_DOWNLOAD = "hf download AiEson2/SonicGauss --local-dir FOLDER"
+
+
+@dataclass(frozen=True)
+class PublishedSizes:
+    """Sizes of all parts; the defaults are the published ones."""
+
+    encoder: EncoderSizes = field(default_factory=EncoderSizes)
+    width: int = 1024
+    """Of tokens."""
+    contact: tuple[int, ...] = (256, 512)
+    fusion_heads: int = 8
+    transformer: Mapping[str, Any] = field(
+        default_factory=lambda: (
+            {"num_layers": 3, "num_single_layers": 9, "attention_head_dim": 128}
+            | {"num_attention_heads": 4, "in_channels": 64, "axes_dims_rope": (16, 56, 56)}
+        )
+    )
+    """Of diffusers' FluxTransformer2DModel."""
+    autoencoder: Mapping[str, Any] = field(default_factory=dict)
+    """Of diffusers' AutoencoderOobleck, whose defaults are those of Stable Audio Open."""
+
+
+class _Fourier(nn.Module):
+    """A number, and its sines and cosines at random frequencies."""
+
+    def __init__(self, count: int = 128) -> None:
+        super().__init__()
+        self.weights = nn.Parameter(torch.randn(count))
+
+    def forward(self, values: Float[Tensor, " batch"]) -> Float[Tensor, "batch dim"]:
+        angles = values[:, None] * self.weights * 2.0 * math.pi
+        return torch.cat([values[:, None], angles.sin(), angles.cos()], dim=1)
+
+
+class _Duration(nn.Module):
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.time_positional_embedding = nn.Sequential(_Fourier(), nn.Linear(257, width))
+
+    def forward(self, seconds: Float[Tensor, " batch"]) -> Float[Tensor, "batch 1 width"]:
+        token: Tensor = self.time_positional_embedding(seconds.clamp(0.0, LONGEST) / LONGEST)
+        return token[:, None]
+
+
+class _Generator(nn.Module):
+    def __init__(self, sizes: PublishedSizes) -> None:
+        super().__init__()
+        width = sizes.width
+        self.fc = nn.Sequential(nn.Linear(width, width), nn.ReLU())
+        # The published name.
+        self.duration_emebdder = _Duration(width)
+        self.transformer = _diffusers()[1](
+            **sizes.transformer, joint_attention_dim=width, pooled_projection_dim=width, guidance_embeds=False
+        )
+
+
+class _GaussianEncoder(nn.Module):
+    def __init__(self, sizes: PublishedSizes) -> None:
+        super().__init__()
+        backbone = PointEncoder(CHANNELS, sizes.encoder)
+        self.feature_predictor = nn.ModuleDict({"backbone": nn.ModuleDict({"backbone": backbone})})
+        self.projection = nn.Linear(sizes.encoder.channels[-1], sizes.width)
+
+    def forward(self, seen: Normalized) -> Float[Tensor, "1 tokens width"]:
+        """Return 64 tokens: evenly thinned along the order of voxels, or continued by zeros."""
+        backbone = self.feature_predictor["backbone"]["backbone"]  # type: ignore[index]
+        device = self.projection.weight.device
+        tokens: Tensor = self.projection(backbone(seen.centers.to(device), seen.features.to(device)))
+        if len(tokens) > FRAMES:
+            tokens = tokens[torch.linspace(0, len(tokens) - 1, FRAMES).long()]
+        return torch.nn.functional.pad(tokens, (0, 0, 0, FRAMES - len(tokens)))[None]
+
+
+class PublishedSonicGauss(nn.Module):
+    """All parts of the published model."""
+
+    def __init__(self, sizes: PublishedSizes) -> None:
+        super().__init__()
+        self.sizes = sizes
+        with warnings.catch_warnings():
+            # Nothing that a user of this package could change.
+            warnings.filterwarnings("ignore", message="`torch.nn.utils.weight_norm` is deprecated")
+            self.autoencoder = _diffusers()[0](**sizes.autoencoder)
+        self.generator = _Generator(sizes)
+        self.gaussians = _GaussianEncoder(sizes)
+        self.contact = ContactEncoding(sizes.contact, sizes.width)
+        self.fusion = Fusion(sizes.width, sizes.fusion_heads)
+
+    @classmethod
+    def load(cls, folder: Path, sizes: PublishedSizes | None = None) -> "PublishedSonicGauss":
+        """Read the published files.
+
+        Raises EvaluationError where diffusers is missing, for a file that is missing or cannot be read, and for tensors
+        that are missing, of another shape, or of another model, the first of which it names.
+        """
+        model = cls(PublishedSizes() if sizes is None else sizes)
+        for name, part in model.files().items():
+            _load(part, folder / name)
+        return model.eval()
+
+    def files(self) -> dict[str, nn.Module]:
+        """Return which file holds the weights of which part."""
+        return {
+            "model.safetensors": self.autoencoder,
+            "model_1.safetensors": self.generator,
+            "model_2.safetensors": self.gaussians,
+            "model_3.safetensors": self.contact,
+            "model_4.safetensors": self.fusion,
+        }
+
+    def trained(self) -> list[nn.Parameter]:
+        """Return what is fine-tuned: all but the autoencoder and the duration."""
+        parts = (self.generator.transformer, self.generator.fc, self.gaussians, self.contact, self.fusion)
+        return [weight for part in parts for weight in part.parameters()]
+
+    def condition(
+        self, tokens: Float[Tensor, "1 tokens width"], places: Float[Tensor, "batch 3"]
+    ) -> Float[Tensor, "batch both width"]:
+        """Return the tokens of an object, as `gaussians` encodes it, and of contacts in its cube."""
+        fused: Tensor = self.fusion(tokens.expand(len(places), -1, -1), self.contact(places))
+        return fused
+
+    def velocity(
+        self,
+        latents: Float[Tensor, "batch frames channels"],
+        times: Float[Tensor, " batch"],
+        tokens: Float[Tensor, "batch both width"],
+        *,
+        seconds: float,
+        kept: Float[Tensor, "batch 1 1"] | None = None,
+    ) -> Float[Tensor, "batch frames channels"]:
+        """Return the velocity of latents of sounds that last `seconds`; tokens are multiplied by `kept`.
+
+        What is pooled of the tokens stays, as published.
+        """
+        pooled = self.generator.fc(tokens.mean(1))
+        duration = self.generator.duration_emebdder(times.new_full((len(times),), seconds))
+        states = torch.cat([tokens, duration], dim=1)
+        found: Tensor = self.generator.transformer(
+            hidden_states=latents,
+            timestep=times,
+            guidance=None,
+            pooled_projections=pooled,
+            encoder_hidden_states=states if kept is None else states * kept,
+            txt_ids=latents.new_zeros(states.shape[1], 3),
+            img_ids=torch.arange(latents.shape[1], device=latents.device)[:, None].expand(-1, 3).to(latents),
+            return_dict=False,
+        )[0]
+        return found
+
+
+def folder_digest(folder: Path) -> str:
+    """Return a digest of the names and sizes of a folder's weights and of the first and last mebibyte of each."""
+    digest = hashlib.sha256()
+    for path in sorted(folder.glob("*.safetensors")):
+        digest.update(f"{path.name}\0{path.stat().st_size}\0".encode())
+        with open(path, "rb") as file:
+            digest.update(file.read(1 << 20))
+            file.seek(max(0, path.stat().st_size - (1 << 20)))
+            digest.update(file.read())
+    return digest.hexdigest()[:16]
+
+
+def _load(part: nn.Module, path: Path) -> None:
+    state = part.state_dict()
+    try:
+        with safe_open(path, framework="pt") as file:
+            names = set(file.keys())
+            tensors = {name: file.get_tensor(name) for name in state if name in names}
+    except (SafetensorError, OSError) as error:
+        raise EvaluationError(
+            f"{path}: expected published weights of SonicGauss, got {error}; {_DOWNLOAD}", file=path
+        ) from error
+    expect_tensors(path, tensors, {name: tuple(each.shape) for name, each in state.items()})
+    unknown = sorted(name for name in names - state.keys() if not name.startswith(_UNUSED))
+    if unknown:
+        raise EvaluationError(
+            f"{path}: expected only tensors of the published model, got {unknown[0]} and {len(unknown) - 1} others; "
+            f"{_DOWNLOAD}",
+            file=path,
+            name=unknown[0],
+            value=tuple(unknown),
+        )
+    part.load_state_dict(tensors)
+
+
+def _diffusers() -> tuple[Any, Any]:
+    try:
+        from diffusers import AutoencoderOobleck, FluxTransformer2DModel
+    except (ImportError, RuntimeError) as error:
+        raise EvaluationError(
+            f"sonicgauss: expected the package diffusers, got {error}; pip install 'avmsf[text]', or take "
+            "sonicgauss-small",
+            name="diffusers",
+        ) from error
+    return AutoencoderOobleck, FluxTransformer2DModel

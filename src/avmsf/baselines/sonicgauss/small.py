@@ -1,0 +1,189 @@
+"""A small SonicGauss, trained from scratch: the published objective and conditioning, three million weights."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from avmsf._utils.files import write_whole
+from avmsf._utils.records import record_of
+from avmsf._utils.state import read_tensors
+from avmsf.baselines.sonicgauss.conditioning import (
+    CHANNELS,
+    ContactEncoding,
+    Fusion,
+    Normalized,
+    degree_one,
+    normalized,
+)
+from avmsf.baselines.sonicgauss.patches import CHANNELS as LATENTS
+from avmsf.baselines.sonicgauss.patches import PATCHES, VALUES, PatchCodec
+from avmsf.baselines.sonicgauss.tensors import expect_tensors
+from avmsf.errors import EvaluationError
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.points import farthest_points
+
+COMMAND = "python -m benchmarks baselines --parts sonicgauss-training --weights FILE"
+"""What makes the weights."""
+_KEY, _WHAT = "sonicgauss-small", "the weights of the small SonicGauss"
+_CODEC = ("mean", "components", "scale")
+
+
+@dataclass(frozen=True)
+class SmallConfig:
+    """Sizes of the network."""
+
+    width: int = 160
+    heads: int = 5
+    blocks: int = 5
+    """Of the generator."""
+    encoder_blocks: int = 2
+    """Of the encoder of Gaussians."""
+    tokens: int = 32
+    """Gaussian tokens; the fusion doubles them."""
+
+
+class SmallSonicGauss(nn.Module):
+    """Velocity of latents, given an object's Gaussians and a contact."""
+
+    mean: Tensor
+    deviation: Tensor
+
+    def __init__(self, config: SmallConfig) -> None:
+        super().__init__()
+        width = config.width
+        self.config = config
+        self.register_buffer("mean", torch.zeros(CHANNELS))
+        self.register_buffer("deviation", torch.ones(CHANNELS))
+        self.embedding = nn.Linear(CHANNELS, width)
+        layer = nn.TransformerEncoderLayer(
+            width, config.heads, 4 * width, dropout=0.0, activation="gelu", batch_first=True, norm_first=True
+        )
+        self.encoder = nn.TransformerEncoder(layer, config.encoder_blocks, enable_nested_tensor=False)
+        self.contact = ContactEncoding((64, 128), width)
+        self.fusion = Fusion(width, config.heads)
+        self.pooled = nn.Sequential(nn.Linear(width, width), nn.ReLU())
+        self.time = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
+        self.latents = nn.Linear(LATENTS, width)
+        self.position = nn.Parameter(0.02 * torch.randn(PATCHES, width))
+        self.blocks = nn.ModuleList(_Block(width, config.heads) for _ in range(config.blocks))
+        self.last = nn.LayerNorm(width, elementwise_affine=False)
+        self.modulation = nn.Linear(width, 2 * width)
+        self.output = nn.Linear(width, LATENTS)
+        for layer_of_zeros in (self.modulation, self.output):
+            nn.init.zeros_(layer_of_zeros.weight)
+            nn.init.zeros_(layer_of_zeros.bias)
+
+    def condition(
+        self, features: Float[Tensor, "batch tokens 23"], places: Float[Tensor, "batch 3"]
+    ) -> Float[Tensor, "batch both width"]:
+        """Return the tokens of objects and contacts."""
+        tokens = self.encoder(self.embedding((features - self.mean) / self.deviation))
+        fused: Tensor = self.fusion(tokens, self.contact(places))
+        return fused
+
+    def forward(
+        self,
+        latents: Float[Tensor, "batch patches channels"],
+        times: Float[Tensor, " batch"],
+        tokens: Float[Tensor, "batch both width"],
+    ) -> Float[Tensor, "batch patches channels"]:
+        """Return the velocity at latents and times, given what `condition` returns."""
+        rates = torch.exp(-math.log(1e4) * torch.arange(self.config.width // 2) / (self.config.width // 2))
+        angles = 1000.0 * times[:, None] * rates.to(times)
+        control = self.time(torch.cat([angles.sin(), angles.cos()], dim=1)) + self.pooled(tokens.mean(1))
+        state = torch.cat([tokens, self.latents(latents) + self.position], dim=1)
+        for block in self.blocks:
+            state = block(state, control)
+        shift, scale = self.modulation(torch.nn.functional.silu(control))[:, None].chunk(2, dim=-1)
+        velocity: Tensor = self.output(self.last(state[:, tokens.shape[1] :]) * (1 + scale) + shift)
+        return velocity
+
+
+class _Block(nn.Module):
+    """Attention and perceptron side by side, modulated by time and condition: a single-stream block of Flux."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm = nn.LayerNorm(width, elementwise_affine=False)
+        self.modulation = nn.Linear(width, 3 * width)
+        self.input = nn.Linear(width, 3 * width + 4 * width)
+        self.output = nn.Linear(width + 4 * width, width)
+        nn.init.zeros_(self.modulation.weight)
+        nn.init.zeros_(self.modulation.bias)
+
+    def forward(
+        self, state: Float[Tensor, "batch tokens width"], control: Float[Tensor, "batch width"]
+    ) -> Float[Tensor, "batch tokens width"]:
+        width = state.shape[-1]
+        shift, scale, gate = self.modulation(torch.nn.functional.silu(control))[:, None].chunk(3, dim=-1)
+        projected = self.input(self.norm(state) * (1 + scale) + shift)
+        query, key, value = (
+            each.unflatten(-1, (self.heads, -1)).transpose(1, 2)
+            for each in projected[..., : 3 * width].chunk(3, dim=-1)
+        )
+        attended = torch.nn.functional.scaled_dot_product_attention(query, key, value).transpose(1, 2).flatten(2)
+        hidden = torch.nn.functional.gelu(projected[..., 3 * width :], approximate="tanh")
+        return state + gate * self.output(torch.cat([attended, hidden], dim=-1))
+
+
+@dataclass(frozen=True, eq=False)
+class SmallWeights:
+    """What training has made."""
+
+    network: SmallSonicGauss
+    codec: PatchCodec
+    report: Mapping[str, Any]
+    """Objects, steps, seed, losses and seconds, as plain values."""
+
+    def write(self, path: Path) -> None:
+        """Write one safetensors file. Raises EvaluationError where that cannot be."""
+        tensors = {f"network.{name}": each.contiguous() for name, each in self.network.state_dict().items()}
+        tensors |= {f"codec.{name}": getattr(self.codec, name) for name in _CODEC}
+        text = json.dumps({"config": asdict(self.network.config), "report": dict(self.report)})
+        write_whole(path, lambda place: save_file(tensors, place, {_KEY: text}), raising=EvaluationError)
+
+    @classmethod
+    def read(cls, path: Path) -> "SmallWeights":
+        """Read what `write` has written. Raises EvaluationError for anything else, and names a tensor that differs."""
+        text, tensors = read_tensors(path, _KEY, what=_WHAT, advice=f"make it: {COMMAND}", raising=EvaluationError)
+        try:
+            content = json.loads(text)
+            network = SmallSonicGauss(record_of(SmallConfig(), content["config"], "config"))
+            report = dict(content["report"])
+        except (ValueError, TypeError, KeyError, RuntimeError) as error:
+            raise EvaluationError(
+                f"{path}: expected {_WHAT}, got another description ({error}); {COMMAND}", file=path, name=_KEY
+            ) from error
+        shapes = {f"network.{name}": tuple(each.shape) for name, each in network.state_dict().items()}
+        shapes |= {"codec.mean": (VALUES,), "codec.components": (VALUES, LATENTS), "codec.scale": (LATENTS,)}
+        expect_tensors(path, tensors, shapes)
+        network.load_state_dict({name: tensors[f"network.{name}"] for name in network.state_dict()})
+        codec = PatchCodec(*(tensors[f"codec.{name}"] for name in _CODEC))
+        return cls(network.eval(), codec, report)
+
+
+def visible(cloud: GaussianCloud) -> Normalized:
+    """Return an object's Gaussians in its unit cube. Raises EvaluationError where nothing can be seen of it."""
+    return normalized(cloud, degree_one(cloud))
+
+
+def object_tokens(found: Normalized, *, count: int) -> Float[Tensor, "tokens 23"]:
+    """Return an object's features, mean over the cells around `count` far-apart Gaussians.
+
+    A cell holds the Gaussians nearest to its own. Raises EvaluationError for fewer Gaussians than tokens.
+    """
+    centers = found.centers
+    start = int((centers - centers.mean(0)).norm(dim=1).argmax())
+    distances = torch.cdist(centers, centers[farthest_points(centers, count, start=start)])
+    cells = torch.nn.functional.one_hot(distances.argmin(1), count).to(found.features)
+    tokens: Tensor = (cells.T @ found.features) / cells.sum(0)[:, None].clamp(min=1.0)
+    return tokens

@@ -1,0 +1,120 @@
+"""What `avmsf info` prints and draws of Gaussians and features."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from matplotlib.figure import Figure
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from avmsf._utils.wording import counted
+from avmsf.cli.options.info import Options
+from avmsf.cli.printing import console, say
+from avmsf.cli.scenes import features_words
+from avmsf.errors import SceneError
+from avmsf.features.feature_field import GEOMETRY, FeatureField
+from avmsf.features.store import load_features, read_report
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.initialize import ZEROTH
+from avmsf.gaussians.ply import read_splats
+from avmsf.plotting.clouds import component_colors, draw_cloud, draw_features, save_turntable
+from avmsf.plotting.pictures import save_picture
+from avmsf.symmetry.symmetries import Symmetries
+
+_UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
+def describe_cloud(options: Options) -> dict[str, Any]:
+    """Print a description of Gaussians, draw them with --plots, and return their values."""
+    cloud = read_splats(options.file)
+    extent = (cloud.centers.amax(0) - cloud.centers.amin(0)).tolist()
+    screen = console(errors=options.json)
+    sides = " x ".join(f"{side:.3g}" for side in extent)
+    screen.print(f"{options.file}: {counted(len(cloud), 'Gaussian')}, {sides} m", soft_wrap=True)
+    if options.plots is not None:
+        _draw_cloud(cloud, options, options.plots)
+    return {"kind": "gaussians", "file": str(options.file), "count": len(cloud), "extent_meters": extent}
+
+
+def describe_features(options: Options) -> dict[str, Any]:
+    """Print a description of features, draw them with --plots, and return their values."""
+    features, report = load_features(options.file), read_report(options.file)
+    screen = console(errors=options.json)
+    count, dim = features.features.shape
+    screen.print(f"{options.file}: {dim} features of {features.encoder} on {count} points", soft_wrap=True)
+    if "encoder" in report:
+        screen.print(features_words(report), soft_wrap=True)
+    if options.plots is not None:
+        _draw_features(features, report, options, options.plots)
+    values = {"kind": "features", "file": str(options.file), "encoder": features.encoder, "points": count, "dim": dim}
+    return {**values, "report": report}
+
+
+def _draw_cloud(cloud: GaussianCloud, options: Options, folder: Path) -> None:
+    colors = plain_colors(cloud)
+    title = f"{options.file.name}: {counted(len(cloud), 'Gaussian')}"
+    _write(draw_cloud(cloud.centers, {"color": colors}, title=title, up=_UP[options.up]), folder / "cloud.png")
+    _turn(cloud.centers, colors, options.up, folder)
+
+
+def _draw_features(features: FeatureField, report: dict[str, Any], options: Options, folder: Path) -> None:
+    symmetries = Symmetries.from_dict(report["symmetries"]) if "symmetries" in report else None
+    shown = without_positions(features)
+    figure = draw_features(
+        shown,
+        title=f"{options.file.name}: {features.encoder} on {len(features.points)} points",
+        colors=None if options.cloud is None else _colors_of(options.cloud, features),
+        clusters=min(options.regions, len(features.points)),
+        symmetries=symmetries,
+        up=_UP[options.up],
+    )
+    _write(figure, folder / "features.png")
+    _turn(features.points, component_colors(shown.features), options.up, folder, symmetries=symmetries)
+
+
+def _colors_of(path: Path, features: FeatureField) -> Float[Tensor, "points 3"]:
+    """Return the colors of the Gaussians that the features lie on."""
+    cloud = read_splats(path)
+    apart, rows = cKDTree(cloud.centers.numpy()).query(features.points.numpy())
+    if apart.any():
+        raise SceneError(
+            f"{path}: expected the {len(features.points)} Gaussians of the features, got {len(cloud)} others; name the "
+            "file that the features were computed on",
+            file=path,
+            name="--cloud",
+            value=len(cloud),
+        )
+    return plain_colors(cloud.take(torch.from_numpy(rows)))
+
+
+def _turn(
+    points: Float[Tensor, "points 3"],
+    colors: Float[Tensor, "points 3"],
+    up: str,
+    folder: Path,
+    *,
+    symmetries: Symmetries | None = None,
+) -> None:
+    path = folder / "turntable.gif"
+    save_turntable(points, colors, path, symmetries=symmetries, up=_UP[up])
+    say(f"wrote {path}")
+
+
+def _write(picture: Figure, path: Path) -> None:
+    save_picture(picture, path)
+    say(f"wrote {path}")
+
+
+def without_positions(features: FeatureField) -> FeatureField:
+    """Return the features without the positions, which would outweigh them."""
+    if not features.encoder.startswith(f"{GEOMETRY} and "):
+        return features
+    return replace(features, features=features.features[:, 3:])
+
+
+def plain_colors(cloud: GaussianCloud) -> Float[Tensor, "points 3"]:
+    """Return the Gaussians' colors independent of the direction of view, 0 to 1."""
+    return (0.5 + ZEROTH * cloud.harmonics[:, 0]).clamp(0, 1).detach()

@@ -1,0 +1,135 @@
+"""Capture folders side by side in one folder, read as one dataset; a single capture is a collection of one."""
+
+from functools import cached_property
+from pathlib import Path
+
+import soundfile
+
+from avmsf.capture.filenames import PICTURE_SUFFIXES, find_surface_file
+from avmsf.capture.folder import Capture, read_capture
+from avmsf.capture.settings import CaptureSettings, settings_of
+from avmsf.capture.table import TABLE, read_rows, refuse_repeated_files, understand
+from avmsf.capture.together import common_rate
+from avmsf.datasets.dataset import DatasetReport, Look, ObjectFacts, ObjectReport
+from avmsf.datasets.numbering import in_order, refuse_unknown
+from avmsf.errors import CaptureError, DatasetError
+from avmsf.photographs.colmap import find_model
+
+_SEEN_IN = ("*.mp4", "*.mov", "*.m4v", "*.avi", "*.mkv", "*.webm", "splats.ply", "point_cloud.ply", "transforms.json")
+"""Files other than meshes, photographs and COLMAP's models that show what an object looks like."""
+
+
+class CaptureCollection:
+    """A folder of capture folders, or one capture folder.
+
+    Hidden folders are ignored, and so are folders without a table of impacts, which `check` names. An object has the
+    name of its folder. Sounds start where its settings say, unless `time_zero` does.
+    """
+
+    name = "captures"
+
+    def __init__(self, folder: str | Path, *, time_zero: str | None = None) -> None:
+        self.folder = Path(folder)
+        self._time_zero = time_zero
+
+    def objects(self) -> tuple[str, ...]:
+        """Return the names of all capture folders, by numbers where they begin with one, else by the alphabet."""
+        return tuple(self._folders)
+
+    def facts(self, identifier: str) -> ObjectFacts:
+        """Return what the capture is called. Raises DatasetError for an unknown one."""
+        folder = self._expect(identifier)
+        try:
+            return ObjectFacts(identifier, settings_of(folder).name or identifier)
+        except CaptureError:
+            # Settings that cannot be read are reported where they are needed.
+            return ObjectFacts(identifier, identifier)
+
+    def capture(self, identifier: str) -> Capture:
+        """Read one capture by `read_capture`. Raises DatasetError for an unknown or unreadable one."""
+        folder = self._expect(identifier)
+        try:
+            return read_capture(folder, settings_of(folder).starting(self._time_zero))
+        except CaptureError as error:
+            raise DatasetError(str(error), **error.attributes) from error
+
+    def look(self, identifier: str) -> Look | None:
+        """Return the capture's folder where there is anything in it to see. Raises DatasetError for an unknown one and
+        for settings that cannot be read."""
+        folder = self._expect(identifier)
+        try:
+            settings = settings_of(folder)
+            return Look(folder, settings) if _shows(folder, settings) else None
+        except CaptureError as error:
+            raise DatasetError(f"{folder}: {error}", **error.attributes) from error
+
+    def check(self) -> DatasetReport:
+        """Report what is present and what is missing, from tables and headers; `avmsf check` also reads sounds."""
+        reports = tuple(self._report(identifier) for identifier in self.objects())
+        known = set(self._folders.values())
+        others = in_order(path.name for path in _visible(self.folder) if path not in known and self.folder not in known)
+        remarks = (f"folders without {TABLE} are ignored: {', '.join(others)}",) if others else ()
+        return DatasetReport(self.name, reports, (), remarks)
+
+    @cached_property
+    def _folders(self) -> dict[str, Path]:
+        if (self.folder / TABLE).is_file():
+            return {self.folder.resolve().name: self.folder}
+        found = {path.name: path for path in _visible(self.folder) if (path / TABLE).is_file()}
+        return {name: found[name] for name in in_order(found)}
+
+    def _expect(self, identifier: str) -> Path:
+        if identifier not in self._folders:
+            refuse_unknown(identifier, self._folders, str(self.folder))
+        return self._folders[identifier]
+
+    def _report(self, identifier: str) -> ObjectReport:
+        folder = self._folders[identifier]
+        facts = self.facts(identifier)
+        problems, files, rates = [], [], []
+        try:
+            settings = settings_of(folder)
+            rows, _ = read_rows(folder)
+        except CaptureError as error:
+            return ObjectReport(facts, 0, (str(error),))
+        strikes = []
+        for row in rows:
+            try:
+                strikes.append(understand(row, settings))
+                header = soundfile.info(str(folder / strikes[-1].file))
+            except CaptureError as error:
+                problems.append(str(error))
+            except (soundfile.LibsndfileError, OSError):
+                there = (folder / strikes[-1].file).is_file()
+                got = "an unreadable one; export it again as wav" if there else "none; copy it there"
+                problems.append(f"{strikes[-1].file}: expected a sound file, got {got}")
+            else:
+                files.append(strikes[-1].file)
+                rates.append(float(header.samplerate))
+        try:
+            refuse_repeated_files(strikes)
+            if rates:
+                common_rate(rates, files)
+        except CaptureError as error:
+            problems.append(str(error))
+        surface = find_surface_file(folder, settings)
+        if surface is not None and not surface.is_file():
+            problems.append(f"{surface.name}: the surface of capture.toml is missing")
+        # One row that cannot be read makes `read_capture` refuse the folder.
+        return ObjectReport(facts, 0 if problems else len(files), tuple(problems))
+
+
+def _visible(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".")
+
+
+def _shows(folder: Path, settings: CaptureSettings) -> bool:
+    """Return whether there is anything in a capture folder that shows the object."""
+    surface = find_surface_file(folder, settings)
+    pictures = (folder / "images").rglob("*") if (folder / "images").is_dir() else folder.iterdir()
+    return (
+        (surface is not None and surface.is_file())
+        or any(path.suffix.lower() in PICTURE_SUFFIXES for path in pictures)
+        or any(next(folder.glob(pattern), None) for pattern in _SEEN_IN)
+        or find_model(folder) is not None
+    )

@@ -1,0 +1,167 @@
+"""From a dataset's recordings of one object to its capture, prepared as the files of a user's own folder are."""
+
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import soundfile
+import torch
+from jaxtyping import Float64
+
+from avmsf.capture.audio import Recording
+from avmsf.capture.folder import Capture
+from avmsf.capture.impacts import Impacts
+from avmsf.capture.measure import measure, shared_problems
+from avmsf.capture.placement import judge_placement, surface_points
+from avmsf.capture.prepare import prepare
+from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.starts import cut_together, shorten
+from avmsf.capture.together import common_rate
+from avmsf.errors import CaptureError, CaptureWarning, DatasetError
+from avmsf.mesh.surface import Surface
+
+FEWEST = 2
+_SHOWN = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Blow:
+    """One recording of a dataset, with what is known of the blow."""
+
+    name: str
+    """What the capture calls it."""
+    recording: Recording
+    contact: Float64[np.ndarray, " 3"]
+    """Object frame, meters."""
+    newtons: float | None = None
+    """Peak force, where it is known."""
+    gain_db: float = 0.0
+    """By how much the recorder made the sound louder, which is divided out."""
+
+
+def gather(
+    blows: Iterable[Blow],
+    *,
+    name: str,
+    origin: str,
+    settings: CaptureSettings,
+    surface: Surface | None = None,
+    remarks: Sequence[str] = (),
+    recorded: bool = True,
+) -> Capture:
+    """Prepare an object's blows one after the other, as `read_capture` does, and return the object's capture.
+
+    `blows` may be read as it is asked for: only what is kept stays in memory. A recording that cannot be used (silent,
+    too short after its impact) is left out. A `CaptureWarning` lists these, suspicious recordings, contacts off the
+    surface or with several impacts, and the `remarks`. Computed sounds, not `recorded`, are not searched for clipping,
+    noise and second impacts. Raises DatasetError, which names the `origin`, where fewer than two recordings
+    remain or they do not fit together, and where contacts and surface count different units.
+    """
+    kept: list[tuple[str, str, float, np.ndarray]] = []
+    recordings, reports, remarks = [], [], list(remarks)
+    try:
+        for blow in blows:
+            try:
+                prepared = prepare(blow.recording, settings, newtons=blow.newtons)
+            except CaptureError as error:
+                remarks.append(f"left out: {error}")
+                continue
+            if recorded:
+                # Clipping shows only before the amplifier's gain is divided out.
+                reports.append(measure(blow.recording, prepared, settings=settings, line=len(kept) + 1))
+            gain = 10 ** (-blow.gain_db / 20)
+            prepared = replace(prepared, sound=prepared.sound * gain, before=prepared.before * gain)
+            recordings.append(shorten(prepared, rate=blow.recording.sample_rate, settings=settings))
+            kept.append((blow.name, blow.recording.name, blow.recording.sample_rate, blow.contact))
+        remarks += shared_problems(reports)
+        refuse_few(len(kept), origin=origin, reasons=remarks)
+        names, files, rates, contacts = zip(*kept, strict=True)
+        rate = common_rate(rates, files)
+        cut = cut_together(recordings, files, rate=rate, settings=settings)
+    except CaptureError as error:
+        raise DatasetError(f"{origin}: {error}", **error.attributes) from error
+    forces = [each.newtons for each in recordings]
+    impacts = Impacts(
+        contacts=torch.from_numpy(np.stack(contacts).astype(np.float64)),
+        sounds=cut.sounds,
+        sample_rate=rate * settings.playback_speed,
+        names=names,
+        forces=None if None in forces else torch.tensor(forces, dtype=torch.float32),
+        before=cut.before,
+        after=cut.after,
+    )
+    remarks += [str(each) for each in cut.remarks] + _repeated(impacts) + _misplaced(impacts, surface, origin=origin)
+    if remarks:
+        warnings.warn(CaptureWarning(f"{origin}: {listed(remarks)}", name=origin, value=tuple(remarks)), stacklevel=3)
+    return Capture(name, impacts, surface)
+
+
+def refuse_few(count: int, *, origin: str, reasons: Sequence[str]) -> None:
+    """Raise DatasetError with the reasons where fewer than two recordings can be used."""
+    if count < FEWEST:
+        raise DatasetError.expected(
+            f"at least {FEWEST} usable recordings with contacts", count, name=origin, advice=listed(reasons)
+        )
+
+
+def judge_wav(path: Path, *, shown: str, rate: float, frames: int) -> DatasetError | None:
+    """Return the error of a sound file, from its header alone, whose message calls it `shown`; or None.
+
+    Expected is one channel of at least so many frames at the rate, Hz.
+    """
+    if not path.is_file():
+        return DatasetError(f"{shown}: expected a sound file, got none; unpack or download it again", file=path)
+    try:
+        header = soundfile.info(str(path))
+    except (soundfile.LibsndfileError, OSError) as error:
+        reason = getattr(error, "error_string", str(error)).strip().rstrip(".")
+        return DatasetError(f"{shown}: expected a sound file, got {reason!r}; unpack or download it again", file=path)
+    for name, found, expected in (
+        ("sample rate", header.samplerate, int(rate)),
+        ("number of channels", header.channels, 1),
+    ):
+        if found != expected:
+            return DatasetError(
+                f"{shown}: expected a {name} of {expected}, got {found}; take the published file",
+                file=path,
+                name=name,
+                value=found,
+            )
+    if header.frames < frames:
+        return DatasetError(
+            f"{shown}: expected {frames} frames, got {header.frames}; unpack or download it again",
+            file=path,
+            name="frames",
+            value=header.frames,
+        )
+    return None
+
+
+def listed(sentences: Sequence[str]) -> str:
+    """Return the first messages, and how many more there are."""
+    more = f"; and {len(sentences) - _SHOWN} more" if len(sentences) > _SHOWN else ""
+    return "; ".join(sentences[:_SHOWN]) + more
+
+
+def _repeated(impacts: Impacts) -> list[str]:
+    places: dict[tuple[float, ...], list[str]] = {}
+    for name, contact in zip(impacts.names, impacts.contacts.tolist(), strict=True):
+        places.setdefault(tuple(round(value, 6) for value in contact), []).append(name)
+    repeated = [", ".join(names) for names in places.values() if len(names) > 1]
+    return [f"impacts at the same contact: {' and '.join(repeated[:_SHOWN])}"] if repeated else []
+
+
+def _misplaced(impacts: Impacts, surface: Surface | None, *, origin: str) -> list[str]:
+    if surface is None:
+        return []
+    placement = judge_placement(impacts.contacts, surface_points(surface))
+    found = placement.describe(impacts.names)
+    if placement.other_unit:
+        raise DatasetError(
+            f"{origin}: expected contacts and surface in one unit; {found}",
+            name=origin,
+            value=placement.mistake.factor if placement.mistake else None,
+        )
+    return [found] if found else []

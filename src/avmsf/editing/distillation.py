@@ -1,0 +1,223 @@
+"""Targets from a text prompt: add noise to a sound, let a text-to-audio diffusion model denoise it.
+
+Noise level t from 0 to 1 turns latents z by the angle a = pi t / 2: z_t = cos(a) z + sin(a) noise. A deterministic
+(DDIM) step estimates the clean latents and the noise from z_t and puts them together again at a lower level; partial
+denoising starts at a random level in the middle, so that much of the rendered sound stays. No gradient passes through
+the model: the decoded result is a target like a recording.
+"""
+
+import math
+import warnings
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.editing.clips import lasting, levelled, resampled
+from avmsf.editing.config import DistillationConfig, expect_prompt
+from avmsf.editing.modal_edit import ModalEdit, Struck
+from avmsf.errors import AvmsfWarning, EditError
+
+
+@runtime_checkable
+class AudioDiffusion(Protocol):
+    """A frozen latent diffusion model from text to audio."""
+
+    @property
+    def name(self) -> str:
+        """Name in reports and checkpoints."""
+        ...
+
+    @property
+    def sample_rate(self) -> float:
+        """Of its waveforms, Hz."""
+        ...
+
+    @property
+    def channels(self) -> int:
+        """Of its waveforms: 2 for stereo."""
+        ...
+
+    @property
+    def device(self) -> torch.device:
+        """Where it computes."""
+        ...
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Precision of the denoiser."""
+        ...
+
+    def describe(self) -> dict[str, Any]:
+        """Return its weights, window and precision, which identify it, as plain values."""
+        ...
+
+    def encode(self, waveforms: Float[Tensor, "contacts channels samples"]) -> Float[Tensor, "contacts dim frames"]:
+        """Return float32 latents of waveforms, continued by silence to the length that the model works at."""
+        ...
+
+    def decode(
+        self, latents: Float[Tensor, "contacts dim frames"], *, samples: int
+    ) -> Float[Tensor, "contacts channels samples"]:
+        """Return the first `samples` samples of the waveforms of latents, float32."""
+        ...
+
+    def embed(self, prompt: str, negative: str | None, *, seconds: float) -> Any:
+        """Return the conditioning of `denoised`: a prompt for a sound of this duration.
+
+        `negative` is a text to move away from; None is no text.
+        """
+        ...
+
+    def denoised(
+        self,
+        latents: Float[Tensor, "contacts dim frames"],
+        level: Float[Tensor, " contacts"],
+        conditioning: Any,
+        *,
+        guidance: float,
+    ) -> Float[Tensor, "contacts dim frames"]:
+        """Return the clean latents that the model sees in noisy ones, float32 (see the module's text).
+
+        With classifier-free guidance g the estimate is u + g (c - u), c with the prompt and u with the negative one.
+        """
+        ...
+
+
+def noised(
+    clean: Float[Tensor, "contacts dim frames"],
+    noise: Float[Tensor, "contacts dim frames"],
+    level: Float[Tensor, " contacts"],
+) -> Float[Tensor, "contacts dim frames"]:
+    """Return cos(a) clean + sin(a) noise, a = pi level / 2."""
+    angle = (0.5 * math.pi * level)[:, None, None]
+    return torch.cos(angle) * clean + torch.sin(angle) * noise
+
+
+def partial_denoising(
+    model: AudioDiffusion,
+    noisy: Float[Tensor, "contacts dim frames"],
+    level: Float[Tensor, " contacts"],
+    conditioning: Any,
+    *,
+    steps: int,
+    guidance: float,
+) -> Float[Tensor, "contacts dim frames"]:
+    """Return clean latents by deterministic (DDIM) steps from `level`, one a contact, down to 0 in equal parts."""
+    clean = noisy
+    for step in range(steps):
+        above, below = level * (1 - step / steps), level * (1 - (step + 1) / steps)
+        angle = (0.5 * math.pi * above)[:, None, None]
+        clean = model.denoised(noisy, above, conditioning, guidance=guidance)
+        noisy = noised(clean, (noisy - torch.cos(angle) * clean) / torch.sin(angle), below)
+    return clean
+
+
+class DecoderDistillation:
+    """A guide towards a prompt (Audio-SDS's decoder variant with partial multi-step denoising)."""
+
+    def __init__(
+        self,
+        model: AudioDiffusion,
+        prompt: str,
+        *,
+        sample_rate: float,
+        negative: str | None = None,
+        config: DistillationConfig | None = None,
+    ) -> None:
+        """Set a prompt for sounds of `sample_rate` Hz, that of the field, and a negative prompt.
+
+        Raises `EditError` for an empty prompt.
+        """
+        self.model, self.prompt, self.negative = model, expect_prompt(prompt), negative
+        self.sample_rate = sample_rate
+        self.config = DistillationConfig() if config is None else config
+        self.batch = self.config.batch
+        self._conditioning: tuple[int, Any] | None = None
+
+    def describe(self) -> dict[str, Any]:
+        """Return its identifying settings, as plain values."""
+        return {
+            "prompt": self.prompt,
+            "negative": self.negative,
+            "model": self.model.name,
+            **self.model.describe(),
+            "guidance": self.config.guidance,
+            "denoising_steps": self.config.denoising,
+            "noise_levels": [self.config.lowest, self.config.highest],
+        }
+
+    def start(self, struck: Struck) -> ModalEdit:
+        """Return the field as it is: Audio-SDS starts from the object's own sound."""
+        return ModalEdit.none(struck.bank)
+
+    def targets(
+        self, sounds: Float[Tensor, "contacts samples"], step: int, generator: torch.Generator
+    ) -> Float[Tensor, "contacts samples"]:
+        """Return the model's denoised versions of rendered sounds, at their level; failed rows are not finite.
+
+        A batch that does not fit into the GPU's memory is halved, with a warning, for all later steps too. Raises
+        `EditError` where one sound does not fit, and for sounds too long for the model.
+        """
+        with torch.no_grad():
+            heard = resampled(sounds, sample_rate=self.sample_rate, wanted=self.model.sample_rate)
+            lowest, highest = self.config.lowest, self.config.highest
+            level = lowest + (highest - lowest) * torch.rand(len(sounds), generator=generator)
+            # One seed a sound, so that the noise depends neither on the batch nor on the device.
+            seeds = torch.randint(1 << 62, (len(sounds),), generator=generator).tolist()
+            made: list[Tensor] = []
+            while len(made) < len(sounds):
+                rows = slice(len(made), len(made) + self.batch)
+                try:
+                    made += self._cleaned(heard[rows], level[rows], seeds[rows]).unbind()
+                    continue
+                except torch.OutOfMemoryError as error:
+                    if self.batch == 1:
+                        raise EditError.expected(
+                            f"memory on {self.model.device} for one sound of {self.model.name}",
+                            1,
+                            got="too little",
+                            name="batch",
+                            advice="use fewer seconds, free memory, or choose the device cpu",
+                        ) from error
+                # Not before the error is gone: its traceback holds the tensors that filled the memory.
+                self._halve()
+            back = resampled(torch.stack(made), sample_rate=self.model.sample_rate, wanted=self.sample_rate)
+            return levelled(lasting(back.to(sounds), sounds.shape[1]), sounds, sample_rate=self.sample_rate)
+
+    def _cleaned(
+        self, heard: Float[Tensor, "batch heard"], level: Float[Tensor, " batch"], seeds: list[int]
+    ) -> Float[Tensor, "batch heard"]:
+        model, samples = self.model, heard.shape[1]
+        if self._conditioning is None or self._conditioning[0] != samples:
+            words = model.embed(self.prompt, self.negative, seconds=samples / model.sample_rate)
+            self._conditioning = (samples, words)
+        # The model was trained on audio at full scale: the peak becomes .5.
+        peak = heard.abs().amax(dim=1, keepdim=True).clamp_min(torch.finfo(heard.dtype).tiny)
+        waveforms = (0.5 * heard / peak)[:, None].expand(-1, model.channels, -1).to(model.device)
+        latents = model.encode(waveforms)
+        draws = [torch.randn(latents.shape[1:], generator=torch.Generator().manual_seed(seed)) for seed in seeds]
+        level = level.to(latents)
+        clean = partial_denoising(
+            model,
+            noised(latents, torch.stack(draws).to(latents), level),
+            level,
+            self._conditioning[1],
+            steps=self.config.denoising,
+            guidance=self.config.guidance,
+        )
+        return model.decode(clean, samples=samples).mean(dim=1).float().cpu()
+
+    def _halve(self) -> None:
+        self.batch //= 2
+        if self.model.device.type == "cuda":
+            torch.cuda.empty_cache()
+        warnings.warn(
+            AvmsfWarning(
+                f"{self.model.name}: out of memory on {self.model.device}; continuing with batches of {self.batch}",
+                name="batch",
+                value=self.batch,
+            ),
+            stacklevel=3,
+        )

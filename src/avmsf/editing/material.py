@@ -1,0 +1,155 @@
+"""The same shape in another material or size: what linear modal analysis says without a new solve.
+
+Where Poisson's ratio stays, stiffness goes as Young's modulus E and mass as the density r, so that the shapes of the
+modes stay. With the size times s, undamped angular frequencies become w' = w sqrt(E' / E) (r' / r)^(-1/2) / s, and
+mass-normalized shapes phi' = phi (r' / r)^(-1/2) s^(-3/2). With Rayleigh damping d = (alpha + beta w^2) / 2 a mode
+sounds at sqrt(w^2 - d^2) / 2 pi. What a blow moves at a place is the product of two shapes, over the damped angular
+frequency where that is a displacement.
+"""
+
+import math
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from avmsf._utils.wording import counted
+from avmsf.editing.edits import EDITS, edited, muted
+from avmsf.errors import EditError
+from avmsf.fem.material import Material, material_named
+from avmsf.field.sound_field import Origin, SoundField
+from avmsf.modal.bank import ModalBank
+
+
+@dataclass(frozen=True)
+class GainLaw:
+    """How gains follow frequencies and the body's mass: a' = a ((r' / r)^(-1) s^(-3))^mass (f / f')^frequency."""
+
+    name: str
+    mass: float
+    """Power of the mass, which all modes share: 1, or 0 where only their ratios count."""
+    frequency: float
+    """Power of the frequencies."""
+
+
+DISPLACEMENT = GainLaw("displacement", mass=1.0, frequency=1.0)
+"""The full law, for gains that are displacements: a' = a (r' / r)^(-1) s^(-3) f / f'."""
+VELOCITY = GainLaw("velocity", mass=1.0, frequency=0.0)
+"""The full law for gains that are velocities, as a laser vibrometer's are."""
+ACCELERATION = GainLaw("acceleration", mass=1.0, frequency=-1.0)
+"""The full law for gains that are accelerations, which what a microphone close by hears goes with."""
+RATIO_ONLY = GainLaw("ratio-only", mass=0.0, frequency=1.0)
+"""The paper's law, a' = a f / f', which leaves mass and size out."""
+LAWS = {law.name: law for law in (DISPLACEMENT, VELOCITY, ACCELERATION, RATIO_ONLY)}
+"""All of them, by name."""
+
+
+def change_material(
+    field: SoundField, old: Material | str, new: Material | str, *, size: float = 1.0, law: GainLaw = DISPLACEMENT
+) -> SoundField:
+    """Return the field of an object of the same shape, `size` times as large, in a new material.
+
+    Materials are given as such, or by their name in `avmsf.fem.material.MATERIALS`.
+    The dampings of the field are multiplied by the ratio of what the two materials' Rayleigh laws say, so that
+    each mode's deviation from the law (by supports and radiation) stays in proportion; the same material changes
+    nothing, and a third material in between gives the same result, unless it overdamps a mode.
+    Where neither material damps, dampings stay. Ratios of gains between places stay, the residual too. A place on the
+    new object is `size` times the old one's.
+
+    `origin.capture` becomes the old name with the new material, such as "mug, glass".
+    What was done is the last entry of `origin.report["edits"]`, with its remarks: modes that have moved to half the
+    sample rate or above, which are silent and come back with an edit that lowers them; modes that the new material
+    damps beyond the critical damping, which have no tone: they are mute from then on, and keep the frequency and the
+    damping that they had; and another Poisson's ratio, which changes shapes and takes a new solve.
+
+    Raises `EditError` for a size that is not positive, and where one of the materials has no damping and the other has,
+    and `SimulationError` for a name of no material.
+    """
+    old, new = (material_named(each) if isinstance(each, str) else each for each in (old, new))
+    _expect(old, new, size)
+    before, mute = field.bank, muted(field)
+    omega = torch.hypot(2.0 * math.pi * before.frequency, before.damping)
+    moved = omega * (math.sqrt(new.young / old.young) * math.sqrt(old.density / new.density) / size)
+    damping = before.damping * _rayleigh_ratio(omega, moved, old, new)
+    dead = (damping >= moved) & torch.isfinite(damping) & ~mute
+    # Without a tone a mode has no frequency that a bank could hold, and what is mute no place where it would be heard.
+    left = dead | mute
+    angular = torch.where(damping >= moved, moved, torch.sqrt((moved.square() - damping.square()).clamp_min(0.0)))
+    bank = ModalBank(
+        torch.where(left, before.frequency, angular / (2.0 * math.pi)), torch.where(left, before.damping, damping)
+    )
+    mass = (new.density / old.density) * size**3
+    scale = (before.frequency / bank.frequency) ** law.frequency / mass**law.mass
+    entry: dict[str, Any] = {
+        "edit": "change_material",
+        "from": asdict(old),
+        "to": asdict(new),
+        "size": float(size),
+        "law": law.name,
+        "overdamped_hertz": bank.frequency[dead].tolist(),
+        "remarks": _remarks(old, new, bank, dead),
+    }
+    changed = edited(field, bank, torch.where(left, 0.0, scale), entry=entry, length=size)
+    return replace(changed, origin=replace(changed.origin, capture=_name(field.origin, old, new)))
+
+
+def _name(origin: Origin, old: Material, new: Material) -> str:
+    """Return the object's name with its new material in place of the one of an earlier edit."""
+    if new.name == old.name:
+        return origin.capture
+    earlier = [edit["to"]["name"] for edit in origin.report.get(EDITS, []) if edit["edit"] == "change_material"]
+    base = origin.capture.removesuffix(f", {earlier[-1]}") if earlier else origin.capture
+    return f"{base}, {new.name}" if base else new.name
+
+
+def rayleigh_damping(omega: Float64[Tensor, " modes"], material: Material) -> Float64[Tensor, " modes"]:
+    """Return a material's own dampings, 1/s, at undamped angular frequencies: (alpha + beta w^2) / 2."""
+    return 0.5 * (material.alpha + material.beta * omega.square())
+
+
+def _rayleigh_ratio(
+    omega: Float64[Tensor, " modes"], moved: Float64[Tensor, " modes"], old: Material, new: Material
+) -> Float64[Tensor, " modes"]:
+    if not _damps(old):
+        return torch.ones_like(omega)
+    return rayleigh_damping(moved, new) / rayleigh_damping(omega, old)
+
+
+def _damps(material: Material) -> bool:
+    return material.alpha > 0 or material.beta > 0
+
+
+def _remarks(old: Material, new: Material, bank: ModalBank, dead: Bool[Tensor, " modes"]) -> list[str]:
+    """Return messages on neglected changes and overdamped modes."""
+    remarks = []
+    if new.poisson != old.poisson:
+        stiffer = math.sqrt((1.0 - old.poisson**2) / (1.0 - new.poisson**2)) - 1.0
+        remarks.append(
+            f"Poisson's ratio changes from {old.poisson:g} to {new.poisson:g}, which this law neglects: bending "
+            f"frequencies of a thin wall would change by about {100 * stiffer:+.1f} %, and the mode shapes slightly"
+        )
+    if bool(dead.any()):
+        remarks.append(
+            f"{int(dead.sum())} of {counted(len(bank), 'mode')} overdamped by alpha {new.alpha:g} 1/s and beta "
+            f"{new.beta:g} s, and silent: " + ", ".join(f"{each:.4g} Hz" for each in bank.frequency[dead].tolist())
+        )
+    return remarks
+
+
+def _expect(old: Material, new: Material, size: float) -> None:
+    if not 0.0 < size < math.inf:
+        raise EditError.expected("the ratio of new to old lengths, above 0, such as 1.5", size, name="size")
+    if _damps(old) and not _damps(new):
+        raise EditError(
+            f"new material {new.name}: expected alpha (1/s) or beta (s) above 0, got 0 and 0",
+            name="new",
+            value=(new.alpha, new.beta),
+        )
+    if _damps(new) and not _damps(old):
+        raise EditError(
+            f"old material {old.name}: expected alpha (1/s) or beta (s) above 0, as for {new.name}, got 0 and 0",
+            name="old",
+            value=(old.alpha, old.beta),
+        )

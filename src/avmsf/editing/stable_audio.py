@@ -1,0 +1,273 @@
+"""Stable Audio through diffusers (extra `text`): from the hub or its cache, or from a local folder.
+
+Its denoiser predicts v = cos(a) noise - sin(a) z from cos(a) z + sin(a) noise at the angle a = pi t / 2; diffusers'
+scheduler words the same with sigma = tan(a) in the latents z + sigma noise, and its preconditioning is used here, so
+that a pipeline with another scheduler of that family is taken at its word.
+"""
+
+import math
+import warnings
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from avmsf._utils.arrays import Seed, generator_of
+from avmsf._utils.device import usable_device
+from avmsf.editing.clips import lasting
+from avmsf.editing.config import STABLE_AUDIO, expect_prompt
+from avmsf.editing.stable_audio_files import digest, load_pipeline
+from avmsf.errors import EditError
+
+
+@dataclass(frozen=True, eq=False)
+class Conditioning:
+    """What the denoiser is told, without the words (or with the negative ones) and with them."""
+
+    text: Float[Tensor, "2 words dim"]
+    """Embedded words and times, for cross-attention."""
+    times: Float[Tensor, "2 1 twice"]
+    """Embedded start and end."""
+
+
+class StableAudio:
+    """A `StableAudioPipeline` as an `AudioDiffusion`: its autoencoder, text encoder and denoiser; all frozen."""
+
+    def __init__(self, pipeline: Any, *, name: str, seconds: float | None = None) -> None:
+        """Wrap a pipeline on whatever device it is.
+
+        `seconds` is how much the denoiser works at; None is all that it was trained on, 47 s for Stable Audio Open,
+        which costs in proportion. The autoencoder is only given what sounds. Raises `EditError` for more seconds than
+        the model has.
+        """
+        self.pipeline, self.name = pipeline, name
+        for part in (pipeline.vae, pipeline.text_encoder, pipeline.projection_model, pipeline.transformer):
+            part.eval().requires_grad_(False)
+        pipeline.set_progress_bar_config(disable=True)
+        self._hop = int(pipeline.vae.hop_length)
+        self._longest = int(pipeline.transformer.config.sample_size)
+        self._frames = self._longest if seconds is None else self._frames_of(seconds)
+        self._reach = _reach(pipeline.vae.config.downsampling_ratios)
+        self._silence: Float[Tensor, "1 dim 1"] | None = None
+
+    @classmethod
+    def load(
+        cls,
+        source: str | Path = STABLE_AUDIO,
+        *,
+        seconds: float | None = None,
+        device: str | torch.device | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> "StableAudio":
+        """Load a pipeline of the hub by name, or a folder that holds one.
+
+        On CUDA and in bfloat16 where there is a GPU, else on the CPU in float32, by default. Raises `EditError` where
+        diffusers is missing, where the model is neither here nor to be downloaded (its license has to be accepted
+        first), for a folder that holds another model or a part of one, and for a device that is not there or whose
+        memory does not hold the model.
+        """
+        place = usable_device(device, raising=EditError)
+        precision = dtype or (torch.bfloat16 if place.type == "cuda" else torch.float32)
+        pipeline, name = load_pipeline(source, precision)
+        try:
+            pipeline = pipeline.to(place)
+        except torch.OutOfMemoryError as error:
+            raise EditError.expected(
+                f"one with memory for {name}",
+                str(place),
+                name="device",
+                advice="free memory, or choose the device cpu",
+            ) from error
+        return cls(pipeline, name=name, seconds=seconds)
+
+    @property
+    def sample_rate(self) -> float:
+        """Of its waveforms, Hz."""
+        return float(self.pipeline.vae.config.sampling_rate)
+
+    @property
+    def channels(self) -> int:
+        """Of its waveforms."""
+        return int(self.pipeline.vae.config.audio_channels)
+
+    @property
+    def device(self) -> torch.device:
+        """Where it computes."""
+        return next(self._denoiser.parameters()).device
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Precision of the denoiser."""
+        return next(self._denoiser.parameters()).dtype
+
+    def describe(self) -> dict[str, Any]:
+        """Return a digest of its weights and configurations, the frames that it works at, and its precision."""
+        return {"weights_sha256": self._digest, "frames": self._frames, "precision": str(self.dtype)}
+
+    @cached_property
+    def _digest(self) -> str:
+        return digest(self.pipeline)
+
+    @property
+    def _denoiser(self) -> nn.Module:
+        denoiser: nn.Module = self.pipeline.transformer
+        return denoiser
+
+    def encode(self, waveforms: Float[Tensor, "contacts channels samples"]) -> Float[Tensor, "contacts dim frames"]:
+        """Return the means of the autoencoder's latents, continued by silence to the frames that are worked at."""
+        samples = waveforms.shape[2]
+        if samples > self._frames * self._hop:
+            raise EditError(
+                f"{self.name}: expected sounds of at most {self._frames * self._hop / self.sample_rate:.4g} s, got "
+                f"{samples / self.sample_rate:.4g} s; load the model with more seconds, or edit with fewer",
+                name="seconds",
+                value=samples / self.sample_rate,
+            )
+        # Beyond the reach of its filters the autoencoder hears silence alone, and says the same of all of it; as far
+        # from the end of what it is given, it would hear that end.
+        sounding = math.ceil(samples / self._hop) + self._reach
+        given = min(self._frames, sounding + self._reach)
+        rows = lasting(waveforms.flatten(0, 1), given * self._hop).reshape(*waveforms.shape[:2], -1)
+        latents = self._encoded(rows)
+        if given == self._frames:
+            return latents
+        silence = self._silent_latent().expand(len(latents), -1, self._frames - sounding)
+        return torch.cat([latents[:, :, :sounding], silence], dim=2)
+
+    def decode(
+        self, latents: Float[Tensor, "contacts dim frames"], *, samples: int
+    ) -> Float[Tensor, "contacts channels samples"]:
+        """Return the beginning of the latents' waveforms; what cannot reach it is not decoded."""
+        frames = math.ceil(samples / self._hop) + self._reach
+        with torch.no_grad():
+            decoded: Tensor = self.pipeline.vae.decode(latents[:, :, :frames].float()).sample
+        return decoded[:, :, :samples]
+
+    def embed(self, prompt: str, negative: str | None, *, seconds: float) -> Conditioning:
+        """Return the embedding of a prompt, for a sound that starts at 0 and lasts `seconds`."""
+        pipeline, device = self.pipeline, self.device
+        with torch.no_grad():
+            words = pipeline.encode_prompt(prompt, device, negative is not None, negative)
+            times = pipeline.encode_duration(0.0, seconds, device, False, 1)
+            parts = [torch.cat([each, *times], dim=1) for each in words.split(1)]
+        # Without negative words the denoiser is told nothing, the times of the cross-attention included.
+        without, told = parts if negative is not None else (torch.zeros_like(parts[0]), parts[0])
+        both = torch.cat(times, dim=2)
+        return Conditioning(torch.cat([without, told]), torch.cat([both, both]))
+
+    def denoised(
+        self,
+        latents: Float[Tensor, "contacts dim frames"],
+        level: Float[Tensor, " contacts"],
+        conditioning: Conditioning,
+        *,
+        guidance: float,
+    ) -> Float[Tensor, "contacts dim frames"]:
+        """Return the clean latents that the model sees in noisy ones."""
+        from diffusers.models.embeddings import get_1d_rotary_pos_embed
+
+        scheduler, count = self.pipeline.scheduler, len(latents)
+        angle = (0.5 * math.pi * level)[:, None, None]
+        sigma = torch.tan(angle)
+        noisy = latents / torch.cos(angle)
+        taken = [1] if guidance == 1.0 else [0, 1]
+        rows = torch.tensor(taken, device=latents.device).repeat_interleave(count)
+        rotary = get_1d_rotary_pos_embed(
+            self.pipeline.rotary_embed_dim,
+            latents.shape[2] + conditioning.times.shape[1],
+            use_real=True,
+            repeat_interleave_real=False,
+        )
+        with torch.no_grad():
+            predicted = self._denoiser(
+                scheduler.precondition_inputs(noisy, sigma).repeat(len(taken), 1, 1).to(self.dtype),
+                scheduler.precondition_noise(sigma).flatten().repeat(len(taken)),
+                encoder_hidden_states=conditioning.text[rows],
+                global_hidden_states=conditioning.times[rows],
+                rotary_embedding=tuple(each.to(latents.device) for each in rotary),
+                return_dict=False,
+            )[0].float()
+        parts = predicted.reshape(len(taken), *latents.shape)
+        guided = parts[0] if len(taken) == 1 else parts[0] + guidance * (parts[1] - parts[0])
+        clean: Tensor = scheduler.precondition_outputs(noisy, guided, sigma)
+        return clean
+
+    def generate(
+        self,
+        prompt: str,
+        *,
+        seconds: float,
+        seed: Seed = None,
+        negative: str | None = None,
+        steps: int = 100,
+        guidance: float = 7.0,
+    ) -> Float[Tensor, " samples"]:
+        """Return a sound generated from a prompt alone, mono at the model's rate, by the pipeline's own sampler.
+
+        Without a `seed` it is that of the seed 0.
+
+        Raises `EditError` for an empty prompt, more seconds than the model has, and where memory runs out.
+        """
+        words = expect_prompt(prompt)
+        self._frames_of(seconds)
+        try:
+            latents = self._sampled(words, seconds, seed, negative=negative, steps=steps, guidance=guidance)
+            return self.decode(latents, samples=round(seconds * self.sample_rate))[0].mean(dim=0).cpu()
+        except torch.OutOfMemoryError as error:
+            raise EditError.expected(
+                f"one with memory for a sound of {self.name}",
+                str(self.device),
+                name="device",
+                advice="free memory, or choose the device cpu",
+            ) from error
+
+    def _sampled(
+        self, words: str, seconds: float, seed: Seed, *, negative: str | None, steps: int, guidance: float
+    ) -> Float[Tensor, "1 dim frames"]:
+        """Return the latents that the pipeline makes of words."""
+        with warnings.catch_warnings():
+            # Its schedule ends at 500 in float32, a last digit beyond what the sampler's noise was made for.
+            warnings.filterwarnings("ignore", message="Should have t[ab]")
+            # Latents, for the pipeline would give the autoencoder the denoiser's precision.
+            latents: Tensor = self.pipeline(
+                words,
+                audio_end_in_s=seconds,
+                negative_prompt=negative,
+                num_inference_steps=steps,
+                guidance_scale=guidance,
+                generator=generator_of(seed),
+                output_type="latent",
+            ).audios
+        return latents
+
+    def _frames_of(self, seconds: float) -> int:
+        """Return how many frames hold a length of time. Raises `EditError` for more than the model has."""
+        longest = self._longest * self._hop / self.sample_rate
+        if not 0 < seconds <= longest:
+            raise EditError.expected(f"more than 0 and at most {longest:.4g} for {self.name}", seconds, name="seconds")
+        return math.ceil(seconds * self.sample_rate / self._hop)
+
+    def _encoded(self, waveforms: Float[Tensor, "contacts channels samples"]) -> Float[Tensor, "contacts dim frames"]:
+        with torch.no_grad():
+            latents: Tensor = self.pipeline.vae.encode(waveforms.to(self.device).float()).latent_dist.mode()
+        return latents
+
+    def _silent_latent(self) -> Float[Tensor, "1 dim 1"]:
+        if self._silence is None:
+            silence = torch.zeros(1, self.channels, (2 * self._reach + 1) * self._hop)
+            self._silence = self._encoded(silence)[:, :, self._reach : self._reach + 1]
+        return self._silence
+
+
+def _reach(strides: list[int]) -> int:
+    """Return how many frames to each side the autoencoder's filters see at most.
+
+    Each level has three residual filters of 7 taps, dilated by 1, 3 and 9, at the rate above its stride, and one as
+    wide as its stride; at the ends are filters of at most 7 taps, at the waveform's rate and at the frames'.
+    """
+    rates = [math.prod(strides[:level]) for level in range(len(strides) + 1)]
+    return math.ceil((3 + sum(39 * rate for rate in rates[:-1]) + sum(rates[1:]) + 3 * rates[-1]) / rates[-1])

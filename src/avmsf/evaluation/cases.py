@@ -1,0 +1,277 @@
+"""Splits of an object's contacts into training and test contacts, as data.
+
+Contacts are chosen and counted, not recordings: all recordings at a contact are either training or test recordings. A
+test at a training contact would be too easy.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
+
+from jaxtyping import Float64
+from torch import Tensor
+
+from avmsf._utils.wording import counted
+from avmsf.capture.impacts import Impacts
+from avmsf.capture.places import rows_by_place
+from avmsf.errors import EvaluationError
+from avmsf.gaussians.points import closest_points, farthest_points
+
+COUNTS = (3, 4, 6, 8, 12, 16, 24, 32, 48)
+"""Default numbers of training contacts."""
+_LEFT = 0.25
+"""Fraction of the contacts to test on with the default numbers."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One choice of training and test impacts, by their rows in an object's `Impacts`."""
+
+    label: str
+    """Heading in tables; the cases of one label are folds of one experiment, and their values are pooled."""
+    train: tuple[int, ...]
+    """Indices of training recordings, in the order of their choice."""
+    test: tuple[int, ...]
+    """Indices of test recordings, ascending."""
+    fold: str = ""
+    """Fold of the experiment, where it has several."""
+    views: int | None = None
+    """Maximum number of views for visual features; None for all."""
+
+    @property
+    def key(self) -> str:
+        """Unique name among the cases of the object."""
+        return f"{self.label}: {self.fold}" if self.fold else self.label
+
+
+@runtime_checkable
+class Choosing(Protocol):
+    """A choice of training contacts, with all recordings there."""
+
+    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
+        """Return the cases of an object. Raises EvaluationError for too few contacts."""
+        ...
+
+
+@dataclass(frozen=True)
+class Farthest:
+    """Training contacts by farthest-point sampling, from the first one on (paper, section 4.1)."""
+
+    fraction: float = 0.2
+    """Fraction of the contacts to train on, at least 2 contacts."""
+
+    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
+        """Return the one case, the same as that of `avmsf.evaluation.splits.split`."""
+        places = Places.of(impacts)
+        wanted = places.expect_part(self.fraction)
+        return (places.case("farthest", farthest_points(places.contacts, wanted)),)
+
+
+@dataclass(frozen=True)
+class Closest:
+    """Training contacts in one region: the first contact and those nearest to it (paper, supplement)."""
+
+    fraction: float = 0.2
+    """Fraction of the contacts to train on, at least 2 contacts."""
+
+    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
+        """Return the one case."""
+        places = Places.of(impacts)
+        wanted = places.expect_part(self.fraction)
+        return (places.case("closest", closest_points(places.contacts, wanted)),)
+
+
+@dataclass(frozen=True)
+class Predefined:
+    """Test recordings by their names; all others are for training, but for those at contacts of the test recordings."""
+
+    test: tuple[str, ...] = ()
+    """Names of test recordings."""
+
+    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
+        """Return the one case. Raises EvaluationError for a name that no recording has."""
+        unknown = sorted(set(self.test) - set(impacts.names))
+        if unknown:
+            raise EvaluationError.expected(
+                f"names of {counted(len(impacts.names), 'recording')}, {impacts.names[0]} to {impacts.names[-1]}",
+                unknown[0],
+                name="test",
+            )
+        places, tested = Places.of(impacts), {row for row, name in enumerate(impacts.names) if name in self.test}
+        chosen = [place for place, rows in enumerate(places.rows) if tested.isdisjoint(rows)]
+        places.expect(len(chosen))
+        case = places.case("predefined", chosen)
+        return (replace(case, test=tuple(sorted(tested))),)
+
+
+@dataclass(frozen=True)
+class LeaveOneOut:
+    """Every contact is tested once, after training on all others."""
+
+    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
+        """Return a case for each contact, named by its first recording."""
+        places = Places.of(impacts)
+        count = len(places.rows)
+        places.expect(count - 1)
+        return tuple(
+            places.case("leave-one-out", (place for place in range(count) if place != left), fold=impacts.names[row[0]])
+            for left, row in enumerate(places.rows)
+        )
+
+
+@dataclass(frozen=True)
+class Shots:
+    """Nested subsets of training contacts, all with the same test contacts."""
+
+    counts: tuple[int, ...] = (16, 8, 4, 2, 1)
+    """Numbers of training contacts; those that would leave no test contact are omitted."""
+
+    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
+        """Return a case for each number; the test contacts are those left by the largest."""
+        places = Places.of(impacts)
+        counts = [count for count in self.counts if count < len(places.rows)] or [places.expect(min(self.counts))]
+        order = farthest_points(places.contacts, max(counts)).tolist()
+        test = places.case("", order).test
+        cases = [places.case(f"{count} shots" if count > 1 else "1 shot", order[:count]) for count in counts]
+        return tuple(Case(case.label, case.train, test) for case in cases)
+
+
+@dataclass(frozen=True)
+class Growing:
+    """Growing subsets of training contacts by farthest-point sampling, from several first contacts.
+
+    The subsets of one start are nested, and have the same test contacts: those left by the largest.
+    """
+
+    counts: tuple[int, ...] = ()
+    """Numbers of training contacts; by default those of `COUNTS` that leave a quarter of the contacts."""
+    starts: int = 3
+    """Number of first contacts, evenly spaced in the table."""
+
+    def __post_init__(self) -> None:
+        if any(count < 1 for count in self.counts):
+            raise EvaluationError(
+                f"expected numbers of contacts of 1 or more, got {list(self.counts)}",
+                name="counts",
+                value=list(self.counts),
+            )
+        if self.starts < 1:
+            raise EvaluationError(f"expected 1 start or more, got {self.starts}", name="starts", value=self.starts)
+
+    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
+        """Return a case for each start and number. Raises EvaluationError for a number that leaves no test contact."""
+        places = Places.of(impacts)
+        total = len(places.rows)
+        counts = self._counts(total)
+        firsts = dict.fromkeys(round(number * total / self.starts) for number in range(self.starts))
+        orders = {first: farthest_points(places.contacts, max(counts), start=first).tolist() for first in firsts}
+        tests = {first: places.case("", order).test for first, order in orders.items()}
+        return tuple(
+            Case(
+                label_of(count),
+                places.case("", order[:count]).train,
+                tests[first],
+                fold=f"from {impacts.names[places.rows[first][0]]}",
+            )
+            for count in counts
+            for first, order in orders.items()
+        )
+
+    def _counts(self, places: int) -> tuple[int, ...]:
+        if not self.counts:
+            counts = tuple(count for count in COUNTS if count <= (1.0 - _LEFT) * places)
+            if counts:
+                return counts
+            raise EvaluationError(
+                f"expected more contacts than {places} to train on {min(COUNTS)} and test on a quarter; record more, "
+                "or give the numbers of contacts",
+                name="contacts",
+                value=places,
+            )
+        if max(self.counts) >= places:
+            raise EvaluationError(
+                f"expected at most {places - 1} of {places} contacts to train on, got {max(self.counts)}",
+                name="counts",
+                value=max(self.counts),
+            )
+        return tuple(sorted(set(self.counts)))
+
+
+def label_of(count: int) -> str:
+    """Return the label of a number of contacts."""
+    return counted(count, "place")
+
+
+@dataclass(frozen=True)
+class FewerViews:
+    """The same training contacts, with all views of the object and with fewer."""
+
+    counts: tuple[int | None, ...] = (None, 12)
+    """Numbers of views; None is all."""
+    choosing: Choosing = Farthest()
+    """How training contacts are chosen."""
+
+    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
+        """Return the cases of `choosing`, once for each number of views."""
+        return tuple(
+            Case("all views" if views is None else f"{views} views", case.train, case.test, case.fold, views)
+            for views in self.counts
+            for case in self.choosing.cases(impacts)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """The distinct contacts of an object, by `places_of`, in the order of their first recordings.
+
+    Repeated recordings are of one contact even if its position was measured each time.
+    """
+
+    contacts: Float64[Tensor, "places 3"]
+    """Position of the first recording at each, meters."""
+    rows: tuple[tuple[int, ...], ...]
+    """Indices of the recordings at each."""
+
+    @classmethod
+    def of(cls, impacts: Impacts) -> "Places":
+        """Find the distinct contacts of an object's impacts."""
+        rows = rows_by_place(impacts.contacts)
+        return cls(impacts.contacts.double()[[each[0] for each in rows]], rows)
+
+    @property
+    def recordings(self) -> int:
+        """Number of recordings at all contacts."""
+        return sum(map(len, self.rows))
+
+    def number_of(self, row: int) -> int:
+        """Return the contact of a recording. Raises EvaluationError for an index out of range."""
+        for place, rows in enumerate(self.rows):
+            if row in rows:
+                return place
+        raise EvaluationError(
+            f"expected the index of a recording, 0 to {self.recordings - 1}, got {row}", name="start", value=row
+        )
+
+    def expect(self, wanted: int, *, least: int = 1) -> int:
+        """Return `wanted`, or raise EvaluationError for fewer training contacts than `least` or no test contact."""
+        if not least <= wanted < len(self.rows):
+            raise EvaluationError(
+                f"expected {least} to {len(self.rows) - 1} training contacts of "
+                f"{counted(self.recordings, 'recording')} at {counted(len(self.rows), 'contact')}, got {wanted}; "
+                "choose another number or record more contacts",
+                name="count",
+                value=wanted,
+            )
+        return wanted
+
+    def expect_part(self, fraction: float) -> int:
+        """Return the number of a fraction of the contacts, at least 2. Raises EvaluationError as `expect`."""
+        return self.expect(max(2, round(fraction * len(self.rows))), least=2)
+
+    def case(self, label: str, chosen: Iterable[int] | Tensor, *, fold: str = "") -> Case:
+        """Return the case that trains on the chosen contacts: first recordings first, then the repeated ones."""
+        taken = [self.rows[int(place)] for place in chosen]
+        train = [rows[0] for rows in taken] + sorted(row for rows in taken for row in rows[1:])
+        heard = set(train)
+        test = tuple(row for row in range(self.recordings) if row not in heard)
+        return Case(label, tuple(train), test, fold)

@@ -1,0 +1,241 @@
+"""How far rendered sounds are from recorded ones.
+
+Conventions. `predicted` and `truth` are sounds [contacts, samples] of one sample rate and one unit, row for row the
+same contact; nothing is aligned, scaled or trimmed. Every metric is zero for equal sounds, lower is better, and it
+returns one value a contact, in float64: their mean is the score, and their standard deviation gives its standard
+error. Every metric calls `validate` first, which raises EvaluationError with the row at fault.
+
+- `relative_stft_error`: differences of STFT magnitudes in proportion to the truth's. Free of unit and level: 0 is
+  perfect, 1 is silence. The measure that objects and methods are compared by here.
+- `spectrogram_distance` (L1), `log_mel_distance` (L1-log) and `envelope_distance` (ENV): the paper's three.
+- `objectfolder_distance`: the ObjectFolder benchmark's spectrogram distance.
+
+CDPAM is in `avmsf.evaluation.cdpam`; modes are compared with true ones in `avmsf.evaluation.modal_metrics`, positions
+with true ones in `avmsf.evaluation.localization`. A `Convention` (`conventions`) names the parameters of each.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+
+import numpy as np
+import scipy
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from avmsf.errors import EvaluationError
+from avmsf.modal.config import scaled_fft_size
+from avmsf.modal.spectra import envelope, htk_filters, log_mel, magnitude_stft, slaney_filters
+
+# `validate` reports shapes that differ, so the annotations leave them open.
+Sounds = Float[Tensor, "..."]
+PerContact = Float64[Tensor, " contacts"]
+
+_BLOCK = 16
+"""Sounds compared at a time: bounds the memory that their spectrograms take."""
+
+
+def validate(
+    predicted: Sounds,
+    truth: Sounds,
+    *,
+    names: Sequence[str] | None = None,
+    sample_rates: tuple[float, float] | None = None,
+) -> None:
+    """Raise EvaluationError unless both are [contacts, samples] of one shape, not empty, and finite throughout.
+
+    The message names a row by `names`, or else by its index. Where both sample rates are given (Hz, predicted and
+    true) they have to be equal.
+    """
+    if sample_rates is not None and sample_rates[0] != sample_rates[1]:
+        raise EvaluationError(
+            f"expected predicted sounds at the true ones' {sample_rates[1]:g} Hz, got {sample_rates[0]:g} Hz; resample "
+            "one of them",
+            name="sample_rates",
+            value=sample_rates,
+        )
+    for what, sounds in (("predicted", predicted), ("truth", truth)):
+        _expect_rows(sounds, what)
+    if len(predicted) != len(truth):
+        raise EvaluationError(
+            f"expected one predicted sound for each of {len(truth)} true ones, got {len(predicted)}",
+            name="predicted",
+            value=len(predicted),
+        )
+    if predicted.shape[1] != truth.shape[1]:
+        raise EvaluationError(
+            f"expected predicted sounds of {truth.shape[1]} samples as the true ones, got {predicted.shape[1]}; check "
+            "sample rates and durations",
+            name="predicted",
+            value=list(predicted.shape),
+        )
+    for what, sounds in (("predicted", predicted), ("truth", truth)):
+        _expect_numbers(sounds, what, names)
+
+
+def validate_sounds(sounds: Sounds, *, what: str = "sounds") -> None:
+    """Raise EvaluationError unless the argument `what` is [contacts, samples], not empty, and finite throughout."""
+    _expect_rows(sounds, what)
+    _expect_numbers(sounds, what, None)
+
+
+def resampled(sounds: Float64[Tensor, "contacts samples"], *, sample_rate: float, wanted: float) -> Sounds:
+    """Return sounds at another sample rate (Hz) by a polyphase filter, band-limited to the new rate.
+
+    The ratio of the rates is the nearest with a denominator up to 20,000, exact for all rates in use. Raises
+    EvaluationError for a rate that is not a positive number, or less than a thousandth of the wanted one.
+    """
+    if not (math.isfinite(sample_rate) and sample_rate >= 1e-3 * wanted):
+        raise EvaluationError(
+            f"expected a sample rate of {1e-3 * wanted:g} Hz or more to resample to {wanted:g} Hz, got "
+            f"{sample_rate:g} Hz",
+            name="sample_rate",
+            value=sample_rate,
+        )
+    if sample_rate == wanted:
+        return sounds
+    ratio = (Fraction(wanted) / Fraction(sample_rate)).limit_denominator(20000)
+    return torch.from_numpy(scipy.signal.resample_poly(sounds.numpy(), ratio.numerator, ratio.denominator, axis=1))
+
+
+def default_fft_sizes(sample_rate: float) -> tuple[int, ...]:
+    """Return 2048, 1024, 512 and 256 samples, the paper's, at 44.1 and 48 kHz, scaled for other rates (Hz).
+
+    512, 256, 128 and 64 at 400 Hz.
+    """
+    return tuple(scaled_fft_size(size, sample_rate=sample_rate) for size in (2048, 1024, 512, 256))
+
+
+def relative_stft_error(predicted: Sounds, truth: Sounds, *, fft_sizes: Sequence[int]) -> PerContact:
+    """Return the sums of absolute differences of STFT magnitudes, over the truth's sum, mean over FFT sizes.
+
+    Hann windows, hop a quarter of the FFT size, frames centered, silence beyond the ends. The truth's sum is the mean
+    over all contacts given, so that the mean of the result is the ratio of the sums over all contacts: loud impacts
+    weigh more than quiet ones. Raises EvaluationError where the truth is silent throughout.
+    """
+    validate(predicted, truth)
+    error = torch.zeros(len(truth), dtype=torch.float64)
+    for size in fft_sizes:
+        difference, weight = _stft_sums(predicted, truth, fft_size=size, hop=max(1, size // 4))
+        if weight.sum() == 0.0:
+            raise EvaluationError.expected("sounds that are not all silent", 0.0, got="silence", name="truth")
+        error += difference / weight.mean()
+    return error / len(fft_sizes)
+
+
+def spectrogram_distance(predicted: Sounds, truth: Sounds, *, fft_size: int, hop: int) -> PerContact:
+    """Return the mean absolute difference of the STFT magnitudes, in the sounds' unit (L1).
+
+    Magnitudes as `avmsf.modal.spectra` has them, unscaled; sizes in samples.
+    """
+    validate(predicted, truth)
+
+    def distance(a: Sounds, b: Sounds) -> PerContact:
+        spectra = [magnitude_stft(sounds, fft_size=fft_size, hop=hop) for sounds in (a, b)]
+        return (spectra[0] - spectra[1]).abs().mean(dim=(1, 2))
+
+    return _blockwise(distance, predicted, truth)
+
+
+def log_mel_distance(
+    predicted: Sounds,
+    truth: Sounds,
+    *,
+    sample_rate: float,
+    fft_size: int,
+    hop: int,
+    mel_count: int,
+    floor: float,
+) -> PerContact:
+    """Return the mean absolute difference of the natural logarithms of mel magnitudes, in nepers (L1-log).
+
+    HTK triangles of height one from 0 Hz to half the rate; magnitudes below `floor`, in the sounds' unit, count as
+    `floor`.
+    """
+    validate(predicted, truth)
+    filters = htk_filters(mel_count, fft_size=fft_size, sample_rate=sample_rate, lowest=0.0, highest=sample_rate / 2)
+
+    def mels(sounds: Float64[Tensor, "contacts samples"]) -> Float64[Tensor, "contacts mels frames"]:
+        return log_mel(sounds, filters, fft_size=fft_size, hop=hop, floor=floor)
+
+    return _blockwise(lambda a, b: (mels(a) - mels(b)).abs().mean(dim=(1, 2)), predicted, truth)
+
+
+def envelope_distance(predicted: Sounds, truth: Sounds) -> PerContact:
+    """Return the root mean square difference of the Hilbert envelopes over time, in the sounds' unit (ENV)."""
+    validate(predicted, truth)
+    return _blockwise(lambda a, b: (envelope(a) - envelope(b)).square().mean(dim=1).sqrt(), predicted, truth)
+
+
+def objectfolder_distance(predicted: Sounds, truth: Sounds, *, sample_rate: float) -> PerContact:
+    """Return the ObjectFolder benchmark's spectrogram distance, a mean square between 0 and 1.
+
+    Sounds, on the scale of full-scale one, are resampled to 22,050 Hz (polyphase); magnitudes of an FFT of 1024 at hop
+    256 in 80 Slaney mels from 125 to 7600 Hz, not below 1e-5, go to (20 log10 - 20 + 100) / 100, clipped to [0, 1]; the
+    first 860 frames, 10 s, are compared. The benchmark's own frames mirror the sound at its ends where ours continue it
+    with silence. Raises EvaluationError for a capture that does not reach 7600 Hz.
+    """
+    validate(predicted, truth)
+    if sample_rate < 2 * 7600.0:
+        raise EvaluationError(
+            f"expected a sample rate of 15200 Hz or more for ObjectFolder's spectrogram, got {sample_rate:g} Hz; "
+            "evaluate in the convention PAPER",
+            name="sample_rate",
+            value=sample_rate,
+        )
+    filters = slaney_filters(80, fft_size=1024, sample_rate=22050.0, lowest=125.0, highest=7600.0)
+
+    def image(sounds: Float64[Tensor, "contacts samples"]) -> Float64[Tensor, "contacts mels frames"]:
+        heard = resampled(sounds, sample_rate=sample_rate, wanted=22050.0)
+        nepers = log_mel(heard, filters, fft_size=1024, hop=256, floor=1e-5)[:, :, :860]
+        return ((nepers * (20.0 / np.log(10.0)) - 20.0 + 100.0) / 100.0).clamp(0.0, 1.0)
+
+    return _blockwise(lambda a, b: (image(a) - image(b)).square().mean(dim=(1, 2)), predicted, truth)
+
+
+def _expect_rows(sounds: Sounds, what: str) -> None:
+    if sounds.ndim != 2:
+        raise EvaluationError(
+            f"{what}: expected sounds [contacts, samples], got the shape {tuple(sounds.shape)}; give a single sound as "
+            "one row, sound[None]",
+            name=what,
+            value=list(sounds.shape),
+        )
+    if sounds.numel() == 0:
+        raise EvaluationError.expected(
+            "one contact and one sample or more", list(sounds.shape), got=f"the shape {tuple(sounds.shape)}", name=what
+        )
+
+
+def _expect_numbers(sounds: Sounds, what: str, names: Sequence[str] | None) -> None:
+    bad = torch.nonzero(~torch.isfinite(sounds))
+    if len(bad):
+        row, sample = bad[0].tolist()
+        value = float(sounds[row, sample])
+        sound = f"row {row}" if names is None else f"row {row} ({names[row]})"
+        raise EvaluationError(
+            f"{what}, {sound}: expected finite samples, got {value} at sample {sample}",
+            row=row,
+            name=what,
+            value=value,
+        )
+
+
+def _stft_sums(predicted: Sounds, truth: Sounds, *, fft_size: int, hop: int) -> tuple[PerContact, PerContact]:
+    """Return the sums over bins and frames of the absolute differences, and of the truth's magnitudes."""
+
+    def sums(a: Sounds, b: Sounds) -> Float64[Tensor, "contacts 2"]:
+        spectra = [magnitude_stft(sounds, fft_size=fft_size, hop=hop) for sounds in (a, b)]
+        return torch.stack([(spectra[0] - spectra[1]).abs().sum(dim=(1, 2)), spectra[1].sum(dim=(1, 2))], dim=1)
+
+    difference, weight = _blockwise(sums, predicted, truth).unbind(dim=1)
+    return difference, weight
+
+
+def _blockwise(
+    distance: Callable[[Tensor, Tensor], Tensor], predicted: Sounds, truth: Sounds
+) -> Float64[Tensor, "contacts *figures"]:
+    """Apply a distance that works row by row to a few rows at a time, in float64 and without gradients."""
+    blocks = zip(torch.split(predicted.detach().cpu(), _BLOCK), torch.split(truth.detach().cpu(), _BLOCK), strict=True)
+    return torch.cat([distance(a.double(), b.double()) for a, b in blocks])

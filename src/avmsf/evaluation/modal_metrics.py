@@ -1,0 +1,222 @@
+"""How far a method's modes and gains are from an object's true ones, which only a simulation knows.
+
+Conventions. A mode's amplitudes at the contacts are complex numbers. It weighs by its true
+energy, the sum over contacts of |amplitude|^2 / (4 damping), which is what its damped sine has over all time. True
+modes and a method's are matched one to one by frequency alone (`match_modes`); true ones that found no partner count
+as silence in `gain_error` and as 0 in `mac`, so that no method gains by leaving modes out. Of one contact alone `mac`
+tells nothing: it is 1 for all modes found.
+
+Both count time from the same moment: the caller takes the truth to the first sample of the recordings that the method
+learned from (`avmsf.evaluation.ground_truth`). A common delay by t would turn mode k by 2 pi f_k t, which is
+free, and scale it by exp(-d_k t), which is not.
+
+What is inaudible is free: a mode's phase, one for all contacts, since the paper's fields have sines only, and a
+contact's polarity, one sign for all its modes, since fields flip the signs of impacts from opposite sides to agree.
+Both are chosen so that `gain_error` is least.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Complex, Complex128, Float, Float64, Int
+from scipy.optimize import linear_sum_assignment
+from torch import Tensor
+
+from avmsf.errors import EvaluationError
+from avmsf.modal.bank import ModalBank
+from avmsf.simulate.ground_truth import Truth
+
+Amplitudes = Complex128[Tensor, "contacts modes"]
+_TURNS = 100
+"""Most rounds in which phases and polarities are chosen in turn; a few suffice."""
+
+
+@runtime_checkable
+class ModalRenderer(Protocol):
+    """A method whose sounds are modes times gains, with or without residual noise."""
+
+    @property
+    def bank(self) -> ModalBank:
+        """The modes, the same at all contacts."""
+        ...
+
+    def complex_gains(
+        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Complex[Tensor, "contacts modes"]:
+        """Return amplitudes A at the contacts: their sounds are the real part of the sum of A exp((-d + 2 pi i f) t).
+
+        In the unit of the training sounds; `directions` are the unit vectors of the impacts, for methods that use them.
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class ModalScores:
+    """A method's modes compared with the true ones, one entry a true mode."""
+
+    weight: Float64[Tensor, " modes"]
+    """Part of the true energy, 0 to 1."""
+    match: Int[Tensor, " modes"]
+    """The method's mode that was taken for this one, or -1."""
+    frequency_error: Float64[Tensor, " modes"]
+    """(found - true) / true; NaN without a match, as in the next."""
+    damping_error: Float64[Tensor, " modes"]
+    """ln(found / true)."""
+    gain_error: Float64[Tensor, " modes"]
+    """Norm over contacts of the amplitudes' difference, over the true norm: 0 is perfect, 1 is silence."""
+    mac: Float64[Tensor, " modes"]
+    """Modal assurance criterion, the squared correlation of the amplitudes over contacts, 0 to 1."""
+    false_modes: int
+    """The method's modes that were taken for none."""
+    false_energy: float
+    """Their energy at the contacts, over the true energy."""
+
+    def figures(self) -> dict[str, float | None]:
+        """Return the means that tables have, each mode weighing by its true energy.
+
+        `found` (part of the energy whose modes were found), `frequency_error` and `damping_error` (absolute, over the
+        modes found; None if there are none), `gain_error` (root of the mean square), `mac`, `false_modes` and
+        `false_energy`.
+        """
+        found = self.match >= 0
+        share = float(self.weight[found].sum())
+        errors: dict[str, float | None] = {"found": share}
+        for name, values in (("frequency_error", self.frequency_error), ("damping_error", self.damping_error)):
+            total = float((self.weight * values.abs())[found].sum())
+            errors[name] = total / share if share > 0.0 else None
+        return errors | {
+            "gain_error": math.sqrt(float((self.weight * self.gain_error.square()).sum())),
+            "mac": float((self.weight * self.mac).sum()),
+            "false_modes": float(self.false_modes),
+            "false_energy": self.false_energy,
+        }
+
+
+def judge_modes(
+    renderer: ModalRenderer,
+    contacts: Float[Tensor, "contacts 3"],
+    truth: Truth,
+    *,
+    directions: Float[Tensor, "contacts 3"] | None = None,
+    widths: float = 1.0,
+    relative: float = 0.002,
+) -> ModalScores:
+    """Compare a method's modes and its gains at the contacts with the true ones, row for row.
+
+    `directions` are the unit vectors of the impacts, which the true gains belong to; `widths` and `relative` as
+    `match_modes` has them. Raises EvaluationError where rows differ in number, for values that are not finite, and
+    where the truth is silence at all contacts.
+    """
+    bank, true = renderer.bank, truth.amplitudes
+    predicted = renderer.complex_gains(contacts, directions=directions).detach().cpu().to(torch.complex128)
+    _expect_amplitudes(predicted, bank.frequency, "predicted")
+    _expect_amplitudes(true, truth.frequency, "truth")
+    if len(predicted) != len(true):
+        raise EvaluationError(
+            f"expected true gains at {len(predicted)} contacts, got {len(true)}; take the ground truth of these "
+            "recordings, in their order",
+            name="truth",
+            value=len(true),
+        )
+    energy = true.abs().square().sum(dim=0) / (4 * truth.damping)
+    if not float(energy.sum()) > 0.0:
+        raise EvaluationError.expected("modes with energy", 0.0, got="zero gains at all contacts", name="truth")
+    match = match_modes(bank, ModalBank(truth.frequency, truth.damping), widths=widths, relative=relative)
+    found = match >= 0
+    partner = match[found]
+    frequency_error, damping_error = torch.full((2, len(match)), math.nan, dtype=torch.float64)
+    frequency_error[found] = bank.frequency.detach()[partner] / truth.frequency[found] - 1
+    damping_error[found] = torch.log(bank.damping.detach()[partner] / truth.damping[found])
+    paired = torch.zeros_like(true)
+    paired[:, found] = predicted[:, partner]
+    cross = _free_agreement(paired.conj() * true, 1 / (4 * truth.damping))
+    squares, true_squares = paired.abs().square().sum(dim=0), true.abs().square().sum(dim=0)
+    # A mode that is silent at all contacts weighs nothing; any figure will do.
+    floor = torch.finfo(torch.float64).tiny
+    remaining = (squares + true_squares - 2 * cross).clamp(min=0.0)
+    false = torch.ones(len(bank), dtype=torch.bool)
+    false[partner] = False
+    false_energy = (predicted.abs().square().sum(dim=0) / (4 * bank.damping.detach()))[false].sum()
+    return ModalScores(
+        weight=energy / energy.sum(),
+        match=match,
+        frequency_error=frequency_error,
+        damping_error=damping_error,
+        gain_error=(remaining / true_squares.clamp(min=floor)).sqrt(),
+        mac=cross.square() / (squares * true_squares).clamp(min=floor),
+        false_modes=int(false.sum()),
+        false_energy=float(false_energy / energy.sum()),
+    )
+
+
+def match_modes(
+    found: ModalBank, true: ModalBank, *, widths: float = 1.0, relative: float = 0.002
+) -> Int[Tensor, " modes"]:
+    """Return for each true mode the row of the found mode that is taken for it, or -1: one to one, by frequency alone.
+
+    Two modes can be one where their frequencies differ by at most `widths` half-power widths of the true mode (damping
+    / pi, Hz) or, if that is more, `relative` of its frequency. Of all ways to pair them that is taken in which the sum
+    over pairs of 1 - (difference / allowed)^2 is largest: many pairs, and close ones rather than a chain of bad ones.
+    """
+    if not (widths >= 0.0 and relative >= 0.0 and math.isfinite(widths + relative) and widths + relative > 0.0):
+        raise EvaluationError(
+            f"expected widths and relative of 0 or more, not both 0, got {widths:g} and {relative:g}",
+            name="widths",
+            value=(widths, relative),
+        )
+    allowed = torch.maximum(widths * true.damping / math.pi, relative * true.frequency)
+    distance = (found.frequency.detach()[None] - true.frequency[:, None]).abs() / allowed[:, None]
+    possible = (distance <= 1.0).numpy()
+    worth = np.where(possible, 1.0 - distance.square().numpy(), 0.0)
+    match = torch.full((len(true),), -1)
+    for row, column in zip(*linear_sum_assignment(worth, maximize=True), strict=True):
+        if possible[row, column]:
+            match[row] = int(column)
+    return match
+
+
+def _free_agreement(products: Amplitudes, weights: Float64[Tensor, " modes"]) -> Float64[Tensor, " modes"]:
+    """Return |sum over contacts of polarity times conj(predicted) true| for each mode, by the best polarities.
+
+    The best phase of a mode makes its sum real and positive. The polarities make the weighted total large: phases and
+    polarities are chosen in turn until nothing changes, from two beginnings, no contact turned and the signs in the
+    products' strongest pattern; of the two ends the larger.
+    """
+    weighted = products * weights
+    pattern = torch.linalg.svd(torch.cat([weighted.real, weighted.imag], dim=1), full_matrices=False)[0][:, 0]
+    ends = []
+    for polarity in (torch.ones_like(pattern), _signs(pattern)):
+        for _ in range(_TURNS):
+            sums = polarity.to(weighted) @ weighted
+            better = _signs((weighted * torch.sgn(sums).conj()).real.sum(dim=1))
+            if torch.equal(better, polarity):
+                break
+            polarity = better
+        ends.append((polarity.to(products) @ products).abs())
+    return max(ends, key=lambda sums: float((sums * weights).sum()))
+
+
+def _signs(values: Float64[Tensor, " contacts"]) -> Float64[Tensor, " contacts"]:
+    return torch.where(values < 0.0, -1.0, 1.0).double()
+
+
+def _expect_amplitudes(amplitudes: Complex128[Tensor, "..."], frequency: Float[Tensor, " modes"], what: str) -> None:
+    if amplitudes.ndim != 2 or amplitudes.shape[1] != len(frequency) or not len(amplitudes):
+        raise EvaluationError(
+            f"{what}: expected gains [contacts, {len(frequency)} modes] at one contact or more, got the shape "
+            f"{tuple(amplitudes.shape)}",
+            name=what,
+            value=list(amplitudes.shape),
+        )
+    bad = torch.nonzero(~torch.isfinite(amplitudes.abs()))
+    if len(bad):
+        row, mode = bad[0].tolist()
+        raise EvaluationError(
+            f"{what}, row {row}: expected finite gains, got {amplitudes[row, mode].item()} of mode {mode}",
+            row=row,
+            name=what,
+            value=amplitudes[row, mode].item(),
+        )

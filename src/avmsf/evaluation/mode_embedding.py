@@ -1,0 +1,267 @@
+"""An embedding of objects by their modes, and distances of edited ones from their new material (paper, supplement).
+
+The points are labelled objects' sets of modes, embedded by UMAP (umap-learn, extra `eval`); an edited object is placed
+among them, and its score is the distance to the mean of the points of its target material, in the embedding's units,
+lower is better. The paper gives neither UMAP's settings nor how a set becomes a vector (`mode_features`), so
+that its values and these cannot be compared.
+
+UMAP always places a new point near known points, however far away it is. The plain distance between the vectors, in
+octaves, has no such limit and needs no randomness and no package.
+"""
+
+import json
+import warnings
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from avmsf._utils.files import write_whole
+from avmsf._utils.text_files import read_json
+from avmsf.errors import EvaluationError
+from avmsf.evaluation.mode_features import ModeFeatures, Pitches, features_of
+from avmsf.modal.bank import ModalBank
+
+FORMAT = 1
+"""Number of the file's format; it grows with every change that older versions could not read."""
+_FEWEST = 6
+"""Objects that UMAP has anything to arrange of."""
+_PACKAGES = ("umap-learn", "numba", "numpy", "scipy", "scikit-learn", "avmsf")
+"""Those that an embedding depends on, down to its last digits."""
+_TOLERANCE = 1e-3
+"""How far, in the embedding's units, its points may lie from where they were when it is made again."""
+
+
+@dataclass(frozen=True)
+class UmapSettings:
+    """How UMAP arranges the objects; everything else as umap-learn has it."""
+
+    neighbors: int = 8
+    """Objects that each one's place is decided by; one less than all where these are fewer."""
+    least_distance: float = 0.1
+    """How close points may come: `min_dist`."""
+    seed: int = 0
+    """Start of all chance: one seed gives one embedding, on one core."""
+
+
+@dataclass(frozen=True, eq=False)
+class MaterialSpace:
+    """Labelled objects by their modes; `MaterialSpace.of` makes one."""
+
+    features: ModeFeatures
+    materials: tuple[str, ...]
+    """Each object's, row for row."""
+    names: tuple[str, ...]
+    """What each object is called."""
+    vectors: Float64[np.ndarray, "objects dim"]
+    settings: UmapSettings
+    stored: Float[np.ndarray, "objects 2"] | None = None
+    """The embedding that a file holds, for a space that was read from one."""
+    versions: tuple[tuple[str, str], ...] = ()
+    """Packages and their versions that made `stored`."""
+
+    @classmethod
+    def of(
+        cls,
+        mode_sets: Sequence[ModalBank],
+        materials: Sequence[str],
+        seed: int = 0,
+        *,
+        names: Sequence[str] | None = None,
+        features: ModeFeatures | None = None,
+        settings: UmapSettings | None = None,
+    ) -> "MaterialSpace":
+        """Return the space of labelled sets of modes; `features` are `Pitches()`, the paper's, unless others are given.
+
+        `settings` carry a seed of their own. Raises EvaluationError for labels that do not fit the sets, for fewer than
+        six objects or two materials, and as the features do, with the object's name.
+        """
+        chosen = Pitches() if features is None else features
+        called = tuple(f"object {row}" for row in range(len(mode_sets))) if names is None else tuple(names)
+        if not len(mode_sets) == len(materials) == len(called):
+            raise EvaluationError(
+                f"expected a material and a name for each of {len(mode_sets)} sets of modes, got {len(materials)} "
+                f"materials and {len(called)} names",
+                name="materials" if len(materials) != len(mode_sets) else "names",
+                value=len(materials) if len(materials) != len(mode_sets) else len(called),
+            )
+        if len(mode_sets) < _FEWEST or len(set(materials)) < 2:
+            raise EvaluationError(
+                f"expected {_FEWEST} objects of two materials or more, got {len(mode_sets)} objects of "
+                f"{len(set(materials))} materials",
+                name="mode_sets",
+                value=(len(mode_sets), len(set(materials))),
+            )
+        vectors = []
+        for name, bank in zip(called, mode_sets, strict=True):
+            try:
+                vectors.append(chosen.vector(bank))
+            except EvaluationError as error:
+                raise EvaluationError(f"{name}: {error}", **{**error.attributes, "name": name}) from error
+        settings = UmapSettings(seed=seed) if settings is None else settings
+        return cls(chosen, tuple(materials), called, np.stack(vectors), settings)
+
+    @property
+    def known(self) -> tuple[str, ...]:
+        """All materials that objects are of, in the order of the alphabet."""
+        return tuple(sorted(set(self.materials)))
+
+    @cached_property
+    def embedding(self) -> Float[np.ndarray, "objects 2"]:
+        """Where UMAP has the objects. Raises EvaluationError where umap-learn is missing."""
+        return np.asarray(self._umap.embedding_) if self.stored is None else self.stored
+
+    def place(self, bank: ModalBank) -> Float[np.ndarray, " 2"]:
+        """Return where UMAP puts another set of modes; it depends on this set alone."""
+        vector = self.features.vector(bank)
+        with warnings.catch_warnings():
+            _quieten()
+            return np.asarray(self._umap.transform(vector[None]))[0]
+
+    def center(self, material: str) -> Float[np.ndarray, " 2"]:
+        """Return the mean of the points of a material. Raises EvaluationError with the materials there are."""
+        return self.embedding[self._rows(material)].mean(axis=0)
+
+    def distance(self, place: Float[np.ndarray, " 2"], material: str) -> float:
+        """Return how far a place is from a material's center, in UMAP's units."""
+        return float(np.linalg.norm(place - self.center(material)))
+
+    def plain_distance(self, bank: ModalBank, material: str) -> float:
+        """Return how far a set of modes is from the mean of a material's vectors, octaves, without any UMAP."""
+        center = self.vectors[self._rows(material)].mean(axis=0)
+        return float(np.linalg.norm(self.features.vector(bank) - center))
+
+    def spread(self, material: str) -> float:
+        """Return the mean distance of a material's own points from their center, in UMAP's units."""
+        own = self.embedding[self._rows(material)]
+        return float(np.linalg.norm(own - own.mean(axis=0), axis=1).mean())
+
+    def told_apart(self) -> float:
+        """Return the part of objects whose nearest other object, by the plain vectors, is of their own material.
+
+        What a distance to a material can mean at all: objects drawn at random would have the materials' shares.
+        """
+        apart = np.linalg.norm(self.vectors[:, None] - self.vectors[None], axis=2)
+        np.fill_diagonal(apart, np.inf)
+        nearest = apart.argmin(axis=1)
+        return float(np.mean([self.materials[row] == self.materials[other] for row, other in enumerate(nearest)]))
+
+    def record(self) -> dict[str, Any]:
+        """Return all that the scores rest on, as JSON holds it: settings, versions, vectors and the embedding."""
+        embedding = self.embedding
+        versions = dict(self.versions) if self.stored is not None else {name: version(name) for name in _PACKAGES}
+        return {
+            "format": FORMAT,
+            "features": self.features.record(),
+            "umap": asdict(self.settings),
+            "versions": versions,
+            "materials": list(self.materials),
+            "names": list(self.names),
+            "vectors": self.vectors.tolist(),
+            "embedding": embedding.tolist(),
+            "centers": {material: self.center(material).tolist() for material in self.known},
+        }
+
+    def save(self, path: str | Path) -> None:
+        """Write the record to a JSON file. Raises EvaluationError where it cannot be written."""
+        text = json.dumps(self.record(), allow_nan=False, indent=1)
+        write_whole(Path(path), lambda place: place.write_text(text, encoding="utf-8"), raising=EvaluationError)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "MaterialSpace":
+        """Read a file that `save` wrote. Raises EvaluationError for any other.
+
+        Points are placed by the embedding made again, which has to come out as stored: with other versions of its
+        packages it may not, and then `place` raises EvaluationError with the versions that are needed.
+        """
+        path = Path(path)
+        try:
+            record = read_json(path)
+            found = record["format"]
+            if found != FORMAT:
+                raise EvaluationError(
+                    f"{path}: expected a space of format {FORMAT}, got {found}; read it with the version of avmsf that "
+                    "wrote it, or compute it again",
+                    file=path,
+                    name="format",
+                    value=found,
+                )
+            materials, vectors = tuple(map(str, record["materials"])), np.array(record["vectors"], dtype=np.float64)
+            embedding = np.array(record["embedding"], dtype=np.float32)
+            if not vectors.ndim == 2 or not len(materials) == len(vectors) == len(record["names"]):
+                raise ValueError(f"{len(materials)} materials and vectors of the shape {vectors.shape}")
+            if embedding.shape != (len(vectors), 2):
+                raise ValueError(f"an embedding of the shape {embedding.shape}")
+            return cls(
+                features_of(record["features"]),
+                materials,
+                tuple(map(str, record["names"])),
+                vectors,
+                UmapSettings(**record["umap"]),
+                embedding,
+                tuple((str(name), str(each)) for name, each in record["versions"].items()),
+            )
+        except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+            raise EvaluationError(
+                f"{path}: expected a space of objects by their modes, got {type(error).__name__}: {error}; compute it "
+                "again",
+                file=path,
+            ) from error
+
+    def _rows(self, material: str) -> list[int]:
+        rows = [row for row, own in enumerate(self.materials) if own == material]
+        if not rows:
+            raise EvaluationError(
+                f"expected a material of {', '.join(self.known)}, got {material!r}", name="material", value=material
+            )
+        return rows
+
+    @cached_property
+    def _umap(self) -> Any:
+        """Return umap-learn's model, fitted to the vectors."""
+        umap = _import_umap()
+        model = umap.UMAP(
+            n_components=2,
+            n_neighbors=min(self.settings.neighbors, len(self.vectors) - 1),
+            min_dist=self.settings.least_distance,
+            random_state=self.settings.seed,
+            transform_seed=self.settings.seed,
+            n_jobs=1,
+        )
+        with warnings.catch_warnings():
+            _quieten()
+            model.fit(self.vectors)
+        if self.stored is not None:
+            apart = float(np.abs(np.asarray(model.embedding_) - self.stored).max())
+            if not apart <= _TOLERANCE:
+                raise EvaluationError(
+                    f"expected the embedding within {_TOLERANCE:g} of the stored one, got {apart:.3g}; "
+                    f"install {', '.join(f'{name} {each}' for name, each in self.versions)}, or compute it again",
+                    name="embedding",
+                    value=apart,
+                )
+        return model
+
+
+def _quieten() -> None:
+    """Ignore the warnings of umap-learn and its dependencies."""
+    warnings.simplefilter("ignore")
+
+
+def _import_umap() -> Any:
+    # Half a minute the first time, while numba compiles: so only those who embed pay for it.
+    try:
+        with warnings.catch_warnings():
+            _quieten()
+            import umap
+    except ImportError as error:
+        raise EvaluationError(
+            f"UMAP distance: expected the package umap-learn, got {error}; pip install 'avmsf[eval]'",
+            name="umap-learn",
+        ) from error
+    return umap

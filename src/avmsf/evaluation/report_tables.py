@@ -1,0 +1,380 @@
+"""The content of a report, as titles, paragraphs and tables, for Markdown and HTML."""
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from avmsf._utils.wording import counted
+from avmsf.evaluation.protocols import BASELINE, PROTOCOLS
+from avmsf.evaluation.published import COMPUTATION, published, published_ratios
+from avmsf.evaluation.results import ObjectRecord
+from avmsf.evaluation.summary import (
+    RISING,
+    Mean,
+    Table,
+    differences,
+    failures_of,
+    figures_of,
+    labels_of,
+    means,
+    ratios,
+    times_of,
+)
+from avmsf.evaluation.titles import TITLES, kind_of
+
+HEADINGS = {
+    "l1": "L1",
+    "l1_log": "L1-log",
+    "envelope": "ENV",
+    "cdpam": "CDPAM",
+    "relative_stft": "relative STFT",
+    "mac": "MAC",
+    "gain_error": "gain error",
+    "rmed": "RMED",
+    "rmed_posterior": "RMED, posterior",
+    "found": "energy of found modes",
+}
+"""Headings of metrics; others have their names."""
+WARNING = (
+    "The paper describes its metrics in words only. The convention used here is inferred from its rows for white "
+    "noise. Compare ratios to KNN with the paper's, not absolute values."
+)
+_DASH = "–"
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table of text; the first column names the rows."""
+
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    best: frozenset[tuple[int, int]] = frozenset()
+    """Rows and columns of the best cells of each column."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """One part of a report."""
+
+    title: str
+    words: tuple[str, ...] = ()
+    """Paragraphs before the table."""
+    grid: Grid | None = None
+    remarks: tuple[str, ...] = ()
+    """Paragraphs after it."""
+
+
+def sections(
+    records: Sequence[ObjectRecord],
+    identity: Mapping[str, Any],
+    *,
+    subsets: Mapping[str, frozenset[str]],
+    missing: Mapping[str, Sequence[str]] | None = None,
+) -> list[Section]:
+    """Return all parts of the report on these results, and which are missing: methods by object."""
+    protocol, dataset = str(identity["protocol"]), str(identity["dataset"])
+    order = list(identity["methods"])
+    labels = labels_of(records)
+    tables = {label: _ordered(figures_of(records, label), order) for label in labels}
+    main = tables[labels[0]] if labels else {}
+    shown = _metrics(main, protocol)
+    parts = [_opening(records, identity, labels, missing or {})]
+    if main:
+        parts.append(_main_table(main, shown, protocol, dataset, labels))
+        if any(BASELINE in methods for methods in main.values()):
+            parts.append(_ratio_table(main, shown, protocol, dataset))
+            parts.append(_difference_table(main, shown))
+        for name, members in subsets.items():
+            chosen = {each: main[each] for each in main if each in members}
+            if chosen and len(chosen) < len(main):
+                parts.append(_subset_table(name, chosen, shown))
+        if len(labels) > 1:
+            parts += [_case_table(metric, tables, protocol, dataset) for metric in shown]
+        parts += _mode_table(main, shown) + _object_tables(main, shown)
+    parts.append(_times(records, order, protocol, dataset))
+    parts.append(_failures(records))
+    return parts
+
+
+def figure(value: float | None, digits: int = 3) -> str:
+    """Return a number with so many significant digits; a dash for None or NaN."""
+    if value is None or not math.isfinite(value):
+        return _DASH
+    if value == 0 or not 1e-3 <= abs(value) < 1e6:
+        return f"{value:.{digits - 1}e}" if value else "0"
+    return f"{value:.{max(0, digits - 1 - math.floor(math.log10(abs(value))))}f}"
+
+
+def _opening(
+    records: Sequence[ObjectRecord],
+    identity: Mapping[str, Any],
+    labels: Sequence[str],
+    missing: Mapping[str, Sequence[str]],
+) -> Section:
+    protocol = PROTOCOLS.get(str(identity["protocol"]))
+    about = f"{protocol.summary} " if protocol else ""
+    trained = [len(case.train) for record in records for case in record.cases if case.label in labels[:1]]
+    tested = sum(sum(len(case.test) for case in record.cases if case.label in labels[:1]) for record in records)
+    return Section(
+        f"{identity['protocol']} on {identity['dataset']}",
+        (
+            *([_incomplete(missing, {record.identifier for record in records})] if missing else []),
+            f"{about}Objects: {len(records)}; training recordings of each: {_span(trained)}; "
+            f"test recordings in total: {tested}"
+            f"{f' ({labels[0]})' if len(labels) > 1 else ''}; avmsf {identity['version']}, seed {identity['seed']}.",
+            "Values are means over an object's test recordings (CDPAM: over `cdpam_contacts` of them, 0 for all), then "
+            "over objects, ± the standard error over objects. RMED is the distance between the located and the true "
+            "contact relative to the diagonal of the object, by cosine distance; methods that cannot locate count as a "
+            "random point. Lower is better, except for MAC and the energy of found modes. L1, L1-log and ENV follow "
+            "the convention `paper` of docs/conventions.md; relative STFT does not depend on unit and level. With the "
+            "level full-scale, an object's sounds are multiplied by one factor that brings its loudest recording to a "
+            "peak of one.",
+            WARNING,
+            f"Settings of metrics: {_words(identity['metrics'])}. Of modes: {_words(identity['modes'])}.",
+        ),
+    )
+
+
+def _words(settings: Mapping[str, Any]) -> str:
+    """Return plain values in words, those of nested settings in parentheses."""
+    return ", ".join(
+        f"{name} ({_words(value)})" if isinstance(value, Mapping) else f"{name} {value}"
+        for name, value in settings.items()
+    )
+
+
+def _incomplete(missing: Mapping[str, Sequence[str]], begun: Collection[str]) -> str:
+    """Return the sentence on results that are not computed yet: methods are named only of objects that are begun."""
+    listed = ", ".join(f"{name} ({', '.join(methods)})" if name in begun else name for name, methods in missing.items())
+    objects = counted(len(missing), "object")
+    return f"Incomplete: results of {objects} are missing: {listed}. Run the same command again to compute them."
+
+
+def _span(counts: Sequence[int]) -> str:
+    """Return a number, or the least and the largest of several."""
+    least, most = min(counts, default=0), max(counts, default=0)
+    return f"{least}" if least == most else f"{least} to {most}"
+
+
+def _main_table(main: Table, shown: Sequence[str], protocol: str, dataset: str, labels: Sequence[str]) -> Section:
+    found = means(main)
+    rows = [
+        (method, *(_mean(figures.get(metric)) for metric in shown), _count(figures))
+        for method, figures in found.items()
+    ]
+    best = _best(main, shown)
+    paper = published(protocol, dataset)
+    if paper is not None:
+        rows += [
+            (f"paper: {row.title}", *(figure(row.figures.get(metric)) for metric in shown), _DASH)
+            for row in paper.rows
+            if row.label in (None, labels[0])
+        ]
+    remark = (
+        f"Rows that begin with “paper:” are the paper's values on {paper.dataset}. {WARNING}"
+        if paper is not None
+        else f"The paper has no values of this experiment on {dataset}."
+    )
+    grid = Grid(("method", *_headings(shown), "objects"), tuple(rows), best)
+    titles = "; ".join(f"{method}: {TITLES[kind_of(method)]}" for method in found if kind_of(method) in TITLES)
+    remarks = (*_of_fewer(main), remark, *([f"{titles}."] if titles else []))
+    return Section("All methods" + (f": {labels[0]}" if len(labels) > 1 else ""), (), grid, remarks)
+
+
+def _ratio_table(main: Table, shown: Sequence[str], protocol: str, dataset: str) -> Section:
+    found = ratios(main)
+    falling = [metric for metric in shown if any(metric in figures for figures in found.values())]
+    rows = [(method, *(figure(found[method].get(metric)) for metric in falling)) for method in found]
+    for source, methods in published_ratios(protocol).items():
+        if published(protocol, dataset) is not None and not dataset.startswith(source):
+            continue
+        rows += [
+            (f"paper, {source}: {method}", *(figure(figures.get(metric)) for metric in falling))
+            for method, figures in methods.items()
+            if method in map(kind_of, found)
+        ]
+    return Section(
+        f"Ratio to {BASELINE}",
+        (
+            "Below 1 is better than the mean of the three nearest recordings. Our values are geometric means of the "
+            "objects' ratios; the paper's are ratios of its means, since it gives no ratios, from its main tables "
+            "where its table of this experiment has no KNN.",
+        ),
+        Grid(("method", *_headings(falling)), tuple(rows)),
+    )
+
+
+def _difference_table(main: Table, shown: Sequence[str]) -> Section:
+    found = differences(main)
+    shown = [metric for metric in shown if any(metric in figures for figures in found.values())]
+    rows = tuple(
+        (method, *(_mean(found[method].get(metric), signed=True) for metric in shown))
+        for method in found
+        if method != BASELINE
+    )
+    return Section(
+        f"Paired difference to {BASELINE}",
+        ("Method minus baseline, paired by object; below two standard errors a difference is not significant.",),
+        Grid(("method", *_headings(shown)), rows),
+    )
+
+
+def _subset_table(name: str, chosen: Table, shown: Sequence[str]) -> Section:
+    found = means(chosen)
+    rows = tuple((method, *(_mean(found[method].get(metric)) for metric in shown)) for method in found)
+    words = f"{len(chosen)} objects: {', '.join(chosen)}."
+    return Section(
+        f"Objects: {name}", (words,), Grid(("method", *_headings(shown)), rows, _best(chosen, shown)), _of_fewer(chosen)
+    )
+
+
+def _case_table(metric: str, tables: Mapping[str, Table], protocol: str, dataset: str) -> Section:
+    found = {label: means(table) for label, table in tables.items()}
+    methods = list(dict.fromkeys(method for each in found.values() for method in each))
+    rows = [(method, *(_mean(found[label].get(method, {}).get(metric)) for label in tables)) for method in methods]
+    paper = published(protocol, dataset)
+    for title in dict.fromkeys(row.title for row in paper.rows) if paper is not None else ():
+        own = {row.label: row.figures.get(metric) for row in paper.rows if row.title == title} if paper else {}
+        if any(own.get(label) is not None for label in tables):
+            rows.append((f"paper: {title}", *(figure(own.get(label)) for label in tables)))
+    return Section(f"{HEADINGS.get(metric, metric)} by case", (), Grid(("method", *tables), tuple(rows)))
+
+
+def _mode_table(main: Table, shown: Sequence[str]) -> list[Section]:
+    others = [metric for metric in _found(main) if metric not in shown]
+    if not others:
+        return []
+    found = means(main)
+    rows = tuple(
+        (method, *(_mean(figures.get(metric)) for metric in others))
+        for method, figures in found.items()
+        if any(metric in figures for metric in others)
+    )
+    words = (
+        "Of methods that have modes: the fraction of the true energy whose modes were found, the errors of their "
+        "frequency (relative) and damping (natural logarithm), false modes, and their energy relative to the true one."
+    )
+    return [Section("Modes compared with the ground truth", (words,), Grid(("method", *_headings(others)), rows))]
+
+
+def _object_tables(main: Table, shown: Sequence[str]) -> list[Section]:
+    methods = list(dict.fromkeys(method for figures in main.values() for method in figures))
+    return [
+        Section(
+            f"{HEADINGS.get(metric, metric)} by object",
+            (),
+            Grid(
+                ("object", *methods),
+                tuple(
+                    (identifier, *(figure(figures.get(method, {}).get(metric)) for method in methods))
+                    for identifier, figures in main.items()
+                ),
+            ),
+        )
+        for metric in shown
+    ]
+
+
+def _times(records: Sequence[ObjectRecord], order: Sequence[str], protocol: str, dataset: str) -> Section:
+    times = times_of(records)
+    fits = {
+        method: [times[each]["methods"][method] for each in times if method in times[each]["methods"]]
+        for method in order
+    }
+    rows = [
+        (
+            method,
+            figure(sum(each["fit"] for each in found) / len(found)),
+            figure(sum(each["render"] for each in found) / len(found)),
+        )
+        for method, found in fits.items()
+        if found
+    ]
+    shared = [each["shared"] for each in times.values()]
+    if shared:
+        rows.append(("shared: modes and features", figure(sum(shared) / len(shared)), _DASH))
+    words = "Seconds on one thread, mean over objects, sum over a protocol's cases, without the computation of metrics."
+    if published(protocol, dataset) is not None:
+        rows += [
+            (f"paper: {each.title}", figure(each.train_seconds), figure(each.render_seconds)) for each in COMPUTATION
+        ]
+        words += " Rows that begin with “paper:” are the paper's: one training and one sound on an A5000 GPU."
+    return Section(
+        "Time per object",
+        (words,),
+        Grid(("method", "fit", "render the test contacts"), tuple(rows)),
+    )
+
+
+def _failures(records: Sequence[ObjectRecord]) -> Section:
+    failures = failures_of(records)
+    if not failures:
+        return Section("Failures", ("None.",))
+    rows = tuple(
+        (str(each["object"]), each["case"] or "all", each["method"] or "all", str(each["failure"])) for each in failures
+    )
+    return Section("Failures", (), Grid(("object", "case", "method", "reason"), rows))
+
+
+def _ordered(table: Table, order: Sequence[str]) -> Table:
+    """Return the table with its methods in the requested order."""
+    return {
+        identifier: {method: figures[method] for method in order if method in figures}
+        for identifier, figures in table.items()
+    }
+
+
+def _metrics(table: Table, protocol: str) -> tuple[str, ...]:
+    """Return the protocol's columns that have values."""
+    columns = PROTOCOLS[protocol].metrics if protocol in PROTOCOLS else tuple(HEADINGS)
+    return tuple(metric for metric in columns if metric in _found(table))
+
+
+def _found(table: Table) -> dict[str, None]:
+    return dict.fromkeys(metric for figures in table.values() for values in figures.values() for metric in values)
+
+
+def _headings(metrics: Sequence[str]) -> tuple[str, ...]:
+    return tuple(HEADINGS.get(metric, metric.replace("_", " ")) for metric in metrics)
+
+
+def _mean(mean: Mean | None, *, signed: bool = False) -> str:
+    if mean is None:
+        return _DASH
+    words = figure(mean.mean)
+    if signed and mean.mean > 0:
+        words = f"+{words}"
+    return words if mean.standard_error is None else f"{words} ± {figure(mean.standard_error, 2)}"
+
+
+def _count(figures: Mapping[str, Mean]) -> str:
+    return str(max((each.objects for each in figures.values()), default=0))
+
+
+def _best(table: Table, shown: Sequence[str]) -> frozenset[tuple[int, int]]:
+    """Return the best cells of each metric's column, among the methods that have it of all objects that have it."""
+    found, best = means(table), set()
+    for column, metric in enumerate(shown, 1):
+        total = sum(any(metric in values for values in figures.values()) for figures in table.values())
+        complete = {
+            row: figures[metric].mean
+            for row, figures in enumerate(found.values())
+            if metric in figures and figures[metric].objects == total
+        }
+        if complete:
+            pick = max if metric in RISING else min
+            best.add((pick(complete, key=lambda row: complete[row]), column))
+    return frozenset(best)
+
+
+def _of_fewer(table: Table) -> tuple[str, ...]:
+    """Return the sentence on methods without results of some objects; nothing where there are none."""
+    methods = dict.fromkeys(method for figures in table.values() for method in figures)
+    fewer = [method for method in methods if any(method not in figures for figures in table.values())]
+    if not fewer:
+        return ()
+    return (
+        f"Not of all {len(table)} objects: {', '.join(fewer)}. Their means are of other objects than those of the "
+        "other rows, and not marked as best; ratios and paired differences are of the same objects.",
+    )

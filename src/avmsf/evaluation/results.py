@@ -1,0 +1,258 @@
+"""A folder of results: one file per object, written atomically after every method, so that a kill loses one method."""
+
+import json
+import math
+import re
+import traceback
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from avmsf._utils.files import write_whole
+from avmsf._utils.text_files import read_json
+from avmsf.errors import AvmsfError, EvaluationError
+
+IDENTITY, OBJECTS = "protocol.json", "objects"
+"""The file that identifies the evaluation, and the folder of the objects' files."""
+ENCODER = ", encoder "
+"""What comes between a method's description and the encoder of the features that it reads."""
+_OPTIONS = "options"
+"""Key of the command line's options in the file: they explain the identity and are no part of it."""
+_MAX_BYTES = 64 << 20
+"""Largest file of results that is read: three million values, as of 100 contacts by 10 metrics in 3000 cases."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Result of one method in one case of an object."""
+
+    case: str
+    """The case's key."""
+    method: str
+    values: Mapping[str, tuple[float | None, ...]] = field(default_factory=dict)
+    """Each metric's value for every test contact, in the case's order; None where it was not computed."""
+    figures: Mapping[str, float | None] = field(default_factory=dict)
+    """Values over all test contacts."""
+    fit_seconds: float = 0.0
+    """Without the modes and features, which methods share."""
+    render_seconds: float = 0.0
+    """For all test contacts."""
+    sounds: Mapping[str, str] = field(default_factory=dict)
+    """Files of sounds for the page, relative to the folder, by the names of their recordings."""
+    report: Mapping[str, Any] = field(default_factory=dict)
+    """Choices that the method made."""
+    maps: Mapping[str, str] = field(default_factory=dict)
+    """Files of located contacts' maps, likewise."""
+    failure: str | None = None
+    """Reason for missing values, in the first line (`failure_of`)."""
+    digest: str = ""
+    """Of the files that a method's sounds are read from (`FromFiles`); empty for all other methods."""
+
+
+@dataclass(frozen=True)
+class CaseRecord:
+    """One case of an object, with names in place of indices."""
+
+    key: str
+    label: str
+    train: tuple[str, ...]
+    test: tuple[str, ...]
+    sounds: Mapping[str, str] = field(default_factory=dict)
+    """Files of the recordings for the page."""
+    shared_seconds: float = 0.0
+    """Time of modes and features, which all methods share."""
+
+
+@dataclass(frozen=True)
+class ObjectRecord:
+    """Evaluation of one object."""
+
+    identifier: str
+    name: str = ""
+    material: str | None = None
+    inferred: bool = False
+    """Whether name and material are inferred rather than read."""
+    digest: str = ""
+    """Of the recordings, and of the ground truth where it is known."""
+    contacts: int = 0
+    """Number of distinct contacts."""
+    sample_rate: float = 0.0
+    duration: float = 0.0
+    """Seconds of every sound."""
+    cases: tuple[CaseRecord, ...] = ()
+    outcomes: tuple[Outcome, ...] = ()
+    failure: str | None = None
+    """Why the object could not be evaluated at all."""
+
+    def done(self, case: str, method: str, digest: str = "") -> bool:
+        """Whether this method has values in this case, of files with this digest; failures are retried."""
+        wanted = (case, method, digest, None)
+        return any((each.case, each.method, each.digest, each.failure) == wanted for each in self.outcomes)
+
+    def adding(self, outcome: Outcome) -> "ObjectRecord":
+        """Return the record with this outcome in place of an earlier one of its case and method."""
+        others = (each for each in self.outcomes if (each.case, each.method) != (outcome.case, outcome.method))
+        return replace(self, outcomes=(*others, outcome))
+
+
+@dataclass(frozen=True)
+class ResultsFolder:
+    """Folder in which an evaluation stores its results."""
+
+    path: Path
+
+    def begin(
+        self, identity: Mapping[str, Any], methods: Mapping[str, str], options: Mapping[str, str] | None = None
+    ) -> None:
+        """Use the folder for results of this identity, or continue with those that it holds.
+
+        `identity` holds plain values that determine the results; `methods` describes each method. Methods may be added
+        later. `options` are those of a command line, as it spelled them, for messages. Raises EvaluationError where the
+        folder's results are of another identity, or a method has changed.
+        """
+        wanted = json.loads(json.dumps(dict(identity)))
+        place = self.path / IDENTITY
+        known = self.identity() if place.exists() else {**wanted, "methods": {}}
+        # A kill may leave a hidden part of the file behind.
+        if not place.exists() and self.path.is_dir() and any(self.path.glob("[!.]*")):
+            raise EvaluationError.expected(
+                f"an empty folder or one with {IDENTITY}",
+                got="other files",
+                file=self.path,
+                name="output",
+                advice="choose a new --output",
+            )
+        kept, typed = known.pop("methods"), known.pop(_OPTIONS, {})
+        for key in dict.fromkeys((*wanted, *known)):
+            if wanted.get(key) != known.get(key):
+                raise self._of_another(key, wanted, known, *_different(options or {}, typed))
+        for name in methods:
+            if name in kept and kept[name] != methods[name]:
+                raise self._of_another_method(name, methods[name], kept[name])
+        given = {_OPTIONS: dict(options or typed)} if options or typed else {}
+        write_json(place, {**wanted, **given, "methods": {**kept, **methods}})
+
+    def _of_another(
+        self, key: str, wanted: Mapping[str, Any], known: Mapping[str, Any], asked: str, found: str
+    ) -> EvaluationError:
+        """Return the error for results of another identity; `asked` and `found` are the options that differ."""
+        if key == "source":
+            message = "made by this version of avmsf, got those of another, whose code differs; choose another --output"
+        elif asked and key not in ("version", "protocol", "dataset"):
+            message = f"made {asked}, got those made {found}; give the same options, or choose another --output"
+        else:
+            message = f"of {key} {_brief(wanted.get(key))}, got {_brief(known.get(key))}; choose another --output"
+        text = f"{self.path}: expected results {message}"
+        return EvaluationError(text, file=self.path, name=key, value=known.get(key))
+
+    def _of_another_method(self, name: str, wanted: str, known: str) -> EvaluationError:
+        parts = [each.partition(ENCODER) for each in (wanted, known)]
+        if parts[0][0] == parts[1][0]:
+            asked, found = (f"--lift.encoder {each[2]}" for each in parts)
+        else:
+            asked, found = "these settings and weights", "others"
+        text = f"{self.path}: expected results of {name} made with {asked}, got those made with {found}"
+        return EvaluationError(f"{text}; choose another --output", file=self.path, name=name, value=known)
+
+    def identity(self) -> dict[str, Any]:
+        """Return the evaluation that the folder holds, with its methods. Raises EvaluationError where there is none."""
+        place = self.path / IDENTITY
+        read = self._read(place)
+        if not isinstance(read.get("methods"), dict):
+            raise self._damaged(place, "it names no methods")
+        return read
+
+    def read(self, identifier: str) -> ObjectRecord | None:
+        """Return an object's record, or None where there is none yet."""
+        place = self._place(identifier)
+        return self._record(place) if place.exists() else None
+
+    def write(self, record: ObjectRecord) -> None:
+        """Keep an object's record in place of an earlier one."""
+        write_json(self._place(record.identifier), asdict(record))
+
+    def records(self) -> tuple[ObjectRecord, ...]:
+        """Return all objects' records, in natural order."""
+        places = sorted((self.path / OBJECTS).glob("[!.]*.json"), key=lambda place: natural(place.stem))
+        return tuple(self._record(place) for place in places)
+
+    def _place(self, identifier: str) -> Path:
+        return self.path / OBJECTS / f"{identifier}.json"
+
+    def _record(self, place: Path) -> ObjectRecord:
+        read = self._read(place)
+        try:
+            cases = tuple(
+                CaseRecord(**{**each, "train": tuple(each["train"]), "test": tuple(each["test"])})
+                for each in read.pop("cases")
+            )
+            outcomes = tuple(
+                Outcome(**{**each, "values": {name: tuple(values) for name, values in each["values"].items()}})
+                for each in read.pop("outcomes")
+            )
+            return ObjectRecord(**read, cases=cases, outcomes=outcomes)
+        except (KeyError, TypeError, AttributeError) as error:
+            raise self._damaged(place, error) from error
+
+    def _read(self, place: Path) -> dict[str, Any]:
+        try:
+            read = read_json(place, max_bytes=_MAX_BYTES)
+        except (OSError, ValueError) as error:
+            raise self._damaged(place, error) from error
+        if not isinstance(read, dict):
+            raise self._damaged(place, "no JSON object")
+        return read
+
+    def _damaged(self, place: Path, error: object) -> EvaluationError:
+        return EvaluationError(
+            f"{place}: expected results of this version, got {error}; delete the file to compute them again, or choose "
+            "another --output",
+            file=place,
+        )
+
+
+def write_json(place: Path, values: Mapping[str, Any]) -> None:
+    """Write plain values whole. Raises EvaluationError where that cannot be."""
+    words = json.dumps(_finite(values), indent=1, ensure_ascii=False, allow_nan=False)
+    write_whole(place, lambda path: path.write_text(words + "\n", encoding="utf-8"), raising=EvaluationError)
+
+
+def failure_of(error: Exception) -> str:
+    """Return an error of the package as one line; any other with its name, and its traceback in the lines below."""
+    message = " ".join(str(error).split())
+    if isinstance(error, AvmsfError):
+        return message
+    return "\n".join((f"{type(error).__name__}: {message}", *traceback.format_tb(error.__traceback__)))
+
+
+def natural(words: str) -> tuple[tuple[int, int, str], ...]:
+    """Return a key that sorts numbers within names by value."""
+    parts = re.findall(r"\d+|\D+", words)
+    return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts)
+
+
+def _finite(value: Any) -> Any:
+    """Return the values with null for what JSON cannot hold."""
+    if isinstance(value, Mapping):
+        return {str(key): _finite(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _different(asked: Mapping[str, str], found: Mapping[str, str]) -> tuple[str, str]:
+    """Return the options that differ between two command lines, as each spelled them; nothing where one is unknown."""
+    names = [name for name in dict.fromkeys((*asked, *found)) if asked.get(name) != found.get(name)]
+    if not (asked and found and names):
+        return "", ""
+    both = [
+        ", ".join(f"with {each[name]}" if name in each else f"without {name}" for name in names)
+        for each in (asked, found)
+    ]
+    return both[0], both[1]
+
+
+def _brief(value: object) -> str:
+    words = json.dumps(value, ensure_ascii=False) if not isinstance(value, str) else value
+    return words if len(words) <= 160 else f"{words[:157]}..."

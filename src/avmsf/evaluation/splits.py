@@ -1,0 +1,187 @@
+"""Splits into training and test recordings, and the scores of any renderer on the test recordings."""
+
+import math
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+
+from avmsf._utils.arrays import ArrayLike, as_floats
+from avmsf._utils.wording import counted
+from avmsf.capture.folder import Capture
+from avmsf.capture.impacts import Impacts
+from avmsf.errors import EvaluationError, ExtractionError, FitError, PositionWarning
+from avmsf.evaluation.cases import Places
+from avmsf.evaluation.conventions import PAPER, Convention
+from avmsf.evaluation.metrics import PerContact, default_fft_sizes, relative_stft_error, validate
+from avmsf.evaluation.renderer import Renderer, expect_renderer
+from avmsf.field.sound_field import SoundField
+from avmsf.gaussians.points import farthest_points
+from avmsf.modal.extraction.extract import Extraction, extract_modes
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """How far rendered sounds are from recorded ones, by several metrics; lower is better."""
+
+    def __repr__(self) -> str:
+        means = ", ".join(f"{metric} {value:.3g}" for metric, value in self.mean().items())
+        return f"Scores({counted(len(self.names), 'recording')}: {means})"
+
+    convention: str
+    """Name of the convention that the metrics follow, `relative_stft` apart, which is the same in all."""
+    names: tuple[str, ...]
+    """Name of each scored recording."""
+    values: Mapping[str, PerContact]
+    """For each metric, by name, one value a recording."""
+
+    def mean(self) -> dict[str, float]:
+        """Return each metric's mean over the impacts."""
+        return {metric: float(values.mean()) for metric, values in self.values.items()}
+
+    def standard_error(self) -> dict[str, float]:
+        """Return the standard error of each mean, as if the impacts were independent; NaN for a single impact."""
+        return {
+            metric: float(values.std()) / math.sqrt(len(values)) if len(values) > 1 else math.nan
+            for metric, values in self.values.items()
+        }
+
+
+def split(
+    impacts: Impacts, *, fraction: float = 0.2, count: int | None = None, start: int = 0
+) -> tuple[Impacts, Impacts]:
+    """Return (train, test): all recordings at contacts chosen by farthest-point sampling, and all others.
+
+    Contacts nearer to each other than 1 % of the bounding box's diagonal count as one (`places_of`). `count` contacts
+    to train on, or else the nearest whole number to `fraction` of all contacts and at least 2. Training recordings are
+    in the order of the choice, from the contact of row `start` on, one a contact, and then the repeated ones; so with
+    more contacts the first ones stay the same. Raises EvaluationError where no contact would remain to train on, with a
+    fraction fewer than 2, or none to test.
+    """
+    if count is None and not 0.0 < fraction < 1.0:
+        raise EvaluationError(
+            f"expected a fraction of training contacts between 0 and 1, got {fraction:g}",
+            name="fraction",
+            value=fraction,
+        )
+    places = Places.of(impacts)
+    wanted = places.expect_part(fraction) if count is None else places.expect(count)
+    case = places.case("", farthest_points(places.contacts, wanted, start=places.number_of(start)))
+    return impacts.take(case.train), impacts.take(case.test)
+
+
+def align_split(
+    train: Impacts, test: Impacts, *, modes: Callable[[], Extraction] | None = None
+) -> tuple[Impacts, Impacts]:
+    """Return both with the starts that the training recordings have in common; without modes they keep their own.
+
+    `avmsf evaluate` does this before it fits and scores methods. `modes` finds the modes of `train`, by default with
+    the settings of `extract_modes`.
+    """
+    if train.before is None:
+        return train, test
+    try:
+        found = extract_modes(train) if modes is None else modes()
+    except ExtractionError:
+        return replace(train, before=None, after=None), replace(test, before=None, after=None)
+    return found.aligned(train), found.aligned(test)
+
+
+def evaluate(
+    renderer: Renderer | Callable[[Impacts], Renderer],
+    test: Capture | Impacts,
+    *,
+    train: Capture | Impacts | None = None,
+    convention: Convention = PAPER,
+    fft_sizes: Sequence[int] | None = None,
+) -> Scores:
+    """Score the sounds that `renderer` renders at the contacts of recordings against these recordings.
+
+    With the training recordings as `train`, `renderer` is a class or function that makes one from them. It gets them,
+    and is scored on `test`, as the methods of `avmsf evaluate` are: aligned with one another (`align_split`). Without
+    them, recordings are taken as they are. For a SoundField, those that are not aligned yet are aligned as its fit
+    aligned those it was fitted to, and its sounds are as long as the recordings. Raises as `score`, and EvaluationError
+    for what is no renderer, and for one at another sample rate.
+    """
+    impacts = _impacts_of(test, "test")
+    if train is not None:
+        make = _expect_maker(renderer)
+        aligned, impacts = align_split(_impacts_of(train, "train"), impacts)
+        try:
+            renderer = make(aligned)
+        except FitError as error:
+            if error.name != "capture":
+                raise
+            raise EvaluationError.expected(
+                "a renderer made of recordings alone",
+                "SoundField",
+                got="a SoundField, whose fit needs the shape in a Capture",
+                name="renderer",
+                advice="give avmsf.SoundField.fit(train), without `train`: it aligns the test recordings itself",
+            ) from error
+    made = expect_renderer(renderer)
+    if isinstance(made, SoundField):
+        impacts = made.aligned(impacts)
+    if made.sample_rate != impacts.sample_rate:
+        raise EvaluationError(
+            f"expected recordings at the field's {made.sample_rate:g} Hz, got {impacts.sample_rate:g} Hz; resample "
+            "them, or fit a field to recordings of their rate",
+            name="sample_rate",
+            value=impacts.sample_rate,
+        )
+    with torch.no_grad(), warnings.catch_warnings():
+        # Reading the capture has warned of contacts off the object.
+        warnings.simplefilter("ignore", PositionWarning)
+        if isinstance(made, SoundField):
+            samples = impacts.sounds.shape[1]
+            sounds = made.render(impacts.contacts, impacts.directions, samples=samples)
+        else:
+            sounds = made.render(impacts.contacts, directions=impacts.directions)
+    return score(sounds, impacts, convention=convention, fft_sizes=fft_sizes)
+
+
+def _impacts_of(recordings: Capture | Impacts, name: str) -> Impacts:
+    impacts = recordings.impacts if isinstance(recordings, Capture) else recordings
+    if not isinstance(impacts, Impacts):
+        raise EvaluationError(
+            f"{name}: expected a Capture or Impacts, got {type(impacts).__name__}",
+            name=name,
+            value=type(impacts).__name__,
+        )
+    return impacts
+
+
+def _expect_maker(given: Any) -> Callable[[Impacts], Renderer]:
+    if not callable(given) or (isinstance(given, Renderer) and not isinstance(given, type)):
+        raise EvaluationError.expected(
+            "a class or function that makes a renderer of the training recordings",
+            type(given).__name__,
+            got=f"an object of {type(given).__name__}",
+            name="renderer",
+            advice="leave out `train`, or give the class",
+        )
+    make: Callable[[Impacts], Renderer] = given
+    return make
+
+
+def score(
+    sounds: ArrayLike,
+    impacts: Impacts,
+    *,
+    convention: Convention = PAPER,
+    fft_sizes: Sequence[int] | None = None,
+) -> Scores:
+    """Score sounds that were made otherwise than by a renderer, row for row of the impacts.
+
+    `relative_stft` with `fft_sizes` in samples, or else with `default_fft_sizes`, and the convention's metrics. Raises
+    EvaluationError for sounds that do not fit the impacts or are not finite, with the name of the impact, and
+    ArrayError for what are no numbers.
+    """
+    sounds = as_floats(sounds, "sounds")
+    validate(sounds, impacts.sounds, names=impacts.names)
+    sizes = default_fft_sizes(impacts.sample_rate) if fft_sizes is None else tuple(fft_sizes)
+    values = {"relative_stft": relative_stft_error(sounds, impacts.sounds, fft_sizes=sizes)}
+    values |= convention.scores(sounds, impacts.sounds, sample_rate=impacts.sample_rate)
+    return Scores(convention=convention.name, names=impacts.names, values=values)

@@ -1,0 +1,97 @@
+"""Real signed amplitudes, for formats in which all modes have one phase."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float32, Float64, Int
+from torch import Tensor
+
+from avmsf.export.sampled_field import SampledField
+from avmsf.modal.phase import common_phase
+from avmsf.modal.spectra import magnitude_stft
+from avmsf.modal.synthesis import synthesize
+
+_JUDGED = 8
+"""Number of points at which an export is compared with the field."""
+_WINDOW = 0.04
+"""Window of the short-time spectra, seconds: about the temporal resolution of hearing."""
+_FLOOR = 1e-3
+"""Magnitude relative to the largest below which spectra are not compared: -60 dB."""
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """Difference between an export's sounds and the field's, at a few points."""
+
+    waveform: float
+    """Largest difference of samples, relative to the largest sample."""
+    spectrum_db: float
+    """Mean difference of short-time magnitude spectra, dB, weighted by the field's energy."""
+
+
+def signed_amplitudes(field: SampledField) -> Float32[Tensor, "points modes"]:
+    """Return a real amplitude of each mode at each point, without its phase.
+
+    It is the magnitude of sine and cosine part, so that levels do not change, with the sign of the projection on the
+    phase that is common to all points, so that it changes at the mode's nodal lines.
+    """
+    amplitude = torch.complex(field.sine.double(), field.cosine.double())
+    phase = common_phase(field.sine, field.cosine)
+    along = (amplitude * torch.polar(torch.ones_like(phase), -phase)).real
+    return torch.where(along < 0, -amplitude.abs(), amplitude.abs()).float()
+
+
+def shared_dampings(field: SampledField) -> Float64[Tensor, " modes"]:
+    """Return one damping for each mode, 1/s: the mean over points, weighted by the mode's energy there."""
+    if field.shared_damping:
+        return field.damping
+    energy = field.sine.double().square() + field.cosine.double().square()
+    total = energy.sum(0)
+    weights = torch.where(total > 0, energy / total.clamp(min=1e-300), 1.0 / len(field))
+    return (weights * field.damping).sum(0)
+
+
+def deviation(
+    field: SampledField,
+    *,
+    sine: Float32[Tensor, "points modes"] | None,
+    cosine: Float32[Tensor, "points modes"] | None,
+    damping: Float64[Tensor, "*points modes"],
+) -> Deviation:
+    """Return the difference between these modes, without noise, and the field at a few points."""
+    rows = field.spread(_JUDGED)
+    zero = torch.zeros(len(rows), len(field.frequency))
+    heard = synthesize(
+        zero if sine is None else sine[rows],
+        field.frequency,
+        damping if damping.ndim == 1 else damping[rows],
+        samples=field.samples,
+        sample_rate=field.sample_rate,
+        quadrature=zero if cosine is None else cosine[rows],
+    )
+    true = field.render(rows)
+    return Deviation(_relative(heard, true), _apart_db(heard, true, field.sample_rate))
+
+
+def importance(field: SampledField, damping: Float64[Tensor, " modes"]) -> Int[Tensor, " modes"]:
+    """Return the modes' rows, sorted by descending energy over all contacts."""
+    energy = (field.sine.double().square() + field.cosine.double().square()).sum(0) / damping
+    return torch.argsort(energy, descending=True, stable=True)
+
+
+def _relative(heard: Tensor, true: Tensor) -> float:
+    peak = float(true.abs().max())
+    return float((heard - true).abs().max()) / peak if peak > 0 else 0.0
+
+
+def _apart_db(
+    heard: Float32[Tensor, "contacts samples"], true: Float32[Tensor, "contacts samples"], sample_rate: float
+) -> float:
+    size = max(4, 2 ** round(math.log2(_WINDOW * sample_rate)))
+    found, expected = (magnitude_stft(each, fft_size=size, hop=size // 4) for each in (heard, true))
+    floor, energy = _FLOOR * float(expected.max()), expected.square()
+    if floor == 0:
+        return 0.0
+    apart = 20.0 * torch.log10((found + floor) / (expected + floor)).abs()
+    return float((energy * apart).sum() / energy.sum())

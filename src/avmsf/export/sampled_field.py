@@ -1,0 +1,233 @@
+"""A sound field sampled at points of the surface: all that other programs need to synthesize impacts there."""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Float64, Int
+from torch import Tensor
+
+from avmsf.errors import ExportError
+from avmsf.export.normals import outward_normals
+from avmsf.field.gain_field import GainField
+from avmsf.field.gains.body import BodyGains
+from avmsf.field.gains.model import MixtureGains
+from avmsf.field.positions import points_on_object
+from avmsf.field.scaled_gains import ScaledGains
+from avmsf.field.sound_field import SoundField
+from avmsf.gaussians.points import farthest_points, nearest_points
+from avmsf.modal.pulse import ForcePulse
+from avmsf.modal.synthesis import synthesize
+
+_BATCH = 1024
+"""Points sampled at once; bounds the memory."""
+_RENDERED = 32
+"""Contacts rendered at once; bounds the memory."""
+_DRAWN = 4
+"""Candidates for each selected point: farthest point sampling of a million points takes too long."""
+
+
+@dataclass(frozen=True, eq=False)
+class SampledField:
+    """Modal parameters of impacts at some points, perpendicular to the surface unless other directions are given.
+
+    The sound of an impact of force 1 at a point is the sum over modes of exp(-d t) (sine sin(2 pi f t) + cosine
+    cos(2 pi f t)), plus the noise.
+    """
+
+    points: Float[Tensor, "points 3"]
+    """Contacts, object frame, meters."""
+    normals: Float32[Tensor, "points 3"]
+    """Outward unit normals at the contacts, or the opposites of given directions: impacts go against them."""
+    frequency: Float64[Tensor, " modes"]
+    """Hz, all below half the sample rate."""
+    damping: Float64[Tensor, "*points modes"]
+    """1/s; one row for each point if the damping depends on the contact, otherwise one vector for all."""
+    sine: Float32[Tensor, "points modes"]
+    """Signed amplitudes of the sines, in the unit of the training sounds."""
+    cosine: Float32[Tensor, "points modes"]
+    """Signed amplitudes of the cosines; zero where all modes start as sines."""
+    noise: Float32[Tensor, " samples"]
+    """Residual noise: the realization that `SoundField.render` adds."""
+    sample_rate: float
+    """Samples per second of the training sounds, Hz."""
+    per_newton: bool = False
+    """Whether forces are in newtons; otherwise force 1 is that of an average recorded impact."""
+    name: str = ""
+    """Name of the object."""
+    origin: dict[str, Any] = field(default_factory=dict)
+    """Provenance of the field, as plain values."""
+    supporting: tuple[int, ...] = ()
+    """Columns of the modes' tensors that are supporting poles, see `SoundField.is_mode`."""
+
+    @classmethod
+    def of(
+        cls,
+        sound_field: SoundField,
+        points: Float[Tensor, "points 3"] | None = None,
+        normals: Float[Tensor, "normals 3"] | None = None,
+        *,
+        directions: Float[Tensor, "points 3"] | None = None,
+        limit: int | None = None,
+    ) -> "SampledField":
+        """Return the field at `points` (object frame, meters), by default at its own that lie on the object.
+
+        More than `limit` points are reduced to evenly spread ones. `normals` are outward normals; by default those of
+        the field's body, or without a body estimated from the points. `directions` are those of the impacts at given
+        points, as in `SoundField.render`; one of length zero is against the normal. Raises `ExportError` for no
+        points, and for points that are not finite.
+        """
+        places = points_on_object(sound_field.gain_field) if points is None else points
+        _expect_places(places, normals, limit)
+        if limit is not None and len(places) > limit:
+            rows = spread_rows(places, limit)
+            places = places[rows]
+            normals, directions = (None if each is None else each[rows] for each in (normals, directions))
+        if normals is None:
+            normals = _known_normals(sound_field.gain_field, places)
+        if normals is None:
+            normals = outward_normals(places)
+        if directions is not None:
+            normals = torch.where(directions.any(1, keepdim=True), -directions.double(), normals.double())
+        heard = torch.nonzero(sound_field.audible).flatten()
+        parts = torch.split(places, _BATCH)
+        ways = [None] * len(parts) if directions is None else torch.split(directions, _BATCH)
+        known = [sound_field.known(part, directions=way) for part, way in zip(parts, ways, strict=True)]
+        along, ahead = torch.cos(sound_field.phase), torch.sin(sound_field.phase)
+        sines, cosines = [], []
+        for part in known:
+            mean = part.mean.double()
+            quadrature = torch.zeros_like(mean) if part.quadrature is None else part.quadrature.double()
+            sines.append((mean * along - quadrature * ahead)[:, heard].float())
+            cosines.append((mean * ahead + quadrature * along)[:, heard].float())
+        damping = sound_field.bank.damping[heard]
+        factors = [part.damping[:, heard] for part in known if part.damping is not None]
+        origin = sound_field.origin
+        return cls(
+            places.detach(),
+            torch.nn.functional.normalize(normals.float(), dim=1),
+            sound_field.bank.frequency[heard],
+            damping * torch.cat(factors) if factors else damping,
+            torch.cat(sines),
+            torch.cat(cosines),
+            sound_field.noise().float(),
+            sound_field.sample_rate,
+            origin.per_newton,
+            origin.capture,
+            {
+                "capture": origin.capture,
+                "trained_on": list(origin.trained_on),
+                "gain_field": sound_field.gain_field.kind,
+            },
+            supporting_columns(sound_field),
+        )
+
+    @property
+    def samples(self) -> int:
+        """Length of the training sounds."""
+        return len(self.noise)
+
+    @property
+    def shared_damping(self) -> bool:
+        """Whether the dampings are the same at all contacts."""
+        return self.damping.ndim == 1
+
+    @property
+    def energy(self) -> Float64[Tensor, " points"]:
+        """Energy of the modes over time of an impact of force 1, gain^2 / (4 d) summed."""
+        return ((self.sine.double().square() + self.cosine.double().square()) / (4.0 * self.damping)).sum(1)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def nearest(self, places: Float[Tensor, "places 3"]) -> Int[Tensor, " places"]:
+        """Return the row of the point nearest to each position (object frame, meters)."""
+        return nearest_points(self.points, places)[:, 0]
+
+    def spread(self, count: int) -> Int[Tensor, " chosen"]:
+        """Return `count` rows, or all if there are fewer, by farthest point sampling."""
+        return spread_rows(self.points, min(count, len(self)))
+
+    def take(self, rows: Int[Tensor, " chosen"]) -> "SampledField":
+        """Return the field at some of its points."""
+        return replace(
+            self,
+            points=self.points[rows],
+            normals=self.normals[rows],
+            damping=self.damping if self.shared_damping else self.damping[rows],
+            sine=self.sine[rows],
+            cosine=self.cosine[rows],
+        )
+
+    def damping_at(self, rows: Int[Tensor, " chosen"]) -> Float64[Tensor, "chosen modes"]:
+        """Return the dampings at some points, 1/s."""
+        return self.damping.expand(len(rows), -1) if self.shared_damping else self.damping[rows]
+
+    def render(
+        self,
+        rows: Int[Tensor, " contacts"],
+        *,
+        force: float = 1.0,
+        samples: int | None = None,
+        pulse: ForcePulse | None = None,
+        noise: bool = True,
+    ) -> Float32[Tensor, "contacts samples"]:
+        """Return the sounds of impacts at the points of some rows, as `SoundField.render` does.
+
+        `samples` is the length, by default that of the training sounds, after whose end there is no noise. With
+        `noise=False` the sounds contain only the modes.
+        """
+        length = self.samples if samples is None else samples
+        added = torch.nn.functional.pad(self.noise, (0, max(0, length - self.samples)))[:length]
+        parts = []
+        for chosen in torch.split(rows, _RENDERED):
+            modes = synthesize(
+                self.sine[chosen],
+                self.frequency,
+                self.damping if self.shared_damping else self.damping[chosen],
+                samples=length,
+                sample_rate=self.sample_rate,
+                quadrature=self.cosine[chosen],
+            )
+            parts.append(modes if pulse is None else pulse.soften(modes, sample_rate=self.sample_rate))
+        sounds = torch.cat(parts)
+        return force * (sounds + added if noise else sounds)
+
+
+def supporting_columns(sound_field: SoundField) -> tuple[int, ...]:
+    """Return the indices of the supporting poles among the audible modes."""
+    sounding = sound_field.is_mode[sound_field.audible]
+    return tuple(torch.nonzero(~sounding).flatten().tolist())
+
+
+def spread_rows(points: Float[Tensor, "points 3"], count: int) -> Int[Tensor, " chosen"]:
+    """Return `count` rows of the points by farthest point sampling."""
+    drawn = torch.arange(len(points))
+    if len(points) > _DRAWN * count:
+        drawn = torch.from_numpy(np.sort(np.random.default_rng(0).permutation(len(points))[: _DRAWN * count]))
+    return drawn[farthest_points(points[drawn], count)]
+
+
+def _expect_places(
+    places: Float[Tensor, "points 3"], normals: Float[Tensor, "normals 3"] | None, limit: int | None
+) -> None:
+    finite = bool(torch.isfinite(places).all()) and (normals is None or bool(torch.isfinite(normals).all()))
+    if len(places) == 0 or not finite:
+        found = "none" if len(places) == 0 else "NaN or infinity"
+        raise ExportError(
+            f"points: expected finite points of the object's surface, got {found}; name a mesh or Gaussians of the "
+            "object, or fit the field to features on its surface",
+            name="points",
+            value=len(places),
+        )
+    if normals is not None and normals.shape != places.shape:
+        raise ExportError.expected(f"one for each of {len(places)} points", len(normals), name="normals")
+    if limit is not None and limit < 1:
+        raise ExportError(f"limit: expected 1 point or more, got {limit}", name="limit", value=limit)
+
+
+def _known_normals(gain_field: GainField, places: Float[Tensor, "points 3"]) -> Float64[Tensor, "points 3"] | None:
+    if isinstance(gain_field, ScaledGains):
+        return _known_normals(gain_field.field, places.double() / gain_field.length)
+    return gain_field.normals(places) if isinstance(gain_field, MixtureGains | BodyGains) else None

@@ -1,0 +1,214 @@
+"""A grid of impacts as wav files, with a table of them and an SFZ instrument, for samplers."""
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import soundfile
+import torch
+from jaxtyping import Float32, Float64, Int
+from torch import Tensor
+
+from avmsf.errors import ExportError
+from avmsf.export.sampled_field import SampledField
+from avmsf.export.writing import Written, write_folder
+from avmsf.modal.config import PulseShape
+from avmsf.modal.pulse import ForcePulse
+
+TABLE, INSTRUMENT, SOUNDS = "samples.csv", "instrument.sfz", "sounds"
+_WHERE = ("x", "y", "z", "nx", "ny", "nz")
+_HOW = ("force", "contact_time", "midi_note", "velocity_low", "velocity_high")
+COLUMNS = ("file", *_WHERE, *_HOW, "seconds", "peak_db", "contact")
+HIGHEST_NOTE = 127
+LOWEST_NOTE = 36
+"""MIDI note of the first contact: C2, where drum maps begin."""
+
+_CONTACT = 5e-4
+"""Contact time that the recorded impacts are taken to have had, s: that of a small steel tip on plastic, as
+`avmsf.simulate.hammer` computes it; on steel it has a sixth of it."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """The force at all contacts for one range of a keyboard's velocities."""
+
+    force: float = 1.0
+    """Newtons where the field knows forces, else relative to an average recorded impact."""
+    contact_time: float = 0.0
+    """Seconds that hammer and object are in contact; 0 is the impact as recorded."""
+    shape: PulseShape = "half-sine"
+    """Course of the force over that time."""
+
+
+def hertz_layers(forces: Sequence[float], shape: PulseShape = "half-sine") -> tuple[Layer, ...]:
+    """Return layers of which the hardest is as recorded, and softer ones are longer in contact by Hertz's law.
+
+    A round tip's contact time goes with its speed to the power -1/5 and its force with the speed to the power 6/5
+    (`avmsf.simulate.hammer`), so that the time goes with the force to the power -1/6. The recorded pulse is in the
+    gains already: what is added makes its width, whose squares add, as long as the softer impact's.
+    """
+    hardest = max(forces, default=0.0)
+    ratios = [(hardest / force) ** (1 / 3) - 1.0 if force > 0 else 0.0 for force in forces]
+    return tuple(Layer(force, _CONTACT * math.sqrt(each), shape) for force, each in zip(forces, ratios, strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Impacts to write."""
+
+    contacts: int = 16
+    """Maximum number of contacts, one MIDI note each. More are reduced by farthest point sampling."""
+    layers: tuple[Layer, ...] = (Layer(),)
+    """Each contact has one impact of each; they are sorted by their level."""
+    seconds: float | None = None
+    """Length of the sounds; that of the training sounds where it is not given."""
+    level_db: float = -1.0
+    """Peak of the loudest sound, dB relative to full scale; all sounds are scaled by one factor."""
+    noise: bool = True
+    """Whether the sounds have the residual noise in addition to the modes."""
+
+
+def write_grid(field: SampledField, folder: str | Path, grid: Grid | None = None, *, force: bool = False) -> Written:
+    """Write a float32 wav for every contact and layer, the table and the instrument.
+
+    All sounds are scaled by one factor, which the manifest names as `scale`. Raises `ExportError` for no layers, more
+    contacts than MIDI has notes, and settings that are not positive.
+    """
+    grid = Grid() if grid is None else grid
+    _expect(grid)
+    rate = round(field.sample_rate)
+    if rate != field.sample_rate or rate < 1:
+        raise ExportError.expected(
+            "whole hertz for wav files", field.sample_rate, got=f"{field.sample_rate:g} Hz", name="sample_rate"
+        )
+    rows = torch.arange(len(field)) if len(field) <= grid.contacts else field.spread(grid.contacts)
+    samples = field.samples if grid.seconds is None else max(1, round(grid.seconds * rate))
+    pulses = [ForcePulse(layer.contact_time, layer.shape) for layer in grid.layers]
+    sounds = [
+        field.render(rows, force=layer.force, samples=samples, pulse=pulse, noise=grid.noise)
+        for layer, pulse in zip(grid.layers, pulses, strict=True)
+    ]
+    layers, sounds = _soft_to_loud(grid.layers, sounds)
+    peak = max(float(each.abs().max()) for each in sounds)
+    scale = 10 ** (grid.level_db / 20) / peak if peak > 0 else 1.0
+    # From 1 on: a note of velocity 0 is the end of one. No range is empty, as there are no more layers than velocities.
+    edges = np.linspace(1, HIGHEST_NOTE + 1, len(layers) + 1).round().astype(int)
+    amplitudes = np.stack([each.double().square().mean(1).sqrt().numpy() for each in sounds])
+    records, curves = [], []
+    for place, row in enumerate(rows.tolist()):
+        curves += _curves(amplitudes[:, place], edges)
+        for number, layer in enumerate(layers):
+            sound = scale * sounds[number][place]
+            where = [f"{value:.9g}" for value in (*field.points[row].tolist(), *field.normals[row].tolist())]
+            range_ = (int(edges[number]), int(edges[number + 1]) - 1)
+            loudest = float(sound.abs().max())
+            note = LOWEST_NOTE + place
+            name = f"{SOUNDS}/{place + 1:03d}-{number + 1}.wav"
+            level = f"{20 * math.log10(loudest):.2f}" if loudest > 0 else "-inf"
+            blow = [f"{layer.force:g}", f"{layer.contact_time:g}", note, *range_, f"{samples / rate:.6g}", level, row]
+            records.append((sound, [name, *where, *blow]))
+
+    def fill(place: Path) -> None:
+        (place / SOUNDS).mkdir()
+        for sound, record in records:
+            (place / str(record[0])).write_bytes(_wav(sound, rate))
+        (place / TABLE).write_text(_table([record for _, record in records]))
+        (place / INSTRUMENT).write_text(_instrument(field.name, [record for _, record in records], curves))
+
+    manifest = {"name": field.name, "sampleRate": rate, "scale": scale, "perNewton": field.per_newton}
+    manifest["pulses"] = [layer.shape for layer in layers]
+    sizes = write_folder(Path(folder), fill, manifest, force=force)
+    remarks = [f"all sounds are scaled by {scale:.4g}, so that the loudest reaches {grid.level_db:g} dB"]
+    if layers != grid.layers:
+        named = ", ".join(f"{layer.force:g} ({layer.contact_time:g} s)" for layer in layers)
+        remarks.append(f"layers are sorted from soft to loud: force (contact time) {named}")
+    return Written(sizes, tuple(remarks))
+
+
+def _soft_to_loud(
+    layers: tuple[Layer, ...], sounds: list[Float32[Tensor, "contacts samples"]]
+) -> tuple[tuple[Layer, ...], list[Float32[Tensor, "contacts samples"]]]:
+    """Return the layers and their sounds sorted by their energy at all contacts; equal ones stay in order."""
+    energies = [float(each.double().square().sum()) for each in sounds]
+    order = sorted(range(len(layers)), key=energies.__getitem__)
+    return tuple(layers[number] for number in order), [sounds[number] for number in order]
+
+
+def _expect(grid: Grid) -> None:
+    most = HIGHEST_NOTE + 1 - LOWEST_NOTE
+    if not 1 <= grid.contacts <= most:
+        raise _setting("contacts", f"1 to {most}, one MIDI note each from {LOWEST_NOTE}", grid.contacts)
+    if not 1 <= len(grid.layers) <= HIGHEST_NOTE:
+        raise _setting("layers", f"1 to {HIGHEST_NOTE} forces", len(grid.layers))
+    for layer in grid.layers:
+        if not (math.isfinite(layer.force) and layer.force > 0):
+            raise _setting("force", "a number above 0", layer.force)
+        if not 0 <= layer.contact_time < 1:
+            raise _setting("contact_time", "0 to 1 s", layer.contact_time)
+    if grid.seconds is not None and not (math.isfinite(grid.seconds) and grid.seconds > 0):
+        raise _setting("seconds", "more than 0", grid.seconds)
+    if not (math.isfinite(grid.level_db) and grid.level_db <= 0):
+        raise _setting("level_db", "0 dB or below", grid.level_db)
+
+
+def _setting(name: str, expected: str, value: float | int) -> ExportError:
+    return ExportError(f"{name}: expected {expected}, got {value:g}", name=name, value=value)
+
+
+def _wav(sound: Float32[Tensor, " samples"], rate: int) -> bytes:
+    if not bool(sound.isfinite().all()):
+        raise ExportError(
+            "expected finite samples, got NaN or infinity; fit the field again, or export smaller forces",
+            name="samples",
+        )
+    memory = io.BytesIO()
+    soundfile.write(memory, sound.numpy(), rate, subtype="FLOAT", format="WAV")
+    return memory.getvalue()
+
+
+def _table(records: Sequence[Sequence[object]]) -> str:
+    memory = io.StringIO()
+    writer = csv.writer(memory, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    writer.writerows(records)
+    return memory.getvalue()
+
+
+def _curves(amplitude: Float64[np.ndarray, " layers"], edges: Int[np.ndarray, " edges"]) -> list[str]:
+    """Return the velocity curves of one contact's layers, whose root mean square amplitudes are given.
+
+    Each layer's hardest velocity plays its sound as it is. From there down to the hardest velocity of the layer below,
+    the level falls evenly in decibels to that layer's; the lowest layer falls with the velocity's square, as SFZ
+    players do. A layer that is louder than the next one is lowered to it, so that the level never falls as the
+    velocity rises.
+    """
+    tops = np.minimum.accumulate(np.maximum(amplitude, np.finfo(float).tiny)[::-1])[::-1]
+    curves = []
+    for number, top in enumerate(tops):
+        velocity = np.arange(edges[number], edges[number + 1])
+        if number == 0:
+            level = top * (velocity / velocity[-1]) ** 2
+        else:
+            part = (velocity - edges[number] + 1) / len(velocity)
+            level = tops[number - 1] ** (1 - part) * top**part
+        gains = level / max(amplitude[number], np.finfo(float).tiny)
+        curves.append(" ".join(f"amp_velcurve_{each}={gain:.6g}" for each, gain in zip(velocity, gains, strict=True)))
+    return curves
+
+
+def _instrument(name: str, records: Sequence[Sequence[object]], curves: Sequence[str]) -> str:
+    """Return an SFZ instrument that plays each contact at its note and each layer at its velocities by its curve."""
+    lines = [f"// {name or 'object'}, as exported by avmsf", "<global> loop_mode=one_shot amp_veltrack=100"]
+    regions = [dict(zip(COLUMNS, record, strict=True)) for record in records]
+    for low, high in sorted({(int(str(each["velocity_low"])), int(str(each["velocity_high"]))) for each in regions}):
+        lines.append(f"<group> lovel={low} hivel={high}")
+        lines += [
+            f"<region> sample={each['file']} key={each['midi_note']} {curve}"
+            for each, curve in zip(regions, curves, strict=True)
+            if each["velocity_low"] == low
+        ]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,151 @@
+"""The studio's page with one field: a folder for any static host, or a single file.
+
+A single file has the page's modules as data: addresses in its import map, and all other files as base64, which the
+modules turn into blobs: a browser does not load other files for a page that was opened from a disk. The libraries three
+and spark go with it, spark where Gaussians are shown: no network is needed.
+"""
+
+import base64
+import json
+import re
+from collections.abc import Mapping
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from avmsf.capture.impacts import Impacts
+from avmsf.errors import ExportError
+from avmsf.export.bundle import Bundle, make_bundle, write_files
+from avmsf.export.formats import MOST_POINTS, PAGE_SUFFIXES
+from avmsf.export.policy import directives_of, with_policy
+from avmsf.export.sampled_field import SampledField
+from avmsf.export.writing import Written, generator, write_file, write_folder
+from avmsf.field.sound_field import SoundField
+from avmsf.mesh.surface import Surface
+
+IMPORT_MAP = re.compile(r'(<script type="importmap"[^>]*>)(.*?)(</script>)', re.DOTALL)
+"""The import map, which has the addresses of three and spark."""
+_SPARK = "page/vendor/spark.min.js"
+"""Draws Gaussians alone, and has 2.7 MB."""
+_TITLE = re.compile(r"<title>[^<]*</title>")
+_STYLE = re.compile(r'<link\b[^>]*\bhref="(?:\./)?page/(\w+\.css)"[^>]*>')
+_START = re.compile(r'<script type="module" src="(?:\./)?page/(\w+\.js)"[^>]*></script>')
+_IMPORTED = re.compile(r"""(\bfrom\s*|\bimport\s*\(\s*|\bimport\s+)(["'])\./(\w+\.js)\2""")
+MEDIA_TYPES = {
+    ".aif": "audio/aiff",
+    ".aiff": "audio/aiff",
+    ".bin": "application/octet-stream",
+    ".css": "text/css",
+    ".flac": "audio/flac",
+    ".glb": "model/gltf-binary",
+    ".js": "text/javascript",
+    ".json": "application/json",
+    ".mjs": "text/javascript",
+    ".mp3": "audio/mpeg",
+    ".ogg": "audio/ogg",
+    ".ply": "application/octet-stream",
+    ".wasm": "application/wasm",
+    ".wav": "audio/wav",
+}
+"""Media types of the page's files by suffix; no other files are included or served."""
+
+
+def write_webpage(
+    field: SoundField | SampledField,
+    output: str | Path,
+    *,
+    object: Path | Surface | None = None,
+    meters: float = 1.0,
+    surface: Path | Surface | None = None,
+    strikes: Impacts | None = None,
+    limit: int = MOST_POINTS,
+    force: bool = False,
+) -> Written:
+    """Write a page that plays the field: one file if `output` ends in .html, otherwise a folder.
+
+    The arguments are those of `make_bundle`, whose errors are raised. What exists is replaced only with `force`.
+    """
+    output = Path(output)
+    bundle = make_bundle(field, object=object, meters=meters, surface=surface, strikes=strikes, limit=limit)
+    if output.suffix.lower() in PAGE_SUFFIXES:
+        return Written(write_file(output, single_file(bundle).encode(), force=force), bundle.remarks)
+    content = {**_needed(page_files(), bundle), **bundle.files}
+    html = _titled(content["index.html"].decode(), bundle)
+    content["index.html"] = with_policy(html, directives_of(html)).encode()
+    sizes = write_folder(output, lambda place: write_files(content, place), dict(bundle.manifest), force=force)
+    return Written(sizes, bundle.remarks)
+
+
+def page_files() -> dict[str, bytes]:
+    """Return the files of the studio's page by relative path: index.html, and all others below page/."""
+    folder = files("avmsf") / "studio" / "page"
+    served = (".js", ".css", ".LICENSE")
+    paths = [(f"page/{each.name}", each) for each in folder.iterdir() if each.is_file()]
+    paths += [(f"page/vendor/{each.name}", each) for each in (folder / "vendor").iterdir()]
+    names = {name: each.read_bytes() for name, each in sorted(paths) if name.endswith(served)}
+    return {"index.html": (folder / "index.html").read_bytes(), **names}
+
+
+def _needed(page: Mapping[str, bytes], bundle: Bundle) -> dict[str, bytes]:
+    """Return the page's files without spark where it has nothing to draw."""
+    gaussians = bundle.manifest["object"]["kind"] == "gaussians"
+    return {name: each for name, each in page.items() if gaussians or name != _SPARK}
+
+
+def single_file(bundle: Bundle, page: Mapping[str, bytes] | None = None) -> str:
+    """Return the page with bundle, styles and modules in one file. `page` is by default that of `page_files`."""
+    page = _needed(page_files() if page is None else page, bundle)
+    html = _titled(page["index.html"].decode(), bundle)
+    html = _once(IMPORT_MAP, html, lambda found: found[1] + _carrying(found[2], page) + found[3], "import map")
+    html = _STYLE.sub(lambda found: f"<style>\n{page[f'page/{found[1]}'].decode()}</style>", html)
+    carried = {"manifest.json": json.dumps(bundle.manifest).encode(), "page/bank.js": page["page/bank.js"]}
+    inlined = {name: _carried(name, content) for name, content in {**carried, **bundle.files}.items()}
+    begin = (
+        f"<script>globalThis.avmsfInlined = {json.dumps(inlined)};</script>\n"
+        '<script type="module">import "avmsf/{name}";</script>'
+    )
+    # The generator at the beginning is how a later export recognizes the file.
+    html = html.replace("<!doctype html>\n", f"<!doctype html>\n<!-- {generator()} -->\n", 1)
+    html = _once(_START, html, lambda found: begin.replace("{name}", found[1]), "script that starts the page")
+    return with_policy(html, directives_of(html, single=True))
+
+
+def _titled(html: str, bundle: Bundle) -> str:
+    """Return the page with the object's name as its title, which is shown until the page's script runs."""
+    title = f"<title>{escape(bundle.manifest['name'] or 'Sound field')}</title>"
+    return _once(_TITLE, html, lambda found: title, "title")
+
+
+def _bare(source: str) -> str:
+    """Return a module with bare specifiers in its imports: a data: address has no base for relative ones."""
+    return _IMPORTED.sub(r"\1\2avmsf/\3\2", source)
+
+
+def _carrying(words: str, page: Mapping[str, bytes]) -> str:
+    """Return the import map with the page's modules and libraries as data: addresses, each once."""
+    scripts = {name: each.decode() for name, each in page.items() if name.endswith(".js")}
+    imports, first = dict[str, str](), dict[str, str]()
+    for specifier, address in json.loads(words)["imports"].items():
+        path = address.removeprefix("./")
+        if path in first:
+            imports[specifier] = _data_url(f'export * from "{first[path]}";')
+        elif path in scripts:
+            first[path], imports[specifier] = specifier, _data_url(scripts[path])
+    own = {name.removeprefix("page/"): each for name, each in scripts.items() if name.count("/") == 1}
+    return json.dumps({"imports": imports | {f"avmsf/{name}": _data_url(_bare(each)) for name, each in own.items()}})
+
+
+def _data_url(source: str) -> str:
+    return f"data:text/javascript;base64,{base64.b64encode(source.encode()).decode()}"
+
+
+def _carried(name: str, content: bytes) -> dict[str, str]:
+    return {"type": MEDIA_TYPES[Path(name).suffix], "base64": base64.b64encode(content).decode()}
+
+
+def _once(pattern: re.Pattern[str], text: str, change: Any, what: str) -> str:
+    changed, count = pattern.subn(change, text)
+    if count != 1:
+        raise ExportError.expected(f"one {what}", count, file="index.html", name=what, advice="install avmsf again")
+    return changed

@@ -1,0 +1,245 @@
+"""From features in images to features on the object: every point looked up in all views that see it (paper, 3.2)."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+from avmsf.errors import SceneError
+from avmsf.features.encoder import Encoder, continue_outside
+from avmsf.features.feature_field import FeatureField
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.points import nearest_points
+from avmsf.gaussians.rasterizer.protocol import Rasterizer, choose_rasterizer
+from avmsf.gaussians.visibility import DepthMap, Sight, depth_of_cloud, depth_reach, look
+from avmsf.photographs.cameras import Camera, View
+
+_REACH = 1.0
+"""Standard deviations by which a Gaussian may lie behind the depth that is seen and still be of that surface. Two let
+twice as many through thin walls; what one turns away is seen at a slant, and by other views better."""
+_NEIGHBORS = 3
+"""Seen points whose features an unseen one takes the mean of."""
+
+LEAST_SEEN = 0.05
+"""Part of the views that have a point in their image that must see it, for it to be one of the surface.
+
+Fitted Gaussians also fill walls and the space behind them. On a simulated mug with 48 views of 192 pixels, 34 % of
+10,332 lie more than 2 mm off the true surface. Of the 8080 that `supported` leaves, 18 % do; of those within 1 mm it
+leaves out 1.7 %. A part of .1 costs three times as many of these.
+"""
+Weighting = Callable[[Sight], Float[Tensor, " points"]]
+"""How much one view's word counts for each point, given what it sees of them; zero where it sees nothing."""
+
+
+@dataclass(frozen=True)
+class LiftProgress:
+    """How far a lift has come."""
+
+    view: str
+    """Name of the view just described."""
+    done: int
+    """Views described."""
+    total: int
+
+
+@dataclass(frozen=True, eq=False)
+class Lifted:
+    """Features of points, and how much the views had to say about them."""
+
+    features: FeatureField
+    seen: Int[Tensor, " points"]
+    """Number of views that see each point; where it is 0 the feature is its neighbors'."""
+    past: Int[Tensor, " points"]
+    """Number of these that see a surface behind the point."""
+    agreement: float
+    """Share of the features' variance over points and views that lies between points, not between views of a point."""
+    dropped: int = 0
+    """Number of points that were left out because the views contradict them."""
+
+    @property
+    def unseen(self) -> int:
+        """Number of points that no view sees."""
+        return int((self.seen == 0).sum())
+
+
+def supported(lifted: Lifted, views: Sequence[View]) -> Lifted:
+    """Return the points that views see as part of the surface.
+
+    That are at least one view and `LEAST_SEEN` of those that have the point in their image: what the views agree to be
+    hidden is inside the object or behind its surface. And at least as many as see a surface behind the point, which is
+    then afloat before it. Raises SceneError where no point is left.
+    """
+    points = lifted.features.points
+    held = torch.zeros(len(points), device=points.device)
+    for view in views:
+        places, depth = view.camera.project(points.cpu())
+        size = places.new_tensor([view.camera.width, view.camera.height])
+        held += ((depth > 0) & (places >= 0).all(1) & (places <= size).all(1)).to(held)
+    kept = (lifted.seen >= (LEAST_SEEN * held).clamp_min(1.0)) & (2 * lifted.past <= lifted.seen)
+    if not bool(kept.any()):
+        raise SceneError(
+            f"expected points visible in {100 * LEAST_SEEN:g} % of the views that show their position, got none of "
+            f"{len(points)} ({int((lifted.seen > 0).sum())} are visible in any); check that cameras and points are in "
+            "one frame and unit, and that the Gaussians were fitted to these views",
+            name="points",
+            value=0,
+        )
+    features = replace(lifted.features, points=points[kept], features=lifted.features.features[kept])
+    return replace(
+        lifted, features=features, seen=lifted.seen[kept], past=lifted.past[kept], dropped=int((~kept).sum())
+    )
+
+
+def by_presence(sight: Sight) -> Float[Tensor, " points"]:
+    """Weigh all views that see a point alike: the paper's plain mean."""
+    return sight.seen.double()
+
+
+def by_visibility(sight: Sight) -> Float[Tensor, " points"]:
+    """Weigh a view by how surely it sees a point, and by the pixels that it spends on a piece of surface there."""
+    nearness = torch.where(sight.share > 0, sight.camera.focal[0] * sight.camera.focal[1] / sight.depth**2, 0.0)
+    return sight.share * nearness
+
+
+def lift(
+    cloud: GaussianCloud,
+    views: Sequence[View],
+    encoder: Encoder,
+    *,
+    rasterizer: Rasterizer | None = None,
+    weighting: Weighting = by_presence,
+    inpainted: bool = True,
+    progress: Callable[[LiftProgress], None] | None = None,
+) -> Lifted:
+    """Give every Gaussian the mean of the features at its places in the views that see it.
+
+    A view sees a Gaussian whose center lies inside its mask, where it has one, and no deeper than the depth that the
+    cloud shows there plus the Gaussian's own standard deviation along the view and two pixels: a surface of Gaussians
+    is as thick as they are. The `rasterizer` is by default the one for the cloud's device. Raises as `lift_points`.
+    """
+    rasterizer = choose_rasterizer(cloud.centers.device) if rasterizer is None else rasterizer
+    return lift_points(
+        cloud.centers,
+        views,
+        encoder,
+        depth_map=depth_of_cloud(cloud, rasterizer),
+        reach=lambda camera: _REACH * depth_reach(cloud, camera),
+        weighting=weighting,
+        inpainted=inpainted,
+        progress=progress,
+    )
+
+
+def lift_points(
+    points: Float[Tensor, "points 3"],
+    views: Sequence[View],
+    encoder: Encoder,
+    *,
+    depth_map: DepthMap,
+    reach: Callable[[Camera], Float[Tensor, " points"]] | None = None,
+    weighting: Weighting = by_presence,
+    inpainted: bool = True,
+    progress: Callable[[LiftProgress], None] | None = None,
+) -> Lifted:
+    """Give points of a surface, whose depth in a camera `depth_map` knows, the mean of the features in their views.
+
+    `reach` says how far behind that depth a point may lie, meters; without it, points lie on the surface. Images are
+    `inpainted` outside their masks with the object's colors, or described as they are (paper). One view is
+    described at a time. Raises SceneError where there is nothing to lift or where no view sees any point.
+    """
+    if not len(points) or not len(views):
+        raise SceneError(
+            f"expected points and views to compute features from, got {len(points)} and {len(views)}",
+            name="views" if len(points) else "points",
+            value=0,
+        )
+    tally = _Tally(len(points))
+    for done, view in enumerate(views, start=1):
+        behind = points.new_zeros(len(points)) if reach is None else reach(view.camera)
+        sight = look(points.detach(), view, depth_map(view.camera), reach=behind)
+        found = _sample(_describe(view, encoder, inpainted=inpainted), sight)
+        tally.add(found, torch.where(sight.seen, weighting(sight), 0.0).float(), view.name)
+        tally.past += sight.seen & (sight.past > 0.5)
+        if progress is not None:
+            progress(LiftProgress(view.name, done, len(views)))
+    return tally.result(points, encoder.name)
+
+
+class _Tally:
+    """Sums over the views so far."""
+
+    def __init__(self, count: int) -> None:
+        self.weights = torch.zeros(count)
+        self.seen, self.past = torch.zeros(count, dtype=torch.long), torch.zeros(count, dtype=torch.long)
+        self.sums, self.squares = torch.zeros(count, 0), torch.zeros(count, dtype=torch.float64)
+
+    def add(self, found: Float[Tensor, "points dim"], weights: Float[Tensor, " points"], view: str) -> None:
+        """Add the features of one view."""
+        if not self.sums.shape[1]:
+            self.sums = torch.zeros(found.shape)
+        if found.shape != self.sums.shape:
+            raise SceneError(
+                f"{view}: expected {self.sums.shape[1]} features as in the other views, got {found.shape[1]}; use an "
+                "encoder of one dimension",
+                name=view,
+                value=found.shape[1],
+            )
+        self.seen += weights > 0
+        self.weights += weights
+        self.sums += weights[:, None] * found
+        self.squares += weights * found.double().square().sum(1)
+
+    def result(self, points: Float[Tensor, "points 3"], encoder: str) -> Lifted:
+        """Return the means, with those of seen neighbors where there is none."""
+        known = self.seen > 0
+        if not bool(known.any()):
+            raise SceneError(
+                f"expected points visible in the views, got none of {len(points)}; check that points and cameras are "
+                "in one frame and in meters, and that the masks are not empty",
+                name="points",
+                value=0,
+            )
+        means = self.sums[known] / self.weights[known][:, None]
+        features = torch.zeros_like(self.sums)
+        features[known] = means
+        if not bool(known.all()):
+            places = points.detach().cpu()
+            near = nearest_points(places[known], places[~known], count=min(_NEIGHBORS, int(known.sum())))
+            features[~known] = means[near].mean(1)
+        field = FeatureField(points.detach().float(), features.to(points.device), encoder)
+        return Lifted(field, self.seen.to(points.device), self.past.to(points.device), self._agreement())
+
+    def _agreement(self) -> float:
+        """Return 1 - (variance between views of one point) / (variance in all), of the points that two views see."""
+        often = self.seen > 1
+        weights, sums = self.weights[often].double(), self.sums[often].double()
+        own = float((self.squares[often] - sums.square().sum(1) / weights).sum())
+        total = float(self.squares[often].sum() - sums.sum(0).square().sum() / weights.sum())
+        return 1.0 - own / total if total > 0 else 1.0
+
+
+def _describe(view: View, encoder: Encoder, *, inpainted: bool) -> Float[Tensor, "dim rows columns"]:
+    coverage = view.coverage
+    color = view.color if coverage is None or not inpainted else continue_outside(view.color, coverage)
+    found = encoder.describe(color)
+    if found.ndim != 3 or not found.numel() or not bool(torch.isfinite(found).all()):
+        raise SceneError(
+            f"{view.name}: expected finite features [dim, rows, columns] from the encoder {encoder.name!r}, got "
+            f"{list(found.shape)}" + (" with numbers that are not finite" if found.numel() else ""),
+            name=encoder.name,
+            value=list(found.shape),
+        )
+    return found.float()
+
+
+def _sample(features: Float[Tensor, "dim rows columns"], sight: Sight) -> Float[Tensor, "points dim"]:
+    """Return the map's values at the places that are seen, bilinear between the cells' centers."""
+    size = sight.places.new_tensor([sight.camera.width, sight.camera.height])
+    # Without aligned corners, -1 and 1 are the image's edges, as in the pixels' own convention.
+    grid = (2 * sight.places / size - 1).float().to(features.device)
+    return functional.grid_sample(
+        features[None], grid[None, None], mode="bilinear", padding_mode="border", align_corners=False
+    )[0, :, 0].T.cpu()

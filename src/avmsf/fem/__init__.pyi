@@ -1,0 +1,2 @@
+from .material import MATERIALS as MATERIALS
+from .material import Material as Material

@@ -1,0 +1,470 @@
+"""Guesses at what lies behind an object's surface, each with the shapes in which such a body would vibrate."""
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from threading import Lock
+from types import MappingProxyType
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Int
+
+from avmsf._utils.caching import key_of, source_digest
+from avmsf._utils.compiled import lane_count
+from avmsf.errors import SceneError, SimulationError
+from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
+from avmsf.fem.elastic_store import modes_once
+from avmsf.fem.elements import SecondOrder
+from avmsf.fem.material import LARGEST_ERROR, NOMINAL, Material
+from avmsf.fem.mesh_check import CheckedSurface, checked
+from avmsf.fem.mesh_filling import FEWEST, TRIANGLES, count_dofs, expect_memory, filled_solid, wall_solids
+from avmsf.fem.solid import Solid
+from avmsf.fem.supports import Support, supports_of
+from avmsf.mesh.surface import Surface
+
+WALLS = tuple(float(part) for part in np.geomspace(0.003, 0.05, 6))
+"""Thickness of walls that are tried, over the diagonal of the box around the surface."""
+TRIAL = 12_000
+"""Degrees of freedom at most of each of several bodies."""
+WALL_TRIAL = 22_000
+"""Degrees of freedom at most of each of several walls of a shape: with 12,000 the log evidence of one thickness
+scatters by 15 nats from one mesh to the next, with 22,000 by about 3 (a mug)."""
+_LOWEST = 8
+"""Frequencies that are compared."""
+_FORMAT = 3
+"""Number of the way in which bodies are made; kept files of another are not read."""
+_THICKNESSES = 5
+"""Thicknesses that are computed at first of a shape whose wall is not known."""
+_MEANS = frozenset({"memory", "timeout", "pytetwild"})
+"""Names of errors that are no fault of a surface or its wall."""
+
+
+@runtime_checkable
+class Shape(Protocol):
+    """An object's shape as seen from outside, which a wall of any thickness may have."""
+
+    @property
+    def thickness_range(self) -> tuple[float, float] | None:
+        """Least and largest thickness of a wall that is worth a trial, meters; None for an object without a cavity."""
+        ...
+
+    def as_seen(self) -> Surface:
+        """Return the closed surface of what was seen, both sides of walls included."""
+        ...
+
+    def shell(self, thickness: float, *, faces: int) -> Surface:
+        """Return the closed surface of a wall, meters thick, behind the outer side. Raises SceneError without one.
+
+        Each of its sides has about so many triangles.
+        """
+        ...
+
+    def digest(self) -> str:
+        """Return a digest of all that decides the surfaces."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class NominalBody:
+    """One guess at what lies behind an object's surface, and how it would vibrate."""
+
+    wall: float | None
+    """Thickness of its wall, meters; None for a solid body."""
+    elastic: ElasticModes
+    """Nominal material."""
+    fine: bool = True
+    """Whether its elements are as many as were asked for; `refined` makes those finer that were made to be compared."""
+    support: Support | None = None
+    """Where it is held; None for a free body."""
+    updated: float | None = None
+    """Log evidence (nats) that it gained by departures of its stiffness and density; None without."""
+
+    @property
+    def name(self) -> str:
+        """What it is, for people."""
+        parts = [body_name(self.wall), "" if self.support is None else self.support.name]
+        parts.append("" if self.updated is None else "stiffness and density updated")
+        return ", ".join(filter(None, parts))
+
+
+@dataclass(frozen=True, eq=False)
+class NominalBodies:
+    """All guesses from which modes could be computed."""
+
+    bodies: tuple[NominalBody, ...]
+    """At least one: the solid body first, then walls from thin to thick, or as the user states them."""
+    refused: Mapping[float | None, str]
+    """Reasons why others could not be had, by the others' walls: names of two may be alike."""
+
+
+def nominal_bodies(
+    surface: Surface | Shape,
+    *,
+    walls: Sequence[float | None] | None = None,
+    count: int = 80,
+    dofs: int = 40_000,
+    material: Material = NOMINAL,
+    cache: Path | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> NominalBodies:
+    """Return the bodies that may lie behind a surface, with the lowest `count` modes of each, made of `material`.
+
+    `walls` states what to try: thicknesses in meters, None for what the surface encloses. By itself it tries that,
+    and walls of `WALLS` times the surface's size where the surface is a sheet or holds much more than the wall would;
+    of a `Shape`, walls all over its range of thickness. Where one body is left, it has about `dofs` degrees of
+    freedom, at most a fifth more; of several each has at most `TRIAL`, or `WALL_TRIAL`, enough to choose by, and
+    `refined` makes the chosen one fine. Dense, noisy and inverted surfaces are repaired, and `tell` is called with a
+    note; the wall of an open one lies behind its triangles, whichever way they face. Modes are kept by content in the
+    folder `cache`, for they take most of the time; a damaged file is made again.
+
+    Raises SimulationError for a surface of points, and where no body can be had, with the reason for each: by the name
+    "surface", or by that of the reason where only memory, time or the mesher stood against it.
+    """
+    told = tell or (lambda words: None)
+    maker = _Maker(surface, count, cache, told, material)
+    _expect_settings(count, dofs, walls)
+    guessed = walls is None
+    wanted: list[float | None] = maker.guesses() if walls is None else list(dict.fromkeys(walls))
+    refused: dict[float | None, SimulationError] = {}
+    likely: list[float | None] = []
+    for wall in wanted:
+        try:
+            maker.expect_likely(wall, guessed=guessed)
+            likely.append(wall)
+        except SimulationError as error:
+            refused[wall] = error
+    bodies = maker.bodies(likely, dofs, refused)
+    reasons = _grouped(refused)
+    if not bodies:
+        causes = {str(error.name) for error in refused.values()}
+        other = "give the wall thickness in meters" if guessed else "give another wall thickness, or none"
+        raise SimulationError(
+            f"expected a surface with a finite-element model, got none ({'; '.join(reasons)}); repair the mesh, or "
+            f"{other}",
+            name=min(causes) if causes <= _MEANS else "surface",
+            value=reasons,
+        )
+    for reason in reasons:
+        told(_without(reason))
+    if len(bodies) == 1 and not bodies[0].fine:
+        bodies = [refined(surface, bodies[0], dofs=dofs, cache=cache, tell=tell)]
+    return NominalBodies(tuple(bodies), MappingProxyType({wall: str(error) for wall, error in refused.items()}))
+
+
+def with_wall(
+    surface: Surface | Shape,
+    wall: float,
+    *,
+    count: int = 80,
+    dofs: int = 40_000,
+    cache: Path | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> NominalBody | None:
+    """Return the body with a wall of this thickness, meters, coarse as those of `nominal_bodies`; None if that fails.
+
+    `tell` is called with the reason.
+    """
+    told = tell or (lambda words: None)
+    try:
+        return _Maker(surface, count, cache, told).body(wall, dofs, fine=False)
+    except SimulationError as error:
+        told(_without(f"{body_name(wall)}: {error}"))
+        return None
+
+
+def refined(
+    surface: Surface | Shape,
+    body: NominalBody,
+    *,
+    dofs: int = 40_000,
+    cache: Path | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> NominalBody:
+    """Return a body of `nominal_bodies` computed with about `dofs` degrees of freedom; a fine one as it is.
+
+    Where that fails, for want of memory or because it cannot be filled so finely, the coarser one is returned, which
+    was good enough to choose by, and `tell` is called with the reason. Raises SimulationError for settings that cannot
+    be meant.
+    """
+    if body.fine:
+        return body
+    told = tell or (lambda words: None)
+    _expect_settings(len(body.elastic), dofs, [body.wall])
+    try:
+        maker = _Maker(surface, len(body.elastic), cache, told, body.elastic.material)
+        if body.support is None:
+            return maker.body(body.wall, dofs, fine=True)
+        modes = maker.held(body.wall, dofs, maker.solid(body.wall, dofs), body.support, perturbed=True)
+        return replace(body, elastic=modes, fine=True)
+    except SimulationError as error:
+        told(f"{body.name}: using the coarse mesh: {error}")
+        return body
+
+
+def supported(
+    surface: Surface | Shape,
+    body: NominalBody,
+    *,
+    dofs: int = 40_000,
+    cache: Path | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> tuple[NominalBody, ...]:
+    """Return a free body of `nominal_bodies`, and held where an object may be: at its lowest face or point, or an edge.
+
+    All have the same tetrahedra, of `TRIAL` or `WALL_TRIAL` degrees of freedom at most, enough to choose by; `refined`
+    makes the chosen one fine, without a check of its convergence. Those whose modes cannot be computed are left out,
+    and `tell` is called with the reason; none are returned if the free one's cannot.
+    """
+    told = tell or (lambda words: None)
+    trial = TRIAL if isinstance(surface, Surface) else WALL_TRIAL
+    few = min(dofs, trial)
+    maker, bodies = _Maker(surface, len(body.elastic), cache, told, body.elastic.material), []
+    try:
+        solid = maker.solid(body.wall, few)
+        for support in (None, *supports_of(SecondOrder.of(solid))):
+            try:
+                modes = maker.held(body.wall, few, solid, support, perturbed=dofs <= trial)
+                bodies.append(NominalBody(body.wall, modes, dofs <= trial, support))
+            except SimulationError as error:
+                if support is None:
+                    raise
+                told(_without(f"{body.name}, {support.name}: {error}"))
+    except SimulationError as error:
+        told(f"{body.name}: no supports tested: {error}")
+    return tuple(bodies)
+
+
+class _Maker:
+    """Makes the bodies of one surface or shape, and does once what all of them need."""
+
+    def __init__(
+        self,
+        surface: Surface | Shape,
+        count: int,
+        cache: Path | None,
+        tell: Callable[[str], None],
+        material: Material = NOMINAL,
+    ) -> None:
+        self._given = surface
+        self._shape = None if isinstance(surface, Surface) else surface
+        self._count, self._cache, self._tell, self._material = count, cache, tell, material
+        self._walls: dict[int, Callable[[float], Solid]] = {}
+        self._lock = Lock()
+
+    @cached_property
+    def _seen(self) -> Surface:
+        return self._given if isinstance(self._given, Surface) else self._given.as_seen()
+
+    @cached_property
+    def checked(self) -> CheckedSurface:
+        """The surface, mended."""
+        return checked(self._seen, tell=self._tell)
+
+    def guesses(self) -> list[float | None]:
+        """Return the walls to try; None for what the surface encloses."""
+        if self._shape is None:
+            return [None, *(part * self.checked.skin.size for part in WALLS)]
+        between = self._shape.thickness_range
+        return [None] if between is None else [None, *np.geomspace(*between, _THICKNESSES).tolist()]
+
+    def expect_likely(self, wall: float | None, *, guessed: bool) -> None:
+        """Raise SimulationError where a body is out of the question before tetrahedra are made."""
+        if wall is None:
+            self.checked.expect_filling()
+        elif wall >= self.checked.width:
+            raise SimulationError(
+                f"expected a wall thinner than the object's width of {_millimeters(self.checked.width, 3)}, got "
+                f"{_millimeters(wall, 3)}; give a thinner wall",
+                name="wall",
+                value=wall,
+            )
+        elif guessed and self._shape is None:
+            self.checked.expect_hollow(wall)
+
+    def body(self, wall: float | None, dofs: int, *, fine: bool) -> NominalBody:
+        """Return one body with so many degrees of freedom, or with at most `TRIAL` where it need not be fine."""
+        trial = TRIAL if self._shape is None else WALL_TRIAL
+        if not fine and dofs > trial:
+            try:
+                return NominalBody(wall, self._modes(wall, trial, perturbed=False), fine=False)
+            except SimulationError as error:
+                # Thin walls are lost in few tetrahedra. A shape has other thicknesses, and the thinnest is a bound.
+                if self._shape is not None:
+                    raise
+                self._tell(f"retrying with more tetrahedra ({error})")
+        return NominalBody(wall, self._converged(wall, dofs))
+
+    def bodies(
+        self, walls: Sequence[float | None], dofs: int, refused: dict[float | None, SimulationError]
+    ) -> list[NominalBody]:
+        """Return the bodies with these walls, fine if it is one; `refused` gets the errors of those that fail."""
+        bodies = []
+        # Most of the time goes to factorizations, which release the interpreter's lock and keep a processor busy each.
+        with ThreadPoolExecutor(lane_count()) as pool:
+            pending = {wall: pool.submit(self.body, wall, dofs, fine=len(walls) == 1) for wall in walls}
+            try:
+                for wall, body in pending.items():
+                    try:
+                        bodies.append(body.result())
+                    except SimulationError as error:
+                        refused[wall] = error
+            finally:
+                pool.shutdown(cancel_futures=True)
+        return bodies
+
+    def _converged(self, wall: float | None, dofs: int) -> ElasticModes:
+        """Return modes of one body, of twice as many degrees of freedom where their frequencies still change much."""
+        modes = self._modes(wall, dofs, perturbed=True)
+        # The thickness of a shape's wall is found with such elements, and makes up for their stiffness.
+        if dofs <= TRIAL or (self._shape is not None and wall is not None):
+            return modes
+        try:
+            error = _frequency_error(self._modes(wall, TRIAL, perturbed=False), modes)
+        except SimulationError as failure:
+            self._tell(f"{body_name(wall)}: mesh convergence not checked ({failure})")
+            return modes
+        if error > LARGEST_ERROR:
+            try:
+                finer = self._modes(wall, 2 * dofs, perturbed=True)
+                modes, error = finer, _frequency_error(modes, finer)
+            except SimulationError as failure:
+                self._tell(f"{body_name(wall)}: no finer mesh ({failure})")
+        if error > LARGEST_ERROR:
+            self._tell(
+                f"{body_name(wall)}: mesh too coarse, relative error of the lowest frequencies about {error:.0%}; "
+                f"allow {4 * dofs} degrees of freedom (--body.dofs)"
+            )
+        return modes
+
+    def held(
+        self, wall: float | None, dofs: int, solid: Solid, support: Support | None, *, perturbed: bool
+    ) -> ElasticModes:
+        """Return the modes of tetrahedra that are held, or free without a support, read from where they are kept."""
+        fixed = None if support is None else support.nodes(SecondOrder.of(solid))
+        kept = self._kept(wall, dofs, support, perturbed=perturbed)
+        return modes_once(kept, lambda: self._solved(solid, dofs, fixed, perturbed=perturbed), tell=self._tell)
+
+    def _modes(self, wall: float | None, dofs: int, *, perturbed: bool) -> ElasticModes:
+        """Return the modes of one free body, read from where they are kept."""
+        kept = self._kept(wall, dofs, perturbed=perturbed)
+        return modes_once(kept, lambda: self._computed(wall, dofs, perturbed=perturbed), tell=self._tell)
+
+    def _computed(self, wall: float | None, dofs: int, *, perturbed: bool) -> ElasticModes:
+        return self._solved(self.solid(wall, dofs), dofs, None, perturbed=perturbed)
+
+    def _solved(
+        self, solid: Solid, dofs: int, fixed: Int[np.ndarray, " fixed"] | None, *, perturbed: bool
+    ) -> ElasticModes:
+        size = count_dofs(solid)
+        self._tell(f"{self._count} elastic modes of {size} degrees of freedom")
+        try:
+            return elastic_modes(solid, self._material, count=self._count, fixed=fixed, perturbed=perturbed)
+        except MemoryError as error:
+            raise SimulationError(
+                f"expected enough memory for {size} degrees of freedom, got too little; use "
+                f"{max(dofs // 2, FEWEST)} (--body.dofs), or close other programs",
+                name="dofs",
+                value=size,
+            ) from error
+
+    def solid(self, wall: float | None, dofs: int) -> Solid:
+        """Return tetrahedra with about so many degrees of freedom."""
+        expect_memory(dofs)
+        self._tell(f"dividing the {body_name(wall)} into tetrahedra")
+        if wall is None:
+            return filled_solid(self.checked, dofs)
+        if self._shape is not None:
+            try:
+                surface = self._shape.shell(wall, faces=round(0.5 * TRIANGLES * dofs))
+            except SceneError as error:
+                raise SimulationError(str(error), **error.attributes) from error
+            return filled_solid(checked(surface, tell=self._tell), dofs, wall=wall)
+        with self._lock:
+            if dofs not in self._walls:
+                self._walls[dofs] = wall_solids(self.checked, dofs)
+        return self._walls[dofs](wall)
+
+    def _kept(self, wall: float | None, dofs: int, support: Support | None = None, *, perturbed: bool) -> Path | None:
+        if self._cache is None:
+            return None
+        values = {
+            "format": _FORMAT,
+            "version": version("avmsf"),
+            "source": source_digest(__name__),
+            "surface": self._digest,
+            "wall": wall,
+            "count": self._count,
+            "dofs": dofs,
+            "perturbed": perturbed,
+            "material": asdict(self._material),
+            "support": None if support is None else asdict(support),
+        }
+        return self._cache / f"nominal-{key_of(values)}.safetensors"
+
+    @cached_property
+    def _digest(self) -> str:
+        """Digest of the surface's vertices and triangles, or of the shape."""
+        if self._shape is not None:
+            return self._shape.digest()
+        surface = self._seen
+        vertices, faces = surface.vertices.double().cpu().numpy(), surface.faces.long().cpu().numpy()
+        content = hashlib.sha256(f"{vertices.shape} {faces.shape}".encode())
+        content.update(vertices.tobytes())
+        content.update(faces.tobytes())
+        return content.hexdigest()
+
+
+def _frequency_error(coarse: ElasticModes, fine: ElasticModes) -> float:
+    """Return an estimate of the largest relative error of the finer body's lowest frequencies (Richardson's).
+
+    Errors go with the second power of the edges' length where facets cut off cross-section, and with the fourth where
+    they lock; taken is the third. The number of nodes on the surface goes with the inverse of the second.
+    """
+    count = min(_LOWEST, len(coarse), len(fine))
+    change = float((coarse.frequency[:count] / fine.frequency[:count] - 1.0).abs().max())
+    return change / max((len(fine.nodes) / len(coarse.nodes)) ** 1.5 - 1.0, 1.0)
+
+
+def _expect_settings(count: int, dofs: int, walls: Sequence[float | None] | None) -> None:
+    if count < 1:
+        raise SimulationError(f"count: expected 1 mode or more, got {count}", name="count", value=count)
+    if dofs < FEWEST:
+        raise SimulationError(f"dofs: expected {FEWEST} or more, got {dofs}", name="dofs", value=dofs)
+    if walls is not None and not len(walls):
+        raise SimulationError(
+            "walls: expected thicknesses in meters, or None for a solid body, got an empty list",
+            name="walls",
+            value=[],
+        )
+    for row, wall in enumerate(walls or ()):
+        if wall is not None and not 0 < wall < float("inf"):
+            raise SimulationError.expected("more than 0 m, or None for a solid body", wall, row=row, name="walls")
+
+
+def _grouped(refused: Mapping[float | None, SimulationError]) -> list[str]:
+    """Return each reason once, after the names of all that it holds for."""
+    names: dict[str, list[str]] = {}
+    for wall, error in refused.items():
+        names.setdefault(str(error), []).append(body_name(wall))
+    shown = {reason: f"{each[0]} to {each[-1]}" if len(each) > 2 else ", ".join(each) for reason, each in names.items()}
+    return [f"{each}: {reason}" for reason, each in shown.items()]
+
+
+def _without(reason: str) -> str:
+    """Return the note of a body that cannot be had, where there are others; without an error's advice."""
+    return f"not tried as the body: {reason.partition('; ')[0]}; the other candidates are compared"
+
+
+def body_name(wall: float | None) -> str:
+    """Return what a body of this wall, meters, is called, with two digits; None is all that the surface encloses."""
+    return "solid body" if wall is None else f"wall of {_millimeters(wall, 2)}"
+
+
+def _millimeters(meters: float, digits: int) -> str:
+    """Return a length with so many significant digits and no exponent."""
+    return f"{float(f'{1000 * meters:.{digits}g}'):g} mm"

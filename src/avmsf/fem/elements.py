@@ -1,0 +1,168 @@
+"""Second-order tetrahedra: their nodes, and the stiffness and mass matrices of linear elasticity on them.
+
+A cell has ten nodes, its corners and the middles of its edges, and straight edges, so that the gradients of its
+barycentric coordinates are constant in it. Its shape functions are l_i (2 l_i - 1) at corner i and 4 l_i l_j between
+the corners i and j. The products of their gradients are of second degree, which four points integrate exactly; the
+mass matrix is the same for all cells but for their volume.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse
+from jaxtyping import Float64, Int
+from torch import Tensor
+
+from avmsf.fem.material import Material
+from avmsf.fem.perturbation import Elements
+from avmsf.fem.solid import Solid
+
+_EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
+"""Corners at the ends of the edges on whose middles a cell's nodes 4 to 9 lie."""
+_INNER, _OUTER = (5.0 + 3.0 * np.sqrt(5.0)) / 20.0, (5.0 - np.sqrt(5.0)) / 20.0
+_QUADRATURE = np.full((4, 4), _OUTER) + np.eye(4) * (_INNER - _OUTER)
+"""Barycentric coordinates of four points of equal weight, exact to the second degree."""
+
+
+@dataclass(frozen=True, eq=False)
+class SecondOrder:
+    """A solid with a node in the middle of each edge."""
+
+    solid: Solid
+    nodes: Float64[np.ndarray, "nodes 3"]
+    """The solid's points, then the middles of the edges, meters."""
+    cells: Int[np.ndarray, "cells 10"]
+    """Rows of `nodes`: a cell's corners, then the middles of its edges 01, 12, 02, 03, 13 and 23."""
+
+    @classmethod
+    def of(cls, solid: Solid) -> "SecondOrder":
+        """Return the nodes on a solid."""
+        points, corners = solid.points.numpy(), solid.cells.numpy()
+        ends = np.sort(corners[:, _EDGES], axis=-1).reshape(-1, 2)
+        # One number an edge sorts many times faster than rows of two.
+        keys, which = np.unique(ends[:, 0] * len(points) + ends[:, 1], return_inverse=True)
+        middles = 0.5 * (points[keys // len(points)] + points[keys % len(points)])
+        edges = which.reshape(-1, len(_EDGES)) + len(points)
+        return cls(solid, np.concatenate([points, middles]), np.concatenate([corners, edges], axis=1))
+
+    @cached_property
+    def boundary(self) -> Int[np.ndarray, "triangles 6"]:
+        """Rows of `nodes` on the outer triangles: corners, then the middles of the edges 01, 12 and 20."""
+        corners = self.solid.boundary.numpy()
+        points = len(self.solid.points)
+        ends = np.sort(self.cells[:, :4][:, _EDGES], axis=-1).reshape(-1, 2)
+        keys, first = np.unique(ends[:, 0] * points + ends[:, 1], return_index=True)
+        outer = np.sort(corners[:, [[0, 1], [1, 2], [2, 0]]], axis=-1)
+        found = first[np.searchsorted(keys, outer[..., 0] * points + outer[..., 1])]
+        return np.concatenate([corners, self.cells[:, 4:].ravel()[found]], axis=1)
+
+    def assemble(
+        self, factors: Float64[np.ndarray, "cells 10 10 size size"] | Float64[np.ndarray, "cells 10 10"]
+    ) -> scipy.sparse.bsr_array | scipy.sparse.csr_array:
+        """Return the matrix that sums the cells' own, over nodes or over the components of a vector at each node."""
+        order, starts, rows, columns = self._pattern
+        entries = factors.reshape(len(self.cells) * 100, -1)
+        summing = scipy.sparse.csr_array((np.ones(len(order)), order, starts), shape=(len(rows), len(entries)))
+        summed = summing @ entries
+        pointer = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=len(self.nodes)))])
+        if factors.ndim == 3:
+            return scipy.sparse.csr_array((summed[:, 0], columns, pointer), shape=(len(self.nodes),) * 2)
+        size = factors.shape[-1]
+        blocks = summed.reshape(-1, size, size)
+        return scipy.sparse.bsr_array((blocks, columns, pointer), shape=(size * len(self.nodes),) * 2)
+
+    @cached_property
+    def _pattern(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The cells' pairs of nodes in the order of the matrix, where each entry's begin, its row and its column."""
+        pairs = (self.cells[:, :, None] * len(self.nodes) + self.cells[:, None, :]).ravel()
+        order = np.argsort(pairs, kind="stable")
+        ordered = pairs[order]
+        first = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
+        entries = ordered[first]
+        return order, np.append(first, len(order)), entries // len(self.nodes), entries % len(self.nodes)
+
+
+def stiffness(
+    mesh: SecondOrder, material: Material, factor: Float64[Tensor, " cells"] | None = None
+) -> scipy.sparse.bsr_array:
+    """Return the stiffness matrix over the components of the nodes' displacements, newtons per meter.
+
+    `factor` multiplies Young's modulus, a number a cell. Row 3 n + i is the force along axis i on node n.
+    """
+    young = material.young * (np.ones(len(mesh.cells)) if factor is None else factor.numpy())
+    shear = young / (2.0 * (1.0 + material.poisson))
+    squeeze = shear * 2.0 * material.poisson / (1.0 - 2.0 * material.poisson)
+    slopes = _slopes(mesh)
+    weight = mesh.solid.volumes.numpy() / len(_QUADRATURE)
+    flat = slopes.reshape(len(slopes), len(_QUADRATURE), 30)
+    # products[cell, a, i, b, j]: the integral of the slope of a's function along i times that of b's along j.
+    products = np.matmul(flat.transpose(0, 2, 1), flat * weight[:, None, None]).reshape(-1, 10, 3, 10, 3)
+    products = products.transpose(0, 1, 3, 2, 4)
+    blocks = squeeze[:, None, None, None, None] * products
+    blocks += shear[:, None, None, None, None] * products.swapaxes(3, 4)
+    along = shear[:, None, None] * np.trace(products, axis1=3, axis2=4)
+    for axis in range(3):
+        blocks[:, :, :, axis, axis] += along
+    return mesh.assemble(blocks)
+
+
+def mass(mesh: SecondOrder, density: Float64[Tensor, " cells"]) -> scipy.sparse.csr_array:
+    """Return the consistent mass matrix over the nodes, kilograms; all three components have the same.
+
+    `density` is in kilograms per cubic meter.
+    """
+    weight = (mesh.solid.volumes * density).numpy()
+    return mesh.assemble(weight[:, None, None] * _REFERENCE_MASS)
+
+
+def elements_of(mesh: SecondOrder) -> Elements:
+    """Return what the matrices are integrated from."""
+    centers = mesh.nodes[mesh.cells[:, :4]].mean(axis=1)
+    return Elements(mesh.cells, centers, mesh.solid.volumes.numpy(), _slopes(mesh), _REFERENCE_MASS)
+
+
+def _slopes(mesh: SecondOrder) -> Float64[np.ndarray, "cells points 10 3"]:
+    """Return the gradients of the shape functions at the quadrature's points, 1/m."""
+    corners = mesh.nodes[mesh.cells[:, :4]]
+    inverse = np.linalg.inv(corners[:, 1:] - corners[:, :1])
+    gradients = np.concatenate([-inverse.sum(axis=2, keepdims=True), inverse], axis=2).transpose(0, 2, 1)
+    return np.matmul(_reference_slopes(_QUADRATURE)[None], gradients[:, None])
+
+
+def _reference_slopes(places: Float64[np.ndarray, "points 4"]) -> Float64[np.ndarray, "points 10 4"]:
+    """Return the derivatives of the shape functions by the four barycentric coordinates."""
+    slopes = np.zeros((len(places), 10, 4))
+    for corner in range(4):
+        slopes[:, corner, corner] = 4.0 * places[:, corner] - 1.0
+    for edge, (one, other) in enumerate(_EDGES):
+        slopes[:, 4 + edge, one] = 4.0 * places[:, other]
+        slopes[:, 4 + edge, other] = 4.0 * places[:, one]
+    return slopes
+
+
+def _reference_mass() -> Float64[np.ndarray, "10 10"]:
+    """Return the integrals of the products of shape functions over a cell of volume 1.
+
+    The integral of l_0^a l_1^b l_2^c l_3^d is 6 a! b! c! d! / (a + b + c + d + 3)!, of which the products need a few.
+    """
+    factorial = np.array([1.0, 1.0, 2.0, 6.0, 24.0, 120.0, 720.0, 5040.0])
+    terms: list[list[tuple[float, np.ndarray]]] = []
+    unit = np.eye(4, dtype=int)
+    for corner in range(4):
+        terms.append([(2.0, 2 * unit[corner]), (-1.0, unit[corner])])
+    for one, other in _EDGES:
+        terms.append([(4.0, unit[one] + unit[other])])
+    table = np.zeros((10, 10))
+    for row, left in enumerate(terms):
+        for column, right in enumerate(terms):
+            for scale, powers in left:
+                for other_scale, other_powers in right:
+                    total = powers + other_powers
+                    table[row, column] += (
+                        scale * other_scale * 6.0 * factorial[total].prod() / factorial[total.sum() + 3]
+                    )
+    return table
+
+
+_REFERENCE_MASS = _reference_mass()

@@ -1,0 +1,156 @@
+"""A surface given a wall: a layer of prisms inwards from it, each of them three tetrahedra.
+
+One layer of second-order elements bends as a shell does, so that the prisms may be many times as wide as the wall is
+thick, where tetrahedra of even shape would have to be as small as the wall.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int
+
+from avmsf.errors import SimulationError
+from avmsf.fem.skin import Skin, unit
+from avmsf.fem.solid import Solid
+from avmsf.fem.tetrahedra import expect_detail, fill
+from avmsf.mesh.surface import Surface
+
+_STEPS = 30
+"""Most times that the wall is turned and thinned where prisms are folded."""
+_LEANING = 0.1
+"""How far a folded triangle turns the wall towards its own inside, each time."""
+_THINNING = 0.85
+"""Factor on the wall's thickness at folded prisms, each time."""
+_SLOPE = 0.3
+"""Most that the thickness grows along an edge over the edge's length, where it was thinned."""
+_SPARED = 0.1
+"""Part of the surface at which the wall may be folded, or thinner than half of what was asked for."""
+_FLATTEST = 0.05
+"""Volume of a tetrahedron over that of a third of a straight prism, below which the prism is folded."""
+
+
+def shell(surface: Surface, *, thickness: float, detail: float = 0.04) -> Solid:
+    """Return the wall of `thickness` meters that lies inwards of a surface, against its triangles' normals.
+
+    The surface is an open sheet, whose rims are closed straight through the wall, or the outer skin of a hollow body.
+    It is remeshed to triangles with sides of about `detail` times its size, the diagonal of the box around it. Where it
+    bends more tightly than the wall is thick the wall is thinner, on a tenth of the surface at most. Where even that
+    folds prisms, as on scans with creases, both sides of the wall are filled as `fill` does, which is slower.
+
+    Raises SimulationError for a surface without triangles or area, one whose triangles face different ways, a
+    thickness that is not positive or too large for how tightly the surface bends, and a closed skin that holds less
+    than the wall would.
+    """
+    if not 0 < thickness < np.inf:
+        raise SimulationError.expected("more than 0 m", thickness, name="thickness")
+    expect_detail(detail)
+    skin = Skin.of(surface).oriented()
+    if skin.open_edges == 0 and skin.areas.sum() * thickness > abs(skin.volume):
+        middle = 0.5 * abs(skin.volume) / skin.areas.sum()
+        raise SimulationError(
+            f"thickness: expected less than the {4 * middle:.2g} m of the closed surface on average, got "
+            f"{thickness:.3g} m; use a solid body (0 m), or a wall of {middle:.1g} m",
+            name="thickness",
+            value=thickness,
+        )
+    coarse = skin.remeshed(detail * skin.size)
+    if _folded_part(coarse, thickness) > _SPARED:
+        fitting = (thickness * 0.5**step for step in range(1, 8))
+        suggested = next((each for each in fitting if _folded_part(coarse, each) <= _SPARED), None)
+        hint = "smooth the mesh" if suggested is None else f"try thickness={suggested:.2g}, or smooth the mesh"
+        raise SimulationError(
+            f"thickness: expected less than the surface's radius of curvature, got {thickness:g} m; {hint}",
+            name="thickness",
+            value=thickness,
+        )
+    solid = prisms(coarse, np.full(len(coarse.points), thickness))
+    return solid if solid is not None else fill(_both_sides(coarse, thickness), detail=detail)
+
+
+def prisms(skin: Skin, thickness: Float64[np.ndarray, " points"], *, layers: int = 1) -> Solid | None:
+    """Return a wall of this thickness at each point inwards of a skin, or None where some prisms stay folded."""
+    offsets = _offsets(skin, thickness)
+    if offsets is None:
+        return None
+    count = len(skin.points)
+    points = np.concatenate([skin.points + layer / layers * offsets for layer in range(layers + 1)])
+    cells = np.concatenate([_prisms(skin.faces, count) + layer * count for layer in range(layers)])
+    return Solid.build(torch.from_numpy(points), torch.from_numpy(cells))
+
+
+def _offsets(skin: Skin, thickness: Float64[np.ndarray, " points"]) -> Float64[np.ndarray, "points 3"] | None:
+    """Return the way from each point through the wall, or None where some prisms stay folded."""
+    directions, lengths = -skin.normals, thickness.copy()
+    ends = skin.faces[:, [[0, 1], [1, 2], [2, 0], [1, 0], [2, 1], [0, 2]]].reshape(-1, 2)
+    slack = _SLOPE * np.linalg.norm(skin.points[ends[:, 0]] - skin.points[ends[:, 1]], axis=1)
+    for _ in range(_STEPS):
+        folded = _folded(skin, lengths[:, None] * directions)
+        if not folded.any():
+            thin = lengths[skin.faces].mean(axis=1) < 0.5 * thickness[skin.faces].mean(axis=1)
+            return lengths[:, None] * directions if thin @ skin.areas <= _SPARED * skin.areas.sum() else None
+        directions = _leaned(skin, directions, folded)
+        lengths[np.unique(skin.faces[folded])] *= _THINNING
+        # A wall that thins within one triangle would fold the next.
+        np.minimum.at(lengths, ends[:, 0], lengths[ends[:, 1]] + slack)
+    return None
+
+
+def _folded_part(skin: Skin, thickness: float) -> float:
+    """Return the part of the area at which a wall of even thickness folds."""
+    return float(_folded(skin, -thickness * skin.normals) @ skin.areas / skin.areas.sum())
+
+
+def _both_sides(skin: Skin, thickness: float) -> Surface:
+    """Return the closed surface of a wall: the skin, its like inside turned round, and strips along the rims."""
+    start, end = skin.rim.T
+    inner = len(skin.points)
+    strips = [np.stack([end, start, start + inner], axis=1), np.stack([end, start + inner, end + inner], axis=1)]
+    faces = np.concatenate([skin.faces, skin.faces[:, ::-1] + inner, *strips])
+    points = np.concatenate([skin.points, skin.points - thickness * skin.normals])
+    return Surface(torch.from_numpy(points).float(), torch.from_numpy(faces))
+
+
+def _leaned(skin: Skin, directions: np.ndarray, folded: np.ndarray) -> np.ndarray:
+    """Return directions that lean towards the inside of the folded triangles around each vertex.
+
+    Where there is a direction that all triangles around a vertex see from outside, this finds one in the end.
+    """
+    leaned = directions.copy()
+    corners = skin.points[skin.faces[folded]]
+    inward = -unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    np.add.at(leaned, skin.faces[folded], _LEANING * inward[:, None])
+    return unit(leaned)
+
+
+def _folded(skin: Skin, offsets: np.ndarray) -> np.ndarray:
+    """Return which triangles' prisms hold a tetrahedron that is flat or inside out, [faces]."""
+    points = np.concatenate([skin.points, skin.points + offsets])
+    cells = points[_prisms(skin.faces, len(skin.points))]
+    volumes = np.linalg.det(cells[:, 1:] - cells[:, :1]).reshape(-1, 3) / 6.0
+    straight = skin.areas * np.linalg.norm(offsets, axis=1)[skin.faces].mean(axis=1) / 3.0
+    return (volumes <= _FLATTEST * straight[:, None]).any(axis=1)
+
+
+def _prisms(faces: Int[np.ndarray, "faces 3"], points: int) -> Int[np.ndarray, "cells 4"]:
+    """Return three tetrahedra for each triangle; those of neighbors meet in whole sides.
+
+    The diagonal of a prism's side starts at the outer one of its vertices that comes first, whichever prism asks.
+    The cells are of positive volume where the inner vertices lie behind the triangle.
+    """
+    first = faces.argmin(axis=1)
+    rows = np.arange(len(faces))
+    a, b, c = (faces[rows, (first + turn) % 3] for turn in range(3))
+    inner = (a + points, b + points, c + points)
+    rising = b < c
+    low, high = np.where(rising, b, c), np.where(rising, c, b)
+    cells = np.stack(
+        [
+            np.stack([a, b, c, high + points], axis=1),
+            np.stack([a, low, low + points, high + points], axis=1),
+            np.stack([a, inner[0], inner[1], inner[2]], axis=1),
+        ],
+        axis=1,
+    )
+    # All three now run the same way round, but for the middle one where c comes before b.
+    cells[:, [0, 2]] = cells[:, [0, 2]][..., [0, 2, 1, 3]]
+    cells[~rising, 1] = cells[~rising, 1][:, [0, 2, 1, 3]]
+    return cells.reshape(-1, 4)

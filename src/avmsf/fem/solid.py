@@ -1,0 +1,128 @@
+"""A body as tetrahedra."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse
+import torch
+from jaxtyping import Float64, Int
+from torch import Tensor
+
+from avmsf.errors import SimulationError
+from avmsf.mesh.surface import Surface
+
+_FACES = torch.tensor([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
+"""Corners of a tetrahedron's sides, counter-clockwise from outside; side i lies opposite to corner i."""
+FLATTEST = 1e-9
+"""Volume of a tetrahedron over the cube of its longest edge, below which it is flat; a regular one has .118."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """Straight-edged tetrahedra that fill a body."""
+
+    points: Float64[Tensor, "points 3"]
+    """Corners, object frame, meters; every one belongs to a tetrahedron."""
+    cells: Int[Tensor, "cells 4"]
+    """Rows of `points` at the corners of each tetrahedron, all of positive volume."""
+
+    @classmethod
+    def build(cls, points: Float64[Tensor, "points 3"], cells: Int[Tensor, "cells 4"]) -> "Solid":
+        """Return the solid with cells turned to positive volume and unused points left out.
+
+        Raises SimulationError where there are no cells, where a cell names a point that is not there or is flat, and
+        for coordinates that are not finite.
+        """
+        if not len(cells):
+            raise no_tetrahedra()
+        if int(cells.min()) < 0 or int(cells.max()) >= len(points):
+            found = int(cells.max()) if int(cells.min()) >= 0 else int(cells.min())
+            raise SimulationError(
+                f"expected corners of tetrahedra from 0 to {len(points) - 1}, got {found}; make the tetrahedra again",
+                name="cells",
+                value=found,
+            )
+        used, rows = torch.unique(cells, return_inverse=True)
+        corners = points[used]
+        if not bool(torch.isfinite(corners).all()):
+            row = int(used[(~torch.isfinite(corners)).any(dim=1).nonzero()[0]])
+            value = points[row].tolist()
+            raise SimulationError(
+                f"point {row}: expected finite coordinates in meters, got {value}", row=row, name="points", value=value
+            )
+        volumes = _volumes(corners, rows)
+        turned = torch.where((volumes < 0)[:, None], rows[:, [0, 2, 1, 3]], rows)
+        solid = cls(corners, turned)
+        solid.expect_volume()
+        return solid
+
+    @cached_property
+    def volumes(self) -> Float64[Tensor, " cells"]:
+        """Volume of each tetrahedron, cubic meters."""
+        return _volumes(self.points, self.cells)
+
+    @property
+    def volume(self) -> float:
+        """Cubic meters."""
+        return float(self.volumes.sum())
+
+    @cached_property
+    def size(self) -> float:
+        """Diagonal of the box around the body, meters."""
+        return float((self.points.amax(dim=0) - self.points.amin(dim=0)).norm())
+
+    @cached_property
+    def boundary(self) -> Int[Tensor, "triangles 3"]:
+        """Rows of `points` at the corners of the outer triangles, counter-clockwise from outside, cell by cell."""
+        sides = self.cells[:, _FACES].reshape(-1, 3)
+        _, which, count = np.unique(np.sort(sides.numpy(), axis=1), axis=0, return_inverse=True, return_counts=True)
+        return sides[torch.from_numpy(count[which.ravel()] == 1)]
+
+    @property
+    def surface(self) -> Surface:
+        """The outer triangles."""
+        used, rows = torch.unique(self.boundary, return_inverse=True)
+        return Surface(self.points[used].float(), rows)
+
+    @cached_property
+    def parts(self) -> Int[Tensor, " cells"]:
+        """Number of the part that each cell belongs to; cells that share a side are of one part, largest first."""
+        sides = np.sort(self.cells[:, _FACES].numpy().reshape(-1, 3), axis=1)
+        _, which = np.unique(sides, axis=0, return_inverse=True)
+        owners = np.repeat(np.arange(len(self.cells)), 4)
+        belongs = scipy.sparse.csr_array((np.ones(len(owners)), (owners, which.ravel())))
+        number, label = scipy.sparse.csgraph.connected_components(belongs @ belongs.T, directed=False)
+        size = np.bincount(label, weights=self.volumes.numpy(), minlength=number)
+        rank = np.empty(number, dtype=np.int64)
+        rank[np.argsort(-size, kind="stable")] = np.arange(number)
+        return torch.from_numpy(rank[label])
+
+    def expect_volume(self) -> None:
+        """Raise SimulationError where a tetrahedron is flat or inside out, naming the first."""
+        longest = (self.points[self.cells][:, :, None] - self.points[self.cells][:, None]).norm(dim=-1).amax(dim=(1, 2))
+        unfit = torch.nonzero(~(self.volumes > FLATTEST * longest**3)).flatten()
+        if len(unfit):
+            row = int(unfit[0])
+            volume = float(self.volumes[row])
+            raise SimulationError(
+                f"tetrahedron {row}: expected a positive volume, got {volume:.3g} m3 with edges up to "
+                f"{float(longest[row]):.3g} m ({len(unfit)} of {len(self.cells)} are flat or inverted); make the "
+                "tetrahedra with another detail",
+                row=row,
+                name="cells",
+                value=volume,
+            )
+
+
+def no_tetrahedra() -> SimulationError:
+    """Return the error of a body without volume."""
+    return SimulationError(
+        "expected tetrahedra, got none: the shape has no volume; give a sheet a thickness", name="cells", value=0
+    )
+
+
+def _volumes(points: Float64[Tensor, "points 3"], cells: Int[Tensor, "cells 4"]) -> Float64[Tensor, " cells"]:
+    corners = points[cells]
+    edges = corners[:, 1:] - corners[:, :1]
+    return (torch.linalg.cross(edges[:, 0], edges[:, 1]) * edges[:, 2]).sum(dim=1) / 6.0

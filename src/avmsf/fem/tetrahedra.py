@@ -1,0 +1,172 @@
+"""Any mesh or scan as tetrahedra, by pytetwild, which allows holes and self-intersections.
+
+pytetwild inserts the triangles in a random order. Its seed is fixed from outside, so the same mesh has the same
+tetrahedra in each run. That cannot be done on macOS and Windows, nor where the library's table of functions is
+protected: there two runs differ in their tetrahedra and somewhat in the body's frequencies. Keep the solid to keep its
+sounds. It runs in a process of its own, for it may crash, and never ends on some meshes.
+"""
+
+import importlib.util
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64
+
+from avmsf._utils.children import end_child, start_child
+from avmsf.errors import SimulationError
+from avmsf.fem import tetrahedra_worker
+from avmsf.fem.skin import Skin
+from avmsf.fem.solid import Solid
+from avmsf.mesh.closest_point import Closest, ClosestPoints
+from avmsf.mesh.surface import Surface
+
+WORKER = Path(tetrahedra_worker.__file__)
+_ENVELOPE = 0.04
+"""How far the solid's surface may lie from the mesh, over the length of the tetrahedra's edges."""
+_SHORTEST = 0.1
+"""Length of the edges that are taken out of the mesh beforehand, over that of the tetrahedra's edges."""
+_TURN = 0.7
+"""Cosine of the angle by which triangles may turn then. It makes a scan's filling ten times as quick."""
+_LID = 0.25
+"""Part of the solid's surface that may close holes."""
+_LOST = 0.1
+"""Part of the mesh, or of the volume of its parts, that may be left out."""
+
+
+def fill(surface: Surface, *, detail: float = 0.05, timeout: float = 600.0) -> Solid:
+    """Return what a mesh or scan encloses; holes are closed, and triangles inside and loose small parts left out.
+
+    `detail` is the length of the tetrahedra's edges over the body's size, the diagonal of the box around it, where
+    nothing asks for shorter ones; the solid's surface keeps within a 25th of that length of the mesh. Takes some
+    seconds to a minute. Raises SimulationError where pytetwild fails or takes more than `timeout`
+    seconds, and for what encloses no body: points, sheets, parts that do not touch and walls too thin for the detail.
+    """
+    expect_detail(detail)
+    skin = Skin.of(surface)
+    advice = _advice(skin)
+    # Of a sheet fTetWild makes a sliver as thin as its envelope, or nothing, as chance has it.
+    if skin.open_edges and _flatness(skin) < 2.0 * _ENVELOPE * detail * skin.size:
+        raise SimulationError(
+            f"expected a mesh that encloses a volume, got a flat sheet; {advice}", name="volume", value=0
+        )
+    coarse = skin.coarsened(_SHORTEST * detail * skin.size, turn=_TURN)
+    points, cells = _tetrahedralize(coarse, detail, timeout)
+    if not len(cells):
+        raise SimulationError(
+            f"expected a mesh that encloses a volume, got {skin.open_edges} open edges; {advice}",
+            name="volume",
+            value=skin.open_edges,
+        )
+    solid = _largest(Solid.build(torch.from_numpy(points), torch.from_numpy(cells)))
+    _expect_likeness(solid, skin, tolerance=4.0 * _ENVELOPE * detail * skin.size, advice=advice)
+    return solid
+
+
+def expect_detail(detail: float) -> None:
+    """Raise SimulationError for what is no length of edges over the body's size."""
+    if not 0 < detail < 1:
+        raise SimulationError.expected("a part of the object's size, above 0 and below 1", detail, name="detail")
+
+
+def _tetrahedralize(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return points and cells as pytetwild's process leaves them."""
+    found = importlib.util.find_spec("pytetwild")
+    assert found is not None
+    assert found.submodule_search_locations
+    with tempfile.TemporaryDirectory(prefix="avmsf-fill-") as name:
+        job, result = Path(name) / "job.npz", Path(name) / "result.npz"
+        np.savez(
+            job, points=skin.points, faces=skin.faces.astype(np.uint32), edge=detail, envelope=_ENVELOPE * detail,
+            library=found.submodule_search_locations[0],
+        )  # fmt: skip
+        # -P keeps this folder, whose modules have common names, from where the worker looks for libraries.
+        command = [sys.executable, "-P", str(WORKER), str(job), str(result)]
+        single = os.environ | {"OMP_NUM_THREADS": "1"}
+        with open(Path(name) / "log", "wb") as log:
+            # fTetWild leaves a file of its own where it runs.
+            ended = start_child(command, stdout=log, stderr=log, env=single, cwd=name)
+        try:
+            ended.wait(timeout)
+        except subprocess.TimeoutExpired as error:
+            raise SimulationError(
+                f"expected tetrahedra of {len(skin.faces)} triangles within {timeout:g} s, got none; simplify the "
+                "mesh, or use a larger detail or fewer degrees of freedom",
+                name="timeout",
+                value=timeout,
+            ) from error
+        finally:
+            end_child(ended)
+        if ended.returncode != 0 or not result.is_file():
+            words = (Path(name) / "log").read_text(encoding="utf-8", errors="replace")
+            last = words.strip().splitlines()[-1:] or ["no message"]
+            raise SimulationError(
+                f"pytetwild: expected exit status 0, got {ended.returncode} ({last[0][:200]}); simplify the mesh, or "
+                "change detail or the degrees of freedom",
+                name="pytetwild",
+                value=ended.returncode,
+            )
+        with np.load(result) as arrays:
+            return arrays["points"], arrays["cells"]
+
+
+def _largest(solid: Solid) -> Solid:
+    """Return the largest part. Raises SimulationError where the others are more than loose bits."""
+    volumes = torch.bincount(solid.parts, weights=solid.volumes)
+    if float(volumes[0]) < (1.0 - _LOST) * float(volumes.sum()):
+        sizes = ", ".join(f"{volume:.3g}" for volume in volumes[:4].tolist())
+        raise SimulationError(
+            f"expected a connected shape, got {len(volumes)} parts of {sizes}{', ...' if len(volumes) > 4 else ''} m3; "
+            "join them, or give one of them",
+            name="parts",
+            value=len(volumes),
+        )
+    return Solid.build(solid.points, solid.cells[solid.parts == 0])
+
+
+def _expect_likeness(solid: Solid, skin: Skin, *, tolerance: float, advice: str) -> None:
+    """Raise SimulationError where much of the mesh is not the solid's surface, or much of that surface is no mesh."""
+    outside = Skin(solid.points.numpy(), solid.boundary.numpy())
+    places = skin.spread()
+    found = ClosestPoints(outside.points[outside.faces])(places)
+    # Where bodies cross, the mesh runs inside; only what lies outside was lost.
+    lost = float(((found.distances > tolerance) & ~_behind(outside, found, places)).mean())
+    if lost > _LOST:
+        raise SimulationError(
+            f"expected tetrahedra within {tolerance:.2g} m of the mesh, got {lost:.0%} of it without "
+            f"({skin.open_edges} open edges, or thin walls); use a smaller detail or more degrees of freedom, close "
+            f"the mesh, or {advice}",
+            name="detail",
+            value=lost,
+        )
+    lids = float((ClosestPoints(skin.points[skin.faces])(outside.spread()).distances > tolerance).mean())
+    if lids > _LID:
+        raise SimulationError(
+            f"expected a nearly closed mesh, got {skin.open_edges} open edges whose holes are {lids:.0%} of the "
+            f"surface; close the mesh, or {advice}",
+            name="holes",
+            value=lids,
+        )
+
+
+def _behind(skin: Skin, found: Closest, places: Float64[np.ndarray, "places 3"]) -> Bool[np.ndarray, " places"]:
+    """Return which places lie behind the triangle that is closest to them."""
+    corners = skin.points[skin.faces[found.rows]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return (normals * (places - np.einsum("pc,pcd->pd", found.weights, corners))).sum(axis=1) < 0
+
+
+def _flatness(skin: Skin) -> float:
+    """Return the extent of the skin's corners along the axis that they spread least along, meters."""
+    places = skin.points[skin.faces].reshape(-1, 3)
+    places = places - places.mean(axis=0)
+    _, axes = np.linalg.eigh(places.T @ places)
+    return float(np.ptp(places @ axes[:, 0]))
+
+
+def _advice(skin: Skin) -> str:
+    return f"give a wall thickness, such as {0.015 * skin.size:.1g} m"

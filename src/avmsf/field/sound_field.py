@@ -1,0 +1,432 @@
+"""An object's sound at every contact: modes, a gain field, and noise."""
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, SupportsIndex
+
+import torch
+from jaxtyping import Bool, Complex, Float, Float64
+from torch import Tensor
+
+from avmsf._utils.arrays import ArrayLike, as_count, as_directions, as_numbers, as_vectors
+from avmsf._utils.progress import working
+from avmsf._utils.summary import short_repr
+from avmsf.capture.folder import Capture
+from avmsf.capture.impacts import Impacts
+from avmsf.capture.settings import CaptureSettings
+from avmsf.errors import PositionWarning
+from avmsf.field.config import FitConfig
+from avmsf.field.gain_field import GainField, Gains
+from avmsf.field.gains.model import MixtureGains
+from avmsf.field.positions import expect_near, off_surface, off_surface_gains
+from avmsf.field.probable_body import ProbableBody
+from avmsf.field.scaled_gains import fitted_gains, length_of
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.alignment import Alignment
+from avmsf.modal.pulse import ForcePulse
+from avmsf.modal.residual_noise import Residual, low_fluctuation_noise, shape_noise
+from avmsf.modal.synthesis import synthesize_phased
+
+if TYPE_CHECKING:
+    from avmsf.features.feature_field import FeatureField
+    from avmsf.field.config import GainModel
+    from avmsf.field.suggest import Suggestions
+    from avmsf.localization.contact_map import ContactMap
+    from avmsf.localization.preprocess import Sound
+    from avmsf.pipeline.config import PipelineConfig
+
+SUPPORTING = "supporting_poles"
+"""What a report calls the rows of the bank's poles that are no modes of the object."""
+_BATCH = 32
+"""Contacts rendered at once, which bounds the memory."""
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where a field comes from."""
+
+    __repr__ = short_repr
+
+    capture: str = ""
+    """Name of the capture."""
+    trained_on: tuple[str, ...] = ()
+    """Names of the recordings that it was fitted to."""
+    per_newton: bool = False
+    """Whether the recordings were divided by the force, so that a force in newtons scales an impact's sound."""
+    config: FitConfig = field(default_factory=FitConfig)
+    """Settings of the fit."""
+    report: dict[str, Any] = field(default_factory=dict)
+    """What the fit chose and reached, as plain numbers and text."""
+    settings: CaptureSettings = field(default_factory=CaptureSettings)
+    """By which its recordings were read."""
+
+
+@dataclass(frozen=True)
+class FieldQuality:
+    """Relative STFT errors at training contacts, each predicted from those at all other positions."""
+
+    positions: int
+    """Positions that were left out in turn, each with all of its recordings."""
+    error: float
+    """Of the field; modes, and the prior of its gain model's hypotheses, are those of all contacts."""
+    nearest_mean: float
+    """Of the mean of the three nearest recordings at other positions."""
+    next_contact: tuple[float, float, float] | None = None
+    """The contact (object frame, meters) that reduces the field's expected error most; None if there is no other."""
+    next_distance: float | None = None
+    """From there to the nearest contact that was recorded, meters."""
+    standard_error: float = 0.0
+    """Of the difference of both errors, by its scatter over the positions."""
+
+    @classmethod
+    def of(cls, record: Mapping[str, Any]) -> "FieldQuality":
+        """Return it from plain values, as they are in a file."""
+        contact = record.get("next_contact")
+        return cls(**{**record, "next_contact": None if contact is None else tuple(contact)})
+
+    def __str__(self) -> str:
+        """Return the verdict, and the advice if there is any."""
+        return " ".join(filter(None, [self.verdict, self.advice]))
+
+    @property
+    def verdict(self) -> str:
+        """How good the field is. Leaving out mostly overstates the error: spread contacts are far from each other."""
+        if self.level == 0:
+            return (
+                f"By leave-one-out, the relative STFT error of the field is about {self.error:.2f}, of the mean of "
+                f"the three nearest recordings {self.nearest_mean:.2f} ({self.positions} positions)."
+            )
+        found = "worse than" if self.level == 2 else "hardly better than"
+        return (
+            f"Warning: by leave-one-out, the field is {found} the mean of the three nearest recordings: relative STFT "
+            f"errors of {self.error:.2f} and {self.nearest_mean:.2f} ({self.positions} positions). Look for mistakes "
+            "by avmsf check: recordings given to other contacts, a mesh in another frame or of another object. Record "
+            "more positions; without a mesh, add one, or make the shape from photographs by avmsf reconstruct."
+        )
+
+    @property
+    def level(self) -> int:
+        """0 for a field better than the mean of the three nearest recordings by a standard error, 2 for a worse one."""
+        gained = self.nearest_mean - self.error
+        return 0 if gained > self.standard_error else 1 if gained >= -self.standard_error else 2
+
+    @property
+    def advice(self) -> str:
+        """Where another impact would help most; empty if that is not known."""
+        if self.next_contact is None or self.next_distance is None:
+            return ""
+        where = ", ".join(f"{value + 0.0:.3f}" for value in self.next_contact)
+        return (
+            f"Another impact near ({where}) m, {1000 * self.next_distance:.0f} mm from the nearest contact, would help "
+            "most."
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class GainPosterior:
+    """The posterior distribution of complex gains A, which sound as the real part of A exp((-d + 2 pi i f) t)."""
+
+    __repr__ = short_repr
+
+    mean: Complex[Tensor, "contacts modes"]
+    """In the unit of the training sounds."""
+    std: Float[Tensor, "contacts modes"]
+    """Standard deviation: the square root of the expected squared distance of a gain from its mean."""
+
+
+@dataclass(frozen=True, eq=False)
+class SoundField:
+    """Renders the sound of an impact anywhere on one object (paper, eq. 4).
+
+    Positions, directions and forces are lists, numpy arrays or tensors. Methods raise ArrayError for other shapes and
+    for values that are not finite, and PositionError for a position that lies farther from the object than this is
+    large; for one nearer but off the object they give a PositionWarning. Directions of any length count as unit
+    vectors. One of length zero is unknown, and the impact then goes straight into the surface.
+    """
+
+    bank: ModalBank
+    """Frequencies and dampings, shared by all contacts."""
+    gain_field: GainField
+    """Gains at contacts, and the factors on the dampings where these vary."""
+    phase: Float64[Tensor, " modes"]
+    """How each mode starts, radians: mode k sounds as exp(-d t) sin(2 pi f t + phase). Zero in the paper."""
+    residual: Residual
+    """Noise in addition to the modes."""
+    sample_rate: float
+    """Samples per second of rendered sounds, Hz."""
+    samples: int
+    """Length of rendered sounds."""
+    origin: Origin
+    alignment: Alignment | None = None
+    """How the recordings that it was fitted to were aligned with one another; None where they were not."""
+
+    def __repr__(self) -> str:
+        fitted, seconds = len(self.origin.trained_on), self.samples / self.sample_rate
+        text = (
+            f"SoundField({self.origin.capture!r}, {self.bank}, gains {self.gain_field.kind!r} of {fitted} recordings, "
+            f"{seconds:.3g} s at {self.sample_rate:g} Hz)"
+        )
+        quality, body = self.quality, self.body
+        if quality is not None:
+            text += (
+                f"\nleave-one-out error {quality.error:.2f}, mean of 3 nearest recordings {quality.nearest_mean:.2f}"
+            )
+        return f"{text}\n{body.warning}" if body is not None and body.warning else text
+
+    @property
+    def quality(self) -> FieldQuality | None:
+        """How well its contacts are predicted from one another.
+
+        None for few places, for the attention network, and for an edited field, which has no recordings.
+        """
+        found = None if self.origin.report.get("edits") else self.origin.report.get("quality")
+        return FieldQuality.of(found) if isinstance(found, dict) else None
+
+    @property
+    def body(self) -> ProbableBody | None:
+        """The most probable body behind the surface, with a warning where no material could be so stiff.
+
+        None where no body predicts the contacts from one another, and for an edited field.
+        """
+        return None if self.origin.report.get("edits") else ProbableBody.of(self.origin.report)
+
+    @property
+    def audible(self) -> Bool[Tensor, " modes"]:
+        """Which modes sound: those below half the sample rate, above which an edit may have moved some."""
+        return self.bank.frequency < 0.5 * self.sample_rate
+
+    @property
+    def is_mode(self) -> Bool[Tensor, " modes"]:
+        """Which of the bank's poles are modes of the object; the others support the model of the recordings.
+
+        True for all where the report does not say it: in a field without recordings, or made without the pipeline.
+        """
+        mask = torch.ones(len(self.bank), dtype=torch.bool)
+        mask[self.origin.report.get(SUPPORTING, [])] = False
+        return mask
+
+    @classmethod
+    def fit(
+        cls,
+        capture: Capture,
+        gain_model: "GainModel | None" = None,
+        *,
+        features: "FeatureField | None" = None,
+        config: "PipelineConfig | None" = None,
+        seed: int | None = None,
+        device: str | None = None,
+        progress: bool = True,
+    ) -> "SoundField":
+        """Fit a field to the recordings of a capture, as `avmsf fit` does.
+
+        The recordings are aligned and their modes found, the object's elastic modes are computed where the capture has
+        a mesh, and the gain model is fitted and compared with the recordings by leave-one-out (`quality`). It takes
+        seconds to minutes. `gain_model`, `seed` and `device` take the place of those of `config`: by default "auto",
+        the Gaussian process over all kernel families, seed 0, and a CUDA GPU where there is one. `features` describe
+        the object's points for the gain models "visual" and "network"; without them these are positions on the mesh.
+        With `progress`, the standard error says what is done.
+
+        Raises AvmsfError for a capture that no field can be fitted to.
+        """
+        from avmsf.pipeline.fitting import fit_with_progress
+
+        return fit_with_progress(
+            capture, gain_model, features=features, config=config, seed=seed, device=device, progress=progress
+        )
+
+    @classmethod
+    def load(cls, path: str | Path) -> "SoundField":
+        """Read a field that `save` wrote. Raises FieldFileError for a missing or damaged file, and for another kind."""
+        from avmsf.field.store import load
+
+        return load(path)
+
+    def save(self, path: str | Path) -> None:
+        """Write the field to one safetensors file. Raises FieldFileError where it cannot be written."""
+        from avmsf.field.store import save
+
+        save(self, path)
+
+    def posterior(self, positions: ArrayLike, directions: ArrayLike | None = None) -> GainPosterior:
+        """Return the posterior of the gains of impacts at positions (object frame, meters), [contacts, 3].
+
+        `directions` as in `render`. Raises FitError for a field without a posterior: of the attention network, of
+        recordings in one place, or guessed without recordings.
+        """
+        from avmsf.field.uncertainty import parts_of, std_of
+
+        contacts, ways = self._impacts(positions, directions)
+        std = std_of(self, contacts, ways).square().sum(2).sqrt()
+        return GainPosterior(self._amplitudes(parts_of(self, contacts, ways)), std)
+
+    def suggest(
+        self,
+        count: SupportsIndex = 5,
+        *,
+        candidates: ArrayLike | None = None,
+        unseen: bool = False,
+        progress: bool = True,
+    ) -> "Suggestions":
+        """Return where the next `count` impacts lower the field's expected error most.
+
+        `candidates` are the positions to choose from (object frame, meters, on the surface), without them all that a
+        hammer reaches from outside. With `unseen` they are on all of the body's surface, also where no photograph shows
+        it. With `progress`, the standard error says that it works. Raises FitError as `posterior` and as
+        `avmsf.field.suggest.suggest`.
+        """
+        from avmsf.field.suggest import suggest
+
+        pool = None if candidates is None else as_vectors(candidates, "candidates")
+        with working("computing the expected error over the surface", shown=progress):
+            return suggest(self, count, candidates=pool, unseen=unseen)
+
+    def locate(
+        self, recording: "Sound", *, sample_rate: float | int | None = None, progress: bool = True
+    ) -> "ContactMap":
+        """Return where on the object a recorded impact was: points with probabilities.
+
+        `recording` is the path of a sound file, or the samples of one channel at `sample_rate` Hz (by default the
+        field's). The first recording takes seconds to minutes, in which the gains over the surface are computed; with
+        `progress`, the standard error says so. `avmsf.locate` takes more arguments. Raises LocationError for a
+        recording that is silent or too short.
+        """
+        from avmsf.localization.locate import locate
+
+        return locate(self, recording, sample_rate=sample_rate, progress=progress)
+
+    def aligned(self, impacts: Impacts) -> Impacts:
+        """Return recordings of the object with the starts that the field's sounds have."""
+        return impacts if self.alignment is None else self.alignment.apply(impacts)
+
+    def gains(self, contacts: ArrayLike, *, directions: ArrayLike | None = None) -> Float[Tensor, "contacts modes"]:
+        """Return the signed amplitudes at the contacts (object frame, meters), in the unit of the training sounds.
+
+        `directions`, unit vectors, are those of the impacts; without them they go straight into the surface.
+        """
+        places, ways = self._impacts(contacts, directions)
+        return self.known(places, directions=ways).mean
+
+    def complex_gains(
+        self, contacts: ArrayLike, *, directions: ArrayLike | None = None
+    ) -> Complex[Tensor, "contacts modes"]:
+        """Return amplitudes A at the contacts: their sounds are the real part of the sum of A exp((-d + 2 pi i f) t).
+
+        Contacts, directions and unit as in `gains`; dampings d are those of the contacts.
+        """
+        places, ways = self._impacts(contacts, directions)
+        return self._amplitudes(self.known(places, directions=ways).parts)
+
+    def known(self, contacts: ArrayLike, *, directions: ArrayLike | None = None) -> Gains:
+        """Return all that a sound needs at the contacts: both parts of the gains, and the factors on the dampings."""
+        places = as_vectors(contacts, "contacts")
+        ways = None if directions is None else as_directions(directions, "directions", count=len(places))
+        with torch.no_grad():
+            return self.gain_field.point_estimate(places, ways)
+
+    def dampings(self, contacts: ArrayLike) -> Float[Tensor, "contacts modes"]:
+        """Return the dampings at the contacts, 1/s: the bank's where they are shared."""
+        places, _ = self._impacts(contacts, None)
+        factors = self.known(places).damping
+        shared = self.bank.damping.expand(len(places), -1)
+        return shared if factors is None else shared * factors
+
+    def render(
+        self,
+        positions: ArrayLike,
+        directions: ArrayLike | None = None,
+        forces: float | int | ArrayLike | None = None,
+        *,
+        samples: int | None = None,
+        pulse: ForcePulse | None = None,
+        noise: bool = True,
+    ) -> Float[Tensor, "contacts samples"]:
+        """Return the sound of an impact at each position (object frame, meters), [contacts, 3].
+
+        `directions`, unit vectors, [contacts, 3], are those of the impacts. One of [0, 0, 0] is unknown, as in tables
+        of contacts: the impact goes straight into the surface, as all do without `directions`. `forces`, one for all or
+        one for each, are in newtons where the recordings were divided by theirs, else relative to an average one of
+        them; without them they are 1. Of `samples` samples, or as long as the training sounds. The noise is the same at
+        every contact and in every call, so that a contact's sound depends on nothing else. Modes that are not `audible`
+        are silent.
+
+        `pulse` is what a softer hammer adds to the recorded impacts' own pulses; it has the same impulse, however long
+        it is, and leaves the noise as it is. The noise grows with the force as the modes do, which is a simplification:
+        recorded background noise does not depend on the force of an impact. `noise=False` renders the modes alone.
+        """
+        contacts, ways = self._impacts(positions, directions)
+        length = self.samples if samples is None else as_count(samples, "samples")
+        recorded = noise and self.residual.recordings is not None
+        added = self.noise(length) if noise and not recorded else torch.zeros(length)
+        parts = [torch.zeros(0, length)]
+        for rows in torch.split(torch.arange(len(contacts)), _BATCH):
+            way = None if ways is None else ways[rows]
+            modes = self.modal_sounds(self.known(contacts[rows], directions=way), length)
+            sounds = modes if pulse is None else pulse.soften(modes, sample_rate=self.sample_rate)
+            parts.append(sounds + (self._recorded(contacts[rows], way, length) if recorded else added))
+        sounds = torch.cat(parts)
+        if forces is None:
+            return sounds
+        return as_numbers(forces, "forces", count=len(contacts)).to(sounds)[:, None] * sounds
+
+    def _impacts(
+        self, positions: ArrayLike, directions: ArrayLike | None
+    ) -> tuple[Float[Tensor, "contacts 3"], Float[Tensor, "contacts 3"] | None]:
+        """Return positions and directions as tensors. Warns of positions off the object."""
+        contacts = as_vectors(positions, "positions")
+        expect_near(contacts, self.gain_field.points)
+        off = off_surface(contacts, self.gain_field)
+        if off:
+            row, distance = max(off, key=lambda each: each[1])
+            message = (
+                f"positions, row {row}: expected positions on the object, got {len(off)} off them, this one "
+                f"by {1e3 * distance:.3g} mm; {off_surface_gains(self.gain_field)}"
+            )
+            warnings.warn(PositionWarning(message, name="positions", row=row, value=distance), stacklevel=3)
+        ways = None if directions is None else as_directions(directions, "directions", count=len(contacts))
+        return contacts, ways
+
+    def _amplitudes(self, parts: Float64[Tensor, "contacts modes 2"]) -> Complex[Tensor, "contacts modes"]:
+        sines, cosines = parts.unbind(2)
+        return torch.complex(cosines, -sines) * torch.exp(1j * self.phase)
+
+    def _recorded(
+        self,
+        contacts: Float[Tensor, "contacts 3"],
+        directions: Float[Tensor, "contacts 3"] | None,
+        samples: int,
+    ) -> Float[Tensor, "contacts samples"]:
+        """Return the mean of what the nearest recordings have in addition to their modes; silence after their end."""
+        gains, recordings = fitted_gains(self.gain_field), self.residual.recordings
+        assert isinstance(gains, MixtureGains)
+        assert recordings is not None
+        rows, signs = gains.nearest(gains.sites(contacts.double() / length_of(self.gain_field), directions))
+        found = (recordings[rows] * signs[..., None]).mean(1).float()[:, :samples]
+        return torch.nn.functional.pad(found, (0, samples - found.shape[1]))
+
+    def noise(self, samples: int | None = None) -> Float[Tensor, " samples"]:
+        """Return the residual noise of an impact of force 1; `samples` as in `render`.
+
+        Of the kind that the fit's configuration names: a fixed sequence of low fluctuation, or a Gaussian draw
+        (paper, eq. 6), which differs with `samples`.
+        """
+        length = self.samples if samples is None else as_count(samples, "samples")
+        if self.origin.config.residual_noise == "low-fluctuation":
+            return low_fluctuation_noise(self.residual.magnitude, samples=length)
+        generator = torch.Generator().manual_seed(self.origin.config.seed)
+        return shape_noise(self.residual.magnitude, contacts=1, samples=length, generator=generator)[0]
+
+    def modal_sounds(self, known: Gains, samples: int) -> Float[Tensor, "contacts samples"]:
+        """Return the sounds of the audible modes with these gains, without noise."""
+        damping = self.bank.damping if known.damping is None else self.bank.damping * known.damping
+        rows = torch.nonzero(self.audible).flatten()
+        return synthesize_phased(
+            known.mean[:, rows],
+            self.bank.frequency[rows],
+            damping[..., rows],
+            self.phase[rows],
+            samples=samples,
+            sample_rate=self.sample_rate,
+            quadrature=None if known.quadrature is None else known.quadrature[:, rows],
+        )

@@ -1,0 +1,106 @@
+"""Where Gaussians start: points on or near the object, with colors, each a small soft ball."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from avmsf.errors import SceneError
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.photographs.cameras import View
+
+ZEROTH = 0.28209479177387814
+"""The harmonic of degree 0, sqrt(1 / 4 pi): a color is one half more than this times its coefficient."""
+
+
+@dataclass(frozen=True, eq=False)
+class StartPoints:
+    """Points to start Gaussians at: of structure from motion, of a surface, of a visual hull."""
+
+    points: Float[Tensor, "points 3"]
+    """Meters."""
+    colors: Float[Tensor, "points 3"]
+    """Red, green, blue, 0 to 1."""
+    normals: Float[Tensor, "points 3"] | None = None
+    """Unit normals to the surface, where they are known."""
+
+    def __post_init__(self) -> None:
+        if len(self.points) < 4 or not all(bool(torch.isfinite(each).all()) for each in (self.points, self.colors)):
+            raise SceneError(
+                f"expected 4 or more finite initial points on the object, got {len(self.points)}; give others, or "
+                "masks for a visual hull",
+                name="points",
+                value=len(self.points),
+            )
+
+
+def starting_cloud(
+    start: StartPoints, *, degree: int, scale: float, opacity: float, flatness: float = 1.0
+) -> GaussianCloud:
+    """Return one Gaussian a point, `scale` mean distances to its 3 nearest neighbors wide (3DGS, section 5.1).
+
+    Round, or where normals are known a disc across the normal, `flatness` times as thick as wide. Where points
+    coincide, the width is a thousandth of their bounding box's diagonal at least.
+    """
+    count = len(start.points)
+    places = start.points.double().numpy()
+    nearest = cKDTree(places).query(places, k=4)[0][:, 1:].mean(1)
+    least = 1e-3 * float(np.linalg.norm(np.ptp(places, axis=0)))
+    if not least > 0.0:
+        raise SceneError(
+            f"expected initial points on the object, got {count} at one position", name="points", value=count
+        )
+    scales = torch.from_numpy(np.log(np.maximum(scale * nearest, least))).float()[:, None].repeat(1, 3)
+    harmonics = torch.zeros(count, (degree + 1) ** 2, 3)
+    harmonics[:, 0] = (start.colors - 0.5) / ZEROTH
+    if start.normals is None:
+        rotations = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
+    else:
+        rotations = _turns(start.normals.float())
+        scales[:, 2] += math.log(flatness)
+    logits = torch.full((count,), math.log(opacity / (1.0 - opacity)))
+    return GaussianCloud(start.points.float().clone(), rotations, scales, logits, harmonics)
+
+
+def _turns(normals: Float[Tensor, "points 3"]) -> Float[Tensor, "points 4"]:
+    """Return quaternions of the shortest turns that take the z axis to the normals."""
+    x, y, z = normals.unbind(1)
+    # From z to -z every way is equally short: about the x axis.
+    opposite = z < -1.0 + 1e-6
+    turns = torch.stack([1.0 + z, -y, x, torch.zeros_like(x)], dim=1)
+    turns[opposite] = torch.tensor([0.0, 1.0, 0.0, 0.0])
+    return torch.nn.functional.normalize(turns, dim=1)
+
+
+def photographed_colors(
+    points: Float[Tensor, "points 3"], views: Sequence[View], *, spacing: float
+) -> Float[Tensor, "points 3"]:
+    """Return the middle (median) of each point's colors in the views that see it, gray where none does.
+
+    The points hide one another as balls of `spacing`, meters, would; what lies less than two of these behind the
+    foremost is seen as well. Where they stand out from the object, some views show what is beside it: hence no mean.
+    """
+    shown = np.full((len(views), len(points), 3), np.nan, dtype=np.float32)
+    for row, view in enumerate(views):
+        places, depths = view.camera.project(points)
+        # One cell of the depth map is as wide as a ball, so that the balls of a surface leave no gap.
+        cell = max(1.0, spacing * view.camera.focal[0] / max(float(depths.median()), 1e-9))
+        inside = (depths > 0) & (places >= 0).all(1) & (places[:, 0] < view.camera.width)
+        inside &= places[:, 1] < view.camera.height
+        place, depth = places[inside].numpy(), depths[inside].numpy()
+        cells = (place / cell).astype(np.int64)
+        foremost = np.full((int(view.camera.height / cell) + 1, int(view.camera.width / cell) + 1), np.inf)
+        np.minimum.at(foremost, (cells[:, 1], cells[:, 0]), depth)
+        seen = depth <= foremost[cells[:, 1], cells[:, 0]] + 2 * spacing
+        pixels = place[seen].astype(np.int64)
+        chosen = np.flatnonzero(inside.numpy())[seen]
+        shown[row, chosen] = view.image.numpy()[pixels[:, 1], pixels[:, 0]] / 255.0
+    colors = np.full((len(points), 3), 0.5, dtype=np.float32)
+    known = np.isfinite(shown[:, :, 0]).any(0)
+    colors[known] = np.nanmedian(shown[:, known], axis=0)
+    return torch.from_numpy(colors)

@@ -1,0 +1,122 @@
+"""Which Gaussians are the object: not faint, not beside the masks, not afloat, not huge, not hidden inside."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from avmsf.errors import SceneError
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.initialize import ZEROTH
+from avmsf.gaussians.rasterizer.protocol import Rasterizer
+from avmsf.photographs.cameras import View
+
+_NEIGHBORS = 8
+_AFLOAT = 6.0
+"""Distance to the neighbors, in medians of that distance, beyond which a Gaussian belongs to nothing."""
+_OVERSIZE = 0.15
+"""Largest scale, in diagonals of the box around the middle 98 % of the centers."""
+_RIM = 2
+"""Pixels that a center may lie outside of a mask, whose edge is not known better."""
+
+
+def keep_object(
+    cloud: GaussianCloud,
+    views: Sequence[View],
+    *,
+    rasterizer: Rasterizer | None = None,
+    least_opacity: float = 0.1,
+    dissent: float = 0.1,
+    least_weight: float = 0.5,
+) -> GaussianCloud:
+    """Return the Gaussians that lie on the object.
+
+    Those go whose opacity is less than `least_opacity`; whose center is outside of the masks in more than `dissent` of
+    the views that have it in their image; whose scale is that of the object; whose neighbors are far away; and, with a
+    `rasterizer`, those that in no view color as much as `least_weight` pixels in sum, because others hide them.
+    Raises `SceneError` where nothing remains.
+    """
+    cloud = cloud.detach()
+    rows = torch.nonzero(cloud.opacities >= least_opacity)[:, 0]
+    rows = rows[masks_agree(cloud.centers[rows], views, dissent=dissent)]
+    _expect_some(rows, cloud)
+    rows = rows[_sized(cloud.take(rows))]
+    if rasterizer is not None:
+        rows = rows[blended_weight(cloud.take(rows), views, rasterizer=rasterizer) >= least_weight]
+    _expect_some(rows, cloud)
+    rows = rows[_close(cloud.centers[rows])]
+    _expect_some(rows, cloud)
+    return cloud.take(rows)
+
+
+def masks_agree(
+    points: Float[Tensor, "points 3"], views: Sequence[View], *, dissent: float = 0.1
+) -> Bool[Tensor, " points"]:
+    """Return which points at most `dissent` of the views that have them in their image see outside of their mask.
+
+    Views without a mask, or with an empty one, do not vote; a point that no view sees is not on the object, where some
+    view could have.
+    """
+    device, points = points.device, points.cpu()
+    seen, against, voters = torch.zeros(len(points)), torch.zeros(len(points)), 0
+    for view in views:
+        if view.mask is None or not bool((view.mask > 127).any()):
+            continue
+        voters += 1
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _RIM + 1, 2 * _RIM + 1))
+        mask = torch.from_numpy(cv2.dilate(view.mask.numpy(), kernel)) > 127
+        places, depth = view.camera.project(points)
+        inside = (depth > 0) & (places >= 0).all(1)
+        inside &= (places[:, 0] < view.camera.width) & (places[:, 1] < view.camera.height)
+        pixels = places[inside].long()
+        seen += inside
+        against[inside] += (~mask[pixels[:, 1], pixels[:, 0]]).float()
+    if not voters:
+        return torch.ones(len(points), dtype=torch.bool, device=device)
+    return ((seen > 0) & (against <= dissent * seen)).to(device)
+
+
+def blended_weight(cloud: GaussianCloud, views: Sequence[View], *, rasterizer: Rasterizer) -> Float[Tensor, " points"]:
+    """Return each Gaussian's largest share in an image: its blending weights summed over the pixels of a view.
+
+    Taken from the slope of a rendering by the Gaussians' own brightness, so that any rasterizer tells it.
+    """
+    largest = torch.zeros_like(cloud.logit_opacities)
+    for view in views:
+        # Gray is far from black, at which colors are cut off and have no slope.
+        gray = torch.zeros_like(cloud.harmonics[:, :1], requires_grad=True)
+        plain = replace(cloud.detach(), harmonics=gray)
+        color = rasterizer(plain, view.camera, background=largest.new_zeros(3)).color
+        (slope,) = torch.autograd.grad(color[..., 0].sum(), gray)
+        largest = torch.maximum(largest, slope[:, 0, 0] / ZEROTH)
+    return largest
+
+
+def _sized(cloud: GaussianCloud) -> Bool[Tensor, " points"]:
+    places = cloud.centers
+    low, high = torch.quantile(places[:: max(1, len(places) // 100_000)], places.new_tensor([0.01, 0.99]), dim=0)
+    return cloud.log_scales.amax(1).exp() <= _OVERSIZE * float((high - low).norm())
+
+
+def _close(points: Float[Tensor, "points 3"]) -> Bool[Tensor, " points"]:
+    places = points.double().cpu().numpy()
+    count = min(_NEIGHBORS, len(places) - 1)
+    if count < 1:
+        return torch.ones(len(points), dtype=torch.bool, device=points.device)
+    distance = cKDTree(places).query(places, k=np.arange(2, count + 2))[0].mean(1)
+    return torch.from_numpy(distance <= _AFLOAT * np.median(distance)).to(points.device)
+
+
+def _expect_some(rows: Tensor, cloud: GaussianCloud) -> None:
+    if not len(rows):
+        raise SceneError(
+            f"expected Gaussians on the object, got none of {len(cloud)}; check that masks, cameras and Gaussians "
+            "belong together and that not all are almost transparent",
+            name="gaussians",
+            value=0,
+        )

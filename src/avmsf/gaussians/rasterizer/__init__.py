@@ -1,0 +1,1 @@
+"""Gaussians to images and back: one interface, kernels for processors and for graphics cards."""

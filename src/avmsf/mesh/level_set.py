@@ -1,0 +1,90 @@
+"""From values on a grid to the closed surface of what they enclose, drawn and thinned by libraries."""
+
+import fast_simplification
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from avmsf.errors import CaptureError
+from avmsf.mesh.surface import Surface
+
+_SPECK = 0.02
+"""Area of a part over the largest part's, below which it does not belong to the object."""
+
+
+def enclose(
+    values: Float32[np.ndarray, "x y z"],
+    level: float,
+    *,
+    lowest: Float64[np.ndarray, " 3"],
+    spacing: float,
+    faces: int | None = None,
+) -> Surface:
+    """Return the closed surface around all that is above `level` on a grid, triangles counter-clockwise from outside.
+
+    `lowest` is the position of the first value and `spacing` the distance between two, meters; the values at the grid's
+    edge must be below the level. Parts much smaller than the largest are left out. With `faces` the surface is made
+    coarser until it has at most so many triangles, twice or four times as many where fewer would pinch it open. Raises
+    CaptureError where nothing or everything is above the level.
+    """
+    if not float(values.max()) > level or any(
+        float(values.take(end, axis=axis).max()) >= level for axis in range(3) for end in (0, -1)
+    ):
+        raise CaptureError(
+            f"expected values above {level:g} inside the grid and none at its edge, got {values.min():g} to "
+            f"{values.max():g}",
+            name="values",
+            value=[float(values.min()), float(values.max())],
+        )
+    # Imported here, for it takes a third of a second that hardly any command needs.
+    from skimage import measure
+
+    drawn = measure.marching_cubes(values, level, gradient_direction="ascent")  # type: ignore[no-untyped-call]
+    vertices, triangles = drawn[:2]
+    vertices, triangles = _without_specks(vertices.astype(np.float64), triangles.astype(np.int64))
+    if faces is not None and len(triangles) > faces:
+        vertices, triangles = _coarser(vertices, triangles, faces)
+    return Surface(torch.from_numpy(lowest + spacing * vertices).float(), torch.from_numpy(triangles))
+
+
+def _without_specks(
+    vertices: Float64[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "faces 3"]
+) -> tuple[Float64[np.ndarray, "kept 3"], Int[np.ndarray, "remaining 3"]]:
+    ends = triangles[:, [0, 1]], triangles[:, [1, 2]]
+    rows, columns = np.concatenate(ends).T
+    links = coo_array((np.ones(len(rows)), (rows, columns)), shape=(len(vertices), len(vertices)))
+    part = connected_components(links, directed=False)[1][triangles[:, 0]]
+    corners = vertices[triangles]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    size = np.bincount(part, weights=areas)
+    return _compact(vertices, triangles[size[part] >= _SPECK * size.max()])
+
+
+def _compact(
+    vertices: Float64[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "faces 3"]
+) -> tuple[Float64[np.ndarray, "kept 3"], Int[np.ndarray, "remaining 3"]]:
+    used, rows = np.unique(triangles, return_inverse=True)
+    return vertices[used], rows.reshape(-1, 3)
+
+
+def _coarser(
+    vertices: Float64[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "faces 3"], faces: int
+) -> tuple[Float64[np.ndarray, "fewer 3"], Int[np.ndarray, "coarse 3"]]:
+    wanted = faces
+    while wanted < len(triangles):
+        places, rows = fast_simplification.simplify(vertices, triangles, target_count=wanted)
+        fewer, coarse = _compact(places.astype(np.float64), rows.astype(np.int64))
+        if _closed(coarse):
+            return fewer, coarse
+        # Where it pinches a thin part off, a finer one does not.
+        wanted *= 2
+    return vertices, triangles
+
+
+def _closed(triangles: Int[np.ndarray, "faces 3"]) -> bool:
+    """Return whether each edge is run along once in each direction."""
+    edges = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    once = np.unique(edges, axis=0)
+    return len(once) == len(edges) and bool(np.array_equal(once, np.unique(edges[:, ::-1], axis=0)))

@@ -1,0 +1,90 @@
+"""The object's shape, as triangles or as points."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from avmsf._utils.arrays import ArrayLike, as_vectors
+from avmsf.errors import ArrayError, CaptureError
+
+SurfaceKind = Literal["ply", "obj", "glb"]
+"""Formats that surfaces are written in."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles, or points alone."""
+
+    vertices: Float[Tensor, "points 3"]
+    """Object frame, meters."""
+    faces: Int[Tensor, "faces 3"]
+    """Rows of `vertices` at the corners of each triangle; no rows for a point cloud."""
+
+    @classmethod
+    def of(cls, vertices: ArrayLike, faces: ArrayLike = ()) -> "Surface":
+        """Return the surface of vertices in meters, [points, 3], and triangles, [faces, 3]; points alone without these.
+
+        Raises ArrayError for other shapes, for vertices that are not finite and for corners that are no vertices.
+        """
+        places = as_vectors(vertices, "vertices").float()
+        given = as_vectors(faces, "faces") if len(faces) else torch.zeros(0, 3)
+        corners = given.long()
+        wrong = torch.nonzero(((corners != given) | (corners < 0) | (corners >= len(places))).any(1)).flatten()
+        if len(wrong):
+            row = int(wrong[0])
+            raise ArrayError(
+                f"faces: expected indices of vertices, 0 to {len(places) - 1}, got {given[row].tolist()} (row {row})",
+                name="faces",
+                row=row,
+                value=given[row].tolist(),
+            )
+        return cls(places, corners)
+
+    @classmethod
+    def read(cls, path: str | Path, *, meters: float = 1.0) -> "Surface":
+        """Read a mesh or a point cloud, see `read_surface`. Raises CaptureError for a file without points."""
+        return read_surface(path, meters=meters)
+
+    def write(self, path: str | Path) -> None:
+        """Write a binary PLY file in meters."""
+        write_surface(self, Path(path))
+
+    def __repr__(self) -> str:
+        size = " x ".join(f"{side:.3g}" for side in (self.vertices.amax(0) - self.vertices.amin(0)).tolist())
+        return f"Surface({len(self.vertices)} vertices, {len(self.faces)} triangles, {size} m)"
+
+
+def read_surface(path: str | Path, *, meters: float = 1.0) -> Surface:
+    """Read a mesh or a point cloud whose coordinates count `meters` each; vertices keep the file's order.
+
+    A scene of several parts becomes one surface. `CaptureError` as `load_mesh`, and where it holds no points.
+    """
+    # Imports trimesh, which takes half a second and what reads no mesh does without.
+    from avmsf.mesh.io import load_parts
+
+    path = Path(path)
+    vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
+    for part in load_parts(path):
+        points = np.asarray(getattr(part, "vertices", np.zeros((0, 3))), dtype=np.float64)
+        vertices.append(points)
+        faces.append(np.asarray(getattr(part, "faces", np.zeros((0, 3))), dtype=np.int64).reshape(-1, 3) + count)
+        count += len(points)
+    joined = np.concatenate(vertices)
+    if not len(joined):
+        raise CaptureError(f"{path}: expected points, got none; export the surface again", file=path, value=0)
+    return Surface(torch.from_numpy((joined * meters).astype(np.float32)), torch.from_numpy(np.concatenate(faces)))
+
+
+def write_surface(surface: Surface, path: Path, *, kind: SurfaceKind = "ply") -> None:
+    """Write a surface in meters: as a binary PLY, which holds float32 coordinates to the last bit, as OBJ or as GLB."""
+    vertices, faces = surface.vertices.numpy(), surface.faces.numpy()
+    cloud = not len(faces)
+    import trimesh
+
+    shape = trimesh.PointCloud(vertices) if cloud else trimesh.Trimesh(vertices, faces, process=False)  # type: ignore[no-untyped-call]
+    shape.export(path, file_type=kind)

@@ -1,0 +1,244 @@
+"""A triangle mesh with its colors, as scanners and modelling programs write it: obj, ply, glb or stl."""
+
+import math
+import re
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from avmsf.errors import CaptureError, Remark
+from avmsf.mesh.io import expect_corners, expect_finite_vertices, load_parts
+from avmsf.mesh.surface import Surface
+
+GRAY = 0.7
+"""Brightness of what has no color, 0 to 1."""
+CREASE = 40.0
+"""Degrees between a face and the mean of the faces around one of its corners, beyond which the corner is sharp.
+
+A box's corner leans 55 degrees from each of its three sides, an edge at a right angle 45 from both.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class TexturedMesh:
+    """Triangles with smooth normals and the colors of their surface, all given at the corners of each face.
+
+    The color of a place is that of its texture times that of the mesh; what has no texture has a white one.
+    """
+
+    vertices: Float[Tensor, "points 3"]
+    """Object frame, meters; no two in one place."""
+    faces: Int[Tensor, "faces 3"]
+    """Rows of `vertices` at the corners of each triangle."""
+    normals: Float[Tensor, "faces 3 3"]
+    """Unit normal at each corner, the same for all faces around it unless the edge is sharp."""
+    colors: Float[Tensor, "faces 3 3"]
+    """Red, green, blue at each corner as displayed (sRGB), 0 to 1."""
+    coordinates: Float[Tensor, "faces 3 2"]
+    """Place of each corner in its texture: u to the right and v up, each 0 to 1 over the image, which repeats."""
+    materials: Int[Tensor, " faces"]
+    """Which of `textures` each face shows."""
+    textures: tuple[UInt8[Tensor, "_ _ 3"], ...]
+    """Images, red, green, blue as displayed; one white pixel for faces without texture."""
+
+    @classmethod
+    def build(
+        cls,
+        vertices: Float[Tensor, "points 3"],
+        faces: Int[Tensor, "faces 3"],
+        *,
+        colors: Float[Tensor, "faces 3 3"] | None = None,
+        coordinates: Float[Tensor, "faces 3 2"] | None = None,
+        textures: Sequence[UInt8[Tensor, "_ _ 3"]] = (),
+        materials: Int[Tensor, " faces"] | None = None,
+    ) -> "TexturedMesh":
+        """Return the mesh with vertices in one place made one, unused ones left out, and its normals computed.
+
+        Without colors and textures the mesh is plain gray; texture coordinates without materials belong to the first
+        texture. Raises CaptureError for coordinates that are not numbers, for faces that name vertices which are not
+        there, and for a mesh without a face that has an area.
+        """
+        _expect_mesh(vertices, faces)
+        used, rows = np.unique(vertices.numpy()[faces.numpy().ravel()], axis=0, return_inverse=True)
+        welded = rows.reshape(-1, 3)
+        textured = bool(textures)
+        if colors is None:
+            colors = torch.full((len(faces), 3, 3), 1.0 if textured else GRAY)
+        return cls(
+            vertices=torch.from_numpy(used).float(),
+            faces=torch.from_numpy(welded),
+            normals=torch.from_numpy(corner_normals(used, welded)).float(),
+            colors=colors.float(),
+            coordinates=torch.zeros(len(faces), 3, 2) if coordinates is None else coordinates.float(),
+            materials=torch.zeros(len(faces), dtype=torch.int64) if materials is None else materials,
+            textures=tuple(textures) or (torch.full((1, 1, 3), 255, dtype=torch.uint8),),
+        )
+
+    @classmethod
+    def plain(cls, surface: Surface) -> "TexturedMesh":
+        """Return a surface's triangles in gray; raises CaptureError as `build`, also for points without triangles."""
+        return cls.build(surface.vertices, surface.faces)
+
+    @cached_property
+    def surface(self) -> Surface:
+        """The shape alone."""
+        return Surface(self.vertices, self.faces)
+
+
+def read_textured_mesh(path: str | Path, *, meters: float = 1.0) -> TexturedMesh:
+    """Read a mesh whose coordinates count `meters` each, with its textures, vertex colors or face colors.
+
+    Parts of a scene become one mesh. Colors are taken as they are written and opaque, whatever the file says of
+    light and transparency. Normals in the file are not used. What has no color at all, or whose texture file is
+    missing or corrupt, is gray, and a `CaptureWarning` says so. Raises CaptureError as `load_mesh`, and where the
+    file holds no triangles.
+    """
+    path = Path(path)
+    parts = [part for part in load_parts(path) if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    if not parts:
+        raise CaptureError(
+            f"{path}: expected a mesh with triangles to render, got none; export the mesh with its faces, or give the "
+            "points as the capture's surface",
+            file=path,
+            name="faces",
+            value=0,
+        )
+    lacking = _missing_images(path)
+    painted = [_paint(part, lacking) for part in parts]
+    remarks = dict.fromkeys(paint.remark for paint in painted if paint.remark)
+    offsets = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    vertices = np.concatenate([np.asarray(part.vertices, dtype=np.float64) for part in parts]) * meters
+    faces = np.concatenate([np.asarray(part.faces, dtype=np.int64) + start for part, start in zip(parts, offsets)])  # noqa: B905
+    counts = [len(part.faces) for part in parts]
+    try:
+        mesh = TexturedMesh.build(
+            torch.from_numpy(vertices),
+            torch.from_numpy(faces),
+            colors=torch.from_numpy(np.concatenate([paint.colors for paint in painted])),
+            coordinates=torch.from_numpy(np.concatenate([paint.coordinates for paint in painted])),
+            textures=[torch.from_numpy(paint.texture) for paint in painted],
+            materials=torch.from_numpy(np.repeat(np.arange(len(parts)), counts)),
+        )
+    except CaptureError as error:
+        raise CaptureError(f"{path}: {error}", file=path, row=error.row, name=error.name, value=error.value) from error
+    for remark in remarks:
+        warnings.warn(remark.about(path), stacklevel=2)
+    return mesh
+
+
+def corner_normals(vertices: Float[np.ndarray, "points 3"], faces: Int[np.ndarray, "faces 3"]) -> np.ndarray:
+    """Return the unit normal at each corner, [faces, 3, 3]: the faces' mean around it, weighted by their angles there.
+
+    Where a face leans more than `CREASE` from that mean, its corner keeps the face's own normal.
+    """
+    corners = vertices.astype(np.float64)[faces]
+    sides = _unit(np.roll(corners, -1, axis=1) - corners)
+    # At each corner, the side that leaves it and the one that arrives, turned round.
+    angles = np.arccos(np.clip(-(sides * np.roll(sides, 1, axis=1)).sum(axis=-1), -1, 1))
+    flat = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    total = np.zeros((len(vertices), 3))
+    for axis in range(3):
+        weights = angles * flat[:, axis, None]
+        total[:, axis] = np.bincount(faces.ravel(), weights=weights.ravel(), minlength=len(vertices))
+    smooth = _unit(total)[faces]
+    sharp = (smooth * flat[:, None]).sum(axis=-1) < math.cos(math.radians(CREASE))
+    return np.where(sharp[..., None], flat[:, None], smooth)
+
+
+@dataclass(frozen=True, eq=False)
+class _Paint:
+    """The colors of one part."""
+
+    colors: np.ndarray
+    coordinates: np.ndarray
+    texture: np.ndarray
+    remark: Remark | None = None
+
+
+_COLORLESS = Remark("has neither texture nor colors; it is rendered gray", name="colors")
+
+
+def _paint(part: trimesh.Trimesh, lacking: dict[str, str]) -> _Paint:
+    faces = np.asarray(part.faces)
+    white = np.full((1, 1, 3), 255, dtype=np.uint8)
+    nowhere = np.zeros((len(faces), 3, 2))
+    visual: Any = part.visual
+    if visual.kind == "vertex":
+        return _Paint(np.asarray(visual.vertex_colors)[faces][..., :3] / 255.0, nowhere, white)
+    if visual.kind == "face":
+        own = np.asarray(visual.face_colors)[:, None, :3] / 255.0
+        return _Paint(np.repeat(own, 3, axis=1), nowhere, white)
+    gray = np.full((len(faces), 3, 3), GRAY)
+    if visual.kind != "texture":
+        return _Paint(gray, nowhere, white, _COLORLESS)
+    material = visual.material
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    factor = getattr(material, "baseColorFactor", None)
+    if image is not None and visual.uv is not None:
+        try:
+            texture = np.array(image.convert("RGB"))
+        except (OSError, SyntaxError, ValueError) as error:  # what Pillow raises for images that are cut or corrupt
+            remark = Remark(f"its texture cannot be read ({error}); it is rendered gray", name="texture")
+            return _Paint(gray, nowhere, white, remark)
+        coordinates = np.nan_to_num(np.asarray(visual.uv, dtype=np.float64)[faces])
+        tint = np.asarray([255.0] * 3 if factor is None else factor, dtype=np.float64)[:3] / 255.0
+        return _Paint(np.broadcast_to(tint, gray.shape).copy(), coordinates, texture)
+    name = str(getattr(material, "name", ""))
+    if name in lacking:
+        message = f"its texture {lacking[name]} is missing; the part is rendered gray"
+        return _Paint(gray, nowhere, white, Remark(message, name="texture", value=lacking[name]))
+    if factor is None and "kd" not in getattr(material, "kwargs", {}):
+        return _Paint(gray, nowhere, white, _COLORLESS)
+    tint = np.asarray(material.main_color, dtype=np.float64)[:3] / 255.0
+    return _Paint(np.broadcast_to(tint, gray.shape).copy(), nowhere, white)
+
+
+def _missing_images(path: Path) -> dict[str, str]:
+    """Return, for each material of an obj file whose image is not there, the image's name."""
+    if path.suffix.lower() != ".obj":
+        return {}
+    text = path.read_text(encoding="utf-8", errors="replace")
+    lacking = {}
+    for library in re.findall(r"^\s*mtllib\s+(.+?)\s*$", text, flags=re.MULTILINE):
+        source = path.parent / library
+        if not source.is_file():
+            continue
+        material = ""
+        for line in source.read_text(encoding="utf-8", errors="replace").splitlines():
+            key, _, rest = line.strip().partition(" ")
+            if key == "newmtl":
+                material = rest.strip()
+            elif key.lower() == "map_kd" and rest.strip() and not (source.parent / rest.split()[-1]).is_file():
+                lacking[material] = rest.split()[-1]
+    return lacking
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.where(length > 0, length, 1.0)
+
+
+def _expect_mesh(vertices: Tensor, faces: Tensor) -> None:
+    if not len(faces):
+        raise CaptureError(
+            f"expected a mesh with triangles to render, got {len(vertices)} points without any", name="faces", value=0
+        )
+    expect_finite_vertices(vertices.numpy())
+    expect_corners(faces.numpy(), len(vertices))
+    corners = vertices.double()[faces]
+    doubled = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    if not bool((doubled != 0).any()):
+        raise CaptureError(
+            f"expected triangles with an area, got {len(faces)} without; export the mesh again",
+            name="area",
+            value=0.0,
+        )

@@ -1,0 +1,155 @@
+"""Lenses as files describe them, with distortion, and pictures made straight."""
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.capture.location import Location
+from avmsf.photographs.cameras import Camera
+from avmsf.photographs.images import Picture
+
+# A lens is judged on this many points along each side of the image that it would give.
+_GRID = 33
+# A straightened picture takes in at most this many times the width and height that the lens has in its middle.
+_WIDEST = 2.0
+
+
+_ANY_CAMERA = Location(None, item="the camera")
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """Intrinsics with distortion, for images of one size; pixels as in `Camera`: centers half a pixel from the edges.
+
+    With x, y the point's place at depth one and r its distance from the axis, the perspective lens moves it to
+    x (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²) and likewise in y; the fisheye lens moves it along its
+    radius from r to θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸), θ = arctan r. These are OpenCV's and COLMAP's models.
+    """
+
+    focal: tuple[float, float]
+    """Along x and y, pixels."""
+    principal: tuple[float, float]
+    """Pixels."""
+    width: int
+    """Pixels."""
+    height: int
+    """Pixels."""
+    distortion: tuple[float, ...] = ()
+    """k1 k2 p1 p2 k3 of a perspective lens, k1 k2 k3 k4 of a fisheye; empty for a perspective lens without any."""
+    fisheye: bool = False
+    origin: Location = _ANY_CAMERA
+    """Where it was read, for errors."""
+
+    def __post_init__(self) -> None:
+        numbers = [*self.focal, *self.principal, *self.distortion]
+        if not all(map(math.isfinite, numbers)) or min(self.focal) <= 0 or min(self.width, self.height) < 1:
+            raise self.origin.error(
+                "expected finite intrinsics, positive focal lengths and a size in pixels, got focal lengths "
+                f"{self.focal}, principal point {self.principal}, distortion {self.distortion}, size {self.width} x "
+                f"{self.height}; calibrate this camera again",
+                name="intrinsics",
+                value=[*numbers, self.width, self.height],
+            )
+
+    @property
+    def straight(self) -> bool:
+        """Whether the lens is a pinhole already."""
+        return not self.fisheye and not any(self.distortion)
+
+    def resized(self, width: int, height: int) -> "Lens":
+        """Return the lens of the same picture with another number of pixels."""
+        across, down = width / self.width, height / self.height
+        return replace(
+            self,
+            focal=(self.focal[0] * across, self.focal[1] * down),
+            principal=(self.principal[0] * across, self.principal[1] * down),
+            width=width,
+            height=height,
+        )
+
+    def camera(self, world_to_camera: Float[Tensor, "4 4"]) -> Camera:
+        """Return the pinhole camera with this lens's intrinsics, its distortion left aside."""
+        return Camera(world_to_camera.to(torch.float64), self.focal, self.principal, self.width, self.height)
+
+
+def straighten(picture: Picture, lens: Lens) -> tuple[Picture, Lens]:
+    """Return the picture as a pinhole would have taken it, mask included, and that pinhole.
+
+    It has the size and the principal point of the original. Its focal length is the smallest at which every pixel
+    still shows something, so that nothing black is made up at the edges: a part of the outermost pixels may be lost,
+    and a fisheye keeps at most what twice the width and height of its middle take in. Interpolation is bilinear.
+    Raises CaptureError where the distortion folds the image over, as coefficients of another model do.
+    """
+    if lens.straight:
+        return picture, replace(lens, distortion=())
+    pinhole = _widest_pinhole(lens)
+    across, down = _sources(lens, pinhole, (pinhole.width, pinhole.height))
+
+    def look_up(pixels: np.ndarray) -> np.ndarray:
+        return cv2.remap(pixels, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+    mask = None if picture.mask is None else look_up(picture.mask)
+    return Picture(look_up(picture.color), mask), pinhole
+
+
+def _widest_pinhole(lens: Lens) -> Lens:
+    """Return the pinhole of smallest focal length, by bisection, whose every pixel lies in the lens's image."""
+    narrow, wide = 4.0, 1 / _WIDEST
+    if not _covers(lens, narrow):
+        raise lens.origin.error(
+            f"expected an invertible distortion, got {lens.distortion}; check the camera model (fisheye: "
+            f"{lens.fisheye}) and the order of its coefficients",
+            name="distortion",
+            value=lens.distortion,
+        )
+    if _covers(lens, wide):
+        narrow = wide
+    while narrow / wide > 1 + 1e-5:
+        middle = math.sqrt(narrow * wide)
+        narrow, wide = (middle, wide) if _covers(lens, middle) else (narrow, middle)
+    return _pinhole(lens, narrow)
+
+
+def _pinhole(lens: Lens, zoom: float) -> Lens:
+    return replace(lens, focal=(lens.focal[0] * zoom, lens.focal[1] * zoom), distortion=(), fisheye=False)
+
+
+def _covers(lens: Lens, zoom: float) -> bool:
+    """Whether a pinhole with `zoom` times the focal length sees only what the lens sees, and sees it unfolded."""
+    # One step more on each side than the image has, so that slopes are central differences up to its corners.
+    steps = (max(lens.width - 1, 1) / (_GRID - 1), max(lens.height - 1, 1) / (_GRID - 1))
+    across, down = _sources(lens, _pinhole(lens, zoom), (_GRID + 2, _GRID + 2), steps=steps, margin=1)
+    (across_y, across_x), (down_y, down_x) = np.gradient(across), np.gradient(down)
+    unfolded = across_x * down_y - across_y * down_x > 0
+    inside = (across >= -1e-3) & (across <= lens.width - 1 + 1e-3) & (down >= -1e-3) & (down <= lens.height - 1 + 1e-3)
+    return bool((inside & unfolded)[1:-1, 1:-1].all())
+
+
+def _sources(
+    lens: Lens,
+    pinhole: Lens,
+    size: tuple[int, int],
+    *,
+    steps: tuple[float, float] = (1.0, 1.0),
+    margin: int = 0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return where in the lens's image the pinhole's pixels come from.
+
+    `size` of them, each `steps` pixels from the next, from `margin` steps before the first pixel.
+    """
+    # OpenCV puts pixel centers at whole numbers: half a pixel off both principal points.
+    old, new = np.eye(3), np.eye(3)
+    old[0, 0], old[1, 1] = lens.focal
+    old[0, 2], old[1, 2] = lens.principal[0] - 0.5, lens.principal[1] - 0.5
+    for axis in range(2):
+        new[axis, axis] = pinhole.focal[axis] / steps[axis]
+        new[axis, 2] = (pinhole.principal[axis] - 0.5) / steps[axis] + margin
+    coefficients = np.array(lens.distortion or (0.0, 0.0, 0.0, 0.0), dtype=np.float64)
+    maps = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
+    across, down = maps(old, coefficients, np.eye(3), new, size, cv2.CV_32FC1)
+    return across, down

@@ -1,0 +1,298 @@
+"""Pictures of a mesh, taken by casting rays: what stands for photographs where there is a scan."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from avmsf.errors import CaptureError
+from avmsf.mesh.surface import Surface
+from avmsf.mesh.texture import TextureAtlas
+from avmsf.mesh.textured_mesh import TexturedMesh
+from avmsf.photographs.cameras import Camera, View
+
+FOCAL = 886.81
+"""Focal length of the usual renders of ObjectFolder's scans, pixels, for an image of `FOCAL_SIZE`."""
+FOCAL_SIZE = 1024
+RADIUS = 2.25
+"""Object units from the middle of an object's bounding box to its corners: see `orbit_cameras`."""
+MOST_RAYS = 1 << 19
+"""Rays cast at once: about 100 bytes each."""
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Light on a matte surface: some from everywhere, some from a sky, a half sphere of even brightness.
+
+    A face that leans by an angle t from the middle of the sky sees (1 + cos t) / 2 of it, so that no side of an object
+    is dark. The light stays with the object, so that a place has one color in all views. Both are factors of the
+    surface's color as displayed.
+    """
+
+    ambient: float = 0.4
+    """Light from everywhere."""
+    sky: float = 0.6
+    """Light from the whole sky."""
+    direction: tuple[float, float, float] = (0.36, 0.48, 0.8)
+    """Towards the middle of the sky, in the object frame; of any length. Along none of the axes, so that the sides of a
+    box differ."""
+
+
+MATTE = Lighting()
+UNLIT = Lighting(ambient=1.0, sky=0.0)
+"""The surface's own colors (albedo)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What of a mesh lies behind the center of each pixel."""
+
+    faces: Int[Tensor, "height width"]
+    """Row of the mesh's faces; -1 where there is none."""
+    depth: Float[Tensor, "height width"]
+    """Meters along the optical axis; infinite where there is no face."""
+    normals: Float[Tensor, "height width 3"]
+    """Smooth unit normals in the object frame, turned towards the camera; zero where there is no face."""
+
+
+class MeshTracer:
+    """A mesh made ready for rays (by Embree, on the CPU)."""
+
+    def __init__(self, mesh: TexturedMesh) -> None:
+        vertices = mesh.vertices.double().numpy()
+        low, high = vertices.min(axis=0), vertices.max(axis=0)
+        # Embree counts in float32 and near the origin: the mesh is moved there and given the size of a few units.
+        self.middle, self.size = (low + high) / 2, float(np.linalg.norm(high - low))
+        self.vertices, self.faces = vertices, mesh.faces.numpy()
+        self.normals = mesh.normals.numpy()
+        self.colors = mesh.colors.numpy()
+        self.coordinates = mesh.coordinates.numpy()
+        self.materials = mesh.materials.numpy()
+        self.atlas = TextureAtlas([texture.numpy() for texture in mesh.textures])
+        self.texels = self._texels_per_meter()
+        self.scene = EmbreeScene()
+        placed = ((vertices - self.middle) / self.size).astype(np.float32)
+        TriangleMesh(self.scene, placed, self.faces.astype(np.int32))
+
+    def look(self, camera: Camera) -> Sight:
+        """Return what lies behind the center of each pixel."""
+        faces = torch.full((camera.height, camera.width), -1)
+        depth = torch.full((camera.height, camera.width), torch.inf, dtype=torch.float64)
+        normals = torch.zeros(camera.height, camera.width, 3, dtype=torch.float64)
+        for hits in self._cast(camera):
+            rows, columns = torch.from_numpy(hits.rows), torch.from_numpy(hits.columns)
+            faces[rows, columns] = torch.from_numpy(hits.faces)
+            depth[rows, columns] = torch.from_numpy(hits.depth)
+            normals[rows, columns] = torch.from_numpy(self._normals(hits).astype(np.float64))
+        return Sight(faces, depth, normals)
+
+    def photograph(
+        self, camera: Camera, *, name: str, lighting: Lighting, background: tuple[float, float, float], supersample: int
+    ) -> View:
+        """Take one picture as `render_views` does."""
+        fine = camera.resized(camera.width * supersample, camera.height * supersample)
+        count = camera.width * camera.height
+        sums, covered = np.zeros((count, 3)), np.zeros(count)
+        for hits in self._cast(fine):
+            pixel = hits.rows // supersample * camera.width + hits.columns // supersample
+            color = self._colors(hits, fine, lighting)
+            covered += np.bincount(pixel, minlength=count)
+            for channel in range(3):
+                sums[:, channel] += np.bincount(pixel, weights=color[:, channel], minlength=count)
+        samples = supersample * supersample
+        image = sums / samples + (1 - covered / samples)[:, None] * np.asarray(background)
+        shape = (camera.height, camera.width)
+        return View(
+            name,
+            torch.from_numpy(np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8).reshape(*shape, 3)),
+            camera,
+            torch.from_numpy(np.rint(255 * covered / samples).astype(np.uint8).reshape(shape)),
+        )
+
+    def _cast(self, camera: Camera) -> "list[_Hits]":
+        """Cast a ray through each pixel of the rectangle that the mesh fills, a band of rows at a time."""
+        left, top, right, bottom = self._rectangle(camera)
+        if right <= left:
+            return []
+        height = max(1, MOST_RAYS // (right - left))
+        bands = []
+        for start in range(top, bottom, height):
+            stop = min(start + height, bottom)
+            cut = replace(
+                camera,
+                principal=(camera.principal[0] - left, camera.principal[1] - start),
+                width=right - left,
+                height=stop - start,
+            )
+            bands.append(self._cast_band(cut, left=left, top=start))
+        return bands
+
+    def _cast_band(self, camera: Camera, *, left: int, top: int) -> "_Hits":
+        directions = camera.rays().reshape(-1, 3).numpy()
+        origin = (camera.position.numpy() - self.middle) / self.size
+        origins = np.broadcast_to(origin.astype(np.float32), directions.shape)
+        found = self.scene.run(np.ascontiguousarray(origins), directions.astype(np.float32), output=1)
+        hit = np.flatnonzero(found["primID"] >= 0)
+        faces = found["primID"][hit].astype(np.int64)
+        u, v = found["u"][hit].astype(np.float64), found["v"][hit].astype(np.float64)
+        weights = np.stack([1 - u - v, u, v], axis=1)
+        # The distance of a float32 ray is coarse beside the corners' own depths, of which it is the mean.
+        pose = camera.world_to_camera.numpy()
+        depths = self.vertices @ pose[2, :3] + pose[2, 3]
+        return _Hits(
+            rows=hit // camera.width + top,
+            columns=hit % camera.width + left,
+            faces=faces,
+            weights=weights.astype(np.float32),
+            directions=directions[hit].astype(np.float32),
+            depth=(depths[self.faces[faces]] * weights).sum(axis=1),
+        )
+
+    def _rectangle(self, camera: Camera) -> tuple[int, int, int, int]:
+        """Return the left, top, right and bottom pixel edges around all that the mesh can fill."""
+        pixels, depth = camera.project(torch.from_numpy(self.vertices))
+        if not bool((depth > 0).any()):
+            return 0, 0, 0, 0
+        if bool((depth <= 0).any()):
+            return 0, 0, camera.width, camera.height
+        low, high = pixels.amin(0).tolist(), pixels.amax(0).tolist()
+        left, top = (max(0, math.floor(value)) for value in low)
+        right, bottom = min(camera.width, math.ceil(high[0])), min(camera.height, math.ceil(high[1]))
+        return left, top, max(left, right), max(top, bottom)
+
+    def _normals(self, hits: "_Hits") -> np.ndarray:
+        normals = np.einsum("nca,nc->na", self.normals[hits.faces], hits.weights)
+        towards = np.sign((normals * hits.directions).sum(axis=1, keepdims=True))
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        return normals * -np.where(towards == 0, 1, towards) / np.maximum(length, 1e-30)
+
+    def _colors(self, hits: "_Hits", camera: Camera, lighting: Lighting) -> np.ndarray:
+        """Return the color of each hit, 0 to 1."""
+        places = np.einsum("nca,nc->na", self.coordinates[hits.faces], hits.weights)
+        # Size of a ray's neighborhood on a face that looks at the camera; one that leans shows more.
+        spans = hits.depth / min(camera.focal) * self.texels[hits.faces]
+        colors = self.atlas.look_up(places, self.materials[hits.faces], spans=spans)
+        colors *= np.einsum("nca,nc->na", self.colors[hits.faces], hits.weights)
+        if lighting.sky:
+            towards = np.asarray(lighting.direction) / np.linalg.norm(lighting.direction)
+            colors *= (lighting.ambient + lighting.sky * (1 + self._normals(hits) @ towards) / 2)[:, None]
+        else:
+            colors *= lighting.ambient
+        return colors
+
+    def _texels_per_meter(self) -> np.ndarray:
+        """Return how many texels lie side by side on a meter of each face, [faces]."""
+        corners = self.vertices[self.faces]
+        doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        pixels = self.coordinates * self.atlas.sizes[self.materials][:, None]
+        across, down = pixels[:, 1] - pixels[:, 0], pixels[:, 2] - pixels[:, 0]
+        texels = np.abs(across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0])
+        return np.sqrt(texels / np.maximum(doubled, 1e-30))
+
+
+@dataclass(frozen=True, eq=False)
+class _Hits:
+    """Rays that met the mesh."""
+
+    rows: np.ndarray
+    columns: np.ndarray
+    faces: np.ndarray
+    weights: np.ndarray
+    """How much of each of the face's corners, [hits, 3]."""
+    directions: np.ndarray
+    depth: np.ndarray
+    """Meters along the optical axis."""
+
+
+def render_views(
+    mesh: TexturedMesh,
+    cameras: Sequence[Camera],
+    *,
+    lighting: Lighting = MATTE,
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    supersample: int = 3,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[View, ...]:
+    """Return one picture of the mesh from each camera, called view_000, view_001, ..., with masks.
+
+    Each pixel is the mean of `supersample` x `supersample` rays on an even grid; the mask says how many met the mesh,
+    and `background` (red, green, blue, 0 to 1) fills what they left. Both sides of every face are seen.
+    `progress` is called with the number of pictures done and their total. Raises CaptureError for no camera and for
+    values out of range.
+    """
+    if not cameras:
+        raise CaptureError(
+            "expected cameras to render from, got none: `orbit_cameras` makes some", name="cameras", value=0
+        )
+    if supersample < 1:
+        raise CaptureError(
+            f"expected a supersample of at least 1, got {supersample}", name="supersample", value=supersample
+        )
+    if not all(0 <= value <= 1 for value in background):
+        raise CaptureError(
+            f"expected a background of numbers from 0 to 1, got {background}", name="background", value=background
+        )
+    tracer = MeshTracer(mesh)
+    views = []
+    for number, camera in enumerate(cameras):
+        name = f"view_{number:03d}"
+        views.append(
+            tracer.photograph(camera, name=name, lighting=lighting, background=background, supersample=supersample)
+        )
+        if progress is not None:
+            progress(number + 1, len(cameras))
+    return tuple(views)
+
+
+def orbit_cameras(
+    surface: Surface,
+    *,
+    size: int = FOCAL_SIZE,
+    elevations: Sequence[float] = (0.0, 45.0, -45.0),
+    azimuths: int = 24,
+    distance: float = 5.0,
+    unit: float | None = None,
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+) -> tuple[Camera, ...]:
+    """Return cameras on circles around an object that all look at the middle of its bounding box.
+
+    As the defaults stand, the 72 views of ObjectFolder's scans: three elevations, degrees, of 24 azimuths each, square
+    images of `size` pixels that span 60 degrees. `distance` counts object units. A unit is `unit` meters, or, where
+    that is not given, such that the bounding box reaches `RADIUS` units from its middle to its corners: the sphere
+    around the object then spans 87 % of the image. Raises CaptureError for an object without extent, and for an
+    elevation straight along `up`.
+    """
+    vertices = surface.vertices.double()
+    low, high = vertices.amin(0), vertices.amax(0)
+    radius = float((high - low).norm()) / 2
+    if not (math.isfinite(radius) and radius > 0):
+        raise CaptureError(
+            f"expected a surface with a positive extent, got {radius:g} m; check its points",
+            name="surface",
+            value=radius,
+        )
+    reach = distance * (radius / RADIUS if unit is None else unit)
+    vertical = torch.tensor(up, dtype=torch.float64)
+    vertical = vertical / vertical.norm()
+    # The axis least along `up` leads to azimuth zero: x for z-up and for y-up objects.
+    start = torch.eye(3, dtype=torch.float64)[int(vertical.abs().argmin())]
+    start = start - (start @ vertical) * vertical
+    start = start / start.norm()
+    side = torch.linalg.cross(vertical, start)
+    cameras = []
+    for elevation in map(math.radians, elevations):
+        for number in range(azimuths):
+            azimuth = 2 * math.pi * number / azimuths
+            outward = math.cos(elevation) * (math.cos(azimuth) * start + math.sin(azimuth) * side)
+            position = (low + high) / 2 + reach * (outward + math.sin(elevation) * vertical)
+            focal = FOCAL * size / FOCAL_SIZE
+            cameras.append(
+                Camera.looking(position, (low + high) / 2, up=vertical, focal=focal, width=size, height=size)
+            )
+    return tuple(cameras)

@@ -1,0 +1,200 @@
+"""`transforms.json` as nerfstudio, instant-ngp and the synthetic NeRF scenes write it."""
+
+import math
+import sys
+from collections import ChainMap
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import torch
+
+from avmsf._utils.text_files import read_json
+from avmsf.capture.filenames import PICTURE_SUFFIXES
+from avmsf.capture.location import Location
+from avmsf.capture.placement import Mistake
+from avmsf.errors import CaptureError, Remark
+from avmsf.photographs.lenses import Lens
+from avmsf.photographs.poses import TOLERANCE, opencv_from_opengl, rigid
+from avmsf.photographs.shots import Shot, Shots, listed, refuse_many
+
+PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+
+
+def read_transforms(path: Path) -> Shots:
+    """Read the shots of a transforms.json; paths in it count from its folder.
+
+    Poses are camera to world with OpenGL's axes; intrinsics stand at the top or in each frame. Raises CaptureError
+    where the file is not JSON, lacks something, or holds a pose or a camera model that cannot be used.
+    """
+    record = load_record(path)
+    frames = record.get("frames")
+    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+        raise CaptureError(
+            f"{path}: expected a list 'frames', each with file_path and transform_matrix, got {type(frames).__name__}",
+            file=path,
+            name="frames",
+            value=type(frames).__name__,
+        )
+    refuse_many(len(frames), path)
+    common = {key: value for key, value in record.items() if key != "frames"}
+    shots, scaled = [], []
+    for row, frame in enumerate(frames):
+        file = _text(frame, "file_path", Location(path, row, f"frame {row}"))
+        where = Location(path, row, f"frame {row} ({file})")
+        pose, scale = rigid(_matrix(frame, where), where)
+        image = _with_suffix(path.parent / file)
+        name = _name(file, image)
+        if abs(scale - 1) > TOLERANCE:
+            scaled.append(f"{name} ({scale:.4g})")
+        settings = ChainMap(frame, common)
+        mask = path.parent / _text(frame, "mask_path", where) if frame.get("mask_path") else None
+        _camera_model(settings, where)
+        shots.append(Shot(name, image, opencv_from_opengl(pose), partial(_lens, settings, where), mask))
+    message = f"poses have a scaled rotation; the scale was removed: {listed(scaled)}"
+    return Shots(path, tuple(shots), (Remark(message, name="transform_matrix", value=scaled),) if scaled else ())
+
+
+def stated_moves(folder: Path, *, meters: float = 1.0) -> list[Mistake]:
+    """Return how nerfstudio says that it moved an object, in transforms.json or beside it; none where it does not.
+
+    A place x became scale * (transform x), in units of so many `meters`. What cannot be read is passed over.
+    """
+    found = []
+    for name, keys in (
+        ("transforms.json", ("applied_transform", "applied_scale")),
+        ("dataparser_transforms.json", ("transform", "scale")),
+    ):
+        try:
+            record = read_json(folder / name)
+            matrix = np.array(record.get(keys[0], np.eye(4)), dtype=np.float64)[:3].reshape(3, 4)
+            scale = float(record.get(keys[1], 1.0))
+        except (OSError, ValueError, TypeError, AttributeError):
+            continue
+        stretch = float(np.linalg.det(matrix[:, :3])) ** (1 / 3) if np.linalg.det(matrix[:, :3]) > 0 else math.nan
+        factor, shift = scale * stretch * meters, torch.from_numpy(scale * meters * matrix[:, 3])
+        if (
+            0 < factor < math.inf
+            and np.isfinite(matrix).all()
+            and not (factor == 1 and np.allclose(matrix, np.eye(4)[:3]))
+        ):
+            words = ", ".join(f"{key} = {np.round(record[key], 4).tolist()}" for key in keys if key in record)
+            found.append(Mistake(factor, torch.from_numpy(matrix[:, :3] / stretch), shift, stated=f"{name} ({words})"))
+    return found
+
+
+def load_record(path: Path) -> dict[str, Any]:
+    """Return the file's JSON object; raises CaptureError for anything else."""
+    try:
+        record = read_json(path)
+    except (OSError, ValueError) as error:
+        raise CaptureError(f"{path}: expected a JSON file, got one that cannot be read ({error})", file=path) from error
+    if not isinstance(record, dict):
+        raise CaptureError.expected(
+            "a JSON object with 'frames'", type(record).__name__, got=type(record).__name__, file=path
+        )
+    return record
+
+
+def _lens(settings: Mapping[str, Any], where: Location, image_width: int, image_height: int) -> Lens:
+    """Return a frame's lens; the image's size is used where the file has none."""
+    fisheye = _camera_model(settings, where) in FISHEYE
+    sized = "w" in settings and "h" in settings
+    width = int(_number(settings, "w", where)) if sized else image_width
+    height = int(_number(settings, "h", where)) if sized else image_height
+    across = _focal(settings, "x", width, where)
+    down = _focal(settings, "y", height, where)
+    if across is None and down is None:
+        raise where.error("expected fl_x or camera_angle_x, in the frame or at the top of the file", name="fl_x")
+    # With one focal length alone, pixels are square.
+    focal = (across or down or 0.0, down or across or 0.0)
+    principal = (_number(settings, "cx", where, width / 2), _number(settings, "cy", where, height / 2))
+    k1, k2, k3, k4, p1, p2 = (_number(settings, key, where, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    if not fisheye and k4:
+        raise where.error(
+            f"expected k1 k2 p1 p2 k3 of a perspective lens, got k4 = {k4}; calibrate again", name="k4", value=k4
+        )
+    distortion = (k1, k2, k3, k4) if fisheye else (k1, k2, p1, p2, k3)
+    return Lens(focal, principal, width, height, distortion, fisheye, where)
+
+
+def _focal(settings: Mapping[str, Any], axis: str, pixels: int, where: Location) -> float | None:
+    if f"fl_{axis}" in settings:
+        return _number(settings, f"fl_{axis}", where)
+    if f"camera_angle_{axis}" not in settings:
+        return None
+    angle = _number(settings, f"camera_angle_{axis}", where)
+    if not 0 < angle < math.pi:
+        raise where.error(
+            f"expected camera_angle_{axis} in radians between 0 and pi, got {angle}",
+            name=f"camera_angle_{axis}",
+            value=angle,
+        )
+    return pixels / 2 / math.tan(angle / 2)
+
+
+def _camera_model(settings: Mapping[str, Any], where: Location) -> str:
+    """Return the name of the frame's camera model; raises CaptureError unless it is perspective or fisheye."""
+    fallback = "OPENCV_FISHEYE" if settings.get("is_fisheye") else "OPENCV"
+    name = str(settings.get("camera_model") or fallback).upper()
+    if name not in PERSPECTIVE + FISHEYE:
+        raise where.error(
+            f"expected a camera model among {', '.join(PERSPECTIVE + FISHEYE)}, got {name}; undistort the images first",
+            name="camera_model",
+            value=name,
+        )
+    return name
+
+
+def _matrix(frame: dict[str, Any], where: Location) -> np.ndarray:
+    key = "transform_matrix"
+    written = frame.get(key)
+    if written is None:
+        raise where.error(f"expected {key}, the camera-to-world pose, got none", name=key)
+    try:
+        matrix = np.array(written, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise where.error(f"expected {key} as 4 rows of 4 numbers ({error})", name=key, value=written) from error
+    if matrix.ndim != 2:
+        raise where.error(
+            f"expected {key} as 4 rows of 4 numbers, got {matrix.ndim} dimensions", name=key, value=written
+        )
+    return matrix
+
+
+def _number(settings: Mapping[str, Any], key: str, where: Location, fallback: float | None = None) -> float:
+    value = settings.get(key, fallback)
+    # A whole number of a JSON file may be larger than any float.
+    known = not isinstance(value, bool) and isinstance(value, int | float) and abs(value) <= sys.float_info.max
+    if value is None or not known:
+        raise where.error(f"expected a finite number as {key}, got {value!r}", name=key, value=value)
+    return float(value)
+
+
+def _text(frame: dict[str, Any], key: str, where: Location) -> str:
+    value = frame.get(key)
+    if not isinstance(value, str) or not value.strip():
+        raise where.error(f"expected the path of a file as {key}, got {value!r}", name=key, value=value)
+    return value.replace("\\", "/")
+
+
+def _with_suffix(path: Path) -> Path:
+    """Return the file itself, or the image file of that name where the suffix was left out."""
+    if path.suffix.lower() in PICTURE_SUFFIXES or path.is_file():
+        return path
+    spellings = [path.with_name(path.name + suffix) for small in PICTURE_SUFFIXES for suffix in (small, small.upper())]
+    return next((spelling for spelling in spellings if spelling.is_file()), path)
+
+
+def _name(file: str, image: Path) -> str:
+    """Return the image's path without a leading `./`, `../` or `images/`, with its suffix."""
+    stem = PurePosixPath(file)
+    parts = [part for part in stem.parts[:-1] if part not in (".", "..", "/")]
+    if stem.is_absolute() or Path(file).is_absolute():
+        parts = []
+    if parts and parts[0] == "images":
+        parts = parts[1:]
+    return "/".join([*parts, image.name])

@@ -1,0 +1,90 @@
+"""The shape of what Gaussians show, and pictures of them."""
+
+from collections.abc import Sequence
+from dataclasses import fields
+
+import torch
+
+from avmsf.errors import SceneError
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.rasterizer.protocol import Rasterizer, choose_rasterizer
+from avmsf.gaussians.visibility import depth_of_cloud
+from avmsf.mesh.surface import Surface
+from avmsf.photographs.cameras import View
+from avmsf.photographs.mesh_views import orbit_cameras
+from avmsf.reconstruction import ObjectShape, object_surface
+
+_FEWEST = 100
+"""Gaussians; what encloses an object is not known from fewer."""
+_FAINT = 0.05
+"""Opacity below which a Gaussian does not show where the object is."""
+_FEWEST_MASKS = 3
+"""Masks from which outlines are taken; with fewer, pictures of the Gaussians have them."""
+_SIZE = 256
+"""Width and height of such pictures, pixels."""
+
+
+def shape_of_cloud(cloud: GaussianCloud, views: Sequence[View] = (), *, cells: int = 128) -> ObjectShape:
+    """Return the shape of the object that Gaussians show; masks of views say where its outlines are.
+
+    Where fewer than 3 views have masks, pictures of the Gaussians from all sides stand for them. Raises SceneError for
+    fewer than 100 Gaussians that can be seen, numbers that are not finite, Gaussians in one place, and as
+    `object_surface` does.
+    """
+    cloud = _visible(cloud)
+    rasterizer = choose_rasterizer(cloud.centers.device)
+    if not masks_suffice(views):
+        views = views_of_cloud(cloud, rasterizer, size=_SIZE)
+    return object_surface(views, depth_of_cloud(cloud, rasterizer), cells=cells)
+
+
+def masks_suffice(views: Sequence[View]) -> bool:
+    """Return whether 3 or more views have masks that show something."""
+    return sum(view.mask is not None and bool((view.mask > 127).any()) for view in views) >= _FEWEST_MASKS
+
+
+def views_of_cloud(cloud: GaussianCloud, rasterizer: Rasterizer, *, size: int) -> tuple[View, ...]:
+    """Return the 72 pictures of `orbit_cameras` of Gaussians before white, `size` pixels wide, with masks."""
+    box = Surface(cloud.centers.float(), torch.zeros(0, 3, dtype=torch.int64))
+    views = []
+    for number, camera in enumerate(orbit_cameras(box, size=size)):
+        with torch.no_grad():
+            seen = rasterizer(cloud, camera, background=cloud.centers.new_ones(3))
+        image, mask = ((255 * each.clamp(0, 1)).round().to(torch.uint8) for each in (seen.color, seen.alpha))
+        views.append(View(f"view_{number:03d}", image, camera, mask))
+    return tuple(views)
+
+
+def _visible(cloud: GaussianCloud) -> GaussianCloud:
+    """Return the Gaussians that are not faint. Raises SceneError where they cannot be an object."""
+    for each in fields(cloud):
+        values = getattr(cloud, each.name).detach()
+        wrong = torch.nonzero(~torch.isfinite(values.reshape(len(values), -1)).all(1)).flatten()
+        if len(wrong):
+            row = int(wrong[0])
+            found = values[row].tolist()
+            raise SceneError(
+                f"{each.name}, row {row}: expected finite numbers, got {found} ({len(wrong)} Gaussians); remove them "
+                "with GaussianCloud.take",
+                row=row,
+                name=each.name,
+                value=found,
+            )
+    visible = cloud.detach().take(cloud.opacities.detach() >= _FAINT)
+    if len(visible) < _FEWEST:
+        raise SceneError(
+            f"opacities: expected {_FEWEST} Gaussians or more of at least {_FAINT}, got {len(visible)} of "
+            f"{len(cloud)}; fit the Gaussians again, with more steps or better masks",
+            name="opacities",
+            value=len(visible),
+        )
+    extent = (visible.centers.amax(0) - visible.centers.amin(0)).tolist()
+    if not max(extent) > 0:
+        center = visible.centers[0].tolist()
+        raise SceneError(
+            f"centers: expected Gaussians all over an object, got {len(visible)} at one position, {center}; fit the "
+            "Gaussians again",
+            name="centers",
+            value=center,
+        )
+    return visible

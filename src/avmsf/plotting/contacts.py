@@ -1,0 +1,137 @@
+"""The probability of a contact, as a picture of the object from all sides and as a colored point cloud."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from matplotlib import colormaps
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize, to_rgb
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from avmsf._utils.files import write_whole
+from avmsf.errors import EvaluationError
+from avmsf.localization.contact_map import ContactMap
+from avmsf.plotting.clouds import draw_cloud
+from avmsf.plotting.sides import ALL_SIDES, Side
+from avmsf.plotting.style import FIRST, SECOND, SEQUENTIAL, styled
+
+_DECADES = 3.0
+"""Powers of ten below the likeliest that colors tell apart."""
+_FOUND, _OTHER, _TRUTH = to_rgb(FIRST), (0.95, 0.95, 0.95), to_rgb(SECOND)
+"""Blue and red, the paper's colors of the found and the true contact."""
+_MARK = 0.018
+"""Radius of a mark over the object's diagonal."""
+_DRAWN = 6000
+"""Points in a picture, about."""
+
+
+@styled
+def draw_contact(
+    contact: ContactMap,
+    *,
+    title: str,
+    others: Float[Tensor, "others 3"] | None = None,
+    truth: Float[Tensor, " 3"] | None = None,
+    sides: Sequence[Side] = ALL_SIDES,
+) -> Figure:
+    """Draw the probability of a contact over the object, and below it the paper's cosine distance, from all sides.
+
+    The most probable contact is marked blue, equivalent `others` white, and the true contact, `truth`, red if given.
+    """
+    points = contact.points
+    # The likeliest point and its neighborhood must not fall between those that are drawn.
+    rows = torch.arange(0, len(points), max(1, len(points) // _DRAWN))
+    rows = torch.unique(torch.cat([rows, torch.topk(contact.probability, min(64, len(points))).indices]))
+    marks: list[tuple[Tensor, tuple[float, float, float]]] = [] if others is None else [(o, _OTHER) for o in others]
+    marks.append((contact.position, _FOUND))
+    if truth is not None:
+        marks.append((truth, _TRUTH))
+    likely, alike = (
+        _marked(points, colors, marks)[rows] for colors in (contact_colors(contact), _distance_colors(contact))
+    )
+    figure = draw_cloud(
+        points[rows], {"probability": likely, "cosine distance": alike}, title=_title(title, marks), sides=sides
+    )
+    low, high = _span(contact)
+    for line, (first, last, words, heat) in enumerate(
+        (
+            (-_DECADES, 0.0, "log10 of probability / maximum", SEQUENTIAL),
+            (low, high, "cosine distance of the gains", f"{SEQUENTIAL}_r"),
+        )
+    ):
+        panels = figure.axes[line * len(sides) : (line + 1) * len(sides)]
+        figure.colorbar(ScalarMappable(Normalize(first, last), heat), ax=list(panels), shrink=0.75, label=words)
+    return figure
+
+
+def contact_colors(contact: ContactMap) -> Float[Tensor, "points 3"]:
+    """Return colors, 0 to 1, dark purple for a thousandth of the greatest probability and less, up to yellow."""
+    likely = contact.probability.double()
+    share = likely / likely.max().clamp_min(torch.finfo(torch.float64).tiny)
+    level = 1.0 + torch.log10(share.clamp_min(10.0**-_DECADES)) / _DECADES
+    return _heat(level)
+
+
+def write_contact_cloud(contact: ContactMap, path: Path) -> None:
+    """Write the object's points with their colors as a binary `.ply` that any viewer of point clouds opens.
+
+    The vertices have the floats `probability` (they sum to one) and `cosine_distance` beside place and color. Raises
+    EvaluationError where it cannot be written.
+    """
+    kinds = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
+    kinds += [(name, "<f4") for name in ("probability", "cosine_distance")]
+    table = np.zeros(len(contact.points), dtype=kinds)
+    columns: Mapping[str, Tensor] = {
+        **dict(zip("xyz", contact.points.double().T, strict=True)),
+        **dict(zip(("red", "green", "blue"), (255.0 * contact_colors(contact)).round().T, strict=True)),
+        "probability": contact.probability,
+        "cosine_distance": contact.distance,
+    }
+    for name, column in columns.items():
+        table[name] = column.cpu().numpy()
+    words = {"<f4": "float", "u1": "uchar"}
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
+    header += [f"property {words[kind]} {name}" for name, kind in kinds] + ["end_header", ""]
+    content = "\n".join(header).encode("ascii") + table.tobytes()
+    write_whole(path, lambda place: place.write_bytes(content), raising=EvaluationError)
+
+
+def _distance_colors(contact: ContactMap) -> Float[Tensor, "points 3"]:
+    low, high = _span(contact)
+    return _heat(1.0 - (contact.distance.double() - low) / (high - low))
+
+
+def _span(contact: ContactMap) -> tuple[float, float]:
+    low, high = float(contact.distance.min()), float(contact.distance.max())
+    return low, max(high, low + 1e-6)
+
+
+def _heat(level: Float[Tensor, " points"]) -> Float[Tensor, "points 3"]:
+    return torch.from_numpy(colormaps[SEQUENTIAL](level.clamp(0.0, 1.0).numpy())[:, :3]).float()
+
+
+def _marked(
+    points: Float[Tensor, "points 3"],
+    colors: Float[Tensor, "points 3"],
+    marks: Sequence[tuple[Tensor, tuple[float, float, float]]],
+) -> Float[Tensor, "points 3"]:
+    """Return the colors with those of the points about each mark replaced by the mark's."""
+    painted = colors.clone()
+    diagonal = float((points.amax(0) - points.amin(0)).norm())
+    for place, color in marks:
+        apart = (points.double() - place.double()).norm(dim=1)
+        near = (apart <= max(_MARK * diagonal, float(apart.min()))).nonzero().flatten()
+        ring = near[apart[near] >= 0.5 * _MARK * diagonal]
+        # A ring leaves the heat in its middle visible; where points are sparse, the nearest one alone is painted.
+        painted[ring if len(ring) >= 6 else near] = torch.tensor(color)
+    return painted
+
+
+def _title(title: str, marks: Sequence[tuple[Tensor, tuple[float, float, float]]]) -> str:
+    used = {color for _, color in marks}
+    named = ((_FOUND, "blue: most probable"), (_OTHER, "white: equivalent"), (_TRUTH, "red: true contact"))
+    return "\n".join([title, ", ".join(words for color, words in named if color in used)])

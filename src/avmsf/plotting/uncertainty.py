@@ -1,0 +1,137 @@
+"""Pictures of predictive uncertainty: over the object from several sides, with contacts, and of a spectrum."""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from avmsf.field.uncertainty import SpectrumBand
+from avmsf.plotting.sides import ALL_SIDES, name_axes, view_from
+from avmsf.plotting.style import FIRST, SECOND, SEQUENTIAL, styled
+
+_RANGE_DB = 100.0
+"""What a spectrum shows below its highest level."""
+_FLAT = 1e-3
+"""Extent over the longest below which an object is flat."""
+_BEHIND = 0.04
+"""Depth over the object's size by which a point in front hides a mark."""
+_INCHES = 4.0
+"""Width of an object in its picture."""
+
+
+@styled
+def draw_doubt(
+    points: Float[Tensor, "points 3"],
+    doubt: Float[Tensor, " points"],
+    *,
+    title: str,
+    struck: Float[Tensor, "struck 3"] | None = None,
+    suggested: Float[Tensor, "suggested 3"] | None = None,
+    directions: Float[Tensor, "suggested 3"] | None = None,
+) -> Figure:
+    """Draw the relative standard deviation of gains (`relative_gain_std`) on an object's points (object frame, meters).
+
+    From six sides. Recorded contacts, `struck`, are marked by crosses, `suggested` ones by their numbers, each where it
+    is visible: no point is in front of it, and the impact, whose `directions` may be given, points away from the
+    viewer, so that the two sides of a wall are distinguished. A suggested one that no side shows is drawn in a white
+    disc, on the side that most faces it. An object that is flat along an axis is drawn once, in its plane.
+    """
+    places, values = points.double().numpy(), doubt.double().numpy()
+    crosses, numbers = (None if each is None else each.double().numpy() for each in (struck, suggested))
+    extent = np.ptp(places, axis=0)
+    flat = np.flatnonzero(extent <= _FLAT * extent.max())
+    frames = [view_from(side).T for side in ALL_SIDES] if len(flat) == 0 else [_plane(int(flat[0]))]
+    figure = Figure(figsize=(14, 9.5) if len(frames) > 1 else (8, 5), layout="constrained")
+    grid = figure.subplots(2, 3).flatten() if len(frames) > 1 else np.array([figure.subplots()])
+    for axes, frame in zip(grid, frames, strict=True):
+        drawn = _scatter(axes, places @ frame, values)
+        name_axes(axes, frame.T)
+        if crosses is not None:
+            _cross(axes, (crosses @ frame)[_in_front(places @ frame, crosses @ frame)])
+    hidden = False
+    if numbers is not None:
+        away = None if directions is None or len(frames) == 1 else directions.double().numpy()
+        hidden = _number(grid, frames, places, numbers, away)
+    figure.colorbar(drawn, ax=list(grid), shrink=0.7, label="standard deviation of gains / rms gain")
+    known = [words for words, each in (("× recorded", struck), ("numbers: suggested", suggested)) if each is not None]
+    known += ["white discs: hidden contacts"] * hidden
+    figure.suptitle("\n".join([title, ", ".join(known)] if known else [title]))
+    return figure
+
+
+@styled
+def draw_band(band: SpectrumBand, *, title: str) -> Figure:
+    """Draw the credible band of a sound's spectrum."""
+    figure = Figure(figsize=(9, 4.2), layout="constrained")
+    axes = figure.subplots()
+    frequencies = band.frequencies.numpy()
+    lower, middle, upper = (each.numpy() for each in (band.lower_db, band.middle_db, band.upper_db))
+    inside = f"{100 * band.level:g} % credible band"
+    axes.fill_between(frequencies, lower, upper, color=FIRST, alpha=0.3, linewidth=0, label=inside)
+    axes.plot(frequencies, middle, color=FIRST, linewidth=1, label="median")
+    axes.set_ylim(max(upper.max() - _RANGE_DB, lower.min() - 3.0), upper.max() + 3.0)
+    axes.set_xlim(0.0, float(frequencies[-1]))
+    axes.set_xlabel("frequency (Hz)")
+    axes.set_ylabel("energy (dB re loudest band)")
+    axes.grid()
+    axes.legend()
+    figure.suptitle(title)
+    return figure
+
+
+def _plane(thin: int) -> np.ndarray:
+    wide = [axis for axis in range(3) if axis != thin]
+    return np.eye(3)[:, [*wide, thin]]
+
+
+def _scatter(axes: Axes, seen: np.ndarray, values: np.ndarray) -> PathCollection:
+    wide, high = np.ptp(seen[:, 0]), np.ptp(seen[:, 1])
+    # Dots about twice as wide as their distance close to a surface; near ones cover far ones.
+    dot = 72 * _INCHES * 2.4 / math.sqrt(len(seen) * max(wide, high) / max(min(wide, high), 0.05 * wide))
+    order = np.argsort(seen[:, 2])
+    across, along = seen[order, 0], seen[order, 1]
+    top = max(float(values.max()), 1e-12)
+    drawn = axes.scatter(
+        across, along, c=values[order], s=dot**2, cmap=SEQUENTIAL, vmin=0.0, vmax=top, linewidths=0, rasterized=True
+    )
+    axes.set_aspect("equal")
+    axes.set_axis_off()
+    return drawn
+
+
+def _in_front(seen: np.ndarray, marks: np.ndarray) -> np.ndarray:
+    """Return which marks no point hides, both in a side's own frame."""
+    size = float(np.linalg.norm(np.ptp(seen, axis=0)))
+    apart = np.linalg.norm(seen[None, :, :2] - marks[:, None, :2], axis=2)
+    nearer = seen[None, :, 2] - marks[:, None, 2] > _BEHIND * size
+    visible: np.ndarray = ~np.any((apart < size / math.sqrt(len(seen))) & nearer, axis=1)
+    return visible
+
+
+def _cross(axes: Axes, marks: np.ndarray) -> None:
+    axes.scatter(marks[:, 0], marks[:, 1], c="white", marker="x", s=45, linewidths=3.5)
+    axes.scatter(marks[:, 0], marks[:, 1], c="black", marker="x", s=35, linewidths=1.5)
+
+
+def _number(
+    grid: np.ndarray, frames: list[np.ndarray], places: np.ndarray, marks: np.ndarray, away: np.ndarray | None
+) -> bool:
+    """Draw each mark's number on all sides that show it, or on one of those that do not; return if there are such."""
+    faces = np.stack([np.zeros(len(marks)) if away is None else -(away @ frame)[:, 2] for frame in frames])
+    shown = np.stack([_in_front(places @ frame, marks @ frame) for frame in frames])
+    if away is not None:
+        shown &= faces > 0
+    hidden = np.logical_not(shown.any(axis=0))
+    shown[faces.argmax(axis=0)[hidden], np.flatnonzero(hidden)] = True
+    for axes, frame, rows in zip(grid, frames, shown, strict=True):
+        across, along = (marks @ frame)[:, 0], (marks @ frame)[:, 1]
+        colors = np.where(hidden[rows], "white", SECOND)
+        axes.scatter(across[rows], along[rows], c=colors, s=190, edgecolors="black", linewidths=1)
+        for row in np.flatnonzero(rows).tolist():
+            place = (float(across[row]), float(along[row]))
+            axes.annotate(str(row + 1), place, ha="center", va="center", fontsize=9, fontweight="bold")
+    return bool(hidden.any())

@@ -1,0 +1,5 @@
+from .object_shape import Cavity as Cavity
+from .object_shape import ObjectShape as ObjectShape
+from .object_shape import ShapeReport as ShapeReport
+from .outer_surface import DepthMap as DepthMap
+from .outer_surface import object_surface as object_surface

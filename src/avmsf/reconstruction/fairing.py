@@ -1,0 +1,134 @@
+"""A visual hull made smaller where no outline touches it: the surface there is a stretched membrane.
+
+Cameras below a flat top see only its near edge, so that the hull has a low pyramid above it. Every line of sight along
+an outline touches the object somewhere. It is assumed to do so where many other outlines pass as well, which meet at
+edges of the object but hardly on a pyramid, and of these places where the hull is bent most. Between these places the
+surface is a membrane that is fixed at them.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
+from jaxtyping import Bool, Float32, Float64, Int
+from scipy import ndimage
+
+from avmsf.reconstruction.grid import Grid
+from avmsf.reconstruction.object_shape import closed_surface
+from avmsf.reconstruction.silhouettes import Outline
+
+_ROUND = 0.015
+"""Standard deviation of the Gaussian blur of the hull that measures how bent its surface is, over the diagonal."""
+_TOUCHING = 0.75
+"""Distance from an outline, pixels, within which a place is on it."""
+_EVEN = 0.03
+"""Difference of the blurred hull up to which two places are equally bent: a plane has .5, a right-angled edge .25."""
+_ALIKE = 0.5
+"""Part of the most outlines that pass a place on a line of sight, from which on another place is touched as well. On a
+bracket with a hole, 15 to 23 of 72 pass the places of the hole's edge and 3 to 9 the pyramid's around it."""
+_COUNTS = 2
+"""Times that the outlines which pass a place are counted, the second time only those that chose it. On that bracket the
+mean distance is .43 % of the diagonal with one, .34 with two, .35 with four."""
+_HELD = 1e-3
+"""Weight of the hull's own position, relative to the membrane's: parts that no outline touches stay about there."""
+_ROUNDS = 300
+"""Iterations of the conjugate gradient method at most."""
+
+
+def drawn_taut(
+    hull: Float32[np.ndarray, "x y z"], outlines: Sequence[Outline], grid: Grid, diagonal: float
+) -> tuple[Float32[np.ndarray, "x y z"], Float32[np.ndarray, "x y z"]]:
+    """Return how far inside the smaller hull each cell lies, and how far from the nearest touched place, meters."""
+    surface = closed_surface(hull, grid)
+    places, faces = surface.vertices.double().numpy(), surface.faces.numpy()
+    full = ndimage.gaussian_filter((hull > 0).astype(np.float32), _ROUND * diagonal / grid.spacing)
+    bent = ndimage.map_coordinates(full, ((places - grid.lowest) / grid.spacing).T, order=1, output=np.float64)
+    touched = _touched(outlines, places, bent)
+    if not touched.any():
+        return hull, np.full(grid.shape, diagonal, dtype=np.float32)
+    drawn = _membrane(places, faces, touched)
+    inward = np.maximum(((places - drawn) * _normals(places, faces)).sum(axis=1), 0.0)
+    fall = np.zeros(grid.shape, dtype=np.float32)
+    cells = tuple(np.rint((places - grid.lowest) / grid.spacing).astype(int).T)
+    np.maximum.at(fall, cells, inward.astype(np.float32))
+    far = np.ones(grid.shape, dtype=bool)
+    far[cells] = False
+    nearest = ndimage.distance_transform_edt(far, return_distances=False, return_indices=True)
+    fall = fall[tuple(nearest)]
+    # A low pyramid is lowered with what lies just below it; farther below nothing changes.
+    taut = np.where((hull > 0) & (hull < 2.0 * (fall + grid.spacing)), hull - fall, hull)
+    away = np.ones(grid.shape, dtype=bool)
+    away[tuple(each[touched] for each in cells)] = False
+    return taut, ndimage.distance_transform_edt(away).astype(np.float32) * np.float32(grid.spacing)
+
+
+def _touched(
+    outlines: Sequence[Outline], places: Float64[np.ndarray, "places 3"], bent: Float64[np.ndarray, " places"]
+) -> Bool[np.ndarray, " places"]:
+    """Return which places of a hull's surface the object is taken to touch."""
+    passing = [_passing(each, places) for each in outlines]
+    votes = np.bincount(np.concatenate([rows for rows, _ in passing]), minlength=len(places)).astype(np.float64)
+    for _ in range(_COUNTS):
+        chosen = np.zeros(len(places))
+        for each, (rows, pixels) in zip(outlines, passing, strict=True):
+            often = votes[rows] >= _ALIKE * _largest(votes[rows], pixels, each.inside.shape)
+            few, where = rows[often], pixels[:, often]
+            chosen[few[bent[few] <= _EVEN - _largest(-bent[few], where, each.inside.shape)]] += 1
+        votes = chosen
+    return votes > 0
+
+
+def _passing(
+    outline: Outline, places: Float64[np.ndarray, "places 3"]
+) -> tuple[Int[np.ndarray, " found"], Int[np.ndarray, "2 found"]]:
+    """Return which places an outline passes, and the rows and columns of their pixels."""
+    seen = places @ outline.projection[:, :3].T + outline.projection[:, 3]
+    pixels = seen[:, :2] / np.maximum(seen[:, 2:], 1e-12)
+    height, width = outline.inside.shape
+    rows = np.flatnonzero((seen[:, 2] > 0) & (pixels > 0).all(axis=1) & (pixels < [width, height]).all(axis=1))
+    apart = ndimage.map_coordinates(outline.inside, pixels[rows, ::-1].T - 0.5, order=1, mode="nearest")
+    rows = rows[np.abs(apart) < _TOUCHING]
+    return rows, pixels[rows, ::-1].astype(int).T
+
+
+def _largest(
+    values: Float64[np.ndarray, " found"], pixels: Int[np.ndarray, "2 found"], shape: tuple[int, int]
+) -> Float64[np.ndarray, " found"]:
+    """Return the largest value in each one's pixel and those around: their lines of sight touch in the same place."""
+    found = np.full(shape, -np.inf)
+    np.maximum.at(found, tuple(pixels), values)
+    largest: Float64[np.ndarray, " found"] = ndimage.maximum_filter(found, 3)[tuple(pixels)]
+    return largest
+
+
+def _membrane(
+    places: Float64[np.ndarray, "places 3"], faces: Int[np.ndarray, "faces 3"], fixed: Bool[np.ndarray, " places"]
+) -> Float64[np.ndarray, "places 3"]:
+    """Return where the vertices of a stretched membrane lie that is `fixed` at some of them, meters."""
+    ends = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    count = len(places)
+    links = scipy.sparse.csr_array((np.ones(len(ends)), ends.T), shape=(count, count))
+    links = links.maximum(links.T)
+    pull = scipy.sparse.dia_array((np.asarray(links.sum(axis=0))[None], [0]), shape=(count, count)).tocsr() - links
+    free = np.flatnonzero(~fixed)
+    matrix = pull[free][:, free] + _HELD * scipy.sparse.eye_array(len(free), format="csr")
+    right = _HELD * places[free] - pull[free][:, np.flatnonzero(fixed)] @ places[fixed]
+    scale = scipy.sparse.dia_array((1.0 / matrix.diagonal()[None], [0]), shape=matrix.shape)
+    drawn = places.copy()
+    for axis in range(3):
+        drawn[free, axis] = scipy.sparse.linalg.cg(
+            matrix, right[:, axis], x0=places[free, axis], rtol=1e-5, maxiter=_ROUNDS, M=scale
+        )[0]
+    return drawn
+
+
+def _normals(
+    places: Float64[np.ndarray, "places 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Float64[np.ndarray, "places 3"]:
+    corners = places[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = np.zeros_like(places)
+    for corner in range(3):
+        np.add.at(total, faces[:, corner], across)
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)

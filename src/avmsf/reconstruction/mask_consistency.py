@@ -1,0 +1,92 @@
+"""How far masks can be trusted: which contradict the others, and by how much all are too large or too small."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from avmsf.mesh.textured_mesh import TexturedMesh
+from avmsf.photographs.cameras import View
+from avmsf.photographs.mesh_views import MeshTracer
+from avmsf.reconstruction.grid import Grid
+from avmsf.reconstruction.object_shape import closed_surface
+from avmsf.reconstruction.silhouettes import Outline, hull_distance
+
+DISSENT = 0.05
+"""Part of the masks that may be wrong."""
+_CUT = 0.002
+"""Part of the consensus that a right mask leaves out in most views (median over 20 objects with 72 views: 0)."""
+_CUT_ALONE = 0.15
+"""Part of the consensus that only a wrong mask leaves out. One view in twelve, which alone saw under a dish, leaves out
+.096; of the other objects' right masks none leaves out more than .07."""
+_BEYOND = 0.01
+"""Part of a mask beyond the consensus from which on it is wrong. Right masks of the 20 objects have .0000; nine in ten
+mirrored ones have .015 and more, unless the object looks the same from there."""
+_TIMES_MEDIAN = 4.0
+"""Both parts must also be so many times the median over views: where all cameras are inexact, no mask is wrong."""
+_REACH, _STEP = 4.0, 0.25
+"""Pixels on both sides of outlines in which edges are searched, and the width of a bin."""
+_CLEAR = 3.0
+"""Gradient at an edge over its median within reach, from which on it is one. The 20 objects have 5 to 18."""
+
+
+def edge_offset(views: Sequence[View], outlines: Sequence[Outline]) -> float:
+    """Return how far inside the outlines of masks the edges in the photographs lie, pixels; negative outside.
+
+    All masks count together: the mean gradient of the photographs by the distance from the outline has its peak there.
+    It is 0 where no peak within 3 pixels stands out. On 19 objects, masks eroded or dilated by 1 or 2 pixels, it is
+    right within .2 pixels.
+    """
+    bins = round(2 * _REACH / _STEP)
+    total, count = np.zeros(bins), np.zeros(bins)
+    for view, outline in zip(views, outlines, strict=True):
+        smooth = cv2.GaussianBlur(view.image.numpy().astype(np.float32), (0, 0), 0.7)
+        gradient = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
+        place = np.floor((outline.inside + _REACH) / _STEP).astype(int)
+        near = (place >= 0) & (place < bins)
+        total += np.bincount(place[near], gradient.max(axis=2)[near], minlength=bins)
+        count += np.bincount(place[near], minlength=bins)
+    mean = total / np.maximum(count, 1)
+    peak, usual = int(mean.argmax()), float(np.median(mean))
+    pixels = (np.arange(bins) + 0.5) * _STEP - _REACH
+    if not mean[peak] > _CLEAR * usual or abs(pixels[peak]) > _REACH - 1:
+        return 0.0
+    # The middle of the peak's upper half.
+    weight = np.maximum(mean - (mean[peak] + usual) / 2, 0.0) * (np.abs(pixels - pixels[peak]) < 2)
+    return float((weight * pixels).sum() / weight.sum())
+
+
+def agreeing(views: Sequence[View], outlines: Sequence[Outline], grid: Grid) -> Bool[np.ndarray, " views"]:
+    """Return which masks agree with the consensus of all, on a grid around the object.
+
+    The consensus is what all but 5 % of the masks keep. A right mask may leave out a part of it that few other views
+    could see, but shows nothing beyond it; one that does both is wrong, and one that leaves out much.
+    At least half of the masks agree, for a wrong one leaves out more than the median.
+    """
+    values = hull_distance(outlines, grid, rank=round(DISSENT * len(outlines)))
+    solid = values > 0
+    if not solid.any():
+        return np.ones(len(outlines), dtype=bool)
+    cut = np.array([_left_out(each, grid, solid) for each in outlines])
+    suspect = cut > max(_CUT, _TIMES_MEDIAN * float(np.median(cut)))
+    if not suspect.any():
+        return ~suspect
+    # Half a cell larger, for cells are coarse.
+    values = np.maximum(values + 0.5 * np.float32(grid.spacing), -grid.spacing)
+    tracer = MeshTracer(TexturedMesh.plain(closed_surface(values, grid)))
+    beyond = np.array([_beyond(view, each, tracer) for view, each in zip(views, outlines, strict=True)])
+    shown = beyond > max(_BEYOND, _TIMES_MEDIAN * float(np.median(beyond)))
+    return ~(suspect & (shown | (cut > _CUT_ALONE)))
+
+
+def _left_out(outline: Outline, grid: Grid, solid: Bool[np.ndarray, "x y z"]) -> float:
+    distance: Float32[np.ndarray, "x y z"] = hull_distance([outline], grid, solid, rank=0)
+    return float((distance[solid] < -0.5 * grid.spacing).mean())
+
+
+def _beyond(view: View, outline: Outline, tracer: MeshTracer) -> float:
+    """Return the part of a mask, without its outermost pixel, in which a view does not see a surface."""
+    inside = outline.inside > 1
+    seen = (tracer.look(view.camera).faces >= 0).numpy()
+    return float((inside & ~seen).sum() / max(int(inside.sum()), 1))

@@ -1,0 +1,256 @@
+"""An object's shape on a grid: its outer side, its cavities, and the bodies that it may be."""
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int
+from scipy import ndimage
+
+from avmsf.errors import CaptureError, SceneError
+from avmsf.mesh.boolean import difference
+from avmsf.mesh.level_set import enclose
+from avmsf.mesh.surface import Surface
+from avmsf.reconstruction.distance import distance_from
+from avmsf.reconstruction.grid import Grid
+
+FACES = 6000
+"""Triangles at most of a body's surface: tetrahedra of 12,000 to 40,000 degrees of freedom have no more outside."""
+_SOLID = 0.03
+"""Half the thickness beyond the wall's, over the diagonal, below which a part is solid unless seen to be hollow:
+handles are. By trial: .06 for the thickness (mugs, jugs, pans)."""
+_LID_TURN = 0.8
+"""Cosine of the angle to a lid's normal within which the rim beside it belongs to the lid."""
+_LID_REACH = 0.6
+"""How far a lid grows over the rim, and over floors that were not seen to lie below it, over the radius of a disc of
+its area."""
+_SHIFTED = 0.5
+"""Pixels by which outlines are moved, from which on the user hears of it; masks that the package finds take .2."""
+_THINNEST, _THICKEST = 0.0025, 0.06
+"""Wall thicknesses over the diagonal that are worth trying. Of the 20 simulated objects a tube has the least, .0027,
+and thinner walls take more elements than a model has."""
+_BLUR = 0.6
+"""Standard deviation of the blur that takes steps out of surfaces, cells."""
+
+
+@dataclass(frozen=True)
+class Cavity:
+    """A hollow that opens to the outside."""
+
+    volume: float
+    """Cubic meters, as far as views saw it empty."""
+    depth: float
+    """Largest distance from the openings, meters, as far as views saw it empty."""
+    openings: int
+    """Separate openings; 2 for a tube."""
+    opening_area: float
+    """Of all openings, square meters."""
+
+
+@dataclass(frozen=True)
+class ShapeReport:
+    """What is known of how good a shape is."""
+
+    views: int
+    """Views whose masks were used."""
+    rejected: tuple[str, ...]
+    """Names of the views whose masks contradict the others'."""
+    mask_offset: float
+    """How far inside the masks' outlines the photographs' edges lay, pixels; outlines were moved there."""
+    depth_bias: float
+    """How far depth lay behind the surface, meters; it was taken off."""
+    unseen: float
+    """Part of the surface, 0 to 1, that no view saw; it was closed by the convex hull of what was seen."""
+    unseen_direction: tuple[float, float, float] | None
+    """Mean outward normal of the part that no view saw, of length 1; None where all was seen."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectShape:
+    """The outer side of an object and its cavities, as signed distances on a grid; positive inside."""
+
+    grid: Grid
+    outer: Float32[np.ndarray, "x y z"]
+    """Meters inside the outer side, with cavities filled up to flat lids; exact near the surface only."""
+    seen: Float32[np.ndarray, "x y z"]
+    """Meters inside what views show, cavities empty as far as seen; exact near the surface only."""
+    hollow: Int[np.ndarray, "x y z"]
+    """Number of the cavity, from 1, that each cell was seen to be in; 0 elsewhere."""
+    supposed: bool
+    """Whether no view saw into the cavities: they only may be there, behind flat faces."""
+    diagonal: float
+    """Of the box around the object, meters."""
+    report: ShapeReport
+
+    @cached_property
+    def cavities(self) -> tuple[Cavity, ...]:
+        """All cavities, the largest first."""
+        found = []
+        for number in range(1, int(self.hollow.max()) + 1):
+            here = self.hollow == number
+            lids, count = ndimage.label(self._lids & ndimage.binary_dilation(here, iterations=2), np.ones((3, 3, 3)))
+            sizes = np.bincount(lids.ravel())[1:]
+            big = sizes >= 0.05 * sizes.max(initial=0)
+            depth = ndimage.distance_transform_edt(~(lids > 0))[here].max() if count else 0.0
+            cell = self.grid.spacing
+            found.append(
+                Cavity(int(here.sum()) * cell**3, float(depth) * cell, int(big.sum()), float(sizes.sum()) * cell**2)
+            )
+        return tuple(found)
+
+    @property
+    def thickness_range(self) -> tuple[float, float] | None:
+        """Least and largest thickness of walls around the cavities that the views allow, meters; None without any.
+
+        Views see into a cavity no farther than to its wall, so that a wall is hardly thicker than what they leave.
+        """
+        if not self.hollow.any():
+            return None
+        if self.supposed:
+            return _THINNEST * self.diagonal, _THICKEST * self.diagonal
+        rim = (self.hollow > 0) & ndimage.binary_dilation((self.hollow == 0) & (self.outer > 0)) & ~self._lids
+        left = 1.5 * float(np.quantile(self._depth[rim], 0.5)) if rim.any() else 0.0
+        most = min(max(left, 3 * _THINNEST * self.diagonal), _THICKEST * self.diagonal)
+        return _THINNEST * self.diagonal, most
+
+    def solid(self, *, faces: int = FACES) -> Surface:
+        """Return the outer side, cavities filled."""
+        return self._enclose(self.outer, self.grid, faces)
+
+    def as_seen(self) -> Surface:
+        """Return what views show: both sides of walls where both were seen."""
+        return self._as_seen
+
+    @cached_property
+    def _as_seen(self) -> Surface:
+        return self._enclose(self.seen, self.grid, 2 * FACES)
+
+    def shell(self, thickness: float, *, faces: int = FACES) -> Surface:
+        """Return the body whose walls around its cavities are `thickness` meters thick, measured from outside.
+
+        Space deeper below the outer side is empty where it is connected with a cavity; parts that are hardly
+        thicker than a wall on both sides, like handles, stay solid. Raises SceneError where there is no cavity, and for
+        a thickness that is not positive or leaves nothing of the cavity.
+        """
+        if not 0 < thickness < np.inf:
+            raise SceneError(f"expected a thickness above 0 m, got {thickness:g} m", name="thickness", value=thickness)
+        if not self.hollow.any():
+            raise SceneError(
+                "expected an object with a cavity, got one without; use solid() or as_seen()", name="cavity"
+            )
+        empty = self._emptied(thickness)
+        if empty is None:
+            deepest = float(self._depth[self.hollow > 0].max())
+            raise SceneError(
+                f"expected a wall thickness below {1000 * deepest:.3g} mm, the depth of the cavity, got "
+                f"{1000 * thickness:.3g} mm",
+                name="thickness",
+                value=thickness,
+            )
+        # Both sides are drawn by themselves, so a wall may be thinner than a cell.
+        values = np.minimum(self._signed_depth - np.float32(thickness), -empty)
+        grid = Grid(self.grid.lowest - self.grid.spacing, self.grid.spacing, tuple(each + 2 for each in values.shape))
+        cavity = self._enclose(np.pad(values, 1, constant_values=-self.grid.spacing), grid, faces)
+        left = difference(self.solid(faces=faces), cavity)
+        if not len(left.faces):
+            raise SceneError(
+                f"expected a wall that can be represented, got {1000 * thickness:.3g} mm; choose a thicker one",
+                name="thickness",
+                value=thickness,
+            )
+        return left
+
+    @cached_property
+    def _lids(self) -> Bool[np.ndarray, "x y z"]:
+        """Cells inside the outer side at whose surface it only covers a cavity."""
+        inside = self.outer > 0
+        skin = inside & ~ndimage.binary_erosion(inside)
+        if self.supposed:
+            lids = self.hollow > 0
+        else:
+            lids = skin & (self.seen <= 0) & ndimage.binary_dilation(self.hollow > 0, np.ones((3, 3, 3)))
+        slopes = np.stack([-each for each in np.gradient(ndimage.gaussian_filter(self.outer, 1.5))], axis=-1)
+        slopes /= np.maximum(np.linalg.norm(slopes, axis=-1, keepdims=True), 1e-12)
+        label, count = ndimage.label(lids, np.ones((3, 3, 3)))
+        grown = lids.copy()
+        for number in range(1, count + 1):
+            here = label == number
+            if int(here.sum()) < 0.02 * int(lids.sum()):
+                grown &= ~here
+                continue
+            steps = max(1, round(_LID_REACH * float(np.sqrt(here.sum() / np.pi))))
+            normal = slopes[here].mean(axis=0)
+            normal /= max(float(np.linalg.norm(normal)), 1e-12)
+            grown |= ndimage.binary_dilation(
+                here, np.ones((3, 3, 3)), iterations=steps, mask=skin & (slopes @ normal > _LID_TURN)
+            )
+        return grown
+
+    @cached_property
+    def _depth(self) -> Float32[np.ndarray, "x y z"]:
+        """Distance from the outer side without its lids, meters."""
+        return distance_from(self.outer, self._lids) * np.float32(self.grid.spacing)
+
+    @cached_property
+    def _signed_depth(self) -> Float32[np.ndarray, "x y z"]:
+        """Distance below the outer side without its lids, meters; negative outside unless a lid is nearer."""
+        near = self._depth <= 1.2 * np.abs(self.outer) + 0.5 * self.grid.spacing
+        outside = (self.outer <= 0) & near
+        return np.where(outside, -self._depth, self._depth)
+
+    def _emptied(self, thickness: float) -> Float32[np.ndarray, "x y z"] | None:
+        """Return how far each cell lies from what is emptied, meters; None where nothing is."""
+        margin, seen = _SOLID * self.diagonal, self.hollow > 0
+        inside = self.outer > 0
+        deep = inside & (self._depth > thickness)
+        label, _ = ndimage.label(inside & (self._depth > thickness + margin))
+        joined = np.unique(label[ndimage.binary_dilation(seen) & (label > 0)])
+        start = (seen & deep) | np.isin(label, joined[joined > 0])
+        if not start.any():
+            return None
+        away = ndimage.distance_transform_edt(~start).astype(np.float32) * np.float32(self.grid.spacing)
+        return away - np.float32(1.2 * margin)
+
+    def _enclose(self, values: Float32[np.ndarray, "x y z"], grid: Grid, faces: int) -> Surface:
+        smooth = ndimage.gaussian_filter(values, _BLUR)
+        # Triangles without area, where the surface passes through the middle of a cell, pinch coarser ones.
+        least = np.float32(0.02 * grid.spacing)
+        smooth = np.where(smooth > 0, np.maximum(smooth, least), np.minimum(smooth, -least))
+        return closed_surface(smooth, grid, faces)
+
+    def describe(self) -> str:
+        """Return sentences on the shape: its cavities, what no view saw, and masks that were left out."""
+        count = int(self.hollow.max())
+        cavities = f"{count or 'no'} {'cavities' if count > 1 else 'cavity'}"
+        parts = [f"{cavities}{', supposed behind faces that no outline touches' if self.supposed and count else ''}"]
+        if self.report.unseen > 0:
+            parts.append(f"{self.report.unseen:.0%} of the surface was seen by no view and is closed")
+        if abs(self.report.mask_offset) >= _SHIFTED:
+            way = "inwards" if self.report.mask_offset > 0 else "outwards"
+            parts.append(f"outlines of masks moved {way} by {abs(self.report.mask_offset):.1f} pixels")
+        if self.report.rejected:
+            parts.append(f"masks left out, which contradict the others: {', '.join(self.report.rejected)}")
+        return "; ".join(parts)
+
+    def digest(self) -> str:
+        """Return a digest of all that decides the surfaces."""
+        content = hashlib.sha256(f"{self.grid} {self.supposed} {self.diagonal}".encode())
+        for values in (self.outer, self.seen, self.hollow):
+            content.update(np.ascontiguousarray(values).tobytes())
+        return content.hexdigest()
+
+
+def closed_surface(values: Float32[np.ndarray, "x y z"], grid: Grid, faces: int | None = None) -> Surface:
+    """Return the closed surface where values on a grid are zero, positive inside, of about `faces` triangles.
+
+    Raises SceneError where nothing is inside, and where the inside touches the grid's edge.
+    """
+    try:
+        return enclose(values, 0.0, lowest=grid.lowest, spacing=grid.spacing, faces=faces)
+    except CaptureError as error:
+        raise SceneError(
+            f"expected a shape with an inside, got none on a grid of {grid.shape}: {error}",
+            name=error.name,
+            value=error.value,
+        ) from error

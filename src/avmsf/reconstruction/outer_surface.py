@@ -1,0 +1,270 @@
+"""From masks and depth of many views to an object's shape."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Float64
+from scipy import ndimage
+from torch import Tensor
+
+from avmsf.errors import SceneError
+from avmsf.mesh.textured_mesh import TexturedMesh
+from avmsf.photographs.cameras import Camera, View
+from avmsf.photographs.extent import masked_views, no_common_point, object_extent
+from avmsf.photographs.mesh_views import MeshTracer
+from avmsf.reconstruction.convex_hull import depth_in_convex_hull
+from avmsf.reconstruction.depth_fusion import SeenDepth, fused_depth
+from avmsf.reconstruction.fairing import drawn_taut
+from avmsf.reconstruction.grid import Grid
+from avmsf.reconstruction.mask_consistency import DISSENT, agreeing, edge_offset
+from avmsf.reconstruction.object_shape import ObjectShape, ShapeReport, closed_surface
+from avmsf.reconstruction.silhouettes import Outline, hull_distance
+
+DepthMap = Callable[[Camera], Float[Tensor, "height width"]]
+"""What gives the depth of the first surface that each pixel of a camera sees, meters along the axis; 0 where none."""
+
+_ROUGH = 48
+"""Cells along an edge of the first grids, which find where the object is and which masks are wrong."""
+_FINER = 4.0
+"""Times as many cells along the longest side of a slender object, at most."""
+_MARGIN = 4
+"""Cells of free room around the hull."""
+_BAND = 0.015
+"""How far behind a view's depth places are still seen, over the diagonal: depth of Gaussians scatters so much."""
+_QUANTILE = 0.35
+"""Of the distances before the surface: two thirds of the views must see a place free."""
+_SLACK = 0.005
+"""How far depth must lie behind the hull to be believed, over the diagonal: its mean over views is so exact."""
+_LEAST = 0.04
+"""Part of the views that must see a place for its depth to count, but three views at least."""
+_CLOSED = 4000
+"""Triangles of the surface whose convex hull closes what no view sees."""
+_NARROW = 2
+"""Half the width of hollows that are none, cells."""
+_UNTOUCHED = 0.025
+"""Distance from the nearest touch of an outline, over the diagonal, from which on a place is inside a face of which
+outlines tell the edge alone. Touches on round parts are three pixels apart."""
+_ALIKE = 0.7
+"""Area of such a face over that of the largest, from which on both are openings or neither: the ends of a tube."""
+_LARGE_FACE = 0.02
+"""Part of the surface that a face must be for a supposed opening."""
+_HOLLOW_DEPTH = 0.08
+"""Depth below its lid, over the diagonal, from which on what is free is a cavity."""
+_HOLLOW_VOLUME = 0.08
+"""Part of the filled volume from which on it is a cavity although it is shallow: plates."""
+
+
+def object_surface(views: Sequence[View], depth_map: DepthMap, *, cells: int = 128) -> ObjectShape:
+    """Return the shape of the object that views with masks show, and whose depth `depth_map` gives.
+
+    `cells` count along the longest side; slender objects have up to four times as many. Views whose masks contradict
+    the others' are left out, and all outlines are moved to the edges in the photographs by the same number of pixels.
+    Depth may lie behind the surface by the same length everywhere: that is found where the masks' outlines touch the
+    surface, and taken off. Raises SceneError where fewer than 3 views have masks, where masks have nothing in
+    common, and where views do not bound the object: an image cuts it, or all are from one side.
+    """
+    if cells < 16:
+        raise SceneError(f"cells: expected 16 or more, got {cells}", name="cells", value=cells)
+    masked = masked_views(views)
+    outlines = [Outline.of(view) for view in masked]
+    offset = edge_offset(masked, outlines)
+    outlines = [outline.moved_in(offset) for outline in outlines]
+    rough = Grid.around(*_rough(masked, outlines), cells=_ROUGH, finest=_FINER, margin=2)
+    right = agreeing(masked, outlines, rough)
+    kept = [view for view, each in zip(masked, right, strict=True) if each]
+    outlines = [outline for outline, each in zip(outlines, right, strict=True) if each]
+    low, high = _box(hull_distance(outlines, rough, rank=0) > -rough.spacing, rough, len(kept))
+    grid = Grid.around(low, high, cells=cells, finest=_FINER, margin=_MARGIN)
+    hull = _hull(outlines, grid)
+    low, high = _box(hull > 0, grid, len(kept))
+    diagonal = float(np.linalg.norm(high - low))
+    hull, untouched = drawn_taut(hull, outlines, grid, diagonal)
+    depths = [_Depth(view, depth_map(view.camera).detach().cpu().float().numpy()) for view in kept]
+    bias = _bias(hull, grid, depths, diagonal)
+    free, sights = _free(hull, grid, depths, bias, diagonal)
+    seen = np.minimum(hull, _SLACK * diagonal - free)
+    seen, bound, unseen, direction = _closed(hull, seen, sights, grid)
+    hollow = _hollows(bound, seen, grid, diagonal)
+    supposed = not hollow.any()
+    if supposed:
+        hollow = _supposed(seen, untouched > _UNTOUCHED * diagonal)
+    outer = seen
+    if not supposed:
+        outer = np.where(_covered(hollow > 0, (bound > 0) & (seen <= 0)), np.maximum(seen, bound), seen)
+    rejected = tuple(view.name for view, each in zip(masked, right, strict=True) if not each)
+    report = ShapeReport(len(kept), rejected, offset, bias, unseen, direction)
+    return ObjectShape(grid, outer, seen, hollow, supposed, diagonal, report)
+
+
+class _Depth:
+    """What one view sees."""
+
+    def __init__(self, view: View, depth: np.ndarray) -> None:
+        assert view.mask is not None
+        self.camera = view.camera
+        self.projection = (view.camera.intrinsics @ view.camera.world_to_camera[:3]).numpy()
+        # At the outline a pixel's depth is the background's in part.
+        self.depth = np.where(view.mask.numpy() > 127, depth, np.float32(0.0)).astype(np.float32)
+
+
+def _rough(
+    views: Sequence[View], outlines: Sequence[Outline]
+) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
+    """Return the lowest and highest corner of a box around what all but a few masks keep, meters."""
+    middle, reach = object_extent(views)
+    for _ in range(5):
+        grid = Grid(middle - reach, 2 * reach / (_ROUGH - 1), (_ROUGH,) * 3)
+        solid = hull_distance(outlines, grid, rank=round(DISSENT * len(outlines))) > -grid.spacing
+        if not any(solid.take(end, axis=axis).any() for axis in range(3) for end in (0, -1)):
+            return _box(solid, grid, len(views))
+        reach *= 1.5
+    raise SceneError(
+        f"expected views from several sides, whose masks bound the object, got {len(views)} whose masks leave it open "
+        f"{reach / 1.5:.3g} m from its middle; add views of the complete object from other sides",
+        name="views",
+        value=len(views),
+    )
+
+
+def _hull(outlines: Sequence[Outline], grid: Grid) -> Float32[np.ndarray, "x y z"]:
+    """Return how far inside the hull each cell lies; far outside it, the distance of a cell of a coarser grid."""
+    coarse = grid.coarser(2)
+    rough = hull_distance(outlines, coarse, rank=0)
+    rough = rough.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
+    rough = rough[: grid.shape[0], : grid.shape[1], : grid.shape[2]]
+    near = rough > -4 * grid.spacing
+    fine = hull_distance(outlines, grid, near, rank=0)
+    return np.where(near, fine, rough)
+
+
+def _box(
+    inside: Bool[np.ndarray, "x y z"], grid: Grid, views: int
+) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
+    """Return the lowest and highest corner of the box around what is inside, meters."""
+    rows = np.argwhere(inside)
+    if not len(rows):
+        raise no_common_point(views)
+    return grid.places(rows.min(axis=0)), grid.places(rows.max(axis=0))
+
+
+def _bias(hull: Float32[np.ndarray, "x y z"], grid: Grid, depths: Sequence[_Depth], diagonal: float) -> float:
+    """Return by how much depth lies behind the hull where it does so most often, meters.
+
+    Most of a surface touches its hull; the depth of cavities lies behind it by lengths of all kinds.
+    """
+    tracer = MeshTracer(TexturedMesh.plain(closed_surface(hull, grid, 40_000)))
+    behind = []
+    for each in depths[:: max(1, len(depths) // 24)]:
+        front = tracer.look(each.camera).depth.numpy()
+        both = np.isfinite(front) & (each.depth > 0)
+        behind.append((each.depth - front)[both])
+    found = np.sort(np.concatenate(behind))
+    found = found[np.abs(found) < 0.05 * diagonal]
+    if len(found) < 100:
+        return 0.0
+    # The half that is closest together, again and again (half-sample mode).
+    while len(found) > 100:
+        half = len(found) // 2
+        start = int((found[half:] - found[:-half]).argmin())
+        found = found[start : start + half + 1]
+    return float(np.median(found))
+
+
+def _free(
+    hull: Float32[np.ndarray, "x y z"], grid: Grid, depths: Sequence[_Depth], bias: float, diagonal: float
+) -> tuple[Float32[np.ndarray, "x y z"], Float32[np.ndarray, "x y z"]]:
+    """Return how far each cell lies before the surface that views see, meters, and how many see the cell."""
+    known = [
+        SeenDepth(each.projection, np.where(each.depth > 0, each.depth - np.float32(bias), np.float32(0.0)))
+        for each in depths
+    ]
+    least = max(3.0, _LEAST * len(depths))
+    band = _BAND * diagonal
+    free, sights = fused_depth(known, grid, hull > -2 * grid.spacing, band=band, quantile=_QUANTILE, least=least)
+    return ndimage.gaussian_filter(free, 1.0), sights
+
+
+def _supposed(seen: Float32[np.ndarray, "x y z"], untouched: Bool[np.ndarray, "x y z"]) -> np.ndarray:
+    """Return cavities, numbered, right below the largest faces that no outline touches, as deep as a cell.
+
+    Outlines do not say whether such a face is there, or only its edge.
+    """
+    inside = seen > 0
+    shallow = inside & ~ndimage.binary_erosion(inside)
+    skin = shallow & untouched
+    label, count = ndimage.label(skin, np.ones((3, 3, 3)))
+    sizes = np.bincount(label.ravel(), minlength=count + 1)[1:]
+    total = int(shallow.sum())
+    large = [row + 1 for row in range(count) if sizes[row] >= max(_ALIKE * sizes.max(), _LARGE_FACE * total)]
+    numbers = np.zeros(count + 1, dtype=np.int32)
+    numbers[large] = np.arange(1, len(large) + 1)
+    return numbers[label]
+
+
+def _closed(
+    hull: Float32[np.ndarray, "x y z"],
+    seen: Float32[np.ndarray, "x y z"],
+    sights: Float32[np.ndarray, "x y z"],
+    grid: Grid,
+) -> tuple[Float32[np.ndarray, "x y z"], Float32[np.ndarray, "x y z"], float, tuple[float, float, float] | None]:
+    """Cut what no view sees by the convex hull of what views see.
+
+    Return the cut solid, the hull cut likewise, which lids cavities, the part of the surface that no view saw, and the
+    direction in which it lies.
+    """
+    surface = closed_surface(seen, grid, _CLOSED)
+    places = surface.vertices.double().numpy()
+    rows = np.rint((places - grid.lowest) / grid.spacing).astype(int)
+    known = ndimage.maximum_filter(sights, 3)[tuple(rows.T)] >= 1
+    if int(known.sum()) < 4:
+        raise SceneError(
+            "expected views with a surface in their masks, got none; check that depth and views are of one object",
+            name="views",
+            value=0,
+        )
+    near = hull > -2 * grid.spacing
+    bound = hull.copy()
+    inside = depth_in_convex_hull(places[known], grid, np.argwhere(near))
+    bound[near] = np.minimum(hull[near], inside)
+    corners = surface.vertices.double()[surface.faces]
+    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).numpy()
+    hidden = ~known[surface.faces.numpy()].any(axis=1)
+    areas = np.linalg.norm(normals, axis=1)
+    total = normals[hidden].sum(axis=0)
+    length = float(np.linalg.norm(total))
+    direction = None if length == 0.0 else (float(total[0]), float(total[1]), float(total[2]))
+    if direction is not None:
+        direction = (direction[0] / length, direction[1] / length, direction[2] / length)
+    return np.minimum(seen, bound), bound, float(areas[hidden].sum() / areas.sum()), direction
+
+
+def _covered(hollow: Bool[np.ndarray, "x y z"], free: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
+    """Return the cells that lids cover: cavities, the shallow parts beside them, and a margin."""
+    if hollow.any():
+        label, _ = ndimage.label(free)
+        hollow = np.isin(label, np.unique(label[hollow]))
+    return ndimage.binary_dilation(hollow, iterations=_NARROW)
+
+
+def _hollows(
+    bound: Float32[np.ndarray, "x y z"], seen: Float32[np.ndarray, "x y z"], grid: Grid, diagonal: float
+) -> np.ndarray:
+    """Return the number of the cavity that each cell is in, the largest first; 0 in none."""
+    free = (bound > 0) & (seen <= 0)
+    core = ndimage.distance_transform_edt(free) > _NARROW
+    opened = free & (ndimage.distance_transform_edt(~core) <= _NARROW + 0.5)
+    label, count = ndimage.label(opened)
+    depth = ndimage.distance_transform_edt(bound > 0)
+    total = int((bound > 0).sum())
+    sizes = np.bincount(label.ravel(), minlength=count + 1)
+    deepest = ndimage.maximum(depth, label, np.arange(count + 1))
+    kept = [
+        number
+        for number in range(1, count + 1)
+        if deepest[number] * grid.spacing > _HOLLOW_DEPTH * diagonal or sizes[number] > _HOLLOW_VOLUME * total
+    ]
+    numbers = np.zeros(count + 1, dtype=np.int32)
+    for place, number in enumerate(sorted(kept, key=lambda each: -int(sizes[each]))):
+        numbers[number] = place + 1
+    return numbers[label]

@@ -1,0 +1,162 @@
+"""A simulated object as a capture folder: what a user's own folder holds, and its truth beside that."""
+
+import os
+import shutil
+import uuid
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+from avmsf.capture.folder import write_capture
+from avmsf.errors import CaptureError, SimulationError
+from avmsf.mesh.textured_mesh import TexturedMesh
+from avmsf.photographs.mesh_views import orbit_cameras, render_views
+from avmsf.photographs.write import write_views
+from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
+from avmsf.simulate.recipe import AXES, ObjectRecipe
+from avmsf.simulate.simulation import Simulation
+
+_CIRCLES = 3
+"""Circles of cameras around an object."""
+
+
+def write_simulation(
+    simulation: Simulation, folder: str | Path, *, progress: Callable[[int, int], None] | None = None
+) -> None:
+    """Write a folder that `read_capture`, `read_views` and `read_truth` read, and any tool that takes captures.
+
+    It holds impacts.csv, the wav files, capture.toml, truth.safetensors, and where the recipe asks for them the surface
+    in its colors (surface.ply, or surface.glb where it has textures) and transforms.json with images and masks. The
+    folder appears whole or not at all. `progress` is called with the number of pictures rendered and their total.
+    Raises SimulationError where the folder exists and is not empty, and where it cannot be written.
+    """
+    folder = Path(folder)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise SimulationError(
+            f"{folder}: expected a new or empty folder, got other files; choose another name or remove it", file=folder
+        )
+    begun = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}")
+    try:
+        _write_recordings(simulation, begun)
+        for sound in begun.glob("*.wav"):
+            _forget_the_hour(sound)
+        if simulation.recipe.surface:
+            write_textured(simulation.mesh, begun)
+        _write_views(simulation, begun, progress)
+        write_truth(simulation.truth, begun / TRUTH)
+        if folder.exists():
+            folder.rmdir()
+        os.rename(begun, folder)
+    except (OSError, CaptureError) as error:
+        raise SimulationError(
+            f"{folder}: expected a writable folder, got {error}; choose another folder", file=folder, value=str(error)
+        ) from error
+    finally:
+        shutil.rmtree(begun, ignore_errors=True)
+
+
+def _write_recordings(simulation: Simulation, folder: Path) -> None:
+    """Write the whole recordings, and settings by which they are read as the simulation's own capture is."""
+    capture = simulation.capture
+    impacts = replace(capture.impacts, sounds=simulation.recordings, before=None, after=None)
+    seconds = capture.settings.seconds if capture.settings.align else None
+    write_capture(replace(capture, surface=None, impacts=impacts), folder, onsets_within=seconds)
+
+
+def is_written(recipe: ObjectRecipe, folder: str | Path) -> bool:
+    """Return whether the folder holds the object of this recipe, made by this version of the package.
+
+    Raises SimulationError where it holds something else, which nobody asked to lose.
+    """
+    folder = Path(folder)
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        return False
+    if not (folder / TRUTH).is_file():
+        raise SimulationError(
+            f"{folder}: expected a simulated object or no files, got no {TRUTH}; choose another name or remove it",
+            file=folder,
+            name=TRUTH,
+        )
+    found, wanted = read_truth(folder).recipe, recipe.values()
+    if found != wanted:
+        differing = sorted(key for key in found.keys() | wanted.keys() if found.get(key) != wanted.get(key))
+        raise SimulationError(
+            f"{folder}: expected an object of these settings, got another {', '.join(differing)}; remove it, or choose "
+            "another folder",
+            file=folder,
+            value=differing,
+        )
+    return True
+
+
+def write_textured(mesh: TexturedMesh, folder: Path) -> None:
+    """Write a mesh in its colors: as `surface.ply` where they stand at its vertices, else as `surface.glb`."""
+    if all(texture.shape[:2] == (1, 1) for texture in mesh.textures):
+        _write_painted(mesh, folder / "surface.ply")
+    else:
+        _write_pictured(mesh, folder / "surface.glb")
+
+
+def _write_painted(mesh: TexturedMesh, path: Path) -> None:
+    """Write colors at vertices; where a vertex has another color in each face, every face gets corners of its own."""
+    vertices, faces = mesh.vertices.numpy(), mesh.faces.numpy()
+    pixels = np.stack([texture[0, 0].numpy() for texture in mesh.textures])[mesh.materials.numpy()]
+    corners = np.rint(mesh.colors.numpy() * pixels[:, None]).astype(np.uint8)
+    colors = np.zeros((len(vertices), 3), dtype=np.uint8)
+    colors[faces.ravel()] = corners.reshape(-1, 3)
+    if not np.array_equal(colors[faces], corners):
+        vertices, colors = vertices[faces].reshape(-1, 3), corners.reshape(-1, 3)
+        faces = np.arange(len(vertices)).reshape(-1, 3)
+    _export([trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)], path)
+
+
+def _write_pictured(mesh: TexturedMesh, path: Path) -> None:
+    """Write one part for each texture, tinted by the mean of the colors that its faces have besides."""
+    parts = []
+    for number, texture in enumerate(mesh.textures):
+        chosen = np.flatnonzero(mesh.materials.numpy() == number)
+        if not len(chosen):
+            continue
+        corners = mesh.vertices.numpy()[mesh.faces.numpy()[chosen]].reshape(-1, 3)
+        tint = np.rint(255.0 * mesh.colors.numpy()[chosen].mean(axis=(0, 1))).astype(np.uint8)
+        material = trimesh.visual.material.PBRMaterial(  # type: ignore[no-untyped-call]
+            baseColorTexture=Image.fromarray(texture.numpy()), baseColorFactor=[*tint.tolist(), 255]
+        )
+        places = mesh.coordinates.numpy()[chosen].reshape(-1, 2)
+        visual = trimesh.visual.TextureVisuals(uv=places, material=material)  # type: ignore[no-untyped-call]
+        faces = np.arange(len(corners)).reshape(-1, 3)
+        parts.append(trimesh.Trimesh(corners, faces, visual=visual, process=False))
+    _export(parts, path)
+
+
+def _export(parts: list[trimesh.Trimesh], path: Path) -> None:
+    shape = parts[0] if len(parts) == 1 else trimesh.Scene(parts)
+    shape.export(path, file_type=path.suffix[1:])
+
+
+def _forget_the_hour(path: Path) -> None:
+    """Set to zero the time of writing that float wav files carry in their PEAK chunk: equal sounds are equal files."""
+    with open(path, "r+b") as file:
+        start = file.read(256).find(b"PEAK")
+        if start >= 0:
+            # Four bytes each of name, length and version stand before it.
+            file.seek(start + 12)
+            file.write(bytes(4))
+
+
+def _write_views(simulation: Simulation, folder: Path, progress: Callable[[int, int], None] | None) -> None:
+    recipe = simulation.recipe
+    if recipe.views == 0:
+        return
+    cameras = orbit_cameras(
+        simulation.mesh.surface, size=recipe.view_size, azimuths=recipe.views // _CIRCLES, up=AXES[recipe.up]
+    )
+    views = render_views(simulation.mesh, cameras, progress=progress)
+    write_views(views, folder / "views")
+    for each in sorted((folder / "views").iterdir()):
+        os.rename(each, folder / each.name)
+    (folder / "views").rmdir()

@@ -1,0 +1,64 @@
+"""Files that cannot be written: advice that fits the system's error."""
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from avmsf._utils.files import way_out, write_whole
+from avmsf.errors import ExportError
+from avmsf.export.writing import write_folder
+from factories.raising import raises
+
+NUMBERS = (errno.ENOSPC, errno.EACCES, errno.EROFS, errno.ENAMETOOLONG, errno.EIO)
+
+
+def test_each_cause_has_its_own_advice() -> None:
+    assert len({way_out(OSError(number, "")) for number in NUMBERS}) == len(NUMBERS)
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_the_advice_fits_the_systems_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    def refuse(*arguments: object, **settings: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    for name in ("open", "mkdir"):
+        monkeypatch.setattr(os, name, refuse)
+    with raises(ExportError, file=tmp_path / "file", value=os.strerror(number)) as refused:
+        write_whole(tmp_path / "file", lambda place: None, raising=ExportError)
+    advice = way_out(OSError(number, ""))
+    assert str(refused.value).endswith(advice)
+    with pytest.raises(ExportError) as refused:
+        write_folder(tmp_path / "folder", lambda place: None, {})
+    assert str(refused.value).endswith(advice)
+
+
+def test_a_file_in_a_folders_place_and_a_folder_in_a_files_are_told_apart(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    for name, number in (("file/new", errno.EEXIST), ("file/deep/new", errno.ENOTDIR), ("folder", errno.EISDIR)):
+        with raises(ExportError, file=tmp_path / name, value=os.strerror(number)) as refused:
+            write_whole(tmp_path / name, lambda place: None, raising=ExportError)
+        assert str(refused.value).endswith(way_out(OSError(number, "")))
+    advice = [way_out(OSError(number, "")) for number in (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.EIO)]
+    assert advice[0] == advice[1]
+    assert len(set(advice)) == 3
+
+
+def test_new_files_and_folders_have_the_mode_of_the_umask_which_stays_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    changed: list[int] = []
+    before = os.umask(0o027)
+    try:
+        with monkeypatch.context() as patched:
+            # Another thread that makes a file meanwhile would see the change.
+            patched.setattr(os, "umask", lambda mask: changed.append(mask) or 0o027)
+            write_whole(tmp_path / "file", lambda place: place.write_text("words"))
+            write_folder(tmp_path / "folder", lambda place: (place / "inside").touch(), {})
+    finally:
+        os.umask(before)
+    modes = [(tmp_path / name).stat().st_mode & 0o777 for name in ("file", "folder", "folder/inside")]
+    assert modes == [0o640, 0o750, 0o640]
+    assert changed == []

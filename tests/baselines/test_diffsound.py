@@ -1,0 +1,262 @@
+"""DiffSound: its objectives, what it recovers of bodies that sound as it assumes, and its gains and weights."""
+
+import math
+from dataclasses import replace
+from functools import cache
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from avmsf.baselines.diffsound import material_fit
+from avmsf.baselines.diffsound.locator import DiffSoundLocator
+from avmsf.baselines.diffsound.losses import ClipSpectra, divergence
+from avmsf.baselines.diffsound.material_fit import (
+    DampingCurve,
+    DiffSoundConfig,
+    MaterialFit,
+    clip_spectra,
+    fit_material,
+    predicted_sound,
+)
+from avmsf.baselines.diffsound.renderer import DiffSound, leveled
+from avmsf.capture.impacts import Impacts
+from avmsf.errors import EvaluationError, LocationError, SimulationError
+from avmsf.fem.block import block
+from avmsf.fem.body_family import BodyFamily, body_family
+from avmsf.fem.isotropic import isotropic_modes
+from avmsf.fem.material import GLASS
+from avmsf.mesh.surface import Surface
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.residual_noise import Residual
+from avmsf.modal.spectra import magnitude_stft
+from avmsf.modal.synthesis import synthesize
+
+RATE, SAMPLES = 48_000.0, 24_000
+STIFFNESS, POISSON = 1.3 * GLASS.young / GLASS.density, 0.27
+SILENT = Residual(torch.zeros(257))
+
+
+@cache
+def family() -> BodyFamily:
+    # No two sides alike: no mode has a twin.
+    return BodyFamily((isotropic_modes(block((0.19, 0.11, 0.013), (6, 4, 1)), count=12),), ())
+
+
+@cache
+def true_modes() -> tuple[torch.Tensor, torch.Tensor]:
+    frequency = known_fit().modes().frequency
+    return frequency, 8.0 + 2e-8 * (2.0 * math.pi * frequency).square()
+
+
+def struck(amplitudes: torch.Tensor, contacts: torch.Tensor | None = None) -> Impacts:
+    frequency, damping = true_modes()
+    sounds = synthesize(amplitudes, frequency, damping, samples=SAMPLES, sample_rate=RATE)
+    places = torch.zeros(len(sounds), 3) if contacts is None else contacts
+    return Impacts(places, sounds, RATE, tuple(f"{row}.wav" for row in range(len(sounds))))
+
+
+def curve() -> DampingCurve:
+    return DampingCurve.of(ModalBank(*true_modes()))
+
+
+def known_fit() -> MaterialFit:
+    return MaterialFit(STIFFNESS, POISSON, None, 0.0, family().bodies[0])
+
+
+CONTACTS = torch.tensor([[0.02, 0.03, 0.013], [0.11, 0.09, 0.013], [0.17, 0.01, 0.013], [0.07, 0.05, 0.013]])
+
+
+@cache
+def simulated() -> Impacts:
+    """Return impacts that sound as DiffSound renders them, each mode 1 to 3 times as strong."""
+    plain = leveled(known_fit(), curve(), struck(torch.ones(4, 12), CONTACTS), SILENT, weighted=False)
+    strength = torch.linspace(1.0, 3.0, 12, dtype=torch.float64)
+    return struck((plain.gains(CONTACTS) * strength / plain.weight[0] * 1e4).float(), CONTACTS)
+
+
+@cache
+def rendered(weighted: bool = False) -> DiffSound:
+    return leveled(known_fit(), curve(), simulated(), SILENT, weighted=weighted)
+
+
+def test_the_divergence_of_points_on_a_line_is_that_of_their_sorted_matching():
+    generator = torch.Generator().manual_seed(0)
+    one, other = torch.rand(2, 200, 1, generator=generator, dtype=torch.float64)
+    other = other + 0.3
+    sorted_cost = 0.5 * (one.sort(dim=0).values - other.sort(dim=0).values).square().mean()
+    # A blur of .01 changes a distance of .1 to .5 by little.
+    torch.testing.assert_close(divergence(one, other), sorted_cost, rtol=0.03, atol=0.0)
+
+
+def test_objectives_vanish_for_the_clip_itself_and_for_nothing_else():
+    frequency, damping = true_modes()
+    clip, heard = predicted_sound(frequency, damping)
+    other, moved = predicted_sound(1.1 * frequency, damping)
+    spectra = ClipSpectra(clip[None], 32_000.0)
+    assert float(spectra.difference(clip)) == 0.0
+    assert float(spectra.transport(clip, heard, row=0)) == pytest.approx(0.0, abs=1e-3)
+    assert float(spectra.difference(other)) > 1.0
+    assert float(spectra.transport(other, moved, row=0)) > 0.01
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.25])
+def test_transport_pulls_a_mode_towards_one_that_it_does_not_overlap(factor):
+    damping = torch.tensor([30.0], dtype=torch.float64)
+    clip, _ = predicted_sound(torch.tensor([4000.0], dtype=torch.float64), damping)
+    frequency = torch.tensor([4000.0 * factor], dtype=torch.float64, requires_grad=True)
+    sound, heard = predicted_sound(frequency, damping)
+    ClipSpectra(clip[None], 32_000.0).transport(sound, heard, row=0).backward()
+    assert frequency.grad is not None
+    assert math.copysign(1.0, float(frequency.grad)) == math.copysign(1.0, factor - 1.0)
+
+
+def test_the_order_and_loudness_of_recordings_change_no_difference():
+    impacts = struck(torch.rand(3, 12, generator=torch.Generator().manual_seed(1)) + 0.5)
+    sound, _ = predicted_sound(*true_modes())
+    straight = clip_spectra(impacts).difference(sound)
+    other = impacts.take([2, 0, 1])
+    other = replace(other, sounds=other.sounds * torch.tensor([[1.0], [0.01], [50.0]]))
+    torch.testing.assert_close(clip_spectra(other).difference(sound), straight, rtol=1e-4, atol=0.0)
+
+
+def test_the_damping_curve_is_the_lower_envelope_of_slow_modes():
+    frequency = torch.tensor([100.0, 200.0, 300.0, 1700.0, 1800.0], dtype=torch.float64)
+    bank = ModalBank(frequency, torch.tensor([9.0, 5.0, 400.0, 20.0, 350.0], dtype=torch.float64))
+    found = DampingCurve.of(bank)
+    assert found.damping == (5.0, 20.0)
+    assert found.frequency == (270.0, 1770.0)
+    between = found(torch.tensor([10.0, 1020.0, 9000.0], dtype=torch.float64))
+    torch.testing.assert_close(between, torch.tensor([5.0, 12.5, 20.0], dtype=torch.float64))
+
+
+@pytest.mark.slow
+def test_it_recovers_the_material_of_a_body_that_sounds_as_it_assumes():
+    spectra = clip_spectra(struck(torch.ones(2, 12)))
+    found = fit_material(spectra, curve(), family(), DiffSoundConfig(transport_steps=2, difference_steps=2))
+    assert found.stiffness == pytest.approx(STIFFNESS, rel=0.02)
+    assert found.poisson == pytest.approx(POISSON, abs=0.03)
+
+
+@pytest.mark.slow
+def test_it_recovers_the_thickness_of_a_wall_that_lies_between_those_computed():
+    across, along = torch.meshgrid(torch.linspace(0, 0.2, 9), torch.linspace(0, 0.14, 7), indexing="ij")
+    # A little bent, so that stretching takes part: thickness and stiffness of a flat sheet cannot be told apart.
+    points = torch.stack([across, along, 2.0 * across**2], dim=-1).reshape(-1, 3)
+    rows = torch.arange(63).reshape(9, 7)
+    a, b, c, d = (each.flatten() for each in (rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:]))
+    walls = body_family(
+        Surface(points, torch.cat([torch.stack([a, b, c], 1), torch.stack([a, c, d], 1)])), count=8, dofs=2000
+    )
+    thickness = 1.2 * walls.thickness[1]
+    frequency = walls.at(thickness).modes(replace(GLASS, young=1.3 * GLASS.young, poisson=POISSON)).frequency
+    damping = 8.0 + 2e-8 * (2.0 * math.pi * frequency).square()
+    sounds = synthesize(torch.ones(1, 8), frequency, damping, samples=SAMPLES, sample_rate=RATE)
+    clips = clip_spectra(Impacts(torch.zeros(1, 3), sounds, RATE, ("1.wav",)))
+    known = DampingCurve.of(ModalBank(frequency, damping))
+    found = fit_material(
+        clips, known, walls, DiffSoundConfig("glass", transport_steps=1, difference_steps=1, search=40)
+    )
+    assert found.thickness == pytest.approx(thickness, rel=0.05)
+    assert found.stiffness == pytest.approx(STIFFNESS, rel=0.02)
+
+
+def test_twice_the_signal_renders_twice_as_loud():
+    loud = replace(simulated(), sounds=2.0 * simulated().sounds)
+    twice = leveled(known_fit(), curve(), loud, SILENT, weighted=True)
+    torch.testing.assert_close(twice.render(CONTACTS), 2.0 * rendered(True).render(CONTACTS), rtol=1e-3, atol=1e-6)
+
+
+def test_an_impact_from_the_other_side_has_opposite_gains():
+    down = torch.tensor([[0.0, 0.0, -1.0]]).expand(4, 3)
+    gains = rendered().gains(CONTACTS, directions=down)
+    torch.testing.assert_close(rendered().gains(CONTACTS, directions=-down), -gains)
+    # From above that is straight into the surface.
+    torch.testing.assert_close(rendered().gains(CONTACTS), gains)
+
+
+def test_gains_are_those_of_the_mode_shapes_over_frequencies():
+    modes = known_fit().modes()
+    along = modes.at(CONTACTS)[:, :, 2]
+    level = rendered().gains(CONTACTS) / (along / rendered().bank.frequency)
+    torch.testing.assert_close(level, level[0, 0].expand_as(level), rtol=1e-9, atol=0.0)
+
+
+def test_weights_make_training_spectra_no_worse_and_find_the_strengths_of_modes():
+    plain, weighted = rendered(), rendered(True)
+    assert float(weighted.weight.min()) >= 0.0
+
+    def misfit(renderer: DiffSound) -> float:
+        atoms = torch.eye(12, dtype=torch.float64)
+        own = synthesize(atoms, renderer.bank.frequency, renderer.bank.damping, samples=SAMPLES, sample_rate=RATE)
+        parts = magnitude_stft(own, fft_size=2048, hop=512).flatten(1)
+        recorded = magnitude_stft(simulated().sounds.double(), fft_size=2048, hop=512).flatten(1)
+        return float((renderer.gains(CONTACTS).abs() @ parts - recorded).square().sum())
+
+    assert misfit(weighted) <= misfit(plain)
+    moving = plain.gains(CONTACTS).abs().amax(dim=0)
+    moving = moving > 0.05 * moving.max()
+    ratio = (weighted.weight / torch.linspace(1.0, 3.0, 12, dtype=torch.float64))[moving]
+    # Where spectra of modes overlap, magnitudes do not add up.
+    torch.testing.assert_close(ratio / ratio.median(), torch.ones_like(ratio), rtol=0.15, atol=0.0)
+
+
+def test_a_rendered_sound_is_located_where_it_was_struck():
+    points = known_fit().modes().nodes
+    points = points[(points[:, 2] > 0.0129) & (points[:, 0] < 0.09) & (points[:, 1] < 0.05)]
+    locator = DiffSoundLocator.of(
+        rendered(), points, directions=torch.tensor([[0.0, 0.0, -1.0]]).expand(len(points), 3)
+    )
+    down = torch.tensor([[0.0, 0.0, -1.0]])
+    for row in (0, 7, 11):
+        sound = rendered().render(points[row : row + 1].float(), directions=down)[0]
+        torch.testing.assert_close(locator.place(sound), points[row])
+        assert float(locator.distance(-sound)[row]) == pytest.approx(0.0, abs=1e-3)
+        late = torch.nn.functional.pad(sound, (3, 0))
+        torch.testing.assert_close(locator.place(late), points[row])
+    with pytest.raises(LocationError):
+        locator.place(torch.zeros(SAMPLES))
+
+
+def test_a_material_that_the_table_lacks_is_refused():
+    with pytest.raises(SimulationError):
+        DiffSoundConfig(material="unobtainium")
+
+
+def test_silent_recordings_are_refused():
+    with pytest.raises(EvaluationError):
+        clip_spectra(struck(torch.zeros(1, 12)))
+    with pytest.raises(EvaluationError):
+        leveled(known_fit(), curve(), struck(torch.zeros(1, 12)), SILENT, weighted=True)
+
+
+def test_a_silent_recording_among_others_counts_for_nothing():
+    amplitudes = torch.ones(2, 12)
+    amplitudes[1] = 0.0
+    assert len(clip_spectra(struck(amplitudes)).clips) == 1
+
+
+@pytest.mark.parametrize("scale", [1000.0, 1e-4])
+def test_a_body_in_the_wrong_unit_is_refused(scale):
+    solid = block((0.19 * scale, 0.11 * scale, 0.013 * scale), (6, 4, 1))
+    other = BodyFamily((isotropic_modes(solid, count=12),), ())
+    with pytest.raises(EvaluationError):
+        fit_material(clip_spectra(struck(torch.ones(1, 12))), curve(), other)
+
+
+def test_recordings_that_are_too_dull_are_refused():
+    frequency, _ = true_modes()
+    with pytest.raises(EvaluationError):
+        DampingCurve.of(ModalBank(frequency, torch.full_like(frequency, 2000.0)))
+
+
+def test_a_search_starts_on_its_bounds():
+    """Whatever rounding makes of the bounds, a start on one of them is a place to search from."""
+
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(40):
+        low = torch.randn(3, dtype=torch.float64, generator=generator)
+        bounds = torch.stack([low, low + torch.rand(3, dtype=torch.float64, generator=generator)])
+        bowl = SimpleNamespace(bounds=bounds, loss=lambda point: float(point.square().sum()))
+        found = material_fit._Problem.searched(bowl, bounds[1], 1)
+        assert bool(((found >= bounds[0]) & (found <= bounds[1])).all())

@@ -1,0 +1,336 @@
+"""SonicGauss: what flow, conditioning, patches and points must obey, and the small generator as a whole."""
+
+import math
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+
+import pytest
+import torch
+
+from avmsf.baselines.sonicgauss import patches
+from avmsf.baselines.sonicgauss.conditioning import ContactEncoding, Fusion, degree_one, first_nine, normalized
+from avmsf.baselines.sonicgauss.flow import draw_times, flow_loss, integrate
+from avmsf.baselines.sonicgauss.objects import TrainingObject, training_recipes
+from avmsf.baselines.sonicgauss.patches import (
+    CHANNELS,
+    FFT,
+    HOP,
+    PATCHES,
+    RATE,
+    PatchCodec,
+    log_magnitudes,
+    sounds_of,
+    spectra,
+)
+from avmsf.baselines.sonicgauss.pretraining import PretrainingConfig, pretrain
+from avmsf.baselines.sonicgauss.small import SmallConfig, SmallSonicGauss, SmallWeights
+from avmsf.baselines.sonicgauss.small_renderer import SmallRenderer, fit_small
+from avmsf.baselines.sonicgauss.tuning import TrainingConfig, train
+from avmsf.errors import EvaluationError
+from avmsf.evaluation.methods import method_named
+from avmsf.evaluation.sonicgauss_method import SmallSonicGaussMethod
+from avmsf.simulate.sim20 import SIM20
+from factories.raising import raises
+from factories.sonicgauss_cases import SECONDS, cloud, impacts
+
+TINY = PretrainingConfig(
+    SmallConfig(width=16, heads=2, blocks=1, encoder_blocks=1, tokens=4), TrainingConfig(4, batch=4, rate=1e-3)
+)
+
+
+@cache
+def weights(seed: int = 0) -> SmallWeights:
+    objects = [
+        TrainingObject(cloud(seed=row), (made := impacts(seed=row)).contacts.float(), made.sounds, made.sample_rate)
+        for row in range(2)
+    ]
+    return pretrain(objects, TINY, seed=seed)
+
+
+def tuned(level: float = 1.0, seed: int = 0) -> SmallRenderer:
+    config = TrainingConfig(steps=3, batch=4, rate=1e-3)
+    return replace(fit_small(weights(), cloud(), impacts(level=level), config, seed=seed), steps=2)
+
+
+def test_straight_paths_arrive_exactly_whatever_the_steps():
+    generator = torch.Generator().manual_seed(0)
+    data, noise = torch.randn(2, 3, 5, 4, generator=generator, dtype=torch.float64)
+    for steps in (1, 7, 50):
+        found = integrate(lambda state, times: noise - data, noise, steps=steps)
+        torch.testing.assert_close(found, data)
+
+
+def test_gaussian_data_are_reached_to_first_order_in_the_step():
+    # Data of deviation d around m: the velocity that minimizes the loss is known, and so is its flow, (e d + m).
+    mean, deviation = 3.0, 0.5
+    noise = torch.randn(1, 1, 2000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def velocity(state: torch.Tensor, times: torch.Tensor) -> torch.Tensor:
+        time = times[:, None, None]
+        variance = ((1 - time) * deviation).square() + time.square()
+        slope = (time - (1 - time) * deviation**2) / variance
+        return slope * (state - (1 - time) * mean) - mean
+
+    errors = [
+        float((integrate(velocity, noise, steps=steps) - (mean + deviation * noise)).abs().mean())
+        for steps in (50, 100, 200)
+    ]
+    assert errors[0] < 0.02
+    for coarse, fine in pairwise(errors):
+        assert math.log2(coarse / fine) == pytest.approx(1.0, abs=0.2)
+
+
+def test_sampling_agrees_with_the_published_scheduler():
+    diffusers = pytest.importorskip("diffusers")
+    scheduler = diffusers.FlowMatchEulerDiscreteScheduler(num_train_timesteps=1000)
+    scheduler.set_timesteps(sigmas=torch.linspace(1.0, 1 / 50, 50).numpy())
+    noise = torch.randn(1, 3, 2, generator=torch.Generator().manual_seed(0))
+    state = noise
+    for time in scheduler.timesteps:
+        state = scheduler.step(torch.sin(state) * (time / 1000), time, state).prev_sample
+    ours = integrate(lambda latents, times: torch.sin(latents) * times[:, None, None], noise)
+    torch.testing.assert_close(ours, state, rtol=1e-4, atol=1e-5)
+
+
+def test_the_loss_vanishes_for_the_true_velocity_alone():
+    data = torch.full((4, 2, 3), 1.5)
+
+    # Of data that are all alike the noise can be told from the state, and with it the velocity.
+    def true(state: torch.Tensor, times: torch.Tensor) -> torch.Tensor:
+        return (state - data) / times[:, None, None]
+
+    assert float(flow_loss(true, data, generator=torch.Generator().manual_seed(0))) < 1e-6
+    wrong = flow_loss(lambda state, times: -true(state, times), data, generator=torch.Generator().manual_seed(0))
+    assert float(wrong) > 1.0
+
+
+def test_times_have_the_published_distribution():
+    times = draw_times(20_000, generator=torch.Generator().manual_seed(0))
+    logits = torch.logit(times.double())
+    assert float(logits.mean()) == pytest.approx(0.0, abs=0.03)
+    assert float(logits.std()) == pytest.approx(1.0, abs=0.02)
+
+
+def test_channels_do_not_change_where_the_object_lies_or_how_large_it_is():
+    one = cloud(degree=2)
+    other = replace(one, centers=3.0 * one.centers + 0.7, log_scales=one.log_scales + math.log(3.0))
+    here, there = (normalized(each, degree_one(each)) for each in (one, other))
+    torch.testing.assert_close(here.features, there.features, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(
+        here.places(one.centers.double()), there.places(other.centers.double()), rtol=1e-4, atol=1e-4
+    )
+    assert here.features.shape[1] == 23
+    assert float(here.centers.min()) == pytest.approx(0.0, abs=1e-6)
+    assert float(here.centers.max()) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_faint_gaussians_are_left_out_and_none_is_an_error():
+    one = cloud(20)
+    opacities = torch.where(torch.arange(20) < 5, 0.01, 0.5)
+    assert len(normalized(replace(one, logit_opacities=opacities), degree_one(one)).centers) == 15
+    with raises(EvaluationError, name="opacity", value=20):
+        normalized(replace(one, logit_opacities=torch.zeros(20)), degree_one(one))
+    with raises(EvaluationError, name="centers", value=20):
+        normalized(replace(one, centers=torch.zeros(20, 3)), degree_one(one))
+
+
+def test_the_published_rest_is_the_first_nine_of_a_file_of_degree_three():
+    one = cloud(3, degree=3)
+    # A file holds all 15 of red, then green, then blue.
+    in_file = torch.cat([one.harmonics[:, 1:, color] for color in range(3)], dim=1)
+    torch.testing.assert_close(first_nine(one), in_file[:, :9])
+    torch.testing.assert_close(degree_one(one), one.harmonics[:, 1:4].reshape(3, 9))
+    assert bool((first_nine(cloud(3, degree=0)) == 0).all())
+
+
+def test_a_contact_is_encoded_by_sines_and_cosines_of_octaves():
+    encoding = ContactEncoding((8,), 63)
+    encoding.mlp = torch.nn.Identity()
+    place = torch.tensor([[0.3, 0.6, 0.9]])
+    found = encoding(place)[0]
+    assert found.shape == (63,)
+    # x first: sine and cosine of pi x, of 2 pi x, and so on.
+    first = [turn(octave * 0.3 * math.pi) for octave in (1, 2) for turn in (math.sin, math.cos)]
+    torch.testing.assert_close(found[:4], torch.tensor(first))
+    assert float(found[20]) == pytest.approx(math.sin(0.6 * math.pi), abs=1e-6)
+    torch.testing.assert_close(found[60:], place[0])
+
+
+def test_fusion_keeps_the_objects_tokens_and_adds_those_of_the_contact():
+    fusion = Fusion(16, 4).eval()
+    tokens, contact = torch.randn(2, 5, 16), torch.randn(2, 16)
+    found = fusion(tokens, contact)
+    assert torch.equal(found[:, :5], tokens)
+    assert not torch.allclose(fusion(tokens, contact + 1.0)[:, 5:], found[:, 5:], atol=1e-3)
+    # With one key, attention adds the same vector to all tokens.
+    fusion.ffn = torch.nn.Identity()
+    fusion.norm2 = torch.nn.Identity()
+    added = (fusion(tokens, contact)[:, 5:] / 2 - tokens).detach()
+    torch.testing.assert_close(added, added[:, :1].expand_as(added), rtol=1e-4, atol=1e-5)
+
+
+def test_patches_with_all_components_lose_nothing():
+    logs = log_magnitudes(spectra(impacts().sounds, 24_000.0), 100.0)
+    # As many sounds' patches as components, and fewer: they span no more than the codec keeps.
+    few = logs[:1, : PATCHES * 16]
+    few = torch.cat([few[:, :400], few[:, :1].expand(-1, 624, -1)], dim=1)
+    codec = PatchCodec.of([few], seed=0)
+    latents = codec.encode(few)
+    assert latents.shape == (1, PATCHES, CHANNELS)
+    torch.testing.assert_close(codec.decode(latents), few, rtol=0, atol=1e-3)
+
+
+def test_true_magnitudes_and_phases_give_back_the_sound():
+    sounds = impacts().sounds
+    found = spectra(sounds, 24_000.0)
+    again = sounds_of(found.abs()[:1], found[0].angle(), sample_rate=24_000.0, samples=sounds.shape[1])
+    error = (again[0] - sounds[0]).square().mean().sqrt() / sounds[0].square().mean().sqrt()
+    # The two resamplings round the highest frequencies off.
+    assert float(error) < 0.05
+
+
+def test_spectra_are_of_two_seconds_at_the_rate_of_the_latents():
+    tone = torch.sin(2.0 * math.pi * 1000.0 * torch.arange(24_000) / 24_000.0)[None]
+    found = spectra(tone, 24_000.0).abs()
+    assert found.shape == (1, 1024, 126)
+    assert int(found[0, :, 20].argmax()) == round(1000.0 * FFT / RATE)
+    assert float(found[0, :, round(1.5 * RATE / HOP)].max()) < 1e-3
+
+
+def test_training_lowers_the_loss_and_a_seed_decides_it():
+    def run(seed: int) -> tuple[list[float], torch.Tensor]:
+        weight = torch.nn.Parameter(torch.zeros(3))
+
+        def loss(rows: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+            noise = torch.rand(1, generator=generator) * 1e-3
+            return (weight - rows.float().mean() - noise).square().mean()
+
+        return train([weight], loss, 5, TrainingConfig(300, batch=2, rate=0.05), seed=seed), weight.detach()
+
+    losses, found = run(0)
+    assert len(losses) == 300
+    # The rows 0 to 4, each as often as any other: their mean.
+    torch.testing.assert_close(found, torch.full((3,), 2.0), rtol=0, atol=0.4)
+    again = run(0)
+    assert again[0] == losses
+    assert torch.equal(again[1], found)
+    assert run(1)[0] != losses
+
+
+def test_weights_come_back_from_their_file(tmp_path):
+    path = tmp_path / "small.safetensors"
+    weights().write(path)
+    again = SmallWeights.read(path)
+    assert again.report == weights().report
+    latents, times, tokens = torch.randn(2, PATCHES, CHANNELS), torch.rand(2), torch.randn(2, 8, 16)
+    assert torch.equal(again.network(latents, times, tokens), weights().network(latents, times, tokens))
+    assert torch.equal(again.codec.decode(latents), weights().codec.decode(latents))
+
+
+def test_training_again_gives_the_same_weights():
+    first, again = weights(), weights.__wrapped__()
+    for name, value in first.network.state_dict().items():
+        assert torch.equal(value, again.network.state_dict()[name])
+    assert torch.equal(first.codec.components, again.codec.components)
+    assert not torch.equal(weights(1).network.position, first.network.position)
+    assert first.report["objects"] == 2
+    assert first.report["clips"] == 12
+
+
+@pytest.mark.parametrize("change", ["missing", "shape"])
+def test_a_file_of_other_weights_is_refused_by_the_tensors_name(tmp_path, change):
+    path = tmp_path / "small.safetensors"
+    made = weights.__wrapped__()
+    if change == "missing":
+        del made.network.pooled
+        name = "network.pooled.0.weight"
+    else:
+        made.network.position = torch.nn.Parameter(torch.zeros(3, 16))
+        name = "network.position"
+    made.write(path)
+    with raises(EvaluationError, file=path, name=name, value=None if change == "missing" else [3, 16]):
+        SmallWeights.read(path)
+
+
+def lively_network() -> SmallSonicGauss:
+    """Return a network whose gates, zero at the start of training, are open."""
+    network = weights.__wrapped__().network.requires_grad_(False)
+    for layer in (network.output, network.modulation, *(block.modulation for block in network.blocks)):
+        torch.nn.init.normal_(layer.weight, generator=torch.Generator().manual_seed(0))
+    return network
+
+
+def test_the_contact_and_the_object_change_the_velocity():
+    network = lively_network()
+    latents, times = torch.randn(1, PATCHES, CHANNELS), torch.tensor([0.5])
+    features, place = torch.randn(1, 4, 23), torch.rand(1, 3)
+    base = network(latents, times, network.condition(features, place))
+    for other in (network.condition(features, place + 0.2), network.condition(features + 0.5, place)):
+        assert not torch.allclose(network(latents, times, other), base, rtol=0, atol=1e-3 * float(base.abs().max()))
+
+
+def test_the_order_of_gaussian_tokens_changes_nothing():
+    network = lively_network()
+    latents, times = torch.randn(1, PATCHES, CHANNELS), torch.tensor([0.5])
+    features, place = torch.randn(1, 4, 23), torch.rand(1, 3)
+    one, other = (
+        network(latents, times, network.condition(each, place)) for each in (features, features[:, [2, 0, 3, 1]])
+    )
+    torch.testing.assert_close(one, other, rtol=0, atol=1e-4 * float(one.abs().max()))
+
+
+@pytest.fixture
+def _few_iterations(monkeypatch):
+    monkeypatch.setattr(patches, "_ITERATIONS", 1)
+
+
+@pytest.mark.usefixtures("_few_iterations")
+def test_a_sound_depends_on_its_contact_alone_and_on_the_seed():
+    renderer = tuned()
+    contacts = impacts(2, seed=3).contacts
+    together = renderer.render(contacts)
+    assert together.shape == (2, round(SECONDS * 24_000))
+    assert bool(torch.isfinite(together).all())
+    assert torch.equal(renderer.render(contacts[1:])[0], together[1])
+    assert torch.equal(tuned().render(contacts), together)
+    assert not torch.equal(tuned(seed=1).render(contacts), together)
+    assert renderer.render(contacts[:0]).shape == (0, together.shape[1])
+
+
+@pytest.mark.usefixtures("_few_iterations")
+def test_levels_follow_those_of_the_recordings():
+    contacts = impacts(2, seed=3).contacts
+    soft, loud = tuned().render(contacts), tuned(level=1000.0).render(contacts)
+    torch.testing.assert_close(loud, 1000.0 * soft, rtol=0, atol=1e-2 * float(loud.abs().max()))
+
+
+def test_silence_is_refused():
+    with raises(EvaluationError, name="sounds", value=0.0):
+        fit_small(weights(), cloud(), replace(impacts(), sounds=torch.zeros(6, 12_000)))
+
+
+def test_no_training_object_is_one_of_sim_20():
+    recipes = training_recipes(60, seed=0)
+    known = {(recipe.kind, recipe.material) for recipe in SIM20.values()}
+    seeds = {recipe.seed for recipe in SIM20.values()}
+    assert not {(recipe.kind, recipe.material) for recipe in recipes} & known
+    assert not {recipe.seed for recipe in recipes} & seeds
+    assert len({recipe.seed for recipe in recipes}) == 60
+    assert training_recipes(60, seed=0) == recipes
+    assert not {recipe.seed for recipe in training_recipes(60, seed=1)} & {recipe.seed for recipe in recipes}
+
+
+def test_the_method_names_the_command_where_there_are_no_weights(tmp_path):
+    for name in ("sonicgauss-small", "sonicgauss-small:", f"sonicgauss-small:{tmp_path / 'none'}"):
+        with raises(EvaluationError, name="method", value=name) as caught:
+            method_named(name)
+        assert "sonicgauss-training" in str(caught.value)
+    other = tmp_path / "other.safetensors"
+    other.write_bytes(b"something else")
+    method = method_named(f"sonicgauss-small:{other}")
+    assert isinstance(method, SmallSonicGaussMethod)
+    assert method.name == f"sonicgauss-small:{other}"
+    known = repr(method)
+    weights().write(other)
+    assert repr(method) != known

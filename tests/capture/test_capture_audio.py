@@ -1,0 +1,211 @@
+"""Sound files: every way in which one can be wrong is refused or warned of by name."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+
+from avmsf.capture import CaptureSettings, check, read_capture, read_sound
+from avmsf.capture.audio import clipped_samples, constant_offset
+from avmsf.errors import CaptureError, CaptureWarning
+from factories.capture_folder import RATE, fill, ring
+from factories.raising import raises, warns
+
+
+def stereo() -> np.ndarray:
+    return np.stack([ring(seed=0), ring(seed=1)], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("samples", "name", "value"),
+    [
+        (np.zeros(4000), None, 0.0),
+        (np.full(4000, 0.25), None, 0.25),
+        (np.zeros(0), None, 0),
+        (np.where(np.arange(4000) == 7, np.nan, ring()), None, 1),
+        (ring(0.015), "samples", 120),
+        (stereo(), "response_channel", 2),
+    ],
+    ids=["silent", "constant", "empty", "nan", "short", "stereo"],
+)
+def test_a_bad_recording_is_named(tmp_path: Path, samples: np.ndarray, name: str | None, value: float) -> None:
+    with raises(CaptureError, file="b.wav", name=name, value=value):
+        read_capture(fill(tmp_path, replace={"b.wav": samples}))
+
+
+@pytest.mark.parametrize("content", [b"", b"not a wav at all", b"RIFF\x24\x00\x00\x00WAVEfmt "])
+def test_a_corrupt_file_is_named(tmp_path: Path, content: bytes) -> None:
+    folder = fill(tmp_path)
+    (folder / "b.wav").write_bytes(content)
+    with raises(CaptureError, file="b.wav", name="bytes", value=len(content)):
+        read_capture(folder)
+
+
+def test_a_missing_file_is_named_and_guessed(tmp_path: Path) -> None:
+    folder = fill(tmp_path)
+    (folder / "b.wav").rename(folder / "b1.wav")
+    with raises(CaptureError, file="b.wav", value="b1.wav"):
+        read_capture(folder)
+    (folder / "040.wav").write_bytes((folder / "a.wav").read_bytes())
+    for missing, near in (("005.wav", None), ("40.wav", "040.wav")):
+        fill(tmp_path, rows=("a.wav,0,0,0", f"{missing},1,0,0"))
+        with raises(CaptureError, file=missing, value=near):
+            read_capture(folder)
+    fill(tmp_path, rows=("a.wav,0,0,0", "takes/b.wav,1,0,0"))
+    with raises(CaptureError, file="takes/b.wav", value=None):
+        read_capture(folder)
+    # A recording with a row of its own is of another contact.
+    (folder / "takes").mkdir()
+    (folder / "takes" / "hammer on rim.wav").write_bytes((folder / "a.wav").read_bytes())
+    for rows, below in ((("a.wav,0,0,0",), "takes/hammer on rim.wav"), (("takes/hammer on rim.wav,0,0,0",), None)):
+        fill(tmp_path, rows=(*rows, "hammer on rim.wav,1,0,0"))
+        with raises(CaptureError, file="hammer on rim.wav", value=below):
+            read_capture(folder)
+
+
+def test_mixed_rates_are_refused_with_their_counts(tmp_path: Path) -> None:
+    folder = fill(tmp_path)
+    soundfile.write(folder / "c.wav", ring(), RATE + 1)
+    with raises(CaptureError, name="sample_rate", value=[RATE, RATE + 1]):
+        read_capture(folder)
+
+
+@pytest.mark.parametrize("rate", [100, 512, 192_000])
+def test_any_rate_from_100_hz_to_192_khz_is_kept(tmp_path: Path, rate: int) -> None:
+    seconds = max(1.0, 200 / rate)
+    sounds = {name: ring(seconds, rate=rate, seed=seed) for seed, name in enumerate(("a.wav", "b.wav", "c.wav"))}
+    folder = fill(tmp_path, replace=sounds, rate=rate)
+    impacts = read_capture(folder, CaptureSettings(align=False)).impacts
+    assert impacts.sample_rate == rate
+    assert torch.equal(impacts.sounds[1], torch.from_numpy(sounds["b.wav"].astype(np.float32)))
+
+
+def test_what_git_lfs_leaves_in_place_of_a_recording_is_named(tmp_path: Path) -> None:
+    folder = fill(tmp_path)
+    (folder / "b.wav").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
+    with raises(CaptureError, file="b.wav") as caught:
+        read_capture(folder)
+    assert "git lfs pull" in str(caught.value)
+
+
+@pytest.mark.parametrize(("rate", "speed"), [(99, 1.0), (192_001, 1.0), (8000, 30.0), (8000, 0.01)])
+def test_other_rates_are_refused(tmp_path: Path, rate: int, speed: float) -> None:
+    folder = fill(tmp_path, rate=rate)
+    with raises(CaptureError, file="a.wav", name="sample_rate", value=rate * speed):
+        read_capture(folder, CaptureSettings(playback_speed=speed))
+
+
+def test_channels_are_counted_from_one(tmp_path: Path) -> None:
+    both = stereo()
+    folder = fill(tmp_path, replace={"a.wav": both, "b.wav": both, "c.wav": both})
+    for channel in (1, 2):
+        sounds = read_capture(folder, CaptureSettings(response_channel=channel, align=False)).impacts.sounds
+        assert torch.equal(sounds[0], torch.from_numpy(both[:, channel - 1].astype(np.float32)))
+    with raises(CaptureError, file="a.wav", name="channel", value=3):
+        read_capture(folder, CaptureSettings(response_channel=3))
+
+
+def test_a_mono_sound_saved_as_stereo_needs_no_role(tmp_path: Path) -> None:
+    sound = ring()
+    folder = fill(tmp_path, replace={"b.wav": np.stack([sound, sound], axis=1)})
+    sounds = read_capture(folder, CaptureSettings(align=False)).impacts.sounds
+    assert torch.equal(sounds[1], torch.from_numpy(sound.astype(np.float32)))
+
+
+def test_eight_bits_are_read_with_a_warning(tmp_path: Path) -> None:
+    with warns(CaptureWarning, file=tmp_path, value=["a.wav", "b.wav", "c.wav"]):
+        impacts = read_capture(fill(tmp_path, subtype="PCM_U8"))
+    assert len(impacts.impacts) == 3
+    reports = check(tmp_path).recordings
+    assert [(report.coding, report.clipped, len(report.problems)) for report in reports] == [("PCM_U8", 0, 1)] * 3
+
+
+@pytest.mark.parametrize(
+    ("container", "subtype", "problems"),
+    [
+        ("WAV", "IMA_ADPCM", 1),
+        ("WAV", "MS_ADPCM", 1),
+        ("OGG", "VORBIS", 1),
+        ("MP3", "MPEG_LAYER_III", 1),
+        ("FLAC", "PCM_16", 0),
+        ("WAV", "PCM_24", 0),
+        ("CAF", "ALAC_16", 0),
+    ],
+)
+def test_compression_with_loss_is_reported(tmp_path: Path, container: str, subtype: str, problems: int) -> None:
+    fill(tmp_path)
+    soundfile.write(tmp_path / "b.wav", ring(), RATE, format=container, subtype=subtype)
+    report = check(tmp_path).recordings[1]
+    assert (report.coding, len(report.problems)) == (subtype, problems)
+
+
+def test_a_clipped_recording_is_read_with_a_warning(tmp_path: Path) -> None:
+    with warns(CaptureWarning, file=tmp_path, value=["b.wav"]):
+        read_capture(fill(tmp_path, replace={"b.wav": np.clip(8 * ring(), -1, 1)}))
+    report = check(tmp_path).recordings[1]
+    assert report.clipped > 3
+    assert len(report.problems) == 1
+
+
+def test_a_recording_of_noise_alone_is_warned_of(tmp_path: Path) -> None:
+    noise = 0.01 * np.random.default_rng(0).standard_normal(4000)
+    with warns(CaptureWarning, file=tmp_path, value=["b.wav"]):
+        read_capture(fill(tmp_path, replace={"b.wav": noise}), CaptureSettings(seconds=0.1))
+    noise_db = check(tmp_path).recordings[1].noise_db
+    assert noise_db is not None
+    assert -20 < noise_db < -10
+
+
+def test_a_recording_far_too_soft_is_warned_of(tmp_path: Path) -> None:
+    with warns(CaptureWarning, file=tmp_path, value=["b.wav"]):
+        read_capture(fill(tmp_path, subtype="PCM_16", replace={"b.wav": ring(noise=0) / 500}))
+    report = check(tmp_path).recordings[1]
+    assert report.peak_db is not None
+    assert -70 < report.peak_db < -60
+    assert len(report.problems) == 1
+
+
+@pytest.mark.parametrize("frequency", [20.0, 25.0, 33.0, 33.3, 50.0, 66.6])
+def test_a_slow_vibration_is_no_offset_and_hides_none(frequency: float) -> None:
+    time = np.arange(48_000) / 48_000
+    noise = 1e-4 * np.random.default_rng(0).standard_normal(48_000)
+    sound = np.exp(-time) * np.sin(2 * np.pi * frequency * time) + noise
+    assert constant_offset(sound, sample_rate=48_000) == 0.0
+    quiet = np.concatenate([noise, sound]) + 0.01
+    assert constant_offset(quiet, sample_rate=48_000) == pytest.approx(0.01, abs=1e-4)
+
+
+def test_flat_tops_count_and_smooth_ones_do_not() -> None:
+    time = np.arange(4000) / RATE
+    wave = np.sin(2 * np.pi * 440 * time) * np.exp(-3 * time)
+    clipped = np.clip(3 * wave, -1, 1)
+    assert clipped_samples(wave) == 0
+    assert clipped_samples(clipped) == np.sum(np.abs(clipped) == 1) > 1000
+    # Turned down after clipping, the tops of one or two samples are not told from chance, all others are.
+    assert 0.8 < clipped_samples(0.3 * clipped) / clipped_samples(clipped) <= 1
+    # A soft 20 Hz wave rounded to 16 bits has one flat top of many samples, and is not clipped.
+    slow = np.round(1000 * np.sin(2 * np.pi * 20 * time) * np.exp(-30 * time)) / 32768
+    assert clipped_samples(slow) == 0
+
+
+def test_read_sound_gives_samples_and_rate(tmp_path: Path) -> None:
+    both = stereo()
+    soundfile.write(tmp_path / "clip.wav", both, 44_100, subtype="FLOAT")
+    sound, rate = read_sound(tmp_path / "clip.wav", channel=2)
+    assert rate == 44_100
+    assert torch.equal(sound, torch.from_numpy(both[:, 1].astype(np.float32)))
+    with raises(CaptureError, file="clip.wav", name="response_channel", value=2):
+        read_sound(tmp_path / "clip.wav")
+    for channel in (0, 3):
+        with raises(CaptureError, file="clip.wav", name="channel", value=channel):
+            read_sound(tmp_path / "clip.wav", channel=channel)
+    soundfile.write(tmp_path / "silence.wav", np.zeros(100), 44_100)
+    with raises(CaptureError, file="silence.wav", value=0.0):
+        read_sound(tmp_path / "silence.wav")
+
+
+def test_integer_samples_become_fractions_of_full_scale(tmp_path: Path) -> None:
+    soundfile.write(tmp_path / "half.wav", np.array([0, 16384, -32768], dtype=np.int16), 48_000)
+    assert read_sound(tmp_path / "half.wav")[0].tolist() == [0, 0.5, -1]

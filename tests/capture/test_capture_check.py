@@ -1,0 +1,229 @@
+"""`check` goes on past every broken thing, measures what it can, and agrees with `read_capture` on what is readable."""
+
+import json
+import warnings
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from avmsf.capture import CaptureSettings, check, read_capture
+from avmsf.capture.measure import shared_problems
+from avmsf.capture.proposals import propose_settings
+from avmsf.errors import CaptureError
+from avmsf.modal.extraction.extract import extract_modes
+from factories.capture_folder import HEADER, RATE, ROWS, fill, ring
+from factories.raising import raises
+
+
+def test_a_good_folder_has_no_problem_and_true_figures(tmp_path: Path) -> None:
+    sound = ring(1.0, before=0.25, noise=1e-3)
+    folder = fill(tmp_path, replace={"a.wav": sound}, settings="seconds = 0.4")
+    report = check(folder)
+    assert report.readable
+    assert report.problems == ()
+    first = report.recordings[0]
+    assert (first.file, first.line, first.readable, first.problems) == ("a.wav", 2, True, ())
+    assert (first.seconds, first.sample_rate, first.channels, first.coding) == (1.0, RATE, 1, "FLOAT")
+    assert first.peak_db == pytest.approx(20 * np.log10(np.abs(sound).max()), abs=1e-3)
+    # The level of 1840 samples of noise is known to 20 / ln 10 / sqrt(2 x 1840) = .14 dB.
+    assert first.noise_db == pytest.approx(20 * np.log10(1e-3 / np.abs(sound).max()), abs=0.5)
+    # The fourth of a period of the lowest mode, 20 samples long.
+    assert first.onset_seconds == pytest.approx(0.25, abs=5 / RATE)
+    assert first.clipped == 0
+    assert first.double_hit_seconds is None
+
+
+def test_noise_is_found_in_the_quietest_part_where_nothing_comes_before(tmp_path: Path) -> None:
+    sound = ring(1.0, noise=1e-3)
+    noise = check(fill(tmp_path, replace={"a.wav": sound})).recordings[0].noise_db
+    # The quietest tenth of blocks of 80 samples lies 1.3 x 20 / ln 10 / sqrt(160) = .9 dB under the mean one.
+    assert noise == pytest.approx(20 * np.log10(1e-3 / np.abs(sound).max()) - 0.9, abs=1)
+
+
+def test_it_goes_on_past_everything_that_is_broken(tmp_path: Path) -> None:
+    rows = (*ROWS, "gone.wav,0,0,0.1", "d.wav,0,0,0.1", "e.wav,0,0,0.2", "f.wav,0,left,0.1", "g.wav,0,0,0.15")
+    clipped = np.clip(10 * ring(), -1, 1)
+    double = ring(1.0) + np.concatenate([np.zeros(3200), ring(0.6, seed=9)])
+    folder = fill(
+        tmp_path,
+        rows=rows,
+        replace={"b.wav": clipped, "c.wav": double, "d.wav": np.zeros(4000), "f.wav": ring(), "stray.wav": ring()},
+    )
+    (folder / "e.wav").write_bytes(b"RIFF")
+    soundfile.write(folder / "g.wav", ring(), 2 * RATE)
+    report = check(folder)
+    assert not report.readable
+    assert [row.line for row in report.recordings] == [2, 3, 4, 5, 6, 7, 8, 9]
+    assert [row.readable for row in report.recordings] == [True, True, True, False, False, False, False, True]
+    assert [len(row.problems) for row in report.recordings] == [0, 1, 1, 1, 1, 1, 1, 0]
+    problems = {row.file: "; ".join(row.problems) for row in report.recordings}
+    assert str(report.recordings[1].clipped) in problems["b.wav"]
+    assert "0.39" in problems["c.wav"]
+    assert "'left'" in problems["f.wav"]
+    assert report.recordings[2].double_hit_seconds == pytest.approx(0.4, abs=0.01)
+    rates, repeated, unlisted = report.problems
+    assert "8000 Hz" in rates
+    assert "5, 6" in repeated
+    assert "stray.wav" in unlisted
+    # What the command line prints as JSON.
+    assert json.loads(json.dumps(asdict(report), allow_nan=False))["recordings"][1]["clipped"] > 3
+
+
+def test_wav_files_in_hidden_folders_are_none_of_the_captures(tmp_path: Path) -> None:
+    folder = fill(tmp_path / ".work" / "cup")
+    for name in (".avmsf/removed/002-ac4f8f352f81.wav", "takes/.trash/001.wav", "._a.wav", "takes/1.wav", "more.wav"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        soundfile.write(folder / name, ring(), RATE)
+    (unlisted,) = check(folder).problems
+    assert "more.wav, takes/1.wav" in unlisted
+    assert "002-ac4f8f352f81.wav" not in unlisted
+
+
+BROKEN = [
+    {},
+    {"rows": ()},
+    {"rows": (*ROWS, "a.wav,0,0,0")},
+    {"rows": (*ROWS[:2], "c.wav,0,0.2,0")},
+    {"rows": (*ROWS[:2], "c.wav,0,0,300")},
+    {"rows": ROWS[:2], "header": "file,x,y"},
+    {"replace": {"b.wav": np.zeros(0)}},
+    {"replace": {"b.wav": np.stack([ring(), ring(seed=1)], axis=1)}},
+    {"replace": {"b.wav": ring(0.015)}},
+    {"replace": {"b.wav": np.clip(10 * ring(), -1, 1)}},
+    {"subtype": "PCM_U8"},
+    {"rate": 99},
+    {"settings": "second = 1"},
+    {"settings": "seconds = 0.001"},
+    {"settings": 'surface = "no.obj"'},
+    {"settings": 'normalize = "peak"'},
+    {"settings": "force_channel = 2"},
+]
+
+
+@pytest.mark.parametrize("case", BROKEN, ids=[str(number) for number in range(len(BROKEN))])
+def test_readable_means_that_it_can_be_read(tmp_path: Path, case: dict) -> None:
+    folder = fill(tmp_path, **case)
+    report = check(folder)
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            read_capture(folder)
+        readable = True
+    except CaptureError:
+        readable, caught = False, []
+    assert report.readable == readable
+    found = [*report.problems, *(problem for row in report.recordings for problem in row.problems)]
+    assert bool(found) == (not readable or bool(caught))
+
+
+def test_a_folder_of_wavs_alone_is_told_what_to_write(tmp_path: Path) -> None:
+    folder = fill(tmp_path)
+    (folder / "impacts.csv").unlink()
+    report = check(folder)
+    assert not report.readable
+    assert report.recordings == ()
+    assert HEADER in report.problems[0]
+
+
+def test_measured_strikes_pass(shared: Path) -> None:
+    captures = Path(__file__).resolve().parents[2] / "benchmarks/captures"
+    for name in ("aircraft", "aircraft_response"):
+        report = check(shared / name, CaptureSettings.read(captures / f"{name}.toml"))
+        assert report.readable
+        # Two files of this measurement are the same, at contacts 112 mm apart.
+        (problem,) = report.problems
+        assert problem.split(", to")[0].replace("impacts/", "") == "017.wav: the same sound as 016.wav"
+        assert len(report.recordings) == 74
+        assert [row.problems for row in report.recordings] == [()] * 74
+
+
+def test_a_missing_file_may_be_one_that_no_row_has(tmp_path: Path) -> None:
+    folder = fill(tmp_path, rows=("a.wav,0.1,0,0", "b.wav,0,0.2,0", "d.wav,0,0,0.3"))
+    with raises(CaptureError, file="d.wav", value="c.wav"):
+        read_capture(folder)
+    assert "c.wav" in check(folder).recordings[2].problems[0]
+    (folder / "c.wav").unlink()
+    with raises(CaptureError, file="d.wav", value=None):
+        read_capture(folder)
+    (problem,) = check(folder).recordings[2].problems
+    assert "a.wav" not in problem
+    assert "b.wav" not in problem
+
+
+def test_contacts_too_far_away_share_one_message(tmp_path: Path) -> None:
+    rows = (*ROWS[:1], "b.wav,0,200,0", "c.wav,0,0,-300")
+    reports = check(fill(tmp_path / "two", rows=rows)).recordings
+    assert [row.readable for row in reports] == [True, False, False]
+    assert reports[1].problems == reports[2].problems
+    assert "300" in reports[1].problems[0]
+    (line,) = shared_problems(reports)
+    assert line.startswith("2 recordings")
+
+
+@pytest.mark.parametrize("names", ["abc", "abcdef"])
+def test_recordings_in_a_subfolder_are_named(tmp_path: Path, names: str) -> None:
+    rows = [f"{name}.wav,0.1,0,0.{place}" for place, name in enumerate(names, start=1)]
+    sounds = {f"{name}.wav": ring() for name in names}
+    folder = fill(tmp_path / "bowl", rows=rows, replace=sounds)
+    (folder / "taps").mkdir()
+    for name in sounds:
+        (folder / name).rename(folder / "taps" / name)
+    report = check(folder)
+    assert not report.readable
+    messages = [*report.problems, *(problem for row in report.recordings for problem in row.problems)]
+    assert any("write taps/a.wav" in message for message in messages)
+    with raises(CaptureError, name="file", value=list(sounds)) as caught:
+        read_capture(folder)
+    assert "write taps/a.wav" in str(caught.value)
+    (folder / "impacts.csv").write_text("\n".join([HEADER, *(f"taps/{row}" for row in rows)]))
+    assert check(folder).readable
+
+
+def test_recordings_that_were_scaled_to_one_peak_are_named(tmp_path: Path) -> None:
+    rows = [f"{name}.wav,{row / 10},0,0" for row, name in enumerate("abcd")]
+    sounds = {row.partition(",")[0]: ring(seed=seed) * (1 + seed) for seed, row in enumerate(rows)}
+    assert check(fill(tmp_path / "as recorded", rows=rows, replace=sounds)).problems == ()
+    equal = {name: 0.9 * sound / np.abs(sound).max() for name, sound in sounds.items()}
+    (problem,) = check(fill(tmp_path / "scaled", rows=rows, replace=equal)).problems
+    assert "same peak, 0.9" in problem
+
+
+def test_a_copy_of_a_recording_is_named_with_its_source(tmp_path: Path) -> None:
+    (problem,) = check(fill(tmp_path, replace={"b.wav": ring(seed=2)})).problems
+    assert problem.startswith("c.wav: the same sound as b.wav")
+
+
+@pytest.mark.parametrize("offset", [0.01, -0.1, 4.0])
+def test_a_constant_offset_of_the_recorder_changes_nothing(tmp_path: Path, offset: float) -> None:
+    rows = [f"{name}.wav,{row / 10},0,0" for row, name in enumerate("abcdef")]
+    sounds = {row.partition(",")[0]: ring(before=0.1, seed=seed) for seed, row in enumerate(rows)}
+    clean = read_capture(fill(tmp_path / "clean", rows=rows, replace=sounds)).impacts
+    moved = {name: sound + offset for name, sound in sounds.items()}
+    read = read_capture(fill(tmp_path / "moved", rows=rows, replace=moved)).impacts
+    # The offset is estimated from the quietest 40 ms or more, whose noise is 1e-4, and samples are float32.
+    np.testing.assert_allclose(read.sounds, clean.sounds, atol=2e-5)
+
+
+def test_sway_and_rumble_are_proposed_to_be_filtered_whatever_their_onset(tmp_path: Path) -> None:
+    rows = [f"{name}.wav,{row / 10},0,0" for row, name in enumerate("abcd")]
+    rate = 16_000
+    time = np.arange(rate) / rate
+    sway = 0.4 * np.sin(2 * np.pi * 8 * time + 1)
+    sounds = {
+        row.partition(",")[0]: ring(1.0, rate=rate, before=0.3, seed=seed) + sway for seed, row in enumerate(rows)
+    }
+    proposed = {each.key: each.value for each in propose_settings(fill(tmp_path, rows=rows, replace=sounds, rate=rate))}
+    assert proposed == {"highpass": 20.0}
+    assert extract_modes(read_capture(tmp_path).impacts) is not None
+
+
+def test_rows_in_the_order_of_text_and_not_of_numbers_are_remarked_on(tmp_path: Path) -> None:
+    names = [f"{number}.wav" for number in range(1, 11)]
+    sounds = {name: ring(1.0, before=0.25, seed=row) for row, name in enumerate(names)}
+    for way, remarked in ((sorted(names), True), (names, False), (names[::-1], False)):
+        rows = tuple(f"{name},{row / 100},0,0" for row, name in enumerate(way))
+        report = check(fill(tmp_path / f"{way[1]}{way[2]}", rows=rows, replace=sounds))
+        assert any("order of text" in each for each in report.remarks) is remarked

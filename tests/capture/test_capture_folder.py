@@ -1,0 +1,197 @@
+"""A capture as a whole: what its sounds have in common, and that written folders read back bit for bit."""
+
+import os
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture, write_capture
+from avmsf.errors import CaptureError, CaptureWarning
+from avmsf.mesh import Surface, read_surface
+from factories.capture_folder import fill, ring
+from factories.raising import raises, warns
+
+
+def invented(*, names: tuple[str, ...] = ("takes/one.wav", "two.wav"), sample_rate: float = 48_000.0) -> Capture:
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.randn(2, 3, generator=generator)
+    contacts = torch.randn(2, 3, dtype=torch.float64, generator=generator) / 7
+    impacts = Impacts(
+        contacts=contacts,
+        sounds=torch.from_numpy(np.stack([ring(1.0, seed=1), ring(1.0, seed=2)]).astype(np.float32)),
+        sample_rate=sample_rate,
+        names=names,
+        directions=directions / directions.norm(dim=1, keepdim=True),
+        forces=torch.rand(2, generator=generator) + 1,
+    )
+    # Its corners are the contacts and others, so that the contacts lie on it.
+    corners = torch.cat([contacts.float(), torch.randn(4, 3, generator=generator) / 5])
+    surface = Surface(corners, torch.tensor([[0, 1, 2], [3, 4, 5]]))
+    return Capture('a "cup" \\ für Tee', impacts, surface)
+
+
+def assert_same(first: Capture, second: Capture) -> None:
+    assert first.name == second.name
+    assert first.impacts.names == second.impacts.names
+    assert first.impacts.sample_rate == second.impacts.sample_rate
+    for name in ("contacts", "sounds", "directions", "forces"):
+        one, other = getattr(first.impacts, name), getattr(second.impacts, name)
+        assert (one is None) == (other is None), name
+        assert one is None or torch.equal(one, other), name
+    assert (first.surface is None) == (second.surface is None)
+    if first.surface is not None and second.surface is not None:
+        assert torch.equal(first.surface.vertices, second.surface.vertices)
+        assert torch.equal(first.surface.faces, second.surface.faces)
+
+
+def test_seconds_count_as_recorded_and_speed_only_raises_the_rate(tmp_path: Path) -> None:
+    folder = fill(tmp_path)
+    plain = read_capture(folder, CaptureSettings(seconds=0.25)).impacts
+    fast = read_capture(folder, CaptureSettings(seconds=0.25, playback_speed=2.5)).impacts
+    assert plain.sounds.shape == (3, 2000)
+    assert torch.equal(plain.sounds, fast.sounds)
+    assert (plain.sample_rate, fast.sample_rate) == (8000, 20_000)
+    assert (plain.duration, fast.duration) == (0.25, 0.1)
+
+
+def test_settings_given_replace_those_of_the_folder(tmp_path: Path) -> None:
+    folder = fill(tmp_path, settings='seconds = 0.1\nname = "cup"')
+    assert read_capture(folder).impacts.sounds.shape[1] == 800
+    capture = read_capture(folder, CaptureSettings(seconds=0.2))
+    assert capture.impacts.sounds.shape[1] == 1600
+    assert capture.name == tmp_path.name
+
+
+def test_one_short_recording_cuts_the_others_with_a_warning(tmp_path: Path) -> None:
+    folder = fill(tmp_path, replace={"b.wav": ring(0.2)})
+    with warns(CaptureWarning, file="b.wav", value=pytest.approx(0.2, abs=0.01)):
+        # The first samples lie before the onset.
+        assert 1590 <= read_capture(folder).impacts.sounds.shape[1] <= 1600
+
+
+def test_recordings_all_shorter_than_asked_are_kept_whole_in_silence(tmp_path: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # The first samples lie before the onset.
+        assert 3990 <= read_capture(fill(tmp_path)).impacts.sounds.shape[1] <= 4000
+
+
+def test_asking_for_less_than_modes_need_is_refused(tmp_path: Path) -> None:
+    with raises(CaptureError, name="seconds", value=0.01):
+        read_capture(fill(tmp_path), CaptureSettings(seconds=0.01))
+
+
+@pytest.mark.parametrize("sample_rate", [48_000.0, 44_100.0, 512 * 1.3, 8000 / 3, 100.01, 7839.059834067738])
+def test_a_written_capture_reads_back_bit_for_bit(tmp_path: Path, sample_rate: float) -> None:
+    capture = invented(sample_rate=sample_rate)
+    write_capture(capture, tmp_path / "new/cup")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert_same(read_capture(tmp_path / "new/cup"), capture)
+
+
+def test_a_read_capture_writes_and_reads_back_bit_for_bit(tmp_path: Path) -> None:
+    rows = ("a.wav,0.1,0.7,0,1,2,3,5.3", "b.wav,0,0.2,0,-1,0.1,0,0.7", "c.wav,1e-3,0,0.3,0,1,0,1.1")
+    folder = fill(tmp_path / "old", header="file,x,y,z,nx,ny,nz,force_newtons", rows=rows)
+    capture = read_capture(folder)
+    write_capture(capture, tmp_path / "again")
+    assert_same(read_capture(tmp_path / "again"), replace(capture))
+
+
+def test_a_capture_without_anything_optional_reads_back(tmp_path: Path) -> None:
+    full = invented()
+    cloud = Surface(torch.randn(5, 3), torch.zeros(0, 3, dtype=torch.int64))
+    for number, surface in enumerate((None, cloud)):
+        capture = Capture("bare", replace(full.impacts, directions=None, forces=None), surface)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # these few random points make no shape about the contacts
+            write_capture(capture, tmp_path / str(number))
+            assert_same(read_capture(tmp_path / str(number)), capture)
+
+
+@pytest.mark.parametrize("names", [("strike 1", "strike 2"), ("../a.wav", "b.wav"), ("a.wav", "A.WAV"), ("a.wav", " ")])
+def test_names_that_cannot_be_files_become_numbers(tmp_path: Path, names: tuple[str, ...]) -> None:
+    write_capture(invented(names=names), tmp_path / "cup")
+    assert read_capture(tmp_path / "cup").impacts.names == ("001.wav", "002.wav")
+    assert sorted(os.listdir(tmp_path)) == ["cup"]
+
+
+def test_writing_never_overwrites(tmp_path: Path) -> None:
+    (tmp_path / "cup").mkdir()
+    write_capture(invented(), tmp_path / "cup")
+    before = sorted(path.name for path in (tmp_path / "cup").iterdir())
+    with raises(CaptureError, file="cup"):
+        write_capture(invented(), tmp_path / "cup")
+    assert sorted(path.name for path in (tmp_path / "cup").iterdir()) == before
+
+
+def test_a_failed_write_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full_disk(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("avmsf.capture.folder.write_surface", full_disk)
+    with raises(CaptureError, file="cup") as caught:
+        write_capture(invented(), tmp_path / "cup")
+    assert isinstance(caught.value.__cause__, OSError)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["obj", "ply", "glb", "stl"])
+def test_the_usual_surfaces_are_found_and_read(tmp_path: Path, kind: str) -> None:
+    folder = fill(tmp_path)
+    trimesh.creation.box((0.2, 0.4, 0.6)).export(folder / f"surface.{kind}")
+    surface = read_capture(folder).surface
+    assert surface is not None
+    assert surface.faces.shape == (12, 3)
+    assert surface.vertices.amax(0).tolist() == pytest.approx([0.1, 0.2, 0.3], rel=1e-6)
+
+
+def test_a_scene_keeps_each_part_where_it_lies(tmp_path: Path) -> None:
+    scene = trimesh.Scene()
+    for place in (0.0, 2.0):
+        scene.add_geometry(trimesh.creation.box(), transform=trimesh.transformations.translation_matrix([place, 0, 0]))
+    scene.export(tmp_path / "two.glb")
+    surface = read_surface(tmp_path / "two.glb", meters=0.1)
+    assert surface.faces.shape == (24, 3)
+    assert surface.faces.max() == len(surface.vertices) - 1
+    assert [surface.vertices[:, 0].min(), surface.vertices[:, 0].max()] == pytest.approx([-0.05, 0.25], rel=1e-6)
+
+
+def test_bad_surfaces_are_named(tmp_path: Path) -> None:
+    folder = fill(tmp_path)
+    with raises(CaptureError, file="shell.obj"):
+        read_capture(folder, CaptureSettings(surface="shell.obj"))
+    with raises(CaptureError, file=folder, name="surface", value="../shell.obj"):
+        read_capture(folder, CaptureSettings(surface="../shell.obj"))
+    (folder / "surface.ply").write_bytes(b"ply\nnonsense")
+    with raises(CaptureError, file="surface.ply"):
+        read_capture(folder)
+
+
+def test_playback_speed_and_rate_make_the_aircraft_a_small_thing(shared: Path) -> None:
+    settings = CaptureSettings(force_channel=1, response_channel=2, playback_speed=93.75, seconds=4.0)
+    impacts = read_capture(shared / "aircraft", settings).impacts
+    assert impacts.sample_rate == 48_000
+    assert impacts.sounds.shape == (74, 2048)
+    assert impacts.directions is not None
+    assert impacts.forces is not None
+    # The recordings' README: the hammer's channel is in newtons, 15.2 N the first.
+    assert impacts.forces[0].item() == pytest.approx(15.2, abs=0.05)
+    assert impacts.sounds.dtype == torch.float32
+
+
+def test_errors_name_the_folder_and_its_file(tmp_path: Path) -> None:
+    with raises(CaptureError, file=tmp_path / "no") as nothing:
+        Capture.read(tmp_path / "no")
+    assert str(nothing.value).count(";") == 1
+    folder = tmp_path / "bowl"
+    folder.mkdir()
+    (folder / "impacts.csv").write_text("file,x,y,z\n001.wav,left,0,0\n")
+    with raises(CaptureError, file=folder / "impacts.csv", row=2, name="x", value="left") as cell:
+        Capture.read(folder)
+    assert str(cell.value).startswith(str(folder / "impacts.csv"))

@@ -1,0 +1,266 @@
+"""Contacts on and off a surface, and mistakes that the test makes and that must be named."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from avmsf.capture import CaptureSettings
+from avmsf.capture.placement import FACTORS, Mistake, contacted_part, judge_placement, surface_points
+from avmsf.capture.table import read_rows, understand
+from avmsf.errors import CaptureError
+from avmsf.mesh import Surface, read_surface
+from factories.raising import raises
+
+Y_UP = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
+"""Takes (x, y, z) of a file with y upwards to one with z upwards."""
+
+
+PARTS = (((0.3, 0.04, 0.1), (0.1, 0, 0)), ((0.05, 0.2, 0.06), (0.2, 0.1, 0)), ((0.04, 0.06, 0.2), (0, 0, 0.1)))
+"""Sizes and places of three boxes."""
+
+
+def object_points(count: int, *, seed: int) -> torch.Tensor:
+    """Points on a thing without symmetry, 0.43 m across, off the origin."""
+    boxes = [trimesh.creation.box(size, trimesh.transformations.translation_matrix(place)) for size, place in PARTS]
+    mesh = trimesh.util.concatenate(boxes)
+    return torch.from_numpy(np.array(trimesh.sample.sample_surface(mesh, count, seed=seed)[0]))
+
+
+CLOUD = object_points(6000, seed=0)
+CONTACTS = object_points(20, seed=1)
+
+
+def test_contacts_on_the_surface_pass() -> None:
+    placement = judge_placement(CONTACTS, CLOUD)
+    assert placement.on_surface
+    assert placement.describe() == ""
+    assert placement.mistake is None
+    # Points of a cloud of 6000 on .15 m^2 lie 5 mm apart.
+    assert float(placement.distances.max()) < 0.01
+
+
+def test_distances_are_meters_to_the_nearest_point() -> None:
+    cloud = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 2]])
+    placement = judge_placement(torch.tensor([[1.0, 0.3, 0.4], [0, 2, 0.25]]), cloud)
+    assert placement.distances.tolist() == pytest.approx([0.5, 0.25])
+    assert placement.diagonal == pytest.approx(3)
+
+
+@pytest.mark.parametrize(
+    ("size", "name"),
+    [(1e-3, "is their unit mm?"), (1e-2, "is their unit cm?"), (0.0254, "is their unit inches?"), (0.3048, "feet?")],
+)
+def test_contacts_in_another_unit_are_told(size: float, name: str) -> None:
+    placement = judge_placement(CONTACTS / size, CLOUD)
+    assert placement.mistake is not None
+    assert placement.mistake.factor == pytest.approx(size)
+    assert placement.mistake.unit_only
+    assert name in placement.describe()
+    assert "divided by" in placement.describe()
+    assert torch.allclose(placement.mistake.undo(CONTACTS / size), CONTACTS)
+
+
+# Contacts on a surface three times too large look like contacts on a part of it.
+@pytest.mark.parametrize("factor", [factor for factor in FACTORS if factor < 1 or factor > 9])
+def test_every_ratio_of_units_is_found_whichever_of_the_two_it_befell(factor: float) -> None:
+    placement = judge_placement(CONTACTS, CLOUD * factor)
+    assert placement.mistake is not None
+    assert placement.mistake.factor == pytest.approx(factor)
+    assert placement.mistake.unit_only
+
+
+def test_a_surface_in_millimeters_is_told_even_if_all_contacts_lie_near_one_of_its_corners() -> None:
+    cloud = 1000 * (CLOUD - CLOUD[0])
+    placement = judge_placement(CONTACTS - CLOUD[0], cloud)
+    assert not placement.off
+    assert not placement.on_surface
+    assert "multiplied by 1000" in placement.describe()
+    assert "is the surface's unit mm?" in placement.describe()
+
+
+def test_y_up_for_z_up_is_told_either_way() -> None:
+    for axes, written in ((Y_UP, "(x, -z, y)"), (Y_UP.T, "(x, z, -y)")):
+        placement = judge_placement(CONTACTS @ axes, CLOUD)
+        assert placement.mistake is not None
+        assert torch.equal(placement.mistake.axes, axes)
+        assert written in placement.describe()
+        assert "mirrored" not in placement.describe()
+
+
+@pytest.mark.slow
+def test_other_names_of_the_axes_are_undone() -> None:
+    missed = []
+    # Two of the eight signs for each order: a turn and a mirror.
+    for number, order in enumerate(((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))):
+        for code in (1 << number % 3, 7 ^ 1 << number % 3):
+            signs = torch.tensor([1.0 - 2 * (code >> axis & 1) for axis in range(3)], dtype=torch.float64)
+            axes = torch.diag(signs) @ torch.eye(3, dtype=torch.float64)[list(order)]
+            placement = judge_placement(CONTACTS @ axes, CLOUD)
+            if placement.mistake is None:
+                missed += [] if placement.on_surface else [(order, code)]
+            else:
+                assert torch.equal(placement.mistake.axes, axes)
+                assert ("mirrored" in placement.describe()) == (float(torch.linalg.det(axes)) < 0)
+    assert missed == []
+
+
+def test_another_origin_is_found_to_the_spacing_of_the_points() -> None:
+    shift = torch.tensor([0.7, -0.2, 0.4], dtype=torch.float64)
+    placement = judge_placement(CONTACTS - shift, CLOUD)
+    assert placement.mistake is not None
+    assert torch.equal(placement.mistake.axes, torch.eye(3, dtype=torch.float64))
+    assert placement.mistake.factor == 1
+    assert float((placement.mistake.shift - shift).norm()) < 0.005
+    assert "moved by" in placement.describe()
+
+
+def test_unit_axes_and_origin_together() -> None:
+    shift = torch.tensor([0.5, 0.1, -0.3], dtype=torch.float64)
+    placement = judge_placement(1000 * (CONTACTS - shift) @ Y_UP, CLOUD)
+    assert placement.mistake is not None
+    assert placement.mistake.factor == pytest.approx(1e-3)
+    assert torch.equal(placement.mistake.axes, Y_UP)
+    assert float((placement.mistake.undo(1000 * (CONTACTS - shift) @ Y_UP) - CONTACTS).norm(dim=1).max()) < 0.005
+
+
+MOVES = {
+    "upside down": ((1.0, -1.0, -1.0), 1.0, 0.0, True),
+    "mirrored": ((-1.0, 1.0, 1.0), 1.0, 0.0, True),
+    "displaced by 4 %": ((1.0, 1.0, 1.0), 1.0, 0.04, False),
+    "12 % too large": ((1.0, 1.0, 1.0), 1.12, 0.0, False),
+    "7.3 times too large": ((1.0, 1.0, 1.0), 7.3, 0.0, True),
+}
+"""Signs, scale and shift over the size of what befell a mesh, and whether no shape can be used as it lies."""
+
+
+@pytest.mark.parametrize(("signs", "scale", "shift", "misplaced"), MOVES.values(), ids=MOVES)
+def test_the_similarity_that_befell_a_mesh_is_named_and_no_row(
+    signs: tuple[float, ...], scale: float, shift: float, misplaced: bool
+) -> None:
+    moved = scale * CLOUD * torch.tensor(signs) + shift * torch.tensor([0.43, 0, 0], dtype=torch.float64)
+    placement = judge_placement(CONTACTS, moved)
+    assert placement.mistake is not None
+    assert placement.mistake.factor == pytest.approx(scale, rel=0.02)
+    assert placement.mistake.axes.diag().tolist() == list(signs)
+    meant = scale * CONTACTS * torch.tensor(signs) + shift * torch.tensor([0.43, 0, 0], dtype=torch.float64)
+    assert float((placement.mistake.undo(CONTACTS) - meant).norm(dim=1).mean()) < 0.01 * scale
+    assert placement.misplaced == misplaced
+    assert "row" not in placement.describe()
+
+
+def test_contacts_that_are_measured_coarsely_are_no_mistake_of_all() -> None:
+    noise = torch.randn(20, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    for part in (0.005, 0.01, 0.02):
+        assert judge_placement(CONTACTS + part * 0.43 * noise, CLOUD).mistake is None
+
+
+def test_one_wrong_row_is_no_mistake_of_all() -> None:
+    contacts = CONTACTS.clone()
+    contacts[7] = contacts[7] + torch.tensor([0.0, 1.0, 0.0])
+    placement = judge_placement(contacts, CLOUD)
+    assert placement.mistake is None
+    assert placement.off == (7,)
+    assert placement.off == (7,)
+    assert "1 of 20 contacts" in placement.describe()
+    assert placement.describe().endswith("check row 7")
+    names = [f"impact {row + 2}" for row in range(20)]
+    assert placement.describe(names).endswith("check impact 9")
+
+
+@pytest.mark.slow
+def test_contacts_of_another_object_are_not_explained() -> None:
+    generator = torch.Generator().manual_seed(0)
+    explained = 0
+    for _ in range(10):
+        contacts = 0.3 * torch.randn(12, 3, dtype=torch.float64, generator=generator)
+        placement = judge_placement(contacts, CLOUD)
+        assert not placement.on_surface
+        explained += placement.mistake is not None
+        assert (placement.mistake is None) == ("align_similarity" in placement.describe())
+    # 48 axes, 13 units and a shift explain a few random contacts now and then.
+    assert explained <= 1
+
+
+def test_sparse_points_widen_the_tolerance() -> None:
+    corners = torch.tensor(trimesh.creation.box((0.2, 0.2, 0.2)).vertices)
+    assert judge_placement(torch.tensor([[0.1, 0.02, 0.0], [0.0, 0.1, 0.0]]), corners).on_surface
+
+
+def test_a_surface_is_covered_by_points_always_the_same() -> None:
+    box = trimesh.creation.box((0.2, 0.2, 0.2))
+    surface = Surface(torch.tensor(box.vertices).float(), torch.tensor(box.faces))
+    points = surface_points(surface)
+    assert torch.equal(points, surface_points(surface))
+    assert bool(((points.abs().amax(dim=1) - 0.1).abs() < 1e-7).all())
+    # 20,000 points on .24 m^2 lie 3.5 mm apart.
+    assert judge_placement(torch.tensor([[0.1, 0.013, -0.052], [0.03, -0.1, 0.02]]), points).distances.max() < 0.01
+
+
+def test_nothing_to_judge_is_refused() -> None:
+    with raises(CaptureError, name="contacts", value=0):
+        judge_placement(torch.zeros(0, 3), CLOUD)
+    with raises(CaptureError, name="contacts", value=2):
+        judge_placement(torch.full((2, 3), torch.nan), CLOUD)
+    with raises(CaptureError, name="points", value=0.0):
+        judge_placement(CONTACTS, torch.ones(5, 3))
+
+
+def test_the_aircrafts_contacts_lie_on_it_and_its_mistakes_are_named(shared: Path) -> None:
+    strikes = [understand(row, CaptureSettings()) for row in read_rows(shared / "aircraft")[0]]
+    contacts = torch.tensor([strike.contact for strike in strikes], dtype=torch.float64)
+    points = surface_points(read_surface(shared / "aircraft/surface.obj"))
+    placement = judge_placement(contacts, points)
+    assert placement.on_surface
+    assert float(placement.distances.max()) < 0.01
+    assert "is their unit mm?" in judge_placement(1000 * contacts, points).describe()
+    assert "(x, -z, y)" in judge_placement(contacts @ Y_UP, points).describe()
+
+
+def test_first_impacts_near_the_middle_of_a_plate_are_no_other_unit() -> None:
+    plate = surface_points(
+        Surface(
+            torch.tensor([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]]),
+            torch.tensor([[0, 1, 2], [0, 2, 3]]),
+        )
+    )
+    first = torch.tensor([[0.02, 0.0, 0.0], [-0.02, 0.01, 0.0]])
+    assert not judge_placement(first, plate).other_unit
+    patch = 0.1 * (torch.rand(8, 3, generator=torch.Generator().manual_seed(0)) - 0.5) * torch.tensor([1.0, 1.0, 0.0])
+    assert not judge_placement(patch, plate).other_unit
+    assert judge_placement(0.01 * patch, plate).other_unit
+    assert judge_placement(1000 * patch, plate).other_unit
+
+
+def test_of_a_scan_with_its_table_the_part_that_the_contacts_lie_on_is_kept() -> None:
+    cup, table = trimesh.creation.icosphere(3, radius=0.05), trimesh.creation.box((0.5, 0.5, 0.02))
+    table.apply_translation((0, 0, -0.07))
+    both = trimesh.util.concatenate([table, cup])
+    scan = Surface(torch.tensor(both.vertices).float(), torch.tensor(both.faces))
+    contacts = torch.from_numpy(np.array(trimesh.sample.sample_surface(cup, 12, seed=0)[0]))
+    kept, areas = contacted_part(scan, contacts)
+    assert len(kept.faces) == len(cup.faces)
+    assert areas == pytest.approx([cup.area, table.area])
+    on_both = torch.cat([contacts, torch.tensor([[0.2, 0.2, -0.06], [-0.2, 0.2, -0.06]])])
+    assert contacted_part(scan, on_both)[1] == []
+    on_table = contacts * torch.tensor([3.0, 3.0, 0.0]) + torch.tensor([0.0, 0.0, -0.06])
+    assert contacted_part(scan, on_table)[1] == []
+
+
+def test_what_a_file_states_goes_before_what_is_fitted_and_an_arbitrary_frame_is_called_one() -> None:
+    turn = torch.from_numpy(Rotation.from_euler("zyx", [28, 15, -40], degrees=True).as_matrix())
+    shift = torch.tensor([0.3, 0.1, -0.2], dtype=torch.float64)
+    moved = 2.9 * CLOUD @ turn.T + shift
+    stated = Mistake(2.9, turn, shift, stated="transforms.json (applied_scale = 2.9)")
+    for contacts in (CONTACTS, CONTACTS + 0.004 * torch.randn(CONTACTS.shape, dtype=torch.float64)):
+        placement = judge_placement(contacts, moved, stated=[stated])
+        assert placement.misplaced
+        assert "once moved as transforms.json (applied_scale = 2.9)" in placement.describe()
+    placement = judge_placement(CONTACTS, moved)
+    assert placement.misplaced
+    assert "different frames" in placement.describe(what="Gaussians")
+    # What is stated of contacts that lie where they should is not believed.
+    assert judge_placement(CONTACTS, CLOUD, stated=[stated]).on_surface

@@ -1,0 +1,258 @@
+"""`avmsf evaluate`: from a folder of captures to tables, and what can be got wrong on the way."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from avmsf.cli.evaluate import run
+from avmsf.cli.options.evaluate import deciding, parse
+from avmsf.errors import AvmsfError, EvaluationError, FitError
+from avmsf.evaluation.field_methods import FieldMethod
+from avmsf.evaluation.object_bodies import ObjectBodies
+from avmsf.evaluation.plan import Evaluation
+from avmsf.evaluation.results import ResultsFolder
+from avmsf.evaluation.task import Task
+from avmsf.modal.extraction.finders import ShortTime
+from avmsf.simulate.sim20 import ABLATED
+from factories.plate_set import fill_plates
+from factories.raising import raises
+
+Streams = pytest.CaptureFixture[str]
+CHEAP = ("--methods", "knn3,nearest", "white-noise", "--no-cdpam")
+
+
+@pytest.fixture(scope="module")
+def plates(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return fill_plates(tmp_path_factory.mktemp("place") / "plates", ("a", "b"))
+
+
+def test_a_dataset_becomes_tables_and_a_page(plates: Path, tmp_path: Path, capsys: Streams) -> None:
+    words = [str(plates), *CHEAP, "--output", str(tmp_path / "results")]
+    assert run(parse(["farthest", *words, "--json"])) == 0
+    out, err = capsys.readouterr()
+    printed = json.loads(out)
+    kept = json.loads((tmp_path / "results" / "summary.json").read_text())
+    assert {key: printed[key] for key in kept} == kept
+    assert list(kept["methods"]) == ["knn3", "nearest", "white-noise"]
+    assert set(kept["methods"]["knn3"]) == {"l1", "l1_log", "envelope", "relative_stft"}
+    assert kept["ratio_to_knn3"]["knn3"]["l1"] == 1.0
+    assert (kept["dataset"], kept["objects"], kept["test_contacts"]) == ("plates", 2, 16)
+    assert "b: done (2 of 2, " in err
+    assert "L1-log" in err
+    assert err.splitlines()[-1].startswith("next: avmsf evaluate ")
+    assert "# farthest on plates" in (tmp_path / "results" / "report.md").read_text()
+    before = (tmp_path / "results" / "objects" / "a.json").read_bytes()
+    assert run(parse(["farthest", *words])) == 0
+    assert (tmp_path / "results" / "objects" / "a.json").read_bytes() == before
+    with raises(AvmsfError, file=tmp_path / "results", name="protocol", value="farthest"):
+        run(parse(["closest", *words]))
+
+
+def test_one_capture_and_one_object_will_do(plates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(parse(["shots", str(plates / "a"), *CHEAP])) == 0
+    summary = json.loads((tmp_path / "evaluation" / "a" / "shots" / "summary.json").read_text())
+    assert list(summary["cases"]) == ["8 shots", "4 shots", "2 shots", "1 shot"]
+    assert run(parse(["farthest", str(plates), "--objects", "b", *CHEAP])) == 0
+    summary = json.loads((tmp_path / "evaluation" / "plates" / "farthest" / "summary.json").read_text())
+    assert summary["objects"] == 1
+
+
+def test_changed_options_are_named_as_they_are_typed(plates: Path, tmp_path: Path) -> None:
+    words = ["farthest", str(plates), *CHEAP, "--objects", "a", "--output", str(tmp_path / "results")]
+    assert run(parse([*words, "--cdpam-contacts", "3", "--body.wall", "0.002"])) == 0
+    for changed, key, ours, theirs in (
+        (["--body.wall", "0.002"], "metrics", "--cdpam-contacts 8", "--cdpam-contacts 3"),
+        (["--cdpam-contacts", "3"], "settings", "without --body.wall", "--body.wall 0.002"),
+        (
+            ["--cdpam-contacts", "3", "--body.wall", "0.002", "--lift.no-positions"],
+            "settings",
+            "--lift.no-p",
+            "--lift.p",
+        ),
+    ):
+        with raises(EvaluationError, file=tmp_path / "results", name=key) as caught:
+            run(parse([*words, *changed]))
+        wanted, _, found = str(caught.value).partition(", got ")
+        assert ours in wanted
+        assert theirs in found
+        assert not set("({=") & set(str(caught.value).removeprefix(str(tmp_path)))
+    # Neither is a result of other methods, objects or workers another one.
+    assert run(parse([*words, "--cdpam-contacts", "3", "--body.wall", "0.002", "--objects", "b"])) == 0
+
+
+def test_options_are_spelled_so_that_they_are_read_again(plates: Path) -> None:
+    words = "--counts 3 6 --body.wall 0 --no-cdpam --lift.no-symmetry --splat.background 0 .5 1 --time-zero peak"
+    options = parse(["learning-curve", str(plates), *words.split()])
+    spelled = deciding(options)
+    again = parse(["learning-curve", str(plates), *" ".join(spelled.values()).split()])
+    assert again == options
+    assert spelled["--body.wall"] == "--body.wall 0"
+    assert "--time-zero" not in deciding(parse(["farthest", str(plates)]))
+
+
+WRONG = {
+    "farhest plates": ("protocol", "farhest"),
+    "farthest plates --methods knn3,fild": ("method", "fild"),
+    "farthest plates --objects c": ("object", "c"),
+    "predefined plates": ("--test", None),
+    "farthest plates --workers 0": ("workers", 0),
+    "farthest plates --cdpam-contacts -1": ("cdpam_contacts", -1),
+    "non-symmetric plates": ("subset", "non-symmetric"),
+}
+
+
+@pytest.mark.parametrize("protocol", ["shots", "learning-curve"])
+def test_files_are_of_one_set_of_training_recordings(protocol: str, plates: Path, tmp_path: Path) -> None:
+    method = f"recorded:{plates}"
+    options = parse([protocol, str(plates), "--methods", f"knn3,{method}", "--output", str(tmp_path / "results")])
+    with raises(EvaluationError, name="method", value=method):
+        options.check_inputs()
+    parse(["closest", str(plates), "--methods", method]).check_inputs()
+
+
+def test_what_is_taken_without_being_asked_for_is_printed(
+    tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*given: object, **settings: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("avmsf.cli.evaluate.run_objects", stop)
+    chosen, others = ABLATED[:2], ("spare", "extra")
+    plates = fill_plates(tmp_path / "plates", (*chosen, *others), count=2, truth=True)
+    words = ["closest", str(plates), "--no-cdpam", "--methods", f"recorded:{plates}", "--quiet"]
+    words += ["--output", str(tmp_path / "results")]
+    assert run(parse([*words, "--time-zero", "peak"])) == 130
+    objects, start = [line for line in capsys.readouterr().err.splitlines() if line.startswith("note:")]
+    assert all(name in objects for name in (*chosen, "--objects"))
+    assert not any(name in objects for name in others)
+    assert f"recorded:{plates}" in start
+    assert run(parse([*words, "--objects", others[0]])) == 130
+    assert "note:" not in capsys.readouterr().err
+
+
+def test_options_of_another_protocol_are_noted(
+    plates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Streams
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["farthest", str(plates), *CHEAP, "--objects", "a", "--output", "results"]
+    assert run(parse([*words, "--starts", "2", "--test", "001.wav"])) == 0
+    notes = [line for line in capsys.readouterr().err.splitlines() if line.startswith("note")]
+    assert [[name for name in ("--test", "--starts", "--counts") if name in note] for note in notes] == [
+        ["--test"],
+        ["--starts"],
+    ]
+
+
+@pytest.mark.parametrize("words", WRONG)
+def test_what_is_wrong_is_said_before_anything_is_written(
+    words: str, plates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(plates.parent)
+    before = sorted(path.name for path in plates.parent.iterdir())
+    name, value = WRONG[words]
+    with raises(AvmsfError, name=name, value=value):
+        options = parse(words.split())
+        options.check_inputs()
+        run(options)
+    with raises(AvmsfError, file="nowhere"):
+        run(parse(["farthest", "nowhere"]))
+    assert sorted(path.name for path in plates.parent.iterdir()) == before
+
+
+@pytest.mark.parametrize("device", ["nothing", "meta"])
+def test_a_device_that_no_field_trains_on_is_refused_before_anything(device: str, plates: Path, tmp_path: Path) -> None:
+    with raises(EvaluationError, name="device", value=device):
+        run(parse(["farthest", str(plates), *CHEAP, "--device", device, "--output", str(tmp_path / "results")]))
+    assert not (tmp_path / "results").exists()
+
+
+def test_methods_train_on_the_device_that_is_asked_for(
+    plates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def stop(*given: object, device: str, **settings: object) -> None:
+        asked.append(device)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("avmsf.evaluation.field_methods.fit", stop)
+    words = ["farthest", str(plates), "--methods", "field-auto", "--no-cdpam", "--device", "cpu"]
+    assert run(parse([*words, "--output", str(tmp_path / "results")])) == 130
+    assert asked == ["cpu"]
+
+
+def test_all_methods_hear_the_start_of_sounds_and_share_the_modes_that_are_asked_for(
+    tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plates, results = fill_plates(tmp_path / "plates", ("a",), truth=True), tmp_path / "results"
+    words = ["farthest", str(plates), "--methods", "knn-gains,paper", "--no-cdpam", "--extraction", "short-time"]
+    words += ["--lift.encoder", "descriptors", "--output", str(results)]
+    heard = []
+
+    def stop(field: FieldMethod, task: Task) -> None:
+        heard.append(task.train.sounds)
+        raise FitError("left out")
+
+    monkeypatch.setattr(FieldMethod, "fit", stop)
+    assert run(parse([*words, "--time-zero", "peak"])) == 0
+    assert "--time-zero" not in capsys.readouterr().err
+    assert bool((heard[0][:, 0].abs() == heard[0].abs().amax(1)).all())
+    # What peaks do to phases, no truth tells.
+    summary = json.loads((results / "summary.json").read_text())
+    assert "relative_stft" in summary["methods"]["knn-gains"]
+    assert "gain_error" not in summary["methods"]["knn-gains"]
+    assert ResultsFolder(results).identity()["modes"] == {"kind": "ShortTime", **asdict(ShortTime(128))}
+    with raises(EvaluationError, name="time_zero", value="peak"):
+        run(parse(words))
+    assert run(parse([*words[:-1], str(tmp_path / "others"), "--time-zero", "onset"])) == 0
+    assert "--time-zero peak" in capsys.readouterr().err
+    summary = json.loads((tmp_path / "others" / "summary.json").read_text())
+    assert "gain_error" in summary["methods"]["knn-gains"]
+
+
+def test_no_figure_at_all_is_an_error(plates: Path, tmp_path: Path) -> None:
+    with raises(AvmsfError, file=tmp_path / "r", name="failures", value=2):
+        run(parse(["farthest", str(plates), "--methods", "field", "--no-cdpam", "--output", str(tmp_path / "r")]))
+
+
+def test_ctrl_c_keeps_what_is_there(
+    plates: Path, tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from avmsf.evaluation.simple_methods import NearestRecording
+
+    def stop(self: NearestRecording, contacts: object, **how: object) -> None:
+        raise KeyboardInterrupt
+
+    words = ["farthest", str(plates), *CHEAP, "--output", str(tmp_path / "results")]
+    with monkeypatch.context() as patched:
+        patched.setattr(NearestRecording, "render", stop)
+        assert run(parse(words)) == 130
+    assert capsys.readouterr().err.splitlines()[-1].startswith("avmsf evaluate: interrupted")
+    kept = json.loads((tmp_path / "results" / "objects" / "a.json").read_text())
+    assert [each["method"] for each in kept["outcomes"]] == ["knn3"]
+    summary = json.loads((tmp_path / "results" / "summary.json").read_text())
+    assert list(summary["methods"]) == ["knn3"]
+    assert summary["missing"] == {"a": ["nearest", "white-noise"], "b": ["knn3", "nearest", "white-noise"]}
+    assert "a (nearest, white-noise), b." in (tmp_path / "results" / "report.md").read_text().splitlines()[2]
+    assert run(parse(words)) == 0
+    assert json.loads((tmp_path / "results" / "summary.json").read_text())["missing"] == {}
+
+
+def test_a_known_wall_is_handed_on(plates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Evaluation] = []
+
+    def stop(evaluation: Evaluation, *objects: object, **settings: object) -> None:
+        asked.append(evaluation)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("avmsf.cli.evaluate.run_objects", stop)
+    words = ["farthest", str(plates), *CHEAP, "--output", str(tmp_path / "results"), "--body.wall", "0"]
+    assert run(parse([*words, "--geometry", "noisy"])) == 130
+    bodies = asked[0].bodies
+    assert isinstance(bodies, ObjectBodies)
+    assert (bodies.config.wall, bodies.geometry) == (0.0, "noisy")
+    # Figures of another wall are not these.
+    assert asked[0].settings["body"]["wall"] == 0.0

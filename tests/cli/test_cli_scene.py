@@ -1,0 +1,251 @@
+"""From pictures, a mesh or Gaussians to a field on the command line: what is made, kept, made anew and refused."""
+
+import json
+import re
+import shutil
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+
+from avmsf.cli import info_clouds as infoclouds
+from avmsf.cli import main
+from avmsf.cli.info import describe
+from avmsf.cli.scene_bar import SceneBar
+from avmsf.features.store import load_features, read_report
+from avmsf.field.store import load
+from avmsf.gaussians.fit import SplatProgress
+from avmsf.gaussians.ply import read_splats
+from avmsf.mesh import Surface
+from avmsf.mesh.surface import write_surface
+from avmsf.photographs.write import write_views
+from avmsf.plotting.clouds import save_turntable
+from factories.plate_capture import PLATE, TINY, fill_plate
+from factories.small_scene import SMALL_SPLAT, THICKNESS, slab_views, write_surface_file
+
+Streams = pytest.CaptureFixture[str]
+LIFT = ("--lift.encoder", "descriptors", "--lift.points", "600")
+RENDERED = ("--views.rendered", "48", "--views.count", "18")
+MODES = ("--modes", "12")
+FIT = tuple(f"--fit.{word[2:]}" if word.startswith("--") else word for word in TINY[: -len(MODES)])
+SMALL = (*SMALL_SPLAT, *LIFT, *FIT, *MODES, "--gain-model", "network")
+
+
+def photograph(folder: Path) -> Path:
+    """Put the slab's pictures into a folder, which may hold recordings."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_views(slab_views(), folder / "pictures")
+    for part in sorted((folder / "pictures").iterdir()):
+        part.rename(folder / part.name)
+    (folder / "pictures").rmdir()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return photograph(fill_plate(tmp_path_factory.mktemp("captures") / "slab", surface=False))
+
+
+@pytest.fixture(scope="module")
+def kept(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The capture's cache after a first reconstruction."""
+    cache = tmp_path_factory.mktemp("cache") / "kept"
+    assert main(["reconstruct", str(capture), "--cache", str(cache), *SMALL]) == 0
+    return cache
+
+
+def counts(messages: str) -> list[tuple[str, str, str, str]]:
+    """Return the number, total, name and mark of each stage that was counted."""
+    return re.findall(r"^(\d+) of (\d+): (\w+)( \(cached\))?$", messages, re.MULTILINE)
+
+
+def made_now(streams: Streams) -> dict[str, bool]:
+    values = json.loads(streams.readouterr().out)
+    return {each["stage"]: each["fresh"] for each in values["stages"]}
+
+
+def test_pictures_and_blows_become_a_field_on_gaussians(kept: Path) -> None:
+    cloud, features = read_splats(kept / "cloud.ply"), load_features(kept / "features.safetensors")
+    # All but the Gaussians that no view sees.
+    assert {*map(tuple, features.points.tolist())} <= {*map(tuple, cloud.centers.tolist())}
+    assert len(cloud) == len(features.points) + read_report(kept / "features.safetensors")["dropped"]
+    field = load(kept / "field.safetensors")
+    assert torch.equal(field.gain_field.points, features.points)
+    assert field.gain_field.encoder == features.encoder
+    assert "descriptors" in features.encoder
+    assert "dino" not in features.encoder
+    made = describe(field)["pipeline"]
+    assert (made["extraction"], made["gain_model"]) == ("high-resolution", "network")
+    assert made["encoder"] in features.encoder
+    assert (made["scene"]["splat"]["steps"], made["scene"]["lift"]["encoder"]) == (60, "descriptors")
+    assert made["fit"] == asdict(field.origin.config)
+    # The slab's box, widened by the reach of Gaussians that its pictures of 48 pixels leave unsure: a pixel is 9 mm.
+    a, b, c = (cloud.centers.amax(0) - cloud.centers.amin(0)).tolist()
+    assert (a, b) == (pytest.approx(0.24, abs=0.02), pytest.approx(0.17, abs=0.02))
+    assert c == pytest.approx(THICKNESS, abs=0.02)
+
+
+def test_the_same_command_makes_nothing_anew_and_another_setting_only_what_follows_it(
+    capture: Path, kept: Path, tmp_path: Path, capsys: Streams
+) -> None:
+    cache = tmp_path / "cache"
+    shutil.copytree(kept, cache)
+    words = ["reconstruct", str(capture), "--cache", str(cache), *SMALL, "--json"]
+    assert main(words) == 0
+    kept_all = dict.fromkeys(("views", "cloud", "features", "modes", "fit"), False)
+    assert made_now(capsys) == kept_all
+    assert main([*words, "--fit.seed", "5"]) == 0
+    found, messages = capsys.readouterr()
+    assert {each["stage"]: each["fresh"] for each in json.loads(found)["stages"]} == kept_all | {"fit": True}
+    cached = [(str(row), "5", name, " (cached)") for row, name in enumerate(("views", "cloud", "features", "modes"), 1)]
+    assert counts(messages) == [*cached, ("5", "5", "field", "")]
+    assert main([*words, "--lift.components", "4"]) == 0
+    assert made_now(capsys) == kept_all | {"features": True, "fit": True}
+
+
+@pytest.mark.slow
+def test_a_changed_picture_makes_everything_anew(capture: Path, kept: Path, tmp_path: Path, capsys: Streams) -> None:
+    cache, changed = tmp_path / "cache", tmp_path / "slab"
+    shutil.copytree(kept, cache)
+    shutil.copytree(capture, changed)
+    pictures = sorted((changed / "images").iterdir())
+    # One picture in another's place: names stay, contents do not.
+    first, second = pictures[0].read_bytes(), pictures[1].read_bytes()
+    pictures[0].write_bytes(second)
+    pictures[1].write_bytes(first)
+    assert (
+        main(["features", str(changed), "--cache", str(cache), *SMALL_SPLAT, "--encoder", "descriptors", "--json"]) == 0
+    )
+    capsys.readouterr()
+    assert (cache / "views" / "images" / pictures[0].name).read_bytes() != (
+        kept / "views" / "images" / pictures[0].name
+    ).read_bytes()
+    assert (cache / "cloud.ply").read_bytes() != (kept / "cloud.ply").read_bytes()
+
+
+def test_an_interrupted_splatting_goes_on_to_the_same_gaussians(
+    capture: Path, kept: Path, tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache = tmp_path / "cache"
+    show = SceneBar.splatting
+    seen: list[int] = []
+
+    def interrupt(self: SceneBar, progress: SplatProgress) -> None:
+        seen.append(progress.step)
+        if len(seen) == 3:
+            raise KeyboardInterrupt
+        show(self, progress)
+
+    monkeypatch.setattr(SceneBar, "splatting", interrupt)
+    words = ["splat", str(capture), "--cache", str(cache), "--output", str(tmp_path / "cloud.ply")]
+    words += [word.replace("--splat.", "--") for word in SMALL_SPLAT]
+    assert main(words) == 130
+    assert "avmsf splat: interrupted" in capsys.readouterr().err
+    assert not (tmp_path / "cloud.ply").exists()
+    del seen[:]
+    seen += [0, 0, 0]
+    assert main(words) == 0
+    assert seen[3] > 30
+    assert (tmp_path / "cloud.ply").read_bytes() == (kept / "cloud.ply").read_bytes()
+    assert sorted(each.name for each in cache.iterdir() if "checkpoint" in each.name) == []
+
+
+@pytest.mark.slow
+def test_a_mesh_is_the_object_itself(tmp_path: Path, capsys: Streams) -> None:
+    folder = tmp_path / "slab"
+    folder.mkdir()
+    write_surface_file(folder)
+    output = tmp_path / "features.safetensors"
+    words = ["features", str(folder), "--encoder", "descriptors", "--points", "700", *RENDERED]
+    assert main([*words, "--output", str(output)]) == 0
+    capsys.readouterr()
+    features, report = load_features(output), read_report(output)
+    assert len(features.points) == 700
+    assert report["encoder"] == "descriptors"
+    assert not (folder / ".avmsf" / "cloud.ply").exists()
+    # Every point lies on one of the box's sides, to the rounding of float32.
+    corner = torch.tensor([PLATE.length, PLATE.width, 0.0])
+    low = corner.new_tensor([0.0, 0.0, -THICKNESS])
+    sides = torch.cat([(features.points - low).abs(), (features.points - corner).abs()], dim=1)
+    assert float(sides.amin(1).max()) < 1e-6
+
+
+@pytest.mark.slow
+def test_gaussians_made_elsewhere_are_looked_at_from_all_sides(kept: Path, tmp_path: Path, capsys: Streams) -> None:
+    folder = tmp_path / "slab"
+    folder.mkdir()
+    shutil.copy(kept / "cloud.ply", folder / "splats.ply")
+    assert main(["features", str(folder), "--encoder", "descriptors", *RENDERED]) == 0
+    out, _ = capsys.readouterr()
+    assert "features: descriptors" in out
+    features = load_features(folder / ".avmsf" / "features.safetensors")
+    # A reader in meters changes nothing: the same Gaussians, written once more.
+    assert torch.equal(features.points, read_splats(kept / "cloud.ply").centers)
+
+
+def test_features_serve_the_fit_of_another_command(kept: Path, capture: Path, tmp_path: Path, capsys: Streams) -> None:
+    output = tmp_path / "field.safetensors"
+    words = ["fit", str(capture), "--features", str(kept / "features.safetensors"), "--output", str(output), *TINY]
+    assert main(words) == 0
+    capsys.readouterr()
+    assert torch.equal(load(output).gain_field.points, load(kept / "field.safetensors").gain_field.points)
+
+
+def test_clouds_and_features_are_drawn(
+    kept: Path, tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(infoclouds, "save_turntable", partial(save_turntable, frames=3))
+    assert main(["info", str(kept / "cloud.ply"), "--plots", str(tmp_path / "a")]) == 0
+    words = ["info", str(kept / "features.safetensors"), "--cloud", str(kept / "cloud.ply"), "--regions", "8"]
+    assert main([*words, "--plots", str(tmp_path / "b")]) == 0
+    out, _ = capsys.readouterr()
+    assert "features: descriptors" in out
+    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["cloud.png", "turntable.gif"]
+    assert sorted(path.name for path in (tmp_path / "b").iterdir()) == ["features.png", "turntable.gif"]
+
+
+def test_two_photographs_are_too_few(capture: Path, tmp_path: Path, capsys: Streams) -> None:
+    folder = tmp_path / "slab"
+    shutil.copytree(capture / "images", folder / "images")
+    for extra in sorted((folder / "images").iterdir())[2:]:
+        extra.unlink()
+    assert main(["features", str(folder), "--encoder", "descriptors"]) == 2
+    assert "expected 3 photographs or more, got 2" in capsys.readouterr().err
+
+
+def test_a_surface_of_points_is_the_object_without_any_look(tmp_path: Path, capsys: Streams) -> None:
+    folder = fill_plate(tmp_path / "plate", surface=False)
+    places = torch.rand(500, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([PLATE.length, PLATE.width])
+    write_surface(
+        Surface(torch.cat([places, torch.zeros(500, 1)], dim=1), torch.zeros(0, 3, dtype=torch.int64)),
+        folder / "surface.ply",
+    )
+    assert main(["reconstruct", str(folder), *FIT, *MODES]) == 0
+    assert counts(capsys.readouterr().err) == [("1", "2", "modes", ""), ("2", "2", "field", "")]
+    assert len(load(folder / ".avmsf" / "field.safetensors").gain_field.points) == 500
+
+
+def test_a_folder_without_any_look_is_refused_by_lift_and_fitted_in_a_box_by_reconstruct(
+    tmp_path: Path, capsys: Streams
+) -> None:
+    folder = fill_plate(tmp_path / "plate", surface=False)
+    assert main(["features", str(folder), "--encoder", "descriptors"]) == 2
+    assert "expected photographs" in capsys.readouterr().err
+    assert main(["reconstruct", str(folder), *FIT, *MODES]) == 0
+    assert "bounding box" in capsys.readouterr().err
+
+
+def test_contacts_on_another_scale_than_the_photographs_are_refused_with_the_scale(
+    capture: Path, kept: Path, tmp_path: Path, capsys: Streams
+) -> None:
+    folder = tmp_path / "slab"
+    shutil.copytree(capture, folder)
+    table = (folder / "impacts.csv").read_text().splitlines()
+    rows = [line.split(",") for line in table[1:]]
+    scaled = [",".join([row[0], *(f"{10 * float(value):.9g}" for value in row[1:4]), *row[4:]]) for row in rows]
+    (folder / "impacts.csv").write_text("\n".join([table[0], *scaled, ""]))
+    assert main(["reconstruct", str(folder), "--cache", str(kept), *SMALL]) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert "multiplied by 0.1" in error

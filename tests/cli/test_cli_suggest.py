@@ -1,0 +1,90 @@
+"""`avmsf suggest`: from a field file to a table, a list and a picture."""
+
+import csv
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from avmsf.cli import suggest as command
+from avmsf.cli.options.checks import OutputError
+from avmsf.cli.options.suggest import parse
+from avmsf.cli.suggest import run
+from avmsf.errors import FitError
+from avmsf.field.store import save
+from factories.believing_field import bar_contacts, drawn_gains, elastic_field, positional_field, sound_field
+from factories.raising import raises
+
+Streams = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    contacts = bar_contacts(6)
+    path = tmp_path_factory.mktemp("fields") / "bar.safetensors"
+    save(sound_field(elastic_field(contacts, drawn_gains(contacts, seed=1))), path)
+    return path
+
+
+def test_the_list_to_walk_by_is_what_is_printed(field: Path, tmp_path: Path, capsys: Streams) -> None:
+    assert run(parse([str(field), "--count", "3", "--output", str(tmp_path / "next"), "--json"])) == 0
+    out, err = capsys.readouterr()
+    printed = json.loads(out)
+    assert "uncertainty of the gains" in err
+    with open(tmp_path / "next" / "suggested.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["order"] for row in rows] == ["1", "2", "3"]
+    for row, known in zip(rows, printed["suggestions"], strict=True):
+        for name in ("x", "y", "z", "nx", "ny", "nz", "error_after"):
+            assert float(row[name]) == pytest.approx(known[name], rel=1e-5, abs=1e-9)
+    errors = [printed["error_before"], *(each["error_after"] for each in printed["suggestions"])]
+    assert errors == sorted(errors, reverse=True)
+    assert (tmp_path / "next" / "suggested.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(("value", "words"), [(-1e-9, "0.0000"), (-0.0, "0.0000"), (-0.00006, "-0.0001"), (3, "3")])
+def test_nothing_that_is_printed_is_minus_nought(value: float, words: str) -> None:
+    assert command._cell(value) == words
+
+
+def test_directions_that_candidates_bring_are_not_said_to_go_straight_in(
+    field: Path, tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    contacts = bar_contacts(12)[6:].float()
+    slanted = torch.tensor([[0.6, 0.0, -0.8]])
+    for directions, straight in ((None, True), (slanted.expand(6, 3), False)):
+        impacts = SimpleNamespace(contacts=contacts, directions=directions, names=tuple("abcdef"))
+        monkeypatch.setattr(command, "read_capture", lambda *_, made=impacts: SimpleNamespace(impacts=made))
+        assert run(parse([str(field), "--count", "2", "--candidates", str(tmp_path)])) == 0
+        out, _ = capsys.readouterr()
+        assert "nx, ny, nz" in out
+        assert ("perpendicular" in out) == straight
+        assert ("0.6000" in out) != straight
+
+
+def test_gains_without_directions_say_none(tmp_path: Path, capsys: Streams) -> None:
+    contacts = bar_contacts(6)
+    path = tmp_path / "bar.safetensors"
+    save(sound_field(positional_field(contacts, drawn_gains(contacts, seed=1))), path)
+    assert run(parse([str(path), "--count", "1"])) == 0
+    out, _ = capsys.readouterr()
+    assert "after" in out.splitlines()[3]
+    assert "nx" not in out
+    assert not list(tmp_path.glob("*.png"))
+
+
+def test_what_cannot_be_done_is_said_before_any_work(field: Path, tmp_path: Path) -> None:
+    with raises(FitError, name="count", value=0):
+        run(parse([str(field), "--count", "0"]))
+    settings = tmp_path / "capture.toml"
+    settings.write_text("")
+    with raises(FitError, name="--settings"):
+        parse([str(field), "--settings", str(settings)]).check_inputs()
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    with raises(OutputError, file=blocked, value="file"):
+        parse([str(field), "--output", str(blocked)]).check_inputs()
+    with raises(FitError, name="--unseen"):
+        parse([str(field), "--unseen", "--candidates", str(tmp_path)]).check_inputs()

@@ -1,0 +1,244 @@
+"""ObjectFolder Real as published: whatever force and gain, the same object sounds the same; and its quirks."""
+
+import json
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+
+from avmsf.capture import Capture
+from avmsf.datasets import ObjectFolderRaw
+from avmsf.datasets.annotations import Gains, read_gains, read_newtons
+from avmsf.datasets.contact_lists import read_contacts
+from avmsf.errors import CaptureWarning, DatasetError
+from factories.dataset_folders import (
+    AUDIO_CONTACTS,
+    RATE,
+    place,
+    records,
+    transfer,
+    write_mesh,
+    write_raw,
+    write_strike,
+)
+from factories.raising import raises
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a raw tree of two objects with contacts and a mesh; nobody changes it."""
+    home = write_raw(tmp_path_factory.mktemp("raw") / "of", {"10": ("0", "1"), "2": AUDIO_CONTACTS})
+    write_mesh(home / "mesh_16k" / "2" / "model.obj")
+    return home
+
+
+def read_silently(dataset: ObjectFolderRaw, identifier: str) -> tuple[Capture, str]:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", CaptureWarning)
+        capture = dataset.capture(identifier)
+    return capture, " ".join(str(each.message) for each in caught)
+
+
+def test_force_gain_and_pad_are_divided_out(folder: Path) -> None:
+    capture, remarks = read_silently(ObjectFolderRaw(folder), "2")
+    impacts = capture.impacts
+    assert remarks == ""
+    assert (impacts.sample_rate, impacts.duration) == (RATE, 3.0)
+    assert impacts.names == ("0.wav", "1.wav", "2.wav", "10.wav")
+    assert impacts.forces is not None
+    assert impacts.forces.tolist() == [2, 3, 4, 5]
+    truth = np.stack([transfer(int(name)) for name in AUDIO_CONTACTS])
+    # The force rises through a tenth of its peak on its first sample, so sample zero is the blow's; what is left is the
+    # rounding to 16 bits, at most half a step over the factor that was divided out.
+    factors = np.array([2 * 10 ** (-2 / 20), 3 * 10 ** (-8 / 20), 4 * 10 ** (6 / 20), 5 * 10 ** (-8 / 20)])
+    error = np.abs(impacts.sounds.numpy() - truth[:, : 3 * RATE]).max(axis=1)
+    assert (error * factors < 1.01 * (0.5 + 1) / 32767).all()
+    assert np.allclose(impacts.contacts, [place("2", name) for name in AUDIO_CONTACTS], rtol=0, atol=0)
+
+
+def test_the_mesh_is_surface_and_look(folder: Path) -> None:
+    dataset = ObjectFolderRaw(folder)
+    look = dataset.look("2")
+    assert look is not None
+    assert (look.folder / (look.settings.surface or "")).name == "model.obj"
+    surface = dataset.capture("2").surface
+    assert surface is not None
+    assert torch.allclose(surface.vertices.norm(dim=1), torch.tensor(0.1), atol=1e-6)
+    assert dataset.look("10") is None
+    assert dataset.capture("10").surface is None
+
+
+def test_objects_and_contacts_come_in_numeric_order(folder: Path) -> None:
+    assert ObjectFolderRaw(folder).objects() == ("2", "10")
+
+
+def test_the_deprecated_contact_is_passed_over(tmp_path: Path) -> None:
+    write_raw(tmp_path, {"24": ("12", "13")})
+    write_strike(tmp_path / "24" / "audio" / "13_deprecated", seed=99)
+    dataset = ObjectFolderRaw(tmp_path)
+    assert dataset.capture("24").impacts.names == ("12.wav", "13.wav")
+    assert dataset.check().objects[0].problems == ()
+
+
+def test_a_missing_note_of_the_gain_is_told_and_the_usual_gain_taken(tmp_path: Path) -> None:
+    for contact in ("34", "35", "36"):
+        write_strike(tmp_path / "92" / "audio" / contact, gain=24.0, seed=35)
+    write_raw(tmp_path / "more", {"92": ()})
+    (tmp_path / "92" / "audio" / "35" / "metadata.yaml").unlink()
+    dataset = ObjectFolderRaw(tmp_path, contacts=lists(tmp_path, "92", ("34", "35", "36")))
+    capture, remarks = read_silently(dataset, "92")
+    assert "metadata.yaml is missing for contact 35" in remarks
+    assert "24 dB less 20 dB by the pad" in remarks
+    assert torch.equal(capture.impacts.sounds[0], capture.impacts.sounds[1])
+    (report,) = dataset.check().objects
+    assert (report.recordings, len(report.problems)) == (3, 1)
+
+
+def lists(folder: Path, identifier: str, names: tuple[str, ...], *, lines: bool = True) -> Path:
+    path = folder / "objectfolder_real_train.json"
+    rows = records(identifier, names)
+    path.write_text("\n".join(map(json.dumps, rows)) if lines else json.dumps(rows))
+    return path
+
+
+@pytest.mark.parametrize("lines", [True, False])
+def test_lists_of_contacts_serve_as_arrays_do(folder: Path, tmp_path: Path, lines: bool) -> None:
+    path = lists(tmp_path, "2", AUDIO_CONTACTS, lines=lines)
+    listed = ObjectFolderRaw(folder, contacts=path)
+    for contact in AUDIO_CONTACTS:
+        assert np.array_equal(read_contacts(path).place("2", contact), place("2", contact))
+    assert listed.check().objects[0].recordings == 4
+    assert "contact 0 in objectfolder_real_train.json" in listed.check().objects[1].problems[0]
+
+
+def test_contacts_beside_the_folder_are_found(tmp_path: Path) -> None:
+    write_raw(tmp_path / "audio_tree", {"3": ("1", "2")}, contacts=False)
+    lists(tmp_path, "3", ("1", "2"))
+    assert (
+        ObjectFolderRaw(tmp_path / "audio_tree").capture("3").impacts.contacts[0].tolist() == place("3", "1").tolist()
+    )
+
+
+@pytest.mark.parametrize(
+    ("record", "row", "name", "value"),
+    [
+        ({"location": "x/5.wav", "contact": [0, 0, 0]}, 1, "location", "x/5.wav"),
+        ({"location": "3_5_3sec.wav", "contact": [0, 0]}, 1, "contact", [0, 0]),
+        ({"location": "3_5_3sec.wav", "contact": [0, 0, "1"]}, 1, "contact", [0, 0, "1"]),
+        ([1, 2], 0, "location", None),
+    ],
+)
+def test_lists_that_cannot_be_meant_are_refused(
+    tmp_path: Path, record: object, row: int, name: str, value: object
+) -> None:
+    (tmp_path / "list.json").write_text(json.dumps(record) if isinstance(record, dict) else f"\n{json.dumps([record])}")
+    with raises(DatasetError, file="list.json", row=row, name=name, value=value):
+        read_contacts(tmp_path / "list.json")
+
+
+def test_one_contact_in_two_places_is_refused(tmp_path: Path) -> None:
+    first, second = records("3", ("5", "6"))
+    (tmp_path / "list.json").write_text(json.dumps([first, {**second, "location": first["location"]}]))
+    with raises(DatasetError, file="list.json", row=1, name="5", value=tuple(second["contact"])):
+        read_contacts(tmp_path / "list.json")
+
+
+def test_both_ways_to_write_the_notes(tmp_path: Path) -> None:
+    (tmp_path / "block.yaml").write_bytes(b"gain:\r\n- 12\r\n- 18\r\npad:\r\n- 1\r\n- 0\r\n")
+    (tmp_path / "flow.yaml").write_bytes(b"gain: [12, 18]\r\npad: [1, 0]\r\n")
+    for name in ("block.yaml", "flow.yaml"):
+        assert read_gains(tmp_path / name) == Gains((12.0, 18.0), (True, False))
+    assert read_gains(tmp_path / "flow.yaml").microphone_db == 18.0
+    for text in (b"- striking_force_newtons: 41.5\r\n", b"[{striking_force_newtons: 4.15e1}]"):
+        (tmp_path / "force.yaml").write_bytes(text)
+        assert read_newtons(tmp_path / "force.yaml") == 41.5
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "value"),
+    [
+        ("gain: [12]\npad: [1, 1]", "gain", "gain: [12]\npad: [1, 1]"),
+        ("gain:\n- 12\n- 18\n- 3\npad: [1, 1]", "gain", "gain:\n- 12\n- 18\n- 3\npad: [1, 1]"),
+        ("gain: [12, 18]", "pad", "gain: [12, 18]"),
+        ("gain: [12, 18]\npad: [0.5, 1]", "pad", (0.5, 1.0)),
+    ],
+)
+def test_notes_that_cannot_be_meant_are_refused(tmp_path: Path, text: str, name: str, value: object) -> None:
+    (tmp_path / "metadata.yaml").write_text(f"{text}\n")
+    with raises(DatasetError, file="metadata.yaml", name=name, value=value):
+        read_gains(tmp_path / "metadata.yaml")
+
+
+def test_a_real_note_reads(shared: Path) -> None:
+    assert read_gains(shared / "bowl_clips" / "metadata.yaml") == Gains((12.0, 18.0), (True, True))
+
+
+def test_what_cannot_be_used_is_left_out_and_named(tmp_path: Path) -> None:
+    write_raw(tmp_path, {"7": ("0", "1", "2", "3", "4", "5", "6", "7", "8", "9")})
+    audio = tmp_path / "7" / "audio"
+    (audio / "1" / "Force.wav").unlink()
+    (audio / "2" / "striking_force.yaml").unlink()
+    (audio / "3" / "striking_force.yaml").write_text("- striking_force_newtons: 0\n")
+    (tmp_path / "contacts" / "7" / "4.npy").unlink()
+    np.save(tmp_path / "contacts" / "7" / "5.npy", np.zeros(3, dtype=np.float32))
+    samples = soundfile.read(audio / "6" / "mic.wav", dtype="int16")[0]
+    soundfile.write(audio / "6" / "mic.wav", samples, 44_100, subtype="PCM_16")
+    soundfile.write(audio / "7" / "mic.wav", samples[:200_000], RATE, subtype="PCM_16")
+    dataset = ObjectFolderRaw(tmp_path)
+    (report,) = dataset.check().objects
+    assert report.recordings == 3
+    expected = (
+        ("7/audio/1/Force.wav", "got none"),
+        ("7/audio/2/striking_force.yaml", "got none"),
+        ("7/audio/3/striking_force.yaml", "got 0"),
+        ("contacts/7/4.npy", "got none"),
+        ("contacts/7/5.npy", "got float32 (3,)"),
+        ("7/audio/6/mic.wav", "got 44100"),
+        ("7/audio/7/mic.wav", "got 200000"),
+    )
+    for (file, found), problem in zip(expected, report.problems, strict=True):
+        assert file in problem
+        assert found in problem
+    capture, remarks = read_silently(dataset, "7")
+    assert capture.impacts.names == ("0.wav", "8.wav", "9.wav")
+    assert expected[0][0] in remarks
+    assert "and 2 more" in remarks
+
+
+def test_a_silent_force_is_found_on_reading(tmp_path: Path) -> None:
+    write_raw(tmp_path, {"41": ("0", "1", "2")})
+    soundfile.write(tmp_path / "41/audio/1/Force.wav", np.zeros(288_000, dtype=np.int16), RATE, subtype="PCM_16")
+    capture, remarks = read_silently(ObjectFolderRaw(tmp_path), "41")
+    assert capture.impacts.names == ("0.wav", "2.wav")
+    assert "left out: 41/audio/1/mic.wav" in remarks
+
+
+def test_without_contacts_check_says_where_to_get_them(tmp_path: Path) -> None:
+    dataset = ObjectFolderRaw(write_raw(tmp_path / "of", {"7": ("0", "1")}, contacts=False))
+    report = dataset.check()
+    assert report.objects[0].recordings == 0
+    assert report.missing[0].startswith("contact coordinates, which the audio archives do not hold: put contacts/")
+    with raises(DatasetError, name="ObjectFolder Real, object 7", value=0):
+        dataset.capture("7")
+
+
+def test_check_names_archives_and_shared_objects(folder: Path) -> None:
+    report = ObjectFolderRaw(folder).check()
+    assert [part.split(":")[0] for part in report.missing][:2] == ["objects 11 to 20", "objects 21 to 30"]
+    assert "audio/audio_data_11_20.tar.gz" in report.missing[0]
+    assert any("1 objects have numbers of RealImpact" in each and ": 10;" in each for each in report.remarks)
+
+
+def test_check_reads_no_sound(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(soundfile.SoundFile, "read", None)
+    assert [each.recordings for each in ObjectFolderRaw(folder).check().objects] == [4, 2]
+
+
+@pytest.mark.parametrize(("asked", "meant"), [("3", "2 or 10"), ("2_Bowl", "2")])
+def test_an_unknown_object_lists_near_ones(folder: Path, asked: str, meant: str) -> None:
+    with raises(DatasetError, name="object", value=asked) as caught:
+        ObjectFolderRaw(folder).capture(asked)
+    assert f" {meant}?" in str(caught.value)

@@ -1,0 +1,199 @@
+"""Which dataset a folder holds, captures read as one, and what is said to who names the wrong folder."""
+
+from pathlib import Path
+
+import pytest
+import soundfile
+
+from avmsf.capture import read_capture
+from avmsf.cli import dataset as verb
+from avmsf.cli.options import dataset as options
+from avmsf.datasets import CaptureCollection, Dataset, ObjectFolderRaw, RealImpact, open_dataset
+from avmsf.errors import DatasetError
+from factories.capture_folder import fill
+from factories.dataset_folders import write_mesh, write_raw, write_realimpact
+from factories.raising import raises
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with one dataset of each kind; nobody changes it."""
+    home = tmp_path_factory.mktemp("place")
+    write_raw(home / "raw/of", {"2": ("0", "1")})
+    write_realimpact(home / "impact/RI", "22_Cup")
+    fill(home / "own/captures/bowl")
+    fill(home / "own/captures/10_plate")
+    fill(home / "own/captures/2_cup")
+    fill(home / "own/captures/.hidden")
+    (home / "own/captures/notes").mkdir()
+    (home / "own/captures/.avmsf").mkdir()
+    return home
+
+
+@pytest.mark.parametrize(
+    ("path", "kind", "objects"),
+    [
+        ("raw/of", ObjectFolderRaw, ("2",)),
+        ("impact/RI", RealImpact, ("22_Cup",)),
+        ("own/captures", CaptureCollection, ("2_cup", "10_plate", "bowl")),
+        ("own/captures/bowl", CaptureCollection, ("bowl",)),
+    ],
+)
+def test_each_kind_is_recognized(place: Path, path: str, kind: type[Dataset], objects: tuple[str, ...]) -> None:
+    dataset = open_dataset(place / path)
+    assert isinstance(dataset, kind)
+    assert dataset.objects() == objects
+    assert [report.facts for report in dataset.check().objects] == [dataset.facts(name) for name in objects]
+
+
+@pytest.mark.parametrize("path", ["raw/of", "impact/RI", "own/captures"])
+def test_sounds_of_every_dataset_start_where_they_are_asked_to(place: Path, path: str) -> None:
+    own, peak = (open_dataset(place / path, time_zero=each) for each in (None, "peak"))
+    name = own.objects()[0]
+    usual, sounds = (dataset.capture(name).impacts.sounds for dataset in (own, peak))
+    assert bool((sounds[:, 0].abs() == sounds.abs().amax(1)).all())
+    assert not bool((usual[:, 0].abs() == usual.abs().amax(1)).any())
+    assert (
+        open_dataset(place / path, time_zero="onset").capture(name).impacts.digest()
+        == own.capture(name).impacts.digest()
+    )
+
+
+@pytest.mark.parametrize("path", ["raw/of", "impact/RI", "own/captures"])
+def test_every_dataset_answers_alike(place: Path, path: str) -> None:
+    dataset = open_dataset(place / path)
+    for report in dataset.check().objects:
+        impacts = dataset.capture(report.facts.identifier).impacts
+        assert len(impacts) == report.recordings
+        # Separate names, so that training and test recordings can be told apart.
+        assert len(set(impacts.names)) == len(impacts)
+    for ask in (dataset.facts, dataset.capture, dataset.look):
+        with raises(DatasetError, name="object", value="teapot"):
+            ask("teapot")
+
+
+WRONG = {
+    "raw": ("raw/of",),
+    "raw/of/2": "raw/of",
+    "raw/of/2/audio": "raw/of",
+    "raw/of/2/audio/0": "raw/of",
+    "impact/RI/22_Cup": "impact/RI",
+    "impact/RI/22_Cup/preprocessed": "impact/RI",
+    "own": ("own/captures",),
+}
+"""The folder, or the folders, to name in place of a wrong one."""
+
+
+@pytest.mark.parametrize("path", WRONG)
+def test_the_wrong_folder_is_told_from_the_right_one(place: Path, path: str) -> None:
+    right = WRONG[path]
+    meant = str(place / right) if isinstance(right, str) else tuple(str(place / each) for each in right)
+    with raises(DatasetError, file=path, value=meant):
+        open_dataset(place / path)
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("own/captures/notes", ()),
+        ("own/captures/bowl/impacts.csv", "file"),
+        ("own/capture", ("captures",)),
+    ],
+)
+def test_a_folder_that_is_empty_or_none_is_refused(place: Path, path: str, value: object) -> None:
+    with raises(DatasetError, file=path, value=value):
+        open_dataset(place / path)
+
+
+@pytest.mark.parametrize(
+    ("files", "found", "advice"),
+    [
+        (["100_Frisbee.zip", "10_bowl.zip"], ("100_Frisbee.zip", "10_bowl.zip"), "`unzip 100_Frisbee.zip`"),
+        (["audio_data_1_10.tar.gz"], ("audio_data_1_10.tar.gz",), "`tar -xf audio_data_1_10.tar.gz`"),
+        (["43_IronMortar/preprocessed/"], "preprocessed/", "RealImpact"),
+        (["1/vision/a.mp4", "2/vision/b.mp4"], ("1", "2"), "audio_data_1_10.tar.gz"),
+        (["1/audio/0/"], "audio/", "audio archives"),
+        (["readme.txt", "model.pth"], ("model.pth", "readme.txt"), "model.pth"),
+    ],
+)
+def test_what_is_there_instead_is_named(tmp_path: Path, files: list[str], found: object, advice: str) -> None:
+    for name in files:
+        path = tmp_path / name
+        (path if name.endswith("/") else path.parent).mkdir(parents=True, exist_ok=True)
+        if not name.endswith("/"):
+            path.touch()
+    with raises(DatasetError, file=tmp_path, value=found) as caught:
+        open_dataset(tmp_path)
+    assert advice in str(caught.value)
+
+
+def test_options_of_another_dataset_are_refused(place: Path) -> None:
+    with raises(DatasetError, file="impact/RI", name="contacts", value=str(place)):
+        open_dataset(place / "impact/RI", contacts=place)
+    with raises(DatasetError, file="own/captures", name="table", value=str(place)):
+        open_dataset(place / "own/captures", table=place)
+    with raises(DatasetError, file=place, name="contacts"):
+        open_dataset(place / "raw/of", contacts=place).check()
+
+
+def test_a_collection_reads_what_read_capture_reads(place: Path) -> None:
+    dataset = CaptureCollection(place / "own/captures")
+    one, other = dataset.capture("bowl"), read_capture(place / "own/captures/bowl")
+    assert one.impacts.names == other.impacts.names
+    assert one.impacts.sounds.equal(other.impacts.sounds)
+    assert dataset.check().remarks == ("folders without impacts.csv are ignored: notes",)
+    assert dataset.look("bowl") is None
+    with raises(DatasetError, name="object", value="plate") as caught:
+        dataset.capture("plate")
+    assert "10_plate?" in str(caught.value)
+
+
+@pytest.mark.parametrize("sight", ["surface.ply", "images/a.png", "walk.mp4", "transforms.json", "splats.ply", "a.jpg"])
+def test_a_capture_with_something_to_see_has_a_look(tmp_path: Path, sight: str) -> None:
+    fill(tmp_path / "cup", settings='name = "my cup"')
+    (tmp_path / "cup/images").mkdir()
+    dataset = CaptureCollection(tmp_path)
+    assert dataset.look("cup") is None
+    if "/" not in sight:
+        (tmp_path / "cup/images").rmdir()
+    (tmp_path / "cup" / sight).touch()
+    look = dataset.look("cup")
+    assert look is not None
+    assert (look.folder, look.settings.name, dataset.facts("cup").name) == (tmp_path / "cup", "my cup", "my cup")
+
+
+def test_a_collection_s_check_reads_no_sound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fill(tmp_path / "a")
+    fill(tmp_path / "b")
+    (tmp_path / "b/b.wav").unlink()
+    fill(tmp_path / "c", settings='unit = "miles"')
+    fill(tmp_path / "d", settings='surface = "shape.obj"')
+    monkeypatch.setattr(soundfile.SoundFile, "read", None)
+    a, b, c, d = CaptureCollection(tmp_path).check().objects
+    assert (a.recordings, a.problems) == (3, ())
+    assert (b.recordings, len(b.problems)) == (0, 1)
+    assert b.problems[0].startswith("b.wav")
+    assert "'miles'" in c.problems[0]
+    assert len(d.problems) == 1
+    assert d.problems[0].startswith("shape.obj")
+
+
+def test_the_verb_prints_what_is_there(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_mesh(place / "raw/mesh_16k/2.obj")
+    assert verb.run(options.parse(["check", str(place / "raw/of")])) == 0
+    out = capsys.readouterr().out
+    assert "1 of 1 object can" in out
+    assert "2 recordings" in out
+    assert "objects 11 to 20" in out
+    assert verb.run(options.parse(["check", str(place / "impact/RI"), "--json"])) == 0
+    streams = capsys.readouterr()
+    assert '"identifier": "22_Cup"' in streams.out
+    assert "49 of 50 objects" in streams.err
+
+
+def test_the_verb_ends_with_2_where_nothing_can_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_raw(tmp_path / "of", {"2": ("0", "1")}, contacts=False)
+    assert verb.run(options.parse(["check", str(tmp_path / "of")])) == 2
+    streams = capsys.readouterr()
+    assert "contact coordinates" in streams.out
+    assert str(tmp_path / "of") in streams.err

@@ -1,0 +1,78 @@
+"""README and docs: their commands parse, their Python names exist, their links lead somewhere."""
+
+import ast
+import dataclasses
+import inspect
+import pkgutil
+import re
+import shlex
+import tomllib
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+import avmsf
+from avmsf.capture import CaptureSettings
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
+LINKED = [*PAGES, REPOSITORY / "CONTRIBUTING.md"]
+
+
+def _commands() -> list[str]:
+    lines = [line for page in PAGES for line in page.read_text().splitlines()]
+    return sorted({re.split(r"\s+#", line.strip())[0] for line in lines if line.startswith("    avmsf ")})
+
+
+def _blocks(language: str) -> list[str]:
+    return [block for page in PAGES for block in re.findall(rf"```{language}\n(.*?)```", page.read_text(), re.DOTALL)]
+
+
+def _anchors(page: Path) -> set[str]:
+    """Return the anchors that GitHub gives a page's headings: lower case, letters, digits, spaces as dashes."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("command", _commands())
+def test_every_command_of_the_docs_parses(command: str) -> None:
+    _, verb, *arguments = shlex.split(command)
+    import_module(f"avmsf.cli.options.{verb}").parse(arguments)
+
+
+@pytest.mark.parametrize("block", _blocks("python"))
+def test_every_name_and_keyword_of_the_docs_python_exists(block: str) -> None:
+    tree = ast.parse(block)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "avmsf":
+            assert hasattr(avmsf, node.attr), node.attr
+        if isinstance(node, ast.Call) and re.fullmatch(r"avmsf(\.\w+)+", name := ast.unparse(node.func)):
+            keywords = {keyword.arg: None for keyword in node.keywords if keyword.arg}
+            inspect.signature(pkgutil.resolve_name(name)).bind(*node.args, **keywords)
+
+
+def test_the_docs_give_every_setting_of_a_capture_and_its_default(tmp_path: Path) -> None:
+    defaults, others = _blocks("toml")
+    (tmp_path / "capture.toml").write_text(defaults)
+    assert CaptureSettings.read(tmp_path / "capture.toml") == CaptureSettings()
+    (tmp_path / "capture.toml").write_text(others)
+    CaptureSettings.read(tmp_path / "capture.toml")
+    named = {*tomllib.loads(defaults), *tomllib.loads(others)}
+    assert named == {field.name for field in dataclasses.fields(CaptureSettings)}
+
+
+@pytest.mark.parametrize("page", LINKED, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_no_text_directly_below_a_table_becomes_a_row(page: Path) -> None:
+    assert re.findall(r"^\|.*\n(?![|\n]).+", page.read_text(), re.MULTILINE) == []
+
+
+@pytest.mark.parametrize("page", LINKED, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_every_link_of_the_docs_leads_to_a_file_and_a_heading(page: Path) -> None:
+    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        if "://" in link:
+            continue
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        assert target.exists(), link
+        assert not anchor or anchor in _anchors(target), link

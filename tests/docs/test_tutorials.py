@@ -1,0 +1,109 @@
+"""README and tutorials: their commands and Python blocks run, page by page, on small simulated objects."""
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+
+from avmsf.cli import main
+from avmsf.photographs.write import write_views
+from factories.plate_capture import fill_plate
+from factories.plate_set import fill_plates
+from factories.small_scene import slab_views
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+DOCS = REPOSITORY / "docs"
+PAGES = (*sorted((DOCS / "tutorials").glob("*.md")), REPOSITORY / "README.md", DOCS / "getting-started.md")
+"""Tutorials first: what they have run in the same folder is not repeated for README and getting started."""
+PHOTOGRAPHS = "**With photographs**"
+"""Where README turns from a capture with a mesh to one with photographs."""
+FEW_STEPS = ("--splat.steps", "60", "--splat.start-points", "800")
+FEW_VIEWS = ("--views.rendered", "48", "--views.count", "18")
+SMALL = {
+    "fit bowl.ply": ("--modes", "8", "--body.dofs", "2000", "--body.wall", "0.003"),
+    "fit": ("--gain-model", "smooth", "--modes", "8", "--steps", "4"),
+    "reconstruct": (*FEW_STEPS, *FEW_VIEWS, "--lift.encoder", "descriptors", "--gain-model", "smooth", "--modes", "8"),
+    "splat": tuple(word.replace("splat.", "") for word in FEW_STEPS),
+    "features": (*FEW_STEPS, "--encoder", "descriptors"),
+    "surface": FEW_STEPS,
+    "evaluate": ("--modes", "8"),
+    "evaluate learning-curve": ("--methods", "knn3", "--counts", "3", "--starts", "1", "--modes", "8"),
+}
+"""For each verb, settings that take seconds; the pages' own take minutes."""
+LONG = ("avmsf simulate", "avmsf reconstruct scan")
+"""Commands that take minutes with any setting: what they make is there already, or is not used on the page."""
+
+
+@pytest.fixture(scope="module")
+def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with what the pages' reader has: a capture, its field, and simulated objects."""
+    folder = tmp_path_factory.mktemp("workshop")
+    fill_plate(folder / "bowl")
+    fill_plates(folder / "objects", ("mug-ceramic",), recordings="{:03d}.wav")
+    (folder / "places.csv").write_text("x,y,z\n0.05,0.06,0\n")
+    assert main(["fit", str(folder / "bowl"), "--output", str(folder / "bowl.safetensors"), *SMALL["fit"]]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def photographed(workshop: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the same with photographs in place of the mesh, which lies next to the folder."""
+    folder = tmp_path_factory.mktemp("photographed") / "workshop"
+    shutil.copytree(workshop, folder)
+    (folder / "bowl" / "surface.ply").rename(folder / "bowl.ply")
+    write_views(slab_views(), folder / "views")
+    for part in (folder / "views").iterdir():
+        part.rename(folder / "bowl" / part.name)
+    return folder
+
+
+def parts(page: Path) -> dict[str, str]:
+    """Return the page's text by the folder in which it is to run."""
+    text = page.read_text()
+    if page.stem == "README":
+        mesh, mark, photographs = text.partition(PHOTOGRAPHS)
+        # README's Python, in the second part, would fit bodies of many thicknesses, for minutes, if it had a mesh.
+        return {"workshop": mesh, "photographed": mark + photographs}
+    return {"photographed" if page.stem == "photographs" else "workshop": text}
+
+
+def steps(text: str) -> list[tuple[str, str]]:
+    """Return a page's commands and Python blocks in their order, each as its kind and its text."""
+    found = re.findall(r"^    (avmsf [^\n]+)$|^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    return [("command", re.split(r"\s+#", command)[0]) if command else ("python", block) for command, block in found]
+
+
+def run(command: str) -> None:
+    _, verb, *words = shlex.split(command)
+    small = SMALL.get(f"{verb} {words[0]}", SMALL.get(verb, ()))
+    assert main([verb, *words, *small]) == 0, command
+
+
+@pytest.fixture(scope="module")
+def done() -> set[tuple[str, str]]:
+    """Return the folders and the steps that have run in them on an earlier page."""
+    return set()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_step_of_a_page_runs(
+    page: Path,
+    done: set[tuple[str, str]],
+    request: pytest.FixtureRequest,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for folder, text in parts(page).items():
+        assert steps(text)
+        monkeypatch.chdir(shutil.copytree(request.getfixturevalue(folder), tmp_path / folder))
+        for kind, step in steps(text):
+            if step.startswith(LONG) or (folder, step) in done:
+                continue
+            done.add((folder, step))
+            if kind == "command":
+                run(step)
+            else:
+                exec(compile(step, page.name, "exec"), {})

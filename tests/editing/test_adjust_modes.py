@@ -1,0 +1,147 @@
+"""Sliders: pitch, decay, brightness and levels, alone, together and undone."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from avmsf.editing.material import change_material, rayleigh_damping
+from avmsf.editing.material_before import made_of
+from avmsf.editing.material_guess import guess_materials
+from avmsf.editing.modes import adjust_modes, brightness_center
+from avmsf.errors import EditError
+from avmsf.fem.material import CERAMIC, WOOD
+from avmsf.field.scaled_gains import ScaledGains
+from avmsf.field.sound_field import Origin, SoundField
+from avmsf.field.store import load, save
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.residual_noise import Residual
+from factories.made_fields import BANK, FIELDS, places
+from factories.raising import raises
+
+PLACES = places(7, seed=8)
+RATE = 8000.0
+
+
+def field(name: str = "positional") -> SoundField:
+    phase = torch.tensor([0.0, 0.4, -1.2, 3.0, 1.6], dtype=torch.float64)
+    return SoundField(BANK, FIELDS[name](), phase, Residual(torch.full((9,), 1e-9)), RATE, 600, Origin("plate"))
+
+
+def change_db(before: SoundField, after: SoundField) -> torch.Tensor:
+    """Return by how many decibels each mode became louder, the same at all places."""
+    ratio = (after.gains(PLACES) / before.gains(PLACES)).double()
+    torch.testing.assert_close(ratio, ratio[:1].expand_as(ratio), rtol=1e-6, atol=0)
+    return 20 * torch.log10(ratio[0])
+
+
+def expect_same(found: SoundField, expected: SoundField) -> None:
+    for name in ("frequency", "damping"):
+        torch.testing.assert_close(getattr(found.bank, name), getattr(expected.bank, name), rtol=1e-14, atol=0)
+    torch.testing.assert_close(found.gains(PLACES), expected.gains(PLACES), rtol=1e-6, atol=0)
+
+
+def test_without_values_nothing_changes():
+    before, after = field(), adjust_modes(field())
+    assert torch.equal(after.bank.frequency, before.bank.frequency)
+    assert torch.equal(after.bank.damping, before.bank.damping)
+    assert torch.equal(after.render(PLACES), before.render(PLACES))
+
+
+@pytest.mark.parametrize("name", ["positional", "attention with dampings", "elastic"])
+def test_pitch_moves_frequencies_and_decay_the_ring_times(name):
+    before, factors = field(name), torch.linspace(0.5, 1.5, 5, dtype=torch.float64)
+    after = adjust_modes(before, pitch=1.2, decay=factors)
+    torch.testing.assert_close(after.bank.frequency, 1.2 * before.bank.frequency)
+    torch.testing.assert_close(1 / after.bank.damping, factors / before.bank.damping)
+    torch.testing.assert_close(
+        after.dampings(PLACES).double(), before.dampings(PLACES).double() / factors, rtol=1e-6, atol=0
+    )
+    assert torch.equal(after.gains(PLACES), before.gains(PLACES))
+    told = after.origin.report["edits"][-1]
+    assert (told["edit"], told["pitch"], told["decay"]) == ("adjust_modes", 1.2, factors.tolist())
+
+
+def test_brightness_is_decibels_an_octave_about_the_center():
+    before = field()
+    center = brightness_center(before)
+    # Gains over the whole object, by hand.
+    known = before.known(before.gain_field.points)
+    power = (known.mean.double() ** 2 + known.quadrature.double() ** 2).mean(0)
+    by_hand = float((power * BANK.frequency.log()).sum() / power.sum())
+    assert math.log(center) == pytest.approx(by_hand, rel=1e-6)
+    louder = change_db(before, adjust_modes(before, brightness_db=6.0))
+    torch.testing.assert_close(louder, 6.0 * torch.log2(BANK.frequency / center), rtol=0, atol=1e-5)
+    # Heard where the modes come to lie.
+    high = adjust_modes(before, brightness_db=6.0, pitch=[1.0, 1.0, 1.0, 1.0, 2.0])
+    step = change_db(before, high) - 6.0 * torch.log2(high.bank.frequency / brightness_center(before, high.bank))
+    assert float(step.abs().max()) < 1e-5
+
+
+def test_levels_raise_and_mute_single_modes(tmp_path):
+    before = field()
+    after = adjust_modes(before, gains_db=[0.0, 6.0, -math.inf, -6.0, 0.0])
+    assert not bool(after.gains(PLACES)[:, 2].any())
+    louder = change_db(before, after)
+    assert louder[[0, 1, 3, 4]].tolist() == pytest.approx([0.0, 6.0, -6.0, 0.0], abs=1e-5)
+    assert after.origin.report["edits"][-1]["gains_db"] == [0.0, 6.0, None, -6.0, 0.0]
+    save(after, tmp_path / "one")
+    assert torch.equal(load(tmp_path / "one").render(PLACES), after.render(PLACES))
+
+
+def test_two_edits_are_the_one_with_both_and_an_edit_can_be_undone():
+    before, factors = field(), torch.linspace(0.5, 1.5, 5, dtype=torch.float64)
+    one = {"pitch": 1.2, "decay": factors, "brightness_db": 4.0, "gains_db": 3 * factors}
+    other = {"pitch": 0.7, "decay": 2.0, "brightness_db": -7.0, "gains_db": -4 * factors}
+    both = {"pitch": 1.2 * 0.7, "decay": 2 * factors, "brightness_db": -3.0, "gains_db": -factors}
+    expect_same(adjust_modes(adjust_modes(before, **one), **other), adjust_modes(before, **both))
+    back = {"pitch": 1 / 1.2, "decay": 1 / factors, "brightness_db": -4.0, "gains_db": -3 * factors}
+    expect_same(adjust_modes(adjust_modes(before, **one), **back), before)
+    assert isinstance(before.gain_field, type(adjust_modes(adjust_modes(before, **one), **other).gain_field.field))
+    assert not isinstance(before.gain_field, ScaledGains)
+
+
+def test_modes_beyond_half_the_sample_rate_are_silent_and_come_back():
+    before = field()
+    high = adjust_modes(before, pitch=2.0)
+    assert high.origin.report["edits"][-1]["silent_hertz"] == [4600.0]
+    muted = adjust_modes(high, gains_db=[0.0, 0.0, 0.0, 0.0, -math.inf])
+    assert torch.equal(high.render(PLACES), muted.render(PLACES))
+    assert float((high.render(PLACES) - before.render(PLACES)).abs().max()) > 0
+    expect_same(adjust_modes(high, pitch=0.5), before)
+    gone = adjust_modes(before, pitch=100.0)
+    assert len(gone.origin.report["edits"][-1]["silent_hertz"]) == 5
+    # Nothing but the residual.
+    assert float(gone.render(PLACES).abs().max()) < 1e-8
+
+
+def test_values_that_cannot_be_are_refused():
+    for name in ("pitch", "decay"):
+        for value in (0.0, -1.0, math.inf, math.nan, [1.0, 1.0, 0.0, 1.0, 1.0]):
+            with raises(EditError, name=name, row=2 if isinstance(value, list) else 0):
+                adjust_modes(field(), **{name: value})
+    with raises(EditError, name="pitch", row=4, value=math.inf):
+        adjust_modes(field(), pitch=[1.0, 1.1, 1.2, 1.3, math.inf])
+    with raises(EditError, name="pitch", row=None, value=[3]):
+        adjust_modes(field(), pitch=[1.0, 1.0, 1.0])
+    for value in (math.inf, math.nan):
+        with raises(EditError, name="gains_db", row=0):
+            adjust_modes(field(), gains_db=value)
+        with raises(EditError, name="brightness_db", row=None):
+            adjust_modes(field(), brightness_db=value)
+    with raises(EditError, name="gain factor", row=0, value=math.inf):
+        adjust_modes(field(), gains_db=1e5)
+
+
+def test_adjusted_modes_keep_the_material():
+    """An octave lower, ceramic's dampings would be those of another material."""
+    frequency = torch.tensor([1600.0, 2500.0, 4100.0, 6000.0, 9000.0], dtype=torch.float64)
+    damping = rayleigh_damping(2.0 * math.pi * frequency, CERAMIC)
+    ceramic = replace(field(), bank=ModalBank(frequency, damping), sample_rate=48000.0)
+    assert made_of(ceramic, option="--from").material == CERAMIC
+    lower = adjust_modes(adjust_modes(ceramic, pitch=0.25), decay=torch.linspace(0.1, 0.5, 5), brightness_db=3.0)
+    assert guess_materials(lower.bank)[0].material != CERAMIC
+    assert made_of(lower, option="--from").material == CERAMIC
+    wooden = change_material(lower, CERAMIC, WOOD)
+    assert made_of(adjust_modes(wooden, pitch=2.0), option="--from").material == WOOD

@@ -1,0 +1,311 @@
+"""Another material, another size: the laws against plates in closed form and against fresh finite-element solves."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from avmsf.editing.edits import silenced
+from avmsf.editing.material import ACCELERATION, DISPLACEMENT, LAWS, RATIO_ONLY, VELOCITY, change_material
+from avmsf.editing.material_before import made_of
+from avmsf.editing.material_guess import guess_materials
+from avmsf.editing.modes import adjust_modes
+from avmsf.errors import EditError, SimulationError
+from avmsf.fem.block import block
+from avmsf.fem.damping import rayleigh
+from avmsf.fem.elastic_modes import elastic_modes
+from avmsf.fem.material import CERAMIC, GLASS, NOMINAL, PLASTIC, STEEL, WOOD, Material
+from avmsf.field.gains.family import Sites
+from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.positional import Smooth
+from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
+from avmsf.field.store import load, save
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.residual_noise import Residual
+from avmsf.simulate.plate import Plate, plate_modes, sample_contacts
+from factories.raising import raises
+
+RATE = 44100.0
+CONTACTS = sample_contacts(Plate(), 8, generator=torch.Generator().manual_seed(0))
+OTHER = Material("other", 1900.0, 9.1e10, 0.29, 3.0, 8e-8)
+THIRD = Material("third", 4300.0, 5e9, 0.1, 0.0, 2e-6)
+SMALL_FLOAT = 1e-6
+"""Gains are float32 numbers."""
+
+
+def plate_of(material: Material, *, size: float = 1.0) -> Plate:
+    plain = Plate()
+    return Plate(
+        size * plain.length,
+        size * plain.width,
+        size * plain.thickness,
+        material.young,
+        material.density,
+        material.poisson,
+        material.alpha,
+        material.beta,
+    )
+
+
+def field_of(frequency: torch.Tensor, damping: torch.Tensor, gains: torch.Tensor, contacts: torch.Tensor) -> SoundField:
+    """Return a field that has these gains at these contacts, and smooth ones between them."""
+    values = torch.complex(gains, 0.5 * gains.roll(1, dims=1))
+    sites = Sites(contacts, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(contacts))
+    size = float((contacts.amax(0) - contacts.amin(0)).norm())
+    measured = MeasuredGains(values, torch.zeros_like(frequency), frequency, damping)
+    model = fit_mixture([Smooth(sites, size)], measured, contacts.float(), directional=False)
+    # The mean at the contacts is linear in the gains measured there: these have it pass through the given ones.
+    passed = torch.linalg.solve(model.smoother(), torch.view_as_real(values).permute(1, 2, 0))
+    model = model.with_values(torch.view_as_complex(passed.permute(2, 0, 1).contiguous()))
+    phase = torch.zeros_like(frequency)
+    return SoundField(
+        ModalBank(frequency, damping), model, phase, Residual(torch.full((9,), 1e-9)), RATE, 2000, Origin("plate")
+    )
+
+
+RATIO = {each: each.young / each.density for each in (STEEL, NOMINAL)}
+
+
+def plate_field(material: Material, *, size: float = 1.0, highest: float = 3000.0) -> SoundField:
+    modes = plate_modes(plate_of(material, size=size), size * CONTACTS, highest=highest)
+    return field_of(modes.frequency, modes.damping, modes.gains, size * CONTACTS)
+
+
+def gains_of(field: SoundField, contacts: torch.Tensor) -> torch.Tensor:
+    known = field.gain_field.at(contacts)
+    return torch.stack([known.mean, known.quadrature]).double()
+
+
+def expect_same(found: SoundField, expected: SoundField, contacts: torch.Tensor, *, gains: float = SMALL_FLOAT) -> None:
+    # Rounding of float64: some ten operations.
+    for name in ("frequency", "damping"):
+        torch.testing.assert_close(getattr(found.bank, name), getattr(expected.bank, name), rtol=1e-13, atol=0)
+    one, other = gains_of(found, contacts), gains_of(expected, contacts)
+    torch.testing.assert_close(one, other, rtol=0, atol=gains * float(other.abs().max()))
+    assert torch.equal(found.gain_field.points, expected.gain_field.points)
+
+
+@pytest.mark.parametrize("size", [1.0, 0.5, 3.0])
+def test_a_plate_of_another_material_and_size_is_the_one_in_closed_form(size):
+    steel = replace(STEEL, beta=4e-7)
+    faster = math.sqrt(OTHER.young / OTHER.density / (steel.young / steel.density)) / size
+    undamped = 3000.0
+    expected = plate_modes(plate_of(OTHER, size=size), size * CONTACTS, highest=undamped * faster)
+    # A plate's gains are pseudo-velocities, see `simulate.plate`.
+    found = change_material(plate_field(steel, highest=undamped), steel, OTHER, size=size, law=VELOCITY)
+    torch.testing.assert_close(found.bank.frequency, expected.frequency, rtol=1e-13, atol=0)
+    torch.testing.assert_close(found.bank.damping, expected.damping, rtol=1e-13, atol=0)
+    gains = gains_of(found, size * CONTACTS)[0]
+    torch.testing.assert_close(gains, expected.gains, rtol=0, atol=SMALL_FLOAT * float(expected.gains.abs().max()))
+    # Displacements are those over the damped angular frequency, accelerations are times it.
+    for law, power in ((DISPLACEMENT, 1.0), (ACCELERATION, -1.0)):
+        other = change_material(plate_field(steel, highest=undamped), steel, OTHER, size=size, law=law)
+        start = plate_modes(plate_of(steel), CONTACTS, highest=undamped).frequency
+        ratio = gains_of(other, size * CONTACTS)[0] / gains
+        torch.testing.assert_close(ratio, ((start / expected.frequency) ** power).expand_as(ratio), rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("size", [1.0, 0.6])
+def test_changing_the_material_is_a_fresh_finite_element_solve(size):
+    new = replace(OTHER, poisson=CERAMIC.poisson)
+    generator = torch.Generator().manual_seed(1)
+    places = torch.rand(6, 3, dtype=torch.float64, generator=generator) * torch.tensor([0.11, 0.07, 0.0])
+    ways = torch.nn.functional.normalize(torch.randn(6, 3, dtype=torch.float64, generator=generator), dim=1)
+
+    def solved(material: Material, scale: float) -> SoundField:
+        body = elastic_modes(block((0.11 * scale, 0.07 * scale, 0.02 * scale), (4, 3, 1)), material, count=10)
+        damping = rayleigh(body.frequency, material) / 2
+        angular = torch.sqrt((2 * math.pi * body.frequency) ** 2 - damping**2)
+        shapes = body.gains(scale * places, ways)
+        # Displacement of the last place, by a newton second at each.
+        return field_of(angular / (2 * math.pi), damping, shapes * shapes[-1] / angular, scale * places)
+
+    found, fresh = change_material(solved(CERAMIC, 1.0), CERAMIC, new, size=size), solved(new, size)
+    frequency = (found.bank.frequency / fresh.bank.frequency - 1).abs()
+    assert float(frequency.max()) < 1e-9
+    assert float((found.bank.damping / fresh.bank.damping - 1).abs().max()) < 1e-8
+    one, other = gains_of(found, size * places)[0], gains_of(fresh, size * places)[0]
+    # Of each mode by itself, for high ones move less: shapes of a second solve agree to some 1e-6.
+    assert float(((one - other).abs().amax(0) / other.abs().amax(0)).max()) < SMALL_FLOAT
+
+
+@pytest.mark.parametrize("law", LAWS.values(), ids=LAWS)
+def test_a_material_given_to_itself_and_one_by_way_of_another(law):
+    field = plate_field(STEEL)
+    # Dampings that are not those of the material: a mode's own part of them stays with it.
+    field = replace(
+        field, bank=ModalBank(field.bank.frequency, field.bank.damping * torch.linspace(0.5, 3.0, len(field.bank)))
+    )
+    expect_same(change_material(field, STEEL, STEEL, law=law), field, CONTACTS)
+    twice = change_material(change_material(field, STEEL, OTHER, size=0.5, law=law), OTHER, THIRD, size=3.0, law=law)
+    expect_same(twice, change_material(field, STEEL, THIRD, size=1.5, law=law), 1.5 * CONTACTS)
+    expect_same(change_material(twice, THIRD, STEEL, size=1 / 1.5, law=law), field, CONTACTS)
+    assert len(twice.origin.report["edits"]) == 2
+
+
+def test_the_name_says_the_last_material():
+    field = plate_field(STEEL)
+    field = replace(field, origin=replace(field.origin, capture="mug"))
+    glass = change_material(field, STEEL, GLASS)
+    wood = change_material(adjust_modes(glass, pitch=1.1), GLASS, WOOD)
+    larger = change_material(wood, WOOD, WOOD, size=2.0)
+    names = [each.origin.capture for each in (change_material(field, STEEL, STEEL), glass, wood, larger)]
+    assert names == ["mug", "mug, glass", "mug, wood", "mug, wood"]
+    assert change_material(larger, WOOD, GLASS).origin.capture == "mug, glass"
+
+
+def test_a_modes_own_damping_stays_in_proportion_to_the_law():
+    field = plate_field(GLASS)
+    own = torch.linspace(0.3, 5.0, len(field.bank), dtype=torch.float64)
+    strange = change_material(
+        replace(field, bank=ModalBank(field.bank.frequency, field.bank.damping * own)), GLASS, WOOD
+    )
+    plain = change_material(field, GLASS, WOOD)
+    # Its undamped frequency, which the law is taken at, has its own damping in it: 5e-6 of the frequency here.
+    torch.testing.assert_close(strange.bank.damping / plain.bank.damping, own, rtol=1e-4, atol=0)
+
+
+def test_ratios_of_gains_between_places_stay():
+    field = plate_field(CERAMIC)
+    found = change_material(field, CERAMIC, WOOD, size=2.0)
+    before, after = gains_of(field, CONTACTS), gains_of(found, 2.0 * CONTACTS)
+    change = after / before
+    torch.testing.assert_close(change, change[:1, :1].expand_as(change), rtol=1e-6, atol=0)
+    ratio_only = change_material(field, CERAMIC, WOOD, law=RATIO_ONLY)
+    expected = field.bank.frequency / ratio_only.bank.frequency
+    change = gains_of(ratio_only, CONTACTS) / before
+    torch.testing.assert_close(change, expected.expand_as(change), rtol=1e-6, atol=0)
+
+
+def test_modes_beyond_half_the_sample_rate_are_silent_reported_and_come_back():
+    field = plate_field(PLASTIC, highest=5000.0)
+    found = change_material(field, PLASTIC, OTHER)
+    silent = ~found.audible
+    assert 0 < int(silent.sum()) < len(silent)
+    told = found.origin.report["edits"][-1]
+    assert told["silent_hertz"] == found.bank.frequency[silent].tolist()
+    assert min(told["silent_hertz"]) >= RATE / 2
+    sounds, times = found.render(CONTACTS[:2]), torch.arange(2000, dtype=torch.float64) / RATE
+    known, expected = found.known(CONTACTS[:2]), torch.zeros(2, 2000, dtype=torch.float64)
+    for mode in torch.nonzero(found.audible).flatten().tolist():
+        angle = 2 * math.pi * found.bank.frequency[mode] * times
+        waves = known.mean[:, mode, None] * angle.sin() + known.quadrature[:, mode, None] * angle.cos()
+        expected += torch.exp(-found.bank.damping[mode] * times) * waves
+    # The residual is a millionth; float32 sums.
+    torch.testing.assert_close(sounds.double(), expected, rtol=0, atol=2e-6 * float(expected.abs().max()))
+    expect_same(change_material(found, OTHER, PLASTIC), field, CONTACTS)
+
+
+def test_modes_without_a_tone_are_mute_and_named_and_stay_where_they_are():
+    field = plate_field(GLASS)
+    lossy = replace(GLASS, name="felt", alpha=4000.0)
+    omega = torch.hypot(2 * math.pi * field.bank.frequency, field.bank.damping)
+    dead = 0.5 * (4000.0 + GLASS.beta * omega**2) >= omega
+    assert 0 < int(dead.sum()) < len(dead)
+    found = change_material(field, GLASS, lossy)
+    assert torch.equal(gains_of(found, CONTACTS).abs().amax((0, 1)) == 0, dead)
+    told = found.origin.report["edits"][-1]
+    assert told["overdamped_hertz"] == field.bank.frequency[dead].tolist()
+    assert f"{int(dead.sum())} of {len(dead)} modes overdamped" in told["remarks"][0]
+    assert bool(torch.isfinite(found.render(CONTACTS)).all())
+    back = change_material(found, lossy, GLASS)
+    for name in ("frequency", "damping"):
+        before = getattr(field.bank, name)
+        assert torch.equal(getattr(found.bank, name)[dead], before[dead])
+        torch.testing.assert_close(getattr(back.bank, name), before, rtol=1e-13, atol=0)
+    before, after = gains_of(field, CONTACTS), gains_of(back, CONTACTS)
+    torch.testing.assert_close(after, torch.where(dead, 0.0, before), rtol=1e-6, atol=0)
+    assert back.origin.report["edits"][-1]["remarks"] == []
+
+
+def test_a_mute_mode_is_none_that_a_lower_pitch_brings_back():
+    found = change_material(plate_field(GLASS), GLASS, replace(GLASS, alpha=4e5))
+    high = adjust_modes(found, pitch=1e3)
+    assert not bool(high.audible.any())
+    assert high.origin.report["edits"][-1]["silent_hertz"] == []
+    assert not bool(silenced(high).any())
+    assert change_material(high, GLASS, replace(GLASS, alpha=4e9)).origin.report["edits"][-1]["overdamped_hertz"] == []
+
+
+def test_another_poissons_ratio_is_said_with_what_it_would_do_to_a_plate():
+    stiff = replace(STEEL, poisson=0.45)
+    (words,) = change_material(plate_field(STEEL), STEEL, stiff).origin.report["edits"][-1]["remarks"]
+    lowest = [float(plate_modes(plate_of(each), CONTACTS).frequency[0]) for each in (STEEL, stiff)]
+    assert f"about {100 * (lowest[1] / lowest[0] - 1):+.1f} %" in words
+    assert (
+        change_material(plate_field(STEEL), STEEL, replace(STEEL, young=1e11)).origin.report["edits"][-1]["remarks"]
+        == []
+    )
+
+
+def test_a_field_of_another_material_is_a_field_like_any_other(tmp_path):
+    found = change_material(plate_field(STEEL), STEEL, WOOD, size=0.5)
+    save(found, tmp_path / "wood.safetensors")
+    loaded = load(tmp_path / "wood.safetensors")
+    assert torch.equal(loaded.render(0.5 * CONTACTS), found.render(0.5 * CONTACTS))
+    assert loaded.origin.report == found.origin.report
+    assert loaded.origin.report["edits"][0]["to"]["name"] == "wood"
+
+
+def test_where_neither_material_damps_dampings_stay():
+    bare = [replace(each, alpha=0.0, beta=0.0) for each in (STEEL, OTHER)]
+    field = plate_field(STEEL)
+    assert torch.equal(change_material(field, *bare).bank.damping, field.bank.damping)
+
+
+def test_materials_and_sizes_that_cannot_be_are_refused():
+    field, bare = plate_field(STEEL), replace(OTHER, name="aether", alpha=0.0, beta=0.0)
+    for size in (0.0, -1.0, math.nan, math.inf):
+        with raises(EditError, name="size") as caught:
+            change_material(field, STEEL, OTHER, size=size)
+        assert caught.value.value is size
+    with raises(EditError, name="new", value=(0.0, 0.0)):
+        change_material(field, STEEL, bare)
+    with raises(EditError, name="old", value=(0.0, 0.0)):
+        change_material(field, bare, STEEL)
+    with raises(EditError, name="damping", row=0, value=math.inf):
+        change_material(field, STEEL, OTHER, size=1e-170)
+    with raises(SimulationError, name="young", value=-1.0):
+        change_material(field, STEEL, Material("lead", 1e4, -1.0, 0.4, 1.0, 0.0))
+
+
+@pytest.mark.parametrize("material", [GLASS, WOOD, PLASTIC, STEEL], ids=lambda each: each.name)
+def test_the_material_is_guessed_by_its_dampings(material):
+    field = plate_field(material)
+    generator = torch.Generator().manual_seed(0)
+    off = torch.exp(0.1 * torch.randn(len(field.bank), dtype=torch.float64, generator=generator))
+    off[3] = 40.0
+    best, second, *_ = guess_materials(ModalBank(field.bank.frequency, field.bank.damping * off))
+    assert best.material is material
+    # A normal deviation of .1 has its middle at .067; one mode that is quite off counts for little.
+    assert 1.02 < best.off < 1.12
+    assert best.fits
+    assert second.off > best.off
+    assert not guess_materials(ModalBank(field.bank.frequency, 30 * field.bank.frequency))[0].fits
+
+
+def test_supporting_poles_say_nothing_about_the_material():
+    field = plate_field(STEEL)
+    damping = field.bank.damping.clone()
+    supporting = list(range(1, len(damping)))
+    damping[supporting] *= 30.0
+    report = {SUPPORTING: supporting}
+    mixed = replace(field, bank=ModalBank(field.bank.frequency, damping), origin=Origin("plate", report=report))
+    assert made_of(mixed, option="--from").material == STEEL
+
+
+def test_a_body_too_stiff_for_a_material_excludes_it():
+    """Wood's dampings on a body that is as stiff for its weight as steel are nobody's."""
+    body = {"body": "solid body", "wall_thickness": None, "frequency_factor": math.sqrt(RATIO[STEEL] / RATIO[NOMINAL])}
+    origin = Origin("plate", report={"credibility": {"credible": True}, "bodies": [body]})
+    steel = replace(plate_field(STEEL), origin=origin)
+    assert made_of(steel, option="--from").material == STEEL
+    with raises(EditError, name="--from"):
+        made_of(replace(plate_field(WOOD), origin=origin), option="--from")
+
+
+def test_a_material_that_is_assumed_and_new_is_said():
+    wooden = plate_field(WOOD)
+    known = [made_of(wooden, option="--from", new=new) for new in (None, STEEL, WOOD)]
+    assert ["changes nothing" in each.words for each in known] == [False, False, True]

@@ -1,0 +1,229 @@
+"""Distilling a diffusion model into targets, on models whose every answer is known."""
+
+import math
+import weakref
+from dataclasses import dataclass, field
+
+import pytest
+import torch
+
+from avmsf.editing.clips import level, levelled
+from avmsf.editing.config import DistillationConfig, GuidedEditConfig
+from avmsf.editing.distillation import AudioDiffusion, DecoderDistillation, noised, partial_denoising
+from avmsf.editing.guided import Guide, edit_towards
+from avmsf.errors import AvmsfWarning, EditError
+from factories.raising import raises, warns
+from factories.ringing_field import RATE, ringing_field, sound_of
+
+HOP = 8
+
+
+@dataclass
+class Known:
+    """A model whose latents are the waveform in rows of eight, and which knows what it wants to hear.
+
+    Without words it sees the noisy latents' own share, with words so much of `wanted` on top.
+    """
+
+    wanted: torch.Tensor | None = None
+    sample_rate: float = RATE
+    room: int = 1000
+    """Most sounds that its memory holds."""
+    name: str = "known"
+    channels: int = 2
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+    dtype: torch.dtype = torch.float32
+    batches: list[int] = field(default_factory=list)
+    asked: list = field(default_factory=list)
+
+    def describe(self):
+        return {"room": self.room}
+
+    def encode(self, waveforms):
+        if len(waveforms) > self.room:
+            raise torch.OutOfMemoryError("CUDA out of memory")
+        self.batches.append(len(waveforms))
+        assert waveforms.shape[1] == 2
+        mono = waveforms.mean(1)
+        return torch.nn.functional.pad(mono, (0, -mono.shape[1] % HOP)).reshape(len(mono), -1, HOP).mT
+
+    def decode(self, latents, *, samples):
+        return latents.mT.flatten(1)[:, None, :samples].expand(-1, 2, -1)
+
+    def embed(self, prompt, negative, *, seconds):
+        self.asked.append((prompt, negative, seconds))
+        return prompt
+
+    def denoised(self, latents, level, conditioning, *, guidance):
+        without = torch.cos(0.5 * math.pi * level)[:, None, None] * latents
+        if self.wanted is None:
+            return without
+        wanted = self.encode(self.wanted.expand(len(latents), -1)[:, None].expand(-1, 2, -1))
+        return without + guidance * (wanted - without)
+
+
+class Gaussian(Known):
+    """The best denoiser of data of independent normal numbers of deviation `scale`."""
+
+    scale = 0.3
+
+    def denoised(self, latents, level, conditioning, *, guidance):
+        angle = (0.5 * math.pi * level)[:, None, None]
+        spread = (self.scale * torch.cos(angle)).square() + torch.sin(angle).square()
+        return self.scale**2 * torch.cos(angle) / spread * latents
+
+
+def guide(model, **settings) -> DecoderDistillation:
+    return DecoderDistillation(model, "wood", sample_rate=RATE, config=DistillationConfig(**settings))
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_noise_turns_by_an_angle():
+    clean, noise = torch.ones(3, 1, 1), 2 * torch.ones(3, 1, 1)
+    found = noised(clean, noise, torch.tensor([0.0, 1 / 3, 1.0])).flatten()
+    torch.testing.assert_close(found, torch.tensor([1.0, math.sqrt(3) / 2 + 1.0, 2.0]))
+
+
+def test_partial_denoising_follows_the_flow_of_a_gaussian():
+    # With the best denoiser of N(0, s^2), the flow scales latents by s over their deviation at the level.
+    model, latents = Gaussian(), torch.randn(2, 8, 5, generator=seeded(), dtype=torch.float64)
+    level = torch.tensor([0.8, 0.3], dtype=torch.float64)
+    angle = 0.5 * math.pi * level
+    deviation = torch.sqrt((model.scale * torch.cos(angle)).square() + torch.sin(angle).square())
+    exact = latents * (model.scale / deviation)[:, None, None]
+    errors = [
+        float(
+            (partial_denoising(model, latents, level, None, steps=steps, guidance=1.0) - exact).abs().max()
+            / exact.abs().max()
+        )
+        for steps in (50, 100, 200)
+    ]
+    # A method of first order: twice the steps, half the error.
+    assert errors[2] < 0.02
+    assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.1)
+    assert errors[1] / errors[2] == pytest.approx(2.0, rel=0.1)
+
+
+def test_one_step_is_the_models_own_estimate():
+    model, latents, level = Gaussian(), torch.randn(3, 8, 5, generator=seeded()), torch.tensor([0.2, 0.5, 0.9])
+    found = partial_denoising(model, latents, level, None, steps=1, guidance=1.0)
+    assert torch.equal(found, model.denoised(latents, level, None, guidance=1.0))
+
+
+def test_a_model_that_knows_what_it_wants_is_obeyed():
+    wanted = sound_of(ringing_field(pitch=0.7))
+    sounds = torch.cat([sound_of(ringing_field(level=each)) for each in (1.0, 1e-3)])
+    targets = guide(Known(wanted), guidance=1.0).targets(sounds, 0, seeded())
+    expected = levelled(wanted.expand(2, -1), sounds, sample_rate=RATE)
+    torch.testing.assert_close(targets, expected, rtol=1e-4, atol=1e-6)
+
+
+def test_another_rate_is_resampled_there_and_back():
+    sounds = sound_of(ringing_field())
+    model = Gaussian(sample_rate=44100.0)
+    model.scale = 1e4  # Which takes everything for signal.
+    targets = guide(model, lowest=0.001, highest=0.001).targets(sounds, 0, seeded())
+    assert targets.shape == sounds.shape
+    assert model.asked[0][2] == pytest.approx(0.5, abs=1e-4)
+    # A noise of a thousandth of a quarter turn beside a sound whose peak is .5, and the filters' edge.
+    assert float((targets - sounds).square().mean().sqrt() / sounds.square().mean().sqrt()) < 0.05
+
+
+def test_guidance_scales_the_update():
+    sounds, wanted = sound_of(ringing_field()), sound_of(ringing_field(pitch=0.7))
+    latents = torch.randn(1, 8, 500, generator=seeded())
+    level_ = torch.tensor([0.4])
+    model = Known(wanted)
+    found = [partial_denoising(model, latents, level_, None, steps=1, guidance=each) for each in (0.0, 1.0, 3.0)]
+    torch.testing.assert_close(found[2] - found[0], 3 * (found[1] - found[0]), rtol=1e-4, atol=1e-5)
+    far = [
+        float((guide(model, guidance=each, denoising=1).targets(sounds, 0, seeded()) - wanted).abs().mean())
+        for each in (0.0, 0.5, 1.0)
+    ]
+    assert far[0] > 1.2 * far[1] > 1.2 * far[2]
+
+
+def test_seeds_reproduce_and_batches_do_not_matter():
+    sounds = torch.cat([sound_of(ringing_field(pitch=1 + 0.1 * row)) for row in range(5)])
+    whole = guide(Gaussian()).targets(sounds, 0, seeded())
+    assert torch.equal(guide(Gaussian()).targets(sounds, 0, seeded()), whole)
+    assert torch.equal(guide(Gaussian(), batch=2).targets(sounds, 0, seeded()), whole)
+    assert not torch.allclose(guide(Gaussian()).targets(sounds, 0, seeded(1)), whole)
+
+
+def test_out_of_memory_halves_the_batch_and_says_so():
+    sounds = torch.cat([sound_of(ringing_field(pitch=1 + 0.1 * row)) for row in range(8)])
+    whole, tight = guide(Gaussian()).targets(sounds, 0, seeded()), Gaussian(room=3)
+    small = guide(tight, batch=8)
+    with warns(AvmsfWarning, name="batch") as caught:
+        found = small.targets(sounds, 0, seeded())
+    assert [each.message.value for each in caught] == [4, 2]
+    assert torch.equal(found, whole)
+    assert tight.batches == [2, 2, 2, 2]
+    # It stays so, without another word.
+    small.targets(sounds, 1, seeded())
+    with raises(EditError, name="batch", value=1):
+        guide(Gaussian(room=0), batch=1).targets(sounds, 0, seeded())
+
+
+def test_memory_is_freed_before_it_is_asked_for_again(monkeypatch):
+    filled, freed = [], []
+
+    class Filling(Gaussian):
+        def encode(self, waveforms):
+            held = torch.zeros(9)
+            filled.append(weakref.ref(held))
+            return super().encode(waveforms)
+
+    halve = DecoderDistillation._halve
+    monkeypatch.setattr(DecoderDistillation, "_halve", lambda self: freed.append(filled[-1]() is None) or halve(self))
+    sounds = sound_of(ringing_field(seconds=0.1)).expand(2, -1)
+    with warns(AvmsfWarning, name="batch", value=1):
+        guide(Filling(room=1), batch=2).targets(sounds, 0, seeded())
+    assert freed == [True]
+
+
+def test_what_tells_models_apart_tells_guides_apart():
+    assert guide(Known(room=3)).describe() == guide(Known(room=3)).describe() != guide(Known(room=4)).describe()
+
+
+def test_a_field_is_edited_to_what_the_model_wants():
+    wanted = sound_of(ringing_field(pitch=1.02, damping=2.0))
+    before, seen = ringing_field(), []
+    made = edit_towards(
+        before,
+        guide(Known(wanted), guidance=0.9),
+        config=GuidedEditConfig(steps=40, contacts_per_step=2, preview_every=0, fft_sizes=(2048, 512)),
+        progress=seen.append,
+    )
+    assert seen[-1].pitch == pytest.approx(1.02, abs=0.01)
+    # Single modes' own dampings bring the rest.
+    assert 1.3 < 1 / seen[-1].decay < 2.2
+    assert seen[-1].loss < 0.6 * seen[0].loss
+    entry = made.origin.report["edits"][-1]
+    assert (entry["prompt"], entry["model"], entry["guidance"]) == ("wood", "known", 0.9)
+    torch.testing.assert_close(
+        level(sound_of(made), sample_rate=RATE), level(sound_of(before), sample_rate=RATE), rtol=1e-4, atol=0
+    )
+
+
+def test_it_is_what_the_protocols_ask_for():
+    assert isinstance(Known(), AudioDiffusion)
+    assert isinstance(guide(Known()), Guide)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("lowest", 0.0), ("highest", 1.0), ("denoising", 0), ("batch", 0), ("guidance", math.inf)]
+)
+def test_settings_that_cannot_be_meant(name, value):
+    with raises(EditError, name=name, value=value):
+        DistillationConfig(**{name: value})
+
+
+@pytest.mark.parametrize("prompt", ["", " \n"])
+def test_an_empty_prompt_is_refused(prompt):
+    with raises(EditError, name="prompt", value=prompt):
+        DecoderDistillation(Known(), prompt, sample_rate=RATE)

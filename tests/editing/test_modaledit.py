@@ -1,0 +1,153 @@
+"""An edit moves modes by what it says, and leaves where on the object they are loud alone."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from avmsf.editing.modal_edit import ModalEdit, Struck
+from avmsf.errors import EditError
+from avmsf.field.sound_field import Origin, SoundField
+from avmsf.field.store import load, save
+from avmsf.modal.residual_noise import Residual
+from factories import made_fields
+from factories.raising import raises
+
+RATE = 8000.0
+
+
+def made_field(kind: str = "elastic") -> SoundField:
+    bank = made_fields.BANK
+    phase = torch.linspace(-1.0, 1.0, len(bank), dtype=torch.float64)
+    return SoundField(
+        bank, made_fields.FIELDS[kind](), phase, Residual(torch.zeros(17)), RATE, 4000, Origin(report={"gains": "made"})
+    )
+
+
+def made_edit(*, pitch: float = math.log(0.7)) -> ModalEdit:
+    return ModalEdit(
+        torch.tensor(pitch, dtype=torch.float64),
+        torch.tensor([0.02, -0.01, 0.0, 0.03, 0.0], dtype=torch.float64),
+        torch.tensor(math.log(3.0), dtype=torch.float64),
+        torch.tensor([0.0, 0.1, -0.1, 0.0, 0.2], dtype=torch.float64),
+        torch.tensor([0.0, 0.5, -0.5, 0.1, 1.0], dtype=torch.float64),
+    )
+
+
+def test_the_formula_of_the_paper():
+    field, edit = made_field(), made_edit()
+    bank = edit.of(field).bank
+    torch.testing.assert_close(bank.frequency, 0.7 * field.bank.frequency * edit.shift.exp(), rtol=1e-13, atol=0)
+    torch.testing.assert_close(bank.damping, 3.0 * field.bank.damping * edit.damping_shift.exp(), rtol=1e-13, atol=0)
+    assert (edit.pitch_factor, edit.damping_factor) == (pytest.approx(0.7), pytest.approx(3.0))
+
+
+@pytest.mark.parametrize("kind", made_fields.FIELDS)
+def test_gain_ratios_between_contacts_stay(kind):
+    field, edit = made_field(kind), made_edit()
+    contacts, directions = made_fields.places(7, seed=5), None
+    before, after = (each.known(contacts, directions=directions) for each in (field, edit.of(field)))
+    # To the last digits of float32.
+    torch.testing.assert_close(after.mean, before.mean * edit.scale.exp().float(), rtol=1e-6, atol=0)
+    if before.quadrature is not None:
+        torch.testing.assert_close(after.quadrature, before.quadrature * edit.scale.exp().float(), rtol=1e-6, atol=0)
+
+
+def test_gains_that_follow_frequencies_keep_their_product_with_them():
+    field, edit = made_field(), replace(made_edit(), scale=torch.zeros(5, dtype=torch.float64))
+    contacts = made_fields.places(3, seed=4)
+    new = edit.following(field.bank).of(field)
+    before, after = (each.bank.frequency.float() * each.known(contacts).mean for each in (field, new))
+    torch.testing.assert_close(after, before, rtol=1e-6, atol=0)
+
+
+def test_nothing_changes_nothing():
+    field, contacts = made_field(), made_fields.places(3, seed=4)
+    same = ModalEdit.none(field.bank).of(field)
+    torch.testing.assert_close(same.bank.frequency, field.bank.frequency, rtol=1e-14, atol=0)
+    sounds = field.render(contacts)
+    # Frequencies went through a logarithm and back: 1e-16 of 2300 Hz over half a second.
+    torch.testing.assert_close(same.render(contacts), sounds, rtol=0, atol=1e-6 * float(sounds.abs().max()))
+
+
+@pytest.mark.parametrize("pitch", [math.log(0.7), math.log(2.5)])
+def test_what_is_optimized_is_what_the_edited_field_renders(pitch):
+    # At 2.5 times the pitch two modes lie above half the rate, and are silent in both.
+    field, edit = made_field(), made_edit(pitch=pitch)
+    contacts = made_fields.places(4, seed=6)
+    sounds = Struck.at(field, contacts, samples=field.samples).sounds(edit)
+    rendered = edit.of(field).render(contacts)
+    torch.testing.assert_close(sounds, rendered, rtol=0, atol=2e-6 * float(rendered.abs().max()))
+
+
+def test_the_gradient_reaches_all_five():
+    field = made_field()
+    edit = replace(made_edit(), **{name: getattr(made_edit(), name).requires_grad_() for name in vars(made_edit())})
+    contacts = made_fields.places(2, seed=6)
+    Struck.at(field, contacts, samples=800).sounds(edit).square().sum().backward()
+    for name, value in vars(edit).items():
+        assert float(value.grad.abs().min()) > 0, name
+
+
+def test_a_mode_above_half_the_rate_has_no_slope_but_the_others_have():
+    field = made_field()
+    scale = torch.zeros(5, dtype=torch.float64, requires_grad=True)
+    edit = replace(ModalEdit.none(field.bank, pitch=math.log(2.0)), scale=scale)
+    Struck.at(field, made_fields.places(2, seed=6), samples=800).sounds(edit).square().sum().backward()
+    assert (scale.grad != 0).tolist() == [True, True, True, True, False]
+
+
+def test_an_edited_field_saves_loads_and_is_edited_again(tmp_path):
+    once = made_edit().of(made_field(), told={"prompt": "wood"})
+    save(once, tmp_path / "edited.safetensors")
+    again = made_edit().of(load(tmp_path / "edited.safetensors"))
+    direct = made_edit().of(once)
+    contacts = made_fields.places(3, seed=8)
+    assert torch.equal(again.render(contacts), direct.render(contacts))
+    entries = again.origin.report["edits"]
+    assert [each.get("prompt") for each in entries] == ["wood", None]
+    assert [each["edit"] for each in entries] == ["guided", "guided"]
+    assert entries[0]["pitch"] == pytest.approx(0.7)
+    # As in an edit by hand: what rings a third as long.
+    assert entries[0]["decay"] == pytest.approx(1 / 3)
+    assert again.origin.report["gains"] == "made"
+
+
+def test_the_loudest_modes_by_energy():
+    field = made_field()
+    struck = Struck.at(field, made_fields.places(9, seed=3), samples=4000)
+    known = struck.known
+    atoms = []
+    for mode in range(5):
+        alone = torch.zeros(5, dtype=torch.float64)
+        alone[:] = -40.0
+        alone[mode] = 0.0
+        sounds = Struck(field.bank, field.phase, known, RATE, 40000).sounds(
+            replace(ModalEdit.none(field.bank), scale=alone)
+        )
+        atoms.append(float(sounds.double().square().sum(1).mean()) / RATE)
+    # An exponential envelope with a sine of random phase: half of it at most differs by d / f.
+    torch.testing.assert_close(struck.energy(), torch.tensor(atoms, dtype=torch.float64), rtol=0.02, atol=0)
+    order = sorted(range(5), key=lambda mode: -atoms[mode])
+    assert struck.loudest(2).tolist() == sorted(order[:2])
+
+
+def test_louder_scales_the_sound():
+    field, contacts = made_field(), made_fields.places(3, seed=4)
+    edit = made_edit()
+    plain, loud = (each.of(field).render(contacts) for each in (edit, edit.louder(torch.tensor(2.5))))
+    torch.testing.assert_close(loud, 2.5 * plain, rtol=0, atol=1e-6 * float(loud.abs().max()))
+
+
+def test_an_edit_of_another_bank_is_refused():
+    other = replace(made_field(), bank=made_fields.BANK)
+    edit = ModalEdit(*(torch.zeros(size, dtype=torch.float64) for size in ((), (3,), (), (3,), (3,))))
+    with raises(EditError, name="shift", value=3):
+        edit.of(other)
+
+
+def test_a_frequency_that_is_no_number_is_refused():
+    field = made_field()
+    with raises(EditError, name="frequency", row=0, value=math.inf):
+        ModalEdit.none(field.bank, pitch=800.0).of(field)

@@ -1,0 +1,281 @@
+"""Recordings and materials as what a field shall sound like."""
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+
+from avmsf.editing.clips import lasting, level, levelled, resampled
+from avmsf.editing.material_statistics import MaterialStatistics
+from avmsf.editing.modal_edit import ModalEdit, Struck
+from avmsf.editing.reference import Reference
+from avmsf.editing.start_search import heard_spectrum
+from avmsf.errors import AvmsfWarning, EditError
+from avmsf.fem.material import CERAMIC, WOOD
+from avmsf.field.gain_field import Gains
+from avmsf.modal.bank import ModalBank
+from factories.raising import raises, warns
+from factories.ringing_field import RATE, SameGains, ringing_field, sound_of
+
+
+def write(path: Path, sound: torch.Tensor, *, rate: float = RATE, before: int = 0) -> Path:
+    samples = np.concatenate([np.zeros(before), sound.double().numpy()])
+    soundfile.write(path, samples, round(rate), subtype="FLOAT")
+    return path
+
+
+def struck(**change: float) -> Struck:
+    field = ringing_field(**change)
+    return Struck.at(field, field.gain_field.points, samples=field.samples)
+
+
+def test_a_recording_begins_at_its_onset_at_the_fields_rate(tmp_path):
+    # Recorded at four times the field's rate, with a tenth of a second of silence before.
+    field = ringing_field()
+    times = torch.arange(16000, dtype=torch.float64) / (4 * RATE)
+    terms = zip(field.gains(torch.zeros(1, 3))[0].double(), field.bank.frequency, field.bank.damping, strict=True)
+    fast = sum(gain * torch.exp(-d * times) * torch.sin(2 * math.pi * f * times) for gain, f, d in terms)
+    path = write(tmp_path / "hit.wav", fast, rate=4 * RATE, before=3200)
+    reference = Reference.read(path, sample_rate=RATE)
+    assert reference.lengths[0] == pytest.approx(4000, abs=4)
+    found = heard_spectrum(reference.clips[:, :3990])
+    torch.testing.assert_close(found, heard_spectrum(sound_of(field)[:, :3990]), rtol=0, atol=2e-3)
+
+
+def test_references_are_told_apart_by_every_sample():
+    sounds = 1e-7 * sound_of(ringing_field())
+    other = sounds.clone()
+    other[0, [5, 6]] = other[0, [6, 5]]
+    described = [Reference.of(each, sample_rate=RATE).describe() for each in (sounds, sounds.clone(), other)]
+    assert described[0] == described[1] != described[2]
+
+
+def test_several_clips_each_sound_has_its_nearest(tmp_path):
+    pitches = (0.6, 1.0, 1.7)
+    for pitch in pitches:
+        write(tmp_path / f"{pitch}.wav", sound_of(ringing_field(pitch=pitch))[0])
+    reference = Reference.read(tmp_path, sample_rate=RATE)
+    heard = torch.cat([sound_of(ringing_field(pitch=1.05 * pitch, level=5.0)) for pitch in pitches])
+    targets = reference.targets(heard, 0, torch.Generator())
+    torch.testing.assert_close(level(targets, sample_rate=RATE), level(heard, sample_rate=RATE))
+    wanted = torch.cat([sound_of(ringing_field(pitch=pitch)) for pitch in pitches])
+    # Onsets lie within a sample or two of where the files begin.
+    torch.testing.assert_close(heard_spectrum(targets), heard_spectrum(wanted), rtol=0, atol=2e-3)
+
+
+def test_where_a_clip_ends_nothing_is_asked():
+    field = ringing_field()
+    sound = sound_of(field)
+    reference = Reference.of(sound_of(ringing_field(damping=3.0))[:, :1000], sample_rate=RATE)
+    targets = reference.targets(sound, 0, torch.Generator())
+    assert torch.equal(targets[:, 1000:], sound[:, 1000:])
+    # Until the 10 ms before the end it is the clip alone.
+    early = levelled(lasting(reference.clips, 4000), sound, sample_rate=RATE)
+    torch.testing.assert_close(targets[:, :900], early[:, :900])
+
+
+@pytest.mark.parametrize(
+    ("pitch", "damping", "samples"),
+    [(0.5, 4.0, 4000), (1.6, 0.5, 4000), (1.0, 10.0, 4000), (1.6, 0.5, 800), (1.0, 4.0, 400)],
+)
+def test_the_start_finds_a_common_change(pitch, damping, samples):
+    # Clips of 800 and 400 samples end while they ring: of what comes later, nothing is known.
+    reference = Reference.of(sound_of(ringing_field(pitch=pitch, damping=damping))[:, :samples], sample_rate=RATE)
+    found = reference.start(struck())
+    # Bands are a 24th of an octave, 3 %; dampings are searched to a factor of 64^(1/32), 14 %.
+    assert found.pitch_factor == pytest.approx(pitch, rel=0.04)
+    assert found.damping_factor == pytest.approx(damping, rel=0.35)
+
+
+def test_the_start_stays_within_its_range():
+    # A hundredth of the damping is out of reach.
+    reference = Reference.of(sound_of(ringing_field(damping=1e-2, seconds=0.1)), sample_rate=RATE)
+    assert reference.start(struck(seconds=0.1)).damping_factor == pytest.approx(1 / 64)
+
+
+def test_the_start_of_what_is_there_already():
+    found = Reference.of(sound_of(ringing_field()), sample_rate=RATE).start(struck())
+    assert (found.pitch_factor, found.damping_factor) == (1.0, 1.0)
+
+
+def test_heard_spectra_shift_with_pitch_and_ignore_level():
+    one, double = (heard_spectrum(sound_of(ringing_field(pitch=pitch, damping=pitch))) for pitch in (0.5, 1.0))
+    torch.testing.assert_close(one.sum(1), torch.ones(1))
+    # An octave is 24 bands; each mode's width doubles with its frequency.
+    torch.testing.assert_close(one.roll(24, 1)[:, 60:], double[:, 60:], rtol=0, atol=3e-3)
+    loud = heard_spectrum(1e3 * sound_of(ringing_field()))
+    torch.testing.assert_close(loud, double, rtol=1e-4, atol=1e-7)
+
+
+def test_resampling_keeps_a_tone():
+    times = torch.arange(8000, dtype=torch.float64) / 8000
+    tone = torch.sin(2 * math.pi * 440.0 * times)[None]
+    found = resampled(tone, sample_rate=8000.0, wanted=44100.0)
+    expected = torch.sin(2 * math.pi * 440.0 * torch.arange(44100, dtype=torch.float64) / 44100)
+    assert found.shape == (1, 44100)
+    # The filter's pass-band ripple, away from the ends.
+    torch.testing.assert_close(found[0, 2000:-2000], expected[2000:-2000], rtol=0, atol=3e-3)
+
+
+def test_level_hears_the_blow_not_the_ringing():
+    short, long = (sound_of(ringing_field(damping=damping)) for damping in (1.0, 0.25))
+    ratio = float(level(long, sample_rate=RATE) / level(short, sample_rate=RATE))
+    assert ratio == pytest.approx(1.0, abs=0.25)
+    torch.testing.assert_close(level(3 * short, sample_rate=RATE), 3 * level(short, sample_rate=RATE))
+
+
+def test_recordings_that_cannot_be_used(tmp_path):
+    with raises(EditError, file=tmp_path / "none.wav"):
+        Reference.read(tmp_path / "none.wav", sample_rate=RATE)
+    with raises(EditError, file=tmp_path, name="reference"):
+        Reference.read(tmp_path, sample_rate=RATE)
+    with raises(EditError, file="silent.wav", value=0.0):
+        Reference.read(write(tmp_path / "silent.wav", torch.zeros(4000)), sample_rate=RATE)
+    short = write(tmp_path / "short.wav", sound_of(ringing_field())[0, :100])
+    with raises(EditError, file=short, name="samples"):
+        Reference.read(short, sample_rate=RATE)
+    with raises(EditError, name="clips", row=1, value=0.0):
+        Reference.of(torch.stack([torch.ones(9), torch.zeros(9)]), sample_rate=RATE)
+    with raises(EditError, name="clips", row=0, value=None):
+        Reference.of(torch.full((1, 9), math.nan), sample_rate=RATE)
+
+
+def test_what_holds_no_blow_is_refused(tmp_path):
+    noise = write(tmp_path / "noise.wav", torch.randn(4000, generator=torch.Generator().manual_seed(0)))
+    with raises(EditError, file=noise) as caught:
+        Reference.read(noise, sample_rate=RATE)
+    assert 0.0 < caught.value.value < 6.0
+
+
+def test_of_two_blows_the_first_is_taken_and_that_is_said(tmp_path):
+    first, second = (sound_of(ringing_field(pitch=pitch, seconds=0.25))[0] for pitch in (1.0, 1.4))
+    both = write(tmp_path / "both.wav", torch.cat([first, second]), before=800)
+    with warns(AvmsfWarning, file=both, name="impacts") as caught:
+        reference = Reference.read(both, sample_rate=RATE)
+    assert caught[0].message.value == pytest.approx((0.1, 0.35), abs=0.005)
+    # The second blow is found to half a window of 10 ms, and none of it is left.
+    assert reference.lengths[0] == pytest.approx(2000, abs=40)
+    found = heard_spectrum(reference.clips[:, :1950])
+    torch.testing.assert_close(found, heard_spectrum(first[None, :1950]), rtol=0, atol=2e-3)
+
+
+def test_a_clipped_reference_is_said(tmp_path):
+    sound = sound_of(ringing_field())[0]
+    hard = write(tmp_path / "hard.wav", (4 * sound / sound.abs().max()).clamp(-1.0, 1.0), before=800)
+    with warns(AvmsfWarning, file=hard, name="clipping"):
+        Reference.read(hard, sample_rate=RATE)
+
+
+def test_a_reference_that_lacks_what_the_field_holds_is_said(tmp_path):
+    low = write(tmp_path / "low.wav", sound_of(ringing_field())[0, ::8], rate=RATE / 8, before=100)
+    with warns(AvmsfWarning, file=low, name="sample_rate", value=1000.0):
+        Reference.read(low, sample_rate=RATE)
+
+
+def law(frequency: torch.Tensor, alpha: float, beta: float) -> torch.Tensor:
+    return 0.5 * (alpha + beta * (2 * math.pi * frequency).square())
+
+
+def made_statistics() -> MaterialStatistics:
+    generator = torch.Generator().manual_seed(0)
+    banks, gains = [], []
+    for size in (1.0, 30.0):
+        frequency = torch.exp(torch.linspace(math.log(200.0), math.log(3200.0), 50, dtype=torch.float64))
+        frequency = frequency * torch.exp(0.01 * torch.randn(50, dtype=torch.float64, generator=generator))
+        banks.append(ModalBank(frequency, law(frequency, 12.0, 4e-7)))
+        gains.append((size * (frequency / 200.0) ** -1.0).float())
+    return MaterialStatistics.of_modes(banks, gains, name="made")
+
+
+def test_statistics_find_the_law_the_slope_and_the_band():
+    found = made_statistics()
+    assert (found.alpha, found.beta) == (pytest.approx(12.0, rel=1e-6), pytest.approx(4e-7, rel=1e-6))
+    # Gains in inverse proportion to frequency fall by 6.02 dB an octave.
+    assert found.brightness == pytest.approx(-20 * math.log10(2), rel=0.01)
+    # With weights 1 / f, evenly spaced in log f from 200 Hz, half the weight lies below 2 / (1 + 1/16) times 200 Hz.
+    assert float(found.frequency[31:33].mean()) == pytest.approx(400 / (1 + 1 / 16), rel=0.05)
+
+
+def test_modes_that_are_muted_say_nothing_of_brightness():
+    whole = made_statistics()
+    frequency = torch.exp(torch.linspace(math.log(200.0), math.log(3200.0), 50, dtype=torch.float64))
+    bank = ModalBank(frequency, law(frequency, 12.0, 4e-7))
+    gains = ((frequency / 200.0) ** -1.0).float()
+    for row in (0, 49):
+        muted = gains.clone()
+        muted[row] = 0.0
+        found = MaterialStatistics.of_modes([bank], [muted], name="muted")
+        assert found.brightness == pytest.approx(whole.brightness, rel=0.02)
+
+
+def test_made_up_blows_have_the_statistics():
+    found, generator = made_statistics(), torch.Generator().manual_seed(1)
+    sounds = found.sounds(6, samples=4000, sample_rate=RATE, generator=generator)
+    again = found.sounds(6, samples=4000, sample_rate=RATE, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(sounds, again)
+    assert not torch.allclose(sounds[0], sounds[1])
+    power = torch.fft.rfft(sounds.double()).abs().square().sum(0)
+    hertz = torch.fft.rfftfreq(4000, 1 / RATE)
+    # The modes lie from 200 to 3,200 Hz, and are some ten hertz wide.
+    assert float(power[(hertz > 150) & (hertz < 3500)].sum() / power.sum()) > 0.97
+    # All modes at half the rate or above sound nowhere.
+    high = MaterialStatistics("high", found.frequency * 100, 1.0, 0.0, 0.0)
+    with raises(EditError, name="frequency", value=float(high.frequency[0])):
+        high.sounds(1, samples=100, sample_rate=RATE, generator=generator)
+
+
+def test_another_material_of_the_same_object():
+    field = ringing_field()
+    found = MaterialStatistics.transform(field, CERAMIC, WOOD)
+    ratio = math.sqrt(WOOD.young / CERAMIC.young * CERAMIC.density / WOOD.density)
+    assert (found.alpha, found.beta, found.name) == (WOOD.alpha, WOOD.beta, "wood")
+    assert set(found.frequency.tolist()) <= set((ratio * field.bank.frequency).tolist())
+    start = found.reference(samples=4000, sample_rate=RATE).start(struck())
+    assert start.damping_factor > 2.0
+
+
+def test_statistics_of_no_modes_are_refused():
+    with raises(EditError, name="banks", value=0):
+        MaterialStatistics.of_modes([], [], name="nothing")
+
+
+def test_statistics_of_objects_that_do_not_fit():
+    bank, ones = ringing_field().bank, torch.ones(6)
+    for gains, row, value in (
+        ([ones], None, 1),
+        ([ones, torch.ones(5)], 1, 5),
+        ([ones, 0 * ones], 1, 0.0),
+        ([math.inf * ones, ones], 0, math.inf),
+    ):
+        with raises(EditError, name="gains", row=row, value=value):
+            MaterialStatistics.of_modes([bank, bank], gains, name="things")
+
+
+@dataclass(frozen=True, eq=False)
+class Ahead(SameGains):
+    """Gains of which a part is a quarter of a period ahead."""
+
+    quadrature: torch.Tensor
+
+    def at(self, contacts, directions=None) -> Gains:
+        return Gains(self.gains.expand(len(contacts), -1), self.quadrature.expand(len(contacts), -1))
+
+
+def test_a_modes_size_does_not_depend_on_its_phase():
+    field, turn = ringing_field(), torch.linspace(0.0, 1.5, 6)
+    gains = field.gain_field.gains
+    turned = replace(field, gain_field=Ahead(gains * torch.cos(turn), gains * torch.sin(turn)))
+    own, other = (MaterialStatistics.transform(each, CERAMIC, WOOD) for each in (field, turned))
+    torch.testing.assert_close(other.frequency, own.frequency)
+    assert other.brightness == pytest.approx(own.brightness, rel=1e-5)
+
+
+def test_an_edit_starts_where_nothing_moves_alone():
+    bank = ringing_field().bank
+    edit = ModalEdit.none(bank, pitch=math.log(2.0))
+    assert (edit.pitch_factor, edit.damping_factor) == (pytest.approx(2.0), 1.0)
+    assert not bool(edit.shift.any() or edit.scale.any() or edit.damping_shift.any())

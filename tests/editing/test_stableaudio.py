@@ -1,0 +1,346 @@
+"""Stable Audio's classes with tiny random weights, saved and loaded as a user's folder would be."""
+
+import json
+import math
+import shutil
+import threading
+import warnings
+from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+
+import pytest
+import torch
+
+from avmsf.editing.config import STABLE_AUDIO, DistillationConfig, GuidedEditConfig
+from avmsf.editing.distillation import AudioDiffusion, DecoderDistillation, partial_denoising
+from avmsf.editing.guided import GuidedEditProgress, edit_towards
+from avmsf.editing.modal_edit import ModalEdit, Struck
+from avmsf.editing.parameters import HIERARCHICAL
+from avmsf.editing.reference import Reference
+from avmsf.editing.stable_audio import StableAudio
+from avmsf.editing.stable_audio_files import _expect_weights
+from avmsf.errors import EditError
+from factories.made_audio import DIM, FRAMES, RATE, save_audio, tiny_pipeline
+from factories.raising import raises
+from factories.ringing_field import ringing_field, sound_of
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    diffusers = pytest.importorskip("diffusers")
+    pytest.importorskip("transformers")
+    from diffusers import StableAudioPipeline
+
+pytestmark = pytest.mark.filterwarnings("ignore:`torch.nn.utils.weight_norm` is deprecated:FutureWarning")
+
+
+@pytest.fixture(autouse=True)
+def offline(monkeypatch) -> None:
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return save_audio(tmp_path_factory.mktemp("model") / "tiny-audio")
+
+
+@pytest.fixture(scope="module")
+def model(folder) -> StableAudio:
+    return StableAudio.load(folder, device="cpu")
+
+
+def some_latents(count: int = 2) -> torch.Tensor:
+    return torch.randn(count, DIM // 2, FRAMES, generator=torch.Generator().manual_seed(1))
+
+
+def test_a_folder_is_loaded_and_frozen(model):
+    assert (model.name, model.sample_rate, model.channels) == ("tiny-audio", RATE, 2)
+    assert (model.device.type, model.dtype) == ("cpu", torch.float32)
+    assert isinstance(model, AudioDiffusion)
+    networks = (model.pipeline.vae, model.pipeline.transformer, model.pipeline.text_encoder)
+    assert not any(weight.requires_grad for network in networks for weight in network.parameters())
+
+
+def test_encoding_what_sounds_is_encoding_the_whole_window(model):
+    sounds = torch.randn(2, 2, 1600, generator=torch.Generator().manual_seed(2))
+    found = model.encode(sounds)
+    padded = torch.nn.functional.pad(sounds, (0, FRAMES * 8 - 1600))
+    with torch.no_grad():
+        whole = model.pipeline.vae.encode(padded).latent_dist.mode()
+    assert found.shape == whole.shape
+    # The window's own end is heard by the last frames alone.
+    torch.testing.assert_close(found[:, :, : FRAMES - 60], whole[:, :, : FRAMES - 60], rtol=0, atol=1e-5)
+
+
+def test_decoding_the_beginning_is_the_beginning_of_decoding(model):
+    latents = some_latents()
+    with torch.no_grad():
+        whole = model.pipeline.vae.decode(latents).sample
+    torch.testing.assert_close(model.decode(latents, samples=1001), whole[:, :, :1001], rtol=0, atol=1e-5)
+
+
+def test_the_estimate_is_the_v_prediction_of_the_paper(model):
+    # In the latents cos(a) z + sin(a) noise the network says v, and z = cos(a) noisy - sin(a) v; its time is t itself.
+    latents, level = some_latents(), torch.tensor([0.2, 0.7])
+    conditioning = model.embed("wood", None, seconds=0.4)
+    angle = (0.5 * math.pi * level)[:, None, None]
+    rotary = diffusers.models.embeddings.get_1d_rotary_pos_embed(
+        4, FRAMES + 1, use_real=True, repeat_interleave_real=False
+    )
+    with torch.no_grad():
+        v = model.pipeline.transformer(
+            latents,
+            level,
+            encoder_hidden_states=conditioning.text[1:].expand(2, -1, -1),
+            global_hidden_states=conditioning.times[1:].expand(2, -1, -1),
+            rotary_embedding=rotary,
+            return_dict=False,
+        )[0]
+    found = model.denoised(latents, level, conditioning, guidance=1.0)
+    torch.testing.assert_close(found, torch.cos(angle) * latents - torch.sin(angle) * v, rtol=1e-4, atol=1e-5)
+
+
+def test_guidance_is_linear_in_the_words(model):
+    latents, level = some_latents(), torch.tensor([0.3, 0.6])
+    conditioning = model.embed("glass", None, seconds=0.4)
+    at = [model.denoised(latents, level, conditioning, guidance=each) for each in (0.0, 1.0, 7.0)]
+    torch.testing.assert_close(at[2], at[0] + 7 * (at[1] - at[0]), rtol=1e-3, atol=1e-4)
+    assert float((at[1] - at[0]).abs().max()) > 1e-4
+
+
+def test_deterministic_steps_are_those_of_diffusers_own_solver(model):
+    # Of diffusers' schedulers, this one is deterministic: of first order it takes DDIM's steps. Given our levels, and
+    # this pipeline's reading of the network, it has to arrive where we do.
+    solver = diffusers.EDMDPMSolverMultistepScheduler(sigma_data=1.0, solver_order=1, final_sigmas_type="zero")
+    latents, steps, top = some_latents(1), 5, 0.8
+    conditioning = model.embed("steel", None, seconds=0.4)
+    levels = torch.tensor([top * (1 - step / steps) for step in range(steps)])
+    solver.set_timesteps(steps)
+    solver.sigmas = torch.cat([torch.tan(0.5 * math.pi * levels), torch.zeros(1)])
+    solver.timesteps = solver.precondition_noise(solver.sigmas[:-1])
+    noisy = latents / math.cos(0.5 * math.pi * top)
+    for step in range(steps):
+        angle = 0.5 * math.pi * levels[step]
+        clean = model.denoised(noisy * torch.cos(angle), levels[step : step + 1], conditioning, guidance=3.0)
+        # What this solver makes of its network's word has to be our estimate.
+        sigma = solver.sigmas[step]
+        out = (clean - noisy / (sigma**2 + 1)) / (sigma / (sigma**2 + 1).sqrt())
+        noisy = solver.step(out, solver.timesteps[step], noisy).prev_sample
+    found = partial_denoising(model, latents, torch.tensor([top]), conditioning, steps=steps, guidance=3.0)
+    torch.testing.assert_close(found, noisy, rtol=1e-3, atol=1e-4)
+
+
+def test_words_are_embedded_as_the_pipeline_does(model):
+    plain, against = model.embed("wood", None, seconds=0.4), model.embed("wood", "glass", seconds=0.4)
+    assert not bool(plain.text[0].any())
+    torch.testing.assert_close(against.text[1], plain.text[1])
+    torch.testing.assert_close(against.text[0, :-2], model.embed("glass", None, seconds=0.4).text[1, :-2])
+    assert not torch.allclose(plain.times, model.embed("wood", None, seconds=4.0).times)
+
+
+def test_gradient_reaches_the_modes_and_leaves_the_weights(model):
+    field = ringing_field(seconds=0.2)
+    guide = DecoderDistillation(model, "a wooden bowl", sample_rate=RATE, config=DistillationConfig(denoising=2))
+    weights = {name: each.clone() for name, each in model.pipeline.transformer.state_dict().items()}
+    weights |= {name: each.clone() for name, each in model.pipeline.vae.state_dict().items()}
+    zero = ModalEdit.none(field.bank)
+    edit = replace(zero, **{name: getattr(zero, name).clone().requires_grad_() for name in vars(zero)})
+    sounds = Struck.at(field, field.gain_field.points, samples=1600).sounds(edit)
+    targets = guide.targets(sounds.detach(), 0, torch.Generator().manual_seed(0))
+    assert not targets.requires_grad
+    (sounds - targets).square().sum().backward()
+    for name, value in vars(edit).items():
+        assert float(value.grad.abs().max()) > 0, name
+    made = edit_towards(field, guide, config=GuidedEditConfig(steps=3, contacts_per_step=2, preview_every=0))
+    for before, after in ((field.bank.frequency, made.bank.frequency), (field.bank.damping, made.bank.damping)):
+        assert bool((before != after).all())
+    assert bool((made.gain_field.scale != 1).all())
+    now = {**model.pipeline.transformer.state_dict(), **model.pipeline.vae.state_dict()}
+    assert all(torch.equal(now[name], each) for name, each in weights.items())
+    again = edit_towards(field, guide, config=GuidedEditConfig(steps=3, contacts_per_step=2, preview_every=0))
+    assert torch.equal(again.bank.frequency, made.bank.frequency)
+
+
+def test_what_the_decoder_says_is_the_target(model, monkeypatch):
+    # Latents of one sound are all that this denoiser ever sees: their decoded sound is as good as a recording.
+    wanted = sound_of(ringing_field(pitch=0.98, damping=2.0, seconds=0.2))
+    clean = model.encode((0.5 * wanted / wanted.abs().max())[:, None].expand(-1, 2, -1))
+    monkeypatch.setattr(model, "denoised", lambda latents, *_, **__: clean.expand(len(latents), -1, -1))
+    guide = DecoderDistillation(model, "duller", sample_rate=RATE, config=DistillationConfig(denoising=2))
+    reference = Reference.of(model.decode(clean, samples=1600).mean(dim=1), sample_rate=RATE)
+    field, still = ringing_field(seconds=0.2), replace(HIERARCHICAL, searches=False)
+    config = GuidedEditConfig(steps=8, contacts_per_step=2, preview_every=0)
+    seen: list[GuidedEditProgress] = []
+    by_words = edit_towards(field, guide, config=config, parameters=still, progress=seen.append)
+    by_sound = edit_towards(field, reference, config=config, parameters=still)
+    # A random autoencoder's decoded sound is far from any ring: eight steps take a twentieth off.
+    assert seen[-1].loss < 0.97 * seen[0].loss
+    # Where a magnitude all but meets its target, rounding decides which way the loss would have it.
+    torch.testing.assert_close(by_words.bank.frequency, by_sound.bank.frequency, rtol=5e-5, atol=0)
+    torch.testing.assert_close(by_words.bank.damping, by_sound.bank.damping, rtol=1e-4, atol=0)
+    torch.testing.assert_close(by_words.gain_field.scale, by_sound.gain_field.scale, rtol=1e-4, atol=0)
+    assert float((by_words.bank.damping / field.bank.damping).log().abs().min()) > 0.02
+
+
+def test_models_of_one_name_are_told_apart(model):
+    same, other = (StableAudio(tiny_pipeline(), name="tiny-audio") for _ in range(2))
+    with torch.no_grad():
+        other.pipeline.transformer.proj_in.weight[0, 0] += 1e-3
+    assert same.describe() == model.describe() != other.describe()
+
+
+def test_devices_that_cannot_be_used(folder, monkeypatch):
+    with raises(EditError, name="device", value="gpu"):
+        StableAudio.load(folder, device="gpu")
+    if not torch.cuda.is_available():
+        with raises(EditError, name="device", value="cuda"):
+            StableAudio.load(folder, device="cuda")
+
+    def full(self, place):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(StableAudioPipeline, "to", full)
+    with raises(EditError, name="device", value="cpu"):
+        StableAudio.load(folder, device="cpu")
+
+
+def test_a_sound_from_words_alone(model):
+    first, again, other = (model.generate("wood", seconds=0.3, seed=seed, steps=3) for seed in (1, 1, 2))
+    assert first.shape == (round(0.3 * RATE),)
+    assert torch.equal(first, again)
+    assert not torch.allclose(first, other)
+    with raises(EditError, name="prompt", value=" "):
+        model.generate(" ", seconds=0.3, seed=0)
+
+
+def test_sounds_from_words_that_cannot_be_made(model, monkeypatch):
+    for seconds in (0.6, 0.0, math.nan):
+        with raises(EditError, name="seconds") as caught:
+            model.generate("wood", seconds=seconds, seed=0)
+        assert caught.value.value is seconds
+        assert "0.512" in str(caught.value)
+
+    def full(*_, **__):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(model.pipeline.transformer, "forward", full)
+    with raises(EditError, name="device", value="cpu"):
+        model.generate("wood", seconds=0.3, seed=0, steps=2)
+
+
+def test_seconds_bound_the_window(folder):
+    short = StableAudio.load(folder, seconds=0.25, device="cpu")
+    assert short.describe()["frames"] == 250
+    assert short.encode(torch.zeros(1, 2, 1600)).shape[2] == 250
+    with raises(EditError, name="seconds", value=0.5):
+        short.encode(torch.zeros(1, 2, 4000))
+    with raises(EditError, name="seconds", value=1.0):
+        StableAudio.load(folder, seconds=1.0, device="cpu")
+
+
+def test_bfloat16_keeps_the_autoencoder_exact(folder):
+    rough = StableAudio.load(folder, device="cpu", dtype=torch.bfloat16)
+    assert rough.dtype == torch.bfloat16
+    sounds = torch.randn(1, 2, 800, generator=torch.Generator().manual_seed(2))
+    exact = StableAudio.load(folder, device="cpu")
+    assert torch.equal(rough.encode(sounds), exact.encode(sounds))
+    assert [each.describe()["precision"] for each in (rough, exact)] == ["torch.bfloat16", "torch.float32"]
+    conditioning = rough.embed("wood", None, seconds=0.1)
+    found = rough.denoised(some_latents(), torch.tensor([0.3, 0.6]), conditioning, guidance=2.0)
+    expected = exact.denoised(
+        some_latents(), torch.tensor([0.3, 0.6]), exact.embed("wood", None, seconds=0.1), guidance=2.0
+    )
+    assert found.dtype == torch.float32
+    assert 1e-5 < float((found - expected).square().mean().sqrt()) < 0.1
+
+
+def test_weights_that_are_not_here(monkeypatch, tmp_path):
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    with raises(EditError, name="source", value=STABLE_AUDIO) as caught:
+        StableAudio.load()
+    assert f"https://huggingface.co/{STABLE_AUDIO}" in str(caught.value)
+    assert "hf auth login" in str(caught.value)
+    with raises(EditError, file=tmp_path / "nowhere", name="source"):
+        StableAudio.load(tmp_path / "nowhere")
+
+
+def test_a_refusal_of_the_hub_is_told_with_the_way_in(monkeypatch, tmp_path):
+    asked = []
+
+    class Gate(BaseHTTPRequestHandler):
+        """Answers as the hub does for a gated model and nobody's token."""
+
+        def do_GET(self):
+            asked.append(self.path)
+            self.send_response(401)
+            self.send_header("X-Error-Code", "GatedRepo")
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+
+        def do_HEAD(self):
+            self.do_GET()
+
+        def log_message(self, *_):
+            return
+
+    monkeypatch.delenv("HF_HUB_OFFLINE")
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    with HTTPServer(("127.0.0.1", 0), Gate) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        here = f"http://127.0.0.1:{server.server_port}"
+        monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", here)
+        monkeypatch.setattr("huggingface_hub.hf_api.api.endpoint", here)
+        with raises(EditError, name="source", value=STABLE_AUDIO) as caught:
+            StableAudio.load()
+        assert "hf auth login" in str(caught.value)
+        server.shutdown()
+    assert {path for path in asked if STABLE_AUDIO in path} == {f"/api/models/{STABLE_AUDIO}"}
+
+
+def copied(folder: Path, place: Path) -> Path:
+    return Path(shutil.copytree(folder, place / "copy"))
+
+
+def test_a_folder_of_another_class(folder, tmp_path):
+    place = copied(folder, tmp_path)
+    index = json.loads((place / "model_index.json").read_text())
+    (place / "model_index.json").write_text(json.dumps({**index, "_class_name": "AudioLDM2Pipeline"}))
+    with raises(EditError, file=place, name="_class_name", value="AudioLDM2Pipeline"):
+        StableAudio.load(place)
+    (place / "model_index.json").write_text("{")
+    with raises(EditError, file=place / "model_index.json"):
+        StableAudio.load(place)
+    (place / "model_index.json").unlink()
+    parts = tuple(sorted(path.name for path in place.iterdir()))
+    with raises(EditError, file=place, name="model_index.json", value=parts):
+        StableAudio.load(place)
+
+
+def test_a_folder_without_weights_or_with_a_part_of_them(folder, model, tmp_path):
+    from safetensors.torch import load_file, save_file
+
+    place = copied(folder, tmp_path)
+    path = place / "transformer" / "diffusion_pytorch_model.safetensors"
+    weights = load_file(path)
+    save_file({name: each for name, each in weights.items() if name != "proj_in.weight"}, path)
+    _expect_weights(folder / "transformer", model.pipeline.transformer)
+    with raises(EditError, file=place / "transformer", name="weights", value=("proj_in.weight",)):
+        _expect_weights(place / "transformer", model.pipeline.transformer)
+    path.write_bytes(b"broken")
+    with raises(EditError, file=place, name=None):
+        StableAudio.load(place)
+    path.unlink()
+    with raises(EditError, file=place, name="weights", value=("transformer",)):
+        StableAudio.load(place)
+    shutil.rmtree(place / "vae")
+    with raises(EditError, file=place, name="parts", value=("vae",)):
+        StableAudio.load(place)
+
+
+def test_without_the_extra(monkeypatch, folder):
+    monkeypatch.setattr("avmsf.editing.stable_audio_files.find_spec", lambda name: None)
+    with raises(EditError, name="diffusers") as caught:
+        StableAudio.load(folder)
+    assert "pip install 'avmsf[text]'" in str(caught.value)

@@ -1,0 +1,237 @@
+"""CDPAM beside the authors' own modules, its keeping of embeddings, and weights that are not what they should be."""
+
+import importlib.util
+import math
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from avmsf.errors import EvaluationError
+from avmsf.evaluation.cdpam import Cdpam
+from avmsf.evaluation.cdpam_network import CdpamNetwork
+from avmsf.evaluation.cdpam_weights import CdpamWeights, find_weights, read_weights
+from avmsf.evaluation.convolution import TiledConvolution, Workspace
+from factories.raising import raises
+
+RATE = 22050.0
+needs_weights = pytest.mark.skipif(importlib.util.find_spec("cdpam") is None, reason="needs pip install 'avmsf[eval]'")
+
+
+@pytest.fixture(scope="module")
+def weights() -> CdpamWeights:
+    return read_weights(find_weights())
+
+
+@pytest.fixture(scope="module")
+def network(weights) -> CdpamNetwork:
+    return CdpamNetwork.of(weights)
+
+
+@pytest.fixture
+def cdpam(network, weights) -> Cdpam:
+    return Cdpam(network, weights.digest)
+
+
+@pytest.fixture(scope="module")
+def authors_model(weights) -> torch.nn.Module:
+    """The network of the package's own classes in float64; the module beside it, which imports more, stays asleep."""
+    found = importlib.util.spec_from_file_location("cdpam_models", find_weights().parents[1] / "models.py")
+    module = importlib.util.module_from_spec(found)
+    found.loader.exec_module(module)
+    model = module.FINnet(encoder_layers=16, encoder_filters=64, input_size=512, classif_BN=0)
+    model.load_state_dict(dict(weights.tensors))
+    return model.eval().double()
+
+
+def strikes(samples: int, *, level: float = 0.5) -> torch.Tensor:
+    """Two decaying chords and a noise, as float32 holds them."""
+    times = torch.arange(samples, dtype=torch.float64) / RATE
+    chord = torch.stack([torch.sin(2 * math.pi * pitch * times) for pitch in (440.0, 1210.0, 2990.0)])
+    mixes = torch.tensor([[1.0, 0.5, 0.25], [0.3, -0.9, 0.6]], dtype=torch.float64)
+    sounds = torch.exp(-30 * times) * (mixes @ chord) / 2
+    noise = 0.3 * torch.randn(1, samples, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return (level * torch.cat([sounds, noise])).float().double()
+
+
+@torch.inference_mode()
+def authors_distance(model: torch.nn.Module, sounds: torch.Tensor) -> torch.Tensor:
+    """Distance of each sound from the one before it, cyclically."""
+    heard = torch.nn.functional.normalize(model.base_encoder(sounds[:, None])[1], dim=1)
+    return model.model_dist(heard, heard.roll(1, dims=0))
+
+
+# 300 samples are near the ends all of them; of the others the middle is not, and their remainders of 16 differ. Faint
+# sounds are where rounding would be heard: the authors' own float32 is 8 % off at a level of .1.
+@needs_weights
+@pytest.mark.parametrize(("samples", "level"), [(300, 0.5), (1205, 0.5), (1150, 0.02)])
+def test_distances_are_those_of_the_authors_modules(cdpam, authors_model, samples, level):
+    sounds = strikes(samples, level=level)[[0, 2]]
+    others = sounds.roll(1, dims=0)
+    found = cdpam.distance(sounds, others, sample_rate=RATE)
+    assert torch.allclose(found, authors_distance(authors_model, sounds), rtol=1e-3, atol=0.0)
+    found = cdpam.distance(sounds, others, sample_rate=RATE, scaling="authors")
+    assert torch.allclose(found, authors_distance(authors_model, torch.round(32768 * sounds)), rtol=1e-4)
+
+
+@needs_weights
+@pytest.mark.parametrize("samples", [1, 9])
+def test_a_few_samples_have_a_distance(cdpam, samples):
+    distance = cdpam.distance(strikes(samples), 0 * strikes(samples), sample_rate=RATE, scaling="authors")
+    assert bool(torch.isfinite(distance).all())
+
+
+@needs_weights
+@pytest.mark.parametrize("scaling", ["benchmark", "authors"])
+def test_it_is_a_distance(cdpam, scaling):
+    first, second, third = (sounds[None] for sounds in strikes(1500))
+
+    def distance(a: torch.Tensor, b: torch.Tensor) -> float:
+        return float(cdpam.distance(a, b, sample_rate=RATE, scaling=scaling))
+
+    assert distance(first, first) == 0.0
+    assert distance(first, second) == distance(second, first) > 0.0
+    assert distance(first, third) <= distance(first, second) + distance(second, third)
+
+
+@needs_weights
+def test_scalings_have_keys_of_their_own(cdpam):
+    a, b = strikes(1500)[:1], strikes(1500)[1:2]
+    scores = cdpam.scores(a, b, sample_rate=RATE)
+    assert set(scores) == {"cdpam", "cdpam_scaled"}
+    assert float(scores["cdpam_scaled"]) > 100 * float(scores["cdpam"])
+    assert torch.equal(scores["cdpam"], cdpam.distance(a, b, sample_rate=RATE))
+    one = Cdpam(cdpam.network, cdpam.digest, scalings=("benchmark",))
+    assert set(one.scores(a, b, sample_rate=RATE)) == {"cdpam"}
+
+
+@needs_weights
+def test_sixteen_bits_hold_nothing_below_half_a_step(cdpam):
+    faint = 0.4 / 32768 * torch.sign(strikes(1500)[:1])
+    assert float(cdpam.distance(faint, 0 * faint, sample_rate=RATE, scaling="authors")) == 0.0
+    assert float(cdpam.distance(faint, 0 * faint, sample_rate=RATE)) > 0.0
+
+
+@needs_weights
+def test_the_sample_rate_hardly_matters(cdpam):
+    # Below 3 kHz all; half a sine as fade, so that no edge has more.
+    def sounds(rate: float) -> torch.Tensor:
+        times = torch.arange(round(0.2 * rate), dtype=torch.float64) / rate
+        fade = torch.sin(math.pi * times / 0.2) ** 2
+        return torch.stack([fade * torch.sin(2 * math.pi * pitch * times) for pitch in (500.0, 2900.0)])
+
+    expected = cdpam.distance(sounds(RATE)[:1], sounds(RATE)[1:], sample_rate=RATE, scaling="authors")
+    for rate in (44100.0, 48000.0):
+        found = cdpam.distance(sounds(rate)[:1], sounds(rate)[1:], sample_rate=rate, scaling="authors")
+        assert torch.allclose(found, expected, rtol=0.01)
+
+
+class EmbeddedTwiceError(Exception):
+    """Raised in place of a second embedding of a sound."""
+
+
+def refuse(*_arguments: object) -> torch.Tensor:
+    raise EmbeddedTwiceError
+
+
+@needs_weights
+def test_a_sound_is_embedded_once(cdpam, monkeypatch):
+    sounds = strikes(1000)
+    expected = cdpam.embed(sounds, sample_rate=RATE)
+    monkeypatch.setattr(CdpamNetwork, "features", refuse)
+    assert torch.equal(cdpam.embed(sounds.flip(0), sample_rate=RATE), expected.flip(0))
+    for others in ((0.9 * sounds, RATE, "benchmark"), (sounds, 22051.0, "benchmark"), (sounds, RATE, "authors")):
+        with pytest.raises(EmbeddedTwiceError):
+            cdpam.embed(others[0], sample_rate=others[1], scaling=others[2])
+
+
+@needs_weights
+def test_embeddings_outlive_the_process_in_a_folder(network, tmp_path, monkeypatch):
+    sounds = strikes(1000)
+    folder = tmp_path / "kept"
+    expected = Cdpam(network, "a", folder).embed(sounds, sample_rate=RATE)
+    files = sorted(folder.iterdir())
+    assert len(files) == 3
+    # Damaged, cut short or another's: made again, and kept again.
+    files[0].write_bytes(b"")
+    files[1].write_bytes(files[1].read_bytes()[:-8])
+    np.save(files[2], np.zeros(3))
+    assert torch.equal(Cdpam(network, "a", folder).embed(sounds, sample_rate=RATE), expected)
+    monkeypatch.setattr(CdpamNetwork, "features", refuse)
+    assert torch.equal(Cdpam(network, "a", folder).embed(sounds, sample_rate=RATE), expected)
+    with pytest.raises(EmbeddedTwiceError):
+        Cdpam(network, "other weights", folder).embed(sounds, sample_rate=RATE)
+
+
+@needs_weights
+def test_sounds_that_cannot_be_compared_are_refused(cdpam):
+    good = strikes(500)
+    with raises(EvaluationError, name="predicted", value=[3, 400]):
+        cdpam.distance(good[:, :400], good, sample_rate=RATE)
+    with raises(EvaluationError, name="sounds", row=2):
+        cdpam.embed(good / torch.tensor([[1.0], [1.0], [0.0]]) * torch.tensor([[1.0], [1.0], [0.0]]), sample_rate=RATE)
+    with raises(EvaluationError, name="sounds", value=[500]):
+        cdpam.embed(good[0], sample_rate=RATE)
+    for rate in (0.0, -1.0, math.nan, 10.0):
+        with raises(EvaluationError, name="sample_rate") as caught:
+            cdpam.embed(good, sample_rate=rate)
+        assert caught.value.value is rate
+    with raises(EvaluationError, name="sounds", row=None) as caught:
+        cdpam.embed(1e308 * good, sample_rate=RATE)
+    assert 1e307 < caught.value.value <= 1e308
+
+
+def test_a_missing_package_is_named_with_its_remedy(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with raises(EvaluationError, name="cdpam") as caught:
+        Cdpam.load()
+    assert "pip install 'avmsf[eval]'" in str(caught.value)
+
+
+def test_weights_that_cannot_be_read_are_refused(tmp_path):
+    path = tmp_path / "weights.pth"
+    with raises(EvaluationError, file=path, name=None) as caught:
+        read_weights(path)
+    assert type(caught.value.__cause__) is FileNotFoundError
+    torch.save({"state": {"a": torch.zeros(2)}}, path)
+    assert read_weights(path).take("a", 2).tolist() == [0.0, 0.0]
+    for name, length, found in ("b", 2, None), ("a", 3, [2]):
+        with raises(EvaluationError, name=name, value=found):
+            read_weights(path).take(name, length)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with raises(EvaluationError, file=path, name=None):
+        read_weights(path)
+    torch.save({"model": {}}, path)
+    with raises(EvaluationError, file=path, name="state"):
+        read_weights(path)
+
+
+@pytest.mark.parametrize("legacy", [True, False])
+def test_reading_weights_runs_no_code(tmp_path, legacy):
+    class Touch:
+        def __reduce__(self):
+            return Path.touch, (tmp_path / "touched",)
+
+    path = tmp_path / "weights.pth"
+    torch.save({"state": Touch()}, path, _use_new_zipfile_serialization=not legacy, pickle_module=pickle)
+    with raises(EvaluationError, file=path, name=None) as caught:
+        read_weights(path)
+    assert type(caught.value.__cause__) is pickle.UnpicklingError
+    assert not (tmp_path / "touched").exists()
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+@pytest.mark.parametrize(("taps", "samples"), [(15, 1), (15, 33), (15, 34), (15, 101), (5, 300), (3, 47)])
+def test_tiled_convolutions_are_convolutions(stride, taps, samples):
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.randn(6, 4, taps, generator=generator, dtype=torch.float64)
+    signal = torch.randn(4, samples, generator=generator)
+    expected = torch.nn.functional.conv1d(signal[None].double(), weights, stride=stride, padding=taps // 2)[0]
+    workspace = Workspace()
+    for tile in (24, 32, 48):
+        made = TiledConvolution.of(weights, stride=stride, tile=tile)(signal, workspace)
+        # Sums of up to 60 products of numbers near 1, in float32.
+        assert torch.allclose(made.double(), expected, rtol=0.0, atol=3e-5)

@@ -1,0 +1,244 @@
+"""The CLAP score beside a direct use of the model, its keeping of embeddings, and folders that hold something else."""
+
+import json
+import math
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from avmsf.errors import EvaluationError
+from avmsf.evaluation.clap import Clap
+from factories.made_clap import RATE, SECONDS, save_clap
+from factories.raising import raises
+
+pytest.importorskip("transformers", reason="needs pip install 'avmsf[eval]'")
+CLIP = round(SECONDS * RATE)
+PROMPTS = ("a blow on wood", "a bright metal bell", "glass")
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("clap")
+    save_clap(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def loaded(saved) -> Clap:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HF_HUB_OFFLINE", "1")
+        return Clap.load(saved)
+
+
+@pytest.fixture
+def clap(loaded) -> Clap:
+    """With nothing remembered."""
+    return Clap(loaded.model, loaded.processor, loaded.name, loaded.digest)
+
+
+def strikes(count: int = 3, *, samples: int = 24000, rate: float = RATE) -> torch.Tensor:
+    times = torch.arange(samples, dtype=torch.float64) / rate
+    pitches = 400.0 * torch.arange(1, count + 1, dtype=torch.float64) ** 2
+    return (
+        0.5
+        * torch.exp(-torch.outer(5 * torch.arange(1, count + 1), times))
+        * torch.sin(2 * math.pi * torch.outer(pitches, times))
+    )
+
+
+def directly(clap: Clap, sounds: torch.Tensor, prompts: tuple[str, ...]) -> torch.Tensor:
+    """The cosines by the model's own methods, for sounds of peak one at its own rate that fill its clip."""
+    heard = clap.processor.feature_extractor(list(sounds.numpy()), sampling_rate=int(RATE), return_tensors="pt")
+    said = clap.processor.tokenizer(list(prompts), return_tensors="pt", padding=True)
+    with torch.no_grad():
+        audio = clap.model.get_audio_features(**heard).pooler_output
+        text = clap.model.get_text_features(**said).pooler_output
+    return torch.nn.functional.cosine_similarity(audio, text).double()
+
+
+def test_the_score_is_the_models_own_cosine(clap):
+    sounds = strikes(samples=CLIP)
+    sounds = sounds / sounds.abs().amax(dim=1, keepdim=True)
+    found = clap.score(sounds, PROMPTS, sample_rate=RATE)
+    expected = directly(clap, sounds, PROMPTS)
+    # A random network: the cosines have to differ for their equality to say anything.
+    assert float(expected.max() - expected.min()) > 0.01
+    assert torch.allclose(found, expected, rtol=0.0, atol=1e-5)
+    assert bool((found.abs() <= 1.0).all())
+
+
+def test_one_prompt_goes_with_all_sounds(clap):
+    one = clap.score(strikes(), PROMPTS[:1], sample_rate=RATE)
+    assert torch.equal(one, clap.score(strikes(), PROMPTS[:1] * 3, sample_rate=RATE))
+    with raises(EvaluationError, name="prompts", value=2):
+        clap.score(strikes(), PROMPTS[:2], sample_rate=RATE)
+
+
+def test_level_does_not_matter_and_the_sample_rate_hardly(clap):
+    expected = clap.embed(strikes(), sample_rate=RATE)
+    assert torch.allclose(clap.embed(0.01 * strikes(), sample_rate=RATE), expected, rtol=0.0, atol=1e-5)
+    half = clap.embed(strikes(samples=12000, rate=24000.0), sample_rate=24000.0)
+    others = (half @ expected.T).diagonal()
+    assert float(others.min()) > 0.999
+    # Where the rate is not heeded the pitch is another: that is heard.
+    assert float((clap.embed(strikes(), sample_rate=24000.0) * expected).sum(dim=1).min()) < 0.999
+
+
+def test_a_batch_is_its_sounds_one_by_one(clap, loaded):
+    sounds = strikes(11, samples=6000)
+    alone = Clap(loaded.model, loaded.processor, loaded.name, loaded.digest)
+    expected = torch.cat([alone.embed(sound[None], sample_rate=RATE) for sound in sounds])
+    assert torch.allclose(clap.embed(sounds, sample_rate=RATE), expected, rtol=0.0, atol=1e-6)
+
+
+def test_longer_sounds_are_cut_at_the_same_place_every_time(clap, loaded):
+    sounds = strikes(2, samples=3 * CLIP)
+    np.random.seed(1)
+    first = clap.embed(sounds, sample_rate=RATE)
+    np.random.seed(2)
+    again = Clap(loaded.model, loaded.processor, loaded.name, loaded.digest).embed(sounds, sample_rate=RATE)
+    assert torch.equal(first, again)
+    assert torch.equal(first, clap.embed(sounds[:, :CLIP], sample_rate=RATE))
+
+
+def test_a_fused_network_draws_nothing_by_chance(tmp_path):
+    save_clap(tmp_path, fused=True)
+    found = []
+    for seed in range(3):
+        np.random.seed(seed)
+        found.append(Clap.load(tmp_path).embed(strikes(samples=2 * CLIP), sample_rate=RATE))
+    assert torch.equal(found[0], found[1])
+    assert torch.equal(found[0], found[2])
+
+
+class EmbeddedTwiceError(Exception):
+    """Raised in place of a second embedding of a sound."""
+
+
+def refuse(*_arguments: object) -> torch.Tensor:
+    raise EmbeddedTwiceError
+
+
+def test_a_sound_is_embedded_once(clap, monkeypatch):
+    sounds = strikes()
+    expected = clap.embed(sounds, sample_rate=RATE)
+    monkeypatch.setattr(Clap, "_embed_batch", refuse)
+    assert torch.equal(clap.embed(sounds.flip(0), sample_rate=RATE), expected.flip(0))
+    for others, rate in ((0.9 * sounds, RATE), (sounds, RATE - 1)):
+        with pytest.raises(EmbeddedTwiceError):
+            clap.embed(others, sample_rate=rate)
+
+
+def test_equal_sounds_in_one_call_are_embedded_once(clap, monkeypatch):
+    made = []
+    own = Clap._embed_batch
+    monkeypatch.setattr(Clap, "_embed_batch", lambda self, waves: made.append(len(waves)) or own(self, waves))
+    found = clap.embed(torch.cat([strikes(), strikes()]), sample_rate=RATE)
+    assert made == [3]
+    assert torch.equal(found[:3], found[3:])
+
+
+def test_embeddings_outlive_the_process_in_a_folder(loaded, tmp_path, monkeypatch):
+    def fresh(digest: str) -> Clap:
+        return Clap(loaded.model, loaded.processor, loaded.name, digest, tmp_path / "kept")
+
+    expected = fresh("a").embed(strikes(), sample_rate=RATE)
+    files = sorted((tmp_path / "kept").iterdir())
+    assert len(files) == 3
+    files[0].write_bytes(b"")
+    files[1].write_bytes(files[1].read_bytes()[:-8])
+    assert torch.allclose(fresh("a").embed(strikes(), sample_rate=RATE), expected, rtol=0.0, atol=1e-6)
+    monkeypatch.setattr(Clap, "_embed_batch", refuse)
+    assert torch.allclose(fresh("a").embed(strikes(), sample_rate=RATE), expected, rtol=0.0, atol=1e-6)
+    with pytest.raises(EmbeddedTwiceError):
+        fresh("other weights").embed(strikes(), sample_rate=RATE)
+
+
+def test_other_weights_have_another_digest(loaded, tmp_path):
+    save_clap(tmp_path, seed=1)
+    other = Clap.load(tmp_path)
+    assert other.digest != loaded.digest
+    assert not torch.allclose(
+        other.embed(strikes(), sample_rate=RATE), loaded.embed(strikes(), sample_rate=RATE), atol=1e-3
+    )
+
+
+def test_sounds_and_prompts_that_cannot_be_scored_are_refused(clap):
+    for prompts in ([""], ["  "]):
+        with raises(EvaluationError, name="prompt", value=prompts[0]):
+            clap.score(strikes(), prompts, sample_rate=RATE)
+    for prompts in ("wood", []):
+        with raises(EvaluationError, name="prompts", value=prompts):
+            clap.score(strikes(), prompts, sample_rate=RATE)
+    silent = strikes()
+    silent[1] = 0.0
+    with raises(EvaluationError, name="sounds", row=1, value=0.0):
+        clap.embed(silent, sample_rate=RATE)
+    with raises(EvaluationError, name="sample_rate", value=0.0):
+        clap.embed(strikes(), sample_rate=0.0)
+
+
+def test_folders_that_hold_something_else_are_named(saved, tmp_path):
+    extractors, weights = "preprocessor_config.json or processor_config.json", "model.safetensors or pytorch_model.bin"
+    with raises(EvaluationError, file="nowhere/at/all", name="source"):
+        Clap.load("nowhere/at/all")
+    with raises(EvaluationError, file=tmp_path, value=("config.json", extractors, weights)) as caught:
+        Clap.load(tmp_path)
+    assert "hf download laion" in str(caught.value)
+    other = tmp_path / "other"
+    shutil.copytree(saved, other)
+    (other / "model.safetensors").rename(other / "kept")
+    with raises(EvaluationError, file=other, value=(weights,)):
+        Clap.load(other)
+    (other / "model.safetensors").write_bytes((other / "kept").read_bytes()[:1000])
+    with raises(EvaluationError, file=other, value=None):
+        Clap.load(other)
+    (other / "config.json").write_text(json.dumps({"model_type": "bert"}), encoding="utf-8")
+    with raises(EvaluationError, file=other / "config.json", name="model_type", value="bert"):
+        Clap.load(other)
+    (other / "model_index.json").write_text(json.dumps({"_class_name": "StableAudioPipeline"}), encoding="utf-8")
+    with raises(EvaluationError, file=other, value="StableAudioPipeline"):
+        Clap.load(other)
+
+
+def test_weights_that_are_not_there_are_not_made_up(saved, tmp_path):
+    from safetensors.torch import load_file, save_file
+
+    shutil.copytree(saved, tmp_path, dirs_exist_ok=True)
+    weights = load_file(tmp_path / "model.safetensors")
+    weights.pop("audio_projection.linear1.weight")
+    save_file(weights, tmp_path / "model.safetensors", {"format": "pt"})
+    missing = ("audio_projection.linear1.weight",)
+    with raises(EvaluationError, file=tmp_path / "model.safetensors", name="weights", value=missing):
+        Clap.load(tmp_path)
+
+
+def test_a_model_that_is_neither_here_nor_there_says_how_to_get_it(tmp_path, monkeypatch):
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    with raises(EvaluationError, name="source", value="laion/clap-htsat-unfused") as caught:
+        Clap.load()
+    assert "hf download laion/clap-htsat-unfused --local-dir FOLDER" in str(caught.value)
+
+
+def test_a_failed_download_is_one_sentence_without_the_clients_exception(tmp_path, monkeypatch):
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
+    monkeypatch.setattr("huggingface_hub.hf_api.api.endpoint", "http://127.0.0.1:9")
+    with raises(EvaluationError, name="source", value="laion/clap-htsat-unfused"):
+        Clap.load()
+
+
+def test_a_missing_package_is_named_with_its_remedy(saved, monkeypatch):
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    with raises(EvaluationError, name="transformers") as caught:
+        Clap.load(saved)
+    assert "pip install 'avmsf[eval]'" in str(caught.value)

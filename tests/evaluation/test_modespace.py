@@ -1,0 +1,193 @@
+"""Vectors of mode sets in closed form, and the space that UMAP makes of them: seeded, stored, and made again."""
+
+import importlib.util
+import json
+import math
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from avmsf.errors import EvaluationError
+from avmsf.evaluation.mode_embedding import MaterialSpace, UmapSettings
+from avmsf.evaluation.mode_features import ModeFeatures, Pitches, PitchesAndRings, features_of
+from avmsf.modal.bank import ModalBank
+from factories.raising import raises
+
+FEATURES = (Pitches(), PitchesAndRings())
+
+
+def bank(frequency: list[float] | torch.Tensor, damping: list[float] | torch.Tensor | float = 10.0) -> ModalBank:
+    frequency = torch.as_tensor(frequency, dtype=torch.float64)
+    return ModalBank(frequency, torch.as_tensor(damping, dtype=torch.float64).expand(len(frequency)).clone())
+
+
+def random_bank(modes: int, *, seed: int, pitch: float = 0.0, decay: float = 0.0) -> ModalBank:
+    generator = torch.Generator().manual_seed(seed)
+    drawn = torch.rand(2, modes, generator=generator, dtype=torch.float64)
+    return bank(2 ** (9 + 4 * drawn[0] + pitch), 2 ** (3 + drawn[1] + decay))
+
+
+def shift(features: ModeFeatures, first: ModalBank, second: ModalBank) -> float:
+    return float(np.linalg.norm(features.vector(first) - features.vector(second)))
+
+
+@pytest.mark.parametrize("modes", [1, 7, 200])
+def test_a_set_an_octave_higher_is_one_away(modes):
+    low, high = random_bank(modes, seed=0), random_bank(modes, seed=0, pitch=1.0)
+    assert shift(Pitches(), low, high) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_twice_the_damping_is_one_away_and_no_other_pitch():
+    slow, fast = random_bank(9, seed=0), random_bank(9, seed=0, decay=1.0)
+    assert shift(PitchesAndRings(), slow, fast) == pytest.approx(1.0, abs=1e-12)
+    assert shift(Pitches(), slow, fast) == 0.0
+
+
+def test_dampings_are_taken_where_their_pitch_is():
+    # d = 3 (f / 1000)^2 is a straight line of slope 2; inside a dense set, its mean around a pitch is its value there.
+    frequency = 2 ** torch.linspace(5, 16, 2000, dtype=torch.float64)
+    features = PitchesAndRings(rings=15)
+    curve = features.vector(bank(frequency, 3.0 * (frequency / 1000) ** 2))[features.count :] * math.sqrt(15)
+    expected = math.log2(3.0) + 2 * (np.linspace(math.log2(125.0), math.log2(16000.0), 15) - math.log2(1000.0))
+    assert np.abs(curve - expected)[2:-4] == pytest.approx(0.0, abs=0.01)
+
+
+def test_far_from_every_mode_the_nearest_one_counts():
+    curve = PitchesAndRings().vector(bank([15.0, 16.0], [4.0, 32.0]))[32:] * math.sqrt(15)
+    assert curve[-1] == pytest.approx(5.0, abs=0.1)
+
+
+@pytest.mark.parametrize("features", FEATURES, ids=lambda each: each.name)
+def test_neither_order_nor_number_of_modes_matters(features):
+    one = random_bank(20, seed=1)
+    turned = torch.randperm(20, generator=torch.Generator().manual_seed(0))
+    assert shift(features, one, bank(one.frequency[turned], one.damping[turned])) < 1e-12
+    # Every mode a thousand times instead of once: the quantiles are interpolated a little otherwise.
+    dense = bank(2 ** (9 + 4 * torch.linspace(0, 1, 100)), 8.0)
+    assert shift(features, dense, bank(dense.frequency.repeat(9), 8.0)) < 0.02
+
+
+@pytest.mark.parametrize("features", FEATURES, ids=lambda each: each.name)
+def test_records_give_the_features_back(features):
+    assert features_of(json.loads(json.dumps(features.record()))) == features
+
+
+@pytest.mark.parametrize("features", FEATURES, ids=lambda each: each.name)
+def test_sets_that_are_none_are_refused(features):
+    with raises(EvaluationError, name="bank", value=0):
+        features.vector(bank([]))
+    with raises(EvaluationError, row=1, name="frequency", value=0.0):
+        features.vector(bank([100.0, 0.0]))
+    with raises(EvaluationError, row=0, name="damping"):
+        features.vector(bank([100.0], math.nan))
+
+
+def labelled(count: int = 8) -> tuple[list[ModalBank], list[str]]:
+    """Return deep dull objects, and bright ones three octaves above them."""
+    low = [random_bank(20 + row, seed=row, decay=2.0) for row in range(count)]
+    high = [random_bank(30 - row, seed=50 + row, pitch=3.0) for row in range(count)]
+    return [*low, *high], ["wood"] * count + ["glass"] * count
+
+
+@pytest.fixture(scope="module")
+def space() -> MaterialSpace:
+    # Importing it compiles for many seconds, which only its embeddings need.
+    if importlib.util.find_spec("umap") is None:
+        pytest.skip("needs pip install 'avmsf[eval]'")
+    return MaterialSpace.of(*labelled(), seed=3)
+
+
+@pytest.mark.slow
+def test_an_objects_like_is_near_and_its_opposite_far(space):
+    wood, glass = random_bank(25, seed=99), random_bank(25, seed=98, pitch=3.0)
+    assert space.distance(space.place(wood), "wood") < 0.5 * space.distance(space.place(wood), "glass")
+    assert space.distance(space.place(glass), "glass") < 0.5 * space.distance(space.place(glass), "wood")
+    assert space.told_apart() == 1.0
+    # An edit that ends within its new material's cluster is about as far from the center as the cluster's own.
+    assert space.distance(space.place(glass), "glass") < 3 * space.spread("glass")
+
+
+def test_the_plain_distance_is_that_of_the_vectors(space):
+    far = random_bank(25, seed=99, pitch=10.0)
+    near = random_bank(25, seed=99, pitch=9.0)
+    # Ten octaves away UMAP has no place of its own for it, and the vectors have.
+    assert space.plain_distance(far, "wood") == pytest.approx(space.plain_distance(near, "wood") + 1.0, abs=0.01)
+
+
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_space(space):
+    again = MaterialSpace.of(*labelled(), seed=3)
+    assert np.array_equal(again.embedding, space.embedding)
+    other = random_bank(25, seed=99)
+    assert np.array_equal(again.place(other), space.place(other))
+    # Placing others in between changes nothing.
+    space.place(random_bank(10, seed=97))
+    assert np.array_equal(again.place(other), space.place(other))
+    assert not np.array_equal(MaterialSpace.of(*labelled(), seed=4).embedding, space.embedding)
+
+
+@pytest.mark.slow
+def test_a_space_outlives_the_process_in_a_file(space, tmp_path):
+    path = tmp_path / "space.json"
+    space.save(path)
+    loaded = MaterialSpace.load(path)
+    other = random_bank(25, seed=99)
+    assert np.array_equal(loaded.embedding, space.embedding)
+    assert np.array_equal(loaded.place(other), space.place(other))
+    assert loaded.plain_distance(other, "wood") == space.plain_distance(other, "wood")
+    assert loaded.record() == space.record()
+    record = json.loads(path.read_text(encoding="utf-8"))
+    assert {"umap-learn", "numba", "numpy"} <= set(record["versions"])
+    assert record["umap"]["seed"] == 3
+    assert record["centers"]["wood"] == pytest.approx(np.mean(record["embedding"][:8], axis=0).tolist(), abs=1e-5)
+
+
+@pytest.mark.slow
+def test_an_embedding_that_does_not_come_out_again_is_refused(space, tmp_path):
+    path = tmp_path / "space.json"
+    space.save(path)
+    record = json.loads(path.read_text(encoding="utf-8"))
+    record["embedding"][0][0] += 1.0
+    record["versions"]["numba"] = "0.1"
+    path.write_text(json.dumps(record), encoding="utf-8")
+    loaded = MaterialSpace.load(path)
+    assert loaded.plain_distance(random_bank(25, seed=99), "wood") > 0.0
+    with raises(EvaluationError, name="embedding") as caught:
+        loaded.place(random_bank(25, seed=99))
+    assert caught.value.value == pytest.approx(1.0, abs=1e-3)
+    assert "numba 0.1" in str(caught.value)
+
+
+def test_files_that_hold_something_else_are_named(tmp_path):
+    path = tmp_path / "space.json"
+    with raises(EvaluationError, file=path, name=None) as caught:
+        MaterialSpace.load(path)
+    assert type(caught.value.__cause__) is FileNotFoundError
+    for text in ("{", "[]", '{"format": 1}'):
+        path.write_text(text, encoding="utf-8")
+        with raises(EvaluationError, file=path, name=None):
+            MaterialSpace.load(path)
+    path.write_text('{"format": 7}', encoding="utf-8")
+    with raises(EvaluationError, file=path, name="format", value=7):
+        MaterialSpace.load(path)
+
+
+def test_objects_that_make_no_space_are_refused():
+    banks, materials = labelled()
+    with raises(EvaluationError, name="materials", value=15):
+        MaterialSpace.of(banks, materials[1:])
+    with raises(EvaluationError, name="mode_sets", value=(4, 1)):
+        MaterialSpace.of(banks[:4], materials[:4])
+    with raises(EvaluationError, name="bowl", value=0):
+        MaterialSpace.of([*banks, bank([])], [*materials, "wood"], names=[*map(str, range(16)), "bowl"])
+    with raises(EvaluationError, name="material", value="steel"):
+        MaterialSpace.of(banks, materials).plain_distance(banks[0], "steel")
+
+
+def test_a_missing_package_is_named_with_its_remedy(monkeypatch):
+    monkeypatch.setitem(sys.modules, "umap", None)
+    with raises(EvaluationError, name="umap-learn") as caught:
+        _ = MaterialSpace.of(*labelled(), settings=UmapSettings()).embedding
+    assert "pip install 'avmsf[eval]'" in str(caught.value)

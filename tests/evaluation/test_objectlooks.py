@@ -1,0 +1,141 @@
+"""What a dataset's objects look like is made once, from the views that were asked for."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from avmsf.capture.folder import Capture
+from avmsf.capture.impacts import Impacts
+from avmsf.capture.settings import CaptureSettings
+from avmsf.datasets.dataset import DatasetReport, Look, ObjectFacts
+from avmsf.errors import SceneError
+from avmsf.evaluation.object_features import ObjectLooks
+from avmsf.features.feature_field import FeatureField
+from avmsf.gaussians.config import SplatConfig
+from avmsf.gaussians.ply import read_splats
+from avmsf.mesh.surface import Surface
+from avmsf.photographs.write import write_views
+from avmsf.pipeline.config import PRESETS, LiftConfig, SceneConfig, ViewsConfig
+from avmsf.pipeline.sources import find_source
+from factories.raising import raises
+from factories.small_scene import slab, slab_views, write_surface_file
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*neither texture nor colors")
+
+CONFIG = SceneConfig(
+    views=ViewsConfig(rendered=24), lift=LiftConfig(encoder="descriptors", points=400, components=4, missing=0.0)
+)
+
+
+class OneObject:
+    """A dataset of one object, which can be seen in `seen` or nowhere."""
+
+    name = "one"
+
+    def __init__(self, seen: Path | None, surface: Surface | None = None) -> None:
+        self.seen, self.surface = seen, surface
+
+    def objects(self) -> tuple[str, ...]:
+        return ("slab",)
+
+    def facts(self, identifier: str) -> ObjectFacts:
+        return ObjectFacts(identifier, identifier)
+
+    def capture(self, identifier: str) -> Capture:
+        contacts = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.2, 0.0], [0.1, 0.0, 0.1]], dtype=torch.float64)
+        return Capture("slab", Impacts(contacts, torch.zeros(3, 8), 100.0, ("a", "b", "c")), self.surface)
+
+    def look(self, identifier: str) -> Look | None:
+        return None if self.seen is None else Look(self.seen)
+
+    def check(self) -> DatasetReport:
+        return DatasetReport(self.name, ())
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("slab")
+    write_surface_file(folder)
+    return folder
+
+
+@pytest.mark.slow
+def test_looks_and_positions_are_of_the_same_points_and_made_once(seen: Path, tmp_path: Path) -> None:
+    looks = ObjectLooks(OneObject(seen), tmp_path, CONFIG)
+    aligned, bare, unaligned = (looks("slab", look) for look in ("visual", "positions", "unaligned"))
+    assert torch.equal(aligned.points, bare.points)
+    assert torch.equal(aligned.points, unaligned.points)
+    assert bare.features.shape == (400, 3)
+    assert aligned.features.shape == (400, 3 + 4)
+    # A slab has symmetries, so that what is made to obey them is not what was seen.
+    assert not torch.allclose(aligned.features, unaligned.features)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")}
+    assert len(before) == 2
+    looks("slab", "visual")
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")} == before
+
+
+@pytest.mark.slow
+def test_the_papers_features_are_of_gaussians_even_where_a_mesh_is_there(seen: Path, tmp_path: Path) -> None:
+    scene = replace(CONFIG, splat=SplatConfig(steps=30, start_points=400))
+    paper = replace(PRESETS["paper"].scene.lift, encoder="descriptors")
+    looks = ObjectLooks(OneObject(seen), tmp_path, scene, paper)
+    features = looks("slab", "paper")
+    (cloud,) = tmp_path.rglob("cloud.ply")
+    assert {*map(tuple, features.points.tolist())} <= {*map(tuple, read_splats(cloud).centers.tolist())}
+    # All that the encoder says, and no positions.
+    assert features.features.shape[1] > 4 + 3
+    assert "components" not in features.encoder
+    assert len(looks("slab", "visual").points) == 400
+    # The paper's ablations differ from it in nothing else.
+    bare, unaligned = looks("slab", "paper-positions"), looks("slab", "paper-unaligned")
+    assert torch.equal(bare.points, features.points)
+    assert torch.equal(bare.features, FeatureField.from_points(features.points).features)
+    assert unaligned.features.shape == features.features.shape
+    assert not torch.allclose(unaligned.features, features.features)
+
+
+@pytest.mark.slow
+def test_fewer_views_are_kept_apart_from_all(seen: Path, tmp_path: Path) -> None:
+    looks = ObjectLooks(OneObject(seen), tmp_path, CONFIG)
+    few, every = looks("slab", "visual", 6), looks("slab", "visual")
+    assert not torch.allclose(few.features, every.features)
+    images = {place.name: len(list(place.rglob("images/*.png"))) for place in (tmp_path / "slab").iterdir()}
+    assert images == {"6 views": 6, "all views": 72}
+
+
+def test_an_object_that_nothing_shows_has_positions_alone(tmp_path: Path) -> None:
+    looks = ObjectLooks(OneObject(None), tmp_path, CONFIG)
+    points = looks("slab", "positions").points
+    assert points.amin(0).tolist() == pytest.approx([0.0, 0.0, 0.0], abs=0.02)
+    assert points.amax(0).tolist() == pytest.approx([0.1, 0.2, 0.1], abs=0.02)
+    with raises(SceneError, name="slab"):
+        looks("slab", "visual")
+
+
+def test_a_mesh_may_be_preferred_to_the_photographs_beside_it(tmp_path: Path) -> None:
+    write_views(slab_views(), tmp_path)
+    write_surface_file(tmp_path)
+    best, mesh = (find_source(tmp_path, CaptureSettings(), prefer=each) for each in ("best", "mesh"))
+    assert best is not None
+    assert mesh is not None
+    assert (best.kind, mesh.kind) == ("cameras", "mesh")
+
+
+def test_a_negative_number_of_views_is_refused() -> None:
+    with raises(SceneError, name="count", value=-1):
+        ViewsConfig(count=-1)
+
+
+def test_the_surface_of_a_mesh_needs_no_views_and_is_that_of_a_fit(tmp_path: Path) -> None:
+    found = ObjectLooks(OneObject(None, slab()), tmp_path / "cache", CONFIG, seed=3)("slab", "surface")
+    assert torch.equal(found.points, FeatureField.from_mesh(slab(), seed=3).points)
+    assert not (tmp_path / "cache").exists()
+
+
+@pytest.mark.slow
+def test_the_surface_is_that_of_the_views_where_a_mesh_does_not_count(seen: Path, tmp_path: Path) -> None:
+    looks = ObjectLooks(OneObject(seen, slab()), tmp_path, CONFIG, meshes=False)
+    assert torch.equal(looks("slab", "surface").points, looks("slab", "positions").points)

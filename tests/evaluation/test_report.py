@@ -1,0 +1,313 @@
+"""What is concluded of kept figures, by hand; and pages that stand on their own."""
+
+import base64
+import io
+import json
+import math
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+from PIL import Image
+from test_evaluation_run import planned
+
+from avmsf.errors import EvaluationError
+from avmsf.evaluation.listening import Heard, draw_spectrogram, keep_sound, listening_gain
+from avmsf.evaluation.markdown import markdown
+from avmsf.evaluation.methods import METHODS
+from avmsf.evaluation.parallel import run_objects
+from avmsf.evaluation.published import PUBLISHED, published_ratios
+from avmsf.evaluation.report import write_page, write_summary
+from avmsf.evaluation.report_tables import WARNING, Grid, Section, figure, sections
+from avmsf.evaluation.results import CaseRecord, ObjectRecord, Outcome, ResultsFolder, natural
+from avmsf.evaluation.summary import Mean, missing_of, object_figures, summarize
+from avmsf.evaluation.titles import TITLES
+from factories.plate_set import fill_plates
+from factories.raising import raises
+
+IDENTITY = {
+    "protocol": "farthest",
+    "dataset": "ObjectFolder Real",
+    "version": "0",
+    "seed": 0,
+    "metrics": {"kind": "m"},
+    "modes": {"kind": "n"},
+    "methods": {"knn3": "", "paper": "", "nearest": ""},
+}
+
+
+def record(name: str, figures: dict[str, tuple[float | None, ...] | str], *, label: str = "farthest") -> ObjectRecord:
+    """Return an object with one case of two contacts, and for each method L1 at these or what made it fail."""
+    outcomes = tuple(
+        Outcome(label, method, failure=values) if isinstance(values, str) else Outcome(label, method, {"l1": values})
+        for method, values in figures.items()
+    )
+    return ObjectRecord(name, cases=(CaseRecord(label, label, ("t",), ("u", "v")),), outcomes=outcomes)
+
+
+THREE = (
+    record("1", {"knn3": (1.0, 3.0), "paper": (1.0, 1.0)}),
+    record("2", {"knn3": (4.0, 4.0), "paper": (16.0, None)}),
+    record("10", {"knn3": (6.0, 6.0), "paper": "no modes"}),
+)
+
+
+def test_means_are_over_contacts_then_over_objects() -> None:
+    summary = summarize(THREE, IDENTITY)
+    assert summary["methods"] == {"knn3": {"l1": 4.0}, "paper": {"l1": 8.5}}
+    # Of 2, 4 and 6 the standard deviation is 2; of 1 and 16, 7.5 sqrt 2.
+    assert summary["standard_errors"]["knn3"]["l1"] == pytest.approx(2 / math.sqrt(3))
+    assert summary["standard_errors"]["paper"]["l1"] == pytest.approx(7.5)
+    assert summary["counts"] == {"knn3": 3, "paper": 2}
+    assert summary["failures"] == [{"object": "10", "case": "farthest", "method": "paper", "failure": "no modes"}]
+
+
+def best_of(records: tuple[ObjectRecord, ...], title: str, **settings: frozenset[str]) -> tuple[list[str], Section]:
+    """Return the methods that a table marks as best, and its section."""
+    (part,) = [each for each in sections(records, IDENTITY, subsets=settings) if each.title == title]
+    assert part.grid is not None
+    return [part.grid.rows[row][0] for row, _ in sorted(part.grid.best)], part
+
+
+def test_the_best_is_marked_among_methods_that_have_all_objects() -> None:
+    easy = record("1", {"knn3": (2.0, 2.0), "nearest": (3.0, 3.0), "paper": (1.0, 1.0)})
+    hard = record("2", {"knn3": (9.0, 9.0), "nearest": (8.0, 8.0), "paper": "no modes"})
+    for title, parts in (("All methods", {}), ("Objects: part", {"part": frozenset("12")})):
+        best, part = best_of((easy, hard, record("3", {"knn3": (1.0, 1.0), "nearest": (1.5, 1.5)})), title, **parts)
+        # Of three objects 4 and 4.17, of two 5.5 and 5.5: of equal ones the first.
+        assert best == ["knn3"]
+        assert "paper" in part.remarks[0]
+    whole = len(best_of((easy, hard), "All methods")[1].remarks)
+    best, part = best_of((easy,), "All methods")
+    assert best == ["paper"]
+    assert len(part.remarks) == whole - 1
+    # Where every method lacks an object there is no mean to compare.
+    best, _ = best_of((easy, record("2", {"nearest": (8.0, 8.0)}), record("3", {"knn3": (1.0, 1.0)})), "All methods")
+    assert best == []
+
+
+def test_a_failure_is_not_missing_but_a_method_or_an_object_that_has_not_run_is() -> None:
+    broken = ObjectRecord("3", failure="no recordings")
+    methods = ["knn3", "paper"]
+    assert missing_of((*THREE, broken), dict.fromkeys(("1", "10", "3"), methods)) == {}
+    assert missing_of(THREE, {"1": ["knn3", "field"], "7": methods}) == {"1": ["field"], "7": methods}
+    # One case of two.
+    cases = (*THREE[0].cases, CaseRecord("other", "other", ("t",), ("u",)))
+    assert missing_of((replace(THREE[0], cases=cases),), {"1": methods}) == {"1": methods}
+
+
+def test_differences_and_ratios_are_paired() -> None:
+    summary = summarize(THREE, IDENTITY)
+    # Objects 1 and 2: 1 - 2 and 16 - 4; 1 / 2 and 16 / 4, whose geometric mean is sqrt 2; means 8.5 and 3.
+    assert summary["difference_to_knn3"]["paper"]["l1"] == pytest.approx({"mean": 5.5, "standard_error": 6.5})
+    assert summary["ratio_to_knn3"]["paper"]["l1"] == pytest.approx(math.sqrt(2))
+    assert summary["ratio_of_means_to_knn3"]["paper"]["l1"] == pytest.approx(8.5 / 3)
+    assert summary["ratio_to_knn3"]["knn3"]["l1"] == 1.0
+
+
+def test_a_perfect_method_has_ratio_zero_and_a_perfect_baseline_no_ratio() -> None:
+    summary = summarize((record("1", {"knn3": (2.0, 2.0), "paper": (0.0, 0.0)}),), IDENTITY)
+    assert summary["ratio_to_knn3"]["paper"] == {"l1": 0.0}
+    assert summary["standard_errors"]["paper"] == {"l1": None}
+    summary = summarize((record("1", {"knn3": (0.0, 0.0), "paper": (1.0, 1.0)}),), IDENTITY)
+    assert summary["ratio_to_knn3"] == {}
+
+
+def test_parts_of_one_experiment_are_pooled_and_one_that_failed_spoils_all() -> None:
+    parts = tuple(CaseRecord(f"all: {name}", "all", ("t",), (name,)) for name in "uv")
+    outcomes = [
+        Outcome(f"all: {name}", "knn3", {"l1": (value,)}, {"mac": 0.5}) for name, value in (("u", 1.0), ("v", 5.0))
+    ]
+    whole = ObjectRecord("1", cases=parts, outcomes=tuple(outcomes))
+    assert object_figures(whole, "all") == {"knn3": {"l1": 3.0, "mac": 0.5}}
+    assert object_figures(replace(whole, outcomes=tuple(outcomes[:1])), "all") == {}
+    assert object_figures(whole.adding(Outcome("all: v", "knn3", failure="no")), "all") == {}
+
+
+def test_figures_of_which_more_is_better_have_no_ratio() -> None:
+    cases = (CaseRecord("a", "a", ("t",), ("u",)),)
+    outcomes = tuple(Outcome("a", method, {}, {"mac": 0.5}) for method in ("knn3", "paper"))
+    summary = summarize((ObjectRecord("1", cases=cases, outcomes=outcomes),), IDENTITY)
+    assert summary["methods"]["paper"] == {"mac": 0.5}
+    assert summary["ratio_to_knn3"] == {"knn3": {}, "paper": {}}
+
+
+def test_groups_of_objects_have_their_own_means() -> None:
+    summary = summarize(THREE, IDENTITY, subsets={"odd": frozenset({"1"}), "none": frozenset({"7"})})
+    assert summary["subsets"] == {"odd": {"objects": 1, "methods": {"knn3": {"l1": 2.0}, "paper": {"l1": 1.0}}}}
+
+
+def test_the_mean_of_one_has_no_standard_error() -> None:
+    assert Mean.of([3.0]) == Mean(3.0, None, 1)
+
+
+def test_tables_have_the_papers_rows_for_its_datasets_alone() -> None:
+    words = markdown(sections(THREE, IDENTITY, subsets={}))
+    assert "| paper: AV-MSF | 0.0130 |" in words
+    assert "| knn3 | **4.00 ± 1.2** | 3 |" in words
+    assert "| 10 | farthest | paper | no modes |" in words
+    assert WARNING in words
+    assert "| paper: AV-MSF | 972 | 0.0438 |" in words
+    for folder in ("sim-20", "ObjectFolder Real of mine", "ObjectFolder Real (captures)"):
+        assert "paper: AV-MSF" not in markdown(sections(THREE, {**IDENTITY, "dataset": folder}, subsets={}))
+    other = markdown(sections(THREE, {**IDENTITY, "dataset": "sim-20"}, subsets={}))
+    # The ratios that its tables allow stand beside ours everywhere.
+    assert "| paper, ObjectFolder Real: paper | 0.929 |" in other
+    assert WARNING in other
+
+
+def test_every_method_has_a_title_and_tables_give_it() -> None:
+    assert set(METHODS) <= set(TITLES)
+    assert f"paper: {TITLES['paper']}" in markdown(sections(THREE, IDENTITY, subsets={}))
+    # Also those that read a file or a folder.
+    method = "sonicgauss:/some/folder"
+    records = (record("1", {"knn3": (1.0, 1.0), method: (1.0, 1.0)}),)
+    words = markdown(sections(records, {**IDENTITY, "methods": {"knn3": "", method: ""}}, subsets={}))
+    assert TITLES["sonicgauss"] in words
+
+
+def test_the_papers_ratio_is_of_its_own_rows() -> None:
+    ratios = published_ratios("farthest")
+    assert ratios["ObjectFolder Real"]["paper"]["cdpam"] == pytest.approx(1.35 / 1.53)
+    assert ratios["ObjectFolder Real"]["white-noise"]["l1"] == pytest.approx(3.774 / 0.014)
+    assert set(published_ratios("non-symmetric")) == {"ObjectFolder Real"}
+    assert published_ratios("closest")["RealImpact"]["paper"]["l1"] == pytest.approx(21 / 26)
+    assert sum(len(table.rows) for table in PUBLISHED) == 41
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (None, "–"),
+        (math.nan, "–"),
+        (0.0, "0"),
+        (0.01234, "0.0123"),
+        (1.53e-4, "1.53e-04"),
+        (8.5, "8.50"),
+        (1234.5, "1234"),
+    ],
+)
+def test_figures_have_three_digits(value: float | None, words: str) -> None:
+    assert figure(value) == words
+
+
+def test_markdown_escapes_what_would_be_markup() -> None:
+    words = markdown([Section("a|b", ("x * y < z",), Grid(("a", "b"), (("p|q", "1"),), frozenset({(0, 1)})))])
+    assert words == "# a\\|b\n\nx \\* y &lt; z\n\n| a | b |\n|---|---:|\n| p\\|q | **1** |\n"
+
+
+def test_names_are_in_natural_order() -> None:
+    assert sorted(["10", "9", "a10", "a9", "1_x"], key=natural) == ["1_x", "9", "10", "a9", "a10"]
+
+
+def test_a_kept_sound_is_as_loud_beside_the_recording_as_it_was(tmp_path: Path) -> None:
+    time = torch.arange(4000) / 8000.0
+    recorded = 3.0 * torch.sin(2 * math.pi * 440 * time)
+    gain = listening_gain(recorded)
+    for name, factor, peak in (("same", 1.0, 0.25), ("half", 0.5, 0.125), ("loud", 10.0, 1.0)):
+        keep_sound(tmp_path / name, recorded * factor, sample_rate=8000.0, gain=gain)
+        heard = Heard.read(tmp_path / name)
+        # One step of 16 bits.
+        assert float(heard.samples.abs().max()) == pytest.approx(peak, abs=2e-4)
+    keep_sound(tmp_path / "slow", recorded, sample_rate=400.0, gain=gain)
+    slow = Heard.read(tmp_path / "slow")
+    assert (slow.sample_rate, len(slow.samples)) == (8000.0, 20 * 4000)
+    keep_sound(tmp_path / "silent", torch.zeros(100), sample_rate=8000.0, gain=listening_gain(torch.zeros(100)))
+    with raises(EvaluationError, file=tmp_path / "gone"):
+        Heard.read(tmp_path / "gone")
+
+
+def test_a_pictures_line_is_where_the_tone_is(tmp_path: Path) -> None:
+    time = torch.arange(16000) / 16000.0
+    keep_sound(tmp_path / "tone", torch.sin(2 * math.pi * 1000 * time), sample_rate=16000.0, gain=0.5)
+    address = draw_spectrogram(Heard.read(tmp_path / "tone"), loudest=None, height=100)
+    picture = Image.open(io.BytesIO(base64.b64decode(address.partition(",")[2])))
+    shades = torch.from_numpy(np.array(picture))
+    # From the top, on a logarithmic scale of 60 Hz to 8 kHz; a Hann window is two bins, some rows, wide at 1 kHz.
+    expected = 100 * math.log(8000 / 1000) / math.log(8000 / 60)
+    assert float(shades[:, 120].argmax()) == pytest.approx(expected, abs=2.0)
+    assert shades[5, 120] == 0
+
+
+class Reading(HTMLParser):
+    """Collects what a page refers to, and whether its elements are closed."""
+
+    VOID = frozenset({"meta", "img", "br", "link", "input"})
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: dict[str, list[dict[str, str | None]]] = {}
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.setdefault(tag, []).append(dict(attrs))
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+@pytest.fixture(scope="module")
+def evaluated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("evaluated")
+    plates = fill_plates(place / "plates", ("a", "b <i>"))
+    results = ResultsFolder(place / "results")
+    run_objects(planned(plates, "knn3", "nearest", "paper"), ("a", "b <i>"), results)
+    write_summary(results, subsets={"round": frozenset("a")})
+    write_page(results, subsets={"round": frozenset("a")})
+    return place / "results"
+
+
+def test_the_page_stands_on_its_own_and_can_be_read_by_all(evaluated: Path) -> None:
+    text = (evaluated / "report.html").read_text()
+    page = Reading()
+    page.feed(text)
+    assert page.open == []
+    for tags in page.tags.values():
+        for each in tags:
+            for name in ("src", "href"):
+                value = each.get(name)
+                assert value is None or value.startswith(("data:", "#")), value
+    assert "http" not in text.replace("http-equiv", "")
+    assert "@import" not in text
+    anchors = {each["id"] for tags in page.tags.values() for each in tags if "id" in each}
+    assert {(each["href"] or "")[1:] for each in page.tags["a"]} <= anchors
+    assert all(each["alt"] for each in page.tags["img"])
+    assert all(each["aria-label"] and "controls" in each for each in page.tags["audio"])
+    assert page.tags["html"] == [{"lang": "en"}]
+    assert len(page.tags["h1"]) == 1
+    # Two objects, three contacts, the recording and two methods; the field, which shows nothing of plates, failed.
+    assert len(page.tags["audio"]) == len(page.tags["img"]) == 2 * 3 * 3
+    assert "<i>" not in text
+    sound = page.tags["audio"][0]["src"] or ""
+    samples, rate = soundfile.read(io.BytesIO(base64.b64decode(sound.partition(",")[2])))
+    assert (len(samples), rate) == (2000, 8000)
+
+
+def test_the_page_can_be_made_again_and_is_the_same(evaluated: Path) -> None:
+    before = (evaluated / "report.html").read_bytes()
+    write_page(ResultsFolder(evaluated), subsets={"round": frozenset("a")})
+    assert (evaluated / "report.html").read_bytes() == before
+
+
+def test_the_page_stays_small(evaluated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = (evaluated / "report.html").read_text()
+    monkeypatch.setattr("avmsf.evaluation.page.LARGEST", len(whole) // 3)
+    write_page(ResultsFolder(evaluated), subsets={})
+    smaller = (evaluated / "report.html").read_text()
+    assert len(smaller) < len(whole) / 2
+    assert 0 < smaller.count("<audio") < whole.count("<audio")
+
+
+def test_times_and_failures_are_told(evaluated: Path) -> None:
+    times = json.loads((evaluated / "times.json").read_text())
+    assert set(times["a"]["methods"]) == {"knn3", "nearest", "paper"}
+    assert times["a"]["methods"]["knn3"]["render"] > 0
+    words = (evaluated / "report.md").read_text()
+    assert "| a | farthest | paper | a: nothing shows its look |" in words
+    assert "## Objects: round" in words

@@ -1,0 +1,126 @@
+"""A flat bar whose elastic mode shapes are cosines, and gains that are drawn from what the gain model assumes."""
+
+from collections.abc import Sequence
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from avmsf.fem.elastic_modes import ElasticModes
+from avmsf.fem.material import NOMINAL
+from avmsf.field.gains.elastic import PERTURBATIONS, REMAINDERS, WIDTHS, Elastic
+from avmsf.field.gains.family import KernelFamily, Sites
+from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
+from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
+from avmsf.field.sound_field import Origin, SoundField
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.residual_noise import Residual
+
+LENGTH, WIDTH = 0.4, 0.1
+SIZE = (LENGTH**2 + WIDTH**2) ** 0.5
+ELASTIC = 100.0 * torch.arange(1, 7, dtype=torch.float64)
+BANK = ModalBank(
+    torch.tensor([105.0, 190.0, 310.0, 420.0], dtype=torch.float64),
+    torch.tensor([5.0, 8.0, 12.0, 20.0], dtype=torch.float64),
+)
+"""Modes that are the elastic ones of the same rows, perturbed."""
+DOWN = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
+PERTURBATION, REMAINDER, NOISE = 0.3, 0.1, 0.03
+"""Of the hypothesis that gains are drawn from, see `avmsf.field.gains.elastic`."""
+
+
+def bar_points() -> Tensor:
+    x, y = torch.linspace(0, LENGTH, 41), torch.linspace(0, WIDTH, 7)
+    return torch.stack([*torch.meshgrid(x, y, indexing="ij"), torch.zeros(41, 7)], dim=2).reshape(-1, 3)
+
+
+@cache
+def bar() -> ElasticModes:
+    """Return a sheet that faces up, with the points as nodes."""
+    rows = torch.arange(41 * 7).reshape(41, 7)
+    near, middle, far = rows[:-1:2], rows[1::2], rows[2::2]
+    lower = [near[:, :-1:2], far[:, :-1:2], far[:, 2::2], middle[:, :-1:2], far[:, 1::2], middle[:, 1::2]]
+    upper = [near[:, :-1:2], far[:, 2::2], near[:, 2::2], middle[:, 1::2], middle[:, 2::2], near[:, 1::2]]
+    triangles = torch.cat([torch.stack([each.flatten() for each in half], dim=1) for half in (lower, upper)])
+    nodes = bar_points().double()
+    return ElasticModes(ELASTIC, nodes, triangles, cosines(nodes)[..., None] * DOWN, NOMINAL, 1.0)
+
+
+def cosines(points: Tensor) -> Tensor:
+    """Return what an impact straight down excites of each elastic mode."""
+    return 2**0.5 * torch.cos(torch.pi * torch.arange(1, 7) * points[:, :1] / LENGTH)
+
+
+def bar_contacts(count: int, *, seed: int = 0) -> Tensor:
+    """Return some of the points, where shapes need no interpolation."""
+    order = torch.randperm(41 * 7, generator=torch.Generator().manual_seed(seed))
+    return bar_points()[order[:count]].double()
+
+
+def sound_field(gains: object) -> SoundField:
+    return SoundField(
+        BANK, gains, torch.zeros(4, dtype=torch.float64), Residual(torch.full((9,), 1e-6)), 2000.0, 800, Origin("bar")
+    )  # type: ignore[arg-type]
+
+
+def impacts(contacts: Tensor) -> Sites:
+    """Return impacts straight down."""
+    return Sites(contacts, DOWN.expand_as(contacts))
+
+
+def rows_of(perturbation: float = PERTURBATION, remainder: float = REMAINDER) -> Tensor:
+    """Return the rows of the elastic kernels in which each mode is the elastic one of the same row, perturbed."""
+    profiles, shapes, remainders = len(PERTURBATIONS) + len(WIDTHS), len(ELASTIC), len(REMAINDERS)
+    rows = torch.arange(profiles * shapes * remainders).reshape(profiles, shapes, remainders)
+    return rows[PERTURBATIONS.index(perturbation), : len(BANK), REMAINDERS.index(remainder)]
+
+
+def drawn_gains(contacts: Tensor, *, seed: int, noise: float = NOISE) -> Tensor:
+    """Return gains of contacts that are drawn from one hypothesis of the elastic family, [contacts, modes, 2]."""
+    sites = impacts(contacts)
+    covariance = Elastic(sites, SIZE, bar()).between(sites, sites, rows_of())
+    factor = torch.linalg.cholesky(covariance + 1e-9 * torch.eye(len(contacts), dtype=torch.float64))
+    generator = torch.Generator().manual_seed(seed)
+    smooth = factor @ torch.randn(4, len(contacts), 2, generator=generator, dtype=torch.float64)
+    own = noise**0.5 * torch.randn(4, len(contacts), 2, generator=generator, dtype=torch.float64)
+    return (smooth + own).transpose(0, 1)
+
+
+def _fitted(families: Sequence[KernelFamily], values: Tensor, *, directional: bool) -> MixtureGains:
+    nothing = torch.zeros(len(BANK), dtype=torch.float64)
+    measured = MeasuredGains(torch.view_as_complex(values.contiguous()), nothing, BANK.frequency, BANK.damping)
+    return fit_mixture(families, measured, bar_points(), directional=directional)
+
+
+def elastic_field(contacts: Tensor, values: Tensor) -> MixtureGains:
+    """Return the model of gains at contacts with all families."""
+    sites = impacts(contacts)
+    families = [each(sites, SIZE) for each in (Unstructured, Smooth, ThinPlate)]
+    return _fitted([*families, Elastic(sites, SIZE, bar())], values, directional=True)
+
+
+def positional_field(contacts: Tensor, values: Tensor) -> MixtureGains:
+    """Return the model that knows neither directions nor a body."""
+    sites = impacts(contacts)
+    return _fitted([each(sites, SIZE) for each in (Unstructured, Smooth, ThinPlate)], values, directional=False)
+
+
+def one_hypothesis(
+    contacts: Tensor,
+    values: Tensor,
+    *,
+    perturbation: float = PERTURBATION,
+    remainder: float = REMAINDER,
+    noise: float = NOISE,
+) -> MixtureGains:
+    """Return the model of a single hypothesis for each mode: that of `drawn_gains`, unless another is named."""
+    sites, rows = impacts(contacts), rows_of(perturbation, remainder)
+    family = Elastic(sites, SIZE, bar())
+    weights = torch.zeros(len(rows), len(NOISE_SHARES), 2 * len(rows), dtype=torch.float64)
+    for row in range(len(rows)):
+        weights[row, NOISE_SHARES.index(noise), [row, row + len(rows)]] = 1.0
+    series = values.transpose(1, 2).flatten(1)
+    mixture = KernelMixture(family.kernels()[rows], series, torch.zeros(series.shape[1]).double(), weights)
+    return MixtureGains(bar_points(), sites, (family,), (rows,), mixture, True)

@@ -1,0 +1,104 @@
+"""A simulated plate, its fields and their locators, and how far off its contacts are located."""
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from typing import ClassVar
+
+import torch
+
+from avmsf.field.gain_field import Gains
+from avmsf.field.gains.family import Sites
+from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
+from avmsf.field.sound_field import Origin, SoundField
+from avmsf.localization.contact_map import ContactMap
+from avmsf.localization.locator import Locator
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.least_squares import fit_gains
+from avmsf.modal.residual_noise import Residual
+from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
+from factories.unsaved_gains import Unsaved
+
+PLATE = Plate()
+RATE, SECONDS, HIGHEST = 18000.0, 0.4, 8000.0
+DIAGONAL = math.hypot(PLATE.length, PLATE.width)
+
+
+@dataclass(frozen=True, eq=False)
+class TrueGains(Unsaved):
+    """The plate's own gains, in closed form."""
+
+    points: torch.Tensor
+    turned: bool = False
+    factor: float | None = None
+    plate: Plate = PLATE
+    kind: ClassVar[str] = "true"
+
+    def at(self, contacts: torch.Tensor, directions: torch.Tensor | None = None) -> Gains:
+        gains = plate_modes(self.plate, contacts, highest=HIGHEST).gains.float()
+        shape = gains.shape
+        damping = None if self.factor is None else 1.0 + self.factor * torch.linspace(0, 1, shape[1]).expand(shape)
+        return Gains(gains, 0.4 * gains.roll(1, 1) if self.turned else None, damping)
+
+
+@cache
+def bank() -> ModalBank:
+    modes = plate_modes(PLATE, plate_surface_points(PLATE, 1), highest=HIGHEST)
+    return ModalBank(modes.frequency, modes.damping)
+
+
+def field_of(gains: object, *, phase: float = 0.0) -> SoundField:
+    turned = torch.full((len(bank()),), phase, dtype=torch.float64)
+    noise = Residual(torch.full((65,), 1e-3))
+    return SoundField(bank(), gains, turned, noise, RATE, round(RATE * SECONDS), Origin())
+
+
+@cache
+def true_field(points: int = 1500) -> SoundField:
+    return field_of(TrueGains(plate_surface_points(PLATE, points).float()))
+
+
+@cache
+def locator_of(taps: int | None = None) -> Locator:
+    """Return a locator, of true gains without `taps`."""
+    return Locator.of(true_field() if taps is None else fitted_field(taps))
+
+
+def struck(count: int, *, seed: int, noise_db: float = -40.0, plate: Plate = PLATE):
+    generator = torch.Generator().manual_seed(seed)
+    contacts = sample_contacts(plate, count, generator=generator)
+    return strike(
+        plate, contacts, sample_rate=RATE, seconds=SECONDS, generator=generator, noise_db=noise_db, highest=HIGHEST
+    )
+
+
+@cache
+def fitted_field(taps: int) -> SoundField:
+    impacts = struck(taps, seed=5)
+    values = torch.complex(*(each.double() for each in fit_gains(impacts.sounds, bank(), sample_rate=RATE)))
+    sites = Sites(impacts.contacts, torch.tensor([0.0, 0.0, 1.0]).double().expand_as(impacts.contacts))
+    families = [each(sites, DIAGONAL) for each in (Unstructured, Smooth, ThinPlate)]
+    measured = MeasuredGains(values, torch.zeros_like(bank().damping), bank().frequency, bank().damping)
+    points = plate_surface_points(PLATE, 1500).float()
+    return field_of(fit_mixture(families, measured, points, directional=False))
+
+
+def mirrored(contact: torch.Tensor) -> torch.Tensor:
+    """Return the contact and its images in the plate's two planes of symmetry, which sound the same."""
+    across, along = contact.clone(), contact.clone()
+    across[0] = PLATE.length - contact[0]
+    along[1] = PLATE.width - contact[1]
+    both = across.clone()
+    both[1] = along[1]
+    return torch.stack([contact, across, along, both]).float()
+
+
+def missed(found: ContactMap, row: int, contact: torch.Tensor) -> float:
+    """Return how far a row is from the contact or an image, over the diagonal."""
+    return float((mirrored(contact) - found.points[row]).norm(dim=1).min()) / DIAGONAL
+
+
+def held(found: ContactMap, contact: torch.Tensor) -> bool:
+    nearest = torch.cdist(mirrored(contact), found.points).argmin(1)
+    return bool(found.region(0.9)[nearest].any())

@@ -1,0 +1,143 @@
+"""One gain field of every kind, for a plate whose mode shapes are known in closed form, made in a moment."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import torch
+
+from avmsf.features.feature_field import FeatureField
+from avmsf.fem.elastic_modes import ElasticModes
+from avmsf.field.attention import AttentionGains
+from avmsf.field.config import AttentionShape
+from avmsf.field.gain_field import GainField
+from avmsf.field.gains.body import BodyGains
+from avmsf.field.gains.elastic import Elastic
+from avmsf.field.gains.family import KernelFamily, Sites
+from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
+from avmsf.field.sound_field import Origin, SoundField
+from avmsf.field.store import save
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.residual_noise import Residual
+from factories.made_modes import sliding_plate
+
+SIDES = (0.24, 0.17, 0.004)
+DIAGONAL = sum(side**2 for side in SIDES) ** 0.5
+BANK = ModalBank(
+    torch.tensor([390.0, 850.0, 1300.0, 1360.0, 2300.0], dtype=torch.float64),
+    torch.tensor([12.0, 15.0, 30.0, 22.0, 60.0], dtype=torch.float64),
+)
+"""Measured modes, each a little off one of the plate's elastic ones."""
+
+
+@cache
+def plate() -> ElasticModes:
+    return sliding_plate()
+
+
+def draw(*size: int, seed: int) -> torch.Tensor:
+    return torch.rand(*size, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) - 0.5
+
+
+def places(count: int, *, seed: int) -> torch.Tensor:
+    """Return places on both of the plate's large faces."""
+    drawn = draw(count, 3, seed=seed) * torch.tensor(SIDES, dtype=torch.float64)
+    drawn[:, 2] = torch.where(drawn[:, 2] < 0, -0.5, 0.5) * SIDES[2]
+    # Such that float32 holds them exactly.
+    return drawn.float().double()
+
+
+def blows(contacts: torch.Tensor, *, seed: int) -> torch.Tensor:
+    """Return unit vectors into the plate, up to some thirty degrees askew."""
+    askew = draw(len(contacts), 3, seed=seed)
+    askew[:, 2] = -contacts[:, 2].sign()
+    return askew / askew.norm(dim=1, keepdim=True)
+
+
+def struck(count: int, *, noise: float = 0.05) -> tuple[Sites, torch.Tensor]:
+    """Return impacts and their complex gains, which are nearly those of the plate's first modes."""
+    contacts = places(count, seed=1)
+    directions = blows(contacts, seed=2)
+    shapes = plate().gains(contacts, directions)[:, : len(BANK)]
+    parts = torch.stack([shapes, 0.3 * shapes.roll(1, dims=1)], dim=2) * torch.linspace(2.0, 0.5, len(BANK))[:, None]
+    parts += noise * parts.std() * draw(*parts.shape, seed=3)
+    return Sites(contacts, directions), torch.view_as_complex(parts)
+
+
+def attention(*, spatial_damping: bool = False) -> AttentionGains:
+    shape = AttentionShape(6, 2, 8, 12, 2, feature_scale=4.0, spatial_damping=spatial_damping)
+    network = AttentionGains(
+        FeatureField.from_points(places(150, seed=0)),
+        gain_scale=torch.tensor([2.0, 1.0, 0.5, 1.5, 0.1]),
+        shape=shape,
+        generator=torch.Generator().manual_seed(0),
+    )
+    with torch.no_grad():
+        # Biases start at zero and damping factors at one; a test has to see them.
+        for number, parameter in enumerate(network.parameters()):
+            if parameter.ndim == 1 or not bool(parameter.any()):
+                parameter.normal_(std=0.1, generator=torch.Generator().manual_seed(number))
+    return network.eval().requires_grad_(False)
+
+
+def mixture(sites: Sites, values: torch.Tensor, *more: KernelFamily, directional: bool) -> MixtureGains:
+    """Return a model of the positional families and some more."""
+    families = [each(sites, DIAGONAL) for each in (Unstructured, Smooth, ThinPlate)]
+    variance = torch.full((len(BANK),), 1e-4, dtype=torch.float64)
+    measured = MeasuredGains(values, variance, BANK.frequency, BANK.damping)
+    return fit_mixture([*families, *more], measured, places(150, seed=0).float(), directional=directional)
+
+
+def positional(count: int = 20, *, noise: float = 0.05) -> MixtureGains:
+    """Return a model that knows no directions: all impacts are as from one side."""
+    impacts, values = struck(count, noise=noise)
+    alike = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(count, 3)
+    side = -impacts.directions[:, 2:].sign()
+    return mixture(Sites(impacts.points, alike), side * values, directional=False)
+
+
+def directional() -> MixtureGains:
+    """Return a model that knows directions, and no body."""
+    return mixture(*struck(20), directional=True)
+
+
+def elastic() -> MixtureGains:
+    """Return a model with the plate's own mode shapes, fitted to gains a little off the measured ones."""
+    impacts, values = struck(9)
+    body = Elastic(impacts, DIAGONAL, plate())
+    return mixture(impacts, 1.1 * values, body, directional=True).judged_by(values)
+
+
+def body() -> BodyGains:
+    """Return what the plate's own modes alone say."""
+    known, count = plate(), len(BANK)
+    modes = replace(known, frequency=known.frequency[:count], shapes=known.shapes[:, :count].float().double())
+    return BodyGains(places(150, seed=0).float(), modes)
+
+
+FIELDS: dict[str, Callable[[], GainField]] = {
+    "attention": cache(attention),
+    "attention with dampings": cache(lambda: attention(spatial_damping=True)),
+    "positional": cache(positional),
+    "positional, noisy": cache(lambda: positional(30, noise=3.0)),
+    "positional, few contacts": cache(lambda: positional(4)),
+    "directional": cache(directional),
+    "elastic": cache(elastic),
+    "body": cache(body),
+}
+"""All there are, by what tests call them; the same object at every call."""
+
+
+def sounding(gains: GainField) -> SoundField:
+    """Return a field of the plate's modes with noise, a quarter of a second long."""
+    phase = torch.zeros(len(BANK), dtype=torch.float64)
+    return SoundField(BANK, gains, phase, Residual(torch.full((9,), 0.01)), 8000.0, 2000, Origin("plate"))
+
+
+def saved(gains: GainField, folder: Path) -> Path:
+    """Write the field of these gains, and return its path."""
+    save(sounding(gains), folder / "plate.safetensors")
+    return folder / "plate.safetensors"

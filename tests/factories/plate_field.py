@@ -1,0 +1,58 @@
+"""A small plate, struck and fitted in a moment, for the tests of fields."""
+
+from dataclasses import replace
+
+import torch
+
+from avmsf.capture.impacts import Impacts
+from avmsf.features.feature_field import FeatureField
+from avmsf.field.config import FitConfig
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.residual_noise import Residual
+from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
+
+PLATE = Plate()
+CONTACT_TIME = 5e-4
+HIGHEST = 2500.0
+RATE = 8000.0
+
+QUICK = FitConfig(
+    clusters=8,
+    width=16,
+    hidden=32,
+    warmup_steps=12,
+    steps=12,
+    fft_sizes=(1024, 256),
+    early=1024,
+    damping="shared",
+)
+
+
+def plate_impacts(count: int = 12, *, seconds: float = 0.3, forces: bool = False) -> Impacts:
+    generator = torch.Generator().manual_seed(0)
+    contacts = sample_contacts(PLATE, count, generator=generator)
+    impacts = strike(
+        PLATE,
+        contacts,
+        sample_rate=RATE,
+        seconds=seconds,
+        generator=generator,
+        noise_db=-40.0,
+        highest=HIGHEST,
+        contact_time=CONTACT_TIME,
+    )
+    return replace(impacts, forces=torch.full((count,), 2.0)) if forces else impacts
+
+
+def plate_features(count: int = 600) -> FeatureField:
+    return FeatureField.from_points(plate_surface_points(PLATE, count))
+
+
+def plate_extraction(impacts: Impacts) -> Extraction:
+    """Return the true modes, a little off as an extraction is, and faint noise."""
+    modes = plate_modes(PLATE, impacts.contacts, highest=HIGHEST, contact_time=CONTACT_TIME)
+    gains = modes.gains.float()
+    level = float(impacts.sounds.square().mean().sqrt()) * 0.01
+    bank = ModalBank(modes.frequency + 0.2, modes.damping * 1.05)
+    return Extraction(bank, gains, Residual(torch.full((33,), level)), torch.zeros_like(gains))

@@ -1,0 +1,63 @@
+"""A field that sounds the same wherever it is struck, so that one recording is its whole truth."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+
+from avmsf.field.gain_field import GainField, Gains
+from avmsf.field.sound_field import Origin, SoundField
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.residual_noise import Residual
+
+RATE = 8000.0
+FREQUENCY = (310.0, 565.0, 905.0, 1420.0, 1990.0, 2710.0)
+DAMPING = (9.0, 12.0, 16.0, 25.0, 40.0, 60.0)
+GAINS = (1.0, -0.8, 0.9, 0.6, -0.7, 0.4)
+
+
+@dataclass(frozen=True, eq=False)
+class SameGains(GainField):
+    """Gains that do not depend on the place."""
+
+    gains: torch.Tensor
+
+    kind: ClassVar[str] = "same"
+
+    @property
+    def points(self) -> torch.Tensor:
+        return torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
+
+    def at(self, contacts, directions=None) -> Gains:
+        return Gains(self.gains.expand(len(contacts), -1))
+
+    def record(self) -> dict[str, Any]:
+        return {"modes": len(self.gains)}
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        return {"gains": self.gains}
+
+    @classmethod
+    def skeleton(cls, record):
+        return {"gains": torch.empty(record["modes"], device="meta")}
+
+    @classmethod
+    def restore(cls, record, tensors):
+        return cls(tensors["gains"])
+
+
+def ringing_field(*, pitch: float = 1.0, damping: float = 1.0, seconds: float = 0.5, level: float = 1.0) -> SoundField:
+    frequency, own = (torch.tensor(each, dtype=torch.float64) for each in (FREQUENCY, DAMPING))
+    return SoundField(
+        ModalBank(pitch * frequency, damping * own),
+        SameGains(level * torch.tensor(GAINS)),
+        torch.zeros(len(FREQUENCY), dtype=torch.float64),
+        Residual(torch.zeros(17)),
+        RATE,
+        round(seconds * RATE),
+        Origin(capture="ringing"),
+    )
+
+
+def sound_of(field: SoundField) -> torch.Tensor:
+    return field.render(field.gain_field.points[:1])

@@ -1,0 +1,46 @@
+"""A small painted thing, photographed from all sides, and the plate's blows on it."""
+
+from pathlib import Path
+
+import torch
+
+from avmsf.mesh import Surface
+from avmsf.mesh.textured_mesh import TexturedMesh
+from avmsf.photographs.cameras import View
+from avmsf.photographs.mesh_views import orbit_cameras, render_views
+from factories.plate_capture import PLATE
+
+THICKNESS = 0.02
+"""Of the slab, meters; its upper side is the plate that is struck, at z = 0."""
+SMALL_SPLAT = ("--splat.steps", "60", "--splat.start-points", "800")
+
+
+def slab() -> Surface:
+    """Return a box below the plate's rectangle."""
+    a, b = PLATE.length, PLATE.width
+    corners = [(x, y, z) for z in (-THICKNESS, 0.0) for y in (0.0, b) for x in (0.0, a)]
+    quads = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
+    faces = [face for q in quads for face in ((q[0], q[1], q[2]), (q[0], q[2], q[3]))]
+    return Surface(torch.tensor(corners), torch.tensor(faces))
+
+
+def painted_slab() -> TexturedMesh:
+    """Return the slab with a color that changes from corner to corner."""
+    surface = slab()
+    paint = torch.rand(8, 3, generator=torch.Generator().manual_seed(1))
+    return TexturedMesh.build(surface.vertices, surface.faces, colors=paint[surface.faces])
+
+
+def slab_views(size: int = 48) -> tuple[View, ...]:
+    """Return 24 pictures of the painted slab before black."""
+    mesh = painted_slab()
+    cameras = orbit_cameras(mesh.surface, size=size, azimuths=8)
+    return render_views(mesh, cameras, background=(0.0, 0.0, 0.0), supersample=2)
+
+
+def write_surface_file(folder: Path) -> None:
+    """Write the slab as `surface.obj`."""
+    surface = slab()
+    lines = [f"v {x} {y} {z}" for x, y, z in surface.vertices.tolist()]
+    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in surface.faces.tolist()]
+    (folder / "surface.obj").write_text("\n".join([*lines, ""]))

@@ -1,0 +1,196 @@
+"""DINOv2 as an encoder, on tiny random models of its classes: the map is the model's own tokens, in their places."""
+
+import json
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from avmsf.errors import SceneError
+from avmsf.features.dino import MODELS, DinoEncoder
+from factories.raising import raises
+
+transformers = pytest.importorskip("transformers")
+PATCH = 14
+PREPROCESSOR = "preprocessor_config.json"
+
+
+def tiny(registers: bool) -> torch.nn.Module:
+    """A random model of DINOv2's architecture, sixteen features wide."""
+    sizes = {"hidden_size": 16, "num_hidden_layers": 2, "num_attention_heads": 2, "image_size": 4 * PATCH}
+    torch.manual_seed(0)
+    if registers:
+        config = transformers.Dinov2WithRegistersConfig(patch_size=PATCH, initializer_range=0.3, **sizes)
+        return transformers.Dinov2WithRegistersModel(config).eval()
+    return transformers.Dinov2Model(transformers.Dinov2Config(patch_size=PATCH, initializer_range=0.3, **sizes)).eval()
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["plain", "registers"])
+def folder(request, tmp_path_factory) -> Path:
+    place = tmp_path_factory.mktemp("model") / "tiny"
+    tiny(request.param).save_pretrained(place)
+    record = {"image_mean": [0.4, 0.5, 0.6], "image_std": [0.2, 0.3, 0.1]}
+    (place / PREPROCESSOR).write_text(json.dumps(record))
+    return place
+
+
+def load(folder: Path, **settings) -> DinoEncoder:
+    return DinoEncoder.load(folder, **{"longest": None, **settings})
+
+
+def image(height: int, width: int) -> torch.Tensor:
+    return torch.rand(height, width, 3, generator=torch.Generator().manual_seed(1))
+
+
+def own_tokens(encoder: DinoEncoder, picture: torch.Tensor) -> torch.Tensor:
+    """The model's hidden states on a picture of whole patches, class and register tokens dropped."""
+    normal = (picture - torch.tensor([0.4, 0.5, 0.6])) / torch.tensor([0.2, 0.3, 0.1])
+    with torch.no_grad():
+        states = encoder.model(pixel_values=normal.permute(2, 0, 1)[None]).last_hidden_state[0]
+    extra = 1 + getattr(encoder.model.config, "num_register_tokens", 0)
+    rows, columns = picture.shape[0] // PATCH, picture.shape[1] // PATCH
+    assert len(states) == extra + rows * columns
+    return states[extra:].reshape(rows, columns, -1).permute(2, 0, 1)
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(4, 4), (3, 7), (1, 1)])
+def test_the_map_is_the_models_own_grid(folder, rows, columns):
+    encoder, picture = load(folder), image(rows * PATCH, columns * PATCH)
+    # The same numbers through the same layers in float32; the resize to the same size may round.
+    torch.testing.assert_close(encoder.describe(picture), own_tokens(encoder, picture), rtol=0, atol=1e-4)
+
+
+def test_bytes_are_described_as_the_numbers_that_they_stand_for(folder):
+    encoder, picture = load(folder), (255 * image(28, 42)).round().to(torch.uint8)
+    assert torch.equal(encoder.describe(picture), encoder.describe(picture.float() / 255))
+
+
+@pytest.mark.parametrize(("height", "width"), [(43, 70), (29, 55), (5, 90), (71, 13)])
+def test_any_size_is_described_in_its_place(folder, height, width):
+    encoder, picture = load(folder), image(height, width)
+    found = encoder.describe(picture)
+    rows, columns = -(-height // PATCH), -(-width // PATCH)
+    # Continued by hand: the last row and column again and again.
+    down = torch.arange(rows * PATCH).clamp(max=height - 1)
+    across = torch.arange(columns * PATCH).clamp(max=width - 1)
+    tokens = own_tokens(encoder, picture[down][:, across]).double()
+    assert found.shape == tokens.shape
+    # Equal cells of the image proper have their middles elsewhere than the patches of the continued one.
+    y = ((torch.arange(rows) + 0.5) * height / rows).double()
+    x = ((torch.arange(columns) + 0.5) * width / columns).double()
+    y, x = 2 * y / (rows * PATCH) - 1, 2 * x / (columns * PATCH) - 1
+    grid = torch.stack([x[None, :].expand(rows, columns), y[:, None].expand(rows, columns)], dim=-1)[None]
+    expected = torch.nn.functional.grid_sample(tokens[None], grid, align_corners=False, padding_mode="border")[0]
+    torch.testing.assert_close(found, expected.float(), rtol=0, atol=1e-4)
+
+
+def test_longest_sets_the_resolution_and_keeps_the_proportions(folder):
+    assert load(folder, longest=56).describe(image(100, 200)).shape == (16, 2, 4)
+    assert load(folder, longest=70).describe(image(20, 10)).shape == (16, 5, 3)
+    with raises(SceneError, name="longest", value=0):
+        load(folder, longest=0)
+
+
+def test_a_moved_image_moves_the_patches_content(folder):
+    # Without position encodings a transformer knows patches, not places: an image of repeating tiles, moved around by
+    # one patch, gives its tokens moved around by one.
+    encoder, picture = load(folder), image(4 * PATCH, 4 * PATCH)
+    with torch.no_grad():
+        encoder.model.embeddings.position_embeddings.zero_()
+    moved = encoder.describe(picture.roll(PATCH, 1))
+    torch.testing.assert_close(moved, encoder.describe(picture).roll(1, 2), rtol=0, atol=1e-4)
+    assert float((moved - encoder.describe(picture)).abs().max()) > 0.1
+
+
+def test_a_model_saved_in_half_precision_computes_in_float32(folder, tmp_path):
+    half = load(folder).model.to(torch.bfloat16)
+    half.save_pretrained(tmp_path / "half")
+    encoder, picture = load(tmp_path / "half"), image(28, 28)
+    assert {each.dtype for each in encoder.model.parameters()} == {torch.float32}
+    assert encoder.describe(picture).dtype == torch.float32
+
+
+def test_without_constants_of_its_own_a_model_gets_imagenets(folder, tmp_path):
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    for name in ("config.json", "model.safetensors"):
+        (bare / name).write_bytes((folder / name).read_bytes())
+    picture = image(28, 28)
+    # What ImageNet's constants make of it, told to the model with the other constants.
+    usual = (picture - torch.tensor([0.485, 0.456, 0.406])) / torch.tensor([0.229, 0.224, 0.225])
+    expected = own_tokens(load(folder), usual * torch.tensor([0.2, 0.3, 0.1]) + torch.tensor([0.4, 0.5, 0.6]))
+    torch.testing.assert_close(load(bare).describe(picture), expected, rtol=0, atol=1e-4)
+
+
+def test_the_name_says_where_the_model_came_from(folder):
+    assert load(folder).name == "DINOv2 from the folder tiny"
+
+
+def test_without_network_one_error_says_what_to_put_where(tmp_path, monkeypatch):
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
+    # A port that nobody listens at.
+    monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
+    monkeypatch.setattr("huggingface_hub.hf_api.api.endpoint", "http://127.0.0.1:9")
+    for offline in (False, True):
+        monkeypatch.setattr(constants, "HF_HUB_OFFLINE", offline)
+        began = time.monotonic()
+        with raises(SceneError, name="encoder", value=MODELS[0]):
+            DinoEncoder.load(MODELS[0])
+        # The hub's own retries take 23 s.
+        assert time.monotonic() - began < 10
+
+
+def test_a_path_is_distinguished_from_a_name(tmp_path):
+    with raises(SceneError, file="nowhere", name="encoder"):
+        DinoEncoder.load(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    ("damage", "file", "name"),
+    [
+        (lambda at: (at / "config.json").unlink(), "copy", "config.json"),
+        (lambda at: (at / "model.safetensors").unlink(), "copy", "model.safetensors"),
+        (lambda at: (at / "config.json").write_text("{"), None, None),
+        (lambda at: (at / "config.json").write_text("[]"), None, None),
+        (lambda at: (at / "config.json").write_text('{"model_type": "vit"}'), "config.json", "model_type"),
+        (lambda at: (at / "model.safetensors").write_bytes(b"half"), "model.safetensors", None),
+        (lambda at: _change(at, hidden_size=32), "model.safetensors", None),
+        (lambda at: (at / PREPROCESSOR).write_text('{"image_mean": [1]}'), PREPROCESSOR, "image_mean"),
+    ],
+)
+def test_a_folder_that_is_no_model_is_refused(folder, tmp_path, damage, file, name):
+    copy = _copied(folder, tmp_path / "copy")
+    damage(copy)
+    with raises(SceneError, file=file, name=name):
+        load(copy)
+
+
+def test_weights_without_a_layer_are_refused(folder, tmp_path):
+    copy = _copied(folder, tmp_path / "copy")
+    _change(copy, num_hidden_layers=3)
+    with raises(SceneError, file="model.safetensors") as caught:
+        load(copy)
+    assert ".layer.2." in caught.value.name
+
+
+def _copied(folder: Path, copy: Path) -> Path:
+    copy.mkdir()
+    for each in folder.iterdir():
+        (copy / each.name).write_bytes(each.read_bytes())
+    return copy
+
+
+def _change(folder: Path, **settings) -> None:
+    path = folder / "config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | settings))
+
+
+def test_a_missing_package_is_named(folder, monkeypatch):
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    for source in (folder, MODELS[1]):
+        with raises(SceneError, name="transformers"):
+            DinoEncoder.load(source)

@@ -1,0 +1,137 @@
+"""What is known of an object's points: who is nearest, what a region is described by, and how large the object is."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from avmsf.errors import FitError
+from avmsf.features.feature_field import FeatureField
+from avmsf.gaussians.points import cluster
+from avmsf.mesh.surface import Surface
+from factories.raising import raises
+
+
+def box(count: int = 200) -> torch.Tensor:
+    """Points that fill a box of 0.3 by 0.2 by 0.1 m which does not lie at the origin."""
+    fractions = torch.rand(count, 3, generator=torch.Generator().manual_seed(1))
+    return torch.tensor([1.0, -2.0, 0.5]) + fractions * torch.tensor([0.3, 0.2, 0.1])
+
+
+def test_the_nearest_point_is_the_one_at_least_distance():
+    field = FeatureField.from_points(box())
+    contacts = box(300)[200:] + 0.01
+    brute = torch.cdist(contacts.double(), field.points.double()).argmin(1)
+    assert torch.equal(field.nearest(contacts), brute)
+    assert torch.equal(field.at(contacts), field.features[brute])
+
+
+def test_contacts_are_compared_in_float64():
+    field = FeatureField.from_points(torch.tensor([[1.0, 0.0, 0.0], [1.0 + 2**-22, 0.0, 0.0]]))
+    # Nearer to the second point by less than float32 can say of a coordinate near one.
+    contact = torch.tensor([[1.0 + 2**-23 + 2**-40, 0.0, 0.0]], dtype=torch.float64)
+    assert field.nearest(contact).tolist() == [1]
+    assert field.nearest(contact.float()).tolist() == [0]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_region_is_described_by_the_mean_of_its_points_features(dtype):
+    points = box()
+    features = torch.randn(200, 5, generator=torch.Generator().manual_seed(2), dtype=dtype)
+    field = FeatureField(points, features, "anyone")
+    regions, labels = field.clusters(7), cluster(points, 7).labels
+    for group in range(7):
+        # Sums of some thirty numbers of unit size in float32.
+        torch.testing.assert_close(regions.descriptors[group], features[labels == group].mean(0), rtol=0, atol=1e-6)
+        torch.testing.assert_close(regions.centers[group], points[labels == group].mean(0), rtol=0, atol=1e-6)
+
+
+def test_one_region_a_point_is_the_points_themselves():
+    field = FeatureField.from_points(box(9))
+    regions = field.clusters(9)
+    rows = field.nearest(regions.centers)
+    assert sorted(rows.tolist()) == list(range(9))
+    assert torch.equal(regions.descriptors, field.features[rows])
+
+
+def test_more_regions_than_positions_are_refused():
+    with raises(FitError, name="count", value=10):
+        FeatureField.from_points(box(9)).clusters(10)
+
+
+def test_position_features_know_neither_the_objects_place_nor_its_size():
+    points = box().double()
+    there = FeatureField.from_points(points)
+    elsewhere = FeatureField.from_points(points * 7 + torch.tensor([3.0, 4.0, 5.0], dtype=torch.float64))
+    # Rounding of float32 features of about unit size.
+    torch.testing.assert_close(there.features, elsewhere.features, rtol=0, atol=2e-7)
+    middle = (there.features.amax(0) + there.features.amin(0)) / 2
+    assert float(middle.abs().max()) < 2e-7
+    half_diagonal = float((there.features.amax(0) - there.features.amin(0)).norm()) / 2
+    assert half_diagonal == pytest.approx(1, abs=1e-6)
+    assert elsewhere.half_diagonal == pytest.approx(7 * there.half_diagonal, rel=1e-6)
+
+
+def test_half_the_diagonal_of_a_box():
+    corners = torch.tensor([[1.0, 1.0, 1.0], [3.0, 4.0, 7.0]])
+    assert FeatureField.from_points(corners).half_diagonal == pytest.approx(math.sqrt(4 + 9 + 36) / 2, rel=1e-7)
+
+
+def test_normals_follow_the_positions():
+    normals = torch.nn.functional.normalize(box() - 0.3, dim=1)
+    field = FeatureField.from_points(box(), normals=normals)
+    assert torch.equal(field.features[:, :3], FeatureField.from_points(box()).features)
+    assert torch.equal(field.features[:, 3:], normals)
+
+
+def test_a_mesh_gives_points_on_it_and_points_alone_are_kept():
+    vertices = torch.tensor([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.0, 0.1, 0.0]])
+    generator = torch.Generator().manual_seed(3)
+    mesh = FeatureField.from_mesh(Surface(vertices, torch.tensor([[0, 1, 2]])), seed=generator, count=500)
+    assert mesh.points.shape == (500, 3)
+    x, y, z = mesh.points.T
+    # On the triangle x / 0.2 + y / 0.1 <= 1 in the plane z = 0, to float32.
+    assert float((x / 0.2 + y / 0.1).max()) <= 1 + 1e-6
+    assert float(torch.minimum(x, y).min()) >= 0
+    assert float(z.abs().max()) == 0
+    cloud = FeatureField.from_mesh(Surface(vertices, torch.zeros(0, 3, dtype=torch.long)), seed=generator)
+    assert torch.equal(cloud.points, vertices)
+
+
+@pytest.mark.parametrize("flat", [0, 1, 2])
+def test_points_that_stand_for_contacts_fill_their_box_and_stay_in_their_plane(flat):
+    contacts = box(40)
+    contacts[:, flat] = 0.7
+    field = FeatureField.from_contacts(contacts, count=300)
+    assert 100 < len(field.points) <= 300
+    assert torch.equal(field.points[:, flat], torch.full((len(field.points),), 0.7))
+    torch.testing.assert_close(field.points.amin(0), contacts.amin(0), rtol=0, atol=1e-7)
+    torch.testing.assert_close(field.points.amax(0), contacts.amax(0), rtol=0, atol=1e-7)
+    # No contact is farther from a point than half the diagonal of the lattice's cell; the widest cell has the area of
+    # the box over the number of cells in it.
+    distance = torch.cdist(contacts, field.points).amin(1)
+    assert float(distance.max()) < 0.02
+
+
+def test_points_in_one_place_span_nothing():
+    alike = torch.ones(5, 3)
+    with raises(FitError, name="points", value=5):
+        FeatureField.from_points(alike)
+    with raises(FitError, name="points", value=5):
+        FeatureField.from_contacts(alike)
+    with raises(FitError, name="points", value=0):
+        FeatureField.from_points(alike[:0])
+
+
+def test_points_that_are_not_finite_are_refused():
+    points = box(5)
+    points[2, 1] = float("nan")
+    with raises(FitError, name="points", value=5):
+        FeatureField.from_points(points)
+
+
+def test_a_field_is_a_value():
+    field = FeatureField.from_points(box())
+    assert field.encoder == "geometry"
+    assert replace(field, encoder="other").encoder == "other"

@@ -1,0 +1,111 @@
+"""Features as a file: what was saved comes back to the last bit, and no other file does."""
+
+import json
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from avmsf.errors import SceneError
+from avmsf.features.feature_field import FeatureField
+from avmsf.features.store import load_features, read_report, save_features
+from factories.raising import raises
+
+
+def field() -> FeatureField:
+    generator = torch.Generator().manual_seed(0)
+    return FeatureField(
+        torch.rand(20, 3, generator=generator), torch.randn(20, 5, generator=generator), "descriptors, 5 components"
+    )
+
+
+def test_what_was_saved_comes_back(tmp_path):
+    path = tmp_path / "deep" / "features.safetensors"
+    report = {"unseen": 3, "views": ["a", "b"], "agreement": 0.5}
+    save_features(field(), path, report=report)
+    found = load_features(path)
+    assert torch.equal(found.points, field().points)
+    assert torch.equal(found.features, field().features)
+    assert found.encoder == field().encoder
+    assert read_report(path) == report
+    assert [each.name for each in path.parent.iterdir()] == [path.name]
+
+
+def test_points_that_are_features_too_can_be_saved(tmp_path):
+    points = torch.rand(6, 3)
+    save_features(FeatureField(points, points, "geometry"), tmp_path / "f")
+    assert torch.equal(load_features(tmp_path / "f").features, points)
+    assert read_report(tmp_path / "f") == {}
+
+
+def test_a_failed_save_leaves_the_old_file(tmp_path):
+    path = tmp_path / "features.safetensors"
+    save_features(field(), path)
+    before = path.read_bytes()
+    spoilt = FeatureField(field().points, torch.full((20, 5), torch.nan), "anyone")
+    with raises(SceneError, file=path, name="features"):
+        save_features(spoilt, path)
+    for report in ({"a": float("nan")}, {"a": torch.zeros(1)}):
+        with raises(SceneError, file=path, name="report"):
+            save_features(field(), path, report=report)
+    assert path.read_bytes() == before
+    with raises(SceneError, file=path / "below"):
+        save_features(field(), path / "below")
+
+
+def rewritten(path, *, tensors=None, **changes):
+    """Save a field and change its record or its tensors behind its back."""
+    save_features(field(), path)
+    record = {"format": 1, "version": "0.1.0", "encoder": "x", "sizes": {"points": 20, "dim": 5}, "report": {}}
+    words = json.dumps(record | changes)
+    save_file(load_file(path) if tensors is None else tensors, path, {"avmsf_features": words})
+    return path
+
+
+TENSORS = {"points": torch.zeros(20, 3), "features": torch.zeros(20, 5)}
+SHAPES = {"points": [20, 3], "features": [20, 5]}
+
+
+def test_a_file_as_the_record_says_is_read(tmp_path):
+    assert load_features(rewritten(tmp_path / "f")).encoder == "x"
+
+
+@pytest.mark.parametrize(
+    ("changes", "name", "value"),
+    [
+        ({"format": 2, "version": "9.9"}, "format", 2),
+        ({"sizes": {"points": 20}}, "header", None),
+        ({"sizes": {"points": 20, "dim": 0}}, "header", None),
+        ({"sizes": {"points": 20, "dim": True}}, "header", None),
+        ({"encoder": 3}, "header", None),
+        ({"report": []}, "header", None),
+        ({"sizes": {"points": 20, "dim": 6}}, "tensors", SHAPES),
+        ({"tensors": TENSORS | {"more": torch.zeros(1)}}, "tensors", SHAPES | {"more": [1]}),
+        ({"tensors": {"points": torch.zeros(20, 3)}}, "tensors", {"points": [20, 3]}),
+        ({"tensors": TENSORS | {"features": torch.zeros(20, 5).double()}}, "tensors", SHAPES),
+        ({"tensors": TENSORS | {"features": torch.full((20, 5), torch.inf)}}, "features", None),
+    ],
+)
+def test_a_changed_file_is_refused(tmp_path, changes, name, value):
+    path = rewritten(tmp_path / "f", **changes)
+    with raises(SceneError, file=path, name=name, value=value) as caught:
+        load_features(path)
+    assert str(path) in str(caught.value)
+
+
+def test_other_files_are_refused(tmp_path):
+    path = tmp_path / "f"
+    with raises(SceneError, file=path, value=None):
+        load_features(path)
+    path.write_bytes(b"ply\n")
+    with raises(SceneError, file=path, name=None) as caught:
+        load_features(path)
+    assert "ply" in caught.value.value
+    save_file(TENSORS, path)
+    with raises(SceneError, file=path, name="avmsf_features", value=[]):
+        load_features(path)
+    save_features(field(), path)
+    path.write_bytes(path.read_bytes()[:-10])
+    with raises(SceneError, file=path, name=None) as caught:
+        load_features(path)
+    assert "truncated" in caught.value.value

@@ -1,0 +1,337 @@
+"""Finite elements against beams, plates, a second implementation, and the laws that every elastic body obeys."""
+
+import math
+
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.optimize
+import scipy.sparse.linalg
+import torch
+from jaxtyping import Float64
+from threadpoolctl import threadpool_info, threadpool_limits
+from torch import Tensor
+
+from avmsf.errors import SimulationError
+from avmsf.fem.block import block
+from avmsf.fem.eigen import lowest_vibrations, one_blas_thread, rigid_motions
+from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
+from avmsf.fem.elements import SecondOrder, mass, stiffness
+from avmsf.fem.material import GLASS, STEEL, Material
+from avmsf.fem.solid import Solid
+from factories.raising import raises
+
+BRACKET = ((0.07, 0.05, 0.011), (3, 2, 1))
+"""A block with three different sides, so that no two modes share a frequency."""
+
+
+@pytest.fixture(scope="module")
+def bracket() -> Solid:
+    return block(*BRACKET)
+
+
+@pytest.fixture(scope="module")
+def modes(bracket: Solid) -> ElasticModes:
+    return elastic_modes(bracket, STEEL, count=8)
+
+
+def matrices(solid: Solid, material: Material) -> tuple[SecondOrder, scipy.sparse.csr_array, scipy.sparse.csr_array]:
+    mesh = SecondOrder.of(solid)
+    density = torch.full((len(solid.cells),), material.density, dtype=torch.float64)
+    return mesh, stiffness(mesh, material).tocsr(), mass(mesh, density)
+
+
+def curved(sides: int) -> Solid:
+    """A square of 12 cm, 1.5 mm thick, bent onto a sphere of 10 cm: a piece of a bowl."""
+    flat = block((0.12, 0.12, 0.0015), (sides, sides, 1))
+    along, across = flat.points[:, 0] - 0.06, flat.points[:, 1] - 0.06
+    directions = torch.stack([along, across, torch.full_like(along, 0.1)], dim=1)
+    radii = 0.1 + flat.points[:, 2:]
+    return Solid.build(radii * directions / directions.norm(dim=1, keepdim=True), flat.cells)
+
+
+def rotation() -> Float64[Tensor, "3 3"]:
+    drawn = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))).Q
+    return drawn * torch.linalg.det(drawn)
+
+
+def test_a_slender_bar_bends_as_a_free_beam():
+    length, height, width = 0.4, 0.008, 0.012
+    found = elastic_modes(block((length, height, width), (16, 1, 1)), STEEL, count=6).frequency
+    speed = math.sqrt(STEEL.young / STEEL.density)
+    # cosh x cos x = 1 at the free ends, for bending in the plane of either side.
+    waves = np.array([4.730040745, 7.853204624, 10.995607838])
+    expected = np.concatenate(
+        [waves**2 / (2 * math.pi * length**2) * speed * side / math.sqrt(12) for side in (height, width)]
+    )
+    # Euler and Bernoulli leave out shear and rotary inertia, at most 1.7 % here (x^2 (side / length)^2 / 2).
+    for frequency in np.sort(expected)[:5]:
+        assert float((found / frequency - 1).abs().min()) < 0.02
+    assert float(found[0]) == pytest.approx(expected.min(), rel=5e-3)
+
+
+def test_a_free_square_plate_sounds_where_leissa_has_it():
+    side, thickness = 0.2, 0.002
+    steel = Material("steel", 7850.0, 2e11, 0.3, 0.0, 0.0)
+    found = elastic_modes(block((side, side, thickness), (16, 16, 1)), steel, count=6).frequency
+    rigidity = steel.young * thickness**3 / (12 * (1 - steel.poisson**2))
+    factors = 2 * math.pi * found.numpy() * side**2 * math.sqrt(steel.density * thickness / rigidity)
+    np.testing.assert_allclose(factors, [13.489, 19.789, 24.432, 35.024, 35.024, 61.526], rtol=0.015)
+
+
+def test_a_bar_rings_along_itself_and_twists():
+    # Poisson's ratio of nearly zero: the bar keeps its section, and f = c / 2 L and its multiples are exact.
+    cork = Material("cork", 200.0, 2e7, 1e-6, 0.0, 0.0)
+    found = elastic_modes(block((0.3, 0.03, 0.03), (10, 2, 2)), cork, count=12)
+    speed = math.sqrt(cork.young / cork.density)
+    twist = speed / math.sqrt(2.0) * math.sqrt(0.1406 / (1.0 / 6.0))  # torsion constant of a square, .1406 a^4
+    # Both hold in the limit of a thin bar; that a section's corners lag a little costs the twist most.
+    for expected, tolerance in ((speed / 0.6, 1e-3), (twist / 0.6, 0.02)):
+        assert float((found.frequency / expected - 1).abs().min()) < tolerance
+
+
+def test_frequencies_converge_as_second_order_elements_do():
+    two, four, six = (
+        elastic_modes(block((0.05, 0.04, 0.03), (n, n, n)), GLASS, count=3).frequency.numpy() for n in (2, 4, 6)
+    )
+    for coarse, middle, fine in zip(two, four, six, strict=True):
+        # Errors of n^-p make this ratio of differences, Richardson's. Smooth bodies have p = 4, edges cost some of it;
+        # linear elements have 2.
+        ratio = (coarse - middle) / (middle - fine)
+        order = scipy.optimize.brentq(lambda p, r=ratio: r * (4.0**-p - 6.0**-p) - (2.0**-p - 4.0**-p), 0.5, 8.0)
+        assert 2.8 < order < 4.2
+        assert coarse > middle > fine
+
+
+def test_thin_curved_walls_do_not_lock():
+    skfem = pytest.importorskip("skfem", reason="linear elements are scikit-fem's")
+    coarse, fine = (float(elastic_modes(curved(sides), GLASS, count=4).frequency[0]) for sides in (5, 9))
+    assert coarse == pytest.approx(fine, rel=0.03)
+    linear = linear_frequency(skfem, curved(9), GLASS)
+    assert linear > 1.5 * fine
+
+
+def linear_frequency(skfem: object, solid: Solid, material: Material) -> float:
+    from skfem import Basis, BilinearForm, ElementTetP1, ElementVector, MeshTet
+    from skfem.helpers import dot
+    from skfem.models.elasticity import lame_parameters, linear_elasticity
+
+    basis = Basis(MeshTet(solid.points.numpy().T, solid.cells.numpy().T), ElementVector(ElementTetP1()))
+    forces = linear_elasticity(*lame_parameters(material.young, material.poisson)).assemble(basis)
+    weights = BilinearForm(lambda u, v, w: material.density * dot(u, v)).assemble(basis)
+    squares = scipy.sparse.linalg.eigsh(forces, k=8, M=weights, sigma=-1e6, return_eigenvectors=False)
+    return math.sqrt(np.sort(squares)[6]) / (2 * math.pi)
+
+
+def test_matrices_are_those_of_another_implementation(bracket):
+    skfem = pytest.importorskip("skfem", reason="the oracle is scikit-fem")
+    from skfem.helpers import dot
+    from skfem.models.elasticity import lame_parameters, linear_elasticity
+
+    mesh, forces, weights = matrices(bracket, GLASS)
+    other = skfem.MeshTet(bracket.points.numpy().T, bracket.cells.numpy().T)
+    basis = skfem.Basis(other, skfem.ElementVector(skfem.ElementTetP2()))
+    expected = linear_elasticity(*lame_parameters(GLASS.young, GLASS.poisson)).assemble(basis).toarray()
+    inertia = skfem.BilinearForm(lambda u, v, w: GLASS.density * dot(u, v)).assemble(basis).toarray()
+    # Each of its degrees of freedom has a place and a component; ours are found by their place.
+    rows = np.empty(basis.N, dtype=int)
+    for freedom in range(basis.N):
+        node = np.linalg.norm(mesh.nodes - basis.doflocs[:, freedom], axis=1).argmin()
+        rows[freedom] = 3 * node + {"u^1": 0, "u^2": 1, "u^3": 2}[name_of(basis, freedom)]
+    assert len(set(rows)) == 3 * len(mesh.nodes)
+    np.testing.assert_allclose(forces.toarray()[np.ix_(rows, rows)], expected, atol=1e-9 * expected.max())
+    ours = np.kron(weights.toarray(), np.eye(3))[np.ix_(rows, rows)]
+    np.testing.assert_allclose(ours, inertia, atol=1e-9 * inertia.max())
+
+
+def name_of(basis: object, freedom: int) -> str:
+    found = [
+        name
+        for table, names in ((basis.nodal_dofs, basis.elem.dofnames[:3]), (basis.edge_dofs, basis.elem.dofnames[3:]))
+        for name, row in zip(names, table, strict=True)
+        if freedom in row
+    ]
+    return found[0]
+
+
+def test_rigid_motions_cost_no_force_and_weigh_the_body(bracket):
+    mesh, forces, weights = matrices(bracket, STEEL)
+    motions = rigid_motions(mesh.nodes, weights)
+    assert np.abs(forces @ motions).max() < 1e-9 * abs(forces).max() * np.abs(motions).max()
+    heavy = scipy.sparse.kron(weights, np.eye(3))
+    np.testing.assert_allclose(motions.T @ heavy @ motions, np.eye(6), atol=1e-10)
+    # They are all: the seventh eigenvalue is that of a vibration.
+    values = np.sort(scipy.linalg.eigvalsh(forces.toarray(), heavy.toarray()))
+    assert abs(values[5]) < 1e-8 * values[6]
+    assert weights.sum() == pytest.approx(7850.0 * 0.07 * 0.05 * 0.011, rel=1e-12)
+
+
+def test_modes_are_those_of_the_whole_spectrum(bracket, modes):
+    _, forces, weights = matrices(bracket, STEEL)
+    values = scipy.linalg.eigvalsh(forces.toarray(), np.kron(weights.toarray(), np.eye(3)))
+    expected = np.sqrt(np.sort(values)[6:14]) / (2 * math.pi)
+    np.testing.assert_allclose(modes.frequency.numpy(), expected, rtol=1e-9)
+
+
+def test_shapes_are_mass_normalized_and_free_of_rigid_motion(bracket):
+    mesh, forces, weights = matrices(bracket, STEEL)
+    rigid = rigid_motions(mesh.nodes, weights)
+    found = lowest_vibrations(forces, weights, rigid, count=10, shift=1e4, supported=False)
+    heavy = scipy.sparse.kron(weights, np.eye(3))
+    np.testing.assert_allclose(found.shapes.T @ heavy @ found.shapes, np.eye(10), atol=1e-9)
+    np.testing.assert_allclose(found.shapes.T @ heavy @ rigid, 0.0, atol=1e-9)
+    stored = found.shapes.T @ forces @ found.shapes
+    np.testing.assert_allclose(stored, np.diag(found.squares), atol=1e-8 * found.squares[-1])
+
+
+def test_response_is_reciprocal_and_that_of_the_matrices(bracket, modes):
+    mesh, forces, weights = matrices(bracket, STEEL)
+    heavy = scipy.sparse.kron(weights, np.eye(3), format="csr")
+    # Close above the second mode, where all others together do a thousandth of what it does.
+    square = (2 * math.pi * float(modes.frequency[1])) ** 2 * (1 + 1e-6)
+    one, other = 0, len(bracket.points) - 2
+    directions = torch.tensor([[0.6, 0.0, 0.8], [0.0, 0.28, 0.96]], dtype=torch.float64)
+    gains = modes.gains(torch.from_numpy(mesh.nodes[[one, other]]), directions)
+    responses = []
+    for struck, heard in ((0, 1), (1, 0)):
+        force = np.zeros(forces.shape[0])
+        node = (one, other)[struck]
+        force[3 * node : 3 * node + 3] = directions[struck]
+        moved = scipy.sparse.linalg.spsolve((forces - square * heavy).tocsc(), force).reshape(-1, 3)
+        responses.append(moved[(one, other)[heard]] @ directions[heard].numpy())
+        expected = float(gains[struck, 1] * gains[heard, 1]) / ((2 * math.pi * float(modes.frequency[1])) ** 2 - square)
+        assert responses[-1] == pytest.approx(expected, rel=1e-2)
+    assert responses[0] == pytest.approx(responses[1], rel=1e-6)
+
+
+def test_turned_and_moved_bodies_sound_the_same(bracket, modes):
+    turn, shift = rotation(), torch.tensor([0.3, -1.0, 2.0], dtype=torch.float64)
+    moved = elastic_modes(Solid.build(bracket.points @ turn.T + shift, bracket.cells), STEEL, count=8)
+    assert torch.allclose(moved.frequency, modes.frequency, rtol=1e-8)
+    places = bracket.points[::5]
+    here, there = modes.at(places), moved.at(places @ turn.T + shift)
+    sign = torch.sign((torch.einsum("cmd,ed->cme", here, turn) * there).sum(dim=(0, 2)))
+    expected = torch.einsum("cmd,ed->cme", here, turn) * sign[:, None]
+    assert torch.allclose(there, expected, atol=1e-6 * float(here.abs().max()))
+
+
+def test_size_stiffness_and_density_obey_the_scaling_laws(bracket, modes):
+    larger = elastic_modes(Solid.build(2.5 * bracket.points, bracket.cells), STEEL, count=8)
+    assert torch.allclose(larger.frequency, modes.frequency / 2.5, rtol=1e-9)
+    assert torch.allclose(larger.shapes.abs(), modes.shapes.abs() * 2.5**-1.5, atol=1e-6)
+    factor = torch.full((len(bracket.cells),), 4.0)
+    stiffer = elastic_modes(bracket, STEEL, count=8, stiffness_factor=factor)
+    assert torch.allclose(stiffer.frequency, 2.0 * modes.frequency, rtol=1e-9)
+    heavier = elastic_modes(bracket, STEEL, count=8, density_factor=factor)
+    assert torch.allclose(heavier.frequency, modes.frequency / 2.0, rtol=1e-9)
+    assert heavier.mass == pytest.approx(4.0 * modes.mass, rel=1e-12)
+    assert modes.mass == pytest.approx(STEEL.density * bracket.volume, rel=1e-12)
+
+
+def test_a_heavier_cell_slows_modes_by_its_kinetic_energy(bracket, modes):
+    drawn = torch.rand(len(bracket.cells), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    found = elastic_modes(bracket, STEEL, count=8, density_factor=1.0 + 1e-4 * drawn)
+    mesh, forces, weights = matrices(bracket, STEEL)
+    free = lowest_vibrations(
+        forces, weights, rigid_motions(mesh.nodes, weights), count=8, shift=1e4, supported=False
+    ).shapes
+    added = scipy.sparse.kron(mass(mesh, STEEL.density * 1e-4 * drawn), np.eye(3))
+    # Rayleigh: to first order the squared frequency falls by the added mass's part of the kinetic energy.
+    expected = -0.5 * np.einsum("fm,fm->m", free, added @ free)
+    np.testing.assert_allclose((found.frequency / modes.frequency - 1).numpy(), expected, rtol=1e-2)
+
+
+def test_soft_springs_raise_each_mode_by_its_motion_there(bracket, modes):
+    places = torch.tensor([[0.01, 0.012, 0.0], [0.06, 0.01, 0.0], [0.035, 0.045, 0.0]], dtype=torch.float64)
+    stiff = 1e4
+    held = elastic_modes(bracket, STEEL, count=8, springs=[(place, stiff) for place in places])
+    assert len(held) == 8
+    raised = (2 * math.pi) ** 2 * (held.frequency**2 - modes.frequency**2)
+    # Rayleigh: a spring's energy in a mode that moves its foot by one unit.
+    expected = stiff * modes.at(places).square().sum(dim=(0, 2))
+    assert torch.allclose(raised, expected, rtol=1e-2)
+
+
+def test_stiff_springs_leave_no_rigid_motion(bracket, modes):
+    corners = bracket.points[bracket.points[:, 2] == 0.0]
+    held = elastic_modes(bracket, STEEL, count=4, springs=[(place, 1e12) for place in corners])
+    assert float(held.frequency[0]) > float(modes.frequency[0])
+
+
+def test_places_at_nodes_have_the_nodes_shapes(modes):
+    assert torch.allclose(modes.at(modes.nodes), modes.shapes, atol=1e-9 * float(modes.shapes.abs().max()))
+
+
+def test_interpolation_is_exact_for_second_degree_and_takes_the_nearest_place(modes):
+    nodes = modes.nodes
+    bent = torch.stack([nodes[:, 0] * nodes[:, 1], nodes[:, 2] ** 2, nodes[:, 0] + 1.0], dim=1)
+    field = ElasticModes(modes.frequency[:1], nodes, modes.triangles, bent[:, None], STEEL, modes.mass)
+    drawn = torch.rand(200, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    size = torch.tensor(BRACKET[0], dtype=torch.float64)
+    top = drawn * size
+    top[:, 2] = size[2]
+    expected = torch.stack([top[:, 0] * top[:, 1], top[:, 2] ** 2, top[:, 0] + 1.0], dim=1)
+    assert torch.allclose(field.at(top)[:, 0], expected, atol=1e-14)
+    # Above the block the nearest place is straight below.
+    above = top + torch.tensor([0.0, 0.0, 0.02])
+    assert torch.allclose(field.at(above)[:, 0], expected, atol=1e-14)
+    along = torch.nn.functional.normalize(drawn - 0.5, dim=1)
+    assert torch.allclose(field.gains(above, along)[:, 0], (expected * along).sum(dim=1), atol=1e-14)
+
+
+def test_two_runs_are_the_same_to_the_last_bit(bracket, modes):
+    again = elastic_modes(bracket, STEEL, count=8)
+    assert torch.equal(again.frequency, modes.frequency)
+    assert torch.equal(again.shapes, modes.shapes)
+
+
+def test_highest_leaves_out_what_lies_above(bracket, modes):
+    limit = float(modes.frequency[3]) + 1.0
+    assert torch.equal(elastic_modes(bracket, STEEL, count=8, highest=limit).frequency, modes.frequency[:4])
+
+
+@pytest.mark.parametrize(
+    ("settings", "name", "row", "value"),
+    [
+        ({"count": 0}, "count", None, 0),
+        ({"highest": 10.0}, "highest", None, 10.0),
+        ({"stiffness_factor": torch.ones(3)}, "stiffness_factor", None, 3),
+        ({"density_factor": -torch.ones(36)}, "density_factor", 0, -1.0),
+        ({"springs": [(torch.zeros(3), 0.0)]}, "springs", 0, 0.0),
+    ],
+)
+def test_settings_that_cannot_be(bracket, settings, name, row, value):
+    with raises(SimulationError, name=name, row=row, value=value):
+        elastic_modes(bracket, STEEL, **settings)
+
+
+def test_more_modes_than_nodes_allow(bracket):
+    with raises(SimulationError, name="nodes", value=len(SecondOrder.of(bracket).nodes)):
+        elastic_modes(bracket, STEEL, count=310)
+
+
+def test_positions_that_are_no_numbers(modes):
+    with raises(SimulationError, name="places", row=1, value=pytest.approx([math.nan, 0.0, 0.0], nan_ok=True)):
+        modes.at(torch.tensor([[0.0, 0.0, 0.0], [math.nan, 0.0, 0.0]]))
+
+
+def test_bodies_in_parts_are_refused(bracket):
+    count = len(bracket.points)
+    apart = torch.cat([bracket.points, bracket.points + 1.0])
+    with raises(SimulationError, name="parts", value=2):
+        elastic_modes(Solid.build(apart, torch.cat([bracket.cells, bracket.cells + count])), STEEL, count=4)
+
+
+def test_the_limit_on_blas_is_taken_back_whichever_thread_ends_last():
+    def threads() -> set[int]:
+        return {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"}
+
+    with threadpool_limits(limits=2, user_api="blas"):
+        before, (first, second) = threads(), (one_blas_thread(), one_blas_thread())
+        first.__enter__()
+        second.__enter__()
+        assert threads() == {1}
+        first.__exit__(None, None, None)
+        assert threads() == {1}
+        second.__exit__(None, None, None)
+        assert threads() == before == {2}

@@ -1,0 +1,73 @@
+"""Elastic modes in a file: the same to the last bit, or an error that names the file."""
+
+import json
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from avmsf.errors import SimulationError
+from avmsf.fem.block import block
+from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
+from avmsf.fem.elastic_store import load_modes, save_modes
+from avmsf.fem.material import GLASS
+from factories.raising import raises
+
+TENSORS = {"frequency", "nodes", "triangles", "shapes", "stiffness", "mass", "poisson"}
+
+
+@pytest.fixture(scope="module")
+def modes() -> ElasticModes:
+    return elastic_modes(block((0.07, 0.05, 0.011), (2, 1, 1)), GLASS, count=4, perturbed=True)
+
+
+def test_what_is_read_is_what_was_written(modes, tmp_path):
+    save_modes(modes, tmp_path / "new" / "modes.safetensors")
+    back = load_modes(tmp_path / "new" / "modes.safetensors")
+    for name in ("frequency", "nodes", "triangles", "shapes"):
+        assert torch.equal(getattr(back, name), getattr(modes, name))
+    for name in ("stiffness", "mass", "poisson"):
+        assert (getattr(back.perturbations, name) == getattr(modes.perturbations, name)).all()
+    assert (back.material, back.mass) == (modes.material, modes.mass)
+    assert torch.equal(back.at(modes.nodes[:5]), modes.at(modes.nodes[:5]))
+
+
+def test_files_that_hold_no_modes(modes, tmp_path):
+    path = tmp_path / "modes.safetensors"
+    with raises(SimulationError, file=path, value=None):
+        load_modes(path)
+    save_modes(modes, path)
+    path.write_bytes(path.read_bytes()[:300])
+    with raises(SimulationError, file=path, value="a truncated or damaged file"):
+        load_modes(path)
+    save_file({"frequency": torch.ones(3)}, path)
+    with raises(SimulationError, file=path, name="avmsf_elastic", value=[]):
+        load_modes(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "name", "value"),
+    [
+        (lambda record, tensors: record.update(format=9), "format", 9),
+        (lambda record, tensors: record.pop("mass"), "header", "KeyError('mass')"),
+        (lambda record, tensors: tensors.pop("poisson"), "tensors", sorted(TENSORS - {"poisson"})),
+        (lambda record, tensors: tensors.pop("nodes"), "tensors", sorted(TENSORS - {"nodes"})),
+        (lambda record, tensors: tensors["triangles"].fill_(-1), "triangles", [-1, -1]),
+        (lambda record, tensors: tensors["triangles"].fill_(10_000), "triangles", [10_000, 10_000]),
+    ],
+)
+def test_files_that_were_changed(modes, tmp_path, change, name, value):
+    path = tmp_path / "modes.safetensors"
+    save_modes(modes, path)
+    tensors = load_file(path)
+    record = json.loads(header_of(path))
+    change(record, tensors)
+    save_file(tensors, path, {"avmsf_elastic": json.dumps(record)})
+    with raises(SimulationError, file=path, name=name, value=value):
+        load_modes(path)
+
+
+def header_of(path) -> str:
+    content = path.read_bytes()
+    length = int.from_bytes(content[:8], "little")
+    return json.loads(content[8 : 8 + length])["__metadata__"]["avmsf_elastic"]

@@ -1,0 +1,298 @@
+"""Geometry to elastic shapes: which bodies a surface may hide, and what is said of surfaces that hide none."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from avmsf.errors import SimulationError
+from avmsf.fem import candidate_bodies as nominal
+from avmsf.fem import mesh_filling as nominalsolid
+from avmsf.fem.block import block
+from avmsf.fem.candidate_bodies import NominalBody, nominal_bodies, refined
+from avmsf.fem.elastic_modes import elastic_modes
+from avmsf.fem.material import NOMINAL
+from avmsf.mesh.surface import Surface, read_surface
+from factories.raising import raises
+
+
+def surface_of(mesh: trimesh.Trimesh) -> Surface:
+    return Surface(torch.from_numpy(np.array(mesh.vertices)).float(), torch.from_numpy(np.array(mesh.faces)))
+
+
+def sheet(sides: tuple[int, int] = (12, 9), size: tuple[float, float] = (0.24, 0.17)) -> Surface:
+    """Return a flat rectangle whose normals point up."""
+    x, y = np.meshgrid(np.linspace(0, size[0], sides[0] + 1), np.linspace(0, size[1], sides[1] + 1), indexing="ij")
+    rows = np.arange(x.size).reshape(x.shape)
+    a, b, c, d = (part.ravel() for part in (rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    return Surface(torch.from_numpy(points).float(), torch.from_numpy(faces))
+
+
+def ball(radius: float = 0.05) -> Surface:
+    return surface_of(trimesh.creation.icosphere(subdivisions=3, radius=radius))
+
+
+def test_a_sheet_with_a_wall_vibrates_as_the_plate_it_is():
+    bodies = nominal_bodies(sheet(), walls=[0.004], count=12, dofs=6000).bodies
+    assert [body.name for body in bodies] == ["wall of 4 mm"]
+    assert bodies[0].fine
+    found, plate = bodies[0].elastic, elastic_modes(block((0.24, 0.17, 0.004), (12, 9, 1)), NOMINAL, count=12)
+    assert float((found.frequency / plate.frequency - 1).abs().max()) < 0.02
+    places = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([0.24, 0.17, 0.0])
+    up = torch.tensor([[0.0, 0.0, 1.0]]).expand(200, 3)
+    own, other = found.gains(places, up), plate.gains(places, up)
+    alike = (own * other).sum(0) ** 2 / ((own**2).sum(0) * (other**2).sum(0))
+    assert float(alike[:6].min()) > 0.99
+
+
+def test_walls_of_a_sheet_are_tried_coarsely_and_the_chosen_one_made_fine(monkeypatch: pytest.MonkeyPatch):
+    told: list[str] = []
+    monkeypatch.setattr(nominal, "TRIAL", 1500)
+    found = nominal_bodies(sheet(), count=6, dofs=4000, tell=told.append)
+    assert [body.wall for body in found.bodies] == pytest.approx(
+        [part * math.hypot(0.24, 0.17) for part in nominal.WALLS]
+    )
+    assert not any(body.fine for body in found.bodies)
+    assert any("42 open edges" in message for message in told)
+    assert "42 open edges" in found.refused[None]
+    body = found.bodies[1]
+    fine = refined(sheet(), body, dofs=4000)
+    assert fine.fine
+    assert fine.wall == body.wall
+    assert refined(sheet(), fine) is fine
+    assert len(fine.elastic.nodes) > 2 * len(body.elastic.nodes)
+    # Triangles of the coarse one are a sixth of the sheet long: against a regular mesh it is 3 and 6 % too high.
+    assert float((fine.elastic.frequency / body.elastic.frequency - 1).abs()[:2].max()) < 0.07
+
+
+@pytest.mark.slow
+def test_what_a_ball_encloses_vibrates_as_lambs_sphere_does_and_is_kept(tmp_path: Path):
+    told: list[str] = []
+    inwards = Surface(ball().vertices, ball().faces.flip(1))
+    found = nominal_bodies(inwards, walls=[None], count=20, dofs=10000, cache=tmp_path, tell=told.append).bodies[0]
+    assert any(f"{len(inwards.faces)} of {len(inwards.faces)} triangles" in message for message in told)
+    # Lamb: the torsional oscillation of degree 2, whose wave number times radius is 2.501, belongs to five modes.
+    shear = math.sqrt(NOMINAL.young / (2 * (1 + NOMINAL.poisson)) / NOMINAL.density)
+    # Fillings by other seeds differ by 2 % in frequency at this size.
+    assert found.elastic.frequency[:5].numpy() == pytest.approx(2.501 * shear / (2 * math.pi * 0.05), rel=0.04)
+    kept = sorted(tmp_path.iterdir())
+    again = nominal_bodies(inwards, walls=[None], count=20, dofs=10000, cache=tmp_path).bodies[0]
+    assert torch.equal(again.elastic.shapes, found.elastic.shapes)
+    assert sorted(tmp_path.iterdir()) == kept
+    moved = Surface(inwards.vertices + 0.001, inwards.faces)
+    nominal_bodies(moved, walls=[None], count=20, dofs=10000, cache=tmp_path)
+    assert len(sorted(tmp_path.iterdir())) == 2
+
+
+def test_a_damaged_kept_file_is_made_again(tmp_path: Path):
+    def made(told: list[str]) -> torch.Tensor:
+        bodies = nominal_bodies(sheet(), walls=[0.004], count=4, dofs=2000, cache=tmp_path, tell=told.append)
+        return bodies.bodies[0].elastic.shapes
+
+    first = made([])
+    (kept,) = tmp_path.iterdir()
+    whole = kept.read_bytes()
+    kept.write_bytes(whole[: len(whole) // 2])
+    told: list[str] = []
+    assert torch.equal(made(told), first)
+    assert any(str(kept) in message for message in told)
+    assert kept.read_bytes() == whole
+
+
+@pytest.mark.slow
+def test_both_sides_of_a_wall_are_filled_and_given_no_wall():
+    outer, inner = trimesh.creation.icosphere(3, radius=0.06), trimesh.creation.icosphere(3, radius=0.054)
+    inner.invert()
+    told: list[str] = []
+    found = nominal_bodies(surface_of(trimesh.util.concatenate([outer, inner])), count=8, dofs=8000, tell=told.append)
+    assert [body.wall for body in found.bodies] == [None]
+    # One line for all walls that are too thick, another for the surface's two parts.
+    assert sum("not tried" in message for message in told) == 2
+    # A hollow ball, not a massive one.
+    mass = NOMINAL.density * 4 / 3 * math.pi * (0.06**3 - 0.054**3)
+    assert found.bodies[0].elastic.mass == pytest.approx(mass, rel=0.06)
+    reasons = [reason for wall, reason in found.refused.items() if wall is not None]
+    assert len(reasons) == 6
+    assert all("6 mm" in reason or "2 parts" in reason for reason in reasons)
+
+
+def test_boxes_that_overlap_are_one_body():
+    one, other = trimesh.creation.box((0.3, 0.05, 0.02)), trimesh.creation.box((0.05, 0.2, 0.015))
+    found = nominal_bodies(surface_of(trimesh.util.concatenate([one, other])), walls=[None, 0.001], count=6, dofs=6000)
+    assert [body.name for body in found.bodies] == ["solid body"]
+    volume = 0.3 * 0.05 * 0.02 + (0.2 - 0.05) * 0.05 * 0.015
+    assert found.bodies[0].elastic.mass == pytest.approx(NOMINAL.density * volume, rel=0.05)
+    assert "2 parts" in found.refused[0.001]
+
+
+@pytest.mark.slow
+def test_the_aircraft_is_filled(shared: Path):
+    surface = read_surface(shared / "aircraft_response/surface.obj")
+    found = nominal_bodies(surface, count=6, dofs=12_000)
+    assert [body.name for body in found.bodies] == ["solid body"]
+    # Its wings bend first, far below all else: as metal plates of 8 mm over 1.5 m do.
+    assert 10 < float(found.bodies[0].elastic.frequency[0]) < 20
+
+
+def test_parts_that_do_not_touch_are_refused_with_all_reasons():
+    one, other = trimesh.creation.box((0.1, 0.1, 0.1)), trimesh.creation.box((0.1, 0.1, 0.1))
+    other.apply_translation((0.3, 0.0, 0.0))
+    apart = surface_of(trimesh.util.concatenate([one, other]))
+    with raises(SimulationError, name="surface") as caught:
+        nominal_bodies(apart, walls=[None, 0.001], count=6, dofs=3000)
+    filled, walled = caught.value.value
+    for name, reason in (("solid body", filled), ("wall of 1 mm", walled)):
+        assert reason.startswith(f"{name}: ")
+        assert "2 parts" in reason
+
+
+def test_a_wall_thicker_than_the_object_is_refused():
+    with raises(SimulationError, name="surface") as caught:
+        nominal_bodies(sheet(), walls=[0.2])
+    [reason] = caught.value.value
+    assert reason.startswith("wall of 200 mm: ")
+    assert "170 mm" in reason
+    assert "200 mm" in reason
+    with raises(SimulationError, name="surface") as caught:
+        nominal_bodies(ball(), walls=[0.04])
+    [reason] = caught.value.value
+    assert reason.startswith("wall of 40 mm: thickness: ")
+
+
+def test_points_alone_have_no_body():
+    cloud = Surface(ball().vertices, torch.zeros((0, 3), dtype=torch.int64))
+    with raises(SimulationError, name="faces", value=0) as caught:
+        nominal_bodies(cloud)
+    assert "642" in str(caught.value)
+
+
+def test_a_mesh_too_large_for_the_memory_is_refused_with_the_size_that_fits(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 2 * 377e6)
+    with raises(SimulationError, name="memory") as caught:
+        nominal_bodies(sheet(), walls=[0.004], dofs=80_000)
+    [reason] = caught.value.value
+    assert all(number in reason for number in ("80000", "1.6 GB", "40000"))
+    monkeypatch.setattr(nominalsolid, "_free_memory", lambda: None)
+    assert nominal_bodies(sheet(), walls=[0.004], count=4, dofs=2000).bodies
+
+
+@pytest.mark.parametrize(
+    ("settings", "row", "value"),
+    [
+        ({"count": 0}, None, 0),
+        ({"dofs": 10}, None, 10),
+        ({"walls": []}, None, []),
+        ({"walls": [None, -0.001]}, 1, -0.001),
+        ({"walls": [math.nan]}, 0, math.nan),
+    ],
+)
+def test_settings_that_make_no_sense_are_named(settings: dict, row: int | None, value: object):
+    [name] = settings
+    with raises(SimulationError, name=name, row=row, value=pytest.approx(value, nan_ok=True)):
+        nominal_bodies(sheet(), **settings)
+
+
+@pytest.fixture(scope="module")
+def coarse() -> NominalBody:
+    elastic = nominal_bodies(sheet(), walls=[0.004], count=4, dofs=2000).bodies[0].elastic
+    return NominalBody(0.004, elastic, fine=False)
+
+
+def test_a_body_stays_coarse_where_a_finer_one_does_not_fit_into_the_memory(
+    monkeypatch: pytest.MonkeyPatch, coarse: NominalBody
+):
+    monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 1e9)
+    told: list[str] = []
+    assert refined(sheet(), coarse, dofs=400_000, tell=told.append) is coarse
+    assert told[-1].startswith("wall of 4 mm: ")
+    assert "400000" in told[-1]
+    assert refined(sheet(), coarse, dofs=400_000) is coarse
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"), [(MemoryError(), "1500 (--body.dofs)"), (SimulationError("badly shaped"), "badly shaped")]
+)
+def test_a_body_stays_coarse_where_a_finer_one_fails(
+    monkeypatch: pytest.MonkeyPatch, coarse: NominalBody, error: Exception, reason: str
+):
+    def fail(*solid: object, **settings: object) -> None:
+        raise error
+
+    monkeypatch.setattr(nominal, "elastic_modes", fail)
+    told: list[str] = []
+    assert refined(sheet(), coarse, dofs=3000, tell=told.append) is coarse
+    assert told[-1].startswith("wall of 4 mm: ")
+    assert reason in told[-1]
+
+
+def test_the_only_body_that_is_left_stays_in_use_where_it_cannot_be_made_finer(monkeypatch: pytest.MonkeyPatch):
+    """A wall that does not fit is refused once it is made, so that a single one of several is left."""
+    made, told = nominal.elastic_modes, []
+
+    def fail(solid: object, *material: object, count: int, **kept: object) -> object:
+        if nominal.count_dofs(solid) > 3000:  # type: ignore[arg-type]
+            raise MemoryError
+        if abs(solid.volumes.sum() - 0.24 * 0.17 * 0.004) > 1e-5:  # type: ignore[attr-defined]
+            raise SimulationError("of no use")
+        return made(solid, *material, count=count, **kept)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(nominal, "elastic_modes", fail)
+    monkeypatch.setattr(nominal, "TRIAL", 2000)
+    found = nominal_bodies(sheet(), walls=[0.004, 0.012], count=4, dofs=4000, tell=told.append)
+    assert [(body.wall, body.fine) for body in found.bodies] == [(0.004, False)]
+    assert any(message.startswith("wall of 4 mm: ") and "2000 (--body.dofs)" in message for message in told)
+    assert list(found.refused) == [0.012]
+
+
+def test_walls_whose_names_are_alike_are_refused_each():
+    with raises(SimulationError, name="surface") as caught:
+        nominal_bodies(sheet(), walls=[0.2, 0.2001])
+    [reason] = caught.value.value
+    assert reason.startswith("wall of 200 mm, wall of 200 mm: ")
+    assert "0.2001" not in str(caught.value)
+    found = nominal_bodies(sheet(), walls=[0.2, 0.2001, 0.004], count=4, dofs=2000)
+    assert list(found.refused) == [0.2, 0.2001]
+
+
+def test_modes_that_do_not_fit_into_the_memory_after_all_are_refused(monkeypatch: pytest.MonkeyPatch):
+    def fail(*solid: object, **settings: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(nominal, "elastic_modes", fail)
+    with raises(SimulationError, name="surface") as caught:
+        nominal_bodies(sheet(), walls=[0.004], dofs=3000)
+    [reason] = caught.value.value
+    assert "1500 (--body.dofs)" in reason
+
+
+def test_the_memory_is_asked_for_what_is_computed_and_for_nothing_that_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    walls, settings = [0.004, 0.006], {"count": 4, "dofs": 80_000, "cache": tmp_path}
+    monkeypatch.setattr(nominal, "TRIAL", 2000)
+    # Enough for the few degrees of freedom that two bodies are compared with.
+    monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 377e6)
+    found = nominal_bodies(sheet(), walls=walls, **settings)
+    assert [body.wall for body in found.bodies] == walls
+    monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 0.0)
+    again = nominal_bodies(sheet(), walls=walls, **settings)
+    assert torch.equal(again.bodies[1].elastic.shapes, found.bodies[1].elastic.shapes)
+    with raises(SimulationError, name="memory") as caught:
+        nominal_bodies(sheet(), walls=[0.005, 0.007], **settings)
+    assert all("got 0 GB" in reason for reason in caught.value.value)
+
+
+@pytest.mark.parametrize(
+    ("walls", "advice"), [(None, "give the wall thickness"), ([0.2], "give another wall thickness")]
+)
+def test_what_helps_depends_on_who_stated_the_wall(walls: list[float] | None, advice: str):
+    one = sheet()
+    apart = Surface(torch.cat([one.vertices, one.vertices + 1]), torch.cat([one.faces, one.faces + len(one.vertices)]))
+    with raises(SimulationError, name="surface") as caught:
+        nominal_bodies(apart if walls is None else sheet(), walls=walls, dofs=1000)
+    assert f"or {advice}" in str(caught.value)

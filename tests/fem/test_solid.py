@@ -1,0 +1,310 @@
+"""Tetrahedra: their volume, their outside, and bodies made of meshes that are closed, open or broken."""
+
+import math
+import re
+import sys
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from avmsf.errors import SimulationError
+from avmsf.fem import shell as shells
+from avmsf.fem import tetrahedra
+from avmsf.fem.block import block
+from avmsf.fem.coarsening import coarsen
+from avmsf.fem.shell import shell
+from avmsf.fem.skin import Skin
+from avmsf.fem.solid import Solid
+from avmsf.fem.tetrahedra import fill
+from avmsf.mesh.closest_point import ClosestPoints
+from avmsf.mesh.surface import Surface
+from factories.raising import raises
+
+
+def surface_of(mesh: trimesh.Trimesh) -> Surface:
+    return Surface(torch.from_numpy(np.array(mesh.vertices)).float(), torch.from_numpy(np.array(mesh.faces)))
+
+
+def ball(radius: float = 0.05, subdivisions: int = 3) -> Surface:
+    return surface_of(trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius))
+
+
+def half(surface: Surface) -> Surface:
+    middles = surface.vertices[surface.faces].mean(dim=1)
+    return Surface(surface.vertices, surface.faces[middles[:, 2] < 0])
+
+
+def enclosed(surface: Surface) -> float:
+    corners = surface.vertices.double()[surface.faces]
+    return float((torch.linalg.cross(corners[:, 0], corners[:, 1]) * corners[:, 2]).sum() / 6)
+
+
+def test_the_boundary_is_closed_and_looks_outwards():
+    solid = block((0.2, 0.1, 0.05), (3, 2, 2))
+    assert solid.volume == pytest.approx(0.2 * 0.1 * 0.05, rel=1e-12)
+    # Gauss: what the outside encloses is what the cells fill, with a minus if it looked inwards.
+    assert enclosed(Surface(solid.points, solid.boundary)) == pytest.approx(solid.volume, rel=1e-12)
+    assert Skin(solid.points.numpy(), solid.boundary.numpy()).open_edges == 0
+    assert solid.size == pytest.approx(math.sqrt(0.04 + 0.01 + 0.0025), rel=1e-12)
+    assert enclosed(solid.surface) == pytest.approx(solid.volume, rel=1e-6)
+
+
+def test_cells_are_turned_and_unused_points_left_out():
+    points = torch.tensor([[9.0, 9, 9], [0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=torch.float64)
+    solid = Solid.build(points, torch.tensor([[1, 3, 2, 4]]))
+    assert len(solid.points) == 4
+    assert solid.volumes.tolist() == [pytest.approx(1 / 6)]
+
+
+def test_parts_are_counted_by_shared_sides_largest_first():
+    small, large = block((0.1, 0.1, 0.1), (1, 1, 1)), block((0.2, 0.2, 0.2), (1, 1, 1))
+    # The two meet in one corner only.
+    points = torch.cat([small.points - 0.1, large.points])
+    both = Solid.build(points, torch.cat([small.cells, large.cells + len(small.points)]))
+    assert both.parts.tolist() == [1] * 6 + [0] * 6
+
+
+@pytest.mark.parametrize(
+    ("points", "cells", "name", "row", "value"),
+    [
+        (torch.ones(4, 3).double(), torch.zeros(0, 4).long(), "cells", None, 0),
+        (torch.zeros(4, 3).double(), torch.tensor([[0, 1, 2, 4]]), "cells", None, 4),
+        (torch.full((4, 3), math.nan).double(), torch.tensor([[0, 1, 2, 3]]), "points", 0, [math.nan] * 3),
+        (torch.eye(4, 3).double()[[0, 1, 2, 2]], torch.tensor([[0, 1, 2, 3]]), "cells", 0, 0.0),
+    ],
+)
+def test_tetrahedra_that_cannot_be(points, cells, name, row, value):
+    with raises(SimulationError, name=name, row=row, value=pytest.approx(value, nan_ok=True)):
+        Solid.build(points, cells)
+
+
+def test_closest_points_are_those_of_a_dense_cloud():
+    mesh = trimesh.creation.torus(0.04, 0.015, major_sections=12, minor_sections=6)
+    triangles = np.array(mesh.triangles)
+    # One long triangle beside many small ones.
+    triangles = np.concatenate([triangles, [[[0.0, 0.0, 0.1], [1.0, 0.0, 0.1], [1.0, 0.001, 0.1]]]])
+    places = np.random.default_rng(0).uniform(-0.15, 0.15, (30, 3))
+    search = ClosestPoints(triangles)
+    assert len(search(places[:0]).rows) == 0
+    found = search(places)
+    at = np.einsum("pc,pcd->pd", found.weights, triangles[found.rows])
+    np.testing.assert_allclose(np.linalg.norm(at - places, axis=1), found.distances, atol=1e-12)
+    assert (found.weights >= 0).all()
+    np.testing.assert_allclose(found.weights.sum(axis=1), 1.0, rtol=1e-12)
+    steps = np.array([(i, j, 60 - i - j) for i in range(61) for j in range(61 - i)]) / 60
+    cloud = np.einsum("sc,tcd->std", steps, triangles).reshape(-1, 3)
+    nearest = np.array([np.linalg.norm(cloud - place, axis=1).min() for place in places])
+    assert (found.distances <= nearest + 1e-12).all()
+    # Half a step of the cloud in a small triangle, and of the long one where that is nearest.
+    assert (nearest - found.distances < 0.009).all()
+    assert np.median(nearest - found.distances) < 1e-5
+
+
+def test_closest_points_of_single_triangles_are_those_of_trimesh():
+    # Of a closed surface each side belongs to two triangles, and the other one would stand in for a side left out.
+    random = np.random.default_rng(1)
+    for corners in random.uniform(-0.1, 0.1, (20, 3, 3)):
+        places = random.uniform(-0.2, 0.2, (40, 3))
+        found = ClosestPoints(corners[None])(places)
+        expected = trimesh.triangles.closest_point(np.repeat(corners[None], len(places), axis=0), places)
+        np.testing.assert_allclose(found.weights @ corners, expected, atol=1e-12)
+
+
+def test_a_coarser_skin_keeps_its_volume_and_stays_closed():
+    skin = Skin.of(ball())
+    coarse = skin.remeshed(0.02)
+    assert len(coarse.faces) < 0.3 * len(skin.faces)
+    assert coarse.open_edges == 0
+    # Triangles with sides of up to 3 cm lie within 3 mm of a sphere of 5 cm, 6 % of its radius.
+    assert 0.82 * skin.volume < coarse.volume < skin.volume
+    np.testing.assert_allclose(np.linalg.norm(coarse.points, axis=1), 0.05, rtol=1e-5)
+
+
+@pytest.mark.parametrize("length", [0.0085, 0.009, 0.0095])
+def test_strips_of_long_triangles_become_even(length):
+    grid = block((0.128, 0.129, 0.1), (10, 50, 1))
+    flat = grid.boundary[(grid.points[grid.boundary][:, :, 2] == 0).all(dim=1)]
+    even = Skin.of(Surface(grid.points.float(), flat)).remeshed(length)
+    # Equilateral triangles of this length would be 2.3 for each square of its side.
+    assert len(even.faces) < 3.5 * 0.128 * 0.129 / length**2
+
+
+def test_a_coarser_sheet_keeps_its_hole():
+    grid = block((0.1, 0.1, 0.1), (4, 4, 4))
+    flat = grid.boundary[(grid.points[grid.boundary][:, :, 2] == 0).all(dim=1)]
+    middle = (grid.points[flat].mean(dim=1) - torch.tensor([0.04, 0.04, 0.0])).norm(dim=1).argmin()
+    sheet = Skin.of(Surface(grid.points.float(), flat[torch.arange(len(flat)) != middle]))
+    # Longer than the hole, which is a triangle: to take out one of its edges would sew it up.
+    coarse = sheet.coarsened(0.06, turn=0.7)
+    ends = np.sort(coarse.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    assert len(coarse.faces) < len(sheet.faces)
+    # Euler's characteristic of a sheet with a hole.
+    assert len(coarse.points) - len(np.unique(ends, axis=0)) + len(coarse.faces) == 0
+    assert coarse.areas.sum() == pytest.approx(sheet.areas.sum(), rel=1e-6)
+
+
+def test_a_coarser_ring_stays_a_ring():
+    ring = Skin.of(surface_of(trimesh.creation.torus(0.05, 0.008, major_sections=24, minor_sections=8)))
+    # Edges longer than the tube is round, and no normals to heed: nothing but its topology keeps it from being pinched.
+    faces = coarsen(ring.points, ring.faces, np.zeros_like(ring.points), shortest=0.06, turn=-1.0)
+    edges, count = np.unique(
+        np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0, return_counts=True
+    )
+    assert len(faces) < 0.5 * len(ring.faces)
+    assert (count == 2).all()
+    # Euler's characteristic of a ring.
+    assert len(np.unique(faces)) - len(edges) + len(faces) == 0
+
+
+def test_a_finer_skin_is_the_same_surface():
+    box = Skin.of(surface_of(trimesh.creation.box((0.3, 0.02, 0.01))))
+    fine = box.remeshed(0.01)
+    assert fine.open_edges == 0
+    # But for a corner that may lose its tip.
+    assert fine.volume == pytest.approx(0.3 * 0.02 * 0.01, rel=1e-3)
+    corners = fine.points[fine.faces]
+    assert np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max() <= 0.015
+
+
+def test_an_open_bowl_gets_a_wall():
+    sheet = half(ball())
+    solid = shell(sheet, thickness=0.003, detail=0.06)
+    # Inwards of 5 cm, so between the spheres of 4.7 and 5; facets lie a little inside both.
+    assert solid.volume == pytest.approx(2 / 3 * math.pi * (0.05**3 - 0.047**3), rel=0.08)
+    radii = solid.points.norm(dim=1)
+    assert 0.0468 < float(radii.min()) < 0.0472
+    assert float(radii.max()) == pytest.approx(0.05, abs=1e-6)
+    assert Skin(solid.points.numpy(), solid.boundary.numpy()).open_edges == 0
+    assert int(solid.parts.max()) == 0
+
+
+def test_where_prisms_stay_folded_both_sides_of_the_wall_are_filled(monkeypatch):
+    monkeypatch.setattr(shells, "_offsets", lambda skin, thickness: None)
+    solid = shell(half(ball()), thickness=0.01, detail=0.1)
+    assert solid.volume == pytest.approx(2 / 3 * math.pi * (0.05**3 - 0.04**3), rel=0.15)
+    radii = solid.points.norm(dim=1)
+    assert 0.036 < float(radii.min()) < 0.042
+    assert int(solid.parts.max()) == 0
+
+
+def test_a_hollow_ball_has_two_surfaces():
+    solid = shell(ball(), thickness=0.004, detail=0.06)
+    assert solid.volume == pytest.approx(4 / 3 * math.pi * (0.05**3 - 0.046**3), rel=0.08)
+    # Two closed surfaces of Euler characteristic 2.
+    skin = Skin(solid.points.numpy(), solid.boundary.numpy())
+    assert len(skin.points) - len(skin.faces) / 2 == 4
+
+
+@pytest.mark.parametrize(
+    ("make", "settings", "name", "value"),
+    [
+        (ball, {"thickness": 0.0}, "thickness", 0.0),
+        (ball, {"thickness": 0.003, "detail": 1.5}, "detail", 1.5),
+        (lambda: Surface(torch.rand(9, 3), torch.zeros(0, 3).long()), {"thickness": 0.001}, "faces", 0),
+        (lambda: Surface(torch.zeros(3, 3), torch.tensor([[0, 1, 2]])), {"thickness": 0.001}, "areas", 0.0),
+        (lambda: Surface(torch.rand(3, 3), torch.tensor([[0, 1, 7]])), {"thickness": 0.001}, "faces", 7),
+        (lambda: mixed(ball()), {"thickness": 0.001}, "normals", pytest.approx(0.5, abs=0.3)),
+    ],
+)
+def test_walls_that_cannot_be(make: Callable[[], Surface], settings, name, value):
+    with raises(SimulationError, name=name, value=value):
+        shell(make(), **settings)
+
+
+@pytest.mark.parametrize(
+    ("make", "thickness", "suggested"),
+    [(ball, 0.02, r"0 m.*0\.00\d+ m$"), (lambda: half(ball()), 0.06, r"thickness=0\.0\d+")],
+)
+def test_walls_too_thick_for_the_surface_are_answered_with_one_that_fits(
+    make: Callable[[], Surface], thickness: float, suggested: str
+):
+    with raises(SimulationError, name="thickness", value=thickness) as caught:
+        shell(make(), thickness=thickness)
+    assert re.search(suggested, str(caught.value))
+
+
+def mixed(surface: Surface) -> Surface:
+    """Turn every other triangle round."""
+    faces = surface.faces.clone()
+    faces[::2] = faces[::2].flip(1)
+    return Surface(surface.vertices, faces)
+
+
+@pytest.mark.slow
+def test_two_balls_that_cross_with_a_hole_are_one_body():
+    one = ball()
+    pierced = Surface(one.vertices, one.faces[8:])
+    other = Surface(one.vertices + torch.tensor([0.06, 0.0, 0.0]), one.faces + len(one.vertices))
+    scan = Surface(torch.cat([one.vertices, other.vertices]), torch.cat([pierced.faces, other.faces]))
+    solid = fill(scan, detail=0.1)
+    # Two balls less the lens in which both lie, pi (4 r + d) (2 r - d)^2 / 12.
+    lens = math.pi * (4 * 0.05 + 0.06) * (2 * 0.05 - 0.06) ** 2 / 12
+    assert solid.volume == pytest.approx(2 * 4 / 3 * math.pi * 0.05**3 - lens, rel=0.06)
+    assert int(solid.parts.max()) == 0
+
+
+@pytest.mark.slow
+def test_a_skin_that_runs_through_itself_is_filled_once():
+    # A tube wider than the ring that it is bent to: the part around the axis lies inside of it twice.
+    ring, tube = 0.03, 0.04
+    spindle = surface_of(trimesh.creation.torus(ring, tube, major_sections=48, minor_sections=32))
+    solid = fill(spindle, detail=0.08)
+    # Discs out to the tube's outer side, less the dimples above and below the part that is inside twice.
+    heights = np.linspace(-tube, tube, 2001)
+    half_chord = np.sqrt(tube**2 - heights**2)
+    dimples = np.where(half_chord < ring, ring - half_chord, 0.0)
+    volume = np.trapezoid(math.pi * ((ring + half_chord) ** 2 - dimples**2), heights)
+    assert solid.volume == pytest.approx(volume, rel=0.05)
+    assert int(solid.parts.max()) == 0
+
+
+def test_triangles_that_face_different_ways_are_filled_all_the_same():
+    solid = fill(mixed(ball()), detail=0.1)
+    assert solid.volume == pytest.approx(4 / 3 * math.pi * 0.05**3, rel=0.06)
+
+
+@pytest.mark.parametrize(
+    ("make", "name", "value", "suggested"),
+    [
+        (lambda: half(ball()), "holes", pytest.approx(0.35, abs=0.05), r"0\.00\d m$"),
+        (
+            lambda: Surface(torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]), torch.tensor([[0, 1, 2]])),
+            "volume",
+            0,
+            r"0\.002 m$",
+        ),
+        (lambda: apart(ball(subdivisions=1)), "parts", 2, ""),
+    ],
+)
+def test_meshes_that_cannot_be_filled(make: Callable[[], Surface], name, value, suggested):
+    with raises(SimulationError, name=name, value=value) as caught:
+        fill(make(), detail=0.2)
+    assert re.search(suggested, str(caught.value))
+
+
+def apart(surface: Surface) -> Surface:
+    vertices = torch.cat([surface.vertices, surface.vertices + 0.2])
+    return Surface(vertices, torch.cat([surface.faces, surface.faces + len(surface.vertices)]))
+
+
+def test_filling_that_takes_too_long_says_so():
+    with raises(SimulationError, name="timeout", value=0.01):
+        fill(ball(subdivisions=1), timeout=0.01)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="its seed cannot be fixed elsewhere")
+def test_the_same_mesh_has_the_same_tetrahedra():
+    first, second = (fill(ball(subdivisions=2), detail=0.2) for _ in range(2))
+    assert torch.equal(first.points, second.points)
+    assert torch.equal(first.cells, second.cells)
+
+
+def test_a_crash_of_pytetwild_is_reported(monkeypatch, tmp_path):
+    crashing = tmp_path / "worker.py"
+    crashing.write_text("import os; os.abort()")
+    monkeypatch.setattr(tetrahedra, "WORKER", crashing)
+    with raises(SimulationError, name="pytetwild", value=-6):
+        fill(ball(subdivisions=1))

@@ -1,0 +1,197 @@
+"""The gain network against the paper's equations 7 to 11, written out once more."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from avmsf.errors import FitError
+from avmsf.features.feature_field import FeatureField
+from avmsf.field.attention import AttentionGains, encode
+from avmsf.field.config import AttentionShape
+from avmsf.gaussians.points import cluster
+
+SHAPE = AttentionShape(clusters=5, bands=3, width=8, hidden=12, layers=2, feature_scale=4.0)
+GAIN_SCALE = torch.tensor([1.0, 0.5, 0.0, 20.0])
+
+
+def points(count: int = 60) -> torch.Tensor:
+    return torch.rand(count, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([0.3, 0.2, 0.1])
+
+
+def features() -> FeatureField:
+    descriptors = torch.randn(60, 7, generator=torch.Generator().manual_seed(1))
+    return FeatureField(points(), descriptors, "test")
+
+
+def network(shape: AttentionShape = SHAPE, field: FeatureField | None = None, *, seed: int = 2) -> AttentionGains:
+    made = AttentionGains(
+        features() if field is None else field,
+        gain_scale=GAIN_SCALE,
+        shape=shape,
+        generator=torch.Generator().manual_seed(seed),
+    )
+    with torch.no_grad():
+        # Biases start at zero and damping factors at one; a test has to see them.
+        for number, parameter in enumerate(made.parameters()):
+            if parameter.ndim == 1 or not bool(parameter.any()):
+                parameter.normal_(std=0.1, generator=torch.Generator().manual_seed(number))
+    return made
+
+
+def paper_gains(net: AttentionGains, contact: torch.Tensor) -> tuple[list[float], list[float]]:
+    """Return gains and attention weights at one contact by the paper's equations, with loops, in float64."""
+    state = {name: tensor.double() for name, tensor in net.state_dict().items()}
+    place, own, bands = state["points"], state["features"] * net.shape.feature_scale, net.shape.bands
+    groups = cluster(place, net.shape.clusters)
+    row = min(range(len(place)), key=lambda i: math.dist(place[i].tolist(), contact.tolist()))
+    size = math.dist(place.amax(0).tolist(), place.amin(0).tolist()) / 2
+    encoded = []
+    for center in groups.centers:  # r_k = x_i* - c_k, with its sines and cosines
+        offset = ((place[row] - center) / size).tolist()
+        encoded += offset
+        for value in offset:
+            encoded += [math.sin(2**band * math.pi * value) for band in range(bands)]
+            encoded += [math.cos(2**band * math.pi * value) for band in range(bands)]
+    means = [own[groups.labels == group].mean(0) for group in range(len(groups.centers))]  # equation 7
+    query = state["query.weight"] @ torch.cat([torch.tensor(encoded, dtype=torch.float64), own[row]])  # 8
+    keys = [state["key.weight"] @ mean for mean in means]  # 9
+    values = [state["value.weight"] @ mean for mean in means]
+    scores = [math.exp(float(key @ query) / math.sqrt(net.shape.width)) for key in keys]  # 10
+    attention = [score / sum(scores) for score in scores]
+    context = sum(share * value for share, value in zip(attention, values, strict=True))
+    hidden = torch.cat([context, own[row]])  # 11
+    for layer in range(net.shape.layers):
+        hidden = state[f"head.{2 * layer}.weight"] @ hidden + state[f"head.{2 * layer}.bias"]
+        hidden = hidden / (1 + torch.exp(-hidden))
+    gains = state["to_gains.weight"] @ hidden + state["to_gains.bias"]
+    return (gains * state["gain_scale"]).tolist(), attention
+
+
+@pytest.mark.parametrize("bands", [0, 3])
+@pytest.mark.parametrize("layers", [0, 1, 2])
+def test_gains_are_the_papers_equations(bands, layers):
+    net = network(replace(SHAPE, bands=bands, layers=layers))
+    contacts = points(70)[60:]
+    gains = net.at(contacts)
+    expected = torch.tensor([paper_gains(net, contact)[0] for contact in contacts])
+    # Float32 sums of a hundred products, relative to each mode's size.
+    torch.testing.assert_close(
+        gains.mean / GAIN_SCALE.clamp_min(1), expected / GAIN_SCALE.clamp_min(1), rtol=0, atol=3e-6
+    )
+    assert gains.quadrature is None
+    assert gains.damping is None
+
+
+def test_attention_weighs_the_regions_and_its_weights_sum_to_one(monkeypatch):
+    seen, softmax = [], torch.softmax
+    monkeypatch.setattr(torch, "softmax", lambda *given, **named: seen.append(softmax(*given, **named)) or seen[-1])
+    net, contacts = network(), points(70)[60:]
+    net.at(contacts)
+    (weights,) = seen
+    assert weights.shape == (10, SHAPE.clusters)
+    torch.testing.assert_close(weights.sum(1), torch.ones(10), rtol=0, atol=1e-6)
+    # Over regions, not over contacts; and not the same everywhere, or nothing would be attended to.
+    expected = torch.tensor([paper_gains(net, contact)[1] for contact in contacts])
+    torch.testing.assert_close(weights, expected, rtol=0, atol=1e-6)
+    assert float(weights.detach().std(0).max()) > 0.01
+
+
+def test_the_order_of_regions_does_not_matter():
+    """Keys and values are a set; where the query reads the offsets in the same order, the gains stay."""
+    net, order, contacts = network(), torch.tensor([3, 0, 4, 1, 2]), points(70)[60:]
+    before = net.at(contacts).mean
+    each = 3 * (1 + 2 * SHAPE.bands)
+    with torch.no_grad():
+        net.centers.copy_(net.centers[order])
+        net.descriptors.copy_(net.descriptors[order])
+        blocks = net.query.weight[:, : 5 * each].unflatten(1, (5, each))[:, order]
+        net.query.weight[:, : 5 * each] = blocks.flatten(1)
+    # Other orders of float32 sums.
+    torch.testing.assert_close(net.at(contacts).mean, before, rtol=0, atol=1e-5)
+
+
+def test_contacts_at_one_point_have_identical_gains():
+    field = FeatureField.from_points(points())
+    net = network(field=field)
+    nudge = torch.zeros(60, 3)
+    nudge[:, 0] = 1e-6
+    assert torch.equal(net.at(points()).mean, net.at(points() + nudge).mean)
+    assert torch.equal(net.at(points()).mean, net.read(torch.arange(60)).mean)
+
+
+def test_gains_do_not_depend_on_where_the_object_lies_or_on_how_large_it_is():
+    moved = 3 * points() + torch.tensor([1.0, 2.0, 3.0])
+    here, there = (network(field=FeatureField.from_points(each)) for each in (points(), moved))
+    # Coordinates near 3 m in float32 are known to 2e-7 m, waves of 4 pi to thirty times that part of the size.
+    torch.testing.assert_close(there.at(moved).mean, here.at(points()).mean, rtol=0, atol=1e-4)
+
+
+def test_contacts_in_float64_are_read_as_they_are():
+    net, contacts = network(), points(70)[60:]
+    gains = net.at(contacts.double()).mean
+    assert gains.dtype == torch.float32
+    assert torch.equal(gains, net.at(contacts).mean)
+
+
+def test_features_and_scales_in_float64_make_a_float32_network():
+    single = features()
+    double = FeatureField(single.points.double(), single.features.double(), "test")
+    net = AttentionGains(double, gain_scale=GAIN_SCALE.double(), shape=SHAPE, generator=torch.Generator())
+    assert {each.dtype for each in net.state_dict().values()} == {torch.float32}
+    assert net.at(points()).mean.dtype == torch.float32
+
+
+def test_damping_factors_start_at_one_and_are_positive():
+    shape = replace(SHAPE, spatial_damping=True)
+    fresh = AttentionGains(features(), gain_scale=GAIN_SCALE, shape=shape, generator=torch.Generator())
+    assert torch.equal(fresh.at(points()).damping, torch.ones(60, 4))
+    factors = network(shape).at(points()).damping.detach()
+    assert float(factors.min()) > 0
+    assert float(factors.std(0).min()) > 0
+
+
+def test_the_generator_alone_decides_the_weights():
+    torch.manual_seed(0)
+    before = torch.get_rng_state()
+    first, again, other = network().state_dict(), network().state_dict(), network(seed=3).state_dict()
+    assert torch.equal(torch.get_rng_state(), before)
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    assert not torch.equal(first["query.weight"], other["query.weight"])
+
+
+def test_an_untrained_networks_gains_are_of_the_scale_it_was_given():
+    gains = network().at(points()).mean.detach()
+    size = gains.square().mean(0).sqrt() / GAIN_SCALE.clamp_min(1e-3)
+    assert float(size[2]) == 0
+    assert bool((size[[0, 1, 3]] > 0.02).all())
+    assert bool((size[[0, 1, 3]] < 5).all())
+
+
+@pytest.mark.parametrize("spatial", [False, True])
+def test_modes_put_in_another_order_are_the_same_modes(spatial):
+    net, order = network(replace(SHAPE, spatial_damping=spatial)), torch.tensor([2, 0, 3, 1])
+    before = net.at(points())
+    net.reorder(order)
+    after = net.at(points())
+    torch.testing.assert_close(after.mean, before.mean[:, order], rtol=1e-5, atol=1e-6)
+    if spatial:
+        torch.testing.assert_close(after.damping, before.damping[:, order], rtol=1e-5, atol=1e-6)
+
+
+def test_more_clusters_than_points_are_refused_with_the_most_that_there_can_be():
+    with pytest.raises(FitError) as caught:
+        network(replace(SHAPE, clusters=61))
+    assert all(each in str(caught.value) for each in ("clusters", "61", "60"))
+
+
+def test_encoding_in_closed_form():
+    offsets = torch.tensor([[0.5, -0.25, 1.0]], dtype=torch.float64)
+    expected = [0.5, -0.25, 1.0]
+    for value in (0.5, -0.25, 1.0):
+        expected += [math.sin(math.pi * value), math.sin(2 * math.pi * value)]
+        expected += [math.cos(math.pi * value), math.cos(2 * math.pi * value)]
+    torch.testing.assert_close(encode(offsets, 2)[0], torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-15)
+    assert torch.equal(encode(offsets, 0), offsets)
+    assert encode(torch.zeros(2, 5, 3), 4).shape == (2, 5, 27)

@@ -1,0 +1,253 @@
+"""A fit that is interrupted goes on to the result that it would have had."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from itertools import count
+from pathlib import Path
+
+import pytest
+import torch
+
+from avmsf._utils.state import read_checkpoint, write_checkpoint
+from avmsf.errors import AvmsfWarning, FieldFileError
+from avmsf.field.config import FitConfig
+from avmsf.field.fit import Progress, fit
+from avmsf.field.recipes import Attention
+from avmsf.field.sound_field import SoundField
+from avmsf.field.training import AdamW, TrainingRun
+from factories.plate_field import QUICK, plate_extraction, plate_features, plate_impacts
+from factories.raising import raises, warns
+
+CONFIG = replace(
+    QUICK, damping="validated", warmup_steps=3, steps=11, clusters=4, hidden=16, width=8, fft_sizes=(256,), early=256
+)
+"""Looks at the validation contacts are taken after the steps 3, 13 and 14."""
+STAGES = ("trial with shared damping", "trial with per-contact damping", "fit")
+
+
+def fitted(
+    checkpoint: Path | None, progress: Callable[[Progress], None] | None = None, *, config: FitConfig = CONFIG
+) -> SoundField:
+    impacts = plate_impacts(6, seconds=0.1)
+    modes = plate_extraction(impacts)
+    return fit(impacts, plate_features(60), modes, config, gains=Attention(), checkpoint=checkpoint, progress=progress)
+
+
+@cache
+def uninterrupted(config: FitConfig = CONFIG) -> SoundField:
+    return fitted(None, config=config)
+
+
+def expect_same(field: SoundField, other: SoundField) -> None:
+    assert torch.equal(field.bank.frequency, other.bank.frequency)
+    assert torch.equal(field.bank.damping, other.bank.damping)
+    assert torch.equal(field.residual.magnitude, other.residual.magnitude)
+    mine, others = field.gain_field.state_dict(), other.gain_field.state_dict()
+    assert mine.keys() == others.keys()
+    assert all(torch.equal(mine[name], others[name]) for name in mine)
+    assert field.origin == other.origin
+
+
+class Interruption:
+    """Presses the keys at the given steps of a fit, each once."""
+
+    def __init__(self, *moments: tuple[str, int]) -> None:
+        self.moments, self.told = set(moments), []
+
+    def __call__(self, progress: Progress) -> None:
+        self.told.append((progress.stage, progress.step))
+        if (progress.stage, progress.step) in self.moments:
+            self.moments.remove((progress.stage, progress.step))
+            raise KeyboardInterrupt
+
+
+# In warm-up, at the change of stages, between looks, before a look, at the last step.
+@pytest.mark.parametrize(
+    ("stage", "step"),
+    [
+        *((STAGES[0], step) for step in (1, 3, 8, 13, 14)),
+        (STAGES[1], 2),
+        (STAGES[1], 13),
+        (STAGES[2], 3),
+        (STAGES[2], 14),
+    ],
+)
+def test_an_interrupted_fit_goes_on_to_the_same_result(tmp_path, stage, step):
+    checkpoint, keys = tmp_path / "fit.checkpoint", Interruption((stage, step))
+    with pytest.raises(KeyboardInterrupt):
+        fitted(checkpoint, keys)
+    assert checkpoint.exists()
+    done = len(keys.told)
+    expect_same(fitted(checkpoint, keys), uninterrupted())
+    # It went on from there: no step was taken twice.
+    assert keys.told[done:] == [(each, number) for each in STAGES for number in range(1, 15)][done:]
+    # The finished fit's state stays until its field is saved, and gives the field again without a step.
+    done = len(keys.told)
+    expect_same(fitted(checkpoint, keys), uninterrupted())
+    assert keys.told[done:] == []
+
+
+def test_a_fit_may_be_interrupted_again_and_again(tmp_path):
+    checkpoint = tmp_path / "fit.checkpoint"
+    keys = Interruption(*((stage, step) for stage in STAGES for step in (3, 9, 13)))
+    for _ in range(9):
+        with pytest.raises(KeyboardInterrupt):
+            fitted(checkpoint, keys)
+    expect_same(fitted(checkpoint, keys), uninterrupted())
+
+
+def interrupt(patch: pytest.MonkeyPatch, owner: type, name: str, *, call: int) -> None:
+    """Press the keys at the end of the given call of a method."""
+    original, calls = getattr(owner, name), count(1)
+
+    def interrupted(self, *given, **named):
+        result = original(self, *given, **named)
+        if next(calls) == call:
+            raise KeyboardInterrupt
+        return result
+
+    patch.setattr(owner, name, interrupted)
+
+
+@pytest.mark.parametrize(("owner", "name"), [(TrainingRun, "sounds"), (TrainingRun, "spectral_loss"), (AdamW, "step")])
+def test_an_interruption_in_the_middle_of_a_step_loses_no_more_than_it(tmp_path, monkeypatch, owner, name):
+    """Ctrl-C falls inside the arithmetic nearly always: noise drawn, gradients made, parameters half moved."""
+    checkpoint = tmp_path / "fit.checkpoint"
+    with monkeypatch.context() as patch:
+        interrupt(patch, owner, name, call=6)
+        with pytest.raises(KeyboardInterrupt):
+            fitted(checkpoint)
+    # Half-moved parameters are no state to go on from: such a fit starts from what was saved before, here nothing.
+    assert checkpoint.exists() == (name != "step")
+    expect_same(fitted(checkpoint), uninterrupted())
+
+
+PATIENT = replace(CONFIG, damping="shared", patience=10, learning_rate=0.3, steps=90)
+"""Steps so large that a look in the middle is the best."""
+
+
+def test_patience_survives_an_interruption(tmp_path):
+    stopped = uninterrupted(PATIENT).origin.report["steps"]
+    # Or nothing would have stopped it, and the interruption would never come.
+    assert stopped + 10 < 90
+    keys = Interruption((STAGES[0], 3 + stopped + 10))
+    with pytest.raises(KeyboardInterrupt):
+        fitted(tmp_path / "state", keys, config=PATIENT)
+    expect_same(fitted(tmp_path / "state", keys, config=PATIENT), uninterrupted(PATIENT))
+
+
+def test_a_look_that_was_cut_off_is_taken_again(tmp_path, monkeypatch):
+    stopped = uninterrupted(PATIENT).origin.report["steps"]
+    # Sounds are made once a step after the warm-up and once a look, of which the first comes before those steps.
+    with monkeypatch.context() as patch:
+        interrupt(patch, TrainingRun, "sounds", call=stopped + stopped // 10 + 1)
+        with pytest.raises(KeyboardInterrupt):
+            fitted(tmp_path / "state", config=PATIENT)
+    expect_same(fitted(tmp_path / "state", config=PATIENT), uninterrupted(PATIENT))
+
+
+def test_the_state_is_kept_while_the_fit_runs(tmp_path, monkeypatch):
+    """A fit that is killed leaves a checkpoint behind as well, from the last time that one was due."""
+    monkeypatch.setattr("avmsf.field.fit._CHECKPOINT_SECONDS", 0.0)
+    checkpoint, copies = tmp_path / "fit.checkpoint", {}
+
+    def copy(progress: Progress) -> None:
+        if checkpoint.exists():
+            copies[progress.stage, progress.step] = checkpoint.read_bytes()
+
+    fitted(checkpoint, copy)
+    assert len(copies) == 3 * 14 - 1
+    for moment in [(STAGES[1], 1), (STAGES[2], 14)]:
+        checkpoint.write_bytes(copies[moment])
+        expect_same(fitted(checkpoint), uninterrupted())
+
+
+def test_a_path_may_be_a_word(tmp_path):
+    keys, impacts = Interruption((STAGES[0], 3)), plate_impacts(6, seconds=0.1)
+    arguments = (impacts, plate_features(60), plate_extraction(impacts), CONFIG)
+    with pytest.raises(KeyboardInterrupt):
+        fit(*arguments, gains=Attention(), checkpoint=str(tmp_path / "state"), progress=keys)
+    expect_same(fit(*arguments, gains=Attention(), checkpoint=str(tmp_path / "state")), uninterrupted())
+    assert [path.name for path in tmp_path.iterdir()] == ["state"]
+
+
+def test_a_full_disk_costs_the_checkpoint_and_not_the_fit(tmp_path, monkeypatch):
+    def full(path: Path, *arguments: object, **named: object) -> None:
+        raise FieldFileError(f"{path}: no space", file=path, value="No space left on device")
+
+    monkeypatch.setattr("avmsf.field.fit.write_checkpoint", full)
+    with warns(AvmsfWarning, file="fit.checkpoint", value="No space left on device"):
+        expect_same(fitted(tmp_path / "fit.checkpoint"), uninterrupted())
+
+
+def _louder(impacts, features, modes):
+    return replace(impacts, sounds=impacts.sounds * 1.5), features, modes, CONFIG
+
+
+def _faster(impacts, features, modes):
+    return replace(impacts, sample_rate=9000.0), features, modes, CONFIG
+
+
+def _turned(impacts, features, modes):
+    return replace(impacts, directions=-impacts.directions), features, modes, CONFIG
+
+
+def _undirected(impacts, features, modes):
+    return replace(impacts, directions=None), features, modes, CONFIG
+
+
+def _coarser(impacts, features, modes):
+    return impacts, plate_features(50), modes, CONFIG
+
+
+def _duller(impacts, features, modes):
+    return impacts, features, replace(modes, bank=replace(modes.bank, damping=modes.bank.damping * 2)), CONFIG
+
+
+def _hissing(impacts, features, modes):
+    residual = replace(modes.residual, magnitude=modes.residual.magnitude * 2)
+    return impacts, features, replace(modes, residual=residual), CONFIG
+
+
+def _seeded(impacts, features, modes):
+    return impacts, features, modes, replace(CONFIG, seed=1)
+
+
+@pytest.mark.parametrize("other", [_louder, _faster, _turned, _undirected, _coarser, _duller, _hissing, _seeded])
+def test_a_checkpoint_of_other_arguments_is_refused_and_kept(tmp_path, other):
+    checkpoint, impacts = tmp_path / "fit.checkpoint", plate_impacts(6, seconds=0.1)
+    with pytest.raises(KeyboardInterrupt):
+        fitted(checkpoint, Interruption((STAGES[0], 1)))
+    before = checkpoint.read_bytes()
+    with raises(FieldFileError, file="fit.checkpoint", value=["input, configuration or version"]):
+        fit(*other(impacts, plate_features(60), plate_extraction(impacts)), gains=Attention(), checkpoint=checkpoint)
+    assert checkpoint.read_bytes() == before
+
+
+@pytest.mark.parametrize("kind", ["empty", "text", "cut", "list", "pickle"])
+def test_what_is_no_checkpoint_is_refused_and_kept(tmp_path, kind):
+    checkpoint = tmp_path / "fit.checkpoint"
+    write_checkpoint(checkpoint, {"trials": {}, "running": None}, {"fit": "x"}, raising=FieldFileError)
+    if kind == "list":
+        torch.save([1, 2], checkpoint)
+    elif kind == "pickle":
+        torch.save({"identity": Path("x"), "state": {}}, checkpoint)
+    else:
+        whole = checkpoint.read_bytes()
+        checkpoint.write_bytes({"empty": b"", "text": b"hello there", "cut": whole[:-40]}[kind])
+    before = checkpoint.read_bytes()
+    with raises(FieldFileError, file="fit.checkpoint", value=None) as caught:
+        fitted(checkpoint)
+    # Torch's own words advise to switch its safety off.
+    assert "weights_only" not in str(caught.value)
+    assert checkpoint.read_bytes() == before
+
+
+def test_no_checkpoint_is_none(tmp_path):
+    assert read_checkpoint(tmp_path / "nowhere", {"fit": "x"}, what="a fit", raising=FieldFileError) is None
+
+
+def test_a_folder_is_no_checkpoint(tmp_path):
+    with raises(FieldFileError, file=tmp_path, value=None):
+        read_checkpoint(tmp_path, {"fit": "x"}, what="a fit", raising=FieldFileError)

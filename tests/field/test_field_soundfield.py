@@ -1,0 +1,149 @@
+"""What a field renders: each contact's own sound, in whatever company, at whatever force."""
+
+from copy import deepcopy
+from dataclasses import replace
+from functools import cache
+
+import pytest
+import torch
+
+from avmsf.evaluation.renderer import Renderer
+from avmsf.field.fit import fit
+from avmsf.field.recipes import Attention
+from avmsf.field.sound_field import SoundField
+from avmsf.modal.residual_noise import shape_noise
+from avmsf.simulate.plate import sample_contacts
+from factories.plate_field import PLATE, QUICK, RATE, plate_extraction, plate_features, plate_impacts
+
+CONTACTS = sample_contacts(PLATE, 40, generator=torch.Generator().manual_seed(5))
+
+
+@cache
+def field(damping: str = "per-contact") -> SoundField:
+    impacts = plate_impacts(forces=True)
+    config = replace(QUICK, damping=damping, warmup_steps=20, steps=4, learning_rate=0.05)
+    return fit(impacts, plate_features(), plate_extraction(impacts), config, gains=Attention())
+
+
+def by_hand(sound_field: SoundField, row: int) -> torch.Tensor:
+    """Return the modal part of one contact's sound as the sum that it is (paper, eq. 3), in float64."""
+    contact = CONTACTS[row : row + 1]
+    gains, damping = sound_field.gains(contact)[0], sound_field.dampings(contact)[0]
+    times = torch.arange(2400, dtype=torch.float64) / RATE
+    sound = torch.zeros(2400, dtype=torch.float64)
+    for gain, decay, frequency in zip(gains.double(), damping, sound_field.bank.frequency, strict=True):
+        sound += gain * torch.exp(-decay * times) * torch.sin(2 * torch.pi * frequency * times)
+    return sound
+
+
+@pytest.mark.parametrize("damping", ["shared", "per-contact"])
+def test_a_sound_is_its_modes_and_the_noise(damping):
+    sound_field = field(damping)
+    if damping == "per-contact":
+        assert float(sound_field.dampings(CONTACTS).std(0).min()) > 1e-3
+    sounds, loudest = sound_field.render(CONTACTS), float(sound_field.render(CONTACTS).abs().max())
+    noise = sounds[:2].double() - torch.stack([by_hand(sound_field, row) for row in (0, 1)])
+    # Float32 sounds: the same noise is left at both contacts, to a millionth of the loudest sample.
+    torch.testing.assert_close(noise[0], noise[1], rtol=0, atol=1e-6 * loudest)
+    # Its variance is the mean of the squared magnitudes, between bins on the lines that join them.
+    low, high = sound_field.residual.magnitude[:-1], sound_field.residual.magnitude[1:]
+    level = float(((low.square() + low * high + high.square()) / 3).mean().sqrt())
+    # 2400 samples tell it to 2 % where it is white, and to less where few bands hold most of it.
+    assert float(noise[0].std()) == pytest.approx(0.78 * level, rel=0.15)
+
+
+def test_the_noise_is_the_same_at_every_contact_and_in_every_call():
+    sound_field = field()
+    silent = replace(sound_field, residual=replace(sound_field.residual, magnitude=torch.zeros(33)))
+    noise = sound_field.render(CONTACTS) - silent.render(CONTACTS)
+    level = float(noise.std())
+    assert level > 0
+    # What float32 leaves of it beside the modes.
+    torch.testing.assert_close(noise, noise[:1].expand(40, -1), rtol=0, atol=1e-3 * level)
+    assert torch.equal(sound_field.render(CONTACTS), sound_field.render(CONTACTS))
+
+
+def test_without_noise_a_sound_is_its_modes():
+    sound_field = field()
+    silent = replace(sound_field, residual=replace(sound_field.residual, magnitude=torch.zeros(33)))
+    assert torch.equal(sound_field.render(CONTACTS, noise=False), silent.render(CONTACTS))
+    recordings = torch.ones(len(sound_field.origin.trained_on), 2400)
+    recorded = replace(sound_field, residual=replace(sound_field.residual, recordings=recordings))
+    assert torch.equal(recorded.render(CONTACTS, noise=False), silent.render(CONTACTS))
+
+
+def with_noise(kind: str) -> SoundField:
+    origin = field().origin
+    return replace(field(), origin=replace(origin, config=replace(origin.config, residual_noise=kind)))
+
+
+def test_gaussian_noise_is_the_draw_of_the_fits_seed():
+    sound_field = with_noise("gaussian")
+    generator = torch.Generator().manual_seed(sound_field.origin.config.seed)
+    magnitude = sound_field.residual.magnitude
+    assert torch.equal(sound_field.noise(), shape_noise(magnitude, contacts=1, samples=2400, generator=generator)[0])
+    # The rendered sound contains it, to what float32 leaves of it beside the modes.
+    rest = sound_field.render(CONTACTS) - field().render(CONTACTS)
+    expected = (sound_field.noise() - field().noise()).expand(40, -1)
+    torch.testing.assert_close(rest, expected, rtol=0, atol=1e-3 * float(expected.std()))
+
+
+def test_fields_of_low_fluctuation_noise_differ_in_its_spectrum_alone():
+    config = replace(field().origin.config, seed=5)
+    other = replace(field(), origin=replace(field().origin, config=config))
+    assert field().origin.config.residual_noise == "low-fluctuation"
+    assert torch.equal(other.noise(), field().noise())
+    assert torch.equal(other.noise(6000)[:2400], field().noise())
+
+
+@pytest.mark.parametrize("rows", [[0], [7], [3, 39], list(range(39, -1, -1)), list(range(33))])
+def test_a_contacts_sound_does_not_depend_on_its_company(rows):
+    """More contacts than one batch, one alone, the last one of a batch: to the rounding of other orders of sums."""
+    sounds = field().render(CONTACTS)
+    loudest = float(sounds.abs().max())
+    torch.testing.assert_close(field().render(CONTACTS[rows]), sounds[rows], rtol=0, atol=1e-6 * loudest)
+
+
+def test_no_contacts_make_no_sounds():
+    assert field().render(CONTACTS[:0]).shape == (0, 2400)
+
+
+def test_force_scales_all_of_the_sound():
+    sounds = field().render(CONTACTS)
+    assert torch.equal(field().render(CONTACTS, forces=4.0), 4.0 * sounds)
+    assert torch.equal(field().render(CONTACTS, forces=0.0), torch.zeros(40, 2400))
+    # Noise and modes alike, to float32.
+    torch.testing.assert_close(field().render(CONTACTS, forces=0.3), 0.3 * sounds, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("samples", [1, 511, 2400, 5000])
+def test_modes_of_a_longer_sound_begin_as_those_of_a_shorter_one(samples):
+    silent = replace(field(), residual=replace(field().residual, magnitude=torch.zeros(33)))
+    shorter, longer = silent.render(CONTACTS, samples=samples), silent.render(CONTACTS, samples=6000)
+    assert shorter.shape == (40, samples)
+    loudest = float(longer.abs().max())
+    torch.testing.assert_close(shorter, longer[:, :samples], rtol=0, atol=1e-6 * loudest)
+    assert field().render(CONTACTS, samples=samples).shape == (40, samples)
+
+
+def test_contacts_in_float32_and_float64_sound_alike():
+    sounds = field().render(CONTACTS)
+    assert sounds.dtype == torch.float32
+    assert torch.equal(field().render(CONTACTS.float()), sounds)
+
+
+def test_rendering_keeps_no_gradients_and_changes_no_chance():
+    before = torch.get_rng_state()
+    in_training = replace(field(), gain_field=deepcopy(field().gain_field).requires_grad_(True))
+    assert not in_training.render(CONTACTS).requires_grad
+    assert not in_training.gains(CONTACTS).requires_grad
+    assert not in_training.dampings(CONTACTS).requires_grad
+    assert not any(parameter.requires_grad for parameter in field().gain_field.parameters())
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_a_field_is_a_renderer():
+    assert isinstance(field(), Renderer)
+    assert field().samples == 2400
+    assert field().sample_rate == RATE
+    assert field().origin.per_newton is True

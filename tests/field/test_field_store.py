@@ -1,0 +1,441 @@
+"""A field is one file: it comes back to the last bit, or is refused with a reason."""
+
+import errno
+import json
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+from safetensors import safe_open
+from safetensors.torch import load as from_bytes
+from safetensors.torch import save as to_bytes
+
+from avmsf.capture.settings import CaptureSettings
+from avmsf.errors import FieldFileError
+from avmsf.field.fit import fit
+from avmsf.field.header import FORMAT
+from avmsf.field.recipes import Attention
+from avmsf.field.sound_field import Origin, SoundField
+from avmsf.field.store import load, save
+from avmsf.simulate.plate import sample_contacts
+from factories.plate_field import PLATE, QUICK, plate_extraction, plate_features, plate_impacts
+from factories.raising import raises
+
+CONTACTS = sample_contacts(PLATE, 10, generator=torch.Generator().manual_seed(5))
+CONFIG = replace(QUICK, warmup_steps=4, steps=2)
+SETTINGS = CaptureSettings(response_channel=2, highpass=30.0, align=False)
+
+
+@cache
+def field(damping: str = "shared") -> SoundField:
+    impacts = plate_impacts(forces=True)
+    config = replace(CONFIG, damping=damping, learning_rate=0.05)
+    return fit(
+        impacts,
+        plate_features(),
+        plate_extraction(impacts),
+        config,
+        gains=Attention(),
+        capture="a plate",
+        settings=SETTINGS,
+    )
+
+
+def other_field() -> SoundField:
+    return replace(field(), bank=replace(field().bank, damping=field().bank.damping * 2))
+
+
+@pytest.mark.parametrize("damping", ["shared", "per-contact", "validated"])
+def test_a_field_comes_back_to_the_last_bit(tmp_path, damping):
+    saved, path = field(damping), tmp_path / "plate.safetensors"
+    save(saved, path)
+    loaded = load(str(path))
+    assert torch.equal(loaded.render(CONTACTS), saved.render(CONTACTS))
+    assert torch.equal(loaded.gains(CONTACTS), saved.gains(CONTACTS))
+    assert torch.equal(loaded.dampings(CONTACTS), saved.dampings(CONTACTS))
+    assert loaded.origin == saved.origin
+    assert loaded.origin.settings == SETTINGS
+    assert loaded.origin.config.fft_sizes == (1024, 256)
+    assert loaded.origin.trained_on == plate_impacts().names
+    assert (loaded.sample_rate, loaded.samples) == (saved.sample_rate, saved.samples)
+    assert (loaded.gain_field.shape, loaded.gain_field.encoder) == (saved.gain_field.shape, "geometry")
+    assert not loaded.gain_field.training
+    assert not any(parameter.requires_grad for parameter in loaded.gain_field.parameters())
+
+
+def test_a_file_names_its_tensors_and_itself(tmp_path):
+    save(field(), tmp_path / "plate.safetensors")
+    with safe_open(tmp_path / "plate.safetensors", framework="pt") as file:
+        names, record = set(file.keys()), json.loads(file.metadata()["avmsf"])
+    assert {"bank.frequency", "bank.damping", "phase", "residual.magnitude"} < names
+    assert {name.removeprefix("gains.") for name in names if name.startswith("gains.")} == set(
+        field().gain_field.state_dict()
+    )
+    assert record["format"] == FORMAT
+    assert record["version"] == "0.1.0"
+    assert record["sample_rate"] == 8000.0
+    assert record["origin"]["capture"] == "a plate"
+    assert record["origin"]["per_newton"] is True
+
+
+def test_saving_twice_gives_the_same_bytes(tmp_path):
+    save(field(), tmp_path / "one")
+    save(load(tmp_path / "one"), tmp_path / "two")
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
+
+
+def test_loading_and_saving_leave_chance_alone(tmp_path):
+    before = torch.get_rng_state()
+    save(field(), tmp_path / "plate")
+    load(tmp_path / "plate")
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_a_loaded_field_needs_its_file_no_more(tmp_path):
+    path = tmp_path / "plate.safetensors"
+    save(field(), path)
+    loaded = load(path)
+    with open(path, "r+b") as file:
+        file.write(bytes(path.stat().st_size))
+    path.unlink()
+    assert torch.equal(loaded.render(CONTACTS), field().render(CONTACTS))
+
+
+def test_missing_folders_are_made_and_what_is_there_is_replaced(tmp_path):
+    path = tmp_path / "fields" / "of" / "plates" / "plate.safetensors"
+    save(field(), path)
+    save(other_field(), path)
+    assert torch.equal(load(path).bank.damping, other_field().bank.damping)
+    assert [each.name for each in path.parent.iterdir()] == ["plate.safetensors"]
+
+
+def test_a_saved_file_may_be_read_by_whom_the_umask_lets(tmp_path):
+    mask = os.umask(0o022)
+    try:
+        save(field(), tmp_path / "plate")
+    finally:
+        os.umask(mask)
+    assert (tmp_path / "plate").stat().st_mode & 0o777 == 0o644
+
+
+@pytest.mark.parametrize("place", ["file/plate", "."])
+def test_a_place_where_no_file_can_be_is_refused(tmp_path, place):
+    (tmp_path / "file").write_text("not a folder")
+    with raises(FieldFileError, file=tmp_path / place):
+        save(field(), tmp_path / place)
+    assert [each.name for each in tmp_path.iterdir()] == ["file"]
+    assert (tmp_path / "file").read_text() == "not a folder"
+
+
+def in_another_process(script: str, *arguments: object) -> subprocess.Popen[str]:
+    """Start Python on a script that finds `field` and `path`, the second a place where a field may be written."""
+    head = (
+        "import os, signal, sys\n"
+        "from avmsf.field.store import load, save\n"
+        "field, path = load(sys.argv[1]), sys.argv[2]\n"
+    )
+    return subprocess.Popen(
+        [sys.executable, "-c", head + script, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+
+
+@contextmanager
+def files_of_at_most(size: int) -> Iterator[None]:
+    """Let no file grow beyond `size` bytes, as if the disk were full."""
+    limits, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
+
+
+def test_a_full_disk_leaves_the_old_file_and_nothing_else(tmp_path):
+    path = tmp_path / "plate.safetensors"
+    save(other_field(), path)
+    before = path.read_bytes()
+    with (
+        files_of_at_most(4096),
+        raises(FieldFileError, file=path) as caught,
+    ):
+        save(field(), path)
+    assert isinstance(caught.value.__cause__, OSError)
+    assert caught.value.__cause__.errno == errno.EFBIG
+    assert path.read_bytes() == before
+    assert [each.name for each in tmp_path.iterdir()] == ["plate.safetensors"]
+
+
+@pytest.mark.slow
+def test_a_kill_while_saving_leaves_one_whole_field_or_the_other(tmp_path):
+    source, folder = tmp_path / "source", tmp_path / "there"
+    path = folder / "plate.safetensors"
+    save(field(), source)
+    save(other_field(), path)
+    # Saving again and again, so that the kill falls at any moment of it.
+    process = in_another_process("print('now', flush=True)\nwhile True: save(field, path)", source, path)
+    assert process.stdout is not None
+    with process:
+        assert process.stdout.readline() == "now\n"
+        time.sleep(random.Random(0).uniform(0.02, 0.05))
+        process.send_signal(signal.SIGKILL)
+    assert torch.equal(load(path).bank.frequency, field().bank.frequency)
+    left = {each.name for each in folder.iterdir()} - {path.name}
+    assert all(name.startswith(".plate.safetensors.") and name.endswith(".part") for name in left)
+    save(other_field(), path)
+    assert torch.equal(load(path).bank.damping, other_field().bank.damping)
+
+
+def test_a_kill_before_the_last_moment_leaves_the_old_field(tmp_path):
+    source, path = tmp_path / "source", tmp_path / "there" / "plate.safetensors"
+    save(field(), source)
+    save(other_field(), path)
+    before = path.read_bytes()
+    script = (
+        "import os\ndef die(*given):\n    os.kill(os.getpid(), signal.SIGKILL)\nos.replace = die\nsave(field, path)\n"
+    )
+    process = in_another_process(script, source, path)
+    process.communicate(timeout=60)
+    assert process.returncode == -signal.SIGKILL
+    assert path.read_bytes() == before
+    # The half-done file lies hidden beside it, is none of the user's names, and stands in no later saving's way.
+    (left,) = [each for each in path.parent.iterdir() if each != path]
+    assert left.name.startswith(".plate.safetensors.")
+    save(field(), path)
+    assert torch.equal(load(path).render(CONTACTS), field().render(CONTACTS))
+
+
+Change = Callable[[dict[str, torch.Tensor], dict], None]
+
+
+def changed(tmp_path: Path, change: Change) -> Path:
+    """Save a field, and write it once more with its tensors and record changed."""
+    path = tmp_path / "plate.safetensors"
+    save(field(), path)
+    with safe_open(path, framework="pt") as file:
+        record = json.loads(file.metadata()["avmsf"])
+    tensors = from_bytes(path.read_bytes())
+    change(tensors, record)
+    path.write_bytes(to_bytes(tensors, {"avmsf": json.dumps(record)}))
+    return path
+
+
+def test_a_file_written_again_unchanged_is_read(tmp_path):
+    assert torch.equal(load(changed(tmp_path, lambda *_: None)).render(CONTACTS), field().render(CONTACTS))
+
+
+@pytest.mark.parametrize("kept", [0, 5, 9, 100, 3000, -1])
+def test_a_file_cut_short_is_refused(tmp_path, kept):
+    path = tmp_path / "plate.safetensors"
+    save(field(), path)
+    path.write_bytes(path.read_bytes()[:kept])
+    with raises(FieldFileError, file="plate.safetensors"):
+        load(path)
+
+
+@pytest.mark.parametrize("kind", ["wav", "text", "pickle", "zeros"])
+def test_a_file_of_another_kind_is_refused(tmp_path, kind):
+    path = tmp_path / "something"
+    if kind == "wav":
+        soundfile.write(path, np.zeros(1000), 44100, format="WAV")
+    elif kind == "pickle":
+        torch.save({"bank.frequency": torch.ones(3)}, path)
+    else:
+        path.write_bytes({"text": b"a long text about bowls\n" * 9, "zeros": bytes(200)}[kind])
+    with raises(FieldFileError, file="something"):
+        load(path)
+
+
+def test_someone_elses_safetensors_are_refused(tmp_path):
+    for number, metadata in enumerate([None, {"format": "pt"}]):
+        (tmp_path / f"{number}").write_bytes(to_bytes({"bank.frequency": torch.ones(3)}, metadata))
+        with raises(FieldFileError, file=tmp_path / f"{number}", name="avmsf"):
+            load(tmp_path / f"{number}")
+
+
+def test_a_missing_file_and_a_folder_are_refused(tmp_path):
+    with raises(FieldFileError, file="nowhere"):
+        load(tmp_path / "nowhere")
+    with raises(FieldFileError, file=tmp_path):
+        load(tmp_path)
+
+
+def test_a_newer_format_is_refused_by_name(tmp_path):
+    def change(_: dict, record: dict) -> None:
+        record.update(format=FORMAT + 1, version="3.1.4", something="new")
+
+    with raises(FieldFileError, file="plate.safetensors", name="format", value=FORMAT + 1) as caught:
+        load(changed(tmp_path, change))
+    assert "3.1.4" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("report", "command"),
+    [
+        ({}, "avmsf fit FOLDER --output"),
+        ({"pipeline": {"scene": {"views": {}}}}, "avmsf reconstruct FOLDER --output"),
+        ({"guess": "…", "material": {"name": "glass"}}, "avmsf fit FOLDER --material glass --output"),
+    ],
+)
+def test_an_older_format_is_refused_with_the_command_that_makes_the_field_again(tmp_path, report, command):
+    def change(_: dict, record: dict) -> None:
+        record.update(format=7, gain_field=record.pop("gains"))
+        record["origin"]["report"] = report
+
+    with raises(FieldFileError, file="plate.safetensors", name="format", value=7) as caught:
+        load(changed(tmp_path, change))
+    assert f"{command} {tmp_path}" in str(caught.value)
+    assert "'a plate'" in str(caught.value)
+
+
+def test_missing_and_unexpected_tensors_are_named(tmp_path):
+    def change(tensors: dict[str, torch.Tensor], _: dict) -> None:
+        tensors["gains.to_dampings.bias"] = tensors.pop("gains.to_gains.bias")
+
+    wrong = [["gains.to_gains.bias"], ["gains.to_dampings.bias"]]
+    with raises(FieldFileError, file="plate.safetensors", name="gains.to_gains.bias", value=wrong):
+        load(changed(tmp_path, change))
+
+
+@pytest.mark.parametrize(
+    ("name", "made", "shape"),
+    [
+        ("gains.centers", lambda each: each[:-1].clone(), "float32[7, 3]"),
+        ("bank.damping", lambda each: each.float(), "float32[12]"),
+        ("residual.magnitude", lambda each: each[None], "float32[1, 33]"),
+        ("gains.to_gains.weight", lambda each: each * torch.nan, None),
+        ("bank.damping", lambda each: -each, None),
+        ("bank.frequency", lambda each: each * 0, None),
+        ("bank.frequency", lambda each: each * torch.inf, None),
+        ("residual.magnitude", lambda each: -each, None),
+    ],
+)
+def test_tensors_of_another_form_or_of_impossible_values_are_refused(tmp_path, name, made, shape):
+    def change(tensors: dict[str, torch.Tensor], _: dict) -> None:
+        tensors[name] = made(tensors[name])
+
+    with raises(FieldFileError, file="plate.safetensors", name=name) as caught:
+        load(changed(tmp_path, change))
+    # Of impossible values, the smallest and the largest.
+    assert caught.value.value == shape if shape else len(caught.value.value) == 2
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "name"),
+    [
+        (("sizes", "modes"), 13, "gains.modes"),
+        (("gains", "shape", "clusters"), 9, "gains.centers"),
+        (("gains", "shape", "width"), 10**7, "gains.head.0.weight"),
+        (("gains", "shape", "spatial_damping"), True, "gains.to_dampings.bias"),
+    ],
+)
+def test_a_record_that_is_not_of_these_tensors_is_refused(tmp_path, keys, value, name):
+    with raises(FieldFileError, file="plate.safetensors", name=name):
+        load(changed(tmp_path, lambda _, record: put(record, keys, value)))
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "name"),
+    [
+        (("format",), "1", "format"),
+        (("sample_rate",), "44100", "sample_rate"),
+        (("sample_rate",), -1.0, "sample_rate"),
+        (("samples",), 0, "samples"),
+        (("sizes",), {}, "modes"),
+        (("sizes", "bins"), True, "sizes.bins"),
+        (("gains",), {}, "kind"),
+        (("gains", "points"), 0, "points"),
+        (("gains", "dim"), True, "dim"),
+        (("gains", "encoder"), 5, "encoder"),
+        (("gains", "kind"), "splines", "gains.kind"),
+        (("gains", "shape", "width"), 1.5, "shape.width"),
+        (("gains", "shape", "heads"), 4, "shape.heads"),
+        (("config", "clusters"), 0, "clusters"),
+        (("config", "fft_sizes"), "1024", "config.fft_sizes"),
+        (("config", "unheard_of"), 1, "config.unheard_of"),
+        (("config", "residual_noise"), 0, "config.residual_noise"),
+        (("origin", "trained_on"), [1], "origin.trained_on"),
+        (("origin",), None, "origin"),
+    ],
+)
+def test_a_damaged_record_is_refused_with_what_is_wrong(tmp_path, keys, value, name):
+    path = changed(tmp_path, lambda _, record: put(record, keys, value))
+    with raises(FieldFileError, file="plate.safetensors", name=name):
+        load(path)
+
+
+@pytest.mark.parametrize(
+    ("keys", "value"),
+    [
+        (("origin", "settings", "highpass"), -1.0),
+        (("origin", "report", "quality"), {"positions": 9, "error": 0.3, "nearest_mean": 0.7, "errors": 0.3}),
+    ],
+)
+def test_a_damaged_origin_is_refused(tmp_path, keys, value):
+    path = changed(tmp_path, lambda _, record: put(record, keys, value))
+    with raises(FieldFileError, file="plate.safetensors") as caught:
+        load(path)
+    assert ("highpass" if "highpass" in keys else "errors") in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "keys", [("config", "seed"), ("config", "residual_noise"), ("gains", "shape", "layers"), ("origin", "report")]
+)
+def test_nothing_that_a_record_lacks_is_made_up(tmp_path, keys):
+    def change(_: dict, record: dict) -> None:
+        for key in keys[:-1]:
+            record = record[key]
+        del record[keys[-1]]
+
+    with raises(FieldFileError, file="plate.safetensors") as caught:
+        load(changed(tmp_path, change))
+    assert caught.value.name is not None
+    assert caught.value.name.split(".")[-1] == keys[-1]
+
+
+@pytest.mark.parametrize("words", ["", "[]", "{", '"avmsf"', f'{{"format": {FORMAT}}}'])
+def test_a_record_that_is_none_is_refused(tmp_path, words):
+    path = tmp_path / "plate.safetensors"
+    save(field(), path)
+    path.write_bytes(to_bytes(from_bytes(path.read_bytes()), {"avmsf": words}))
+    with raises(FieldFileError, file="plate.safetensors"):
+        load(path)
+
+
+def put(record: dict, keys: tuple[str, ...], value: object) -> None:
+    for key in keys[:-1]:
+        record = record[key]
+    record[keys[-1]] = value
+
+
+def test_what_could_not_be_read_back_is_not_written(tmp_path):
+    path = tmp_path / "plate.safetensors"
+    bank = replace(field().bank, damping=-field().bank.damping)
+    with raises(FieldFileError, file=path, name="bank.damping"):
+        save(replace(field(), bank=bank), path)
+    for broken in (float("nan"), torch.ones(1)):
+        origin = replace(field().origin, report={"loss": broken})
+        with raises(FieldFileError, file=path, name="origin.report"):
+            save(replace(field(), origin=origin), path)
+    assert not path.exists()
+
+
+def test_an_origin_that_says_nothing_is_kept(tmp_path):
+    save(replace(field(), origin=Origin()), tmp_path / "plate")
+    assert load(tmp_path / "plate").origin == Origin()

@@ -1,0 +1,300 @@
+"""What holds of every gain field, whatever it is made of: the contract of `GainField`."""
+
+import json
+from copy import deepcopy
+from functools import cache
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import load as from_bytes
+from safetensors.torch import save as to_bytes
+
+from avmsf.errors import FieldFileError
+from avmsf.evaluation.renderer import Renderer
+from avmsf.field.attention import AttentionGains
+from avmsf.field.gain_field import GainField, Gains
+from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.refinement import RefinedGains
+from avmsf.field.scaled_gains import ScaledGains
+from avmsf.field.sound_field import Origin, SoundField
+from avmsf.field.store import load, save
+from avmsf.modal.residual_noise import Residual
+from factories.made_fields import BANK, FIELDS, SIDES, blows, places
+from factories.raising import raises
+
+FACTORS = torch.tensor([2.0, -0.5, 1.5, 0.25, 3.0], dtype=torch.float64)
+SCALED = {
+    f"scaled {name}": cache(lambda name=name: ScaledGains(FIELDS[name](), FACTORS))
+    for name in ("attention with dampings", "positional", "elastic", "body")
+}
+"""Of every kind that can be inside; other sizes have tests of their own, for these objects have the same."""
+ALL = {**FIELDS, **SCALED}
+MODES = len(BANK)
+PLACES = places(7, seed=8)
+BLOWS = blows(PLACES, seed=9)
+PHASE = torch.tensor([0.0, 0.4, -1.2, 3.0, 1.6], dtype=torch.float64)
+
+every_field = pytest.mark.parametrize("name", ALL)
+every_kind = pytest.mark.parametrize(
+    "name", ["attention", "positional", "elastic", "body", "scaled elastic", "scaled body"]
+)
+DIRECTIONAL = ("directional", "elastic", "scaled elastic", "body", "scaled body")
+"""Fields that know directions of impacts."""
+REAL = ("attention", "attention with dampings", "scaled attention with dampings", "body", "scaled body")
+"""Fields without a quadrature and without a standard deviation."""
+
+
+def sound_field(gains: GainField, *, noise: float = 0.0) -> SoundField:
+    return SoundField(BANK, gains, PHASE, Residual(torch.full((9,), noise)), 8000.0, 600, Origin("plate"))
+
+
+def parts(field: GainField, contacts: torch.Tensor, directions: torch.Tensor | None = None) -> list[torch.Tensor]:
+    """Return all that a field knows at contacts."""
+    known = field.at(contacts, directions)
+    said = [known.mean, known.quadrature, known.damping, field.deviation(contacts, directions)]
+    return [each for each in said if each is not None]
+
+
+def expect_close(found: list[torch.Tensor], expected: list[torch.Tensor], *, within: float = 1e-5) -> None:
+    """Compare to the rounding of float32 sums, which other orders of the same sums have."""
+    assert len(found) == len(expected)
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=within, atol=within * float(other.abs().max()))
+
+
+def test_power_is_the_same_whatever_the_phase():
+    size, turn = torch.tensor([[1.0, 2.0, 0.5]]), torch.tensor([0.3, -1.1, 2.0])
+    turned = Gains(size * torch.cos(turn), size * torch.sin(turn))
+    # The rounding of float32 amplitudes.
+    torch.testing.assert_close(turned.power, size.double().square(), rtol=1e-6, atol=0)
+    torch.testing.assert_close(Gains(-size).power, size.double().square())
+
+
+@every_field
+def test_gains_are_a_number_a_contact_and_mode(name):
+    field = ALL[name]()
+    assert isinstance(field, GainField)
+    for count in (7, 1, 0):
+        known = field.at(PLACES[:count], BLOWS[:count])
+        for each in (known.mean, known.quadrature, known.damping):
+            assert each is None or (each.shape, each.dtype) == ((count, MODES), torch.float32)
+        deviation = field.deviation(PLACES[:count], BLOWS[:count])
+        assert deviation is None or (deviation.shape, deviation.dtype) == ((count, MODES, 2), torch.float32)
+    assert all(bool(torch.isfinite(each).all()) for each in parts(field, PLACES, BLOWS))
+    assert known.damping is None or float(field.at(PLACES).damping.min()) > 0
+    assert (deviation is None) == (name in REAL)
+    assert deviation is None or float(field.deviation(PLACES).min()) > 0
+    # They vary over the object, or nothing below would be seen.
+    assert float(field.at(PLACES).mean.std(0).max()) > 0
+
+
+@every_field
+def test_points_are_on_the_object(name):
+    points = ALL[name]().points
+    assert points.shape == (150, 3)
+    assert points.dtype == torch.float32
+    assert bool((points.abs() <= torch.tensor(SIDES) / 2 + 1e-6).all())
+
+
+@every_field
+@pytest.mark.parametrize("rows", [[0], [6, 2], [6, 5, 4, 3, 2, 1, 0], [3, 3, 3]])
+def test_a_contacts_gains_do_not_depend_on_the_others(name, rows):
+    field = ALL[name]()
+    together = [each[rows] for each in parts(field, PLACES, BLOWS)]
+    expect_close(parts(field, PLACES[rows], BLOWS[rows]), together)
+
+
+@every_field
+def test_contacts_in_float32_and_float64_are_the_same_places(name):
+    field = ALL[name]()
+    assert PLACES.dtype == torch.float64
+    single, double = (parts(field, contacts) for contacts in (PLACES.float(), PLACES))
+    assert all(torch.equal(*each) for each in zip(single, double, strict=True))
+
+
+@every_field
+def test_an_impact_from_the_other_side_has_opposite_gains_or_its_direction_is_not_used(name):
+    field = ALL[name]()
+    here, there = field.at(PLACES, BLOWS), field.at(PLACES, -BLOWS)
+    sign = -1.0 if name in DIRECTIONAL else 1.0
+    assert torch.equal(there.mean, sign * here.mean)
+    if here.quadrature is not None:
+        assert torch.equal(there.quadrature, sign * here.quadrature)
+    deviations = [field.deviation(PLACES, directions) for directions in (BLOWS, -BLOWS)]
+    assert deviations == [None, None] or torch.equal(*deviations)
+
+
+@every_field
+def test_without_a_direction_an_impact_goes_straight_into_the_body_or_as_its_neighbor(name):
+    field = ALL[name]()
+    contacts = field.points[:7]
+    assumed = torch.zeros_like(contacts)
+    assumed[:, 2] = -contacts[:, 2].sign()
+    if name == "directional":
+        near = torch.cdist(contacts.double(), field.training.points).argmin(1)
+        assumed = field.training.directions[near]
+    expect_close(parts(field, contacts), parts(field, contacts, assumed))
+    expect_close(parts(field, contacts, torch.zeros(7, 3)), parts(field, contacts))
+    askew = field.at(contacts, BLOWS).mean
+    assert torch.equal(askew, field.at(contacts).mean) == (name not in DIRECTIONAL)
+
+
+@pytest.mark.parametrize("name", [name for name in FIELDS if name != "body"])
+def test_modes_put_in_another_order_are_the_same_modes(name):
+    order, field = torch.tensor([2, 4, 0, 3, 1]), FIELDS[name]()
+    if isinstance(field, AttentionGains):
+        trainable = deepcopy(field)
+    else:
+        count = len(field.contacts)
+        trainable = RefinedGains(field, BANK, used=torch.arange(count), training=count)
+    moved = trainable.finished(order)
+    expect_close(parts(moved, PLACES, BLOWS), [each[:, order] for each in parts(field, PLACES, BLOWS)])
+    assert moved.record() == field.record()
+
+
+@every_field
+def test_a_skeleton_has_the_form_of_the_tensors_and_takes_no_memory(name):
+    field = ALL[name]()
+    record = json.loads(json.dumps(field.record(), allow_nan=False))
+    assert record == field.record()
+    assert record["modes"] == MODES
+    skeleton, tensors = field.skeleton(record), field.tensors()
+    assert {each.device.type for each in skeleton.values()} == {"meta"}
+    forms = [{key: (each.shape, each.dtype) for key, each in named.items()} for named in (skeleton, tensors)]
+    assert forms[0] == forms[1]
+    assert all(bool(torch.isfinite(each).all()) for each in tensors.values())
+
+
+@every_field
+def test_a_field_comes_back_from_its_file_to_the_last_bit(name, tmp_path):
+    field = ALL[name]()
+    saved = sound_field(field, noise=0.01)
+    save(saved, tmp_path / "one")
+    loaded = load(tmp_path / "one")
+    assert type(loaded.gain_field) is type(saved.gain_field)
+    assert loaded.gain_field.record() == saved.gain_field.record()
+    assert torch.equal(loaded.gain_field.points, saved.gain_field.points)
+    for directions in (None, BLOWS):
+        said = zip(*(parts(each.gain_field, PLACES, directions) for each in (loaded, saved)), strict=True)
+        assert all(torch.equal(*each) for each in said)
+        sounds = [each.render(PLACES, directions=directions) for each in (loaded, saved)]
+        assert torch.equal(*sounds)
+    if isinstance(field, MixtureGains):
+        assert torch.equal(loaded.gain_field.standardized_errors(), field.standardized_errors())
+    save(loaded, tmp_path / "two")
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
+
+
+@every_field
+def test_a_sound_is_the_sum_of_damped_sines_and_cosines(name):
+    field = ALL[name]()
+    known, times = field.point_estimate(PLACES, BLOWS), torch.arange(600, dtype=torch.float64) / 8000.0
+    ahead = torch.zeros_like(known.mean) if known.quadrature is None else known.quadrature
+    factors = torch.ones_like(known.mean) if known.damping is None else known.damping
+    assert (float(ahead.abs().max()) > 0) == (name not in REAL)
+    expected = torch.zeros(7, 600, dtype=torch.float64)
+    for mode in range(MODES):
+        angle = 2 * torch.pi * BANK.frequency[mode] * times + PHASE[mode]
+        decay = torch.exp(-BANK.damping[mode] * factors[:, mode, None].double() * times)
+        waves = known.mean[:, mode, None] * torch.sin(angle) + ahead[:, mode, None] * torch.cos(angle)
+        expected += decay * waves
+    renderer = sound_field(field)
+    assert isinstance(renderer, Renderer)
+    sounds = renderer.render(PLACES, directions=BLOWS)
+    # Float32 sums: a millionth of the loudest sample.
+    torch.testing.assert_close(sounds.double(), expected, rtol=0, atol=1e-6 * float(expected.abs().max()))
+    assert torch.equal(renderer.gains(PLACES, directions=BLOWS), known.mean)
+    poles = -BANK.damping * factors.double() + 2j * torch.pi * BANK.frequency
+    amplitudes = renderer.complex_gains(PLACES, directions=BLOWS)
+    phasors = (amplitudes[..., None] * torch.exp(poles[..., None] * times)).sum(1)
+    torch.testing.assert_close(phasors.real, expected, rtol=0, atol=1e-6 * float(expected.abs().max()))
+    assert torch.equal(renderer.render(PLACES), sounds) == (name not in DIRECTIONAL)
+
+
+def changed(name: str, folder: Path, tensors: dict[str, torch.Tensor], record: dict) -> Path:
+    """Save a field of this kind, with some of its tensors and of what it says of itself replaced; None takes it out."""
+    path = folder / "plate.safetensors"
+    if not (folder / "whole").exists():
+        save(sound_field(ALL[name]()), folder / "whole")
+    with safe_open(folder / "whole", framework="pt") as file:
+        header = json.loads(file.metadata()["avmsf"])
+    held = from_bytes((folder / "whole").read_bytes())
+    for old, new in ((held, {f"gains.{key}": each for key, each in tensors.items()}), (header, record)):
+        old |= new
+        for key in [key for key, value in new.items() if value is None]:
+            del old[key]
+    path.write_bytes(to_bytes(held, {"avmsf": json.dumps(header)}))
+    return path
+
+
+@every_kind
+def test_a_record_is_refused_where_anything_is_missing_or_wrong(name, tmp_path):
+    field = ALL[name]()
+    whole = {"kind": field.kind, **field.record()}
+    load(changed(name, tmp_path, {}, {"gains": whole}))
+    for key, value in whole.items():
+        # No number of things is a fraction.
+        wrong = {
+            dict: [None, {}],
+            str: [None, 8],
+            bool: [None, 1],
+            int: [None, True, -1, value + 0.5 if isinstance(value, int) else None],
+            float: [None, "eight", -1.0],
+            list: [None, 8, "eight", [*value, 8] if isinstance(value, list) else None],
+        }
+        for other in wrong[type(value)]:
+            with raises(FieldFileError, file="plate.safetensors"):
+                load(changed(name, tmp_path, {}, {"gains": whole | {key: other}}))
+        if key == "spread_share":
+            # Files of earlier versions have none.
+            continue
+        missing = {each: whole[each] for each in whole if each != key}
+        with raises(FieldFileError, file="plate.safetensors", name=key):
+            load(changed(name, tmp_path, {}, {"gains": missing}))
+
+
+@every_kind
+def test_sizes_that_are_not_the_tensors_are_refused(name, tmp_path):
+    field = ALL[name]()
+    whole = {"kind": field.kind, **field.record()}
+    wrong = [{key: whole[key] + 1} for key in ("points", "contacts", "dim", "nodes", "triangles") if key in whole]
+    if "kernels" in whole:
+        wrong.append({"kernels": [1 + each for each in whole["kernels"]]})
+    for body in whole.get("bodies", []):
+        wrong += [{"bodies": [body | {key: size + 1}]} for key, size in body.items()]
+    for each in wrong:
+        with raises(FieldFileError, file="plate.safetensors") as caught:
+            load(changed(name, tmp_path, {}, {"gains": whole | each}))
+        assert caught.value.name is not None
+        assert caught.value.name.startswith("gains.")
+    with raises(FieldFileError, name="gains.modes", value=MODES + 1):
+        load(changed(name, tmp_path, {}, {"gains": whole | {"modes": MODES + 1}}))
+
+
+@every_kind
+def test_damaged_tensors_are_refused_by_name(name, tmp_path):
+    for key, tensor in ALL[name]().tensors().items():
+        with raises(FieldFileError, name=f"gains.{key}", value=[[f"gains.{key}"], []]):
+            load(changed(name, tmp_path, {key: None}, {}))
+        # Not finite, or no whole numbers.
+        with raises(FieldFileError, name=f"gains.{key}"):
+            load(changed(name, tmp_path, {key: tensor * torch.nan}, {}))
+        with raises(FieldFileError, name=f"gains.{key}", value=f"float16{list(tensor.shape)}"):
+            load(changed(name, tmp_path, {key: tensor.half()}, {}))
+    with raises(FieldFileError, name="gains.more", value=[[], ["gains.more"]]):
+        load(changed(name, tmp_path, {"more": torch.ones(3)}, {}))
+
+
+def test_gains_of_other_modes_than_the_banks_are_not_saved(tmp_path):
+    field = FIELDS["positional"]().take(torch.tensor([0, 1, 2]))
+    with raises(FieldFileError, name="gains.modes", value=3):
+        save(sound_field(field), tmp_path / "plate")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_unknown_kind_of_gain_field_is_refused(tmp_path):
+    path = changed("positional", tmp_path, {}, {"gains": {"kind": "wavelets"}})
+    with raises(FieldFileError, file="plate.safetensors", name="gains.kind", value="wavelets"):
+        load(path)

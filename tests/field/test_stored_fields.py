@@ -1,0 +1,87 @@
+"""Fields that earlier versions wrote are read, and sound as they did then."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from avmsf.editing.edits import EDITS
+from avmsf.editing.material import change_material
+from avmsf.editing.material_before import made_of
+from avmsf.editing.modes import adjust_modes
+from avmsf.errors import FieldFileError
+from avmsf.fem.material import GLASS, WOOD
+from avmsf.field import SoundField
+from avmsf.field.header import FORMAT
+from factories.raising import raises
+from factories.stored_fields import fields
+
+FILES = sorted((Path(__file__).parent / "data").glob("format-*/*.safetensors"))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}-{path.stem}")
+def test_a_stored_field_sounds_as_it_did(path):
+    expected = load_file(path.parent / "expected")
+    sounds = SoundField.load(path).render(expected["positions"], samples=200)
+    loudest = float(expected[path.stem].abs().max())
+    # Linear algebra rounds differently on other machines.
+    torch.testing.assert_close(sounds, expected[path.stem], rtol=0, atol=1e-4 * loudest)
+
+
+def test_the_present_format_has_stored_fields_of_all_kinds():
+    assert {path.stem for path in FILES if path.parent.name == f"format-{FORMAT}"} == set(fields())
+
+
+def test_a_stored_alignment_is_read():
+    path = next(path for path in FILES if path.stem == "mixture")
+    alignment = SoundField.load(path).alignment
+    assert alignment is not None
+    assert len(alignment.names) == len(alignment.delays) == 8
+
+
+def test_edits_of_earlier_versions_have_the_present_names(tmp_path):
+    field = adjust_modes(change_material(fields()["mixture"], GLASS, WOOD), pitch=1.1)
+    entries = field.origin.report[EDITS]
+    old = [{**entry, "edit": kind} for entry, kind in zip(entries, ("recast", "retune"), strict=True)]
+    report = {**field.origin.report, EDITS: [*old, {"edit": "steer"}, {"edit": "recast", "to": entries[0]["to"]}]}
+    replace(field, origin=replace(field.origin, report=report)).save(tmp_path / "old.safetensors")
+    assert b"recast" in (tmp_path / "old.safetensors").read_bytes()
+    read = SoundField.load(tmp_path / "old.safetensors")
+    kinds = [entry["edit"] for entry in read.origin.report[EDITS]]
+    assert kinds == ["change_material", "adjust_modes", "guided", "change_material"]
+    assert read.origin.report[EDITS][:2] == entries
+    assert made_of(read, option="--from").material == WOOD
+
+
+@pytest.mark.parametrize(
+    ("entry", "name"),
+    [
+        ("x", "origin.report.edits.0"),
+        ({"a": 1}, "origin.report.edits.0.edit"),
+        ({"edit": "change_material"}, "origin.report.edits.0.to"),
+        ({"edit": "recast", "to": {"name": "wood"}}, "origin.report.edits.0.to.density"),
+        ({"edit": "adjust_modes", "decay": 1.0}, "origin.report.edits.0.pitch"),
+        ({"edit": "adjust_modes", "pitch": 0.0, "decay": 1.0}, "origin.report.edits.0.pitch"),
+        ({"edit": "adjust_modes", "pitch": [1.0], "decay": 1.0}, "origin.report.edits.0.pitch"),
+    ],
+)
+def test_what_is_no_edit_is_refused(entry, name, tmp_path):
+    field = fields()["mixture"]
+    report = {**field.origin.report, EDITS: [entry]}
+    with raises(FieldFileError, name=name):
+        replace(field, origin=replace(field.origin, report=report)).save(tmp_path / "field.safetensors")
+        SoundField.load(tmp_path / "field.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("rows", "name"),
+    [(3, ""), ([[1]], ".0"), ([True], ".0"), ([0, 1.0], ".1"), ([-1], ".0"), ([10_000], ".0")],
+)
+def test_supporting_poles_that_are_no_rows_are_refused(rows, name, tmp_path):
+    field = fields()["mixture"]
+    report = {**field.origin.report, "supporting_poles": rows}
+    with raises(FieldFileError, name=f"origin.report.supporting_poles{name}"):
+        replace(field, origin=replace(field.origin, report=report)).save(tmp_path / "field.safetensors")
+        SoundField.load(tmp_path / "field.safetensors")

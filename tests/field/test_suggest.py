@@ -1,0 +1,234 @@
+"""Where to strike next: against linear algebra written out, and what can be asked for wrongly."""
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any, SupportsIndex
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from avmsf.errors import FitError
+from avmsf.field.gains.elastic import REACH
+from avmsf.field.gains.model import MixtureGains
+from avmsf.field.recipes import SHARED, Attention, gain_case
+from avmsf.field.sound_field import SoundField
+from avmsf.field.suggest import suggest
+from avmsf.field.uncertainty import relative_gain_std
+from factories.believing_field import (
+    BANK,
+    DOWN,
+    ELASTIC,
+    LENGTH,
+    NOISE,
+    PERTURBATION,
+    REMAINDER,
+    SIZE,
+    bar_contacts,
+    bar_points,
+    cosines,
+    drawn_gains,
+    elastic_field,
+    one_hypothesis,
+    positional_field,
+    sound_field,
+)
+from factories.plate_field import QUICK, plate_extraction, plate_features, plate_impacts
+from factories.raising import raises
+
+both_models = pytest.mark.parametrize("made", [elastic_field, positional_field])
+
+
+def of_one_hypothesis(count: int = 5) -> SoundField:
+    contacts = bar_contacts(count)
+    return sound_field(one_hypothesis(contacts, drawn_gains(contacts, seed=1)))
+
+
+def open_variance(field: SoundField, extra: Tensor, points: Tensor) -> Tensor:
+    """Return the energy that is not known at points with `extra` struck too, by the textbook's formula."""
+    gains = field.gain_field
+    assert isinstance(gains, MixtureGains)
+    contacts, values = gains.contacts, torch.view_as_real(gains.values)
+    struck = torch.cat([contacts, extra])
+    total = torch.zeros(len(points), dtype=torch.float64)
+    for mode in range(len(BANK)):
+        shares = 1.0 / (1.0 + (2.0 * torch.log(ELASTIC[mode] / ELASTIC) / PERTURBATION) ** 2)
+        shares = shares / (cosines(contacts).square() @ shares).mean()
+
+        def kernel(one: Tensor, two: Tensor, shares: Tensor = shares) -> Tensor:
+            smooth = torch.exp(-0.5 * (one[:, None] - two).square().sum(2) / (REACH * SIZE) ** 2)
+            return (1 - REMAINDER) * cosines(one) @ torch.diag(shares) @ cosines(two).T + REMAINDER * smooth
+
+        known = kernel(contacts, contacts) + NOISE * torch.eye(len(contacts))
+        scale = torch.einsum("cd,ce,ed->", values[:, mode], torch.linalg.inv(known), values[:, mode])
+        all_of = kernel(struck, struck) + NOISE * torch.eye(len(struck))
+        left = kernel(points, points) - kernel(points, struck) @ torch.linalg.inv(all_of) @ kernel(struck, points)
+        total += scale / len(contacts) * torch.diagonal(left) / (4 * BANK.damping[mode])
+    return total
+
+
+def test_the_expected_error_is_that_of_regression_with_the_contacts_struck() -> None:
+    field = of_one_hypothesis()
+    found = suggest(field, 3)
+    ratio = found.before**2 / float(open_variance(field, found.contacts[:0], found.points).mean())
+    for count, after in enumerate(found.after, 1):
+        expected = float(open_variance(field, found.contacts[:count], found.points).mean())
+        # Shapes are held in float32.
+        assert after**2 == pytest.approx(ratio * expected, rel=1e-4)
+    assert torch.allclose(
+        found.map_after**2, ratio * open_variance(field, found.contacts, found.points), rtol=1e-3, atol=1e-9
+    )
+    assert torch.allclose(
+        found.map_before**2, ratio * open_variance(field, found.contacts[:0], found.points), rtol=1e-3
+    )
+
+
+def test_each_contact_is_the_best_of_all_candidates() -> None:
+    field = of_one_hypothesis()
+    candidates = bar_contacts(12, seed=7)
+    candidates = candidates[((candidates[:, None] - field.gain_field.contacts).norm(dim=2) > 1e-6).all(1)]  # type: ignore[attr-defined]
+    found = suggest(field, 2, candidates=candidates)
+    taken = candidates[:0]
+    for row in found.rows.tolist():
+        errors = [
+            float(open_variance(field, torch.cat([taken, each[None]]), found.points).mean()) for each in candidates
+        ]
+        assert min(range(len(errors)), key=errors.__getitem__) == row
+        taken = torch.cat([taken, candidates[row : row + 1]])
+    assert torch.equal(found.contacts, candidates[found.rows])
+
+
+def test_a_field_that_was_struck_on_one_side_is_to_be_struck_on_the_other() -> None:
+    contacts = bar_contacts(60)
+    contacts = contacts[contacts[:, 0] < 0.3 * LENGTH]
+    for gains in (elastic_field, positional_field):
+        field = sound_field(gains(contacts, drawn_gains(contacts, seed=2)))
+        assert float(suggest(field, 1).contacts[0, 0]) > 0.6 * LENGTH
+
+
+@both_models
+def test_contacts_differ_lie_on_the_object_and_lower_the_error_each(made: type) -> None:
+    contacts = bar_contacts(6)
+    found = suggest(sound_field(made(contacts, drawn_gains(contacts, seed=3))), 8)
+    errors = [found.before, *found.after]
+    assert all(later < earlier for earlier, later in pairwise(errors))
+    assert errors[0] < 1.5
+    both = torch.cat([contacts, found.contacts])
+    assert len(torch.unique(both, dim=0)) == 14
+    assert float((found.contacts[:, None] - bar_points().double()).norm(dim=2).amin(1).max()) < 1e-9
+    assert (found.directions is None) == (made is positional_field)
+    if found.directions is not None:
+        assert torch.allclose(found.directions, DOWN.expand(8, 3))
+
+
+@both_models
+@pytest.mark.parametrize("count", [3, 20])
+def test_what_is_not_known_of_places_has_no_negative_variance(made: type, count: int) -> None:
+    contacts = bar_contacts(count)
+    rows = [*range(count), 0]
+    known = made(contacts[rows], drawn_gains(contacts, seed=4)[rows]).covariances(bar_contacts(40, seed=9), None)
+    for each in known:
+        size = float(torch.diagonal(each.covariance).max())
+        assert each.noise > 0
+        assert torch.allclose(each.covariance, each.covariance.T, atol=1e-9 * size)
+        assert float(torch.linalg.eigvalsh(each.covariance).min()) > -1e-9 * size
+
+
+def test_of_one_hypothesis_the_covariances_are_those_of_the_deviation() -> None:
+    gains = of_one_hypothesis(8).gain_field
+    assert isinstance(gains, MixtureGains)
+    places = bar_contacts(30, seed=5)
+    variances = torch.stack([torch.diagonal(each.covariance) for each in gains.covariances(places, None)], dim=1)
+    torch.testing.assert_close(variances, gains.deviation(places).double().square().sum(2), rtol=1e-4, atol=1e-9)
+
+
+def test_gains_of_unknown_uncertainty_are_refused() -> None:
+    impacts = plate_impacts()
+    modes = plate_extraction(impacts)
+    network = Attention().start(gain_case(impacts, plate_features(), modes, QUICK), SHARED)
+    field = replace(sound_field(network.finished(torch.arange(len(modes.bank)))), bank=modes.bank)
+    with raises(FitError, name="field", value="attention"):
+        suggest(field)
+
+
+ONE = torch.tensor([[0.4, 0.1, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("count", "candidates", "directions", "fault"),
+    [
+        (0, None, None, {"name": "count", "value": 0}),
+        (1, torch.zeros(0, 3), None, {"name": "candidates", "value": 0}),
+        (1, torch.tensor([[0.0, 0, 0], [0.0, float("nan"), 0]]), None, {"name": "candidates", "row": 1}),
+        (1, torch.tensor([[0.4, 0.1, 0.2]]), None, {"name": "candidates", "row": 0, "value": [0.4, 0.1, 0.2]}),
+        (1, ONE, torch.zeros(1, 3), {"name": "directions", "row": 0, "value": [0.0, 0.0, 0.0]}),
+        (1, ONE.expand(2, 3), DOWN.expand(1, 3), {"name": "directions", "value": 1}),
+        (1, None, DOWN.expand(1, 3), {"name": "directions", "value": None}),
+        # One of two has a recording.
+        (2, torch.cat([bar_contacts(1), ONE]), None, {"name": "candidates", "value": 1}),
+        (2, ONE.expand(2, 3), None, {"name": "candidates", "value": 1}),
+    ],
+)
+def test_arguments_that_no_contact_can_be_suggested_for_are_refused(
+    count: int, candidates: Tensor | None, directions: Tensor | None, fault: dict[str, Any]
+) -> None:
+    with raises(FitError, **fault):
+        suggest(of_one_hypothesis(), count, candidates=candidates, directions=directions)
+
+
+@pytest.mark.parametrize("count", [np.array([1, 2]), torch.tensor([1, 2]), True])
+def test_a_count_that_is_no_whole_number_is_refused(count: SupportsIndex) -> None:
+    with raises(FitError, name="count"):
+        suggest(of_one_hypothesis(), count)
+
+
+def test_a_place_that_was_struck_is_not_suggested_again() -> None:
+    contacts = bar_contacts(6)
+    gains = elastic_field(contacts, drawn_gains(contacts, seed=3))
+    with raises(FitError, name="candidates", value=0):
+        suggest(sound_field(gains), 1, candidates=contacts)
+    without = sound_field(gains.without(torch.arange(6) == 4))
+    assert suggest(without, 1, candidates=contacts).rows.tolist() == [4]
+
+
+@both_models
+def test_of_very_many_candidates_some_that_are_far_apart_are_weighed(
+    made: type, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    contacts = bar_contacts(6)
+    field = sound_field(made(contacts, drawn_gains(contacts, seed=3)))
+    candidates = bar_contacts(120, seed=4)
+    whole = suggest(field, 3, candidates=candidates)
+    asked, covariances = [], MixtureGains.covariances
+
+    def counted(gains: MixtureGains, places: Tensor, ways: Tensor | None) -> object:
+        asked.append(len(places))
+        return covariances(gains, places, ways)
+
+    monkeypatch.setattr(MixtureGains, "covariances", counted)
+    monkeypatch.setattr("avmsf.field.suggest.MAX_CANDIDATES", 30)
+    fewer = suggest(field, 3, candidates=candidates, directions=DOWN.expand(120, 3))
+    assert asked == [len(whole.points) + 30]
+    assert torch.equal(fewer.contacts, candidates[fewer.rows])
+    # A quarter of them loses next to nothing.
+    assert fewer.after[-1] < whole.after[-1] + 0.1 * (whole.before - whole.after[-1])
+    with raises(FitError, name="candidates") as caught:
+        suggest(field, 121, candidates=candidates)
+    assert 40 <= caught.value.value <= 120
+    assert len(suggest(field, 40, candidates=candidates).rows) == 40
+
+
+def test_one_place_says_nothing_of_how_gains_vary() -> None:
+    contacts = bar_contacts(1).expand(3, 3)
+    values = drawn_gains(bar_contacts(1), seed=6).expand(3, 4, 2)
+    with raises(FitError, name="field", value=1):
+        suggest(sound_field(positional_field(contacts, values)))
+
+
+def test_errors_are_those_of_the_map_of_uncertainty() -> None:
+    field = of_one_hypothesis()
+    found = suggest(field, 1)
+    # The map is relative to the energy of the mean gains, to which errors add what is not known.
+    doubt = float(relative_gain_std(field, found.points.float()).square().mean())
+    assert found.before**2 == pytest.approx(doubt / (1 + doubt), rel=1e-3)

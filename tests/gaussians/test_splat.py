@@ -1,0 +1,262 @@
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from avmsf.errors import AvmsfWarning, CaptureWarning, SceneError
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.config import SplatConfig
+from avmsf.gaussians.densify import rotation_matrices
+from avmsf.gaussians.fit import SplatProgress, splat
+from avmsf.gaussians.initialize import StartPoints, photographed_colors, starting_cloud
+from avmsf.gaussians.rasterizer.cpu import NumbaRasterizer
+from avmsf.gaussians.ssim import psnr
+from avmsf.gaussians.targets import choose_backdrop, prepare_photographs
+from avmsf.photographs.cameras import View
+from factories.ball_views import MIDDLE, RADIUS, ball_color, ball_view, ball_views
+from factories.raising import raises, warns
+
+QUICK = SplatConfig(steps=60, start_points=400, gaussians=600, densify_every=15)
+NAMES = ("centers", "rotations", "log_scales", "logit_opacities", "harmonics")
+
+
+def _mean_psnr(cloud: GaussianCloud, views: list[View], *, background: float = 0.0) -> float:
+    back = torch.full((3,), background)
+    images = [NumbaRasterizer()(cloud, view.camera, background=back).color for view in views]
+    return sum(psnr(image, view.color) for image, view in zip(images, views, strict=True)) / len(views)
+
+
+def _off_surface(cloud: GaussianCloud) -> torch.Tensor:
+    return ((cloud.centers - torch.tensor(MIDDLE)).norm(dim=1) / RADIUS - 1.0).abs()
+
+
+def _same(one: GaussianCloud, other: GaussianCloud) -> bool:
+    return all(torch.equal(getattr(one, name), getattr(other, name)) for name in NAMES)
+
+
+def _ball_points(count: int) -> torch.Tensor:
+    normals = torch.randn(count, 3, generator=torch.Generator().manual_seed(1))
+    return torch.nn.functional.normalize(normals, dim=1)
+
+
+def test_held_out_views_of_a_ball_are_foretold_and_its_gaussians_lie_on_it() -> None:
+    views = ball_views(30)
+    held, seen = views[::6], [view for place, view in enumerate(views) if place % 6]
+    cloud = splat(seen, replace(QUICK, steps=200, start_points=800, gaussians=1500))
+    # A gray ball of the right outline has 17 dB; 0.5 / 255 of rounding would allow 59.
+    assert _mean_psnr(cloud, held) > 30.0
+    # A Gaussian's middle lies under what it shows by about its width, of a pixel or two; 3 pixels are 14 % here.
+    assert float(_off_surface(cloud).median()) < 0.14
+    # Across the surface they are thin: their shortest axis is the ball's normal.
+    axes = rotation_matrices(cloud.rotations)[torch.arange(len(cloud)), :, cloud.log_scales.argmin(1)]
+    outwards = torch.nn.functional.normalize(cloud.centers - torch.tensor(MIDDLE), dim=1)
+    assert float((axes * outwards).sum(1).abs().median()) > 0.9
+    assert cloud.degree == 2
+    assert not any(getattr(cloud, name).requires_grad for name in NAMES)
+
+
+def test_the_same_seed_gives_the_same_gaussians_and_another_others() -> None:
+    views = ball_views(12)
+    first, second = splat(views, QUICK), splat(views, QUICK)
+    assert _same(first, second)
+    other = splat(views, replace(QUICK, seed=1))
+    assert len(other) != len(first) or not torch.equal(other.centers, first.centers)
+
+
+@pytest.mark.parametrize("background", ["found", "random"])
+def test_an_interrupted_run_goes_on_to_the_same_bits(tmp_path: Path, background: str) -> None:
+    views, place = ball_views(12), tmp_path / "kept" / "splat.ckpt"
+    config = SplatConfig(
+        steps=60, start_points=400, gaussians=600, densify_every=15, background=background, reset_every=15
+    )
+
+    def interrupt(progress: SplatProgress) -> None:
+        # After a split and an opacity reset, and amid the next epoch of views.
+        if progress.step == 40:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        splat(views, config, checkpoint=place, progress=interrupt)
+    steps: list[int] = []
+    resumed = splat(views, config, checkpoint=place, progress=lambda progress: steps.append(progress.step))
+    assert steps == [50, 60]
+    assert _same(resumed, splat(views, config))
+    # The finished run is kept too: what comes after it may fail.
+    assert _same(splat(views, config, checkpoint=place, progress=lambda progress: steps.append(0)), resumed)
+    assert steps == [50, 60]
+    with raises(SceneError, file=place, value=["view, initial point or setting"]):
+        splat(views, replace(config, seed=5), checkpoint=place)
+    with raises(SceneError, file=place, value=["view, initial point or setting"]):
+        splat(views[1:], config, checkpoint=place)
+
+
+def test_a_file_that_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "splat.ckpt").write_text("half of one")
+    with raises(SceneError, file="splat.ckpt", value=None):
+        splat(ball_views(5), QUICK, checkpoint=tmp_path / "splat.ckpt")
+
+
+def test_a_checkpoint_that_cannot_be_written_costs_no_result(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with warns(AvmsfWarning, file="file/splat.ckpt"):
+        cloud = splat(ball_views(5), replace(QUICK, steps=5), checkpoint=tmp_path / "file" / "splat.ckpt")
+    assert len(cloud)
+
+
+def test_progress_tells_what_the_last_step_did() -> None:
+    told: list[SplatProgress] = []
+    views = ball_views(8)
+    splat(views, replace(QUICK, steps=25), progress=told.append)
+    assert [each.step for each in told] == [10, 20, 25]
+    assert all(each.steps == 25 and each.loss > 0 and math.isfinite(each.psnr) for each in told)
+    assert [each.seconds for each in told] == sorted(each.seconds for each in told)
+    assert told[-1].gaussians == len(told[-1].cloud)
+
+
+def test_photographs_without_masks_start_from_points() -> None:
+    views = ball_views(16, masked=False, background=0.6)
+    normals = _ball_points(500)
+    start = StartPoints(torch.tensor(MIDDLE) + RADIUS * normals, ball_color(normals))
+    cloud = splat(views, replace(QUICK, steps=100), start=start)
+    assert _mean_psnr(cloud, views, background=0.6) > 26.0
+    with raises(SceneError, name="views", value=0):
+        splat(views, QUICK)
+
+
+def test_before_random_colors_the_object_alone_is_fitted() -> None:
+    views = []
+    for place, view in enumerate(ball_views(16)):
+        # A background that is another in every view and every pixel, as behind an object that turns.
+        noise = torch.randint(256, (64, 64, 3), generator=torch.Generator().manual_seed(place), dtype=torch.uint8)
+        assert view.mask is not None
+        image = torch.where(view.mask[..., None] > 127, view.image, noise)
+        views.append(View(view.name, image, view.camera, view.mask))
+    assert choose_backdrop(views, QUICK).color is None
+    # Without the loss on the mask, the colors alone must say what is the object.
+    cloud = splat(views, replace(QUICK, steps=120, mask_weight=0.0))
+    assert _mean_psnr(cloud, ball_views(16)) > 24.0
+    inside = [(view.mask > 127, view) for view in views if view.mask is not None]
+    for mask, view in inside[:3]:
+        alpha = NumbaRasterizer()(cloud, view.camera, background=torch.zeros(3)).alpha
+        assert float(alpha[~mask].mean()) < 0.03
+        assert float(alpha[mask].mean()) > 0.95
+
+
+def test_the_backdrop_is_the_plain_color_around_the_object() -> None:
+    found = choose_backdrop(ball_views(4, background=0.6), SplatConfig()).color
+    assert found is not None
+    # 0.6 is 153 of 255.
+    torch.testing.assert_close(found, torch.full((3,), 0.6), rtol=0, atol=1e-6)
+    unmasked = choose_backdrop(ball_views(4, background=0.6, masked=False), SplatConfig()).color
+    assert unmasked is not None
+    torch.testing.assert_close(unmasked, found)
+    given = choose_backdrop(ball_views(4), SplatConfig(background=(0.1, 0.2, 0.3))).color
+    assert given is not None
+    assert given.tolist() == pytest.approx([0.1, 0.2, 0.3])
+    with raises(SceneError, name="background", value="random"):
+        choose_backdrop(ball_views(4, masked=False), SplatConfig(background="random"))
+
+
+def test_views_that_cannot_be_compared_are_passed_over() -> None:
+    views = ball_views(6)
+    empty = replace(views[0], mask=torch.zeros(64, 64, dtype=torch.uint8))
+    backdrop = choose_backdrop(views, replace(QUICK, background="random"))
+    bare = replace(views[1], mask=None)
+    with warns(CaptureWarning, name="masks", value=["01.png"]):
+        kept = prepare_photographs([empty, bare, *views[2:]], backdrop, halvings=1)
+    assert [each.name for each in kept] == ["02.png", "03.png", "04.png", "05.png"]
+    with raises(SceneError, name="views", value=2):
+        prepare_photographs(views[:2], choose_backdrop(views, QUICK), halvings=0)
+
+
+def test_halved_photographs_are_means_that_the_halved_camera_sees() -> None:
+    view = ball_view(ball_views(3, size=65)[1].camera)
+    photograph = prepare_photographs([view] * 3, choose_backdrop([view], QUICK), halvings=2)[0]
+    assert [(camera.width, camera.height) for camera in photograph.cameras] == [(65, 65), (32, 32), (16, 16)]
+    mean = photograph.images[0].double().mean()
+    assert all(float(image.double().mean() - mean) == pytest.approx(0.0, abs=1.0) for image in photograph.images)
+    even = ball_view(ball_views(2)[1].camera)
+    small = prepare_photographs([even] * 3, choose_backdrop([even], QUICK), halvings=1)[0].images[1]
+    blocks = even.image.reshape(32, 2, 32, 2, 3).double().mean((1, 3))
+    # Rounded to a level.
+    assert float((small - blocks).abs().max()) <= 0.5
+    point = torch.tensor([MIDDLE])
+    full, small = (photograph.cameras[level].project(point)[0] / photograph.cameras[level].width for level in (0, 2))
+    torch.testing.assert_close(full, small)
+
+
+def test_gaussians_start_as_wide_as_their_neighbors_are_far() -> None:
+    # On a cubic lattice the three nearest neighbors are one spacing away.
+    axis = torch.arange(5.0) * 0.01
+    points = torch.cartesian_prod(axis, axis, axis)
+    cloud = starting_cloud(StartPoints(points, torch.full((125, 3), 0.25)), degree=1, scale=0.5, opacity=0.3)
+    torch.testing.assert_close(cloud.log_scales.exp(), torch.full((125, 3), 0.005))
+    torch.testing.assert_close(cloud.opacities, torch.full((125,), 0.3))
+    camera = ball_views(1)[0].camera
+    normals = torch.nn.functional.normalize(torch.randn(125, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    normals[0] = torch.tensor([0.0, 0.0, -1.0])
+    start = StartPoints(points, torch.full((125, 3), 0.25), normals)
+    discs = starting_cloud(start, degree=1, scale=0.5, opacity=0.3, flatness=0.2)
+    torch.testing.assert_close(discs.log_scales.exp(), torch.tensor([[0.005, 0.005, 0.001]]).repeat(125, 1))
+    torch.testing.assert_close(rotation_matrices(discs.rotations)[:, :, 2], normals)
+    # One of them alone, seen half a pixel off its middle both ways, has 5 mm at .3 m and the rasterizer's blur of .3
+    # square pixels for its variance.
+    alone = replace(cloud.take(torch.tensor([62])), centers=torch.tensor([MIDDLE]))
+    shown = NumbaRasterizer()(alone, camera, background=torch.zeros(3)).color[32, 32]
+    expected = 0.3 * 0.25 * math.exp(-0.25 / ((0.005 / 0.3 * 128) ** 2 + 0.3))
+    torch.testing.assert_close(shown, torch.full((3,), expected), rtol=1e-3, atol=0)
+
+
+def test_points_take_the_colors_that_photographs_show_of_their_side() -> None:
+    normals = _ball_points(2000)
+    points = torch.tensor(MIDDLE) + RADIUS * normals
+    found = photographed_colors(points, ball_views(24), spacing=2.0 * RADIUS / 2000**0.5)
+    # Depth cells and pixels of .3 / 128 m blur colors that change by 1.8 a radius at most.
+    assert float((found - ball_color(normals)).abs().median()) < 0.05
+    away = photographed_colors(torch.tensor([[9.0, 9.0, 9.0]]), ball_views(3), spacing=0.01)
+    assert away.tolist() == [[0.5, 0.5, 0.5]]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("steps", 0),
+        ("center_rate", 0.0),
+        ("start_opacity", 1.0),
+        ("densify_until", 1.5),
+        ("gaussians", 5),
+        ("background", (0.0, 0.0, 255.0)),
+        ("seed", 2**63),
+    ],
+)
+def test_settings_without_a_meaning_are_refused(name: str, value: Any) -> None:
+    with raises(SceneError, name=name, value=value):
+        SplatConfig(**{name: value})
+
+
+def test_points_that_nothing_can_start_at_are_refused() -> None:
+    with raises(SceneError, name="points", value=2):
+        StartPoints(torch.zeros(2, 3), torch.zeros(2, 3))
+    with raises(SceneError, name="points", value=9):
+        StartPoints(torch.full((9, 3), torch.nan), torch.zeros(9, 3))
+    with raises(SceneError, name="points", value=9):
+        starting_cloud(StartPoints(torch.zeros(9, 3), torch.zeros(9, 3)), degree=0, scale=1.0, opacity=0.5)
+
+
+def test_a_run_that_diverges_says_which_rates_to_lower() -> None:
+    with raises(SceneError) as caught:
+        splat(ball_views(5), replace(QUICK, center_rate=1e20, color_rate=1e30))
+    assert caught.value.name in ("loss", "gaussians")
+
+
+def test_clouds_move_join_and_part() -> None:
+    cloud = starting_cloud(StartPoints(_ball_points(20), torch.rand(20, 3)), degree=1, scale=1.0, opacity=0.5)
+    both = cloud.join(cloud.take(torch.arange(5)))
+    assert len(both) == 25
+    assert _same(both.take(torch.arange(20, 25)), cloud.take(torch.arange(5)))
+    assert _same(cloud.to("cpu").detach(), cloud)
+    np.testing.assert_allclose(cloud.opacities.numpy(), 0.5)

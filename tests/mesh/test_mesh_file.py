@@ -1,0 +1,203 @@
+"""What `load_mesh` returns has indices that exist and finite coordinates; what is beyond its bounds is refused."""
+
+import json
+import logging
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from avmsf._utils.text_files import MAX_TEXT_BYTES
+from avmsf.errors import CaptureError
+from avmsf.mesh import read_surface
+from avmsf.mesh.io import MAX_GLTF_BYTES, load_mesh
+from avmsf.mesh.textured_mesh import read_textured_mesh
+from factories.raising import raises
+
+PLY = (
+    "ply\nformat ascii 1.0\nelement vertex 3\nproperty double x\nproperty double y\nproperty double z\n"
+    "element face 1\nproperty list uchar int vertex_indices\nend_header\n{x} 0 0\n1 0 0\n0 1 0\n3 0 1 {row}\n"
+)
+
+
+def glb(record: dict, binary: bytes = bytes(36)) -> bytes:
+    text = json.dumps({"asset": {"version": "2.0"}, "scene": 0, **record}).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def triangle(*, nodes: int = 1, count: int = 3, matrix: list[float] | None = None) -> bytes:
+    corners = np.eye(3, dtype="<f4").tobytes()
+    node = {"mesh": 0} if matrix is None else {"mesh": 0, "matrix": matrix}
+    accessor = {"componentType": 5126, "count": count, "type": "VEC3"}
+    return glb(
+        {
+            "scenes": [{"nodes": list(range(nodes))}],
+            "nodes": [node] * nodes,
+            "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "mode": 4}]}],
+            "accessors": [accessor if count > 3 else accessor | {"bufferView": 0}],
+            "bufferViews": [{"buffer": 0, "byteLength": 36}],
+            "buffers": [{"byteLength": 36}],
+        },
+        corners,
+    )
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply", "glb", "stl", "off"])
+def test_every_format_gives_the_same_triangles(tmp_path: Path, suffix: str) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.25)
+    ball.export(tmp_path / f"ball.{suffix}")
+    surface = read_surface(tmp_path / f"ball.{suffix}")
+    corners = surface.vertices[surface.faces]
+    assert surface.faces.shape == (len(ball.faces), 3)
+    torch.testing.assert_close(corners, torch.tensor(np.array(ball.triangles)).float(), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("row", [3, 99, -1])
+@pytest.mark.parametrize("read", [read_surface, read_textured_mesh])
+def test_faces_that_name_no_vertex_are_refused(tmp_path: Path, row: int, read) -> None:
+    path = tmp_path / "surface.ply"
+    path.write_text(PLY.format(x=0, row=row))
+    with raises(CaptureError, file="surface.ply", name="faces", value=row):
+        read(path)
+
+
+@pytest.mark.parametrize(("x", "name"), [("nan", "vertices"), ("inf", "vertices"), ("1e200", "coordinates")])
+def test_coordinates_that_are_not_finite_are_refused(tmp_path: Path, x: str, name: str) -> None:
+    path = tmp_path / "surface.ply"
+    path.write_text(PLY.format(x=x, row=2))
+    with raises(CaptureError, file="surface.ply", name=name):
+        read_surface(path)
+
+
+def test_vertices_in_a_plane_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "surface.obj").write_text("v 0 0\nv 1 0\nv 0 1\n")
+    with raises(CaptureError, file="surface.obj", name="vertices", value=[3, 2]):
+        load_mesh(tmp_path / "surface.obj")
+
+
+def test_a_part_moved_out_of_the_world_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "surface.glb"
+    path.write_bytes(triangle())
+    assert len(read_surface(path).faces) == 1
+    path.write_bytes(triangle(matrix=[1e30, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]))
+    with raises(CaptureError, file="surface.glb", name="coordinates", value=pytest.approx(1e30)):
+        read_surface(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "counted", "found"),
+    [
+        ("nodes.glb", triangle(nodes=2000), "nodes", 2000),
+        ("empty.glb", triangle(count=100_000_000), "values", 100_000_000),
+        ("face.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf " + b"1 2 3 " * 1000, "corners of a face", 3000),
+        ("materials.obj", b"".join(b"usemtl m%d\nf 1 2 3\n" % number for number in range(1001)), "materials", 1001),
+        ("folded.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf " + b"1 2 \\\n3 " * 1000, "corners of a face", 3000),
+    ],
+)
+def test_counts_in_the_file_are_bounded_before_anything_is_built(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, content: bytes, counted: str, found: int
+) -> None:
+    def build(*_: object, **__: object) -> None:
+        raise AssertionError("built before its counts were looked at")
+
+    (tmp_path / name).write_bytes(content)
+    monkeypatch.setattr(trimesh, "load", build)
+    monkeypatch.setattr(trimesh, "load_scene", build)
+    with raises(CaptureError, file=name, name=counted, value=found):
+        read_surface(tmp_path / name)
+
+
+def test_a_material_may_return_as_often_as_it_likes(tmp_path: Path) -> None:
+    lines = [f"g group {row}\nusemtl {'red' if row % 2 else 'blue'}\nf 1 2 3\n" for row in range(3000)]
+    (tmp_path / "surface.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "".join(lines))
+    assert len(load_mesh(tmp_path / "surface.obj").geometry) == 2
+
+
+def test_buffers_within_a_text_gltf_may_be_larger_than_other_json(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=8, radius=0.25)
+    (content,) = trimesh.exchange.gltf.export_gltf(ball, embed_buffers=True).values()
+    assert len(content) > MAX_TEXT_BYTES
+    (tmp_path / "ball.gltf").write_bytes(content)
+    assert len(read_surface(tmp_path / "ball.gltf").faces) == len(ball.faces)
+    with open(tmp_path / "ball.gltf", "ab") as file:
+        file.truncate(MAX_GLTF_BYTES + 1)
+    with raises(CaptureError, file="ball.gltf", name="bytes", value=MAX_GLTF_BYTES + 1):
+        read_surface(tmp_path / "ball.gltf")
+
+
+def test_an_archive_is_no_mesh(tmp_path: Path) -> None:
+    (tmp_path / "surface.zip").write_bytes(b"PK\x03\x04")
+    with raises(CaptureError, file="surface.zip", name="suffix", value=".zip"):
+        read_surface(tmp_path / "surface.zip")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("v ", "v\t"), ("f ", "f\t"), ("v ", "  v "), ("v ", "\ufeffv "), (" 3\n", " 3 # -x -y\n")],
+    ids=["tab after v", "tab after f", "indented", "byte-order mark", "comment"],
+)
+def test_white_space_of_an_obj_changes_nothing(tmp_path: Path, old: str, new: str) -> None:
+    text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n"
+    (tmp_path / "a.obj").write_text(text.replace(old, new, 1 if new[0] == "\ufeff" else -1), encoding="utf-8")
+    surface = read_surface(tmp_path / "a.obj")
+    assert surface.faces.tolist() == [[0, 1, 2], [0, 1, 3]]
+    assert surface.vertices[:2].tolist() == [[0, 0, 0], [1, 0, 0]]
+
+
+def test_negative_indices_count_back_from_where_they_stand(tmp_path: Path) -> None:
+    blocks = [f"v {row} 0 0\nv {row} 1 0\nv {row} 0 1\nvt 0 0\nf -3/-1 -2/-1 -1/-1\n" for row in range(3)]
+    (tmp_path / "a.obj").write_text("".join(blocks))
+    surface = read_surface(tmp_path / "a.obj")
+    assert surface.vertices[surface.faces][:, :, 0].tolist() == [[row] * 3 for row in range(3)]
+
+
+def test_a_negative_index_before_the_first_vertex_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 -5\n")
+    with raises(CaptureError, file="a.obj", value=-5):
+        read_surface(tmp_path / "a.obj")
+
+
+def test_normalized_integers_are_from_minus_one_to_one(tmp_path: Path) -> None:
+    record = {
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "scale": [0.5, 0.5, 0.5]}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "mode": 4}]}],
+        "accessors": [{"componentType": 5122, "normalized": True, "count": 3, "type": "VEC3", "bufferView": 0}],
+        "bufferViews": [{"buffer": 0, "byteLength": 24, "byteStride": 8}],
+        "buffers": [{"byteLength": 24}],
+        "extensionsRequired": ["KHR_mesh_quantization"],
+    }
+    corners = np.array([[32767, 0, 0, 7], [0, -32768, 0, 7], [0, 0, 16384, 7]], dtype="<i2")
+    (tmp_path / "a.glb").write_bytes(glb(record, corners.tobytes()))
+    vertices = read_surface(tmp_path / "a.glb").vertices
+    torch.testing.assert_close(vertices, 0.5 * torch.diag(torch.tensor([1.0, -1.0, 0.5])), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "word"),
+    [
+        ("a.glb", glb({"extensionsRequired": ["KHR_draco_mesh_compression"]}), "Draco"),
+        ("a.obj", b"v 0,5 0,1 0,2\nv 1,5 0,1 0,2\nv 0,5 1,1 0,2\nf 1 2 3\n", "decimal commas"),
+        ("a.ply", b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "git lfs pull"),
+    ],
+)
+def test_why_a_mesh_cannot_be_read_is_named(tmp_path: Path, name: str, content: bytes, word: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with raises(CaptureError, file=name) as caught:
+        read_surface(tmp_path / name)
+    assert word in str(caught.value)
+
+
+def test_a_missing_texture_of_a_ply_prints_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(logging.root, "handlers", [])
+    text = PLY.format(x=0, row=2).replace("ascii 1.0\n", "ascii 1.0\ncomment TextureFile lost.png\n")
+    (tmp_path / "a.ply").write_text(text)
+    assert len(read_surface(tmp_path / "a.ply").faces) == 1
+    assert capfd.readouterr() == ("", "")

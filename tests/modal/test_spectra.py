@@ -1,0 +1,124 @@
+"""Spectra against direct sums, scipy and closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+import scipy.signal
+import torch
+
+from avmsf.errors import ArrayError
+from avmsf.modal.spectra import envelope, htk_filters, log_mel, magnitude_stft, slaney_filters
+from factories.raising import raises
+
+
+def noise(rows: int, samples: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(rows, samples, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("samples", [1, 40, 200, 203])
+def test_frames_are_direct_sums_over_centered_windows(samples):
+    fft_size, hop = 64, 16
+    sound = noise(1, samples)
+    magnitudes = magnitude_stft(sound, fft_size=fft_size, hop=hop)
+    assert magnitudes.shape == (1, 33, 1 + samples // hop)
+    window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(fft_size) / fft_size)
+    padded = np.pad(sound[0].numpy(), fft_size // 2)
+    for frame in range(magnitudes.shape[2]):
+        direct = np.abs(np.fft.rfft(window * padded[frame * hop : frame * hop + fft_size]))
+        # Rounding of a sum of 64 terms in float64.
+        np.testing.assert_allclose(magnitudes[0, :, frame].numpy(), direct, rtol=0, atol=1e-12)
+
+
+def test_a_steady_sine_reads_a_quarter_of_its_amplitude_times_the_fft_size():
+    fft_size, amplitude, bin_ = 256, 3.0, 20
+    times = torch.arange(2048, dtype=torch.float64)
+    sine = amplitude * torch.sin(2 * math.pi * bin_ / fft_size * times + 0.3)[None]
+    magnitudes = magnitude_stft(sine, fft_size=fft_size, hop=64)
+    # Frames that the silence beyond the ends does not reach; exact, for a Hann window's leakage ends at the next bin.
+    inner = magnitudes[0, :, 4:-4]
+    assert torch.allclose(inner[bin_], torch.tensor(amplitude * fft_size / 4, dtype=torch.float64), rtol=1e-12)
+    assert float(inner[bin_ + 2 :].max()) < 1e-9
+
+
+def test_white_noise_reads_what_the_text_says():
+    fft_size = 256
+    magnitudes = magnitude_stft(2.0 * noise(4, 100_000), fft_size=fft_size, hop=fft_size)
+    mean = float(magnitudes[:, 1:-1, 2:-2].mean())
+    # 197,000 independent Rayleigh variables scatter by 52 % each: three standard errors are .4 %.
+    assert mean == pytest.approx(2.0 * math.sqrt(3 * math.pi * fft_size / 32), rel=0.004)
+
+
+def test_gradients_are_finite_at_silence_and_right_elsewhere():
+    silent = torch.zeros(2, 100, requires_grad=True)
+    filters = htk_filters(8, fft_size=32, sample_rate=8000.0, lowest=0.0, highest=4000.0).float()
+    total = magnitude_stft(silent, fft_size=32, hop=8).sum() + envelope(silent).sum()
+    (total + log_mel(silent, filters, fft_size=32, hop=8, floor=1e-5).sum()).backward()
+    assert silent.grad is not None
+    assert torch.isfinite(silent.grad).all()
+    sound = noise(1, 40).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: magnitude_stft(x, fft_size=16, hop=4), sound)
+    assert torch.autograd.gradcheck(envelope, sound)
+
+
+@pytest.mark.parametrize("samples", [1, 2, 99, 100])
+def test_envelope_is_scipys(samples):
+    sound = noise(3, samples)
+    expected = np.abs(scipy.signal.hilbert(sound.numpy(), axis=1))
+    np.testing.assert_allclose(envelope(sound).numpy(), expected, rtol=0, atol=1e-13)
+
+
+def test_envelope_of_a_decaying_sine_is_its_decay():
+    rate, damping = 48000.0, 30.0
+    times = torch.arange(round(rate), dtype=torch.float64) / rate
+    decay = torch.exp(-damping * times)
+    found = envelope((decay * torch.sin(2 * math.pi * 2000.0 * times))[None])[0]
+    # From 10 to 50 ms: the onset's own trace in the analytic signal falls only as 1 / t, slower than the sound.
+    inner = slice(480, 2400)
+    assert float(((found - decay).abs() / decay)[inner].max()) < 0.02
+
+
+def test_htk_filters_peak_at_even_mels_and_sum_to_one():
+    sample_rate, fft_size = 16000.0, 4096
+    filters = htk_filters(20, fft_size=fft_size, sample_rate=sample_rate, lowest=100.0, highest=7000.0)
+    bins = np.arange(fft_size // 2 + 1) * sample_rate / fft_size
+    mel = 2595 * np.log10(1 + bins[filters.argmax(dim=1).numpy()] / 700)
+    low, high = (2595 * math.log10(1 + f / 700) for f in (100.0, 7000.0))
+    step = (high - low) / 21
+    # A peak is on the bin next to its edge: within half of 3.9 Hz, at most 3 mel at the lowest filter.
+    np.testing.assert_allclose(mel, low + step * np.arange(1, 21), atol=3.0)
+    # Neighboring triangles of height one over common edges add up to one between the first and the last peak.
+    between = (bins > bins[filters[0].argmax()] + 4) & (bins < bins[filters[-1].argmax()] - 4)
+    np.testing.assert_allclose(filters.sum(dim=0).numpy()[between], 1.0, atol=1e-12)
+    assert float(filters[:, bins < 100].abs().sum()) == 0.0
+    assert float(filters[:, bins > 7000].abs().sum()) == 0.0
+
+
+def test_slaney_filters_have_unit_area_and_his_edges():
+    sample_rate, fft_size = 22050.0, 16384
+    filters = slaney_filters(40, fft_size=fft_size, sample_rate=sample_rate, lowest=200.0 / 3.0, highest=6400.0)
+    width = sample_rate / fft_size
+    # A sum over bins of 1.3 Hz for the area of a triangle 133 Hz wide or wider.
+    np.testing.assert_allclose(filters.sum(dim=1).numpy() * width, 1.0, atol=1e-3)
+    # From mel 1 to mel 42 (6400 Hz is 15 + 27) in 41 steps of one: peaks at 2, 3, ... 41 mel, seen to a bin.
+    mels = np.arange(2, 42)
+    peaks = np.where(mels < 15, mels * 200 / 3, 1000 * 6.4 ** ((mels - 15) / 27))
+    np.testing.assert_allclose(filters.argmax(dim=1).numpy() * width, peaks, atol=width)
+
+
+def test_log_mel_is_a_logarithm_above_its_floor():
+    filters = htk_filters(10, fft_size=128, sample_rate=8000.0, lowest=0.0, highest=4000.0)
+    sound = noise(1, 2000)
+    once = log_mel(sound, filters, fft_size=128, hop=32, floor=1e-9)
+    tenfold = log_mel(10 * sound, filters, fft_size=128, hop=32, floor=1e-9)
+    assert torch.allclose(tenfold - once, torch.tensor(math.log(10), dtype=torch.float64), atol=1e-12)
+    silent = log_mel(0 * sound, filters, fft_size=128, hop=32, floor=1e-5)
+    assert torch.allclose(silent, torch.tensor(math.log(1e-5), dtype=torch.float64), atol=1e-12)
+
+
+@pytest.mark.parametrize("make", [htk_filters, slaney_filters])
+def test_filters_refuse_a_band_or_a_count_that_the_fft_cannot_give(make):
+    with raises(ArrayError, name="highest"):
+        make(10, fft_size=512, sample_rate=8000.0, lowest=0.0, highest=5000.0)
+    with raises(ArrayError, name="count"):
+        make(80, fft_size=128, sample_rate=44100.0, lowest=0.0, highest=22050.0)

@@ -1,0 +1,398 @@
+"""Meshes read and rendered, against closed forms and against the files' own colors."""
+
+import math
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+from avmsf.errors import CaptureError, CaptureWarning
+from avmsf.mesh import Surface
+from avmsf.mesh.textured_mesh import GRAY, TexturedMesh, read_textured_mesh
+from avmsf.photographs.cameras import Camera
+from avmsf.photographs.mesh_views import FOCAL, UNLIT, Lighting, MeshTracer, orbit_cameras, render_views
+from factories.raising import raises, warns
+
+RADIUS, DISTANCE = 0.1, 0.5
+
+
+def sphere(subdivisions: int = 5) -> TexturedMesh:
+    shape = trimesh.creation.icosphere(subdivisions=subdivisions, radius=RADIUS)
+    return TexturedMesh.plain(Surface(torch.tensor(shape.vertices).float(), torch.tensor(shape.faces)))
+
+
+def facing(size: int = 64, *, focal: float = 100.0, distance: float = 1.0) -> Camera:
+    """A camera on the negative z axis that looks along z, with y downwards in its image."""
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[2, 3] = distance
+    return Camera(pose, (focal, focal), (size / 2, size / 2), size, size)
+
+
+def card(texture: np.ndarray, *, half: float = 0.32) -> TexturedMesh:
+    """A square in the plane z = 0 that shows the texture upright to `facing`."""
+    corners = torch.tensor([[-half, -half, 0], [half, -half, 0], [half, half, 0], [-half, half, 0]])
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    # y points down in the image, v up in the texture.
+    places = torch.tensor([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])[faces]
+    return TexturedMesh.build(corners, faces, coordinates=places, textures=[torch.from_numpy(texture)])
+
+
+def noise(size: int) -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (size, size, 3), dtype=np.uint8)
+
+
+def test_a_spheres_silhouette_has_the_area_of_its_cone() -> None:
+    camera = facing(128, focal=250.0, distance=DISTANCE)
+    (view,) = render_views(sphere(), [camera], supersample=4)
+    assert view.coverage is not None
+    # The tangent cone meets the image in a circle of radius f r / sqrt(d^2 - r^2).
+    area = math.pi * 250.0**2 * RADIUS**2 / (DISTANCE**2 - RADIUS**2)
+    # The faces lie inside the sphere by .03 % of its radius; the rays' grid leaves about as much again.
+    assert float(view.coverage.sum()) == pytest.approx(area, rel=2e-3)
+
+
+def test_depth_and_normals_of_a_sphere() -> None:
+    camera = facing(96, focal=200.0, distance=DISTANCE)
+    sight = MeshTracer(sphere()).look(camera)
+    rays = camera.rays()
+    along = rays[..., 2] * DISTANCE
+    under = along.square() - DISTANCE**2 + RADIUS**2
+    hit = sight.faces >= 0
+    assert bool((hit == (under > 0)).float().mean() > 0.998)
+    assert bool(torch.isinf(sight.depth[~hit]).all())
+    clear = hit & (under > 0.1 * RADIUS**2)
+    reach = along - under.clamp(min=0).sqrt()
+    # Facets cut at most 3e-4 of the radius off; at this slant their depth changes by three times that.
+    assert float((sight.depth - reach * rays[..., 2])[clear].abs().max()) < 1e-3 * RADIUS
+    normals = (rays * reach[..., None] - torch.tensor([0.0, 0.0, DISTANCE], dtype=torch.float64)) / RADIUS
+    assert float((sight.normals - normals)[clear].norm(dim=-1).max()) < 0.01
+
+
+def test_an_unlit_picture_of_a_texture_is_the_texture() -> None:
+    texture = noise(64)
+    # One pixel a texel: the ray through a pixel's center meets the texel's center.
+    (view,) = render_views(card(texture), [facing()], lighting=UNLIT, supersample=1)
+    assert np.array_equal(view.image.numpy(), texture)
+    assert view.mask is not None
+    assert bool((view.mask == 255).all())
+
+
+def test_a_checkerboards_fields_are_seen_where_they_lie() -> None:
+    board = np.kron(np.indices((8, 8)).sum(axis=0) % 2, np.ones((16, 16)))[..., None].repeat(3, axis=2) * 255
+    mesh = card(board.astype(np.uint8), half=0.3)
+    camera = Camera.looking(
+        torch.tensor([0.3, 0.2, -1.1]),
+        torch.zeros(3),
+        up=torch.tensor([0.0, -1.0, 0.0]),
+        focal=250.0,
+        width=240,
+        height=200,
+    )
+    (view,) = render_views(mesh, [camera], lighting=UNLIT)
+    centers = (torch.arange(8) + 0.5) * 0.6 / 8 - 0.3
+    for row, y in enumerate(centers.tolist()):
+        for column, x in enumerate(centers.tolist()):
+            pixels, _ = camera.project(torch.tensor([[x, y, 0.0]]))
+            across, down = pixels[0].long().tolist()
+            assert view.image[down, across].tolist() == [255 * ((row + column) % 2)] * 3, (row, column)
+
+
+def test_texels_finer_than_pixels_give_their_mean() -> None:
+    fine = (np.indices((500, 500)).sum(axis=0) % 2 * 255).astype(np.uint8)[..., None].repeat(3, axis=2)
+    (view,) = render_views(card(fine), [facing()], lighting=UNLIT, supersample=1)
+    # 7.8 texels a pixel: without smaller copies, rays would see black, white or what lies between by turns.
+    assert float((view.image[2:-2, 2:-2].float() - 127.5).abs().max()) <= 1
+
+
+def test_textures_repeat() -> None:
+    texture = noise(16)
+    mesh = card(texture)
+    again = TexturedMesh.build(mesh.vertices, mesh.faces, coordinates=4 * mesh.coordinates - 1, textures=mesh.textures)
+    (view,) = render_views(again, [facing()], lighting=UNLIT, supersample=1)
+    assert np.array_equal(view.image.numpy(), np.tile(texture, (4, 4, 1)))
+
+
+def test_colors_between_corners_are_their_mean() -> None:
+    vertices = torch.tensor([[-0.3, -0.3, 0.0], [0.3, -0.3, 0.0], [0.0, 0.3, 0.0]])
+    mesh = TexturedMesh.build(vertices, torch.tensor([[0, 1, 2]]), colors=torch.eye(3)[None])
+    camera = facing(65)
+    (view,) = render_views(mesh, [camera], lighting=UNLIT)
+    pixels, _ = camera.project(vertices.mean(0, keepdim=True))
+    across, down = pixels[0].long().tolist()
+    # A pixel is a 60th of the side: the colors change by 4 from one to the next.
+    assert np.allclose(view.image[down, across].numpy(), 85, atol=4)
+
+
+def test_a_mask_says_how_much_of_a_pixel_is_covered() -> None:
+    # The card's edges lie a third and two thirds into pixels of 0.01 m.
+    vertices = torch.tensor([[-0.1 - 1 / 300, -0.2, 0], [0.1 + 2 / 300, -0.2, 0], [0.1 + 2 / 300, 0.2, 0], [-0.1 - 1 / 300, 0.2, 0]])  # fmt: skip  # noqa: E501
+    mesh = TexturedMesh.build(vertices, torch.tensor([[0, 1, 2], [0, 2, 3]]), colors=torch.full((2, 3, 3), 0.2))
+    (view,) = render_views(mesh, [facing()], lighting=UNLIT, supersample=3, background=(1.0, 0.5, 0.0))
+    assert view.mask is not None
+    assert view.mask[32, 20:24].tolist() == [0, 85, 255, 255]
+    assert view.mask[32, 40:44].tolist() == [255, 255, 170, 0]
+    for column, part in ((20, 0.0), (21, 1 / 3), (30, 1.0), (42, 2 / 3)):
+        expected = [255 * (part * 0.2 + (1 - part) * back) for back in (1.0, 0.5, 0.0)]
+        assert np.allclose(view.image[32, column].numpy(), expected, atol=0.51), column
+
+
+def test_faces_are_as_bright_as_the_part_of_the_sky_that_they_see() -> None:
+    box = trimesh.creation.box((0.2, 0.2, 0.2))
+    mesh = TexturedMesh.plain(Surface(torch.tensor(box.vertices).float(), torch.tensor(box.faces)))
+    light = Lighting(ambient=0.2, sky=0.7, direction=(2.0, -1.0, 2.0))
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            position = torch.zeros(3)
+            position[axis] = sign
+            camera = Camera.looking(
+                position, torch.zeros(3), up=torch.eye(3)[(axis + 1) % 3], focal=100.0, width=32, height=32
+            )
+            (view,) = render_views(mesh, [camera], lighting=light)
+            slant = sign * light.direction[axis] / 3
+            expected = 255 * GRAY * (0.2 + 0.7 * (1 + slant) / 2)
+            assert np.allclose(view.image[16, 16].numpy(), expected, atol=0.51)
+
+
+def test_smooth_where_it_is_round_and_sharp_at_edges() -> None:
+    ball = sphere(3)
+    assert float((ball.normals - ball.vertices[ball.faces] / RADIUS).norm(dim=-1).max()) < 0.01
+    pillar = trimesh.creation.cylinder(radius=1.0, height=2.0, sections=48)
+    mesh = TexturedMesh.plain(Surface(torch.tensor(pillar.vertices).float(), torch.tensor(pillar.faces)))
+    corners = mesh.vertices[mesh.faces]
+    lid = (corners[..., 2].amax(1) - corners[..., 2].amin(1)) < 1e-6
+    assert bool((mesh.normals[lid][..., 2].abs() > 1 - 1e-6).all())
+    # At the rim a side face keeps its own normal, half a section (3.75 degrees) off the corner's direction.
+    outward = corners[~lid][..., :2] / corners[~lid][..., :2].norm(dim=-1, keepdim=True)
+    assert float((mesh.normals[~lid][..., :2] * outward).sum(-1).min()) > math.cos(math.radians(3.76))
+
+
+def test_both_sides_are_seen_and_normals_look_back() -> None:
+    for flip in ([0, 1, 2], [0, 2, 1]):
+        mesh = TexturedMesh.build(torch.tensor([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]]), torch.tensor([flip]))
+        sight = MeshTracer(mesh).look(facing(9))
+        assert sight.normals[4, 4].tolist() == [0, 0, -1]
+        assert sight.depth[4, 4].item() == pytest.approx(1.0, abs=1e-12)
+
+
+def test_no_ray_slips_through_between_faces() -> None:
+    sight = MeshTracer(sphere(4)).look(facing(400, focal=1900.0, distance=DISTANCE))
+    assert bool((sight.faces >= 0).all())
+
+
+def test_a_mesh_far_from_the_origin_is_seen_as_sharply() -> None:
+    near = sphere(3)
+    away = torch.tensor([3000.0, -2000.0, 500.0], dtype=torch.float64)
+    moved = TexturedMesh.plain(Surface(near.vertices, near.faces))
+    object.__setattr__(moved, "vertices", near.vertices.double() + away)
+    camera = facing(48, focal=150.0, distance=DISTANCE)
+    pose = camera.world_to_camera.clone()
+    pose[:3, 3] -= pose[:3, :3] @ away
+    (here,) = render_views(near, [camera])
+    there = MeshTracer(moved).look(Camera(pose, camera.focal, camera.principal, 48, 48))
+    assert here.mask is not None
+    assert bool(((there.faces >= 0) == (here.mask > 127)).float().mean() > 0.99)
+
+
+def test_a_camera_inside_and_one_that_looks_away() -> None:
+    inside = Camera(torch.eye(4, dtype=torch.float64), (20.0, 20.0), (16.0, 16.0), 32, 32)
+    assert bool((MeshTracer(sphere(2)).look(inside).faces >= 0).all())
+    away = Camera(torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)), (20.0, 20.0), (16.0, 16.0), 32, 32)  # fmt: skip  # noqa: E501
+    pose = away.world_to_camera.clone()
+    pose[2, 3] = -1.0
+    (view,) = render_views(sphere(2), [Camera(pose, (20.0, 20.0), (16.0, 16.0), 32, 32)])
+    assert bool((view.image == 255).all())
+    assert view.mask is not None
+    assert not view.mask.any()
+
+
+def test_orbits_are_the_72_views() -> None:
+    ball = sphere(2).surface
+    cameras = orbit_cameras(ball)
+    assert len(cameras) == 72
+    assert {(camera.width, camera.height, camera.focal) for camera in cameras} == {(1024, 1024, (FOCAL, FOCAL))}
+    places = torch.stack([camera.position for camera in cameras])
+    # Five units, of which the half diagonal of the bounding box has 2.25; the box is exact to float32.
+    unit = math.sqrt(3) * RADIUS / 2.25
+    assert places.norm(dim=1).numpy() == pytest.approx(5 * unit, rel=1e-6)
+    heights = torch.rad2deg(torch.asin(places[:, 2] / places.norm(dim=1)))
+    assert heights.reshape(3, 24).numpy() == pytest.approx(np.array([[0.0], [45.0], [-45.0]]).repeat(24, axis=1), abs=1e-4)  # fmt: skip  # noqa: E501
+    for camera in cameras[::7]:
+        pixels, _ = camera.project(torch.zeros(1, 3))
+        assert pixels[0].tolist() == pytest.approx([512, 512], abs=1e-3)
+    small = orbit_cameras(
+        ball, size=256, elevations=(90 - 1e-3, 10.0), azimuths=3, unit=1.0, distance=2.0, up=(0.0, 1.0, 0.0)
+    )
+    assert len(small) == 6
+    assert small[0].focal[0] == FOCAL / 4
+    assert small[0].position.tolist() == pytest.approx([0, 2, 0], abs=1e-3)
+
+
+def test_progress_counts_views() -> None:
+    seen: list[tuple[int, int]] = []
+    views = render_views(
+        sphere(1), orbit_cameras(sphere(1).surface, size=8)[:3], progress=lambda done, total: seen.append((done, total))
+    )
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+    assert [view.name for view in views] == ["view_000", "view_001", "view_002"]
+
+
+@pytest.mark.parametrize("kind", ["obj", "glb"])
+def test_textured_files_look_as_what_they_were_written_from(tmp_path: Path, kind: str) -> None:
+    texture = noise(64)
+    mesh = card(texture)
+    places = mesh.coordinates.reshape(-1, 2).numpy()
+    corners = mesh.vertices[mesh.faces].reshape(-1, 3).numpy()
+    image = Image.fromarray(texture)
+    if kind == "obj":
+        material = trimesh.visual.material.SimpleMaterial(image=image)
+    else:
+        material = trimesh.visual.material.PBRMaterial(baseColorTexture=image)
+    visual = trimesh.visual.TextureVisuals(uv=places, material=material)
+    shape = trimesh.Trimesh(corners, np.arange(6).reshape(2, 3), visual=visual, process=False)
+    (shape if kind == "obj" else trimesh.Scene([shape])).export(tmp_path / f"card.{kind}")
+    read = read_textured_mesh(tmp_path / f"card.{kind}")
+    assert len(read.vertices) == 4
+    (view,) = render_views(read, [facing()], lighting=UNLIT, supersample=1)
+    assert np.array_equal(view.image.numpy(), texture)
+
+
+def test_parts_keep_their_own_textures(tmp_path: Path) -> None:
+    scene = trimesh.Scene()
+    for number, color in enumerate(((255, 0, 0), (0, 0, 255))):
+        # The factor multiplies the image, as glTF says.
+        image = Image.new("RGB", (4, 4), (255, 255, 255))
+        material = trimesh.visual.material.PBRMaterial(baseColorTexture=image, baseColorFactor=[*color, 255])
+        visual = trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), material=material)
+        box = trimesh.Trimesh(*box_arrays(0.1), visual=visual, process=False)
+        scene.add_geometry(box, transform=trimesh.transformations.translation_matrix([0.3 * number - 0.15, 0, 0]))
+    scene.export(tmp_path / "two.glb")
+    read = read_textured_mesh(tmp_path / "two.glb")
+    (view,) = render_views(read, [facing()], lighting=UNLIT)
+    assert view.image[32, 16].tolist() == [255, 0, 0]
+    assert view.image[32, 48].tolist() == [0, 0, 255]
+
+
+def box_arrays(side: float) -> tuple[np.ndarray, np.ndarray]:
+    box = trimesh.creation.box((side, side, side))
+    return np.asarray(box.vertices), np.asarray(box.faces)
+
+
+def test_vertex_and_face_colors_are_read(tmp_path: Path) -> None:
+    vertices, faces = box_arrays(0.2)
+    painted = trimesh.Trimesh(vertices, faces, vertex_colors=np.tile([10, 200, 30, 255], (8, 1)), process=False)
+    painted.export(tmp_path / "vertices.ply")
+    assert np.allclose(read_textured_mesh(tmp_path / "vertices.ply").colors[..., 1], 200 / 255)
+    own = np.arange(12)[:, None] * [20, 1, 0, 0] + [0, 0, 7, 255]
+    trimesh.Trimesh(vertices, faces, face_colors=own, process=False).export(tmp_path / "faces.ply")
+    read = read_textured_mesh(tmp_path / "faces.ply", meters=0.01)
+    assert np.allclose(read.colors[..., 0] * 255, 20 * np.arange(12)[:, None].repeat(3, axis=1), atol=1e-3)
+    assert float(read.vertices.max()) == pytest.approx(1e-3)
+
+
+@pytest.mark.parametrize("kind", ["stl", "ply", "obj"])
+def test_without_colors_a_mesh_is_gray_and_says_so(tmp_path: Path, kind: str) -> None:
+    trimesh.Trimesh(*box_arrays(0.2), process=False).export(tmp_path / f"box.{kind}")
+    with warns(CaptureWarning, file=f"box.{kind}", name="colors"):
+        read = read_textured_mesh(tmp_path / f"box.{kind}")
+    assert bool((read.colors == GRAY).all())
+    assert (len(read.vertices), len(read.faces)) == (8, 12)
+
+
+def write_card(folder: Path, *, image: bytes | None, library: str = "map_Kd skin.png") -> Path:
+    (folder / "card.obj").write_text(
+        "mtllib card.mtl\nusemtl skin\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n"
+    )
+    (folder / "card.mtl").write_text(f"newmtl skin\nKd 0.5 0.25 1\n{library}\n")
+    if image is not None:
+        (folder / "skin.png").write_bytes(image)
+    return folder / "card.obj"
+
+
+def test_a_missing_texture_file_is_named(tmp_path: Path) -> None:
+    with warns(CaptureWarning, file="card.obj", name="texture", value="skin.png"):
+        assert bool((read_textured_mesh(write_card(tmp_path, image=None)).colors == GRAY).all())
+
+
+def test_a_corrupt_texture_file_is_warned_of(tmp_path: Path) -> None:
+    Image.fromarray(noise(64)).save(tmp_path / "whole.png")
+    cut = (tmp_path / "whole.png").read_bytes()[:3000]
+    with warns(CaptureWarning, file="card.obj", name="texture", value=None):
+        assert bool((read_textured_mesh(write_card(tmp_path, image=cut)).colors == GRAY).all())
+
+
+def test_a_material_without_image_has_its_color(tmp_path: Path) -> None:
+    colors = read_textured_mesh(write_card(tmp_path, image=None, library="")).colors
+    assert np.allclose(colors.numpy() * 255, [127, 63, 255], atol=1)
+
+
+def test_bad_meshes_are_refused(tmp_path: Path) -> None:
+    with raises(CaptureError, file="none.obj", name=None):
+        read_textured_mesh(tmp_path / "none.obj")
+    for name, content in (("text.ply", b"ply\nnonsense"), ("noise.glb", bytes(range(200))), ("mesh.docx", b"PK")):
+        (tmp_path / name).write_bytes(content)
+        with raises(CaptureError, file=name):
+            read_textured_mesh(tmp_path / name)
+    (tmp_path / "nan.obj").write_text("v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n")
+    with raises(CaptureError, file="nan.obj", row=1, name="vertices"):
+        read_textured_mesh(tmp_path / "nan.obj")
+    trimesh.PointCloud(np.eye(3)).export(tmp_path / "cloud.ply")
+    with raises(CaptureError, file="cloud.ply", name="faces", value=0):
+        read_textured_mesh(tmp_path / "cloud.ply")
+    with raises(CaptureError, name="faces", value=0):
+        TexturedMesh.plain(Surface(torch.eye(3), torch.zeros(0, 3, dtype=torch.int64)))
+    with raises(CaptureError, name="area", value=0.0):
+        TexturedMesh.build(torch.arange(9.0).reshape(3, 3), torch.tensor([[0, 1, 2]]))
+    with raises(CaptureError, name="faces", value=3):
+        TexturedMesh.build(torch.eye(3), torch.tensor([[0, 1, 3]]))
+
+
+def test_bad_requests_are_refused() -> None:
+    ball = sphere(1)
+    with raises(CaptureError, name="cameras", value=0):
+        render_views(ball, [])
+    with raises(CaptureError, name="supersample", value=0):
+        render_views(ball, [facing(8)], supersample=0)
+    with raises(CaptureError, name="background", value=(255.0, 255.0, 255.0)):
+        render_views(ball, [facing(8)], background=(255.0, 255.0, 255.0))
+    with raises(CaptureError, name="surface", value=0.0):
+        orbit_cameras(Surface(torch.zeros(2, 3), torch.zeros(0, 3, dtype=torch.int64)))
+
+
+REAL = {"mug": False, "bowl": False, "spoon": True, "blue_cup": True, "mini_claw_hammer_1": True, "plate_holder": True}
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_scanned_objects_fill_the_places_of_their_vertices(shared: Path, name: str) -> None:
+    path = shared / "meshes" / name / "textured.obj"
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        mesh = read_textured_mesh(path)
+    # Two of the six come without their image.
+    assert [str(warning.message).count("texture_map.png is missing") for warning in caught] == [1] * (not REAL[name])
+    assert (mesh.textures[0].shape[0] > 1) == REAL[name]
+    cameras = orbit_cameras(mesh.surface, size=128, azimuths=2)
+    for view in render_views(mesh, cameras, supersample=2):
+        assert view.mask is not None
+        pixels, depth = view.camera.project(mesh.vertices)
+        assert bool((depth > 0).all())
+        across, down = pixels.long().clamp(0, 127).T
+        # An outermost vertex may lie in a pixel none of whose four rays meets the mesh.
+        grown = torch.nn.functional.max_pool2d(view.mask[None].float(), 3, stride=1, padding=1)[0]
+        assert float((grown[down, across] > 0).float().mean()) > 0.999
+        rows, columns = view.mask.nonzero().T
+        low, high = pixels.amin(0), pixels.amax(0)
+        assert bool(((columns + 1 >= low[0]) & (columns <= high[0]) & (rows + 1 >= low[1]) & (rows <= high[1])).all())
+
+
+def test_the_blue_cup_is_blue_and_the_spoons_handle_red(shared: Path) -> None:
+    for name, channel in (("blue_cup", 2), ("spoon", 0)):
+        mesh = read_textured_mesh(shared / "meshes" / name / "textured.obj")
+        (view,) = render_views(mesh, orbit_cameras(mesh.surface, size=96)[6:7], lighting=UNLIT)
+        assert view.coverage is not None
+        colors = view.color[view.coverage == 1]
+        assert bool((colors[:, channel] >= colors.amax(dim=1)).float().mean() > 0.4)
+        assert int(colors.mean(0).argmax()) == channel

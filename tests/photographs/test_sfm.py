@@ -1,0 +1,345 @@
+"""Cameras found from pictures alone, against those that took them; and whatever can go wrong on the way."""
+
+import json
+import math
+import subprocess
+import sys
+import textwrap
+import time
+import warnings
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from avmsf.errors import CaptureError, CaptureWarning
+from avmsf.mesh.textured_mesh import TexturedMesh
+from avmsf.photographs import read_views
+from avmsf.photographs.cameras import Camera, View
+from avmsf.photographs.mesh_views import render_views
+from avmsf.photographs.sfm import WORKER, EstimatedCameras, MotionProgress, estimate_cameras
+from avmsf.photographs.similarity import align_similarity, move_views
+from factories.raising import raises
+
+VIEWS, SIZE = 10, 256
+
+
+def scene() -> TexturedMesh:
+    """A hilly ground, 0.4 m wide, with a texture that has details of every size."""
+    rng = np.random.default_rng(3)
+    texture = np.zeros((512, 512, 3), dtype=np.float32)
+    for cells in (4, 8, 16, 32, 64, 128):
+        texture += cv2.resize(rng.normal(size=(cells, cells, 3)).astype(np.float32), (512, 512))
+    side = 21
+    heights = cv2.resize(rng.normal(size=(6, 6)), (side, side), interpolation=cv2.INTER_CUBIC)
+    grid = np.stack(np.meshgrid(np.linspace(0, 1, side), np.linspace(0, 1, side)), axis=-1)
+    vertices = np.concatenate([0.4 * (grid - 0.5), 0.02 * heights[..., None]], axis=-1).reshape(-1, 3)
+    corner = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
+    squares = np.stack([corner, corner + 1, corner + side + 1, corner, corner + side + 1, corner + side], axis=1)
+    faces = squares.reshape(-1, 3)
+    return TexturedMesh.build(
+        torch.from_numpy(vertices),
+        torch.from_numpy(faces),
+        coordinates=torch.from_numpy(grid.reshape(-1, 2)[faces]),
+        textures=[torch.from_numpy(np.clip(128 + 40 * texture, 0, 255).astype(np.uint8))],
+    )
+
+
+def true_views() -> tuple[View, ...]:
+    cameras = []
+    for number in range(VIEWS):
+        azimuth, elevation = math.radians(12 * number), math.radians(50 + 12 * (number % 2))
+        place = 0.5 * torch.tensor(
+            [
+                math.cos(azimuth) * math.cos(elevation),
+                math.sin(azimuth) * math.cos(elevation),
+                math.sin(elevation),
+            ]
+        )
+        cameras.append(
+            Camera.looking(
+                place, torch.zeros(3), up=torch.tensor([0.0, 0.0, 1.0]), focal=1.1 * SIZE, width=SIZE, height=SIZE
+            )
+        )
+    return render_views(scene(), cameras, supersample=2)
+
+
+@pytest.fixture(scope="module")
+def taken() -> tuple[View, ...]:
+    return true_views()
+
+
+@pytest.fixture(scope="module")
+def found(taken: tuple[View, ...], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, EstimatedCameras, list]:
+    """Pictures of the scene, one of them WebP, with one that shows nothing and one that is cut short."""
+    folder = tmp_path_factory.mktemp("scene")
+    fill(folder / "images", taken)
+    (folder / "images/view_004.png").unlink()
+    cv2.imwrite(
+        str(folder / "images/view_004.webp"), taken[4].image.numpy()[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 101]
+    )
+    cv2.imwrite(str(folder / "images/wall.png"), np.full((SIZE, SIZE, 3), 90, dtype=np.uint8))
+    (folder / "images/zero.jpg").write_bytes(b"\xff\xd8\xff")
+    stages: list[MotionProgress] = []
+    with pytest.warns(CaptureWarning) as caught:
+        result = estimate_cameras(
+            folder / "images", folder, features=1024, threads=1, timeout=120.0, progress=stages.append
+        )
+    return folder, result, [*caught, *stages]
+
+
+def fill(folder: Path, views: tuple[View, ...]) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for view in views:
+        cv2.imwrite(str(folder / f"{view.name}.png"), view.image.numpy()[..., ::-1])
+    return folder
+
+
+def test_cameras_agree_with_the_true_ones_up_to_a_similarity(
+    taken: tuple[View, ...], found: tuple[Path, EstimatedCameras, list]
+) -> None:
+    folder, result, _ = found
+    assert len(result.registered) == VIEWS
+    assert "view_004.webp" in result.registered
+    assert result.model == folder / "sparse/0"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CaptureWarning)  # of the two images without cameras
+        views = read_views(folder)
+    places = torch.stack([view.camera.position for view in views])
+    true_places = torch.stack([view.camera.position for view in taken])
+    moved = move_views(views, align_similarity(places, true_places))
+    for view, true in zip(moved, taken, strict=True):
+        # Features are found to a tenth of a pixel, here a 3000th of the distance.
+        assert float((view.camera.position - true.camera.position).norm()) < 0.01 * 0.5
+        turn = view.camera.world_to_camera[:3, :3] @ true.camera.world_to_camera[:3, :3].T
+        assert math.degrees(math.acos(min(1.0, (float(turn.trace()) - 1) / 2))) < 0.5
+    assert result.error < 1
+    assert result.points > 200
+
+
+def test_images_without_a_camera_are_named(found: tuple[Path, EstimatedCameras, list]) -> None:
+    _, result, reports = found
+    assert result.missing == ("wall.png", "zero.jpg")
+    given = [report.message for report in reports if isinstance(report, warnings.WarningMessage)]
+    remarks = {each.name: each.value for each in given if isinstance(each, CaptureWarning)}
+    assert remarks == {"unreadable images": ["zero.jpg"], "cameras": ["wall.png"]}
+
+
+def test_progress_tells_the_stages(found: tuple[Path, EstimatedCameras, list]) -> None:
+    stages = [report for report in found[2] if isinstance(report, MotionProgress)]
+    names = list(dict.fromkeys(stage.stage for stage in stages))
+    # A stage shorter than the time between two checks is not reported.
+    assert set(names) <= {"starting", "features", "matches", "cameras"}
+    assert "features" in names
+    assert max(stage.done for stage in stages if stage.stage == "features") > 0
+    assert [stage.seconds for stage in stages] == sorted(stage.seconds for stage in stages)
+
+
+def test_only_the_model_is_left(found: tuple[Path, EstimatedCameras, list]) -> None:
+    folder, _, _ = found
+    assert sorted(path.name for path in folder.iterdir()) == ["images", "sparse"]
+    assert {"cameras.bin", "images.bin", "points3D.bin"} <= {path.name for path in (folder / "sparse/0").iterdir()}
+
+
+def test_cameras_that_are_there_are_not_overwritten(found: tuple[Path, EstimatedCameras, list]) -> None:
+    folder, _, _ = found
+    with raises(CaptureError, file="sparse/0"):
+        estimate_cameras(folder / "images", folder)
+
+
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_bytes_and_masks_count(taken: tuple[View, ...], tmp_path: Path) -> None:
+    contents = []
+    for name in ("one", "two", "masked"):
+        fill(tmp_path / name / "images", taken[:4])
+        if name == "masked":
+            mask = np.zeros((SIZE, SIZE), dtype=np.uint8)
+            mask[:, : SIZE // 2] = 255
+            (tmp_path / name / "masks").mkdir()
+            for view in taken[:4]:
+                cv2.imwrite(str(tmp_path / name / "masks" / f"{view.name}.png"), mask)
+        estimate_cameras(tmp_path / name / "images", tmp_path / name, features=512, threads=1, seed=5)
+        contents.append((tmp_path / name / "sparse/0/images.bin").read_bytes())
+    assert contents[0] == contents[1]
+    # Each feature is 24 bytes, x and y in float64 first, behind the image's 64 bytes, name and count.
+    for content, most in ((contents[0], SIZE), (contents[2], SIZE // 2)):
+        start = content.index(b".png\0") + len(b".png\0")
+        count = int.from_bytes(content[start : start + 8], "little")
+        rows = np.frombuffer(content[start + 8 : start + 8 + 24 * count], dtype=np.dtype("<f8, <f8, <u8"))
+        assert count > 50
+        assert most - 30 < rows["f0"].max() < most + 1
+
+
+def pretend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str) -> None:
+    """Let another script do the worker's part."""
+    path = tmp_path / "pretended.py"
+    path.write_text("import json, os, pathlib, subprocess, sys, time\n" + textwrap.dedent(script))
+    monkeypatch.setattr("avmsf.photographs.sfm.WORKER", path)
+
+
+def write_models(*groups: tuple[str, ...]) -> str:
+    return f"""
+        folder = pathlib.Path(json.loads(pathlib.Path(sys.argv[1]).read_text())["folder"])
+        models = []
+        for number, names in enumerate({groups!r}):
+            (folder / "models" / str(number)).mkdir(parents=True)
+            (folder / "models" / str(number) / "names").write_text(" ".join(names))
+            models.append(dict(number=number, names=names, points=7, error=0.5))
+        (folder / "result.json").write_text(json.dumps(models))
+    """
+
+
+def pictures(folder: Path, names: str) -> Path:
+    (folder / "images").mkdir(parents=True)
+    for name in names:
+        cv2.imwrite(str(folder / "images" / f"{name}.png"), np.zeros((8, 8, 3), dtype=np.uint8))
+    return folder
+
+
+def test_of_several_models_the_largest_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = pictures(tmp_path / "cup", "abcdefgh")
+    pretend(tmp_path, monkeypatch, write_models(("a.png", "b.png", "c.png"), ("c.png", "d.png", "e.png", "f.png")))
+    with pytest.warns(CaptureWarning) as caught:
+        result = estimate_cameras(folder / "images", folder)
+    remarks = {warning.message.name: warning.message.value for warning in caught}
+    assert remarks == {"groups": [["a.png", "b.png"]], "cameras": ["g.png", "h.png"]}
+    assert result.registered == ("c.png", "d.png", "e.png", "f.png")
+    assert (folder / "sparse/0/names").read_text() == "c.png d.png e.png f.png"
+
+
+@pytest.mark.parametrize("groups", [(), (("a.png", "b.png", "c.png"),), (("a.png", "b.png"), ("c.png", "d.png"))])
+def test_too_few_cameras_are_refused_by_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, groups: tuple[tuple[str, ...], ...]
+) -> None:
+    folder = pictures(tmp_path / "cup", "abcdefgh")
+    pretend(tmp_path, monkeypatch, write_models(*groups))
+    registered = groups[0] if groups else ()
+    lacking = [f"{name}.png" for name in "abcdefgh" if f"{name}.png" not in registered]
+    with raises(CaptureError, file="images", name="cameras", value=lacking):
+        estimate_cameras(folder / "images", folder)
+    assert [path.name for path in folder.iterdir()] == ["images"]
+
+
+def test_a_crash_shows_the_workers_last_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = pictures(tmp_path / "cup", "abc")
+    pretend(tmp_path, monkeypatch, 'print("stage matches")\nprint("no memory left", flush=True)\nos.abort()')
+    with raises(CaptureError, name="matches", value="SIGABRT") as caught:
+        estimate_cameras(folder / "images", folder)
+    assert "no memory left" in str(caught.value)
+    pretend(tmp_path, monkeypatch, "raise RuntimeError('odd images')")
+    with raises(CaptureError, name="starting", value="exit status 1") as caught:
+        estimate_cameras(folder / "images", folder)
+    assert "RuntimeError: odd images" in str(caught.value)
+    assert [path.name for path in folder.iterdir()] == ["images"]
+
+
+SLEEP = """
+    print("stage features", flush=True)
+    pathlib.Path(__file__).with_name("pid").write_text(f"{os.getpid()}")
+    time.sleep(60)
+"""
+
+
+def gone(pid: int) -> bool:
+    def alive() -> bool:
+        try:
+            return "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        except (FileNotFoundError, ProcessLookupError):
+            return False
+
+    deadline = time.monotonic() + 10
+    while alive() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return not alive()
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="sees processes through /proc")
+@pytest.mark.parametrize("how", ["time", "interrupt"])
+def test_time_and_interruption_end_the_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
+    folder = pictures(tmp_path / "cup", "abc")
+    pretend(tmp_path, monkeypatch, SLEEP)
+
+    def interrupt(progress: MotionProgress) -> None:
+        if (tmp_path / "pid").exists() and progress.stage == "features":
+            raise KeyboardInterrupt
+
+    if how == "time":
+        with raises(CaptureError, name="features", value=3.0):
+            estimate_cameras(folder / "images", folder, timeout=3.0)
+    else:
+        with pytest.raises(KeyboardInterrupt):
+            estimate_cameras(folder / "images", folder, progress=interrupt)
+    assert gone(int((tmp_path / "pid").read_text()))
+    assert [path.name for path in folder.iterdir()] == ["images"]
+
+
+def test_the_worker_ends_when_its_parent_does(taken: tuple[View, ...], tmp_path: Path) -> None:
+    fill(tmp_path / "images", taken)
+    job = {
+        "folder": str(tmp_path),
+        "names": sorted(path.name for path in (tmp_path / "images").iterdir()),
+        "true_names": {},
+        "masks": False,
+        "seed": 0,
+        "camera_model": "PINHOLE",
+        "shared_camera": True,
+        "features": 8192,
+        "longest": SIZE,
+        "threads": 1,
+        "exhaustive": True,
+    }
+    (tmp_path / "job.json").write_text(json.dumps(job))
+    command = [sys.executable, "-P", str(WORKER), str(tmp_path / "job.json")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as worker:
+        assert worker.stdout is not None
+        assert worker.stdin is not None
+        assert worker.stdout.readline() == b"stage features\n"
+        # What a dying parent leaves behind: its end of the pipe, closed.
+        worker.stdin.close()
+        assert worker.wait(10) == 1
+    assert not (tmp_path / "result.json").exists()
+
+
+def test_only_what_cannot_be_written_is_called_unwritable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = pictures(tmp_path / "cup", "abc")
+    (tmp_path / "file").write_text("")
+    with raises(CaptureError, file="sfm") as caught:
+        estimate_cameras(folder / "images", tmp_path / "file" / "sfm")
+    assert "writable" in str(caught.value)
+
+    def gone(*_: object, **__: object) -> None:
+        raise FileNotFoundError(2, "No such file or directory", str(folder / "images/b.png"))
+
+    monkeypatch.setattr("avmsf.photographs.sfm._stage_image", gone)
+    with raises(CaptureError, file="b.png"):
+        estimate_cameras(folder / "images", folder)
+    monkeypatch.undo()
+
+    def full(*_: object, **__: object) -> None:
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr("avmsf.photographs.sfm.subprocess.Popen", full)
+    with raises(CaptureError, name="starting"):
+        estimate_cameras(folder / "images", folder)
+
+
+def test_what_cannot_begin_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = pictures(tmp_path / "cup", "ab")
+    with raises(CaptureError, file="images", name="photographs", value=2):
+        estimate_cameras(folder / "images", folder)
+    with raises(CaptureError, file="pictures"):
+        estimate_cameras(folder / "pictures", folder)
+    cv2.imwrite(str(folder / "images/c.png"), np.zeros((8, 8, 3), dtype=np.uint8))
+    cv2.imwrite(str(folder / "images/d.png"), np.zeros((8, 12, 3), dtype=np.uint8))
+    with raises(CaptureError, file="images", name="shared_camera", value=["d.png"]):
+        estimate_cameras(folder / "images", folder)
+    with raises(CaptureError, name="camera_model", value="FISHEYE"):
+        estimate_cameras(folder / "images", folder, camera_model="FISHEYE")
+    with raises(CaptureError, name="timeout", value=0.0):
+        estimate_cameras(folder / "images", folder, timeout=0.0)
+    monkeypatch.setattr("avmsf.photographs.sfm.importlib.util.find_spec", lambda _: None)
+    with raises(CaptureError, name="pycolmap"):
+        estimate_cameras(folder / "images", folder)
+    assert sorted(path.name for path in folder.iterdir()) == ["images"]

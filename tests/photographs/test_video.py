@@ -1,0 +1,127 @@
+"""Frames out of videos that the test writes, some of them blurred."""
+
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from avmsf.errors import CaptureError, CaptureWarning
+from avmsf.photographs.video import pick_frames, sharpness
+from factories.raising import raises, warns
+
+SHARP = (2, 11, 13, 21, 28, 30)
+"""Of 36 frames, one in each sixth that is not blurred."""
+
+
+def picture(number: int, *, blurred: bool, width: int = 96, height: int = 64) -> np.ndarray:
+    """Fine noise whose brightness in the corner tells the frame's number."""
+    frame = np.random.default_rng(number).integers(0, 256, (height, width, 3), dtype=np.uint8)
+    frame = cv2.resize(frame[::2, ::2], (width, height), interpolation=cv2.INTER_NEAREST)
+    if blurred:
+        frame = cv2.GaussianBlur(frame, (0, 0), 2.0)
+    frame[:16, :16] = 7 * number
+    return frame
+
+
+def film(path: Path, *, count: int = 36, codec: str = "MJPG", sharp: tuple[int, ...] = SHARP) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), 30.0, (96, 64))
+    assert writer.isOpened()
+    for number in range(count):
+        writer.write(picture(number, blurred=number not in sharp))
+    writer.release()
+    return path
+
+
+def test_the_sharp_frame_of_each_span_is_kept(tmp_path: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    picked = pick_frames(
+        film(tmp_path / "a.avi"), tmp_path / "images", count=6, progress=lambda done, total: seen.append((done, total))
+    )
+    assert tuple(frame.number for frame in picked) == SHARP
+    assert sorted(path.name for path in (tmp_path / "images").iterdir()) == [f"frame_{n:06d}.png" for n in SHARP]
+    for frame in picked:
+        image = cv2.imread(str(frame.path))
+        # What the frame shows, up to JPEG's error.
+        assert abs(float(image[4:12, 4:12].mean()) - 7 * frame.number) < 2
+        assert frame.sharpness == pytest.approx(sharpness(image))
+    assert seen == [(number, 36) for number in range(1, 37)]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.avi", "images"]
+
+
+def test_as_many_as_there_are_is_all_of_them(tmp_path: Path) -> None:
+    picked = pick_frames(film(tmp_path / "a.avi", count=5), tmp_path / "images", count=5, suffix=".jpg")
+    assert [frame.path.name for frame in picked] == [f"frame_{number:06d}.jpg" for number in range(5)]
+
+
+def test_blur_lowers_the_sharpness_at_any_size() -> None:
+    for size in (64, 700):
+        frame = picture(3, blurred=False, width=size, height=size)
+        values = [sharpness(cv2.GaussianBlur(frame, (0, 0), sigma)) for sigma in (0.5, 1.0, 2.0, 4.0)]
+        assert values == sorted(values, reverse=True)
+        assert values[-1] < 0.1 * values[0]
+    assert sharpness(np.full((32, 32, 3), 90, dtype=np.uint8)) == 0
+
+
+def turn(path: Path) -> None:
+    """Write a turn by 90 degrees clockwise into the matrix of an MP4's track header."""
+    content = bytearray(path.read_bytes())
+    place = content.index(b"tkhd") + 4
+    assert content[place] == 0
+    # Version and flags, times, track, reserved, duration: 24 bytes; reserved, layer, group, volume: 16 more.
+    start = place + 24 + 16
+    struct.pack_into(">9i", content, start, 0, 0x10000, 0, -0x10000, 0, 0, 64 << 16, 0, 0x40000000)
+    path.write_bytes(content)
+
+
+def test_a_video_taken_upright_is_written_upright(tmp_path: Path) -> None:
+    path = film(tmp_path / "a.mp4", count=4, codec="mp4v", sharp=(0, 1, 2, 3))
+    (plain, *_) = pick_frames(path, tmp_path / "plain", count=4)
+    turn(path)
+    (turned, *_) = pick_frames(path, tmp_path / "turned", count=4)
+    lying, upright = cv2.imread(str(plain.path)), cv2.imread(str(turned.path))
+    assert lying.shape == (64, 96, 3)
+    assert np.array_equal(upright, cv2.rotate(lying, cv2.ROTATE_90_CLOCKWISE))
+
+
+@pytest.mark.parametrize("claimed", [0, 5, 35, 37, 90])
+def test_spans_go_by_the_frames_that_are_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, claimed: int) -> None:
+    film(tmp_path / "a.avi")
+    monkeypatch.setattr("avmsf.photographs.video._claimed_frames", lambda _: claimed)
+    if claimed == 90:
+        with warns(CaptureWarning, file="a.avi", name="frames", value=36):
+            picked = pick_frames(tmp_path / "a.avi", tmp_path / "images", count=6)
+    else:
+        picked = pick_frames(tmp_path / "a.avi", tmp_path / "images", count=6)
+    assert tuple(frame.number for frame in picked) == SHARP
+    assert len(list((tmp_path / "images").iterdir())) == 6
+
+
+def test_what_cannot_be_picked_is_refused_and_nothing_is_left(tmp_path: Path) -> None:
+    with raises(CaptureError, file="none.mp4", name=None):
+        pick_frames(tmp_path / "none.mp4", tmp_path / "images", count=3)
+    (tmp_path / "text.mp4").write_text("no video")
+    with raises(CaptureError, file="text.mp4", name="format"):
+        pick_frames(tmp_path / "text.mp4", tmp_path / "images", count=3)
+    short = film(tmp_path / "short.avi", count=4)
+    with raises(CaptureError, file="short.avi", name="count", value=4):
+        pick_frames(short, tmp_path / "images", count=5)
+    with raises(CaptureError, name="count", value=0):
+        pick_frames(short, tmp_path / "images", count=0)
+    with raises(CaptureError, name="suffix", value=".gif"):
+        pick_frames(short, tmp_path / "images", count=2, suffix=".gif")
+    pick_frames(short, tmp_path / "full", count=2)
+    with raises(CaptureError, file="full"):
+        pick_frames(short, tmp_path / "full", count=2)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["full", "short.avi", "text.mp4"]
+
+
+def test_an_interruption_leaves_nothing(tmp_path: Path) -> None:
+    def interrupt(done: int, _: int) -> None:
+        if done == 20:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        pick_frames(film(tmp_path / "a.avi"), tmp_path / "images", count=6, progress=interrupt)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.avi"]

@@ -1,0 +1,216 @@
+"""COLMAP's models: text, binary and what COLMAP itself writes say the same as transforms.json."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+
+from avmsf.errors import CaptureError
+from avmsf.photographs import colmap_binary, colmap_text, read_sparse_points, read_views
+from avmsf.photographs.cameras import View
+from avmsf.photographs.colmap import MODELS, read_colmap
+from factories.raising import raises
+from factories.views_folder import (
+    HEIGHT,
+    PINHOLE,
+    WIDTH,
+    frames,
+    quaternion,
+    ring,
+    write_colmap_binary,
+    write_colmap_text,
+    write_image,
+    write_transforms,
+)
+
+WRITERS = [write_colmap_text, write_colmap_binary]
+NAMES = ["a.png", "b.png", "c.png", "d.png"]
+
+
+def write_images(folder: Path, names: list[str] = NAMES) -> None:
+    for name in names:
+        write_image(folder / "images" / name)
+
+
+def assert_same(ones: tuple[View, ...], others: tuple[View, ...]) -> None:
+    assert [view.name for view in ones] == [view.name for view in others]
+    for one, other in zip(ones, others, strict=True):
+        # A quaternion's rounding in float64.
+        assert (one.camera.world_to_camera - other.camera.world_to_camera).abs().max() < 1e-14
+        assert one.camera.focal == other.camera.focal
+        assert one.camera.principal == other.camera.principal
+        assert torch.equal(one.image, other.image)
+
+
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "."])
+@pytest.mark.parametrize("write", WRITERS)
+def test_models_say_the_same_as_transforms(tmp_path: Path, write: Callable[..., None], place: str) -> None:
+    write_images(tmp_path / "one")
+    write(tmp_path / "one" / place, ring(4), NAMES)
+    write_transforms(tmp_path / "other", frames(ring(4)))
+    assert_same(read_views(tmp_path / "one"), read_views(tmp_path / "other"))
+
+
+@pytest.mark.parametrize("write", WRITERS)
+def test_names_may_have_folders_and_blanks(tmp_path: Path, write: Callable[..., None]) -> None:
+    names = ["upper ring/a 1.png", "lower/b.png", "c.png"]
+    write_images(tmp_path, names)
+    write(tmp_path / "sparse/0", ring(3), names)
+    assert [view.name for view in read_views(tmp_path)] == sorted(names)
+
+
+@pytest.mark.parametrize("write", WRITERS)
+def test_points_and_colors(tmp_path: Path, write: Callable[..., None]) -> None:
+    write(tmp_path / "sparse/0", ring(4), NAMES)
+    found = read_sparse_points(tmp_path, meters=2.0)
+    assert found is not None
+    points, colors = found
+    assert torch.equal(points, torch.tensor([[1.0, -0.5, 4.0], [2.0, 4.0, 6.0]], dtype=torch.float64))
+    assert colors.tolist() == [[255, 128, 0], [1, 2, 3]]
+    for name in ("points3D.txt", "points3D.bin"):
+        (tmp_path / "sparse/0" / name).unlink(missing_ok=True)
+    assert read_sparse_points(tmp_path) is None
+
+
+PYCOLMAP = """
+import sys
+import numpy as np
+import pycolmap
+model, name, width, height = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
+parameters = [float(each) for each in sys.argv[5].split(",")]
+reconstruction = pycolmap.Reconstruction()
+camera = pycolmap.Camera(model=name, width=width, height=height, params=parameters, camera_id=7)
+reconstruction.add_camera_with_trivial_rig(camera)
+for row, line in enumerate(sys.stdin.read().splitlines(), start=1):
+    w, x, y, z, *translation = (float(each) for each in line.split())
+    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([x, y, z, w])), np.array(translation))
+    image = pycolmap.Image(name=f"{chr(96 + row)}.png", camera_id=7, image_id=row)
+    reconstruction.add_image_with_trivial_frame(image, pose)
+reconstruction.add_point3D(np.array([0.5, -0.25, 2.0]), pycolmap.Track(), np.array([255, 128, 0], dtype=np.uint8))
+reconstruction.write_text(model) if sys.argv[6] == "text" else reconstruction.write_binary(model)
+"""
+
+
+@pytest.mark.parametrize("form", ["text", "binary"])
+def test_what_colmap_writes_says_the_same(tmp_path: Path, form: str) -> None:
+    model = tmp_path / "one" / "sparse" / "0"
+    model.mkdir(parents=True)
+    cameras = ring(4)
+    poses = [(*quaternion(camera), *camera.world_to_camera[:3, 3].tolist()) for camera in cameras]
+    command = [sys.executable, "-c", PYCOLMAP, str(model)]
+    done = subprocess.run(
+        [*command, "PINHOLE", str(WIDTH), str(HEIGHT), ",".join(map(str, PINHOLE[1])), form],
+        input="\n".join(" ".join(map(repr, pose)) for pose in poses),
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    if "No module named 'pycolmap'" in done.stderr:
+        pytest.skip("pycolmap is not installed")
+    assert done.returncode == 0, done.stderr
+    write_images(tmp_path / "one")
+    write_transforms(tmp_path / "other", frames(cameras))
+    assert_same(read_views(tmp_path / "one"), read_views(tmp_path / "other"))
+    found = read_sparse_points(tmp_path / "one")
+    assert found is not None
+    assert found[0].tolist() == [[0.5, -0.25, 2.0]]
+    assert found[1].tolist() == [[255, 128, 0]]
+
+
+# By COLMAP's documentation: focal lengths, principal point, then coefficients in the order k1 k2 p1 p2.
+LAYOUTS = {
+    "SIMPLE_PINHOLE": ((50.0, 19.0, 16.0), (50.0, 50.0), (0, 0, 0, 0, 0)),
+    "PINHOLE": ((50.0, 52.0, 19.0, 16.0), (50.0, 52.0), (0, 0, 0, 0, 0)),
+    "SIMPLE_RADIAL": ((50.0, 19.0, 16.0, 0.1), (50.0, 50.0), (0.1, 0, 0, 0, 0)),
+    "RADIAL": ((50.0, 19.0, 16.0, 0.1, 0.2), (50.0, 50.0), (0.1, 0.2, 0, 0, 0)),
+    "OPENCV": ((50.0, 52.0, 19.0, 16.0, 0.1, 0.2, 0.3, 0.4), (50.0, 52.0), (0.1, 0.2, 0.3, 0.4, 0)),
+    "OPENCV_FISHEYE": ((50.0, 52.0, 19.0, 16.0, 0.1, 0.2, 0.3, 0.4), (50.0, 52.0), (0.1, 0.2, 0.3, 0.4)),
+    "SIMPLE_RADIAL_FISHEYE": ((50.0, 19.0, 16.0, 0.1), (50.0, 50.0), (0.1, 0, 0, 0)),
+    "RADIAL_FISHEYE": ((50.0, 19.0, 16.0, 0.1, 0.2), (50.0, 50.0), (0.1, 0.2, 0, 0)),
+}
+
+
+def test_every_model_has_a_layout_here() -> None:
+    assert set(LAYOUTS) == set(MODELS)
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_camera_models(tmp_path: Path, name: str) -> None:
+    parameters, focal, distortion = LAYOUTS[name]
+    write_colmap_text(tmp_path, ring(3), NAMES[:3], (name, parameters))
+    lens = read_colmap(tmp_path, tmp_path / "images").shots[0].lens_of(1, 1)
+    assert (lens.width, lens.height, lens.principal) == (WIDTH, HEIGHT, (19.0, 16.0))
+    assert lens.focal == focal
+    assert lens.distortion == pytest.approx(distortion)
+    assert lens.fisheye == ("FISHEYE" in name)
+
+
+@pytest.mark.parametrize("write", WRITERS)
+def test_other_camera_models_are_refused_by_name(tmp_path: Path, write: Callable[..., None]) -> None:
+    write(tmp_path, ring(3), NAMES[:3], ("FOV", (50.0, 50.0, 19.0, 16.0, 0.5)))
+    with raises(CaptureError, name="camera 7", value="FOV") as caught:
+        read_views(tmp_path)
+    assert caught.value.file in (tmp_path / "cameras.txt", tmp_path / "cameras.bin")
+
+
+def test_an_unknown_number_of_a_model_is_named(tmp_path: Path) -> None:
+    write_colmap_binary(tmp_path, ring(3), NAMES[:3])
+    content = bytearray((tmp_path / "cameras.bin").read_bytes())
+    content[12] = 99
+    (tmp_path / "cameras.bin").write_bytes(bytes(content))
+    with raises(CaptureError, file="cameras.bin", name="camera 7", value=99):
+        read_views(tmp_path)
+
+
+@pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_truncated_binary_files_are_named_wherever_they_end(tmp_path: Path, file: str) -> None:
+    write_images(tmp_path)
+    write_colmap_binary(tmp_path, ring(4), NAMES)
+    content = (tmp_path / file).read_bytes()
+    read = partial(read_sparse_points if file == "points3D.bin" else read_views, tmp_path)
+    for kept in [*range(0, len(content), 7), len(content) - 1]:
+        (tmp_path / file).write_bytes(content[:kept])
+        with raises(CaptureError, file=file, value=kept):
+            read()
+
+
+@pytest.mark.parametrize("read", [colmap_binary.read_cameras, colmap_text.read_cameras])
+def test_what_is_no_readable_file_is_named(tmp_path: Path, read: Callable[[Path], object]) -> None:
+    with raises(CaptureError, file=tmp_path, value="Is a directory"):
+        read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("file", "before", "after", "row", "name"),
+    [
+        ("cameras.txt", " 40 ", " wide ", 2, None),
+        ("cameras.txt", " 16.0", "", None, "camera 7"),
+        ("images.txt", " 7 b.png", " 8 b.png", None, "b.png"),
+        ("images.txt", " 7 b.png", "", 4, None),
+        ("images.txt", "1.5 2.5 -1 10.0 11.0 3\n", "", 3, None),
+    ],
+)
+def test_malformed_text_is_named_by_line(
+    tmp_path: Path, file: str, before: str, after: str, row: int | None, name: str | None
+) -> None:
+    write_colmap_text(tmp_path, ring(4), NAMES)
+    text = (tmp_path / file).read_text()
+    assert before in text
+    (tmp_path / file).write_text(text.replace(before, after, 1))
+    with raises(CaptureError, file=file, row=row, name=name):
+        read_views(tmp_path)
+
+
+def test_a_quaternion_without_length_or_with_nan_is_refused(tmp_path: Path) -> None:
+    for values in ("0 0 0 0", "nan 0 0 1"):
+        write_colmap_text(tmp_path, ring(3), NAMES[:3])
+        line = f"# list\n1 {values} 0 0 1 7 a.png\n\n"
+        (tmp_path / "images.txt").write_text(line)
+        with raises(CaptureError, file="images.txt", name="a.png") as caught:
+            read_views(tmp_path)
+        assert len(caught.value.value) == 4

@@ -1,0 +1,233 @@
+"""Rings photographed before plain walls: whose outline, hole and shadows are known to the pixel."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from avmsf.errors import CaptureError, CaptureWarning
+from avmsf.photographs import background_color, find_foreground
+from avmsf.photographs.cameras import Camera, View
+from avmsf.photographs.coarse_hull import carve
+from factories.raising import raises, warns
+
+WIDTH, HEIGHT = 120, 90
+RING, TUBE = 0.1, 0.03
+
+
+@cache
+def ring_mesh() -> trimesh.Trimesh:
+    return trimesh.creation.torus(RING, TUBE, major_sections=64, minor_sections=24)
+
+
+@cache
+def cameras(count: int = 18) -> tuple[Camera, ...]:
+    """Around and above and below a ring that lies in the plane z = 0; every third lets it leave the image."""
+    found = []
+    for row in range(count):
+        angle, height = 2.4 * row, np.sin(1.7 * row)
+        level = np.sqrt(1 - 0.8 * height**2)
+        position = 0.6 * torch.tensor([level * np.cos(angle), level * np.sin(angle), 0.9 * height])
+        target = torch.tensor([0.0, 0.0, 0.05 if row % 3 == 0 else 0.0])
+        up = torch.tensor([0.0, 0.0, 1.0])
+        found.append(Camera.looking(position, target, up=up, focal=180.0, width=WIDTH, height=HEIGHT))
+    return tuple(found)
+
+
+@cache
+def seen(row: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where camera `row` sees the ring, and how bright a lamp above the camera lights it, 0 to 1."""
+    camera = cameras()[row]
+    rays = camera.rays().numpy().reshape(-1, 3)
+    origins = np.broadcast_to(camera.position.numpy(), rays.shape)
+    faces = ring_mesh().ray.intersects_first(origins, rays)
+    lamp = -rays.mean(axis=0) + np.array([0, 0, 0.5])
+    light = np.abs(ring_mesh().face_normals[faces] @ lamp) / np.linalg.norm(lamp)
+    return (faces >= 0).reshape(HEIGHT, WIDTH), light.reshape(HEIGHT, WIDTH)
+
+
+def photographs(
+    wall: tuple[float, float, float], paint: tuple[float, float, float], *, falloff: float = 0.0, noise: float = 1.5
+) -> list[View]:
+    """The ring in a color before a wall whose corners are darker by a share `falloff`."""
+    generator = np.random.default_rng(0)
+    across, down = np.meshgrid(np.linspace(-1, 1, WIDTH), np.linspace(-1, 1, HEIGHT))
+    lit = 1 - falloff * (across**2 + down**2) / 2
+    views = []
+    for row, camera in enumerate(cameras()):
+        there, light = seen(row)
+        ring = np.array(paint) * (0.35 + 0.65 * light[..., None])
+        image = np.where(there[..., None], ring, np.array(wall) * lit[..., None])
+        image += noise * generator.standard_normal(image.shape)
+        views.append(View(f"{row:02}.png", torch.from_numpy(image.round().clip(0, 255).astype(np.uint8)), camera))
+    return views
+
+
+def painted(view: View, where: np.ndarray, color: Sequence[float]) -> View:
+    image = view.image.numpy().copy()
+    image[where] = color
+    return replace(view, image=torch.from_numpy(image))
+
+
+def overlap(view: View, row: int) -> float:
+    """Intersection over union of the mask and the truth."""
+    assert view.mask is not None
+    found, true = view.mask.numpy() > 127, seen(row)[0]
+    return float((found & true).sum() / (found | true).sum())
+
+
+WALLS = {
+    "white on black": ((2.0, 2.0, 2.0), (220.0, 215.0, 205.0), 0.0),
+    "brown on white": ((235.0, 235.0, 230.0), (120.0, 80.0, 50.0), 0.25),
+    "red on green": ((60.0, 150.0, 70.0), (190.0, 60.0, 50.0), 0.2),
+}
+
+
+@pytest.mark.parametrize(
+    "name", [name if name == "brown on white" else pytest.param(name, marks=pytest.mark.slow) for name in WALLS]
+)
+def test_outlines_and_the_hole_are_found(name: str) -> None:
+    wall, paint, falloff = WALLS[name]
+    views = find_foreground(photographs(wall, paint, falloff=falloff))
+    assert len(views) == len(cameras())
+    # The outline of a ring some 50 pixels wide and 13 thick has 200 pixels of 1000; a blur takes half of one.
+    assert min(overlap(view, row) for row, view in enumerate(views)) > 0.9
+    # Seen from above, the middle of the ring is wall.
+    steep = [row for row, camera in enumerate(cameras()) if abs(float(camera.position[2])) > 0.35]
+    assert len(steep) > 3
+    for row in steep:
+        column, line = cameras()[row].project(torch.zeros(1, 3))[0][0].int().tolist()
+        assert not views[row].mask[line, column]
+    middle = background_color(views)
+    # The median of a wall that falls off by at most a quarter lies within an eighth of its brightness.
+    assert torch.allclose(middle, torch.tensor(wall) / 255, atol=0.02, rtol=falloff / 2)
+
+
+def test_a_shadow_as_dark_as_the_wall_is_filled_and_spots_are_dropped() -> None:
+    wall = (2.0, 2.0, 2.0)
+    views = photographs(wall, (220.0, 215.0, 205.0))
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    shadows = {}
+    for row in (1, 7, 12):
+        there = seen(row)[0]
+        # The pixel of the ring that lies deepest inside it, and all within three pixels of it.
+        depth = np.array([np.hypot(rows[~there] - y, columns[~there] - x).min() for y, x in np.argwhere(there)])
+        y, x = np.argwhere(there)[depth.argmax()]
+        shadows[row] = np.hypot(rows - y, columns - x) <= 3
+        assert there[shadows[row]].all()
+        views[row] = painted(views[row], shadows[row], wall)
+    spot = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    spot[2:14, 2:14] = True
+    assert not seen(4)[0][spot].any()
+    views[4] = painted(views[4], spot, (200.0, 200.0, 200.0))
+    found = find_foreground(views)
+    for row, shadow in shadows.items():
+        assert (found[row].mask.numpy()[shadow] == 255).all()
+    assert not found[4].mask.numpy()[spot].any()
+    assert min(overlap(view, row) for row, view in enumerate(found)) > 0.9
+
+
+def test_blur_at_the_outline_belongs_half_to_either_side() -> None:
+    """A lens out of focus by a pixel or so moves no outline: where half of the object's light is left is its edge."""
+    views = [
+        replace(view, image=torch.from_numpy(cv2.GaussianBlur(view.image.numpy(), (0, 0), 1.3)))
+        for view in photographs((2.0, 2.0, 2.0), (220.0, 215.0, 205.0))
+    ]
+    found = find_foreground(views)
+    areas = [float(view.mask.sum()) / 255 / seen(row)[0].sum() for row, view in enumerate(found)]
+    # A rim of one pixel would be a fifth of the area.
+    assert 0.9 < np.mean(areas) < 1.1
+    assert np.mean([overlap(view, row) for row, view in enumerate(found)]) > 0.9
+
+
+def test_what_touches_the_object_in_one_view_alone_is_dropped() -> None:
+    views = photographs((2.0, 2.0, 2.0), (220.0, 215.0, 205.0))
+    columns = np.flatnonzero(seen(4)[0].any(axis=0))
+    stand = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    stand[HEIGHT // 2 :, columns.mean().astype(int) - 2 : columns.mean().astype(int) + 3] = True
+    stand &= ~seen(4)[0]
+    views[4] = painted(views[4], stand, (200.0, 200.0, 200.0))
+    mask = find_foreground(views)[4].mask.numpy() > 127
+    # Some of it lies where the hull is loose: seen as object by all but one view.
+    assert mask[stand].mean() < 0.3
+
+
+def test_the_background_color_is_taken_outside_the_masks_alone() -> None:
+    view = photographs((40.0, 80.0, 120.0), (220.0, 215.0, 205.0), noise=0.0)[0]
+    image, mask = view.image.clone(), torch.zeros(HEIGHT, WIDTH, dtype=torch.uint8)
+    image[:] = torch.tensor([40, 80, 120], dtype=torch.uint8)
+    image[:, 20:], mask[:, 20:] = 255, 255
+    # The column next to the mask is a mixture, and two columns are left of it.
+    image[:, 18:20] = 200
+    color = background_color([replace(view, image=image, mask=mask)])
+    assert torch.allclose(color, torch.tensor([40.0, 80.0, 120.0]) / 255)
+
+
+def test_given_masks_stay() -> None:
+    views = photographs((2.0, 2.0, 2.0), (220.0, 215.0, 205.0))
+    given = torch.from_numpy(seen(5)[0].astype(np.uint8) * np.uint8(200))
+    views[5] = replace(views[5], mask=given)
+    found = find_foreground(views)
+    assert found[5].mask is given
+    assert all(view.mask is not None for view in found)
+    assert find_foreground(found) == found
+
+
+def test_views_without_object_are_named_and_left_out() -> None:
+    views = photographs((2.0, 2.0, 2.0), (220.0, 215.0, 205.0))
+    views[3] = painted(views[3], np.ones((HEIGHT, WIDTH), dtype=bool), (2.0, 2.0, 2.0))
+    with warns(CaptureWarning, name="object", value=["03.png"]):
+        assert len(find_foreground(views)) == len(views) - 1
+
+
+def test_a_busy_background_is_refused() -> None:
+    views = photographs((2.0, 2.0, 2.0), (220.0, 215.0, 205.0))
+    generator = np.random.default_rng(1)
+    busy = []
+    for row, view in enumerate(views):
+        shelf = np.kron(generator.integers(0, 256, (9, 12, 3)), np.ones((10, 10, 1)))
+        there = ~seen(row)[0]
+        busy.append(painted(view, there, shelf[there]))
+    with raises(CaptureError, name="background") as caught:
+        find_foreground(busy)
+    assert 0.1 < caught.value.value <= 1
+
+
+def test_cameras_that_do_not_fit_are_warned_of_and_colors_decide_alone() -> None:
+    views = photographs((2.0, 2.0, 2.0), (220.0, 215.0, 205.0))
+    turned = []
+    for row, view in enumerate(views):
+        pose = view.camera.world_to_camera.clone()
+        pose[:3, 3] += torch.tensor([0.4 * (-1) ** row, 0.3 * (-1) ** (row // 2), 0.1 * row])
+        turned.append(replace(view, camera=replace(view.camera, world_to_camera=pose)))
+    with warns(CaptureWarning, name="masks"):
+        found = find_foreground(turned)
+    assert min(overlap(view, row) for row, view in enumerate(found)) > 0.9
+
+
+def test_few_views_and_masks_without_background_are_refused() -> None:
+    views = photographs((2.0, 2.0, 2.0), (220.0, 215.0, 205.0))
+    with raises(CaptureError, name="views", value=2):
+        find_foreground(views[:2])
+    with raises(CaptureError, name="background", value=0):
+        background_color(views)
+    blank = [painted(view, np.ones((HEIGHT, WIDTH), dtype=bool), (9.0, 9.0, 9.0)) for view in views]
+    with raises(CaptureError, name="object", value=0):
+        find_foreground(blank)
+
+
+def test_the_hull_of_true_outlines_holds_the_ring_and_not_its_hole() -> None:
+    hull = carve([seen(row)[0] for row in range(len(cameras()))], cameras())
+    assert hull is not None
+    inside = hull.centers[hull.occupied(missing=0)]
+    assert np.abs(inside.max(axis=0)[:2] - (RING + TUBE)).max() < 2 * hull.edge
+    # The middle is seen through from above and below.
+    assert np.hypot(inside[:, 0], inside[:, 1]).min() > (RING - TUBE) / 2
+    # A pixel at half a meter's distance is 3 mm: places that deep in the tube are inside for certain.
+    deep = np.hypot(np.hypot(hull.centers[:, 0], hull.centers[:, 1]) - RING, hull.centers[:, 2]) < TUBE - 0.005
+    assert hull.occupied(missing=0)[deep].mean() > 0.99

@@ -1,0 +1,221 @@
+"""Images and masks of every kind are read as the pixels that they show, and fitted to their cameras."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from avmsf.errors import CaptureError, CaptureWarning
+from avmsf.photographs import read_views
+from avmsf.photographs.images import read_mask, read_picture
+from factories.raising import raises, warns
+from factories.views_folder import HEIGHT, WIDTH, frames, ring, write_image, write_transforms
+
+ACROSS, DOWN = np.meshgrid(np.linspace(20, 230, WIDTH), np.linspace(10, 200, HEIGHT))
+RAMP = np.round(np.dstack([ACROSS, DOWN, np.full_like(DOWN, 60)])).astype(np.uint8)
+
+
+def folder_of(folder: Path, image: np.ndarray | None = None, **settings: object) -> Path:
+    """A ring of four views of one image."""
+    rows = frames(ring(4))
+    write_transforms(folder, rows, images=False, **settings)
+    for row in rows:
+        write_image(folder / row["file_path"], RAMP if image is None else image)
+    return folder
+
+
+# The largest error that each kind of compression may make on a ramp, in levels of 255.
+@pytest.mark.parametrize(("suffix", "tolerance"), [(".png", 0), (".jpg", 12), (".webp", 12)])
+def test_channels_are_red_green_blue(tmp_path: Path, suffix: str, tolerance: int) -> None:
+    Image.fromarray(RAMP).save(tmp_path / f"a{suffix}", quality=95)
+    picture = read_picture(tmp_path / f"a{suffix}")
+    assert np.abs(picture.color.astype(int) - RAMP).max() <= tolerance
+    assert picture.mask is None
+
+
+def test_gray_and_sixteen_bits_show_the_same(tmp_path: Path) -> None:
+    gray = RAMP[..., 0]
+    cv2.imwrite(str(tmp_path / "8.png"), gray)
+    # 257 is 65535 / 255; half a level more still rounds down.
+    cv2.imwrite(str(tmp_path / "16.png"), gray.astype(np.uint16) * 257 + 128)
+    cv2.imwrite(str(tmp_path / "color.png"), RAMP[..., ::-1].astype(np.uint16) * 257 - 128)
+    for name in ("8", "16"):
+        color = read_picture(tmp_path / f"{name}.png").color
+        assert np.array_equal(color, np.repeat(gray[..., None], 3, axis=2))
+    assert np.array_equal(read_picture(tmp_path / "color.png").color, RAMP)
+
+
+def test_alpha_is_the_mask_and_lays_the_object_before_black(tmp_path: Path) -> None:
+    alpha = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
+    alpha[:, 10:20], alpha[:, 20] = 255, 51
+    views = read_views(folder_of(tmp_path, np.dstack([RAMP, alpha])))
+    assert views[0].mask is not None
+    assert np.array_equal(views[0].mask.numpy(), alpha)
+    image = views[0].image.numpy()
+    assert np.array_equal(image[:, 10:20], RAMP[:, 10:20])
+    assert not image[:, :10].any()
+    # 51 is a fifth of 255.
+    assert np.abs(image[:, 20] - RAMP[:, 20] / 5).max() <= 0.5
+
+
+def test_gray_with_alpha_and_opaque_alpha(tmp_path: Path) -> None:
+    alpha = np.where(np.arange(WIDTH) < 9, 255, 0).astype(np.uint8) * np.ones((HEIGHT, 1), dtype=np.uint8)
+    Image.fromarray(np.dstack([RAMP[..., 0], alpha]), "LA").save(tmp_path / "gray.png")
+    picture = read_picture(tmp_path / "gray.png")
+    assert picture.mask is not None
+    assert np.array_equal(picture.mask, alpha)
+    assert np.array_equal(picture.color[:, :9, 1], RAMP[:, :9, 0])
+    write_image(tmp_path / "opaque.png", np.dstack([RAMP, np.full_like(alpha, 255)]))
+    assert read_picture(tmp_path / "opaque.png").mask is None
+
+
+def test_masks_of_zeros_and_ones_colors_or_alpha(tmp_path: Path) -> None:
+    object_there = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
+    object_there[5:9, 4:30] = 1
+    red = np.dstack([object_there * 255, object_there * 0, object_there * 0])
+    write_image(tmp_path / "ones.png", object_there)
+    write_image(tmp_path / "red.png", red)
+    write_image(tmp_path / "alpha.png", np.dstack([RAMP, object_there * 255]))
+    Image.fromarray(object_there > 0).save(tmp_path / "bits.png")
+    for name in ("ones", "red", "alpha", "bits"):
+        assert np.array_equal(read_mask(tmp_path / f"{name}.png"), object_there * 255), name
+
+
+def test_a_mask_of_another_size_is_scaled_or_refused(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path)
+    mask = np.zeros((2 * HEIGHT, 2 * WIDTH), dtype=np.uint8)
+    mask[:, : 2 * 7] = 255
+    write_image(folder / "masks" / "b.png", mask)
+    with warns(CaptureWarning, name="mask sizes", value=["b.png (80 x 60 for 40 x 30)"]):
+        views = read_views(folder)
+    assert views[1].mask is not None
+    assert (views[1].mask.numpy() == np.where(np.arange(WIDTH) < 7, 255, 0)).all()
+    write_image(folder / "masks" / "b.png", mask[:HEIGHT])
+    with raises(CaptureError, file="masks/b.png", name="mask", value=[80, 30]):
+        read_views(folder)
+
+
+def test_masks_without_object_drop_their_views(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path)
+    empty = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
+    write_image(folder / "masks" / "b.png", empty)
+    with warns(CaptureWarning, name="empty masks", value=["b.png"]):
+        assert [view.name for view in read_views(folder)] == ["a.png", "c.png", "d.png"]
+    for name in "acd":
+        write_image(folder / "masks" / f"{name}.png", empty)
+    with raises(CaptureError, file="transforms.json", name="masks", value=0):
+        read_views(folder)
+
+
+def test_masks_that_are_named_but_not_there(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path)
+    record = json.loads((folder / "transforms.json").read_text())
+    record["frames"][1]["mask_path"] = "masks/gone.png"
+    record["frames"][2]["mask_path"] = "masks/broken.png"
+    (folder / "transforms.json").write_text(json.dumps(record))
+    (folder / "masks").mkdir()
+    (folder / "masks" / "broken.png").write_bytes(b"no image")
+    with warns(CaptureWarning, file="transforms.json", name="missing masks", value=["b.png", "c.png"]):
+        views = read_views(folder)
+    assert all(view.mask is None for view in views)
+
+
+def cut_short(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-40])
+
+
+def overwrite(path: Path) -> None:
+    path.write_text("not an image")
+
+
+def empty_out(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+@pytest.mark.parametrize("damage", [Path.unlink, cut_short, overwrite, empty_out])
+def test_missing_and_corrupt_images_are_named_and_left_out(tmp_path: Path, damage: Callable[[Path], None]) -> None:
+    folder = folder_of(tmp_path)
+    damage(folder / "images" / "c.png")
+    with warns(CaptureWarning, file="transforms.json", name="missing images", value=["c.png"]):
+        assert [view.name for view in read_views(folder)] == ["a.png", "b.png", "d.png"]
+    damage(folder / "images" / "a.png")
+    with raises(CaptureError, file="transforms.json", name="views", value=2) as caught:
+        read_views(folder)
+    assert "a.png, c.png" in str(caught.value)
+
+
+def test_a_truncated_jpeg_is_corrupt(tmp_path: Path) -> None:
+    Image.fromarray(np.kron(RAMP, np.ones((8, 8, 1), dtype=np.uint8))).save(tmp_path / "a.jpg")
+    content = (tmp_path / "a.jpg").read_bytes()
+    (tmp_path / "a.jpg").write_bytes(content[: len(content) * 2 // 3])
+    with raises(CaptureError, file="a.jpg", name="bytes", value=len(content) * 2 // 3):
+        read_picture(tmp_path / "a.jpg")
+
+
+def test_images_without_cameras_are_named(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path)
+    write_image(folder / "images" / "late" / "x.png")
+    write_image(folder / "images" / "y.png")
+    with warns(CaptureWarning, name="cameras", value=["late/x.png", "y.png"]):
+        assert len(read_views(folder)) == 4
+    record = json.loads((folder / "transforms.json").read_text())
+    record["frames"] = record["frames"][:2]
+    (folder / "transforms.json").write_text(json.dumps(record))
+    with raises(CaptureError, file="transforms.json", name="views", value=2):
+        read_views(folder)
+
+
+def test_longest_averages_areas_and_takes_the_camera_along(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+    folder = folder_of(tmp_path, image)
+    view = read_views(folder, longest=20)[0]
+    means = image.reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean(axis=(1, 3))
+    assert np.abs(view.image.numpy() - means).max() <= 0.5
+    assert view.camera.focal == (25.0, 26.0)
+    assert view.camera.principal == (9.5, 8.0)
+    for size in (WIDTH, 1000):
+        assert np.array_equal(read_views(folder, longest=size)[0].image.numpy(), image)
+
+
+def test_images_of_another_size_scale_the_intrinsics(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path, np.kron(RAMP, np.ones((3, 3, 1), dtype=np.uint8)))
+    sizes = [f"{name}.png (120 x 90 instead of 40 x 30)" for name in "abcd"]
+    with warns(CaptureWarning, name="image sizes", value=sizes):
+        camera = read_views(folder)[0].camera
+    assert (camera.width, camera.height) == (120, 90)
+    assert camera.focal == (150.0, 156.0)
+    assert camera.principal == (57.0, 48.0)
+
+
+def test_images_of_another_shape_are_refused_with_both_sizes(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path, RAMP[:, :30])
+    with raises(CaptureError, file="images/a.png", name="image", value=[30, 30]):
+        read_views(folder)
+
+
+# EXIF's tag 0x0112: 6 means that the stored image must be turned clockwise by a quarter, 3 by a half.
+def save_turned(path: Path, image: np.ndarray, orientation: int) -> None:
+    tags = Image.Exif()
+    tags[0x0112] = orientation
+    Image.fromarray(image).save(path, exif=tags, quality=95, subsampling=0)
+
+
+def test_orientation_tags_turn_only_what_fits_its_camera_no_other_way(tmp_path: Path) -> None:
+    rows = frames(ring(3))
+    for row in rows:
+        row["file_path"] = row["file_path"].replace(".png", ".jpg")
+    write_transforms(tmp_path, rows, images=False)
+    (tmp_path / "images").mkdir()
+    # As stored: what structure from motion and the NeRF tools read.
+    save_turned(tmp_path / "images" / "a.jpg", RAMP, 3)
+    save_turned(tmp_path / "images" / "b.jpg", RAMP, 1)
+    # A quarter back, so that the tag's clockwise quarter gives the ramp.
+    save_turned(tmp_path / "images" / "c.jpg", np.rot90(RAMP).copy(), 6)
+    with warns(CaptureWarning, name="orientations", value=["c.jpg"]):
+        views = read_views(tmp_path)
+    for view in views:
+        assert np.abs(view.image.numpy().astype(int) - RAMP).max() <= 12

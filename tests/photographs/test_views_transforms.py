@@ -1,0 +1,233 @@
+"""transforms.json: axes, intrinsics, file names and masks as the tools that write it mean them."""
+
+import json
+import math
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from avmsf.errors import CaptureError, CaptureWarning
+from avmsf.photographs import read_sparse_points, read_views
+from avmsf.photographs.nerf_json import read_transforms
+from factories.raising import raises, warns
+from factories.views_folder import HEIGHT, WIDTH, frames, ring, write_image, write_transforms
+
+
+def facing_down_z(folder: Path) -> Path:
+    """Three cameras on the z axis's side, their matrices written by hand: the first at z = 5 with no rotation."""
+    right = [[0, 0, 1, 5], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]]  # at x = 5, backward is +x
+    left = [[0, 0, -1, -5], [0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1]]
+    poses = [[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]], right, left]
+    rows = [
+        {"file_path": f"images/{name}.png", "transform_matrix": pose} for name, pose in zip("abc", poses, strict=True)
+    ]
+    return write_transforms(folder, rows)
+
+
+def test_without_rotation_a_camera_looks_down_z_with_x_right_and_y_up(tmp_path: Path) -> None:
+    view = read_views(facing_down_z(tmp_path))[0]
+    points = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    pixels, depth = view.camera.project(points)
+    # Focal lengths 50 and 52 over a depth of 5; rows count downwards.
+    expected = torch.tensor([[19.0, 16.0], [29.0, 16.0], [19.0, 16.0 - 10.4]], dtype=torch.float64)
+    assert torch.allclose(pixels, expected, atol=1e-9)
+    assert torch.allclose(depth, torch.full((3,), 5.0, dtype=torch.float64))
+
+
+def test_meters_scale_positions_and_nothing_else(tmp_path: Path) -> None:
+    folder = facing_down_z(tmp_path)
+    plain, scaled = read_views(folder), read_views(folder, meters=0.01)
+    for one, other in zip(plain, scaled, strict=True):
+        assert torch.allclose(other.camera.position, one.camera.position / 100, atol=1e-15)
+        assert torch.equal(other.camera.world_to_camera[:3, :3], one.camera.world_to_camera[:3, :3])
+        assert other.camera.focal == one.camera.focal
+
+
+def test_intrinsics_of_a_frame_go_before_those_of_the_file(tmp_path: Path) -> None:
+    rows = frames(ring(3))
+    rows[1] |= {"fl_x": 70.0, "cx": 20.5}
+    views = read_views(write_transforms(tmp_path, rows))
+    assert [view.camera.focal for view in views] == [(50.0, 52.0), (70.0, 52.0), (50.0, 52.0)]
+    assert views[1].camera.principal == (20.5, 16.0)
+
+
+def test_an_angle_of_view_stands_for_the_focal_length(tmp_path: Path) -> None:
+    """The synthetic NeRF scenes: no size, no suffix, a leading ./ and the horizontal angle alone."""
+    rows = frames(ring(3))
+    for row in rows:
+        write_image(tmp_path / row["file_path"])
+        row["file_path"] = "./" + row["file_path"].removesuffix(".png")
+    nothing = dict.fromkeys(("w", "h", "fl_x", "fl_y", "cx", "cy"))
+    write_transforms(tmp_path, rows, images=False, **nothing, camera_angle_x=2 * math.atan(0.4))
+    camera = read_views(tmp_path)[0].camera
+    # tan of half the angle is .4: 20 pixels beside the middle at 50 pixels' distance, and pixels are square.
+    assert camera.focal == pytest.approx((50.0, 50.0))
+    assert camera.principal == (WIDTH / 2, HEIGHT / 2)
+    write_transforms(tmp_path, rows, images=False, **nothing, camera_angle_x=2 * math.atan(0.4), camera_angle_y=1.0)
+    assert read_views(tmp_path)[0].camera.focal == pytest.approx((50.0, 15 / math.tan(0.5)))
+
+
+def test_names_sort_and_lose_the_images_folder(tmp_path: Path) -> None:
+    rows = frames(ring(4))
+    for row, name in zip(rows, ("images/z.png", "./images/b/y.png", "images\\b\\x.png", "images/B.png"), strict=True):
+        write_image(tmp_path / name.replace("\\", "/"))
+        row["file_path"] = name
+    write_transforms(tmp_path, rows, images=False)
+    assert [view.name for view in read_views(tmp_path)] == ["B.png", "b/x.png", "b/y.png", "z.png"]
+
+
+def test_a_file_may_be_named_itself(tmp_path: Path) -> None:
+    write_transforms(tmp_path, frames(ring(3)))
+    (tmp_path / "transforms.json").rename(tmp_path / "transforms_train.json")
+    assert len(read_views(tmp_path / "transforms_train.json")) == 3
+    with raises(CaptureError, file=tmp_path, value=["transforms_train.json"]):
+        read_views(tmp_path)
+
+
+@pytest.mark.parametrize("settings", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
+def test_both_ways_to_say_fisheye(tmp_path: Path, settings: dict) -> None:
+    """Without coefficients a fisheye still bends: its principal point stays, its focal length changes."""
+    camera = read_views(write_transforms(tmp_path, frames(ring(3)), **settings))[0].camera
+    assert camera.principal == (19.0, 16.0)
+    assert camera.focal != (50.0, 52.0)
+
+
+def test_coefficients_go_where_opencv_has_them(tmp_path: Path) -> None:
+    """The file names them k1 to k4, p1 and p2; OpenCV orders k1 k2 p1 p2 k3, or k1 to k4 of a fisheye."""
+    rows = frames(ring(3))
+    rows[1]["camera_model"] = "OPENCV_FISHEYE"
+    rows[1]["k4"] = 0.4
+    write_transforms(tmp_path, rows, k1=0.1, k2=0.2, k3=0.3, p1=0.01, p2=0.02)
+    perspective, fisheye = (shot.lens_of(1, 1) for shot in read_transforms(tmp_path / "transforms.json").shots[:2])
+    assert perspective.distortion == (0.1, 0.2, 0.01, 0.02, 0.3)
+    assert fisheye.distortion == (0.1, 0.2, 0.3, 0.4)
+    assert (perspective.fisheye, fisheye.fisheye) == (False, True)
+
+
+def test_masks_by_name_and_by_path(tmp_path: Path) -> None:
+    rows = frames(ring(4))
+    rows[0]["mask_path"] = "elsewhere/m.png"
+    mask = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
+    for column, place in enumerate(("elsewhere/m.png", "masks/b.png", "masks/c.png.png"), start=1):
+        mask[:] = 0
+        mask[:, column] = 255
+        write_image(tmp_path / place, mask)
+    views = read_views(write_transforms(tmp_path, rows))
+    for column, view in enumerate(views[:3], start=1):
+        assert view.mask is not None
+        assert view.mask.sum(dim=0).nonzero().flatten().tolist() == [column]
+    assert views[3].mask is None
+
+
+def test_points_that_the_file_names(tmp_path: Path) -> None:
+    write_transforms(tmp_path, frames(ring(3)), ply_file_path="sparse.ply")
+    header = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
+    header += "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
+    (tmp_path / "sparse.ply").write_text(header + "1 2 3 255 0 7\n-1 0 0.5 1 2 3\n")
+    found = read_sparse_points(tmp_path, meters=0.1)
+    assert found is not None
+    points, colors = found
+    assert torch.allclose(points, torch.tensor([[0.1, 0.2, 0.3], [-0.1, 0.0, 0.05]], dtype=torch.float64))
+    assert colors.tolist() == [[255, 0, 7], [1, 2, 3]]
+
+
+def test_a_model_beside_the_file_is_in_another_frame_and_left_alone(tmp_path: Path) -> None:
+    write_transforms(tmp_path, frames(ring(3)))
+    (tmp_path / "sparse").mkdir()
+    for name in ("cameras.txt", "images.txt", "points3D.txt"):
+        (tmp_path / "sparse" / name).write_text("1 0 0 0 1 2 3 0.1\n")
+    assert read_sparse_points(tmp_path) is None
+
+
+def test_what_is_not_json_is_named(tmp_path: Path) -> None:
+    (tmp_path / "transforms.json").write_text('{"frames": [')
+    with raises(CaptureError, file="transforms.json", value=None):
+        read_views(tmp_path)
+    (tmp_path / "transforms.json").write_text("[1, 2]")
+    with raises(CaptureError, file="transforms.json", value="list"):
+        read_views(tmp_path)
+    (tmp_path / "transforms.json").write_text('{"frames": 3}')
+    with raises(CaptureError, file="transforms.json", name="frames", value="int"):
+        read_views(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "name", "value"),
+    [
+        ({"transform_matrix": None}, "transform_matrix", None),
+        ({"transform_matrix": "one"}, "transform_matrix", "one"),
+        ({"transform_matrix": [1, 2, 3]}, "transform_matrix", [1, 2, 3]),
+        ({"transform_matrix": [[1, 0], [0, 1]]}, "transform_matrix", [2, 2]),
+        ({"file_path": None}, "file_path", None),
+        ({"fl_x": "wide"}, "fl_x", "wide"),
+        ({"fl_x": -50.0}, "intrinsics", [-50.0, 52.0, 19.0, 16.0, 0, 0, 0, 0, 0, 40, 30]),
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model", "EQUIRECTANGULAR"),
+        ({"k4": 0.1}, "k4", 0.1),
+    ],
+)
+def test_what_a_frame_lacks_is_named(tmp_path: Path, change: dict, name: str, value: Any) -> None:
+    write_transforms(tmp_path, frames(ring(4)))
+    record = json.loads((tmp_path / "transforms.json").read_text())
+    record["frames"][1] |= change
+    (tmp_path / "transforms.json").write_text(json.dumps(record))
+    with raises(CaptureError, file="transforms.json", row=1, name=name, value=value):
+        read_views(tmp_path)
+
+
+def test_without_any_focal_length_it_is_asked_for(tmp_path: Path) -> None:
+    write_transforms(tmp_path, frames(ring(3)), fl_x=None, fl_y=None)
+    with raises(CaptureError, file="transforms.json", row=0, name="fl_x"):
+        read_views(tmp_path)
+    write_transforms(tmp_path, frames(ring(3)), fl_x=None, fl_y=None, camera_angle_x=50.0)
+    with raises(CaptureError, file="transforms.json", row=0, name="camera_angle_x", value=50.0):
+        read_views(tmp_path)
+
+
+def test_an_image_with_two_cameras_is_refused(tmp_path: Path) -> None:
+    rows = frames(ring(4))
+    rows[2]["file_path"] = "./images/a.png"
+    write_transforms(tmp_path, rows)
+    with raises(CaptureError, file="transforms.json", name="a.png"):
+        read_views(tmp_path)
+
+
+def test_folders_without_cameras_say_what_is_missing(tmp_path: Path) -> None:
+    with raises(CaptureError, file="nowhere"):
+        read_views(tmp_path / "nowhere")
+    with raises(CaptureError, file="nowhere.json"):
+        read_views(tmp_path / "nowhere.json")
+    write_image(tmp_path / "images" / "a.png")
+    with raises(CaptureError, file=tmp_path, value=[]):
+        read_views(tmp_path)
+
+
+def test_numbers_that_the_caller_gives_are_checked(tmp_path: Path) -> None:
+    write_transforms(tmp_path, frames(ring(3)))
+    with raises(CaptureError, name="longest", value=0):
+        read_views(tmp_path, longest=0)
+    with raises(CaptureError, name="meters", value=-1.0):
+        read_views(tmp_path, meters=-1.0)
+
+
+def test_progress_counts_every_image(tmp_path: Path) -> None:
+    write_transforms(tmp_path, frames(ring(4)))
+    (tmp_path / "images" / "b.png").unlink()
+    seen: list[tuple[int, int]] = []
+    with warns(CaptureWarning, name="missing images", value=["b.png"]):
+        read_views(tmp_path, progress=lambda done, count: seen.append((done, count)))
+    assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
+
+
+def test_paths_outside_the_folder_are_read(tmp_path: Path) -> None:
+    """instant-ngp's own script writes such paths where the images lie elsewhere."""
+    rows = frames(ring(3))
+    write_transforms(tmp_path / "one", rows)
+    shutil.move(tmp_path / "one" / "images", tmp_path / "shots")
+    for row in rows:
+        row["file_path"] = row["file_path"].replace("images", "../shots")
+    write_transforms(tmp_path / "one", rows, images=False)
+    assert [view.name for view in read_views(tmp_path / "one")] == ["shots/a.png", "shots/b.png", "shots/c.png"]

@@ -1,0 +1,132 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from avmsf.errors import SceneError
+from avmsf.reconstruction import ObjectShape, object_surface
+from factories.looked_at import HEIGHT, RADIUS, ball, cup, cup_volume, depth_of, mesh_of, tube, views_of
+
+CELLS = 64
+WALL = 0.004
+
+
+def _shape(mesh: trimesh.Trimesh, *, behind: float = 0.0, **look: object) -> ObjectShape:
+    return object_surface(views_of(mesh, **look), depth_of(mesh, behind=behind), cells=CELLS)
+
+
+@pytest.fixture(scope="module")
+def cup_shape() -> ObjectShape:
+    return _shape(cup(wall=WALL))
+
+
+def test_a_ball_is_a_closed_ball_without_a_cavity() -> None:
+    shape = _shape(ball(0.05))
+    mesh = mesh_of(shape.as_seen())
+    assert mesh.is_watertight
+    off = np.abs(np.linalg.norm(mesh.vertices, axis=1) - 0.05)
+    # In parts of the diagonal.
+    assert off.mean() < 0.004 * shape.diagonal
+    assert np.quantile(off, 0.95) < 0.012 * shape.diagonal
+    assert shape.cavities == ()
+    assert shape.thickness_range is None
+    with pytest.raises(SceneError):
+        shape.shell(WALL)
+
+
+def test_a_cup_has_one_cavity_with_one_opening(cup_shape: ObjectShape) -> None:
+    (cavity,) = cup_shape.cavities
+    assert cavity.openings == 1
+    assert cavity.opening_area == pytest.approx(np.pi * RADIUS**2, rel=0.25)
+    assert cavity.volume == pytest.approx(np.pi * RADIUS**2 * HEIGHT - cup_volume(WALL), rel=0.15)
+    least, most = cup_shape.thickness_range
+    assert least < WALL < most
+    assert mesh_of(cup_shape.solid()).volume == pytest.approx(np.pi * RADIUS**2 * HEIGHT, rel=0.05)
+
+
+@pytest.mark.parametrize("wall", [0.0007, 0.002, 0.004, 0.008])
+def test_a_shell_is_as_thick_as_asked_for_though_cells_are_wider(cup_shape: ObjectShape, wall: float) -> None:
+    assert cup_shape.grid.spacing > 0.001
+    mesh = mesh_of(cup_shape.shell(wall))
+    assert mesh.is_watertight
+    area = np.pi * RADIUS**2 + 2 * np.pi * RADIUS * HEIGHT
+    # An eighth of a cell.
+    assert mesh.volume == pytest.approx(cup_volume(wall), abs=0.125 * cup_shape.grid.spacing * area)
+
+
+def test_a_thin_shell_of_few_triangles_is_not_pierced(cup_shape: ObjectShape) -> None:
+    wall = 0.004 * cup_shape.diagonal
+    mesh = mesh_of(cup_shape.shell(wall, faces=1100))
+    assert mesh.is_watertight
+    assert mesh.euler_number == 2
+    assert len(mesh.faces) < 2400
+    assert mesh.volume == pytest.approx(cup_volume(wall), rel=0.2)
+
+
+def test_a_tube_is_open_at_both_ends() -> None:
+    shape = _shape(tube())
+    assert sum(cavity.openings for cavity in shape.cavities) == 2
+    mesh = mesh_of(shape.shell(0.003))
+    assert mesh.euler_number == 0
+    assert mesh.volume == pytest.approx(tube().volume, rel=0.08)
+
+
+def test_depth_that_lies_behind_the_surface_is_set_right() -> None:
+    shape = _shape(cup(wall=WALL), behind=0.002)
+    assert shape.report.depth_bias == pytest.approx(0.002, abs=0.0005)
+    assert shape.cavities[0].depth == pytest.approx(HEIGHT - WALL, abs=0.006)
+
+
+def test_a_thin_plate_seen_from_both_sides_keeps_its_thickness() -> None:
+    sides = (0.1, 0.06, 0.002)
+    mesh = mesh_of(_shape(trimesh.creation.box(sides)).as_seen())
+    assert mesh.volume == pytest.approx(np.prod(sides), rel=0.2)
+
+
+def test_wrong_masks_are_found_and_left_out() -> None:
+    mesh = cup(wall=WALL)
+    views = list(views_of(mesh))
+    views[5] = replace(views[5], mask=torch.roll(views[5].mask, 40, dims=1))
+    shape = object_surface(views, depth_of(mesh), cells=CELLS)
+    assert shape.report.rejected == (views[5].name,)
+    assert mesh_of(shape.solid()).volume == pytest.approx(np.pi * RADIUS**2 * HEIGHT, rel=0.05)
+
+
+def test_a_bottom_that_no_view_saw_is_closed_and_reported() -> None:
+    block = trimesh.creation.cylinder(radius=0.04, height=0.08, sections=96)
+    shape = _shape(block, elevations=(30.0, 50.0), azimuths=18)
+    assert shape.report.unseen > 0.02
+    assert shape.report.unseen_direction[2] < -0.95
+    assert float(shape.as_seen().vertices[:, 2].min()) == pytest.approx(-0.04, abs=0.005)
+    assert _shape(block).report.unseen == 0.0
+
+
+def test_too_thick_a_wall_is_refused(cup_shape: ObjectShape) -> None:
+    for wall in (0.0, -1.0, float("nan"), 0.05):
+        with pytest.raises(SceneError):
+            cup_shape.shell(wall)
+
+
+def test_views_without_masks_are_refused() -> None:
+    mesh = ball()
+    views = [replace(view, mask=None) for view in views_of(mesh, azimuths=4)]
+    with pytest.raises(SceneError):
+        object_surface(views, depth_of(mesh))
+
+
+def test_the_digest_is_of_all_that_decides_the_surfaces(cup_shape: ObjectShape) -> None:
+    others = [replace(cup_shape, **{name: getattr(cup_shape, name) + 1}) for name in ("outer", "seen", "hollow")]
+    others.append(replace(cup_shape, supposed=not cup_shape.supposed))
+    assert len({each.digest() for each in (cup_shape, replace(cup_shape), *others)}) == 5
+
+
+def test_a_wall_as_thick_as_the_cup_is_wide_is_refused(cup_shape: ObjectShape) -> None:
+    for part in (0.8, 0.9, 0.95, 1.0, 1.2):
+        try:
+            assert mesh_of(cup_shape.shell(part * RADIUS)).is_watertight
+        except SceneError:
+            continue
+    with pytest.raises(SceneError):
+        cup_shape.shell(1.2 * RADIUS)
