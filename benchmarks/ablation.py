@@ -32,7 +32,7 @@ from avmsf.pipeline.bodies import candidate_bodies, roughened
 from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.shapes import make_shape
 from avmsf.simulate.sim20 import ABLATED
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 from benchmarks.splitcases import COUNTS, ROUGH, SplitCase, bodies_of, measured, simulated, split_case, splits_of
 
 DEFAULT = "default"
@@ -50,7 +50,7 @@ def ablation(options: Options) -> Report:
         cases.append(name)
         for variant, error in _variants(case, options):
             found[variant][name] = error
-            tell(f"{name}, {variant}: {error:.4f}")
+            log(f"{name}, {variant}: {error:.4f}")
     logs = {
         variant: {name: float(np.log(error / found[DEFAULT][name])) for name, error in errors.items()}
         for variant, errors in found.items()
@@ -141,7 +141,7 @@ def outliers(options: Options) -> Report:
             draws["found"] += len(named & wrong)
             draws["false"] += len(named - wrong)
             draws["exchanged"] += 3
-            tell(f"exchanged {sorted(wrong)}, named {sorted(named)}")
+            log(f"exchanged {sorted(wrong)}, named {sorted(named)}")
     for name, counts in COUNTS.items():
         for count in counts[:1] if options.quick_look else counts:
             for case in splits_of(captures[name], count, bodies[name], options):
@@ -179,13 +179,13 @@ def supports(options: Options) -> Report:
             row: list[str | float] = [f"{kind}, {'free' if support is None else support.name}"]
             for tried in ("free", "auto", "try", None):
                 config = BodyConfig() if tried is None else BodyConfig(supports=tried)
-                bodies = None if tried is None else candidate_bodies(solid.surface, config, tell=tell)
+                bodies = None if tried is None else candidate_bodies(solid.surface, config, log=log)
                 model, _ = MixtureEstimator(bodies=bodies).fit(case)
                 error = float((model.at(points, ways).mean.real - exact).norm() / exact.norm())
                 row += [error] if tried != "try" else [error, model.report["bodies"][0]["support"]]
                 figures[f"gains.supports.{kind}.{'free' if support is None else 'held'}.{tried}"] = error
             rows.append(row)
-            tell(f"{row}")
+            log(f"{row}")
     columns = ("object", "taken for free", "default", "supports tried", "found", "no body")
     return Report(tables=(Table("relative error of gains at 200 contacts, 12 known", columns, rows),), figures=figures)
 

@@ -36,7 +36,7 @@ from benchmarks.field import QUICK_LOOK, filled_estimator
 from benchmarks.look import slab
 from benchmarks.material import STRUCK, example_capture, shared_data, surface_features
 from benchmarks.modes import AIRCRAFT, LEAST_SHARE, count_modes, tree_frequencies
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 
 STARTS = (0, 18, 37)
 COUNTS = {"aircraft_response": (8, 15, 28), "ruler10": (5, 7), "tree43": (12, 20, 40)}
@@ -111,7 +111,7 @@ def _captures(options: Options) -> Report:
             "longest": float(delays.max()),
             "refused": float((modes.alignment.agreement < 0.5).sum()),
         }
-        tell(f"{name}: {values}")
+        log(f"{name}: {values}")
         rows.append([name, float(len(after)), *values.values()])
         figures |= {f"align.{name}.{key}": value for key, value in values.items()}
     figures["align.coherence_before"] = figures["align.aircraft_response.before"]
@@ -137,7 +137,7 @@ def _errors(options: Options) -> Report:
                 for method, make in methods.items()
                 for when, impacts in pair.items()
             }
-            tell(f"{name} {count}: {errors}")
+            log(f"{name} {count}: {errors}")
             rows += [
                 [f"{name}, {count} contacts, {method}", errors["before", method], errors["after", method]]
                 for method in methods
@@ -204,7 +204,7 @@ def _jitter_with(options: Options, cache: Path) -> Report:
             key = f"align.{name}.jitter {jitter}"
             figures |= {f"{key}.{method}": error for method, error in means.items()}
             figures |= {f"{key}.rms": rms, f"{key}.ratio": ratio, f"{key}.ratio_uncertainty": uncertainty}
-            tell(f"{name}, jitter {jitter}: {errors}, ratio {ratio:.3f} +- {uncertainty:.3f}, rms {rms:.3f}")
+            log(f"{name}, jitter {jitter}: {errors}, ratio {ratio:.3f} +- {uncertainty:.3f}, rms {rms:.3f}")
     columns = ("object and jitter", "no_body", "auto", "worst ratio to jitter 0", "standard error", "rms", "refused")
     return Report(tables=(Table("held-out error with artificial jitter", columns, rows),), figures=figures)
 

@@ -46,7 +46,7 @@ from avmsf.simulate.simulation_folder import write_simulation
 from benchmarks.costs import method_costs
 from benchmarks.material import surface_features
 from benchmarks.paperrun import paper_runs
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 from benchmarks.sonicgauss import small_method, train_small
 from benchmarks.surface import views_and_gaussians
 
@@ -88,7 +88,7 @@ def measure(options: Options) -> Report:
     with tempfile.TemporaryDirectory() as folder:
         objects = _Objects(options, Path(folder))
         for part in options.parts:
-            tell(f"baselines.{part}")
+            log(f"baselines.{part}")
             with beating(part):
                 report += PARTS[part](objects)
     return report
@@ -122,7 +122,7 @@ class _Objects:
         return surface
 
     def _family(self, name: str) -> BodyFamily:
-        return body_family(self.surface(name), count=MODES, tell=tell)
+        return body_family(self.surface(name), count=MODES, log=log)
 
     def cloud(self, identifier: str, views: int | None = None) -> GaussianCloud:
         clouds = self.folder / "clouds" if self._clouds is None else self._clouds
@@ -145,7 +145,7 @@ class _Objects:
         results = ResultsFolder(self.folder / protocol)
         evaluation.begin(results)
         for name in names:
-            run_object(evaluation, name, results, tell=tell)
+            run_object(evaluation, name, results, log=log)
         return [record for record in map(results.read, names) if record is not None]
 
 
@@ -165,7 +165,7 @@ def _diffsound(objects: _Objects) -> Report:
     found = []
     for name, part in OWN[: objects.most]:
         each = _recovered(name, part, objects)
-        tell(f"{name}: {each}")
+        log(f"{name}: {each}")
         found.append(each)
         rows.append([name, each.stiffness, each.thickness, each.poisson, each.bodies_seconds, each.fit_seconds])
     thick = [abs(each.thickness) for each in found if math.isfinite(each.thickness)]
@@ -290,7 +290,7 @@ def _locating(objects: _Objects) -> Report:
             diffsound=DiffSoundLocator.of(renderer, capture.surface.vertices),
         )  # fmt: skip
         rows.append([name, *(scores.figures(method)["rmed"] for method in LOCATING)])
-        tell(f"locating {rows[-1]}")
+        log(f"locating {rows[-1]}")
     figures = {
         f"locating.{method}.rmed": sum(float(row[place]) for row in rows) / len(rows)
         for place, method in enumerate(LOCATING, 1)

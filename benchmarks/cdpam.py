@@ -13,7 +13,7 @@ from avmsf.evaluation.cdpam import SAMPLE_RATE, Cdpam, Scaling
 from avmsf.evaluation.cdpam_network import CdpamNetwork
 from avmsf.evaluation.cdpam_weights import LAYERS, CdpamWeights, find_weights, read_weights
 from avmsf.evaluation.convolution import Workspace
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 
 
 def measure_cdpam(options: Options) -> Report:
@@ -35,7 +35,7 @@ def measure_cdpam(options: Options) -> Report:
         begun = time.perf_counter()
         plain_means(weights, clip[None])
         times.append((own, used, time.perf_counter() - begun))
-        tell(f"cdpam {repeat} of {repeats}: {own:.2f} s, as layers {times[-1][2]:.2f} s")
+        log(f"cdpam {repeat} of {repeats}: {own:.2f} s, as layers {times[-1][2]:.2f} s")
     own, used, plain = (median(column) for column in zip(*times[1:], strict=True))
     errors = distance_errors(weights, network, strikes(round(short * SAMPLE_RATE), count=4))
     figures = {

@@ -26,7 +26,7 @@ from avmsf.field.store import save
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual_noise import Residual
 from benchmarks.fem import bowl
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 
 PAIRS = ((CERAMIC, WOOD, 1.0), (GLASS, STEEL, 1.0), (WOOD, GLASS, 1.0), (IRON, PLASTIC, 0.5), (CERAMIC, CERAMIC, 2.0))
 """Old material, new material, and the new size over the old one."""
@@ -76,7 +76,7 @@ def changed_material_report(options: Options) -> Report:
         gain = float(((ours - truth).abs().amax(0) / truth.abs().amax(0)).max())
         scaled = "" if size == 1.0 else f", {size:g} times as large"
         rows.append([f"{old.name} to {new.name}{scaled}", frequency, damping, gain, seconds, solve_seconds])
-        tell(f"change_material: {rows[-1][0]}: frequencies off by {frequency:.2g}, gains by {gain:.2g}")
+        log(f"change_material: {rows[-1][0]}: frequencies off by {frequency:.2g}, gains by {gain:.2g}")
     columns = ("edit", "frequency_error", "ring_error", "gain_error", "seconds", "solve_seconds")
     # Errors at their worst, times in the mean.
     worst = {

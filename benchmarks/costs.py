@@ -8,7 +8,7 @@ from pathlib import Path
 
 from avmsf.cli import main as avmsf
 from benchmarks.material import REPOSITORY
-from benchmarks.report import Report, Table, tell
+from benchmarks.report import Report, Table, log
 from benchmarks.step import peak_gigabytes
 
 CONVENTIONS = (
@@ -24,7 +24,7 @@ def method_costs(root: Path, name: str, methods: Sequence[str], folder: Path) ->
     rows: list[list[str | float]] = []
     figures: dict[str, float] = {}
     for number, method in enumerate(methods):
-        tell(f"costs: {method}")
+        log(f"costs: {method}")
         command = [sys.executable, "-m", "benchmarks.costs", str(root), name, method, str(folder / f"{number}")]
         done = subprocess.run(command, cwd=REPOSITORY, stdout=subprocess.PIPE, text=True, check=False)
         if done.returncode != 0:

@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 
 NAME = "43_IronMortar"
 _CHILD = """
@@ -43,7 +43,7 @@ def measure_realimpact(options: Options) -> Report:
         command = [sys.executable, "-c", _CHILD, place, NAME]
         ran = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
     found = json.loads(ran.stdout.splitlines()[-1])
-    tell(f"realimpact: {found['blows']} blows in {found['seconds']:.2f} s, {found['megabytes']:.0f} MB")
+    log(f"realimpact: {found['blows']} blows in {found['seconds']:.2f} s, {found['megabytes']:.0f} MB")
     figures = {
         "realimpact.open_seconds": found["seconds"],
         "realimpact.cpu_seconds": found["cpu"],

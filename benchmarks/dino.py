@@ -24,7 +24,7 @@ from avmsf.photographs import find_foreground, read_views
 from avmsf.photographs.cameras import View
 from avmsf.symmetry.find import find_symmetries
 from benchmarks.material import REPOSITORY, shared_data
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 from benchmarks.step import peak_gigabytes
 
 EVERY = 8
@@ -97,7 +97,7 @@ def _fit(*, quick_look: bool) -> dict[str, Any]:
                     **judge(progress.cloud, held, rasterizer=rasterizer),
                 }
             )
-            tell(f"dino: step {progress.step} of {config.steps}, {curve[-1]['psnr']:.2f} dB")
+            log(f"dino: step {progress.step} of {config.steps}, {curve[-1]['psnr']:.2f} dB")
             judging += time.perf_counter() - paused
 
     began = time.perf_counter()

@@ -17,7 +17,7 @@ from avmsf.evaluation.editing_tasks import SIMULATED_TRANSITIONS, EditTask, Tran
 from avmsf.evaluation.mode_embedding import MaterialSpace, UmapSettings
 from avmsf.evaluation.mode_features import Pitches, PitchesAndRings
 from avmsf.fem.material import MATERIALS
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 from benchmarks.step import peak_gigabytes
 
 PARTS = ("edit",)
@@ -75,11 +75,11 @@ def measure_editing(
 ) -> Report:
     """Make the objects and their space, edit, and judge."""
     begun, resident = time.perf_counter(), _forget_peak()
-    tell("editing: solving shapes")
+    log("editing: solving shapes")
     labelled = labelled_objects(kinds)
     strangers = strange_shapes()
     spaces = spaces_of(labelled)
-    tell(f"editing: {len(labelled)} labelled objects after {time.perf_counter() - begun:.0f} s")
+    log(f"editing: {len(labelled)} labelled objects after {time.perf_counter() - begun:.0f} s")
     tasks = [
         referred_task(strangers[seed % 2], strangers[1 - seed % 2], transition, seed=seed)
         for transition in SIMULATED_TRANSITIONS
@@ -175,7 +175,7 @@ def _report(
 
 
 def _tell_score(score: EditScore) -> None:
-    tell(
+    log(
         f"editing: {score.object} to {score.target}, seed {score.seed}, {score.method}: umap "
         f"{score.umap['pitches']:.2f}, with rings {score.umap['rings']:.2f}, {score.seconds:.1f} s"
     )

@@ -39,7 +39,7 @@ from avmsf.pipeline.config import DINO, PRESETS
 from avmsf.pipeline.features import choose_encoder
 from benchmarks.editing import labelled_objects, referred_task, spaces_of, strange_shapes, stranger
 from benchmarks.editingfigures import write_figures
-from benchmarks.report import Options, Report, Table, show, tell
+from benchmarks.report import Options, Report, Table, log, show
 
 LEAST = 8
 """Objects that an embedding of materials needs to mean anything."""
@@ -137,7 +137,7 @@ def recorded_cast(folder: Path, *, words: bool, seed: int = 0, paper: tuple[str,
             name=dataset.name,
             value=len(REALIMPACT_26) - len(missing),
         )
-    tell(f"editing: extracting modes of {len(REALIMPACT_26) - len(missing)} objects")
+    log(f"editing: extracting modes of {len(REALIMPACT_26) - len(missing)} objects")
     objects = recorded_objects(dataset, paper=None if paper is None else _paper_fields(dataset, *paper, seed=seed))
     present = {each.material for each in objects}
     transitions = [each for each in RECORDED_TRANSITIONS if {each.source, each.target} <= present]
@@ -162,7 +162,7 @@ def _paper_fields(dataset: Dataset, encoder: str, cache: Path, *, seed: int) -> 
     scene = PRESETS["paper"].scene
     lift = replace(scene.lift, encoder=encoder, seed=seed)
     # Before the modes of all objects: without the encoder nothing else is worth its time.
-    choose_encoder(lift, tell=tell)
+    choose_encoder(lift, log=log)
     scene = replace(scene, splat=replace(scene.splat, seed=seed), lift=lift)
     looks = ObjectLooks(dataset, cache, scene, lift)
     return PaperFields(lambda name: looks(name, "paper"), replace(PUBLISHED, seed=seed), cache / "training")
@@ -170,7 +170,7 @@ def _paper_fields(dataset: Dataset, encoder: str, cache: Path, *, seed: int) -> 
 
 def simulated_cast(*, words: bool, seed: int = 0) -> Cast:
     """Return the simulated objects: four shapes in seven materials make the clusters, two strangers are edited."""
-    tell("editing: solving shapes")
+    log("editing: solving shapes")
     labelled, shapes = labelled_objects(), strange_shapes()
     tasks: tuple[EditTask, ...]
     if words:
@@ -272,7 +272,7 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def _tell_score(score: EditScore) -> None:
-    tell(f"editing: {score.object} to {score.target}, {score.method}: umap {score.umap['pitches']:.2f}")
+    log(f"editing: {score.object} to {score.target}, {score.method}: umap {score.umap['pitches']:.2f}")
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from avmsf.modal.extraction.extract import extract_modes, extract_sounds
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder, ShortTime
 from avmsf.simulate.plate import PlateModes, plate_modes
 from benchmarks.material import IMPULSE, clips_in_place
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 
 METHODS: dict[str, ModeFinder] = {"pencil": HighResolution(), "stft": ShortTime()}
 NOISES = (20, 40, 60)
@@ -97,7 +97,7 @@ def _plate(options: Options) -> Report:
         truth = plate_modes(IMPULSE.plate, strikes.contacts)
         for method, finder in METHODS.items():
             found = extract_modes(strikes, finder).bank
-            tell(f"plate, noise {noise} dB down, {method}: {len(found)} modes for {len(truth.frequency)}")
+            log(f"plate, noise {noise} dB down, {method}: {len(found)} modes for {len(truth.frequency)}")
             each = Match.of(found, truth).figures() | {"modes": float(len(found))}
             names = list(each)
             rows.append([f"{method}, {noise} dB", *each.values()])
@@ -131,7 +131,7 @@ def _bowl(options: Options, key: str, highpass: float) -> Report:
             others = torch.cat([sounds[:row], sounds[row + 1 :]])
             bank = _modes_of(others, rate, finder)
             errors[method].append(1.0 if bank is None else _error(sounds[row], bank, rate))
-            tell(f"{key} without {clips[row].name}, {method}: {len(bank or ())} modes, error {errors[method][-1]:.3f}")
+            log(f"{key} without {clips[row].name}, {method}: {len(bank or ())} modes, error {errors[method][-1]:.3f}")
         figures[f"{key}.error_{method}"] = sum(errors[method]) / len(errors[method])
     bank = extract_sounds(sounds, sample_rate=rate, method=METHODS["pencil"]).bank
     low, high = (float(bank.frequency[(bank.frequency - place).abs().argmin()]) for place in DOUBLET)
@@ -178,7 +178,7 @@ def _own_modes(key: str, options: Options) -> Report:
             modes = 0 if bank is None else len(bank)
             figures |= {f"{key}.{clip.name}.error_{method}": error, f"{key}.{clip.name}.modes_{method}": float(modes)}
             row += [error, modes]
-        tell(f"{key}, {clip.name}: {row[2:]}")
+        log(f"{key}, {clip.name}: {row[2:]}")
         rows.append(row)
     for method in METHODS:
         each = [figures[f"{key}.{clip.name}.error_{method}"] for clip in clips]
@@ -192,7 +192,7 @@ def _modes_of(sounds: Float[Tensor, "contacts samples"], sample_rate: float, fin
     try:
         return extract_sounds(sounds, sample_rate=sample_rate, method=finder).bank
     except ExtractionError as error:
-        tell(str(error))
+        log(str(error))
         return None
 
 

@@ -18,7 +18,7 @@ from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.elements import SecondOrder
 from avmsf.fem.material import CERAMIC, STEEL, Material
 from avmsf.fem.solid import Solid
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 from benchmarks.step import peak_gigabytes
 
 _LEISSA = np.array([13.489, 19.789, 24.432, 35.024, 35.024, 61.526])
@@ -35,7 +35,7 @@ def measure_fem(options: Options) -> Report:
         taken = _in_a_process(sides)
         error = float(np.abs(np.array(taken["frequency"]) / reference - 1)[:20].max())
         rows.append([f"{sides} x {sides}", taken["dofs"], taken["seconds"], taken["megabytes"], error])
-        tell(f"fem: {taken['dofs']} degrees of freedom in {taken['seconds']:.1f} s")
+        log(f"fem: {taken['dofs']} degrees of freedom in {taken['seconds']:.1f} s")
     chosen = next((row for row in rows if float(row[1]) >= 40_000), rows[-1])
     figures = {
         "fem.beam_error": beam_error(),

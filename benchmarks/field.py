@@ -30,7 +30,7 @@ from avmsf.modal.extraction.extract import extract_modes
 from avmsf.modal.extraction.least_squares import fit_gains
 from benchmarks.look import finish, lift_pictures, pictures, slab, speckled
 from benchmarks.material import IMPULSE, STRUCK, PlateCase, capture_in_place, surface_features
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 
 METHODS = (
     "white_noise",
@@ -159,7 +159,7 @@ def _crossed(options: Options) -> Report:
         errors["mislabelled"] = evaluate(fitted, test).mean()["relative_stft"]
         errors["mislabelled_named"] = sum(name in named for name in wrong) / len(wrong)
         errors["others_named"] = float(sum(name not in wrong for name in named))
-        tell(f"start {start}: {errors}; wrong {', '.join(wrong)}; named {'; '.join(named.values())}")
+        log(f"start {start}: {errors}; wrong {', '.join(wrong)}; named {'; '.join(named.values())}")
         runs.append(errors)
     means = {name: sum(run[name] for run in runs) / len(runs) for name in runs[0]}
     title = f"aircraft.{CROSSED}: what is known of the object is wrong; mean of starts"
@@ -220,7 +220,7 @@ def _visual(options: Options) -> Report:
             means = evaluate(fit(train, features, modes, config, gains=Attention()), test).mean()
             figures[f"{key}.{name}"] = means["relative_stft"]
             rows.append([name, *means.values()])
-            tell(f"{key}, {name}: {means['relative_stft']:.3f}")
+            log(f"{key}, {name}: {means['relative_stft']:.3f}")
         title = f"{key}: built-in descriptors of {len(views)} pictures, {len(train)} contacts to train on"
         report += Report(
             tables=(Table(title, ("features", "error", "l1", "l1_log", "envelope"), rows),), figures=figures
@@ -288,7 +288,7 @@ def _judge(
     held = coverage(known, test.contacts, heard, directions=test.directions, level=0.9)
     figures |= {"auto.coverage90": held.plain, "auto.coverage90_by_energy": held.by_energy}
     figures |= {"extract_seconds": extracted - begun, "fit_seconds": done - extracted}
-    tell(
+    log(
         f"{name}: {len(modes.bank)} modes in {extracted - begun:.1f} s, fit in {done - extracted:.1f} s, "
         f"{fitted.origin.report.get('damping')} damping, error {figures['field']:.3f} (no_body "
         f"{figures['no_body']:.3f}, auto {figures['auto']:.3f}, floor {figures['floor']:.3f})"

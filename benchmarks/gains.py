@@ -39,7 +39,7 @@ from avmsf.simulate.ground_truth import Truth
 from avmsf.simulate.sim20 import SIM20
 from benchmarks.ablation import ablation, outliers, supports
 from benchmarks.material import MissingDataError, example_capture
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 from benchmarks.splitcases import COUNTS, ROUGH, SplitCase, bodies_of, measured, simulated, split_case, splits_of
 from benchmarks.surface import views_and_gaussians
 
@@ -89,7 +89,7 @@ def _captures(options: Options) -> Report:
                 ratios.append(single[MIXTURE] / simple)
                 bests.append(single[MIXTURE] / min(single.values()))
             means = {method: float(np.mean(each)) for method, each in found.items()}
-            tell(f"{name} {count}: {means}")
+            log(f"{name} {count}: {means}")
             shown = ("mean of 3", "best simple", *FAMILIES, UNREFINED, MIXTURE)
             cells = [f"{means[each]:.3f} ({max(found[each]):.3f})" if each in means else "-" for each in shown]
             rows.append([f"{name}, {count} places", *cells, f"{means['coverage']:.2f}"])
@@ -144,7 +144,7 @@ def _sim20(options: Options, condition: str = "") -> Report:
             )
             errors = [each.error(each.fit(MixtureEstimator(bodies=bodies), quick=options.quick_look)) for each in fewer]
             rows.append([name, *_simulated_row(case, truth, options), *errors])
-            tell(f"{condition} {rows[-1]}")
+            log(f"{condition} {rows[-1]}")
     values = np.array([row[1:] for row in rows])
     ratios = slice(_ERRORS, _ERRORS + _RATIOS)
     means = values.mean(0)

@@ -45,7 +45,7 @@ from avmsf.simulate.sim20 import NON_SYMMETRIC, SIM20, sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from benchmarks.look import slab
 from benchmarks.material import STRUCK, capture_in_place, shared_data, surface_features
-from benchmarks.report import Options, Report, Table, show, tell
+from benchmarks.report import Options, Report, Table, log, show
 
 AIRCRAFT_COUNT, AIRCRAFT_STARTS = 15, (0, 18, 37)
 SOME = ("mug-ceramic", "blob-polycarbonate", "spoon-wood", "bowl-glass", "pot-steel")
@@ -178,7 +178,7 @@ def _simulated(name: str, options: LocatingOptions) -> tuple[Capture, Truth]:
     if options.sim20 is not None:
         folder = options.sim20 / name
         return read_capture(folder), read_truth(folder)
-    tell(f"locate.sim20: simulating {name}")
+    log(f"locate.sim20: simulating {name}")
     made = simulate_object(sim20_recipe(name), name=name, cache=options.cache)
     return made.capture, made.truth
 
@@ -186,7 +186,7 @@ def _simulated(name: str, options: LocatingOptions) -> tuple[Capture, Truth]:
 def _estimator(surface: Surface, wall: float | None, name: str, options: LocatingOptions) -> MixtureEstimator:
     config = BodyConfig(wall=wall, shapes=12, dofs=3000) if options.quick_look else BodyConfig(wall=wall)
     assert options.cache is not None
-    tell(f"locate.{name}: elastic bodies")
+    log(f"locate.{name}: elastic bodies")
     return MixtureEstimator(bodies=candidate_bodies(surface, config, cache=options.cache / name))
 
 
@@ -257,7 +257,7 @@ def _judged(case: LocatingCase, options: LocatingOptions, seconds: list[float]) 
             settings=settings | {"trained_on": list(case.train.names)},
         )
         means = {method: round(scores[kind].figures(method)["rmed_modulo"], 4) for method in METHODS}
-        tell(f"locate: {case.name} {kind or 'all families'}: {json.dumps(means)}")
+        log(f"locate: {case.name} {kind or 'all families'}: {json.dumps(means)}")
         if options.output is not None:
             scores[kind].write(options.output / f"{case.name}{'-' + kind if kind else ''}.json")
     return scores

@@ -25,7 +25,7 @@ from avmsf.simulate.sim20 import sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from avmsf.simulate.simulation_folder import write_simulation
 from benchmarks.material import shared_data
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 
 AIRCRAFT = "aircraft_response"
 OBJECTS = (AIRCRAFT, "mug-ceramic", "jug-glass")
@@ -69,7 +69,7 @@ def paper_runs(options: Options, folder: Path) -> Report:
         dataset = CaptureCollection(_folder(name, folder), time_zero="peak")
         train, test = split(dataset.capture(name).impacts, count=PLACES)
         nearest = evaluate(MeanWaveform(train, count=3), test).mean()["relative_stft"]
-        tell(f"{name}: mean of 3: {nearest:.3f}")
+        log(f"{name}: mean of 3: {nearest:.3f}")
         paper = replace(PRESETS["paper"].scene.lift, encoder=DESCRIPTORS)
         features = ObjectLooks(dataset, folder / "features", paper=paper)(name, "paper")
         begun = time.perf_counter()
@@ -120,7 +120,7 @@ def _curve(
             state = run.generator.get_state()
             error = evaluate(_AsTrained(run, features, train.sample_rate), test).mean()["relative_stft"]
             run.generator.set_state(state)
-            tell(f"{name}, step {run.step} of {end}: {error:.3f}")
+            log(f"{name}, step {run.step} of {end}: {error:.3f}")
             yield run.step, error
         if run.step == end:
             return

@@ -29,7 +29,7 @@ from avmsf.simulate.sim20 import SIM20, sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from benchmarks.field import measured_parts
 from benchmarks.material import surface_features
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 from benchmarks.step import peak_gigabytes
 
 COSTED = "skillet-iron"
@@ -81,7 +81,7 @@ def _cost(options: Options) -> Report:
                 words = f"{'filled' if name else 'wall unknown'}, {'kept shapes' if kept else 'nothing kept'}"
                 values = [taken[each] for each in ("bodies", "fit", "seconds", "gigabytes", "modes", "dofs")]
                 rows.append([words, *values])
-                tell(f"physics.cost: {words}: {taken['seconds']:.0f} s")
+                log(f"physics.cost: {words}: {taken['seconds']:.0f} s")
         figures["physics.render_ms"] = taken["render_ms"]
     title = f"{COSTED}, 8 recordings; a sound is rendered in {taken['render_ms']:.1f} ms"
     columns = ("", "s for bodies", "s for modes and fit", "s", "GB", "modes", "degrees of freedom asked")
@@ -138,7 +138,7 @@ def _coverage(options: Options) -> Report:
             test = modes.aligned(test)
         held = coverage(field, test.contacts, measured_parts(test, field), directions=test.directions, level=0.9)
         rows.append([name, held.plain, held.by_energy, evaluate(field, test).mean()["relative_stft"]])
-        tell(f"physics.coverage: {name}: {held.plain:.3f}, by energy {held.by_energy:.3f}, error {rows[-1][3]:.3f}")
+        log(f"physics.coverage: {name}: {held.plain:.3f}, by energy {held.by_energy:.3f}, error {rows[-1][3]:.3f}")
     plain, by_energy, error = torch.tensor([[float(value) for value in row[1:]] for row in rows]).mean(0).tolist()
     figures = {"physics.coverage90": plain, "physics.coverage90_by_energy": by_energy, "physics.sim20.error": error}
     columns = ("object", "coverage90", "by energy", "error")
@@ -152,16 +152,16 @@ def _frequencies(options: Options) -> Report:
     """Compare the lowest frequencies of nominal bodies, made of what the mesh encloses, with the true ones."""
     rows: list[list[str | float]] = []
     for name, recipe in list(SIM20.items())[: 1 if options.quick_look else None]:
-        true = make_body(replace(recipe, elastic_modes=COMPARED), cache=None, tell=lambda words: None)
+        true = make_body(replace(recipe, elastic_modes=COMPARED), cache=None, log=lambda words: None)
         dofs = 3000 if options.quick_look else 40_000
         heard: list[str] = []
         begun = _processor_seconds()
-        made = nominal_bodies(true.surface, walls=[None], count=COMPARED, dofs=dofs, tell=heard.append)
+        made = nominal_bodies(true.surface, walls=[None], count=COMPARED, dofs=dofs, log=heard.append)
         taken, material = _processor_seconds() - begun, material_named(recipe.material)
         speed = (material.young / material.density * NOMINAL.density / NOMINAL.young) ** 0.5
         error = made.bodies[0].elastic.frequency * speed / true.elastic.frequency - 1.0
         rows.append([name, float(error.abs().max()), float(error.mean()), taken, "; ".join(heard[-1:])])
-        tell(f"physics.frequencies: {name}: {rows[-1][1]:.3f}, {taken:.0f} s")
+        log(f"physics.frequencies: {name}: {rows[-1][1]:.3f}, {taken:.0f} s")
     figures = {
         "physics.frequency_error": sum(float(row[1]) for row in rows) / len(rows),
         "physics.largest_frequency_error": max(float(row[1]) for row in rows),

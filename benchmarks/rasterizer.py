@@ -17,7 +17,7 @@ from avmsf.gaussians.rasterizer.cpu import NumbaRasterizer
 from avmsf.gaussians.rasterizer.protocol import Rendering
 from avmsf.photographs.cameras import Camera
 from benchmarks.rasterizers import render_everywhere, render_padded
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 
 _BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
 _TENSORS = tuple(each.name for each in fields(GaussianCloud))
@@ -33,7 +33,7 @@ def measure_rasterizer(options: Options) -> Report:
     # The first turn compiles and fills caches; it is not counted.
     for repeat in range(repeats + 1):
         times.append((_seconds(own, cloud, camera, target), _seconds(render_padded, cloud, camera, target)))
-        tell(f"rasterizer {repeat} of {repeats}: {1e3 * times[-1][0]:.1f} ms, padded {1e3 * times[-1][1]:.0f} ms")
+        log(f"rasterizer {repeat} of {repeats}: {1e3 * times[-1][0]:.1f} ms, padded {1e3 * times[-1][1]:.0f} ms")
     taken, plain = (median(column) for column in zip(*times[1:], strict=True))
     best, plain_best = (min(column) for column in zip(*times[1:], strict=True))
     image_error, gradient_errors, undecided = compare(cloud, camera)

@@ -90,7 +90,7 @@ def show(report: Report, options: Options, *, name: str, out: TextIO | None = No
     print("\n".join([*lines, "", json.dumps(figures, allow_nan=False)]), file=out, flush=True)
 
 
-def tell(message: str) -> None:
+def log(message: str) -> None:
     """Say how far a benchmark is, beside its report."""
     print(message, file=sys.stderr, flush=True)
 

@@ -20,7 +20,7 @@ from avmsf.simulate.sim20 import SIM20, sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from benchmarks.field import QUICK_LOOK, filled_estimator
 from benchmarks.material import STRUCK, capture_in_place, example_capture, surface_features
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 
 RATES = {"trained": 0.1, "measured": 0.0}
 """Rate at which the fit trains the residual's magnitudes; 0 measures them. Both fields render Gaussian noise."""
@@ -58,16 +58,16 @@ def measure(options: Options) -> Report:
         for case in PARTS[part](options):
             for name, judged in _judged(case, options):
                 rows[name].append(judged)
-                tail, error, log = judged
-                tell(f"residual.{part}: {case.name}, {name}: tail {tail:.2f} dB, error {error:.4f}, l1_log {log:.4f}")
+                tail, error, l1_log = judged
+                log(f"residual.{part}: {case.name}, {name}: tail {tail:.2f} dB, error {error:.4f}, l1_log {l1_log:.4f}")
         table: list[list[str | float]] = []
         figures: dict[str, float] = {}
         for name, found in rows.items():
             columns = torch.tensor(found, dtype=torch.float64)
-            tail, error, log = float(columns[:, 0].median()), *columns[:, 1:].mean(0).tolist()
-            table.append([name, tail, error, log])
+            tail, error, l1_log = float(columns[:, 0].median()), *columns[:, 1:].mean(0).tolist()
+            table.append([name, tail, error, l1_log])
             keys = [f"residual.{part}.{name}.{key}" for key in ("tail_db", "error", "l1_log")]
-            figures |= dict(zip(keys, (tail, error, log), strict=True))
+            figures |= dict(zip(keys, (tail, error, l1_log), strict=True))
         report += Report(tables=(Table(part, ("residual", "tail_db", "error", "l1_log"), table),), figures=figures)
     return report
 

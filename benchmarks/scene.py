@@ -24,7 +24,7 @@ from benchmarks.dino import measure_dino
 from benchmarks.look import SHAPES, finish, lift_pictures, pictures, shape, slab, speckled
 from benchmarks.material import STRUCK
 from benchmarks.rasterizer import measure_rasterizer
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 from benchmarks.symmetry import measure_symmetry
 
 
@@ -60,7 +60,7 @@ def _consistency(options: Options) -> Report:
         key = f"consistency.{name.replace(' ', '_')}"
         figures |= {f"{key}.before": before, f"{key}.after": after}
         rows.append([name, float(found[0]), float(found[1]), before, after])
-        tell(f"{name}: {before:.3f} before, {after:.3f} after")
+        log(f"{name}: {before:.3f} before, {after:.3f} after")
     convention = (
         "consistency: root of the mean variance of descriptors over a point's symmetric places, in the features' own "
         f"spread over the object; {count} pictures of {size} x {size} of gray shapes under one light."
@@ -92,7 +92,7 @@ def _pipeline(options: Options) -> Report:
             config,
             cache=Path(place) / "cache",
             settings=CaptureSettings(),
-            listener=ProgressListener(tell),
+            listener=ProgressListener(log),
         )
         taken = time.perf_counter() - begun
         error = evaluate(load(made.field), test).mean()["relative_stft"]

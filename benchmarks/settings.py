@@ -16,7 +16,7 @@ from avmsf.field.recipes import Attention
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.simulate.plate import Plate
 from benchmarks.material import PlateCase, capture_in_place, surface_features
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 
 PARTS = ("network",)
 GLASS = PlateCase(
@@ -64,7 +64,7 @@ def measure(options: Options) -> Report:
         errors = [_error(case, small) for case in cases]
         figures[f"settings.{name.replace(' ', '_')}"] = sum(errors) / len(errors)
         rows.append([name, *errors, figures[f"settings.{name.replace(' ', '_')}"]])
-        tell(f"{name}: {rows[-1][-1]:.4f}")
+        log(f"{name}: {rows[-1][-1]:.4f}")
     nearby = [evaluate(MeanWaveform(train), test).mean()["relative_stft"] for train, test, _, _ in cases]
     rows.append(["knn3_waveform", *nearby, sum(nearby) / len(nearby)])
     columns = ("variant", "glass", "wood", *(f"aircraft {part} of {count}" for count, _, part in AIRCRAFT), "mean")

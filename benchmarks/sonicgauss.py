@@ -8,7 +8,7 @@ from avmsf.baselines.sonicgauss.pretraining import PretrainingConfig, pretrain
 from avmsf.baselines.sonicgauss.small import SmallConfig
 from avmsf.baselines.sonicgauss.tuning import TrainingConfig
 from avmsf.evaluation.sonicgauss_method import SmallSonicGaussMethod
-from benchmarks.report import Report, Table, tell
+from benchmarks.report import Report, Table, log
 
 OBJECTS = 40
 """Simulated objects, 32 recordings each."""
@@ -19,9 +19,9 @@ def train_small(weights: Path, *, cache: Path | None, quick: bool) -> Report:
     """Make training objects, train on them, write the weights, and return the curve of the loss."""
     config = _QUICK if quick else PretrainingConfig()
     begun = time.process_time()
-    objects = list(training_objects(training_recipes(2 if quick else OBJECTS), cache=cache, tell=tell))
+    objects = list(training_objects(training_recipes(2 if quick else OBJECTS), cache=cache, log=log))
     made = time.process_time() - begun
-    found = pretrain(objects, config, tell=tell)
+    found = pretrain(objects, config, log=log)
     found.write(weights)
     losses = [float(value) for value in found.report["losses"]]
     rows: list[list[str | float]] = [[f"{(place + 1) / len(losses):.0%}", value] for place, value in enumerate(losses)]

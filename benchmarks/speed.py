@@ -25,7 +25,7 @@ from avmsf.field.sound_field import SoundField
 from avmsf.field.training import Targets, TrainingRun
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from benchmarks.material import IMPULSE, STRUCK, shared_data
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 from benchmarks.step import STEPS, PlainRun, full_setting, memory_of_step, pass_warmup, start
 
 QUICK_LOOK = FitConfig(warmup_steps=20, steps=2)
@@ -68,7 +68,7 @@ def _step(options: Options) -> Report:
     times: list[tuple[float, float]] = []
     for repeat in range(repeats):
         times.append((_advance(ours, targets), _advance(plain, targets)))
-        tell(f"step {repeat + 1} of {repeats}: {times[-1][0]:.3f} s, plain {times[-1][1]:.3f} s")
+        log(f"step {repeat + 1} of {repeats}: {times[-1][0]:.3f} s, plain {times[-1][1]:.3f} s")
     own, other = (median(column) for column in zip(*times, strict=True))
     memory = memory_of_step(seconds)
     figures = {
@@ -96,16 +96,16 @@ def _quick(options: Options) -> Report:
     modes, extracting = _timed(lambda: extract_modes(train))
     quick, fitting = _timed(lambda: fit(train, features, modes, config, gains=Attention()))
     quick_error = evaluate(quick, test).mean()["relative_stft"]
-    tell(f"quick: {extracting:.1f} s to extract, {fitting:.1f} s to fit, error {quick_error:.4f}")
+    log(f"quick: {extracting:.1f} s to extract, {fitting:.1f} s to fit, error {quick_error:.4f}")
     task = Task(train, features, modes)
     chosen = quick.origin.report["damping"]
     spatial = chosen == "per-contact"
     estimated, step_seconds = _paper_seconds(task, spatial, config, 2 if options.quick_look else 20)
-    tell(f"paper: {estimated:.0f} s to fit, by its steps of {step_seconds:.2f} s")
+    log(f"paper: {estimated:.0f} s to fit, by its steps of {step_seconds:.2f} s")
     steps = 2 if options.quick_look else min(PAPER.steps, max(1, int(60 * options.paper_minutes / step_seconds)))
     paper, taken = _timed(lambda: _run_paper(task, spatial, steps, config if options.quick_look else PAPER))
     paper_error = evaluate(paper, test).mean()["relative_stft"]
-    tell(f"paper, {steps} steps: {taken:.0f} s, error {paper_error:.4f}")
+    log(f"paper, {steps} steps: {taken:.0f} s, error {paper_error:.4f}")
     figures = {
         "quick_speedup": (extracting + estimated) / (extracting + fitting),
         "quick_seconds": _quick_of_eight(options),
@@ -200,7 +200,7 @@ def _run_paper(task: Task, spatial: bool, steps: int, config: FitConfig) -> Soun
 
     def say(progress: Progress) -> None:
         if progress.step % 100 == 0:
-            tell(f"paper: step {progress.step} of {progress.steps}, loss {progress.loss:.4f}")
+            log(f"paper: step {progress.step} of {progress.steps}, loss {progress.loss:.4f}")
 
     recipe = replace(config, steps=steps, damping=damping)
     return fit(task.train, task.features, task.modes, recipe, gains=Attention(), progress=say)

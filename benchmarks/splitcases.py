@@ -30,7 +30,7 @@ from avmsf.symmetry.characters import groups_of
 from avmsf.symmetry.find import find_symmetries
 from avmsf.symmetry.symmetries import Symmetries
 from benchmarks.material import shared_data, surface_features
-from benchmarks.report import Options, tell
+from benchmarks.report import Options, log
 
 STARTS = (0, 18, 37)
 COUNTS = {
@@ -94,7 +94,7 @@ def split_case(train: Impacts, test: Impacts, capture: Capture, bodies: Candidat
 
 def bodies_of(surface: Surface | ObjectShape, options: Options) -> CandidateBodies:
     config = BodyConfig(shapes=12, dofs=3000) if options.quick_look else BodyConfig()
-    return candidate_bodies(surface, config, tell=tell)
+    return candidate_bodies(surface, config, log=log)
 
 
 def measured(name: str) -> Capture:

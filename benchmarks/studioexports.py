@@ -21,7 +21,7 @@ from avmsf.export.paper_demo import write_demo
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.samples import Grid, write_grid
 from avmsf.export.uff import write_universal
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 
 DRIVER = Path(__file__).resolve().parents[1] / "tests" / "export" / "faust_driver.c"
 CONVENTIONS = (
@@ -70,7 +70,7 @@ def _exports(field: SampledField) -> Report:
     found: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
-        tell("studio: exports")
+        log("studio: exports")
         weights = {
             "gltf": write_gltf(plain, place / "field.glb"),
             "demo": write_demo(plain, place / "demo"),
@@ -150,7 +150,7 @@ def _demo_sounds(folder: Path, field: SampledField, rows: torch.Tensor) -> np.nd
 def _faust(field: SampledField, place: Path) -> dict[str, float]:
     """Return the compiled program's error in both precisions and how long Faust took; nothing where it is missing."""
     if shutil.which("faust") is None or shutil.which("gcc") is None:
-        tell("studio: no faust or no gcc here, its error is not measured")
+        log("studio: no faust or no gcc here, its error is not measured")
         return {}
     found = {}
     for key, flag, real in (("faust_error", "-double", "double"), ("faust_error_single", "-single", "float")):

@@ -22,7 +22,7 @@ from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.sim20 import sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from benchmarks.material import capture_in_place, surface_features
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 
 FIRST = 6
 """Strikes to begin with."""
@@ -59,7 +59,7 @@ def _sim20(options: Options) -> Report:
     names = SIM20_OBJECTS[:1] if options.quick_look else SIM20_OBJECTS
     captures = {}
     for name in names:
-        tell(f"suggest.sim20: simulating {name}")
+        log(f"suggest.sim20: simulating {name}")
         captures[name] = simulate_object(sim20_recipe(name), name=name).capture
     return _compare("sim20", captures, None, options)
 
@@ -85,7 +85,7 @@ def _compare(key: str, captures: dict[str, Capture], wall: float | None, options
                     rows.append([f"{name}, start {number}", count, *errors])
                     found.append(errors)
                     words = ", ".join(f"{way} {error:.3f}" for way, error in zip(WAYS, errors, strict=True))
-                    tell(f"suggest.{key}: {name}, start {number}, {count} strikes: {words}")
+                    log(f"suggest.{key}: {name}, start {number}, {count} strikes: {words}")
     means = dict(zip(WAYS, (sum(each) / len(found) for each in zip(*found, strict=True)), strict=True))
     figures = {f"suggest.{key}.{way}": value for way, value in means.items()}
     ratio = means["suggested"] / means["farthest"]

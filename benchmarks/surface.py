@@ -28,7 +28,7 @@ from avmsf.photographs.cameras import View
 from avmsf.reconstruction import ObjectShape, object_surface
 from avmsf.simulate.sim20 import SIM20
 from benchmarks.material import MissingDataError
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 
 SAMPLES = 8000
 RAYS = 48
@@ -93,7 +93,7 @@ def _objects(folder: Path, clouds: Path, quick: bool) -> Report:
         scores = _scores(views, cloud, truth)
         found.append(scores)
         rows.append([name, *_cells(scores)])
-        tell(f"surface: {name}: {scores}")
+        log(f"surface: {name}: {scores}")
     means = [_mean([getattr(each, key) for each in found]) for key in _KEYS]
     rows.append(["mean", *means])
     names = ("outer_mean", "outer_p95", "thickness_error", "cavity_error", "seconds")
@@ -111,11 +111,11 @@ def _degraded(folder: Path, clouds: Path, quick: bool) -> Report:
             try:
                 found.append(_scores(change(views), cloud, truth))
             except SceneError as error:
-                tell(f"surface: {name}: {error}")
+                log(f"surface: {name}: {error}")
         means = [_mean([getattr(each, key) for each in found]) for key in _KEYS]
         rows.append([name, *means, len(materials) - len(found)])
         figures |= {f"surface.{name}.{key}": value for key, value in zip(_KEYS, means, strict=True)}
-        tell(f"surface: {name}: {means}")
+        log(f"surface: {name}: {means}")
     return Report(tables=(Table("degraded views", ("condition", *_KEYS, "failed"), rows),), figures=figures)
 
 

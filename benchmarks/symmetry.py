@@ -15,7 +15,7 @@ from avmsf.mesh.surface import read_surface
 from avmsf.symmetry.find import find_symmetries
 from avmsf.symmetry.symmetries import Symmetries
 from benchmarks.material import shared_data
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 
 PARTS = ("made", "scanned")
 POINTS = 8000
@@ -242,7 +242,7 @@ def measure_symmetry(options: Options) -> Report:
         shapes = dict(list(shapes.items())[:: max(1, len(shapes) // 3)])
     scores: dict[tuple[str, str], list[Score]] = {}
     for number, (name, shape) in enumerate(shapes.items()):
-        tell(f"symmetry: {name}")
+        log(f"symmetry: {name}")
         mesh = shape.mesh()
         for kind, (condition, change) in enumerate(CONDITIONS.items()):
             scores[name, condition] = [

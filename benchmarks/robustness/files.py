@@ -28,7 +28,7 @@ from avmsf.errors import AvmsfError
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh.textured_mesh import read_textured_mesh
 from avmsf.photographs import read_sparse_points, read_views
-from benchmarks.report import Options, Report, Table, tell
+from benchmarks.report import Options, Report, Table, log
 from benchmarks.robustness.bombs import BOMBS
 from benchmarks.robustness.mutations import damage_bytes, damage_json, damage_text
 from benchmarks.robustness.seeds import SURFACES, write_seeds
@@ -226,7 +226,7 @@ def run(
             shutil.copytree(seeds, folder)
             family, path = bomb(folder)
             outcomes.append(run_apart("bombs", name, partial(FAMILIES[family].read, folder, path)))
-    tell(f"files: {len(outcomes)} inputs in {time.monotonic() - started:.0f} s")
+    log(f"files: {len(outcomes)} inputs in {time.monotonic() - started:.0f} s")
     return outcomes
 
 

@@ -33,7 +33,7 @@ def show_view() -> None:
 
 def show_stage() -> None:
     with OverallBar({"check": 1.0}) as bar:
-        bar.tell(EVIL)
+        bar.log(EVIL)
         bar._bar.refresh()
 
 

@@ -108,12 +108,12 @@ def test_time_is_left_in_a_stage_that_takes_longer_than_usual(monkeypatch: pytes
     now = 0.0
     monkeypatch.setattr("time.monotonic", lambda: now)
     with OverallBar({"bodies": 10.0, "fit": 10.0, REFINEMENT: 20.0}) as bar:
-        bar.tell("bodies: a beginning")
+        bar.log("bodies: a beginning")
         now = 100.0
-        bar.tell("a part of the bodies")
+        bar.log("a part of the bodies")
         # Half of the run has not begun, and it is slow.
         assert bar.left > 50.0
-        bar.tell("fit: a field")
+        bar.log("fit: a field")
         bar.fitting(Progress("shared", 0, 150, 1.0, 0))
         assert bar.done == 0.5
         bar.fitting(Progress("shared", 75, 150, 1.0, 0))
@@ -127,9 +127,9 @@ def test_the_time_left_is_that_of_the_pace_so_far(
     monkeypatch.setattr("time.monotonic", lambda: now)
     with OverallBar({"first": 30.0, "second": 10.0}) as bar:
         assert bar.left == 40.0
-        bar.tell("first: a beginning")
+        bar.log("first: a beginning")
         now = 60.0
-        bar.tell("second: twice as slow as usual")
+        bar.log("second: twice as slow as usual")
         assert bar.done == 0.75
         # At the usual pace 10 s are left, at this one 20 s, in which there is more trust by now.
         assert 15.0 < bar.left < 20.0

@@ -130,5 +130,5 @@ def test_without_symmetries_features_stay_and_there_is_no_orbit():
 
 def test_every_symmetry_is_told():
     heard: list[str] = []
-    refine(field(tube()), symmetries(SIXFOLD, UPRIGHT), tell=heard.append)
+    refine(field(tube()), symmetries(SIXFOLD, UPRIGHT), log=heard.append)
     assert [line.split()[3] for line in heard] == ["6-fold", "mirror"]

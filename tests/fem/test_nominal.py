@@ -53,7 +53,7 @@ def test_a_sheet_with_a_wall_vibrates_as_the_plate_it_is():
 def test_walls_of_a_sheet_are_tried_coarsely_and_the_chosen_one_made_fine(monkeypatch: pytest.MonkeyPatch):
     told: list[str] = []
     monkeypatch.setattr(nominal, "TRIAL", 1500)
-    found = nominal_bodies(sheet(), count=6, dofs=4000, tell=told.append)
+    found = nominal_bodies(sheet(), count=6, dofs=4000, log=told.append)
     assert [body.wall for body in found.bodies] == pytest.approx(
         [part * math.hypot(0.24, 0.17) for part in nominal.WALLS]
     )
@@ -74,7 +74,7 @@ def test_walls_of_a_sheet_are_tried_coarsely_and_the_chosen_one_made_fine(monkey
 def test_what_a_ball_encloses_vibrates_as_lambs_sphere_does_and_is_kept(tmp_path: Path):
     told: list[str] = []
     inwards = Surface(ball().vertices, ball().faces.flip(1))
-    found = nominal_bodies(inwards, walls=[None], count=20, dofs=10000, cache=tmp_path, tell=told.append).bodies[0]
+    found = nominal_bodies(inwards, walls=[None], count=20, dofs=10000, cache=tmp_path, log=told.append).bodies[0]
     assert any(f"{len(inwards.faces)} of {len(inwards.faces)} triangles" in message for message in told)
     # Lamb: the torsional oscillation of degree 2, whose wave number times radius is 2.501, belongs to five modes.
     shear = math.sqrt(NOMINAL.young / (2 * (1 + NOMINAL.poisson)) / NOMINAL.density)
@@ -91,7 +91,7 @@ def test_what_a_ball_encloses_vibrates_as_lambs_sphere_does_and_is_kept(tmp_path
 
 def test_a_damaged_kept_file_is_made_again(tmp_path: Path):
     def made(told: list[str]) -> torch.Tensor:
-        bodies = nominal_bodies(sheet(), walls=[0.004], count=4, dofs=2000, cache=tmp_path, tell=told.append)
+        bodies = nominal_bodies(sheet(), walls=[0.004], count=4, dofs=2000, cache=tmp_path, log=told.append)
         return bodies.bodies[0].elastic.shapes
 
     first = made([])
@@ -109,7 +109,7 @@ def test_both_sides_of_a_wall_are_filled_and_given_no_wall():
     outer, inner = trimesh.creation.icosphere(3, radius=0.06), trimesh.creation.icosphere(3, radius=0.054)
     inner.invert()
     told: list[str] = []
-    found = nominal_bodies(surface_of(trimesh.util.concatenate([outer, inner])), count=8, dofs=8000, tell=told.append)
+    found = nominal_bodies(surface_of(trimesh.util.concatenate([outer, inner])), count=8, dofs=8000, log=told.append)
     assert [body.wall for body in found.bodies] == [None]
     # One line for all walls that are too thick, another for the surface's two parts.
     assert sum("not tried" in message for message in told) == 2
@@ -208,7 +208,7 @@ def test_a_body_stays_coarse_where_a_finer_one_does_not_fit_into_the_memory(
 ):
     monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 1e9)
     told: list[str] = []
-    assert refined(sheet(), coarse, dofs=400_000, tell=told.append) is coarse
+    assert refined(sheet(), coarse, dofs=400_000, log=told.append) is coarse
     assert told[-1].startswith("wall of 4 mm: ")
     assert "400000" in told[-1]
     assert refined(sheet(), coarse, dofs=400_000) is coarse
@@ -225,7 +225,7 @@ def test_a_body_stays_coarse_where_a_finer_one_fails(
 
     monkeypatch.setattr(nominal, "elastic_modes", fail)
     told: list[str] = []
-    assert refined(sheet(), coarse, dofs=3000, tell=told.append) is coarse
+    assert refined(sheet(), coarse, dofs=3000, log=told.append) is coarse
     assert told[-1].startswith("wall of 4 mm: ")
     assert reason in told[-1]
 
@@ -243,7 +243,7 @@ def test_the_only_body_that_is_left_stays_in_use_where_it_cannot_be_made_finer(m
 
     monkeypatch.setattr(nominal, "elastic_modes", fail)
     monkeypatch.setattr(nominal, "TRIAL", 2000)
-    found = nominal_bodies(sheet(), walls=[0.004, 0.012], count=4, dofs=4000, tell=told.append)
+    found = nominal_bodies(sheet(), walls=[0.004, 0.012], count=4, dofs=4000, log=told.append)
     assert [(body.wall, body.fine) for body in found.bodies] == [(0.004, False)]
     assert any(message.startswith("wall of 4 mm: ") and "2000 (--body.dofs)" in message for message in told)
     assert list(found.refused) == [0.012]

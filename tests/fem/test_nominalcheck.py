@@ -37,14 +37,14 @@ def test_an_inverted_part_is_turned_and_the_wall_of_a_void_is_not():
     beside.invert()
     truth = (1.0 - 0.8**3 + 0.5**3) * trimesh.creation.icosphere(2).volume
     told: list[str] = []
-    found = checked(surface_of(trimesh.util.concatenate([outer, inner, beside])), tell=told.append)
+    found = checked(surface_of(trimesh.util.concatenate([outer, inner, beside])), log=told.append)
     assert found.skin.volume == pytest.approx(truth, rel=1e-5)
     assert len(told) == 1
     assert told[0].startswith("320 of 960 triangles")
     # All of it inside out: the void goes with the body around it.
     every = trimesh.util.concatenate([outer, inner])
     every.invert()
-    assert checked(surface_of(every), tell=told.append).skin.volume == pytest.approx(
+    assert checked(surface_of(every), log=told.append).skin.volume == pytest.approx(
         (1.0 - 0.8**3) * trimesh.creation.icosphere(2).volume, rel=1e-5
     )
 
@@ -55,7 +55,7 @@ def test_an_open_vessel_that_faces_inwards_is_told_and_stays(below: float, vesse
     outwards = Surface(torch.from_numpy(skin.points).float(), torch.from_numpy(skin.faces))
     for surface, expected in ((outwards, False), (Surface(outwards.vertices, outwards.faces.flip(1)), vessel)):
         told: list[str] = []
-        found = checked(surface, tell=told.append).skin
+        found = checked(surface, log=told.append).skin
         # A dish a twentieth as deep as its radius has no inside worth the name.
         assert any("inwards" in message for message in told) == expected
         assert (found.volume > 0) == (Skin.of(surface).volume > 0)
@@ -123,7 +123,7 @@ def test_smoothing_is_told():
     noise = 0.02 * clean.size * np.random.default_rng(0).standard_normal(clean.points.shape)
     told: list[str] = []
     rough = Surface(torch.from_numpy(clean.points + noise).float(), torch.from_numpy(clean.faces))
-    checked(rough, tell=told.append)
+    checked(rough, log=told.append)
     assert len(told) == 1
     assert f"{roughness(Skin.of(rough)):.0f} degrees" in told[0]
 

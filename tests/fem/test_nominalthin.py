@@ -44,7 +44,7 @@ def test_a_dense_mesh_vibrates_as_a_coarse_one_of_the_same_shape(
         monkeypatch.setattr(nominalthin, name, 6000)
     told: list[str] = []
     found, known = (
-        nominal_bodies(surface_of(skin), walls=[0.002], count=4, dofs=8000, tell=told.append).bodies[0].elastic
+        nominal_bodies(surface_of(skin), walls=[0.002], count=4, dofs=8000, log=told.append).bodies[0].elastic
         for skin in (dense, coarse)
     )
     assert f"{len(dense.faces)} triangles" in told[0]
@@ -61,7 +61,7 @@ def test_a_noisy_mesh_is_thinned_without_its_noise_and_stays_a_skin(monkeypatch:
     told: list[str] = []
     for name in ("MOST", "ENOUGH"):
         monkeypatch.setattr(nominalthin, name, 4000)
-    found = thinned(Skin(clean.points + noise, clean.faces), tell=told.append)
+    found = thinned(Skin(clean.points + noise, clean.faces), log=told.append)
     assert len(found.faces) == 4000
     assert (found.open_edges, found.crowded_edges) == (0, 0)
     surface = ClosestPoints(clean.points[clean.faces])
@@ -79,7 +79,7 @@ def test_a_thinned_sheet_keeps_its_rim(monkeypatch: pytest.MonkeyPatch) -> None:
     sheet = Skin(points, np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]))
     for name in ("MOST", "ENOUGH"):
         monkeypatch.setattr(nominalthin, name, 1000)
-    found = thinned(sheet, tell=lambda words: None)
+    found = thinned(sheet, log=lambda words: None)
     assert len(found.faces) <= 1000
     # Each corner may lose a triangle, with sides of about .045 now.
     assert found.areas.sum() == pytest.approx(1.0, abs=4 * 0.045**2 / 2)
@@ -96,11 +96,11 @@ def test_more_triangles_are_left_where_fewer_would_tear_the_skin(monkeypatch: py
     monkeypatch.setattr(fast_simplification, "simplify", tearing)
     for name in ("MOST", "ENOUGH"):
         monkeypatch.setattr(nominalthin, name, 1000)
-    found = thinned(ball, tell=lambda words: None)
+    found = thinned(ball, log=lambda words: None)
     assert np.array_equal(found.faces, ball.faces)
     for name in ("MOST", "ENOUGH"):
         monkeypatch.setattr(nominalthin, name, 3000)
-    assert thinned(ball, tell=lambda words: None) is ball
+    assert thinned(ball, log=lambda words: None) is ball
 
 
 def test_fewer_triangles_of_a_thin_shell_keep_its_volume() -> None:

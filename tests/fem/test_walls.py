@@ -53,7 +53,7 @@ def silent(words: str) -> None:
 
 def test_a_thin_tube_bends_like_a_ring():
     radius, wall = 0.05, 0.002
-    solid = filled_solid(checked(tube(radius, wall, 0.15), tell=silent), 15_000)
+    solid = filled_solid(checked(tube(radius, wall, 0.15), log=silent), 15_000)
     lowest = float(elastic_modes(solid, STEEL, count=1).frequency[0])
     # Inextensional bending in two waves (Love, Mathematical Theory of Elasticity, art. 293, in plane strain).
     speed = math.sqrt(STEEL.young / (12 * STEEL.density * (1 - STEEL.poisson**2)))
@@ -134,7 +134,7 @@ def test_a_body_of_too_coarse_elements_is_made_finer_and_its_error_told(monkeypa
             return modes(dofs, error)
 
         monkeypatch.setattr("avmsf.fem.candidate_bodies._Maker._modes", found)
-        nominal_bodies(box(0.1, 0.1, 0.1), walls=[None], count=8, dofs=40_000, tell=heard.append)
+        nominal_bodies(box(0.1, 0.1, 0.1), walls=[None], count=8, dofs=40_000, log=heard.append)
         return asked, heard
 
     assert max(made(0.03)[0]) == 40_000
@@ -151,6 +151,6 @@ def test_the_stem_of_a_goblet_keeps_its_cross_section():
     shape = make_shape("goblet", seed=6)
     found, expected = (
         float(elastic_modes(solid, STEEL, count=1).frequency[0])
-        for solid in (filled_solid(checked(shape.surface, tell=silent), 20_000), shape.solid)
+        for solid in (filled_solid(checked(shape.surface, log=silent), 20_000), shape.solid)
     )
     assert found == pytest.approx(expected, rel=0.08)

@@ -261,6 +261,6 @@ def test_contacts_elsewhere_are_refused_before_any_body_is_computed() -> None:
     told: list[str] = []
     surface = Surface(1000.0 * dome().vertices, dome().faces)
     with raises(FitError, name="contacts") as caught:
-        candidate_bodies(surface, impacts=recorded(12)[0], tell=told.append)
+        candidate_bodies(surface, impacts=recorded(12)[0], log=told.append)
     assert "unit mm" in str(caught.value)
     assert told == []

@@ -82,7 +82,7 @@ def test_bodies_of_a_shape_are_read_again_and_those_of_another_shape_are_not(tmp
 
     def frequency(shape: Cup) -> torch.Tensor:
         said.clear()
-        made = nominal_bodies(shape, walls=[0.009], count=6, dofs=2000, cache=tmp_path, tell=said.append)
+        made = nominal_bodies(shape, walls=[0.009], count=6, dofs=2000, cache=tmp_path, log=said.append)
         return made.bodies[0].elastic.frequency
 
     def computed() -> int:

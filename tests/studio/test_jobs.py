@@ -90,7 +90,7 @@ def test_a_stage_is_named_once(tmp_path: Path) -> None:
     told = ["capture: reading the recordings", "bodies: wall, 1 of 6", "128 elastic modes"]
     with (tmp_path / "told").open("w") as stream:
         for words in told:
-            Voice(stream).tell(words)
+            Voice(stream).log(words)
     heard = [json.loads(line) for line in (tmp_path / "told").read_text().splitlines()]
     assert [(event["stage"], event["words"]) for event in heard] == [
         ("capture", "reading the recordings"),

@@ -200,7 +200,7 @@ class CaptureServer:
         page.route("**/capture/strikes**", self.hear)
         page.route("**/capture/strikes/**", self.change)
         page.route("**/reconstruct", lambda route: answer(route, {"job": "j1"}, 202))
-        page.route("**/jobs/j1/events", self.tell)
+        page.route("**/jobs/j1/events", self.log)
 
     def describe(self) -> dict[str, Any]:
         return {"folder": "/captures/plate", "strikes": list(self.strikes.values()), "problems": [], "ready": True}
@@ -228,7 +228,7 @@ class CaptureServer:
             self.strikes = {key: each for key, each in self.strikes.items() if not request.url.endswith(each["file"])}
         answer(route, {})
 
-    def tell(self, route: "Route") -> None:
+    def log(self, route: "Route") -> None:
         events = [{"stage": "fit", "done": 3, "total": 9, "words": "loss 0.1"}, {"field": "/captures/plate/field"}]
         body = "".join(f"id: {number}\ndata: {json.dumps(event)}\n\n" for number, event in enumerate(events))
         route.fulfill(content_type="text/event-stream", body=body)

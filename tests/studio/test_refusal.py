@@ -118,7 +118,7 @@ def test_a_server_without_a_temporary_folder_does_not_start(tmp_path: Path, monk
     opened = open_plate(tmp_path / "opened")
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "none"))
     with raises(StudioError, name="TMPDIR"):
-        serve(opened, port=0, browser=False, tell=print)
+        serve(opened, port=0, browser=False, log=print)
 
 
 def test_a_capture_folder_that_is_gone_is_said_to_be(capture: Served, tmp_path: Path) -> None:

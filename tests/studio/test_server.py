@@ -603,7 +603,7 @@ def test_a_port_in_use_is_named_with_a_way_out(tmp_path: Path, monkeypatch: pyte
         other.listen()
         taken = other.getsockname()[1]
         with raises(StudioError, name="port", value=taken):
-            serve(open_plate(tmp_path), port=taken, browser=False, tell=print)
+            serve(open_plate(tmp_path), port=taken, browser=False, log=print)
         monkeypatch.setattr(server, "PORT", taken)
         with server._listening(None) as listener:
             assert listener.getsockname()[1] != taken

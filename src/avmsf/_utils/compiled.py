@@ -65,8 +65,8 @@ def _has_space() -> bool:
 
 
 @contextmanager
-def announced(tell: Callable[[str], None], meanwhile: Callable[[str], AbstractContextManager[None]]) -> Iterator[None]:
-    """Report what is compiled: to `tell` once for each part of the package, and by `meanwhile` for as long as it takes.
+def announced(log: Callable[[str], None], meanwhile: Callable[[str], AbstractContextManager[None]]) -> Iterator[None]:
+    """Report what is compiled: to `log` once for each part of the package, and by `meanwhile` for as long as it takes.
 
     Nothing is reported where all is cached.
     """
@@ -76,7 +76,7 @@ def announced(tell: Callable[[str], None], meanwhile: Callable[[str], AbstractCo
             from numba.core import event
 
             event.Listener.register(_Announcer)
-            stack.enter_context(event.install_listener("numba:compile", _Announcer(tell, meanwhile)))
+            stack.enter_context(event.install_listener("numba:compile", _Announcer(log, meanwhile)))
 
         if "numba" in sys.modules:
             listen()
@@ -89,8 +89,8 @@ def announced(tell: Callable[[str], None], meanwhile: Callable[[str], AbstractCo
 
 
 class _Announcer:
-    def __init__(self, tell: Callable[[str], None], meanwhile: Callable[[str], AbstractContextManager[None]]) -> None:
-        self.tell, self.meanwhile, self.told = tell, meanwhile, set[str]()
+    def __init__(self, log: Callable[[str], None], meanwhile: Callable[[str], AbstractContextManager[None]]) -> None:
+        self.log, self.meanwhile, self.told = log, meanwhile, set[str]()
         # A function is compiled within another that calls it; numba compiles in one thread at a time.
         self.running: list[AbstractContextManager[None]] = []
 
@@ -108,7 +108,7 @@ class _Announcer:
         self.running[-1].__enter__()
         if ours and part not in self.told:
             self.told.add(part)
-            self.tell(words)
+            self.log(words)
 
 
 _PARTS = {

@@ -83,7 +83,7 @@ def _go_all_the_way(
     shutil.copytree(EXAMPLE_FOLDER, folder / "capture")
     report = check(folder / "capture")
     wrong = sum(bool(each.problems) for each in report.recordings)
-    bar.tell(f"check: {len(report.recordings)} recordings, {wrong} with problems")
+    bar.log(f"check: {len(report.recordings)} recordings, {wrong} with problems")
     capture = replace(read_capture(folder / "capture"), name="mug")
     train, test = split(capture.impacts, count=TRAIN)
     made = reconstruct(
@@ -97,7 +97,7 @@ def _go_all_the_way(
         fitting=bar.fitting,
     )
     train, test = made.modes.aligned(train), made.modes.aligned(test)
-    bar.tell("page: a web page, sounds, figures and scores")
+    bar.log("page: a web page, sounds, figures and scores")
     shutil.move(made.field, folder / FIELD)
     shutil.move(folder / CACHE / CLOUD, folder / GAUSSIANS)
     field = load(folder / FIELD)

@@ -253,9 +253,9 @@ def settled_lifts(
     if lift.encoder != AUTO:
         return lift, replace(paper, encoder=lift.encoder)
     if any(look.startswith("paper") for look in looks):
-        choose_encoder(paper, tell=say, device=device)
+        choose_encoder(paper, log=say, device=device)
         return replace(lift, encoder=paper.encoder), paper
-    return settled(lift, tell=say, device=device) if set(looks) - {"surface"} else lift, paper
+    return settled(lift, log=say, device=device) if set(looks) - {"surface"} else lift, paper
 
 
 def looks_of(methods: Sequence[Method], protocol: EvaluationProtocol) -> frozenset[Look]:

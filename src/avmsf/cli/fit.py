@@ -148,7 +148,7 @@ def _run_guess(options: Options, material: str, settings: CaptureSettings) -> in
         settings=settings,
         name=settings.name or options.capture.resolve().stem,
         cache=unfinished(options.output, "bodies"),
-        tell=say,
+        log=say,
     )
     guessed = with_record(guessed, options.pipeline, {})
     save(guessed, options.output)

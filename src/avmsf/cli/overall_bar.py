@@ -56,7 +56,7 @@ class OverallBar:
     @property
     def listener(self) -> ProgressListener:
         """Who hears of the stages that lead to features."""
-        return ProgressListener(self.tell, self._splatting, self._lifting)
+        return ProgressListener(self.log, self._splatting, self._lifting)
 
     @property
     def left(self) -> float:
@@ -64,7 +64,7 @@ class OverallBar:
         at, seconds = self._estimate
         return max(0.0, seconds - (time.monotonic() - at))
 
-    def tell(self, words: str) -> None:
+    def log(self, words: str) -> None:
         """Take note of what begins: of a stage, where the words are `stage: ...`, else of a part of the same stage."""
         stage = words.partition(":")[0]
         if stage in self.stages:
@@ -78,7 +78,7 @@ class OverallBar:
     def fitting(self, progress: FitProgress) -> None:
         """Take note of a step of the refinement, which follows the solution for the gains."""
         if self._stage != REFINEMENT and REFINEMENT in self.stages:
-            self.tell(f"{REFINEMENT}: {counted(progress.steps, 'step')}")
+            self.log(f"{REFINEMENT}: {counted(progress.steps, 'step')}")
         doing(f"fit: step {progress.step} of {progress.steps}")
         self._advance(progress.step / progress.steps)
 

@@ -27,7 +27,7 @@ def run(options: Options) -> int:
         opened,
         port=options.port,
         browser=not options.no_browser,
-        tell=lambda address: _tell(address, json=options.json),
+        log=lambda address: _tell(address, json=options.json),
         config=StudioConfig(options.model, options.modes, preset=options.preset),
     )
     say("closed")

@@ -268,11 +268,11 @@ def simulated_objects(
     shapes: tuple[SolvedShape, ...], *, seed: int = 0, progress: Callable[[str], None] | None = None
 ) -> tuple[KnownObject, ...]:
     """Return each shape in each material of the table, in sizes of their own."""
-    tell = progress or (lambda stage: None)
+    log = progress or (lambda stage: None)
     found = []
     for shape in shapes:
         for material in MATERIALS.values():
-            tell(f"{shape.kind} of {material.name}")
+            log(f"{shape.kind} of {material.name}")
             size = drawn_size(shape.kind, material.name, seed=seed)
             found.append(shape.struck(material, size=size))
     return tuple(found)

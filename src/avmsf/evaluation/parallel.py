@@ -57,10 +57,10 @@ def run_objects(
         evaluation.begin(results)
         for done, identifier in enumerate(identifiers):
 
-            def tell(words: str, identifier: str = identifier, done: int = done) -> None:
+            def log(words: str, identifier: str = identifier, done: int = done) -> None:
                 heard(RunProgress(f"{identifier}: {words}", done, len(identifiers)))
 
-            run_object(evaluation, identifier, results, tell)
+            run_object(evaluation, identifier, results, log)
             heard(RunProgress(f"{identifier}: done", done + 1, len(identifiers)))
         return
     ray = _ray()

@@ -24,11 +24,11 @@ from avmsf.simulate.ground_truth import Truth
 
 
 def run_object(
-    evaluation: Evaluation, identifier: str, results: ResultsFolder, tell: Callable[[str], None] | None = None
+    evaluation: Evaluation, identifier: str, results: ResultsFolder, log: Callable[[str], None] | None = None
 ) -> None:
     """Evaluate all methods on one object, except those with stored results; each result is stored at once.
 
-    On one thread. Failures of an object or a method are stored as their results. `tell` is called with a message for
+    On one thread. Failures of an object or a method are stored as their results. `log` is called with a message for
     each method that begins. Raises EvaluationError where stored results are of other recordings.
     """
     with one_thread():
@@ -75,7 +75,7 @@ def run_object(
                 ),
                 record,
                 results,
-                tell,
+                log,
             )
 
 
@@ -134,7 +134,7 @@ def digest_of(impacts: Impacts, truth: Truth | None) -> str:
 
 
 def _run_case(
-    run: CaseRun, record: ObjectRecord, results: ResultsFolder, tell: Callable[[str], None] | None
+    run: CaseRun, record: ObjectRecord, results: ResultsFolder, log: Callable[[str], None] | None
 ) -> ObjectRecord:
     """Run the methods that have no figures in a case, and return the object's record with them."""
     key = run.case.key
@@ -142,8 +142,8 @@ def _run_case(
         digest = method.digest(run.identifier) if isinstance(method, FromFiles) else ""
         if record.done(key, method.name, digest):
             continue
-        if tell is not None:
-            tell(f"{key}, {method.name}")
+        if log is not None:
+            log(f"{key}, {method.name}")
         outcome = replace(run.outcome(method), digest=digest)
         cases = tuple(run.described(case) if case.key == key else case for case in record.cases)
         record = replace(record, cases=cases).adding(outcome)

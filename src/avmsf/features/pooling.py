@@ -33,7 +33,7 @@ def refine(
     iterations: int = ITERATIONS,
     angles: int = ANGLES,
     reach: float = REACH,
-    tell: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
 ) -> FeatureField:
     """Return the same points with features that agree between symmetric places.
 
@@ -43,13 +43,13 @@ def refine(
 
     A rotated point without a point of the cloud within `reach` spacings, in a hole of it, is left out of the mean, so
     that features of another part are not mixed in; `reach` 0 takes the nearest point however far it is (paper). Without
-    symmetries the features come back as they are. `tell` receives a message for each symmetry. Raises
+    symmetries the features come back as they are. `log` receives a message for each symmetry. Raises
     SceneError for fewer than one iteration or angle.
     """
     if iterations < 1 or angles < 1:
         name, value = ("iterations", iterations) if iterations < 1 else ("angles", angles)
         raise SceneError(f"{name}: expected at least 1, got {value}", name=name, value=value)
-    orbits = _orbits(features.points, symmetries, angles=angles, reach=reach, tell=tell or _silent)
+    orbits = _orbits(features.points, symmetries, angles=angles, reach=reach, log=log or _silent)
     pools = [_pool(rows, found) for rows, found in orbits]
     values = features.features.detach().cpu().numpy()
     for _ in range(iterations):
@@ -70,7 +70,7 @@ def orbit_spread(features: FeatureField, symmetries: Symmetries, *, angles: int 
     values = features.features.detach().cpu().double()
     total = float(values.var(dim=0, correction=0).sum())
     within, counted = 0.0, 0
-    for rows, found in _orbits(features.points, symmetries, angles=angles, tell=_silent):
+    for rows, found in _orbits(features.points, symmetries, angles=angles, log=_silent):
         members = found.sum(dim=0)
         shared = members > 1
         mean = torch.from_numpy(_pool(rows, found).astype(np.float64) @ values.numpy())
@@ -97,7 +97,7 @@ def _orbits(
     symmetries: Symmetries,
     *,
     angles: int,
-    tell: Callable[[str], None],
+    log: Callable[[str], None],
     reach: float = REACH,
 ) -> list[Counterparts]:
     """Return the counterparts under every rotation, and then under every mirror plane."""
@@ -109,11 +109,11 @@ def _orbits(
     limit = reach * spacing if reach else torch.full_like(spacing, math.inf)
     orbits = []
     for rotation in symmetries.rotations:
-        tell(f"symmetric points under {rotation}")
+        log(f"symmetric points under {rotation}")
         turned = [rotation.turn(places, angle) for angle in rotation.angles(angles)[1:]]
         orbits.append(_counterparts(turned, tree, limit))
     for mirror in symmetries.mirrors:
-        tell(f"symmetric points under {mirror}")
+        log(f"symmetric points under {mirror}")
         orbits.append(_counterparts([mirror.reflect(places)], tree, limit))
     return orbits
 

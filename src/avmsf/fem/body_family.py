@@ -96,7 +96,7 @@ def body_family(
     count: int,
     dofs: int = DOFS,
     solid_dofs: int = SOLID_DOFS,
-    tell: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
 ) -> BodyFamily:
     """Return the bodies of a surface, with their lowest `count` modes.
 
@@ -108,10 +108,10 @@ def body_family(
 
     Raises SimulationError for points without triangles, and where no body can be made, with the reason.
     """
-    told = tell or (lambda words: None)
+    told = log or (lambda words: None)
     if not isinstance(surface, Surface):
         return _of_shape(surface, count, dofs, solid_dofs, told)
-    found = checked(surface, tell=told)
+    found = checked(surface, log=told)
     if found.lids > _HOLES:
         make = wall_solids(found, dofs)
         thicknesses = [part * found.skin.size for part in WALLS if part * found.skin.size < found.width]
@@ -124,33 +124,33 @@ def body_family(
     return _of_walls(lambda thickness: scaled(thickness / mean), [mean * scale for scale in _SCALES], count, told)
 
 
-def _of_shape(shape: Shape, count: int, dofs: int, solid_dofs: int, tell: Callable[[str], None]) -> BodyFamily:
+def _of_shape(shape: Shape, count: int, dofs: int, solid_dofs: int, log: Callable[[str], None]) -> BodyFamily:
     between = shape.thickness_range
     if between is None:
-        return _solid_body(checked(shape.as_seen(), tell=tell), count, solid_dofs, tell)
+        return _solid_body(checked(shape.as_seen(), log=log), count, solid_dofs, log)
 
     def make(thickness: float) -> Solid:
         try:
             surface = shape.shell(thickness, faces=round(0.5 * TRIANGLES * dofs))
         except SceneError as error:
             raise SimulationError(str(error), **error.attributes) from error
-        return filled_solid(checked(surface, tell=tell), dofs, wall=thickness)
+        return filled_solid(checked(surface, log=log), dofs, wall=thickness)
 
-    return _of_walls(make, np.geomspace(*between, _THICKNESSES).tolist(), count, tell)
+    return _of_walls(make, np.geomspace(*between, _THICKNESSES).tolist(), count, log)
 
 
-def _solid_body(found: CheckedSurface, count: int, dofs: int, tell: Callable[[str], None]) -> BodyFamily:
-    tell("dividing the body into tetrahedra")
+def _solid_body(found: CheckedSurface, count: int, dofs: int, log: Callable[[str], None]) -> BodyFamily:
+    log("dividing the body into tetrahedra")
     return BodyFamily((isotropic_modes(filled_solid(found, dofs), count=count),), ())
 
 
 def _of_walls(
-    make: Callable[[float], Solid], thicknesses: list[float], count: int, tell: Callable[[str], None]
+    make: Callable[[float], Solid], thicknesses: list[float], count: int, log: Callable[[str], None]
 ) -> BodyFamily:
     """Return the bodies of those thicknesses, meters, that can be made."""
     made, reasons = {}, []
     for thickness in thicknesses:
-        tell(f"elastic modes of a wall of {1000 * thickness:.2g} mm")
+        log(f"elastic modes of a wall of {1000 * thickness:.2g} mm")
         try:
             made[thickness] = isotropic_modes(make(thickness), count=count)
         except SimulationError as error:

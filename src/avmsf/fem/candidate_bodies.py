@@ -110,7 +110,7 @@ def nominal_bodies(
     dofs: int = 40_000,
     material: Material = NOMINAL,
     cache: Path | None = None,
-    tell: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
 ) -> NominalBodies:
     """Return the bodies that may lie behind a surface, with the lowest `count` modes of each, made of `material`.
 
@@ -118,14 +118,14 @@ def nominal_bodies(
     and walls of `WALLS` times the surface's size where the surface is a sheet or holds much more than the wall would;
     of a `Shape`, walls all over its range of thickness. Where one body is left, it has about `dofs` degrees of
     freedom, at most a fifth more; of several each has at most `TRIAL`, or `WALL_TRIAL`, enough to choose by, and
-    `refined` makes the chosen one fine. Dense, noisy and inverted surfaces are repaired, and `tell` is called with a
+    `refined` makes the chosen one fine. Dense, noisy and inverted surfaces are repaired, and `log` is called with a
     note; the wall of an open one lies behind its triangles, whichever way they face. Modes are kept by content in the
     folder `cache`, for they take most of the time; a damaged file is made again.
 
     Raises SimulationError for a surface of points, and where no body can be had, with the reason for each: by the name
     "surface", or by that of the reason where only memory, time or the mesher stood against it.
     """
-    told = tell or (lambda words: None)
+    told = log or (lambda words: None)
     maker = _Maker(surface, count, cache, told, material)
     _expect_settings(count, dofs, walls)
     guessed = walls is None
@@ -152,7 +152,7 @@ def nominal_bodies(
     for reason in reasons:
         told(_without(reason))
     if len(bodies) == 1 and not bodies[0].fine:
-        bodies = [refined(surface, bodies[0], dofs=dofs, cache=cache, tell=tell)]
+        bodies = [refined(surface, bodies[0], dofs=dofs, cache=cache, log=log)]
     return NominalBodies(tuple(bodies), MappingProxyType({wall: str(error) for wall, error in refused.items()}))
 
 
@@ -163,13 +163,13 @@ def with_wall(
     count: int = 80,
     dofs: int = 40_000,
     cache: Path | None = None,
-    tell: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
 ) -> NominalBody | None:
     """Return the body with a wall of this thickness, meters, coarse as those of `nominal_bodies`; None if that fails.
 
-    `tell` is called with the reason.
+    `log` is called with the reason.
     """
-    told = tell or (lambda words: None)
+    told = log or (lambda words: None)
     try:
         return _Maker(surface, count, cache, told).body(wall, dofs, fine=False)
     except SimulationError as error:
@@ -183,17 +183,17 @@ def refined(
     *,
     dofs: int = 40_000,
     cache: Path | None = None,
-    tell: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
 ) -> NominalBody:
     """Return a body of `nominal_bodies` computed with about `dofs` degrees of freedom; a fine one as it is.
 
     Where that fails, for want of memory or because it cannot be filled so finely, the coarser one is returned, which
-    was good enough to choose by, and `tell` is called with the reason. Raises SimulationError for settings that cannot
+    was good enough to choose by, and `log` is called with the reason. Raises SimulationError for settings that cannot
     be meant.
     """
     if body.fine:
         return body
-    told = tell or (lambda words: None)
+    told = log or (lambda words: None)
     _expect_settings(len(body.elastic), dofs, [body.wall])
     try:
         maker = _Maker(surface, len(body.elastic), cache, told, body.elastic.material)
@@ -212,15 +212,15 @@ def supported(
     *,
     dofs: int = 40_000,
     cache: Path | None = None,
-    tell: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
 ) -> tuple[NominalBody, ...]:
     """Return a free body of `nominal_bodies`, and held where an object may be: at its lowest face or point, or an edge.
 
     All have the same tetrahedra, of `TRIAL` or `WALL_TRIAL` degrees of freedom at most, enough to choose by; `refined`
     makes the chosen one fine, without a check of its convergence. Those whose modes cannot be computed are left out,
-    and `tell` is called with the reason; none are returned if the free one's cannot.
+    and `log` is called with the reason; none are returned if the free one's cannot.
     """
-    told = tell or (lambda words: None)
+    told = log or (lambda words: None)
     trial = TRIAL if isinstance(surface, Surface) else WALL_TRIAL
     few = min(dofs, trial)
     maker, bodies = _Maker(surface, len(body.elastic), cache, told, body.elastic.material), []
@@ -247,12 +247,12 @@ class _Maker:
         surface: Surface | Shape,
         count: int,
         cache: Path | None,
-        tell: Callable[[str], None],
+        log: Callable[[str], None],
         material: Material = NOMINAL,
     ) -> None:
         self._given = surface
         self._shape = None if isinstance(surface, Surface) else surface
-        self._count, self._cache, self._tell, self._material = count, cache, tell, material
+        self._count, self._cache, self._tell, self._material = count, cache, log, material
         self._walls: dict[int, Callable[[float], Solid]] = {}
         self._lock = Lock()
 
@@ -263,7 +263,7 @@ class _Maker:
     @cached_property
     def checked(self) -> CheckedSurface:
         """The surface, mended."""
-        return checked(self._seen, tell=self._tell)
+        return checked(self._seen, log=self._tell)
 
     def guesses(self) -> list[float | None]:
         """Return the walls to try; None for what the surface encloses."""
@@ -347,12 +347,12 @@ class _Maker:
         """Return the modes of tetrahedra that are held, or free without a support, read from where they are kept."""
         fixed = None if support is None else support.nodes(SecondOrder.of(solid))
         kept = self._kept(wall, dofs, support, perturbed=perturbed)
-        return modes_once(kept, lambda: self._solved(solid, dofs, fixed, perturbed=perturbed), tell=self._tell)
+        return modes_once(kept, lambda: self._solved(solid, dofs, fixed, perturbed=perturbed), log=self._tell)
 
     def _modes(self, wall: float | None, dofs: int, *, perturbed: bool) -> ElasticModes:
         """Return the modes of one free body, read from where they are kept."""
         kept = self._kept(wall, dofs, perturbed=perturbed)
-        return modes_once(kept, lambda: self._computed(wall, dofs, perturbed=perturbed), tell=self._tell)
+        return modes_once(kept, lambda: self._computed(wall, dofs, perturbed=perturbed), log=self._tell)
 
     def _computed(self, wall: float | None, dofs: int, *, perturbed: bool) -> ElasticModes:
         return self._solved(self.solid(wall, dofs), dofs, None, perturbed=perturbed)
@@ -383,7 +383,7 @@ class _Maker:
                 surface = self._shape.shell(wall, faces=round(0.5 * TRIANGLES * dofs))
             except SceneError as error:
                 raise SimulationError(str(error), **error.attributes) from error
-            return filled_solid(checked(surface, tell=self._tell), dofs, wall=wall)
+            return filled_solid(checked(surface, log=self._tell), dofs, wall=wall)
         with self._lock:
             if dofs not in self._walls:
                 self._walls[dofs] = wall_solids(self.checked, dofs)

@@ -122,17 +122,17 @@ def load_modes(path: str | Path) -> ElasticModes:
     return ElasticModes(tensors["frequency"], tensors["nodes"], rows, tensors["shapes"], material, weight, changes)
 
 
-def modes_once(path: Path | None, compute: Callable[[], ElasticModes], *, tell: Callable[[str], None]) -> ElasticModes:
+def modes_once(path: Path | None, compute: Callable[[], ElasticModes], *, log: Callable[[str], None]) -> ElasticModes:
     """Return the modes that `path` keeps, or compute them and keep them there, where that is possible; None keeps none.
 
-    A damaged file is made again, and `tell` hears of it. Raises as `compute`.
+    A damaged file is made again, and `log` is called. Raises as `compute`.
     """
     # Unlike Path.is_file, this is False where the folder cannot be read.
     if path is not None and os.path.isfile(path):
         try:
             return load_modes(path)
         except SimulationError as error:
-            tell(f"computing the modes again ({error})")
+            log(f"computing the modes again ({error})")
     modes = compute()
     if path is not None:
         keep_if_possible(lambda: save_modes(modes, path), path)

@@ -97,19 +97,19 @@ class CheckedSurface:
         return Skin.compact(self.skin.points, self.skin.faces[self.parts == 0]).oriented()
 
 
-def checked(surface: Surface, *, tell: Callable[[str], None]) -> CheckedSurface:
+def checked(surface: Surface, *, log: Callable[[str], None]) -> CheckedSurface:
     """Return a surface with inverted parts turned and noise taken out, and tell what was done and what is missing.
 
     A mesh of very many triangles is thinned first. Raises SimulationError for points without triangles, damaged
     triangles and a mesh without area.
     """
-    skin, turned = _turned(thinned(_closed(Skin.of(surface)), tell=tell))
+    skin, turned = _turned(thinned(_closed(Skin.of(surface)), log=log))
     if turned:
-        tell(f"{turned} of {len(skin.faces)} triangles of the mesh faced inwards: reversed")
+        log(f"{turned} of {len(skin.faces)} triangles of the mesh faced inwards: reversed")
     before = roughness(skin)
     skin, moved = denoised(skin)
     if moved:
-        tell(
+        log(
             f"noisy mesh, adjacent triangles differ by {before:.0f} degrees on average: smoothed, vertices moved by "
             f"{1000 * moved:.2g} mm (RMS)"
         )
@@ -117,12 +117,12 @@ def checked(surface: Surface, *, tell: Callable[[str], None]) -> CheckedSurface:
     if skin.open_edges:
         # No mistake that could be undone: what was seen from inside alone faces inwards, and its wall lies outside.
         if _held(skin) < -_VESSEL * float(skin.areas.sum()) ** 1.5:
-            tell(
+            log(
                 "open mesh whose triangles face inwards: its wall is taken to be outside; reverse the triangles if the "
                 "wall is inside"
             )
         helps = "trying to close the holes" if result.lids <= _LIDS else "give a wall thickness"
-        tell(f"the mesh has {skin.open_edges} open edges: {helps}")
+        log(f"the mesh has {skin.open_edges} open edges: {helps}")
     return result
 
 

@@ -22,7 +22,7 @@ _ROUNDS = 4
 """Averages taken of a noisy mesh over the thinning, so that they reach little farther than an edge that stays."""
 
 
-def thinned(skin: Skin, *, tell: Callable[[str], None]) -> Skin:
+def thinned(skin: Skin, *, log: Callable[[str], None]) -> Skin:
     """Return a skin of at most `MOST` triangles, fewer within the tolerance, and tell what was done to a larger one.
 
     More are left where fewer would open a seam or share an edge among three.
@@ -30,7 +30,7 @@ def thinned(skin: Skin, *, tell: Callable[[str], None]) -> Skin:
     count = len(skin.faces)
     if count <= ENOUGH:
         return skin
-    tell(f"checking a mesh of {count} triangles")
+    log(f"checking a mesh of {count} triangles")
     rough = roughness(skin)
     # Quadrics follow each noisy corner, and tie the skin into knots.
     even = averaged(skin, math.ceil(_ROUNDS * count / MOST)) if rough >= ROUGH else skin
@@ -43,7 +43,7 @@ def thinned(skin: Skin, *, tell: Callable[[str], None]) -> Skin:
     if found is even:
         return skin
     noise = "" if even is skin else f", after smoothing its noise of {rough:.0f} degrees"
-    tell(f"mesh simplified to {len(found.faces)} triangles{noise}")
+    log(f"mesh simplified to {len(found.faces)} triangles{noise}")
     return found
 
 

@@ -26,7 +26,7 @@ class FinerBodies:
     """Degrees of freedom to come near to."""
     cache: Path | None
     """Folder that keeps elastic modes by content."""
-    tell: Callable[[str], None]
+    log: Callable[[str], None]
     """Told what is done, in words."""
     made: dict[tuple[float | None, Support | None], NominalBody] = field(default_factory=dict)
     """Those that are done, by their walls and supports: names of two may be alike."""
@@ -35,7 +35,7 @@ class FinerBodies:
         """Return the body with finer elements, or as it is where that fails: it was good enough to choose by."""
         key = body.wall, body.support
         if key not in self.made:
-            self.made[key] = refined(self.surface, body, dofs=self.dofs, cache=self.cache, tell=self.tell)
+            self.made[key] = refined(self.surface, body, dofs=self.dofs, cache=self.cache, log=self.log)
         return self.made[key]
 
     def digest(self) -> str:
@@ -52,7 +52,7 @@ class HeldBodies:
     """Degrees of freedom at most."""
     cache: Path | None
     """Folder that keeps elastic modes by content."""
-    tell: Callable[[str], None]
+    log: Callable[[str], None]
     """Told what is done, in words."""
     made: dict[float | None, tuple[NominalBody, ...]] = field(default_factory=dict)
     """Those that are done, by their walls."""
@@ -60,7 +60,7 @@ class HeldBodies:
     def __call__(self, body: NominalBody) -> tuple[NominalBody, ...]:
         """Return the free body, and with each support that it may have."""
         if body.wall not in self.made:
-            self.made[body.wall] = supported(self.surface, body, dofs=self.dofs, cache=self.cache, tell=self.tell)
+            self.made[body.wall] = supported(self.surface, body, dofs=self.dofs, cache=self.cache, log=self.log)
         return self.made[body.wall]
 
     def digest(self) -> str:
@@ -79,7 +79,7 @@ class ThickerBodies:
     """Degrees of freedom at most."""
     cache: Path | None
     """Folder that keeps elastic modes by content."""
-    tell: Callable[[str], None]
+    log: Callable[[str], None]
     """Told what is done, in words."""
     made: dict[float, NominalBody | None] = field(default_factory=dict)
     """Those that are done, by their walls."""
@@ -88,7 +88,7 @@ class ThickerBodies:
         """Return the body with a wall of this thickness, meters; None where that fails."""
         if wall not in self.made:
             self.made[wall] = with_wall(
-                self.surface, wall, count=self.count, dofs=self.dofs, cache=self.cache, tell=self.tell
+                self.surface, wall, count=self.count, dofs=self.dofs, cache=self.cache, log=self.log
             )
         return self.made[wall]
 
@@ -103,7 +103,7 @@ def candidate_bodies(
     *,
     impacts: Impacts | None = None,
     cache: Path | None = None,
-    tell: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
 ) -> CandidateBodies:
     """Return the bodies that a surface may enclose; their mode shapes are cached by content in `cache`.
 
@@ -116,12 +116,12 @@ def candidate_bodies(
         expect_placed(impacts.contacts, surface_points(seen), names=impacts.names)
     walls = None if config.wall is None else [config.wall or None]
     try:
-        bodies = nominal_bodies(surface, walls=walls, count=config.shapes, dofs=config.dofs, cache=cache, tell=tell)
+        bodies = nominal_bodies(surface, walls=walls, count=config.shapes, dofs=config.dofs, cache=cache, log=log)
     except SimulationError as error:
         if config.wall is None or error.name != "surface":
             raise
         raise wall_error(surface, config.wall, error) from error
-    made = surface, config.dofs, cache, tell or (lambda words: None)
+    made = surface, config.dofs, cache, log or (lambda words: None)
     several = config.wall is None and sum(body.wall is not None for body in bodies.bodies) > 1
     thicken = ThickerBodies(surface, config.shapes, *made[1:]) if several else None
     hold = None if config.supports == "free" else HeldBodies(*made)

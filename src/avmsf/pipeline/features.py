@@ -40,7 +40,7 @@ class MadeFeatures:
     symmetries, spread over orbits."""
 
 
-def choose_encoder(config: LiftConfig, *, tell: Callable[[str], None], device: str | None = None) -> Encoder:
+def choose_encoder(config: LiftConfig, *, log: Callable[[str], None], device: str | None = None) -> Encoder:
     """Return the encoder that the settings name, on a device as for `usable_device`.
 
     Raises SceneError where either is not available.
@@ -53,15 +53,15 @@ def choose_encoder(config: LiftConfig, *, tell: Callable[[str], None], device: s
     try:
         return DinoEncoder.load(DINO, longest=config.longest, device=place)
     except SceneError as error:
-        tell(f"encoder: the built-in descriptors are used in place of DINOv2 ({error})")
+        log(f"encoder: the built-in descriptors are used in place of DINOv2 ({error})")
         return ImageDescriptors()
 
 
-def settled(config: LiftConfig, *, tell: Callable[[str], None], device: str | None = None) -> LiftConfig:
-    """Return the settings with the encoder that `auto` means here; `tell` reports any other than DINOv2."""
+def settled(config: LiftConfig, *, log: Callable[[str], None], device: str | None = None) -> LiftConfig:
+    """Return the settings with the encoder that `auto` means here; `log` reports any other than DINOv2."""
     if config.encoder != AUTO:
         return config
-    found = choose_encoder(config, tell=tell, device=device)
+    found = choose_encoder(config, log=log, device=device)
     return replace(config, encoder=DESCRIPTORS if isinstance(found, ImageDescriptors) else DINO)
 
 

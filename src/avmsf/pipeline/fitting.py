@@ -193,7 +193,7 @@ def _bodies(
 ) -> CandidateBodies:
     if capture.surface is None:
         raise FitError("surface: expected a mesh in the capture, got none; add surface.obj to it", name="surface")
-    return candidate_bodies(capture.surface, config.body, impacts=capture.impacts, cache=cache, tell=log)
+    return candidate_bodies(capture.surface, config.body, impacts=capture.impacts, cache=cache, log=log)
 
 
 def _symmetries(capture: Capture, config: PipelineConfig) -> Symmetries | None:

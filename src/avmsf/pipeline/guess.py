@@ -49,14 +49,14 @@ def guess_field(
     settings: CaptureSettings | None = None,
     name: str = "",
     cache: Path | None = None,
-    tell: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
 ) -> SoundField:
     """Return the field of a free body of a material, by finite elements, without any recording.
 
     `surface` is in meters. It is filled, unless `body.wall` states the thickness of a wall. At most `modes` modes are
     kept, those that sound below half of `sample_rate`, Hz. Sounds are in pascals per newton of peak force of a small
     steel hammer (`Hammer`), at a distance of 1 m (`radiated_pressure`). There is no residual noise. Elastic modes are
-    cached in the folder `cache`; `tell` receives messages on the progress.
+    cached in the folder `cache`; `log` receives messages on the progress.
 
     Raises SimulationError for an unknown material, a surface without a body and a body that makes no sound, and
     FitError for a surface in another unit and a wall whose thickness has to be stated.
@@ -65,7 +65,7 @@ def guess_field(
     body, settings = body or BodyConfig(), settings or CaptureSettings()
     seen = surface if isinstance(surface, Surface) else surface.as_seen()
     _expect_meters(seen)
-    found = _body(surface, material, body, count=modes, cache=cache, tell=tell)
+    found = _body(surface, material, body, count=modes, cache=cache, log=log)
     vibration = damped(
         found.elastic.frequency,
         torch.diag(rayleigh(found.elastic.frequency, material)),
@@ -145,7 +145,7 @@ def _body(
     *,
     count: int,
     cache: Path | None,
-    tell: Callable[[str], None] | None,
+    log: Callable[[str], None] | None,
 ) -> NominalBody:
     between = None if isinstance(surface, Surface) else surface.thickness_range
     if between is not None and config.wall is None:
@@ -159,7 +159,7 @@ def _body(
     try:
         found = nominal_bodies(
             surface, walls=[config.wall or None], count=count, dofs=config.dofs, material=material, cache=cache,
-            tell=tell,
+            log=log,
         )  # fmt: skip
     except SimulationError as error:
         if config.wall and error.name == "surface":

@@ -124,21 +124,21 @@ def _reconstruct(
     shape = _shape(folder, capture, config, stages, settings=settings, listener=listener)
     method = finder_of(config)
     heard = {"impacts": train.digest(), "method": repr(method)}
-    listener.tell(f"modes: {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
+    listener.log(f"modes: {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
     found = stages.keep(MODES, heard, lambda path: extract_once(train, method, path, needed=True))
     modes, cache = extract_once(train, method, found.path), stages.folder / BODIES
 
     def bodies() -> CandidateBodies:
-        listener.tell("bodies: finite-element models of the object")
-        return candidate_bodies(shape.surface(), config.body, impacts=train, cache=cache, tell=listener.tell)
+        listener.log("bodies: finite-element models of the object")
+        return candidate_bodies(shape.surface(), config.body, impacts=train, cache=cache, log=listener.log)
 
     def make(path: Path) -> None:
         gains = estimator_for(
             config.gain_model, bodies, symmetries=shape.symmetries, features=shape.features,
-            log=listener.tell,
+            log=listener.log,
         )  # fmt: skip
         supporting = supporting_poles(modes, train)
-        listener.tell(f"fit: a field of {modes_words(len(modes.bank), len(supporting))}")
+        listener.log(f"fit: a field of {modes_words(len(modes.bank), len(supporting))}")
         fitted = fit(
             train,
             shape.features if config.gain_model == Visual.kind else shape.points,
@@ -217,7 +217,7 @@ def reconstruct_guess(
                 settings=settings,
                 name=settings.name or folder.resolve().name,
                 cache=stages.folder / BODIES,
-                tell=listener.tell,
+                log=listener.log,
             )
             save(with_record(guessed, config, {}), path)
 
@@ -281,7 +281,7 @@ def _shape(
     stages.count((*(scene.outputs if shows else ()), *((SURFACE,) if shaped else ()), MODES, FIELD), listener.counting)
     if not shows:
         if capture.surface is None:
-            listener.tell(
+            listener.log(
                 f"{folder}: expected views or a mesh, got none: points that fill the bounding box of the contacts are "
                 "used"
             )
@@ -337,7 +337,7 @@ def _surface_stage(
     try:
         return {"surface": keep_surface(stages, surface, digest)}
     except SceneError as error:
-        listener.tell(f"no surface is written: {error}")
+        listener.log(f"no surface is written: {error}")
         return {}
 
 

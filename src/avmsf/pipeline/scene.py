@@ -46,7 +46,7 @@ def _say_nothing(words: str) -> None:
 class ProgressListener:
     """Callbacks that receive the progress of the stages."""
 
-    tell: Callable[[str], None] = _say_nothing
+    log: Callable[[str], None] = _say_nothing
     """Receives a sentence as each stage begins."""
     splatting: Callable[[SplatProgress], None] | None = None
     lifting: Callable[[LiftProgress], None] | None = None
@@ -113,9 +113,7 @@ class SceneStages:
         """The folder of views."""
         if self.splats is not None and self.source is None:
             return self._keep_views_of_cloud()
-        return keep_views(
-            self._source(), self.stages, self.config.views, settings=self.settings, tell=self.listener.tell
-        )
+        return keep_views(self._source(), self.stages, self.config.views, settings=self.settings, log=self.listener.log)
 
     @cached_property
     def cloud(self) -> Kept:
@@ -126,7 +124,7 @@ class SceneStages:
         start = self._start(views)
 
         def make(path: Path) -> None:
-            self.listener.tell(f"splat: {counted(self.config.splat.steps, 'step')} on {len(views)} views")
+            self.listener.log(f"splat: {counted(self.config.splat.steps, 'step')} on {len(views)} views")
             cloud = splat(
                 views,
                 self.config.splat,
@@ -144,7 +142,7 @@ class SceneStages:
     @cached_property
     def features(self) -> Kept:
         """The file of features, on the Gaussians or on points of the mesh."""
-        encoder = choose_encoder(self.config.lift, tell=self.listener.tell, device=self.device)
+        encoder = choose_encoder(self.config.lift, log=self.listener.log, device=self.device)
         on_mesh = self._on_mesh
         recipe = {
             "views": self.views.digest,
@@ -172,9 +170,9 @@ class SceneStages:
             if masks_suffice(views)
             else "images of the Gaussians, as fewer than 3 views have masks,"
         )
-        self.listener.tell(f"shape: of {source} and {len(cloud)} Gaussians")
+        self.listener.log(f"shape: of {source} and {len(cloud)} Gaussians")
         shape = shape_of_cloud(cloud, views)
-        self.listener.tell(f"shape: {shape.describe()}")
+        self.listener.log(f"shape: {shape.describe()}")
         return shape
 
     def made(self) -> dict[str, Kept]:
@@ -205,7 +203,7 @@ class SceneStages:
 
     def _lift_to_cloud(self, views: Sequence[View], encoder: Encoder) -> Lifted:
         cloud = read_splats(self.cloud.path)
-        self.listener.tell(f"features: {encoder.name} of {len(views)} views onto {len(cloud)} Gaussians")
+        self.listener.log(f"features: {encoder.name} of {len(views)} views onto {len(cloud)} Gaussians")
         rasterizer = choose_rasterizer(cloud.centers.device)
         return lift_to_cloud(
             cloud, views, encoder, self.config.lift, rasterizer=rasterizer, progress=self.listener.lifting
@@ -214,7 +212,7 @@ class SceneStages:
     def _lift_to_mesh(self, views: Sequence[View], encoder: Encoder) -> Lifted:
         surface = read_surface(self._source().path, meters=self.settings.surface_meters)
         points = self.config.lift.points
-        self.listener.tell(f"features: {encoder.name} of {len(views)} views onto {points} points of the mesh")
+        self.listener.log(f"features: {encoder.name} of {len(views)} views onto {points} points of the mesh")
         return lift_to_surface(surface, views, encoder, self.config.lift, progress=self.listener.lifting)
 
     def _keep_given(self, splats: Path) -> Kept:
@@ -222,11 +220,11 @@ class SceneStages:
         views = None if self.source is None else self.views
 
         def make(path: Path) -> None:
-            self.listener.tell(f"splat: the Gaussians of {splats.name}, unchanged")
+            self.listener.log(f"splat: the Gaussians of {splats.name}, unchanged")
             read = scaled(read_splats(splats), self.settings.views_meters)
             cloud = without_far(read)
             if len(cloud) < len(read):
-                self.listener.tell(f"splat: {len(read) - len(cloud)} Gaussians far from the object are left out")
+                self.listener.log(f"splat: {len(read) - len(cloud)} Gaussians far from the object are left out")
             if views is not None:
                 cloud = keep_object(cloud, read_views(views.path), rasterizer=choose_rasterizer(cloud.centers.device))
             write_splats(cloud, path)

@@ -87,14 +87,14 @@ def find_splats(folder: Path) -> Path | None:
 
 
 def keep_views(
-    source: Source, stages: StageFolder, config: ViewsConfig, *, settings: CaptureSettings, tell: Tell
+    source: Source, stages: StageFolder, config: ViewsConfig, *, settings: CaptureSettings, log: Tell
 ) -> Kept:
     """Make the folder `views` of a source's views, with masks, or return it where it is as it should be.
 
     Photographs without cameras get them by structure from motion first, kept in `motion`. Raises as the readers do.
     """
     if source.kind in ("photographs", "video"):
-        moved = _keep_motion(source, stages, config, tell=tell)
+        moved = _keep_motion(source, stages, config, log=log)
         recipe = {"motion": moved.digest}
     else:
         moved = None
@@ -102,10 +102,10 @@ def keep_views(
 
     def make(path: Path) -> None:
         if source.kind == "mesh":
-            views = _rendered(source.path, config, settings=settings, tell=tell)
+            views = _rendered(source.path, config, settings=settings, log=log)
         else:
             folder = source.path if moved is None else moved.path
-            views = _photographed(folder, config, meters=settings.views_meters, tell=tell)
+            views = _photographed(folder, config, meters=settings.views_meters, log=log)
         replace_views(_spread(views, config.count), path)
 
     lengths = {"views_meters": settings.views_meters, "surface_meters": settings.surface_meters}
@@ -132,23 +132,23 @@ def _matters(kind: Kind) -> Sequence[str]:
     return ("rendered", "count") if kind == "mesh" else ("longest", "masks", "count")
 
 
-def _photographed(folder: Path, config: ViewsConfig, *, meters: float, tell: Tell) -> tuple[View, ...]:
+def _photographed(folder: Path, config: ViewsConfig, *, meters: float, log: Tell) -> tuple[View, ...]:
     views = read_views(folder, longest=config.longest, meters=meters)
     bare = sum(view.mask is None for view in views)
     if config.masks and bare:
-        tell(f"views: {len(views)}, finding the object in {bare} without a mask")
+        log(f"views: {len(views)}, finding the object in {bare} without a mask")
         views = find_foreground(views)
     return views
 
 
-def _rendered(path: Path, config: ViewsConfig, *, settings: CaptureSettings, tell: Tell) -> tuple[View, ...]:
+def _rendered(path: Path, config: ViewsConfig, *, settings: CaptureSettings, log: Tell) -> tuple[View, ...]:
     mesh = read_textured_mesh(path, meters=settings.surface_meters)
     cameras = orbit_cameras(mesh.surface, size=config.rendered)
-    tell(f"views: rendering {len(cameras)} of {path.name}")
+    log(f"views: rendering {len(cameras)} of {path.name}")
     return render_views(mesh, cameras)
 
 
-def _keep_motion(source: Source, stages: StageFolder, config: ViewsConfig, *, tell: Tell) -> Kept:
+def _keep_motion(source: Source, stages: StageFolder, config: ViewsConfig, *, log: Tell) -> Kept:
     """Return a folder of `images` and the COLMAP model `sparse/0` that was found for them."""
     recipe: dict[str, str | int] = {"files": source.digest, "seed": config.seed}
     if source.kind == "video":
@@ -157,7 +157,7 @@ def _keep_motion(source: Source, stages: StageFolder, config: ViewsConfig, *, te
     def make(path: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
         if source.kind == "video":
-            tell(f"views: picking {config.frames} frames of {source.path.name}")
+            log(f"views: picking {config.frames} frames of {source.path.name}")
             pick_frames(source.path, path / "images", count=config.frames)
         else:
             masks = source.folder / "masks"
@@ -166,7 +166,7 @@ def _keep_motion(source: Source, stages: StageFolder, config: ViewsConfig, *, te
                 place = path / ("masks" if masked else "images") / file.relative_to(masks if masked else source.path)
                 place.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(file, place)
-        tell("views: finding the cameras by structure from motion")
+        log("views: finding the cameras by structure from motion")
         estimate_cameras(path / "images", path, timeout=60 * config.minutes, seed=config.seed)
 
     return stages.keep("motion", recipe, make)

@@ -45,7 +45,7 @@ class Body:
         return self.mesh.surface
 
 
-def make_body(recipe: ObjectRecipe, *, cache: Path | None, tell: Tell) -> Body:
+def make_body(recipe: ObjectRecipe, *, cache: Path | None, log: Tell) -> Body:
     """Make a recipe's body, its elastic modes read from the folder `cache` where they were computed before.
 
     A file that is damaged is made again. Raises SimulationError for an unknown shape and a mesh that cannot be made
@@ -56,12 +56,12 @@ def make_body(recipe: ObjectRecipe, *, cache: Path | None, tell: Tell) -> Body:
     kept = None if cache is None else cache / f"modes-{key_of(recipe.elastic_values())}.safetensors"
 
     def compute() -> ElasticModes:
-        tell("dividing the body into tetrahedra")
+        log("dividing the body into tetrahedra")
         solid = _uneven(recipe, make_solid())
-        tell(f"elastic modes of {len(solid.cells)} tetrahedra")
+        log(f"elastic modes of {len(solid.cells)} tetrahedra")
         return _elastic(recipe, solid, legs)
 
-    return Body(mesh, modes_once(kept, compute, tell=tell), legs)
+    return Body(mesh, modes_once(kept, compute, log=log), legs)
 
 
 def up_of(recipe: ObjectRecipe) -> Float64[Tensor, " 3"]:

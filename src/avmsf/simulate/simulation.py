@@ -62,9 +62,9 @@ def simulate_object(
     Raises SimulationError where the recipe describes no object that sounds, and CaptureError for a mesh that cannot be
     read.
     """
-    tell = progress or (lambda stage: None)
-    body = make_body(recipe, cache=cache, tell=tell)
-    tell("sounds")
+    log = progress or (lambda stage: None)
+    body = make_body(recipe, cache=cache, log=log)
+    log("sounds")
     sounding = sounding_body(recipe, body)
     strikes = draw_strikes(
         body.surface, recipe.impacts, up=up_of(recipe), imperfections=recipe.imperfections, seed=recipe.seed

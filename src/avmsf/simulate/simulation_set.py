@@ -38,15 +38,15 @@ def simulate_set(
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
         raise SimulationError(f"{folder}: expected a folder, got a file; choose another name", file=folder)
-    tell = progress or (lambda _: None)
+    log = progress or (lambda _: None)
     whole = {name: is_written(recipe, folder / name) for name, recipe in recipes.items()}
     for done, (name, recipe) in enumerate(recipes.items()):
 
         def stage(words: str, name: str = name, done: int = done) -> None:
-            tell(SetProgress(name, done, len(recipes), words))
+            log(SetProgress(name, done, len(recipes), words))
 
         if not whole[name]:
             simulation = simulate_object(recipe, name=name, cache=cache, progress=stage)
             stage(f"{recipe.views} views" if recipe.views else "files")
             write_simulation(simulation, folder / name)
-        tell(SetProgress(name, done + 1, len(recipes), "exists" if whole[name] else "done"))
+        log(SetProgress(name, done + 1, len(recipes), "exists" if whole[name] else "done"))

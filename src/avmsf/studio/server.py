@@ -62,10 +62,10 @@ def serve(
     *,
     port: int | None = None,
     browser: bool = True,
-    tell: Callable[[str], None],
+    log: Callable[[str], None],
     config: StudioConfig | None = None,
 ) -> bool:
-    """Serve the page until Ctrl-C; `tell` is called with its address.
+    """Serve the page until Ctrl-C; `log` is called with its address.
 
     Without `port` it is PORT, or a free one if that is in use. Return whether a thread is still computing a result that
     is no longer needed. Raises StudioError if a given port is in use, and the errors of the readers.
@@ -77,7 +77,7 @@ def serve(
         guarded = Guard(make_app(studio), token=token, port=number)
 
         def announce() -> None:
-            tell(address)
+            log(address)
             if browser:
                 # A browser that cannot be opened is no failure: the address is printed.
                 with suppress(OSError):

@@ -59,7 +59,7 @@ class Voice:
         """Send the progress of a stage; `numbers` are for programs, in addition to the text."""
         self.say({"stage": stage, "done": done, "total": total, "words": words, **numbers})
 
-    def tell(self, words: str) -> None:
+    def log(self, words: str) -> None:
         """Send that a stage begins: its name before the colon, a description after it."""
         stage, _, rest = words.partition(": ")
         self.step(stage, 0, 0, rest)
@@ -67,7 +67,7 @@ class Voice:
     @property
     def listener(self) -> ProgressListener:
         """The listener of a reconstruction."""
-        return ProgressListener(self.tell, self._splatting, self._lifting)
+        return ProgressListener(self.log, self._splatting, self._lifting)
 
     def _splatting(self, progress: SplatProgress) -> None:
         if progress.step % _RARELY == 0 or progress.step == progress.steps:
@@ -97,7 +97,7 @@ def make_field(task: Values, voice: Voice) -> Values:
     folder = Path(task["folder"])
     config = replace(PRESETS[task["preset"]], modes=int(task["modes"]))
     settings = capture_settings_of(config, settings_of(folder))
-    voice.tell("capture: reading the recordings")
+    voice.log("capture: reading the recordings")
     capture = read_capture(folder, settings)
     with StageFolder(folder / CACHE).lock(COMMAND):
         made = reconstruct(
@@ -135,7 +135,7 @@ def lead(task: Values, voice: Voice) -> Values:
     if "recording" in task:
         guide = Reference.read(task["recording"], sample_rate=field.sample_rate)
     else:
-        voice.tell("model: loading")
+        voice.log("model: loading")
         model = StableAudio.load(task["model"])
         guide = DecoderDistillation(model, task["prompt"], sample_rate=field.sample_rate)
     config = GuidedEditConfig(steps=int(task["steps"]), preview_every=0)

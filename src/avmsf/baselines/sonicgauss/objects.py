@@ -60,11 +60,11 @@ def training_recipes(count: int, *, seed: int = 0, contacts: int = 32) -> tuple[
 
 
 def training_objects(
-    recipes: Sequence[ObjectRecipe], *, cache: Path | None = None, tell: Callable[[str], None] | None = None
+    recipes: Sequence[ObjectRecipe], *, cache: Path | None = None, log: Callable[[str], None] | None = None
 ) -> Iterator[TrainingObject]:
     """Yield the objects of recipes, kept in files beneath `cache` where it is given.
 
-    An object that cannot be simulated or splatted is left out, and `tell` is called with the reason.
+    An object that cannot be simulated or splatted is left out, and `log` is called with the reason.
     """
     for number, recipe in enumerate(recipes, 1):
         name = f"{number} of {len(recipes)}, {recipe.kind}-{recipe.material}"
@@ -75,13 +75,13 @@ def training_objects(
             # What training reads of it.
             object_tokens(visible(made.cloud), count=SmallConfig().tokens)
         except (SimulationError, SceneError, EvaluationError) as error:
-            if tell is not None:
-                tell(f"{name} is left out: {error}")
+            if log is not None:
+                log(f"{name} is left out: {error}")
             continue
         if path is not None and found is None:
             _keep(path, recipe, made)
-        if tell is not None:
-            tell(f"{name}: {len(made.cloud)} Gaussians")
+        if log is not None:
+            log(f"{name}: {len(made.cloud)} Gaussians")
         yield made
 
 

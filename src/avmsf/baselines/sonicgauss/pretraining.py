@@ -36,7 +36,7 @@ def pretrain(
     config: PretrainingConfig | None = None,
     *,
     seed: int = 0,
-    tell: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
 ) -> SmallWeights:
     """Train on objects' recordings. Raises EvaluationError where there is no object."""
     config = PretrainingConfig() if config is None else config
@@ -64,10 +64,10 @@ def pretrain(
     logs.clear()
 
     def say(step: int, loss: float) -> None:
-        if tell is not None and step % _TOLD == 0:
-            tell(f"step {step} of {config.training.steps}: loss {loss:.4f}, {time.process_time() - begun:.0f} s")
+        if log is not None and step % _TOLD == 0:
+            log(f"step {step} of {config.training.steps}: loss {loss:.4f}, {time.process_time() - begun:.0f} s")
 
-    losses = train(network.parameters(), clips.loss(network.train()), len(owners), config.training, seed=seed, tell=say)
+    losses = train(network.parameters(), clips.loss(network.train()), len(owners), config.training, seed=seed, log=say)
     report = {
         "objects": len(tokens),
         "clips": len(owners),

@@ -75,11 +75,11 @@ def train(
     config: TrainingConfig,
     *,
     seed: int,
-    tell: Callable[[int, float], None] | None = None,
+    log: Callable[[int, float], None] | None = None,
 ) -> list[float]:
     """Train in place on so many clips, in random order without repetition in each round, and return the losses.
 
-    `tell` is called with the step and its loss. All chance starts at `seed`, that of dropout too.
+    `log` is called with the step and its loss. All chance starts at `seed`, that of dropout too.
     """
     generator = torch.Generator().manual_seed(seed)
     optimizer = torch.optim.AdamW(parameters, lr=config.rate, betas=config.betas, weight_decay=config.decay)
@@ -103,6 +103,6 @@ def train(
             optimizer.step()
             schedule.step()
             losses.append(float(value.detach()))
-            if tell is not None:
-                tell(step + 1, losses[-1])
+            if log is not None:
+                log(step + 1, losses[-1])
     return losses
