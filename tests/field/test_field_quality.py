@@ -49,6 +49,14 @@ def test_the_error_at_contacts_left_out_is_about_that_at_new_ones():
     assert averaged / 2 < field.quality.nearest_mean < 2 * averaged
 
 
+def test_repeats_at_a_position_do_not_count_as_independent():
+    train, _ = parted(strikes(20))
+    single = train.take(range(14))
+    once, twice = (fitted(single.take(rows)).quality for rows in (range(14), [*range(14), *range(14)]))
+    assert once.positions == twice.positions
+    assert twice.standard_error == pytest.approx(once.standard_error, rel=0.1)
+
+
 def test_what_recordings_have_in_common_beside_their_modes_is_kept(tmp_path):
     train, test = parted(with_clicks(strikes(20)))
     field = fitted(train)
@@ -152,8 +160,9 @@ def test_the_advice_says_where_and_how_far_away():
     assert FieldQuality(9, 0.3, 0.7).advice == ""
 
 
+@pytest.mark.parametrize(("nearest", "mean"), [(None, 0.7), (0.9, 0.7), (0.7, 0.9)])
 @pytest.mark.parametrize(("error", "level"), [(0.5, 0), (0.66, 1), (0.74, 1), (0.76, 2)])
-def test_the_level_of_quality_asks_for_a_standard_error(error, level):
-    found = FieldQuality(9, error, 0.7, standard_error=0.05)
+def test_the_level_of_quality_asks_for_a_standard_error(error, level, nearest, mean):
+    found = FieldQuality(9, error, mean, standard_error=0.05, nearest=nearest)
     assert found.level == level
     assert found.verdict.startswith("Warning") == (level > 0)

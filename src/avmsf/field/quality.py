@@ -4,7 +4,7 @@ import math
 from dataclasses import asdict, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
@@ -38,12 +38,12 @@ def with_quality(field: SoundField, train: Impacts, *, advise: bool = True) -> S
     fitted = field.modal_sounds(Gains(gains.values.real.float(), gains.values.imag.float()), samples)
     recordings = (train.sounds - fitted).float()
     rows, signs = gains.nearest(gains.training, places)
-    averaged = (train.sounds[rows] * signs[..., None]).float().mean(1)
+    neighbors = (train.sounds[rows] * signs[..., None]).float()
     residuals = {"noise": field.noise(samples)}
     if field.origin.config.residual:
         residuals["recordings"] = (recordings[rows] * signs[..., None]).mean(1)
     modes = [field.modal_sounds(gains.left_out_estimate(share), samples) for share in SHARES]
-    error = _Error(field, train)
+    error = _Error(field, train, places)
     errors = {kind: torch.stack([error(each + added) for each in modes]) for kind, added in residuals.items()}
     best = min(errors, key=lambda kind: float(errors[kind].mean(1).min()))
     if best == "recordings":
@@ -52,14 +52,17 @@ def with_quality(field: SoundField, train: Impacts, *, advise: bool = True) -> S
     field = replace(field, gain_field=replace(gains, spread_share=SHARES[chosen]))
     reached = {kind: float(each[chosen].mean()) for kind, each in errors.items()}
     contact, distance = (_next(field, gains) if advise else ()) or (None, None)
-    simple = error(averaged)
-    scatter = float((errors[best][chosen] - simple).std()) / math.sqrt(len(simple))
-    found = FieldQuality(gains.place_count, reached[best], float(simple.mean()), contact, distance, scatter)
+    nearest, averaged = error(neighbors[:, 0]), error(neighbors.mean(1))
+    simple = min(nearest, averaged, key=lambda each: float(each.mean()))
+    deviation = float((errors[best][chosen] - simple).std()) / math.sqrt(len(simple))
+    found = FieldQuality(
+        gains.place_count, reached[best], float(averaged.mean()), contact, distance, deviation, float(nearest.mean())
+    )
     report = {**field.origin.report, "quality": asdict(found), "residual": reached}
     return replace(field, origin=replace(field.origin, report=report))
 
 
-def smallest_within_error(errors: Float[Tensor, "choices contacts"]) -> int:
+def smallest_within_error(errors: Float[Tensor, "choices places"]) -> int:
     """Return the first choice whose mean error is within one standard error, of the difference, of the least one."""
     more = errors - errors[errors.mean(1).argmin()]
     allowed = more.std(1) / math.sqrt(errors.shape[1])
@@ -82,14 +85,19 @@ def _next(field: SoundField, gains: MixtureGains) -> tuple[tuple[float, float, f
 
 
 class _Error:
-    """Relative STFT errors of sounds at the contacts of recordings, whose mean is that of all contacts together."""
+    """Relative STFT errors of sounds at the contacts of recordings, averaged over the recordings of each place.
 
-    def __init__(self, field: SoundField, train: Impacts) -> None:
+    Repeats at one place are not independent: they share what the other places predict of it.
+    """
+
+    def __init__(self, field: SoundField, train: Impacts, places: Int[Tensor, " contacts"]) -> None:
         sizes, hops, _ = field.origin.config.resolutions(train.sample_rate)
         self.targets = [spectral_target(each[None], fft_sizes=sizes, hops=hops) for each in train.sounds.float()]
         loud = torch.tensor([[float(norm.sum()) for norm in each.norms] for each in self.targets])
         self.weight = (loud / loud.mean(0).clamp_min(torch.finfo(loud.dtype).tiny)).mean(1) / len(sizes)
+        self.places, self.repeats = places, torch.bincount(places)
 
-    def __call__(self, sounds: Float[Tensor, "contacts samples"]) -> Float[Tensor, " contacts"]:
+    def __call__(self, sounds: Float[Tensor, "contacts samples"]) -> Float[Tensor, " places"]:
         pairs = zip(sounds.float(), self.targets, strict=True)
-        return self.weight * torch.stack([spectral_loss(each[None], target) for each, target in pairs])
+        errors = self.weight * torch.stack([spectral_loss(each[None], target) for each, target in pairs])
+        return errors.new_zeros(len(self.repeats)).index_add(0, self.places, errors) / self.repeats

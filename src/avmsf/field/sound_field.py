@@ -78,7 +78,9 @@ class FieldQuality:
     next_distance: float | None = None
     """From there to the nearest contact that was recorded, meters."""
     standard_error: float = 0.0
-    """Of the difference of both errors, by its scatter over the positions."""
+    """Of the difference between the field's error and the smaller one of nearest recordings, over the positions."""
+    nearest: float | None = None
+    """Of the nearest recording at another position; None in fields of avmsf 0.8 and older."""
 
     @classmethod
     def of(cls, record: Mapping[str, Any]) -> "FieldQuality":
@@ -93,24 +95,30 @@ class FieldQuality:
     @property
     def verdict(self) -> str:
         """How good the field is. Leaving out mostly overstates the error: spread contacts are far from each other."""
+        averaged = self.nearest is None or self.nearest_mean <= self.nearest
+        simple = "the mean of the three nearest recordings" if averaged else "the nearest recording"
         if self.level == 0:
             return (
-                f"By leave-one-out, the relative STFT error of the field is about {self.error:.2f}, of the mean of "
-                f"the three nearest recordings {self.nearest_mean:.2f} ({self.positions} positions)."
+                f"By leave-one-out, the relative STFT error of the field is about {self.error:.2f}, of {simple} "
+                f"{self._simple_error:.2f} ({self.positions} positions)."
             )
         found = "worse than" if self.level == 2 else "hardly better than"
         return (
-            f"Warning: by leave-one-out, the field is {found} the mean of the three nearest recordings: relative STFT "
-            f"errors of {self.error:.2f} and {self.nearest_mean:.2f} ({self.positions} positions). Look for mistakes "
+            f"Warning: by leave-one-out, the field is {found} {simple}: relative STFT "
+            f"errors of {self.error:.2f} and {self._simple_error:.2f} ({self.positions} positions). Look for mistakes "
             "by avmsf check: recordings given to other contacts, a mesh in another frame or of another object. Record "
             "more positions; without a mesh, add one, or make the shape from photographs by avmsf reconstruct."
         )
 
     @property
     def level(self) -> int:
-        """0 for a field better than the mean of the three nearest recordings by a standard error, 2 for a worse one."""
-        gained = self.nearest_mean - self.error
+        """0 for a field better than the nearest recording and the mean of three by a standard error, 2 if worse."""
+        gained = self._simple_error - self.error
         return 0 if gained > self.standard_error else 1 if gained >= -self.standard_error else 2
+
+    @property
+    def _simple_error(self) -> float:
+        return self.nearest_mean if self.nearest is None else min(self.nearest, self.nearest_mean)
 
     @property
     def advice(self) -> str:
