@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from avmsf._utils.state import read_checkpoint, write_checkpoint
-from avmsf.errors import AvmsfWarning, FieldFileError
+from avmsf.errors import AvmsfWarning, FieldFileError, FitError
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import Progress, fit
 from avmsf.field.recipes import Attention
@@ -161,6 +161,17 @@ def test_the_state_is_kept_while_the_fit_runs(tmp_path, monkeypatch):
     for moment in [(STAGES[1], 1), (STAGES[2], 14)]:
         checkpoint.write_bytes(copies[moment])
         expect_same(fitted(checkpoint), uninterrupted())
+
+
+def test_a_fit_that_diverged_between_two_reads_of_the_loss_leaves_no_checkpoint(tmp_path, monkeypatch):
+    monkeypatch.setattr("avmsf.field.fit._CHECKPOINT_SECONDS", 0.0)
+    # As on a GPU.
+    monkeypatch.setattr("avmsf.field.fit.steps_between_losses", lambda device: 100)
+    with raises(FitError, name=STAGES[0]):
+        fitted(tmp_path / "state", config=replace(CONFIG, warmup_steps=0, learning_rate=1e30))
+    kept = torch.load(tmp_path / "state", weights_only=True) if (tmp_path / "state").exists() else None
+    tensors = [] if kept is None else list(kept["state"]["running"]["run"]["network"].values())
+    assert all(bool(each.isfinite().all()) for each in tensors)
 
 
 def test_a_path_may_be_a_word(tmp_path):

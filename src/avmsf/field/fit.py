@@ -235,7 +235,7 @@ class _Job:
                     self._save(name, run, validation)
         except KeyboardInterrupt:
             # Amid a step's changes there is nothing to keep but what was saved before.
-            if run.whole:
+            if run.whole and run.finite:
                 self._save(name, run, validation)
             raise
         if validation is not None:
@@ -278,6 +278,9 @@ class _Job:
     def _save(self, name: str, run: TrainingRun, validation: "_Validation | None") -> None:
         if self.checkpoint is None:
             return
+        # On a GPU the loss is read every few steps only: a fit may have diverged since, and could not go on from that.
+        if not run.finite:
+            self._note(Progress(name, run.step, run.step, math.nan, 0))
         running = {"name": name, "run": run.state(), "validation": None if validation is None else validation.best}
         state = {"trials": self.trials, "running": running}
         try:

@@ -161,6 +161,12 @@ class TrainingRun:
         return ModalBank(moved, self.start.bank.damping * torch.exp(self.decay))
 
     @property
+    def finite(self) -> bool:
+        """Whether all parameters are finite numbers; waits for the device."""
+        parameters = (*self.network.parameters(), self.shift, self.decay, self.noise)
+        return all(bool(each.isfinite().all()) for each in parameters)
+
+    @property
     def residual(self) -> Residual:
         """The noise as it stands."""
         if not self.config.residual:
