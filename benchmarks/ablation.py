@@ -87,13 +87,13 @@ def _ablated(options: Options) -> Iterator[tuple[str, SplitCase]]:
     for name, count, start in (("aircraft_response", 15, 18), ("ruler10", 7, 0), ("tree43", 20, 18)):
         capture = measured(name)
         bodies = None if capture.surface is None else bodies_of(capture.surface, options)
-        yield f"{name} {count}", split_case(*split(capture.impacts, count=count, start=start), capture, bodies)
+        yield f"{name} {count}", split_case(*split(capture.impacts, count, start=start), capture, bodies)
     with tempfile.TemporaryDirectory() as cache:
         for name in options.objects or ABLATED[: 1 if options.quick_look else 3]:
             capture, _ = simulated(name, options, Path(cache))
             assert capture.surface is not None
             bodies = bodies_of(capture.surface, options)
-            yield name, split_case(*split(capture.impacts, fraction=0.2), capture, bodies)
+            yield name, split_case(*split(capture.impacts, 0.2), capture, bodies)
 
 
 def _variants(case: SplitCase, options: Options) -> Iterator[tuple[str, float]]:

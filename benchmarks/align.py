@@ -185,7 +185,7 @@ def _jitter_with(options: Options, cache: Path) -> Report:
             away = []
             for seed in range(draws):
                 moved, starts = jittered(files, jitter, seed=seed)
-                train, test = split(moved, count=12)
+                train, test = split(moved, 12)
                 modes, found = extract_modes(train), align(moved)
                 assert found is not None
                 train, test = modes.aligned(train), modes.aligned(test)
@@ -407,7 +407,7 @@ def _methods(capture: Capture, options: Options) -> dict[str, Callable[[], GainR
 def _error(
     impacts: Impacts, capture: Capture, count: int, start: int, make: Callable[[], GainRecipe], options: Options
 ) -> float:
-    train, test = split(impacts, count=count, start=start)
+    train, test = split(impacts, count, start=start)
     modes = extract_modes(train)
     train, test = modes.aligned(train), modes.aligned(test)
     features = FeatureField.from_contacts(impacts.contacts) if capture.surface is None else surface_features(capture)

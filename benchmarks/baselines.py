@@ -280,7 +280,7 @@ def _locating(objects: _Objects) -> Report:
     for name in FEW[: objects.most]:
         capture = objects.capture(name)
         assert capture.surface is not None
-        train, test = split(capture.impacts, fraction=0.2)
+        train, test = split(capture.impacts, 0.2)
         modes = extract_modes(train)
         config = DiffSoundConfig(sim20_recipe(name).material)
         renderer = fit_diffsound(train, objects.family(name), modes, config, weighted=False)

@@ -96,7 +96,7 @@ def _plate_impulse(options: Options) -> Report:
 
 def _of_plate(key: str, title: str, case: PlateCase, seconds: float, options: Options) -> Report:
     count, seconds = (20, 0.25) if options.quick_look else (100, seconds)
-    train, test = split(case.strikes(count, seconds=seconds), fraction=0.2)
+    train, test = split(case.strikes(count, seconds=seconds), 0.2)
     figures = _judge(key, train, test, case.features(), filled_estimator(slab(case.plate), options), options)
     title = f"{key}: {title}; {count} contacts, {len(train)} to train on, {seconds:g} s at 44.1 kHz, noise 40 dB down"
     return Report(tables=(_table(title, figures),), figures=_prefixed(key, figures))
@@ -120,7 +120,7 @@ def _aircraft(options: Options) -> Report:
         key = f"aircraft.{count}"
         runs = []
         for start in starts:
-            train, test = split(capture.impacts, count=count, start=start)
+            train, test = split(capture.impacts, count, start=start)
             runs.append(_judge(f"{key}, start {start}", train, test, features, estimator, options))
         figures = {name: sum(run[name] for run in runs) / len(runs) for name in runs[0]}
         title = (
@@ -146,7 +146,7 @@ def _crossed(options: Options) -> Report:
     estimators = {name: filled_estimator(surface, options) for name, surface in bodies.items()}
     runs: list[Figures] = []
     for start in AIRCRAFT_STARTS[:1] if options.quick_look else AIRCRAFT_STARTS:
-        train, test = split(capture.impacts, count=CROSSED, start=start)
+        train, test = split(capture.impacts, CROSSED, start=start)
         modes = extract_modes(train)
         train, test = modes.aligned(train), modes.aligned(test)
         errors = {
@@ -233,7 +233,7 @@ Visual = tuple[Impacts, Impacts, Surface, TexturedMesh, FeatureField]
 
 def _visual_plate(options: Options) -> Visual:
     count, seconds = (20, 0.25) if options.quick_look else (100, 1.5)
-    train, test = split(STRUCK.strikes(count, seconds=seconds), fraction=0.2)
+    train, test = split(STRUCK.strikes(count, seconds=seconds), 0.2)
     surface = slab(STRUCK.plate)
     return train, test, surface, speckled(surface, seed=0), STRUCK.features()
 
@@ -241,7 +241,7 @@ def _visual_plate(options: Options) -> Visual:
 def _visual_aircraft(options: Options) -> Visual:
     capture = capture_in_place("aircraft_response")
     assert capture.surface is not None
-    train, test = split(capture.impacts, count=15)
+    train, test = split(capture.impacts, 15)
     return train, test, capture.surface, TexturedMesh.plain(capture.surface), surface_features(capture)
 
 

@@ -139,7 +139,7 @@ def _sim20(options: Options, condition: str = "") -> Report:
                 capture = replace(capture, impacts=_moved(capture.impacts))
             bodies = bodies_of(surface, options)
             case, *fewer = (
-                split_case(*split(capture.impacts, count=count), capture, bodies)
+                split_case(*split(capture.impacts, count), capture, bodies)
                 for count in (_IMPACTS if not condition else _IMPACTS[:1])
             )
             errors = [each.error(each.fit(MixtureEstimator(bodies=bodies), quick=options.quick_look)) for each in fewer]
@@ -210,7 +210,7 @@ def _speed(options: Options) -> Report:
         capture = example_capture()
     assert capture.surface is not None
     bodies = bodies_of(capture.surface, options)
-    train, test = split(capture.impacts, count=12)
+    train, test = split(capture.impacts, 12)
     case = split_case(train, test, capture, bodies)
     start = time.perf_counter()
     case.fit(MixtureEstimator(bodies=bodies), quick=options.quick_look)

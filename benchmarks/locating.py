@@ -128,7 +128,7 @@ def measure_locating(options: LocatingOptions) -> Report:
 
 def _plate(options: LocatingOptions) -> Report:
     count, seconds = (20, 0.25) if options.quick_look else (100, 1.5)
-    train, test = split(STRUCK.strikes(count, seconds=seconds), fraction=0.2)
+    train, test = split(STRUCK.strikes(count, seconds=seconds), 0.2)
     recipe = _estimator(slab(STRUCK.plate), 0.0, "plate", options)
     case = LocatingCase("plate", train, test, STRUCK.features(), recipe, plate_images(STRUCK.plate))
     return _table("plate", {"plate": [case]}, options)
@@ -140,7 +140,7 @@ def _aircraft(options: LocatingOptions) -> Report:
     recipe = _estimator(capture.surface, 0.0, "aircraft", options)
     features, cases = surface_features(capture), []
     for start in AIRCRAFT_STARTS[: 1 if options.quick_look else None]:
-        train, test = split(capture.impacts, count=AIRCRAFT_COUNT, start=start)
+        train, test = split(capture.impacts, AIRCRAFT_COUNT, start=start)
         name = f"aircraft, start {start}"
         # Its engines and sensors break the symmetry of its shape: no place counts but the true one.
         cases.append(LocatingCase(name, train, test, features, recipe, Images.none()))
@@ -157,7 +157,7 @@ def _sim20(options: LocatingOptions) -> Report:
 def _sim20_case(name: str, options: LocatingOptions) -> LocatingCase:
     capture, truth = _simulated(name, options)
     assert capture.surface is not None
-    train, test = split(capture.impacts, fraction=0.2)
+    train, test = split(capture.impacts, 0.2)
     row_of = {each: row for row, each in enumerate(truth.names)}
     rows = [row_of[each] for each in test.names]
     recipe = sim20_recipe(name)
@@ -272,7 +272,7 @@ def _other_objects(options: LocatingOptions) -> Report:
     for name, counts, starts in zip(names, (15, 20, 5), (AIRCRAFT_STARTS, (0, 15), (0, 5)), strict=True):
         capture, heard = captures[name], dict[str, list[str | None]]()
         for start in starts[: 1 if options.quick_look else None]:
-            train, test = split(capture.impacts, count=counts, start=start)
+            train, test = split(capture.impacts, counts, start=start)
             # The tree has no mesh: its contacts are points enough.
             bare = FeatureField.from_points(capture.impacts.contacts.float())
             wall = 0.0 if name == names[0] else None
@@ -348,7 +348,7 @@ def _means(scores: Iterable[LocatingScores], method: str) -> dict[str, float]:
 def _stream(options: LocatingOptions) -> Report:
     """Locate blows as they come, on a field of 10,000 points, beside the ringing of those before."""
     seconds = 0.5 if options.quick_look else 1.5
-    train, test = split(STRUCK.strikes(40, seconds=seconds), fraction=0.5)
+    train, test = split(STRUCK.strikes(40, seconds=seconds), 0.5)
     features = FeatureField.from_points(plate_surface_points(STRUCK.plate, STREAM_POINTS))
     field = fit(
         train,

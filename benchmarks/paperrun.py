@@ -67,7 +67,7 @@ def paper_runs(options: Options, folder: Path) -> Report:
         config = replace(config, warmup_steps=2, steps=2)
     for name in options.objects or OBJECTS[: 1 if options.quick_look else None]:
         dataset = CaptureCollection(_folder(name, folder), time_zero="peak")
-        train, test = split(dataset.capture(name).impacts, count=PLACES)
+        train, test = split(dataset.capture(name).impacts, PLACES)
         nearest = evaluate(MeanWaveform(train, count=3), test).mean()["relative_stft"]
         log(f"{name}: mean of 3: {nearest:.3f}")
         paper = replace(PRESETS["paper"].scene.lift, encoder=DESCRIPTORS)

@@ -68,7 +68,7 @@ def _cost(options: Options) -> Report:
         folder = Path(temporary) / COSTED
         recipe = replace(sim20_recipe(COSTED), size=COSTED_SIZE, elastic_modes=COSTED_MODES)
         made = simulate_object(recipe, name=COSTED)
-        train, _ = split(made.capture.impacts, fraction=0.2)
+        train, _ = split(made.capture.impacts, 0.2)
         write_capture(replace(made.capture, impacts=train), folder)
         for name, wall in (("", "unknown"), (".filled", "0")):
             cache = Path(temporary) / f"kept{name}"
@@ -128,7 +128,7 @@ def _coverage(options: Options) -> Report:
     for name in COVERED[:1] if options.quick_look else COVERED:
         made = simulate_object(sim20_recipe(name), name=name)
         assert made.capture.surface is not None
-        train, test = split(made.capture.impacts, fraction=0.2)
+        train, test = split(made.capture.impacts, 0.2)
         config = BodyConfig(dofs=3000) if options.quick_look else BodyConfig()
         with tempfile.TemporaryDirectory() as cache:
             estimator = MixtureEstimator(bodies=candidate_bodies(made.capture.surface, config, cache=Path(cache)))

@@ -102,21 +102,21 @@ def _tail_power(sounds: Float[Tensor, "contacts samples"], sample_rate: float) -
 def _mug(options: Options) -> Iterator[_Case]:
     capture = example_capture()
     assert capture.surface is not None
-    train, test = split(capture.impacts, count=12)
+    train, test = split(capture.impacts, 12)
     bodies = None if options.quick_look else candidate_bodies(capture.surface)
     yield _Case("mug", train, test, surface_features(capture), MixtureEstimator(bodies=bodies))
 
 
 def _plate(options: Options) -> Iterator[_Case]:
     count, seconds = (20, 0.25) if options.quick_look else (100, 3.0)
-    train, test = split(STRUCK.strikes(count, seconds=seconds), fraction=0.2)
+    train, test = split(STRUCK.strikes(count, seconds=seconds), 0.2)
     yield _Case("plate", train, test, STRUCK.features(), MixtureEstimator())
 
 
 def _aircraft(options: Options) -> Iterator[_Case]:
     capture = capture_in_place("aircraft_response")
     assert capture.surface is not None
-    train, test = split(capture.impacts, count=15)
+    train, test = split(capture.impacts, 15)
     gains = MixtureEstimator() if options.quick_look else filled_estimator(capture.surface, options)
     yield _Case("aircraft", train, test, surface_features(capture), gains)
 
@@ -129,7 +129,7 @@ def _sim20(options: Options) -> Iterator[_Case]:
             capture = read_capture(options.sim20 / name)
         assert capture.surface is not None
         full_scale = capture.impacts.sounds / capture.impacts.sounds.abs().max()
-        train, test = split(replace(capture.impacts, sounds=full_scale), count=8)
+        train, test = split(replace(capture.impacts, sounds=full_scale), 8)
         bodies = None if options.quick_look else candidate_bodies(capture.surface, impacts=train)
         yield _Case(name, train, test, surface_features(capture), MixtureEstimator(bodies=bodies))
 

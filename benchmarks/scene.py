@@ -74,7 +74,7 @@ def _pipeline(options: Options) -> Report:
     count, size, seconds = (12, 48, 0.25) if options.quick_look else (60, 256, 3.0)
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place) / "slab"
-        train, test = split(STRUCK.strikes(40, seconds=seconds), count=8)
+        train, test = split(STRUCK.strikes(40, seconds=seconds), 8)
         write_capture(Capture("slab", train), folder)
         write_views(pictures(speckled(slab(STRUCK.plate), seed=0), count=count, size=size), Path(place) / "views")
         for part in sorted((Path(place) / "views").iterdir()):

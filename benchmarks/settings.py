@@ -80,14 +80,14 @@ def measure(options: Options) -> Report:
 def _cases(options: Options) -> list[Case]:
     cases = []
     for plate in (GLASS, WOOD):
-        train, test = split(plate.strikes(60, seconds=1.0, highest=6000.0), count=15)
+        train, test = split(plate.strikes(60, seconds=1.0, highest=6000.0), 15)
         cases.append((train, test, extract_modes(train), plate.features()))
     if options.quick_look:
         return cases[:1]
     capture = capture_in_place("aircraft_response")
     features = surface_features(capture)
     for count, start, part in AIRCRAFT:
-        train, test = split(split(capture.impacts, count=count, start=start)[0], count=part)
+        train, test = split(split(capture.impacts, count, start=start)[0], part)
         modes = extract_modes(train)
         cases.append((modes.aligned(train), modes.aligned(test), modes, features))
     return cases

@@ -91,7 +91,7 @@ def _step(options: Options) -> Report:
 
 def _quick(options: Options) -> Report:
     count, seconds, config = (30, 0.5, QUICK_LOOK) if options.quick_look else (100, 3.0, FitConfig())
-    train, test = split(STRUCK.strikes(count, seconds=seconds), fraction=0.2)
+    train, test = split(STRUCK.strikes(count, seconds=seconds), 0.2)
     features = STRUCK.features()
     modes, extracting = _timed(lambda: extract_modes(train))
     quick, fitting = _timed(lambda: fit(train, features, modes, config, gains=Attention()))

@@ -82,7 +82,7 @@ def splits_of(capture: Capture, count: int, bodies: CandidateBodies | None, opti
     """Yield the splits of a capture."""
     starts = [start for start in STARTS if start < len(capture.impacts)]
     for start in starts[:1] if options.quick_look else starts:
-        yield split_case(*split(capture.impacts, count=count, start=start), capture, bodies)
+        yield split_case(*split(capture.impacts, count, start=start), capture, bodies)
 
 
 def split_case(train: Impacts, test: Impacts, capture: Capture, bodies: CandidateBodies | None) -> SplitCase:

@@ -38,7 +38,7 @@ from factories.plate_capture import fill_plate
 from factories.plate_field import RATE, plate_impacts
 from factories.raising import raises, warns
 
-NAMES = {"Capture", "SoundField", "Surface", "evaluate", "extract_modes", "locate"}
+NAMES = {"Capture", "SoundField", "Surface", "evaluate", "extract_modes", "load", "locate", "read", "split", "suggest"}
 CONTACT = [0.05, 0.06, 0.0]
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), (1.0, 1.0), (2.5, 2.0), 5, 4)
 
@@ -72,9 +72,9 @@ def test_importing_the_package_imports_no_torch():
 
 
 def test_a_capture_written_is_read_back(tmp_path):
-    written = avmsf.Capture.read(fill_plate(tmp_path / "plate"))
+    written = avmsf.read(fill_plate(tmp_path / "plate"))
     written.write(tmp_path / "copy")
-    read = avmsf.Capture.read(str(tmp_path / "copy"))
+    read = avmsf.read(str(tmp_path / "copy"))
     assert torch.equal(read.impacts.sounds, written.impacts.sounds)
     assert torch.equal(read.surface.faces, written.surface.faces)
 
@@ -82,13 +82,13 @@ def test_a_capture_written_is_read_back(tmp_path):
 @pytest.mark.parametrize(("size", "positions"), [(0.75, 12), (12, 12), (1, 1), (0.5, 8)])
 def test_a_split_trains_on_a_part_of_the_positions_or_on_their_number(size, positions):
     whole = avmsf.Capture("plate", plate_impacts(16))
-    train, test = whole.split(train_size=size)
+    train, test = avmsf.split(whole, size)
     assert (len(train.impacts), len(test.impacts)) == (positions, 16 - positions)
     assert {*train.impacts.names, *test.impacts.names} == set(whole.impacts.names)
 
 
 def test_a_split_is_the_same_each_time_and_another_for_another_seed():
-    names = [capture().split(3, seed=seed)[0].impacts.names for seed in (None, None, 1, 1, 2)]
+    names = [avmsf.split(capture(), 3, seed=seed)[0].impacts.names for seed in (None, None, 1, 1, 2)]
     assert names[0] == names[1]
     assert names[2] == names[3]
     assert len(set(names)) > 1
@@ -97,16 +97,14 @@ def test_a_split_is_the_same_each_time_and_another_for_another_seed():
 @pytest.mark.parametrize("size", [0.0, 1.0, -0.5, 0, 1000])
 def test_a_split_that_leaves_nothing_to_train_or_to_test_is_refused(size):
     with pytest.raises(EvaluationError):
-        capture().split(train_size=size)
+        avmsf.split(capture(), size)
 
 
 def test_fit_makes_the_field_that_the_command_makes(tmp_path):
     folder, output = fill_plate(tmp_path / "plate", surface=False), tmp_path / "field.safetensors"
     assert main(["fit", str(folder), "--output", str(output), "--modes", "6", "--steps", "5"]) == 0
-    made = SoundField.fit(
-        avmsf.Capture.read(folder), config=PipelineConfig(modes=6, fit=FitConfig(steps=5)), progress=False
-    )
-    one, other = made.render([CONTACT]), SoundField.load(output).render([CONTACT])
+    made = SoundField.fit(avmsf.read(folder), config=PipelineConfig(modes=6, fit=FitConfig(steps=5)), progress=False)
+    one, other = made.render([CONTACT]), avmsf.load(output).render([CONTACT])
     # Modes of two runs differ in their last digits.
     assert float((one - other).abs().max()) < 1e-4 * float(one.abs().max())
     assert sorted(path.name for path in tmp_path.iterdir()) == ["field.safetensors", "plate"]
@@ -180,11 +178,11 @@ def test_the_posterior_is_narrow_where_an_impact_was_recorded():
 
 def test_suggestions_are_chosen_among_candidates():
     candidates = field().gain_field.points[::30]
-    found = field().suggest(np.int64(2), candidates=candidates.tolist()).contacts
+    found = avmsf.suggest(field(), np.int64(2), candidates=candidates.tolist()).contacts
     assert len(found) == 2
     assert float(torch.cdist(found.double(), candidates.double()).amin(1).max()) < 1e-6
     with raises(ArrayError, name="candidates"):
-        field().suggest(1, candidates=[0.02, 0.03])
+        avmsf.suggest(field(), 1, candidates=[0.02, 0.03])
 
 
 def test_the_attention_network_has_no_posterior():
@@ -200,9 +198,9 @@ def test_a_recording_is_located_by_its_path_or_its_samples(tmp_path):
     places = [
         found.points[found.most_probable]
         for found in (
-            field().locate(sound, sample_rate=RATE),
-            field().locate(sound.tolist(), sample_rate=RATE),
-            field().locate(tmp_path / "hit.wav"),
+            avmsf.locate(field(), sound, sample_rate=RATE),
+            avmsf.locate(field(), sound.tolist(), sample_rate=RATE),
+            avmsf.locate(field(), tmp_path / "hit.wav"),
             avmsf.locate(field(), str(tmp_path / "hit.wav")),
         )
     ]
@@ -232,11 +230,11 @@ def test_evaluation_aligns_recordings_as_the_fit_did(tmp_path):
         before=torch.stack([row[start - 32 : start] for row, start in rows]),
         after=torch.stack([row[start + 2000 : start + 2032] for row, start in rows]),
     )
-    train, test = avmsf.Capture("plate", whole).split(0.75)
+    train, test = avmsf.split(avmsf.Capture("plate", whole))
     made = SoundField.fit(train, config=PipelineConfig(modes=8), progress=False)
     assert made.alignment is not None
     made.save(tmp_path / "field.safetensors")
-    read = SoundField.load(tmp_path / "field.safetensors")
+    read = avmsf.load(tmp_path / "field.safetensors")
     scores = [avmsf.evaluate(each, test).mean()["relative_stft"] for each in (made, read)]
     assert scores[0] == scores[1]
     assert scores[0] == avmsf.evaluate(made, made.aligned(test.impacts)).mean()["relative_stft"]
@@ -264,7 +262,7 @@ def test_modes_are_extracted_from_a_capture_or_its_impacts():
         field,
         lambda: field().bank,
         lambda: avmsf.extract_modes(capture()),
-        lambda: field().locate(capture().impacts.sounds[0]),
+        lambda: avmsf.locate(field(), capture().impacts.sounds[0]),
         lambda: field().posterior([CONTACT]),
         lambda: field().origin,
         lambda: avmsf.evaluate(field(), capture()),
@@ -318,12 +316,12 @@ def test_arguments_of_another_type_are_refused_by_name(tmp_path):
     field().save(tmp_path / "a.safetensors")
     code = f"""
 import avmsf
-field = avmsf.SoundField.load({str(tmp_path / "a.safetensors")!r})
+field = avmsf.load({str(tmp_path / "a.safetensors")!r})
 for call in (
     lambda: avmsf.SoundField.fit("bowl"),
     lambda: avmsf.evaluate(field, "bowl"),
-    lambda: field.suggest(2.5),
-    lambda: field.locate([0.0, 1.0] * 2000, sample_rate="48k"),
+    lambda: avmsf.suggest(field, 2.5),
+    lambda: avmsf.locate(field, [0.0, 1.0] * 2000, sample_rate="48k"),
 ):
     try:
         call()
@@ -368,7 +366,7 @@ def test_values_of_another_type_are_refused_by_name(tmp_path):
     field().save(tmp_path / "a.safetensors")
     code = f"""
 import avmsf
-field = avmsf.SoundField.load({str(tmp_path / "a.safetensors")!r})
+field = avmsf.load({str(tmp_path / "a.safetensors")!r})
 capture = avmsf.Capture("plate", avmsf.capture.Impacts.of([[0, 0, 0]], [[0.0, 1.0]], 8000.0))
 for call in (
     lambda: avmsf.extract_modes("bowl"),

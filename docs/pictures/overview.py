@@ -26,7 +26,7 @@ FFT_SIZE, HOP, SECONDS, MAX_HZ, RANGE_DB = 1024, 128, 0.35, 12_000, 70
 def main() -> None:
     """Read the demo's field and capture, draw, write the picture."""
     demo = Path(sys.argv[1])
-    field, impacts = avmsf.SoundField.load(demo / "mug.safetensors"), avmsf.Capture.read(demo / "capture").impacts
+    field, impacts = avmsf.load(demo / "mug.safetensors"), avmsf.read(demo / "capture").impacts
     fitted = [name in field.origin.trained_on for name in impacts.names]
     train = impacts.take([row for row in range(len(impacts)) if fitted[row]])
     test = impacts.take([row for row in range(len(impacts)) if not fitted[row]]).take(list(HELD_OUT))

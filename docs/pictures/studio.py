@@ -44,7 +44,7 @@ def main() -> None:
         shutil.copy(demo / "mug-surface.ply", mug / ".avmsf/surface.ply")
         shutil.copy(demo / "mug-surface.ply", cup)
         with opened_page(chromium, demo / "mug.safetensors", "--capture", mug, "--object", demo / "mug.ply") as page:
-            draw_field(page, mug, avmsf.SoundField.load(demo / "mug.safetensors"))
+            draw_field(page, mug, avmsf.load(demo / "mug.safetensors"))
         with opened_page(chromium, cup) as page:
             draw_capture(page, mug)
 
@@ -78,7 +78,7 @@ def draw_field(page: Page, capture: Path, field: avmsf.SoundField) -> None:
     page.click(f"#sheet-modes tr[data-mode='{MODE}']")
     save(page, "modes")
     page.click("#tab-find")
-    held_out = [name for name in avmsf.Capture.read(capture).impacts.names if name not in field.origin.trained_on]
+    held_out = [name for name in avmsf.read(capture).impacts.names if name not in field.origin.trained_on]
     page.set_input_files("#sheet-find input[type=file]", capture / held_out[LOCATED])
     page.wait_for_selector("#sheet-find dl")
     save(page, "locate")
@@ -93,7 +93,7 @@ def draw_field(page: Page, capture: Path, field: avmsf.SoundField) -> None:
 
 def draw_capture(page: Page, recordings: Path) -> None:
     """Draw the tab that records, with impacts of another capture."""
-    impacts = avmsf.Capture.read(recordings).impacts
+    impacts = avmsf.read(recordings).impacts
     for number, name in enumerate(CAPTURED, start=1):
         contact = impacts.contacts[impacts.names.index(name)].tolist()
         where = page.evaluate("(contact) => avmsf.project(contact)", contact)

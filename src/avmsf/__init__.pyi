@@ -1,3 +1,5 @@
+import pathlib
+
 from . import baselines as baselines
 from . import capture as capture
 from . import datasets as datasets
@@ -21,9 +23,14 @@ from . import studio as studio
 from . import symmetry as symmetry
 from .capture import Capture as Capture
 from .evaluation.splits import evaluate as evaluate
+from .evaluation.splits import split as split
 from .field.sound_field import SoundField as SoundField
+from .field.store import load as load
+from .field.suggest import suggest as suggest
 from .localization.locate import locate as locate
 from .mesh import Surface as Surface
 from .modal.extraction.extract import extract_modes as extract_modes
 
 __version__: str
+
+def read(folder: str | pathlib.Path, settings: capture.CaptureSettings | None = None) -> Capture: ...

@@ -187,11 +187,11 @@ def test_playback_speed_and_rate_make_the_aircraft_a_small_thing(shared: Path) -
 
 def test_errors_name_the_folder_and_its_file(tmp_path: Path) -> None:
     with raises(CaptureError, file=tmp_path / "no") as nothing:
-        Capture.read(tmp_path / "no")
+        read_capture(tmp_path / "no")
     assert str(nothing.value).count(";") == 1
     folder = tmp_path / "bowl"
     folder.mkdir()
     (folder / "impacts.csv").write_text("file,x,y,z\n001.wav,left,0,0\n")
     with raises(CaptureError, file=folder / "impacts.csv", row=2, name="x", value="left") as cell:
-        Capture.read(folder)
+        read_capture(folder)
     assert str(cell.value).startswith(str(folder / "impacts.csv"))

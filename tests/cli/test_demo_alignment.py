@@ -36,7 +36,7 @@ def sounds_of(folder: Path, kind: str) -> Tensor:
 
 def test_the_demos_page_and_sounds_do_not_depend_on_delays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     delayed = strikes(COUNT, starts=delays(COUNT))
-    train, test = split(delayed, count=demo.TRAIN)
+    train, test = split(delayed, demo.TRAIN)
     modes = extract_modes(train)
     config = FitConfig(steps=0, residual=False)
     field = fit(

@@ -41,7 +41,7 @@ def test_jitter_of_the_starts_does_not_count() -> None:
     )
     errors = {}
     for deviation in (0.0, 3.0):
-        train, test = split(shaken(exact, deviation), count=14)
+        train, test = split(shaken(exact, deviation), 14)
         modes = extract_modes(train)
         features = FeatureField.from_contacts(exact.contacts)
         field = fit(train, features, modes, FitConfig(steps=0), gains=MixtureEstimator(("thin-plate",)))
@@ -61,7 +61,7 @@ def test_neighbors_by_direction_are_scored_where_directions_are_known(directed: 
     signs = torch.tensor([1.0, -1.0]).repeat(5)[:, None]
     directions = torch.tensor([0.0, 0.0, -1.0]) * signs
     impacts = replace(straight, sounds=signs * straight.sounds, directions=directions if directed else None)
-    train, test = split(impacts, count=7)
+    train, test = split(impacts, 7)
     modes = extract_modes(train)
     field = fit(
         train, FeatureField.from_contacts(contacts), modes, FitConfig(steps=0), gains=MixtureEstimator(("thin-plate",))
@@ -70,7 +70,7 @@ def test_neighbors_by_direction_are_scored_where_directions_are_known(directed: 
     by_direction = scores.get("mean waveform of 3 nearest, by direction")
     assert (by_direction is not None) == directed
     if by_direction is not None:
-        alike_train, alike_test = split(straight, count=7)
+        alike_train, alike_test = split(straight, 7)
         alike = evaluate(MeanWaveform(alike_train), alike_test).mean()
         assert by_direction.mean() == pytest.approx(alike, rel=1e-5)
         assert scores["mean waveform of 3 nearest"].mean() != pytest.approx(alike, rel=0.1)

@@ -56,7 +56,7 @@ every_renderer = pytest.mark.parametrize("name", ["white_noise", "nearest", "knn
 
 @every_renderer
 def test_a_sound_depends_on_its_contact_alone(name):
-    train, test = split(plate_impacts())
+    train, test = split(plate_impacts(), 0.2)
     renderer = renderers(train)[name]
     assert isinstance(renderer, Renderer)
     assert renderer.sample_rate == 22050.0
@@ -71,7 +71,7 @@ def test_a_sound_depends_on_its_contact_alone(name):
 
 
 def test_white_noise_is_white_and_as_loud_as_the_training_sounds():
-    train, test = split(plate_impacts())
+    train, test = split(plate_impacts(), 0.2)
     sounds = WhiteNoise(train, seed=1).render(test.contacts)
     loudness = float(train.sounds.square().mean(dim=1).sqrt().mean())
     # 24 sounds of 4410 samples: the standard error of a root mean square is .2 %.
@@ -89,7 +89,7 @@ def test_white_noise_takes_the_two_zeros_for_one_place():
 
 
 def test_nearest_and_means_are_those_of_a_full_search():
-    train, test = split(plate_impacts())
+    train, test = split(plate_impacts(), 0.2)
     order = torch.cdist(test.contacts, train.contacts).argsort(dim=1)
     assert torch.equal(NearestRecording(train).render(test.contacts), train.sounds[order[:, 0]])
     for count in (1, 3, 6):
@@ -99,7 +99,7 @@ def test_nearest_and_means_are_those_of_a_full_search():
 
 
 def test_without_noise_mean_gains_are_mean_waveforms():
-    train, test = split(plate_impacts())
+    train, test = split(plate_impacts(), 0.2)
     for count in (1, 3):
         waveforms = MeanWaveform(train, count=count).render(test.contacts)
         gains = MeanGains(train, true_extraction(train), count=count).render(test.contacts)
@@ -108,7 +108,7 @@ def test_without_noise_mean_gains_are_mean_waveforms():
 
 
 def test_mean_gains_have_both_phases():
-    train, _ = split(plate_impacts())
+    train, _ = split(plate_impacts(), 0.2)
     extraction = true_extraction(train)
     turned = replace(extraction, gains=torch.zeros_like(extraction.gains), quadrature=extraction.gains)
     sounds = MeanGains(train, turned, count=1).render(train.contacts)
@@ -153,21 +153,21 @@ def evaluate_sounds(sounds: torch.Tensor, impacts: Impacts) -> float:
 
 def test_split_trains_on_farthest_points_and_tests_on_the_rest():
     impacts = plate_impacts(30)
-    train, test = split(impacts, fraction=0.2, start=3)
+    train, test = split(impacts, 0.2, start=3)
     assert (len(train), len(test)) == (6, 24)
     assert train.names == tuple(impacts.names[row] for row in farthest_points(impacts.contacts, 6, start=3).tolist())
     assert not set(train.names) & set(test.names)
     assert list(test.names) == sorted(test.names)
     assert torch.equal(train.sounds[0], impacts.sounds[3])
-    assert split(impacts, count=5, start=3)[0].names == train.names[:5]
-    assert len(split(plate_impacts(4))[0]) == 2
+    assert split(impacts, 5, start=3)[0].names == train.names[:5]
+    assert len(split(plate_impacts(4), 0.2)[0]) == 2
 
 
 def test_strikes_at_one_contact_stay_together():
     impacts = plate_impacts(10)
     doubled = impacts.take([*range(10), *range(10)])
     doubled = replace(doubled, names=tuple(f"{row}" for row in range(20)))
-    train, test = split(doubled, count=4)
+    train, test = split(doubled, 4)
     assert len(train) == 8
     assert len(test) == 12
     between = torch.cdist(train.contacts, test.contacts)
@@ -179,21 +179,21 @@ def test_splits_that_leave_too_little_are_refused():
     impacts = plate_impacts(10)
     for count in (10, 0, 11):
         with raises(EvaluationError, name="count", value=count):
-            split(impacts, count=count)
+            split(impacts, count)
     with raises(EvaluationError, name="count", value=2):
-        split(impacts.take([0, 1]))
+        split(impacts.take([0, 1]), 0.2)
     with raises(EvaluationError, name="count", value=2) as caught:
-        split(impacts.take([0, 1, 0, 1, 0, 1]))
+        split(impacts.take([0, 1, 0, 1, 0, 1]), 0.2)
     assert "6 recordings at 2 contacts" in str(caught.value)
-    with raises(EvaluationError, name="fraction", value=1.5):
-        split(impacts, fraction=1.5)
+    with raises(EvaluationError, name="train_size", value=1.5):
+        split(impacts, 1.5)
     with raises(EvaluationError, name="start", value=10):
-        split(impacts, start=10)
+        split(impacts, 0.2, start=10)
 
 
 def test_who_knows_the_answer_scores_zero_and_the_rest_in_order():
     impacts = plate_impacts(40)
-    train, test = split(impacts, fraction=0.5)
+    train, test = split(impacts, 0.5)
     assert set(evaluate(NearestRecording(test), test).mean().values()) == {0.0}
     scores = evaluate(NearestRecording(train), test)
     assert scores.names == test.names
@@ -245,7 +245,7 @@ def fit_to_recordings(train):
 
 
 def test_training_recordings_are_for_what_makes_a_renderer():
-    train, test = split(plate_impacts(4))
+    train, test = split(plate_impacts(4), 0.2)
     assert evaluate(lambda heard: Silent(heard.sample_rate), test, train=train).mean()["relative_stft"] == 1.0
     with raises(EvaluationError, name="renderer", value="Silent"):
         evaluate(Silent(22050.0), test, train=train)
@@ -268,7 +268,7 @@ def test_scores_have_means_and_standard_errors():
 
 
 def test_what_does_not_fit_together_is_refused():
-    train, test = split(plate_impacts())
+    train, test = split(plate_impacts(), 0.2)
     with raises(EvaluationError, name="count", value=7):
         MeanWaveform(train, count=7)
     with raises(EvaluationError, name="count", value=0):
@@ -301,7 +301,7 @@ def test_the_aircraft_scores_what_was_measured_before(shared, count, nearest, me
     impacts = read_aircraft(shared / "aircraft_response")
     found = []
     for start in (0, 18, 37):
-        train, test = split(impacts, count=count, start=start)
+        train, test = split(impacts, count, start=start)
         found.append(
             [
                 evaluate(renderer, test).mean()["relative_stft"]

@@ -71,7 +71,7 @@ def test_rounding_gives_a_perpendicular_impact_no_sign() -> None:
 def test_without_directions_that_differ_it_is_the_papers(known: str) -> None:
     plate = plate_impacts(30, seconds=0.05)
     slanted = normalize(torch.tensor([[0.3, -0.5, -0.8]])).expand(30, 3)
-    train, test = split(replace(plate, directions=slanted))
+    train, test = split(replace(plate, directions=slanted), 0.2)
     train = train if known in ("alike", "in training alone") else replace(train, directions=None)
     directions = test.directions if known in ("alike", "in test alone") else None
     sounds = {
@@ -90,7 +90,7 @@ def test_directions_lower_the_error_of_a_tree_struck_in_two(shared: Path) -> Non
         tree = read_capture(shared / "tree43", CaptureSettings()).impacts
     errors = []
     for start in (0, 18, 37):
-        train, test = split(tree, count=20, start=start)
+        train, test = split(tree, 20, start=start)
         renderers = (MeanWaveform(train), MeanWaveform(train, by_direction=True))
         errors.append([evaluate(renderer, test).mean()["relative_stft"] for renderer in renderers])
     plain, directed = np.mean(errors, axis=0)

@@ -102,7 +102,7 @@ def test_figures_are_those_of_the_one_line_of_evaluation(plates: Path, tmp_path:
     record = ResultsFolder(tmp_path / "results").read("a")
     assert record is not None
     (outcome,) = record.outcomes
-    train, test = split(read_capture(plates / "a").impacts)
+    train, test = split(read_capture(plates / "a").impacts, 0.2)
     expected = evaluate(NearestRecording(train), test)
     assert record.cases[0].train == train.names
     assert record.cases[0].test == test.names
@@ -143,7 +143,7 @@ def test_changed_wavs_are_scored_again_and_no_others(plates: Path, tmp_path: Pat
     results, sounds = ResultsFolder(tmp_path / "results"), tmp_path / "sounds"
     for name in ("a", "b"):
         shutil.copytree(plates / name, sounds / name)
-    tested = {name: split(read_capture(plates / name).impacts)[1].names for name in ("a", "b")}
+    tested = {name: split(read_capture(plates / name).impacts, 0.2)[1].names for name in ("a", "b")}
     changing, missing = sounds / "a" / tested["a"][0], sounds / "b" / tested["b"][0]
     content = missing.read_bytes()
     missing.unlink()
@@ -314,7 +314,7 @@ def test_methods_with_modes_are_judged_by_the_truth(tmp_path: Path) -> None:
     assert waveform.figures == {}
     (case,) = record.cases
     truth = truth_at(read_truth(folder / "a"), case.test)
-    train, test = split(read_capture(folder / "a").impacts)
+    train, test = split(read_capture(folder / "a").impacts, 0.2)
     asked: list[Task] = []
     run_objects(planned(folder, Asking(asked.append)), ("a",), ResultsFolder(tmp_path / "again"))
     fitted = method_named("spline-gains").fit(replace(asked[0], train=train))
@@ -344,7 +344,7 @@ def test_cdpam_is_taken_of_a_few_contacts(plates: Path, tmp_path: Path, monkeypa
     evaluation = replace(planned(plates, "nearest"), judging=Judging(level="raw", cdpam_contacts=3))
     run_objects(evaluation, ("a",), ResultsFolder(tmp_path))
     (record,) = ResultsFolder(tmp_path).records()
-    train, test = split(read_capture(plates / "a").impacts)
+    train, test = split(read_capture(plates / "a").impacts, 0.2)
     expected = (NearestRecording(train).render(test.contacts) - test.sounds).abs().sum(1)
     values = record.outcomes[0].values["cdpam"]
     assert [row for row, value in enumerate(values) if value is not None] == [1, 4, 6]
@@ -353,7 +353,7 @@ def test_cdpam_is_taken_of_a_few_contacts(plates: Path, tmp_path: Path, monkeypa
 
 def test_at_full_scale_the_recordings_unit_does_not_matter(plates: Path, tmp_path: Path) -> None:
     impacts = read_capture(plates / "a").impacts
-    train, test = split(impacts)
+    train, test = split(impacts, 0.2)
     sounds, loudest = NearestRecording(train).render(test.contacts), float(impacts.sounds.abs().max())
     judge = partial(Judging(cdpam=False).judge, NearestRecording(train), truth=None)
     one = judge(sounds, test, loudest=loudest)

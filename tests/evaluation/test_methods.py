@@ -106,7 +106,7 @@ def plate_task(train: Impacts, *, impacts: Impacts | None = None, seed: int = 0)
 
 @cache
 def parts() -> tuple[Impacts, Impacts]:
-    return split(struck(), count=TRAIN)
+    return split(struck(), TRAIN)
 
 
 @cache

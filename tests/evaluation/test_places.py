@@ -33,7 +33,7 @@ def repeated(*, apart: float = 0.0, times: int = 3) -> Impacts:
 @pytest.mark.parametrize("times", [1, 2, 5])
 def test_a_fraction_is_of_places(times: int) -> None:
     for fraction, places in ((0.5, 10), (0.3, 6), (0.9, 18)):
-        train, test = split(repeated(times=times), fraction=fraction)
+        train, test = split(repeated(times=times), fraction)
         assert (len(train), len(test)) == (places * times, (COUNT - places) * times)
         for choosing in (Farthest(fraction), Closest(fraction)):
             (case,) = choosing.cases(repeated(times=times))
@@ -64,25 +64,25 @@ def test_contacts_apart_are_places_of_their_own() -> None:
 
 def test_a_choice_may_start_from_any_recording_of_a_place() -> None:
     impacts = repeated()
-    names = {row: split(impacts, count=5, start=row)[0].names for row in (7, 27, 47)}
+    names = {row: split(impacts, 5, start=row)[0].names for row in (7, 27, 47)}
     assert names[7] == names[27] == names[47]
     assert names[7][0] == "07.wav"
     with raises(EvaluationError, name="start", value=60):
-        split(impacts, count=5, start=60)
+        split(impacts, 5, start=60)
     with raises(EvaluationError, name="count", value=20) as caught:
-        split(impacts, count=20)
+        split(impacts, 20)
     assert "60 recordings at 20 contacts" in str(caught.value)
 
 
 def test_no_impacts_have_no_places() -> None:
     with raises(EvaluationError, name="count") as caught:
-        split(repeated().take([]))
+        split(repeated().take([]), 0.2)
     assert "0 recordings at 0 contacts" in str(caught.value)
 
 
 def test_places_and_recordings_are_told_apart() -> None:
-    assert parts_words(*split(repeated(times=1), count=5)) == "15 positions not trained on, 5 trained on"
-    words = parts_words(*split(repeated(apart=0.002), count=5))
+    assert parts_words(*split(repeated(times=1), 5)) == "15 positions not trained on, 5 trained on"
+    words = parts_words(*split(repeated(apart=0.002), 5))
     assert words == "15 positions not trained on, 5 trained on (45 and 15 recordings)"
 
 
@@ -91,8 +91,8 @@ def test_fractions_of_a_tree_struck_twice_a_place(shared: Path, fraction: float,
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CaptureWarning)
         tree = read_capture(shared / "tree43", CaptureSettings()).impacts
-    train, test = split(tree, fraction=fraction)
+    train, test = split(tree, fraction)
     assert (len(train), len(test)) == (2 * places, 2 * (43 - places))
     moved = tree.contacts + 2e-4 * torch.randn(tree.contacts.shape, generator=torch.Generator().manual_seed(0))
-    again, others = split(replace(tree, contacts=moved), fraction=fraction)
+    again, others = split(replace(tree, contacts=moved), fraction)
     assert (len(again), len(others)) == (len(train), len(test))

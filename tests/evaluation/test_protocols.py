@@ -46,7 +46,7 @@ def test_training_and_test_contacts_never_mix(name: str, repeated: tuple[int, ..
 def test_farthest_is_the_split_that_all_other_commands_make(repeated: tuple[int, ...]) -> None:
     impacts = struck(repeated=repeated)
     (case,) = Farthest().cases(impacts)
-    train, test = split(impacts, fraction=0.2)
+    train, test = split(impacts, 0.2)
     assert impacts.take(case.train).names == train.names
     assert impacts.take(case.test).names == test.names
 

@@ -21,6 +21,7 @@ from avmsf.fem.radiated_sound import AIR_DENSITY, SOUND_SPEED
 from avmsf.fem.radiation import radiated_pressure
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
+from avmsf.field.suggest import suggest
 from avmsf.mesh.surface import Surface, write_surface
 from avmsf.pipeline.config import BodyConfig
 from avmsf.pipeline.guess import guess_field, known_surface
@@ -141,7 +142,7 @@ def test_a_guess_is_kept_whole_and_says_what_it_is(tmp_path: Path):
     assert read.origin.report["guess"].startswith("No recordings")
     assert read.origin.trained_on == ()
     with raises(FitError, name="field", value="body"):
-        read.suggest()
+        suggest(read)
     assert made_of(read, option="--from").material == STEEL
     assert SampledField.of(read, limit=20).sine.shape == (20, 12)
 

@@ -3,11 +3,10 @@
 import csv
 import io
 import os
-import random
 import shutil
 import uuid
 import warnings
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 import soundfile
@@ -42,30 +41,9 @@ class Capture:
         surface = "no surface" if self.surface is None else repr(self.surface)
         return f"Capture({self.name!r}, {self.impacts}, {surface})"
 
-    @classmethod
-    def read(cls, folder: str | Path, settings: CaptureSettings | None = None) -> "Capture":
-        """Read a capture folder, see `read_capture`. Raises CaptureError for a folder that cannot be used."""
-        return read_capture(folder, settings)
-
     def write(self, folder: str | Path) -> None:
-        """Write a folder that `read` reads back to the same values, see `write_capture`."""
+        """Write a folder that is read back to the same values, see `write_capture`."""
         write_capture(self, folder)
-
-    def split(self, train_size: float | int = 0.75, *, seed: int | None = None) -> "tuple[Capture, Capture]":
-        """Return (train, test): the recordings at positions as far apart as possible, and all others.
-
-        `train_size` is a part of the positions (float, 0 to 1) or their number (int, 1 or more). All recordings at a
-        position, also repeated ones, are on one side. The choice starts from the first recording's position, or with a
-        `seed` from one drawn at random. Raises EvaluationError for a size that leaves no position to train or to test.
-        """
-        from avmsf.evaluation.splits import split
-
-        start = 0 if seed is None else random.Random(seed).randrange(len(self.impacts))
-        if isinstance(train_size, float):
-            train, test = split(self.impacts, fraction=train_size, start=start)
-        else:
-            train, test = split(self.impacts, count=int(train_size), start=start)
-        return replace(self, impacts=train), replace(self, impacts=test)
 
 
 def read_capture(folder: str | Path, settings: CaptureSettings | None = None) -> Capture:

@@ -85,7 +85,7 @@ def _go_all_the_way(
     wrong = sum(bool(each.problems) for each in report.recordings)
     bar.log(f"check: {len(report.recordings)} recordings, {wrong} with problems")
     capture = replace(read_capture(folder / "capture"), name="mug")
-    train, test = split(capture.impacts, count=TRAIN)
+    train, test = split(capture.impacts, TRAIN)
     made = reconstruct(
         folder / "capture",
         capture,

@@ -188,9 +188,9 @@ def part_contacts(
 ) -> tuple[Impacts, Impacts | None]:
     """Return the recordings to fit to and those to score on, None where all are fitted to."""
     if fraction is not None:
-        return split(impacts, fraction=fraction, start=start)
+        return split(impacts, fraction, start=start)
     if count is not None:
-        return split(impacts, count=count, start=start)
+        return split(impacts, count, start=start)
     return impacts, None
 
 

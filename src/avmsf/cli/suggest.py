@@ -33,11 +33,13 @@ def run(options: Options) -> int:
     given = False
     doing("choosing the contacts")
     if options.candidates is None:
-        found = suggest(field, options.count, unseen=options.unseen)
+        found = suggest(field, options.count, unseen=options.unseen, progress=False)
     else:
         settings = None if options.settings is None else CaptureSettings.read(options.settings)
         impacts = read_capture(options.candidates, settings).impacts
-        found = suggest(field, options.count, candidates=impacts.contacts, directions=impacts.directions)
+        found = suggest(
+            field, options.count, candidates=impacts.contacts, directions=impacts.directions, progress=False
+        )
         given = impacts.directions is not None
         names = tuple(impacts.names[row] for row in found.rows.tolist())
     rows = _rows(found, names)

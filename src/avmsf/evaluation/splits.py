@@ -1,10 +1,11 @@
 """Splits into training and test recordings, and the scores of any renderer on the test recordings."""
 
 import math
+import random
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import torch
 
@@ -20,6 +21,8 @@ from avmsf.evaluation.renderer import Renderer, expect_renderer
 from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.points import farthest_points
 from avmsf.modal.extraction.extract import Extraction, extract_modes
+
+Recordings = TypeVar("Recordings", bound=Capture | Impacts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,26 +53,31 @@ class Scores:
 
 
 def split(
-    impacts: Impacts, *, fraction: float = 0.2, count: int | None = None, start: int = 0
-) -> tuple[Impacts, Impacts]:
-    """Return (train, test): all recordings at contacts chosen by farthest-point sampling, and all others.
+    recordings: Recordings, train_size: float | int = 0.75, *, seed: int | None = None, start: int = 0
+) -> tuple[Recordings, Recordings]:
+    """Return (train, test): the recordings at contacts as far apart as possible, and all others.
 
-    Contacts nearer to each other than 1 % of the bounding box's diagonal count as one (`places_of`). `count` contacts
-    to train on, or else the nearest whole number to `fraction` of all contacts and at least 2. Training recordings are
-    in the order of the choice, from the contact of row `start` on, one a contact, and then the repeated ones; so with
-    more contacts the first ones stay the same. Raises EvaluationError where no contact would remain to train on, with a
-    fraction fewer than 2, or none to test.
+    `recordings` are a capture, or the impacts of one. `train_size` is a fraction of the contacts (float, 0 to 1; at
+    least 2 contacts) or their number (int). Contacts nearer to each other than 1 % of the bounding box's diagonal count
+    as one (`places_of`), and all recordings at a contact are on one side. The choice, by farthest-point sampling,
+    starts from the contact of row `start`, or with a `seed` from one drawn at random. Training recordings are in the
+    order of the choice, one a contact, and then the repeated ones; so with more contacts the first ones stay the same.
+    Raises EvaluationError where no contact would remain to train on, with a fraction fewer than 2, or none to test.
     """
-    if count is None and not 0.0 < fraction < 1.0:
-        raise EvaluationError(
-            f"expected a fraction of training contacts between 0 and 1, got {fraction:g}",
-            name="fraction",
-            value=fraction,
+    impacts = recordings if isinstance(recordings, Impacts) else recordings.impacts
+    if isinstance(train_size, float) and not 0.0 < train_size < 1.0:
+        raise EvaluationError.expected(
+            "a fraction of the contacts between 0 and 1, or their whole number", train_size, name="train_size"
         )
+    if seed is not None:
+        start = random.Random(seed).randrange(len(impacts))
     places = Places.of(impacts)
-    wanted = places.expect_part(fraction) if count is None else places.expect(count)
+    wanted = places.expect_part(train_size) if isinstance(train_size, float) else places.expect(int(train_size))
     case = places.case("", farthest_points(places.contacts, wanted, start=places.number_of(start)))
-    return impacts.take(case.train), impacts.take(case.test)
+    train, test = impacts.take(case.train), impacts.take(case.test)
+    if isinstance(recordings, Impacts):
+        return cast("tuple[Recordings, Recordings]", (train, test))
+    return replace(recordings, impacts=train), replace(recordings, impacts=test)
 
 
 def align_split(
@@ -119,7 +127,7 @@ def evaluate(
                 "SoundField",
                 got="a SoundField, whose fit needs the shape in a Capture",
                 name="renderer",
-                advice="give avmsf.SoundField.fit(train), without `train`: it aligns the test recordings itself",
+                advice="give avmsf.fit(train), without `train`: it aligns the test recordings itself",
             ) from error
     made = expect_renderer(renderer)
     if isinstance(made, SoundField):

@@ -72,7 +72,7 @@ def smallest_within_error(errors: Float[Tensor, "choices places"]) -> int:
 def _next(field: SoundField, gains: MixtureGains) -> tuple[tuple[float, float, float], float] | tuple[()]:
     """Return the contact that reduces the expected error most and its distance to the nearest one; () for none."""
     try:
-        (contact,) = suggest(field, 1).contacts
+        (contact,) = suggest(field, 1, progress=False).contacts
     except FitError:
         # All points of the object are contacts already.
         return ()

@@ -4,14 +4,13 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, SupportsIndex
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Bool, Complex, Float, Float64
 from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_count, as_directions, as_numbers, as_vectors
-from avmsf._utils.progress import working
 from avmsf._utils.summary import short_repr
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
@@ -32,9 +31,6 @@ from avmsf.modal.synthesis import synthesize_phased
 if TYPE_CHECKING:
     from avmsf.features.feature_field import FeatureField
     from avmsf.field.config import GainModel
-    from avmsf.field.suggest import Suggestions
-    from avmsf.localization.contact_map import ContactMap
-    from avmsf.localization.preprocess import Sound
     from avmsf.pipeline.config import PipelineConfig
 
 SUPPORTING = "supporting_poles"
@@ -244,13 +240,6 @@ class SoundField:
             capture, gain_model, features=features, config=config, seed=seed, device=device, progress=progress
         )
 
-    @classmethod
-    def load(cls, path: str | Path) -> "SoundField":
-        """Read a field that `save` wrote. Raises FieldFileError for a missing or damaged file, and for another kind."""
-        from avmsf.field.store import load
-
-        return load(path)
-
     def save(self, path: str | Path) -> None:
         """Write the field to one safetensors file. Raises FieldFileError where it cannot be written."""
         from avmsf.field.store import save
@@ -268,41 +257,6 @@ class SoundField:
         contacts, ways = self._impacts(positions, directions)
         std = std_of(self, contacts, ways).square().sum(2).sqrt()
         return GainPosterior(self._amplitudes(parts_of(self, contacts, ways)), std)
-
-    def suggest(
-        self,
-        count: SupportsIndex = 5,
-        *,
-        candidates: ArrayLike | None = None,
-        unseen: bool = False,
-        progress: bool = True,
-    ) -> "Suggestions":
-        """Return where the next `count` impacts lower the field's expected error most.
-
-        `candidates` are the positions to choose from (object frame, meters, on the surface), without them all that a
-        hammer reaches from outside. With `unseen` they are on all of the body's surface, also where no photograph shows
-        it. With `progress`, the standard error says that it works. Raises FitError as `posterior` and as
-        `avmsf.field.suggest.suggest`.
-        """
-        from avmsf.field.suggest import suggest
-
-        pool = None if candidates is None else as_vectors(candidates, "candidates")
-        with working("computing the expected error over the surface", shown=progress):
-            return suggest(self, count, candidates=pool, unseen=unseen)
-
-    def locate(
-        self, recording: "Sound", *, sample_rate: float | int | None = None, progress: bool = True
-    ) -> "ContactMap":
-        """Return where on the object a recorded impact was: points with probabilities.
-
-        `recording` is the path of a sound file, or the samples of one channel at `sample_rate` Hz (by default the
-        field's). The first recording takes seconds to minutes, in which the gains over the surface are computed; with
-        `progress`, the standard error says so. `avmsf.locate` takes more arguments. Raises LocationError for a
-        recording that is silent or too short.
-        """
-        from avmsf.localization.locate import locate
-
-        return locate(self, recording, sample_rate=sample_rate, progress=progress)
 
     def aligned(self, impacts: Impacts) -> Impacts:
         """Return recordings of the object with the starts that the field's sounds have."""

@@ -10,6 +10,8 @@ from jaxtyping import Bool, Float, Float64, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from avmsf._utils.arrays import ArrayLike, as_vectors
+from avmsf._utils.progress import working
 from avmsf._utils.summary import short_repr
 from avmsf.errors import FitError
 from avmsf.field.gains.family import Sites
@@ -64,9 +66,10 @@ def suggest(
     field: SoundField,
     count: SupportsIndex = 5,
     *,
-    candidates: Float[Tensor, "candidates 3"] | None = None,
+    candidates: ArrayLike | None = None,
     directions: Float[Tensor, "_given 3"] | None = None,
     unseen: bool = False,
+    progress: bool = True,
 ) -> Suggestions:
     """Return the `count` contacts that lower the expected error of the whole field most, each given those before it.
 
@@ -74,13 +77,25 @@ def suggest(
     them they are points spread over the surface that a hammer can strike from outside (`hammer_access`). `directions`
     are the unit vectors along which candidates can be struck, straight into the surface where not given. A field made
     of photographs has points where they show the object; with `unseen`, error and candidates are those of all of the
-    surface of the field's body instead.
+    surface of the field's body instead. With `progress`, the standard error says that it works.
 
     Raises FitError for gains without a posterior, unfit arguments, fewer candidates than contacts asked for, places
     none of which a hammer gets to, and `unseen` without a body.
     """
+    count, pool = _whole(count), None if candidates is None else as_vectors(candidates, "candidates")
+    with working("computing the expected error over the surface", shown=progress):
+        return _suggest(field, count, pool, directions, unseen=unseen)
+
+
+def _suggest(
+    field: SoundField,
+    count: int,
+    candidates: Float[Tensor, "candidates 3"] | None,
+    directions: Float[Tensor, "_given 3"] | None,
+    *,
+    unseen: bool,
+) -> Suggestions:
     gains = unedited_mixture(field)
-    count = _whole(count)
     surface = _body_nodes(gains) if unseen else gains.points
     points = surface[farthest_points(surface, min(PLACES, len(surface)))].double()
     _expect_directions(directions, candidates)

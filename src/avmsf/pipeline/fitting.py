@@ -120,7 +120,7 @@ def fit_with_progress(
     """Return what `SoundField.fit` returns."""
     if not isinstance(capture, Capture):
         raise FitError(
-            f"capture: expected a Capture, got {type(capture).__name__}; read a folder by avmsf.Capture.read(folder)",
+            f"capture: expected a Capture, got {type(capture).__name__}; read a folder by avmsf.read(folder)",
             name="capture",
             value=type(capture).__name__,
         )

@@ -68,7 +68,7 @@ def extract_modes(recordings: Capture | Impacts, method: ModeFinder | None = Non
             "a Capture or Impacts",
             type(impacts).__name__,
             name="recordings",
-            advice="read a folder by avmsf.Capture.read(folder)",
+            advice="read a folder by avmsf.read(folder)",
         )
     alignment = None if impacts.before is None or len(impacts) < 2 else align(impacts)
     final = impacts if alignment is None else alignment.apply(impacts)
