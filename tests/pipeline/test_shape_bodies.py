@@ -90,7 +90,7 @@ def test_bodies_of_a_shape_are_read_again_and_those_of_another_shape_are_not(tmp
 
     first = frequency(Cup())
     assert computed() == 1
-    # Off Linux, tetrahedra come out a little different each time; what is read is the same to the last bit.
+    # Tetrahedra come out a little different each time; what is read is the same to the last bit.
     assert torch.equal(first, frequency(Cup()))
     assert computed() == 0
     frequency(Cup(most=0.019))

@@ -1,9 +1,8 @@
 """Any mesh or scan as tetrahedra, by pytetwild, which allows holes and self-intersections.
 
-pytetwild inserts the triangles in a random order. Its seed is fixed from outside, so the same mesh has the same
-tetrahedra in each run. That cannot be done on macOS and Windows, nor where the library's table of functions is
-protected: there two runs differ in their tetrahedra and somewhat in the body's frequencies. Keep the solid to keep its
-sounds. It runs in a process of its own, for it may crash, and never ends on some meshes.
+pytetwild inserts the triangles in a random order, so two runs differ in their tetrahedra and somewhat in the body's
+frequencies (docs/limitations.md). Keep the solid, or the modes, to keep the sounds. It runs in a process of its own,
+for it may crash, and never ends on some meshes.
 """
 
 import importlib.util
