@@ -14,7 +14,6 @@ from torch import Tensor
 from avmsf.capture import Impacts
 from avmsf.evaluation.splits import split
 from avmsf.features.feature_field import FeatureField
-from avmsf.fem.block import block
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.elements import SecondOrder
 from avmsf.fem.material import CERAMIC, STEEL
@@ -34,6 +33,7 @@ from avmsf.simulate.shapes import make_shape
 from avmsf.simulate.sim20 import ABLATED
 from benchmarks.report import Options, Report, Table, log
 from benchmarks.splitcases import COUNTS, ROUGH, SplitCase, bodies_of, measured, simulated, split_case, splits_of
+from tests.oracles.block import block
 
 DEFAULT = "default"
 _ALONE = tuple(f"{kind} alone" for kind in FAMILIES)

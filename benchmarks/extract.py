@@ -15,9 +15,9 @@ from avmsf.evaluation.simple_methods import floor
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import extract_modes, extract_sounds
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder, ShortTime
-from avmsf.simulate.plate import PlateModes, plate_modes
 from benchmarks.material import IMPULSE, clips_in_place
 from benchmarks.report import Options, Report, Table, log
+from tests.oracles.plate import PlateModes, plate_modes
 
 METHODS: dict[str, ModeFinder] = {"pencil": HighResolution(), "stft": ShortTime()}
 NOISES = (20, 40, 60)

@@ -13,13 +13,13 @@ import scipy.linalg
 import scipy.optimize
 import torch
 
-from avmsf.fem.block import block
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.elements import SecondOrder
 from avmsf.fem.material import CERAMIC, STEEL, Material
 from avmsf.fem.solid import Solid
 from benchmarks.report import Options, Report, Table, log
 from benchmarks.step import peak_gigabytes
+from tests.oracles.block import block
 
 _LEISSA = np.array([13.489, 19.789, 24.432, 35.024, 35.024, 61.526])
 """Angular frequencies of a free square plate times side^2 sqrt(mass a square meter / rigidity), Poisson's ratio .3."""

@@ -38,7 +38,6 @@ from avmsf.modal.residual_noise import Residual
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.ground_truth import Truth, read_truth
-from avmsf.simulate.plate import Plate, plate_surface_points
 from avmsf.simulate.shapes import make_shape
 from avmsf.simulate.shapes.shape import Symmetry
 from avmsf.simulate.sim20 import NON_SYMMETRIC, SIM20, sim20_recipe
@@ -46,6 +45,7 @@ from avmsf.simulate.simulation import simulate_object
 from benchmarks.look import slab
 from benchmarks.material import STRUCK, capture_in_place, shared_data, surface_features
 from benchmarks.report import Options, Report, Table, log, show
+from tests.oracles.plate import Plate, plate_surface_points
 
 AIRCRAFT_COUNT, AIRCRAFT_STARTS = 15, (0, 18, 37)
 SOME = ("mug-ceramic", "blob-polycarbonate", "spoon-wood", "bowl-glass", "pot-steel")

@@ -16,7 +16,7 @@ from avmsf.photographs.cameras import View
 from avmsf.photographs.mesh_views import Lighting, orbit_cameras, render_views
 from avmsf.pipeline.config import LiftConfig
 from avmsf.pipeline.features import MadeFeatures, finish_features, lift_to_surface
-from avmsf.simulate.plate import Plate
+from tests.oracles.plate import Plate
 
 LIGHT = Lighting(ambient=0.3, sky=0.7, direction=(0.5, 0.3, 0.8))
 """One lamp in one place, which lights an object's symmetric parts differently."""

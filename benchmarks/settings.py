@@ -14,9 +14,9 @@ from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.recipes import Attention
 from avmsf.modal.extraction.extract import Extraction, extract_modes
-from avmsf.simulate.plate import Plate
 from benchmarks.material import PlateCase, capture_in_place, surface_features
 from benchmarks.report import Options, Report, Table, log
+from tests.oracles.plate import Plate
 
 PARTS = ("network",)
 GLASS = PlateCase(

@@ -31,10 +31,10 @@ from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
 from avmsf.modal.residual_noise import Residual, shape_noise
 from avmsf.modal.synthesis import synthesize
-from avmsf.simulate.plate import sample_contacts
 from benchmarks.look import pictures, shape, speckled
 from benchmarks.material import IMPULSE, REPOSITORY
 from benchmarks.report import Options, Report, Table
+from tests.oracles.plate import sample_contacts
 
 STEPS = replace(PAPER, warmup_steps=100, spectral_norm="each", damping="shared")
 """The paper's settings but for a short warm-up, enough for gains of a trained field's size, and relative losses."""

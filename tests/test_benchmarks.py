@@ -16,13 +16,13 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(REPOSITORY))
 
 from avmsf.modal.bank import ModalBank  # noqa: E402
-from avmsf.simulate.plate import PlateModes  # noqa: E402
 from benchmarks import field, speed  # noqa: E402
 from benchmarks.__main__ import main  # noqa: E402
 from benchmarks.extract import Match  # noqa: E402
 from benchmarks.material import clips_in_place  # noqa: E402
 from benchmarks.report import Options, Report, Table, show  # noqa: E402
 from benchmarks.step import STEPS, PlainRun, full_setting, pass_warmup, start  # noqa: E402
+from oracles.plate import PlateModes  # noqa: E402
 
 
 def shown(report: Report, *, quick_look: bool = False) -> list[str]:

@@ -22,7 +22,6 @@ from avmsf.baselines.diffsound.material_fit import (
 from avmsf.baselines.diffsound.renderer import DiffSound, leveled
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, LocationError, SimulationError
-from avmsf.fem.block import block
 from avmsf.fem.body_family import BodyFamily, body_family
 from avmsf.fem.isotropic import isotropic_modes
 from avmsf.fem.material import GLASS
@@ -31,6 +30,7 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.modal.spectra import magnitude_stft
 from avmsf.modal.synthesis import synthesize
+from oracles.block import block
 
 RATE, SAMPLES = 48_000.0, 24_000
 STIFFNESS, POISSON = 1.3 * GLASS.young / GLASS.density, 0.27

@@ -14,8 +14,8 @@ from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.prepare import margin_length, prepare
 from avmsf.capture.starts import start_with_impact
 from avmsf.datasets.recordings import Blow, gather
-from avmsf.simulate.plate import Plate, sample_contacts, strike
 from factories.capture_folder import RATE, fill, ring
+from oracles.plate import Plate, sample_contacts, strike
 
 MARGIN = 160
 """20 ms at 8 kHz."""

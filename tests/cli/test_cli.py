@@ -20,9 +20,9 @@ from avmsf.errors import CaptureError
 from avmsf.field import PAPER, FitConfig
 from avmsf.field.store import load
 from avmsf.gaussians.ply_header import NEEDED
-from avmsf.simulate.plate import plate_modes
 from factories.plate_capture import CONTACT_TIME, HIGHEST, PLATE, RATE, TINY, fill_plate
 from factories.raising import raises
+from oracles.plate import plate_modes
 
 Streams = pytest.CaptureFixture[str]
 AT = ("--position", "0.05", "0.06", "0")

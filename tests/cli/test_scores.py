@@ -14,7 +14,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.modal.extraction.extract import extract_modes
-from avmsf.simulate.plate import Plate, sample_contacts, strike
+from oracles.plate import Plate, sample_contacts, strike
 
 MARGIN = 64
 

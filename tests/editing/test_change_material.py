@@ -12,7 +12,6 @@ from avmsf.editing.material_before import made_of
 from avmsf.editing.material_guess import guess_materials
 from avmsf.editing.modes import adjust_modes
 from avmsf.errors import EditError, SimulationError
-from avmsf.fem.block import block
 from avmsf.fem.damping import rayleigh
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import CERAMIC, GLASS, NOMINAL, PLASTIC, STEEL, WOOD, Material
@@ -23,8 +22,9 @@ from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual_noise import Residual
-from avmsf.simulate.plate import Plate, plate_modes, sample_contacts
 from factories.raising import raises
+from oracles.block import block
+from oracles.plate import Plate, plate_modes, sample_contacts
 
 RATE = 44100.0
 CONTACTS = sample_contacts(Plate(), 8, generator=torch.Generator().manual_seed(0))

@@ -23,8 +23,8 @@ from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
-from avmsf.simulate.plate import Plate, PlateModes, plate_modes, sample_contacts, strike
 from factories.raising import raises
+from oracles.plate import Plate, PlateModes, plate_modes, sample_contacts, strike
 
 PLATE = Plate()
 

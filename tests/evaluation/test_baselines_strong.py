@@ -14,8 +14,8 @@ from avmsf.evaluation.spectral_mean import MeanSpectra
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.residual_noise import Residual
-from avmsf.simulate.plate import Plate, plate_modes, sample_contacts
 from factories.raising import raises
+from oracles.plate import Plate, plate_modes, sample_contacts
 
 
 def scattered(count: int, seed: int = 0) -> torch.Tensor:

@@ -46,7 +46,6 @@ from avmsf.evaluation.editing_tasks import (
 from avmsf.evaluation.mode_embedding import MaterialSpace
 from avmsf.evaluation.mode_features import PitchesAndRings
 from avmsf.features.feature_field import FeatureField
-from avmsf.fem.block import block
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import GLASS, MATERIALS, STEEL, WOOD
 from avmsf.modal.bank import ModalBank
@@ -57,6 +56,7 @@ from factories.made_audio import save_audio
 from factories.made_clap import save_clap
 from factories.made_modes import sliding_plate
 from factories.plate_field import plate_impacts
+from oracles.block import block
 
 # The benchmarks are no part of the package, and `python -m benchmarks` finds them from the repository's root alone.
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))

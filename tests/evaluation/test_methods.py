@@ -23,7 +23,6 @@ from avmsf.evaluation.renderer import Renderer
 from avmsf.evaluation.splits import split
 from avmsf.evaluation.task import Method, Task
 from avmsf.features.feature_field import FeatureField
-from avmsf.fem.block import block
 from avmsf.fem.body_family import BodyFamily
 from avmsf.fem.candidate_bodies import NominalBodies, NominalBody
 from avmsf.fem.elastic_modes import elastic_modes
@@ -40,6 +39,7 @@ from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.synthesis import synthesize
 from factories.plate_field import PLATE, QUICK, RATE, plate_extraction, plate_features, plate_impacts
 from factories.raising import raises
+from oracles.block import block
 
 TINY = replace(QUICK, hidden=16, layers=1, warmup_steps=6, steps=4, fft_sizes=(256,), early=256)
 COUNT, TRAIN = 20, 9

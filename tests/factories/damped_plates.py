@@ -12,8 +12,8 @@ from avmsf.field.sound_field import Origin, SoundField
 from avmsf.localization.locator import Locator
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual_noise import Residual
-from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
 from factories.unsaved_gains import Unsaved
+from oracles.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
 
 RATE, SECONDS, LENGTH = 44100.0, 0.4, 0.24
 HIGHEST = {"wood": 6000.0, "plastic": 3000.0}

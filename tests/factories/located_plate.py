@@ -17,8 +17,8 @@ from avmsf.localization.locator import Locator
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.residual_noise import Residual
-from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
 from factories.unsaved_gains import Unsaved
+from oracles.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
 
 PLATE = Plate()
 RATE, SECONDS, HIGHEST = 18000.0, 0.4, 8000.0

@@ -7,7 +7,7 @@ import torch
 
 from avmsf.capture import Capture, write_capture
 from avmsf.mesh import Surface
-from avmsf.simulate.plate import Plate, sample_contacts, strike
+from oracles.plate import Plate, sample_contacts, strike
 
 RATE, HIGHEST, CONTACT_TIME = 8000.0, 2500.0, 5e-4
 PLATE = Plate(alpha=40.0)

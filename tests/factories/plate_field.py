@@ -10,7 +10,7 @@ from avmsf.field.config import FitConfig
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.residual_noise import Residual
-from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
+from oracles.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
 
 PLATE = Plate()
 CONTACT_TIME = 5e-4

@@ -13,7 +13,7 @@ from avmsf.fem.body_family import BodyFamily
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.mesh import Surface
 from avmsf.simulate.ground_truth import TRUTH, Truth, write_truth
-from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
+from oracles.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
 
 RATE, HIGHEST = 8000.0, 2500.0
 

@@ -13,13 +13,13 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from torch import Tensor
 
 from avmsf.errors import SimulationError
-from avmsf.fem.block import block
 from avmsf.fem.eigen import lowest_vibrations, one_blas_thread, rigid_motions
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.elements import SecondOrder, mass, stiffness
 from avmsf.fem.material import GLASS, STEEL, Material
 from avmsf.fem.solid import Solid
 from factories.raising import raises
+from oracles.block import block
 
 BRACKET = ((0.07, 0.05, 0.011), (3, 2, 1))
 """A block with three different sides, so that no two modes share a frequency."""

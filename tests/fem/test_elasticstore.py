@@ -7,11 +7,11 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from avmsf.errors import SimulationError
-from avmsf.fem.block import block
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.elastic_store import load_modes, save_modes
 from avmsf.fem.material import GLASS
 from factories.raising import raises
+from oracles.block import block
 
 TENSORS = {"frequency", "nodes", "triangles", "shapes", "stiffness", "mass", "poisson"}
 

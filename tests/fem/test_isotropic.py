@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from avmsf.errors import SimulationError
-from avmsf.fem.block import block
 from avmsf.fem.body_family import BodyFamily, body_family
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.isotropic import IsotropicModes, isotropic_modes
 from avmsf.fem.material import STEEL, WOOD, Material
 from avmsf.fem.solid import Solid
 from avmsf.mesh.surface import Surface
+from oracles.block import block
 
 
 @cache

@@ -11,12 +11,12 @@ import trimesh
 from avmsf.errors import SimulationError
 from avmsf.fem import candidate_bodies as nominal
 from avmsf.fem import mesh_filling as nominalsolid
-from avmsf.fem.block import block
 from avmsf.fem.candidate_bodies import NominalBody, nominal_bodies, refined
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import NOMINAL
 from avmsf.mesh.surface import Surface, read_surface
 from factories.raising import raises
+from oracles.block import block
 
 
 def surface_of(mesh: trimesh.Trimesh) -> Surface:

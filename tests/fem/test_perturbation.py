@@ -6,12 +6,12 @@ from functools import cache
 import numpy as np
 import torch
 
-from avmsf.fem.block import block
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.elements import SecondOrder, elements_of
 from avmsf.fem.material import STEEL
 from avmsf.fem.perturbation import Perturbations, smooth_fields
 from avmsf.fem.solid import Solid
+from oracles.block import block
 
 STEP = 1e-4
 

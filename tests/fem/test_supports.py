@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from avmsf.fem.block import block
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.elements import SecondOrder
 from avmsf.fem.material import NOMINAL
 from avmsf.fem.solid import Solid
 from avmsf.fem.supports import supports_of
+from oracles.block import block
 
 
 def standing(solid: Solid) -> Solid:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from avmsf.fem.block import block
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.elements import SecondOrder, elements_of
 from avmsf.fem.material import NOMINAL
@@ -19,6 +18,7 @@ from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, matched
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.positional import Smooth, Unstructured
+from oracles.block import block
 
 MODES = 14
 

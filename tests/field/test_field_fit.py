@@ -22,9 +22,9 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
 from avmsf.modal.synthesis import synthesize_phased
-from avmsf.simulate.plate import plate_modes
 from factories.plate_field import PLATE, QUICK, RATE, plate_extraction, plate_features, plate_impacts
 from factories.raising import raises
+from oracles.plate import plate_modes
 
 LONG = replace(QUICK, width=32, hidden=128, warmup_steps=300, steps=60, correction_rate=3e-3)
 SHORT = replace(QUICK, warmup_steps=4, steps=4)

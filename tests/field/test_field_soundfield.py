@@ -12,8 +12,8 @@ from avmsf.field.fit import fit
 from avmsf.field.recipes import Attention
 from avmsf.field.sound_field import SoundField
 from avmsf.modal.residual_noise import shape_noise
-from avmsf.simulate.plate import sample_contacts
 from factories.plate_field import PLATE, QUICK, RATE, plate_extraction, plate_features, plate_impacts
+from oracles.plate import sample_contacts
 
 CONTACTS = sample_contacts(PLATE, 40, generator=torch.Generator().manual_seed(5))
 

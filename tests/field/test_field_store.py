@@ -30,9 +30,9 @@ from avmsf.field.header import FORMAT
 from avmsf.field.recipes import Attention
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save
-from avmsf.simulate.plate import sample_contacts
 from factories.plate_field import PLATE, QUICK, plate_extraction, plate_features, plate_impacts
 from factories.raising import raises
+from oracles.plate import sample_contacts
 
 CONTACTS = sample_contacts(PLATE, 10, generator=torch.Generator().manual_seed(5))
 CONFIG = replace(QUICK, warmup_steps=4, steps=2)

@@ -7,10 +7,10 @@ import torch
 from avmsf.errors import ArrayError, LocationError
 from avmsf.localization.contact_map import ContactMap, EquivalentPoint
 from avmsf.localization.locator import Locator
-from avmsf.simulate.plate import plate_surface_points
 from avmsf.symmetry.symmetries import MirrorSymmetry, RotationalSymmetry, Symmetries
 from factories.located_plate import PLATE, TrueGains, field_of, struck
 from factories.raising import raises
+from oracles.plate import plate_surface_points
 
 
 def middle() -> torch.Tensor:

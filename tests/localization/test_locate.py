@@ -15,7 +15,6 @@ from avmsf.localization.locator import Locator
 from avmsf.localization.smoothing import distinct_contacts
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.synthesis import synthesize_phased
-from avmsf.simulate.plate import plate_surface_points
 from factories.believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
 from factories.located_plate import (
     DIAGONAL,
@@ -33,6 +32,7 @@ from factories.located_plate import (
 )
 from factories.raising import raises
 from factories.unsaved_gains import Unsaved
+from oracles.plate import plate_surface_points
 
 
 @pytest.mark.parametrize(

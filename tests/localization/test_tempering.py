@@ -15,7 +15,7 @@ from avmsf.localization.locator import Locator
 from avmsf.localization.tempering import calibrate_tempering
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual_noise import Residual
-from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts
+from oracles.plate import Plate, plate_modes, plate_surface_points, sample_contacts
 
 PLATE = Plate()
 HIGHEST = 2500.0

@@ -12,8 +12,7 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.photographs import read_views
 from avmsf.photographs.mesh_views import MeshTracer
-from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER
-from avmsf.simulate.example_mesh import example_mesh
+from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER, example_mesh
 from avmsf.simulate.ground_truth import read_truth
 
 

@@ -1,8 +1,12 @@
 """The built-in example: a ceramic mug, struck and photographed by this package's own simulator."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from avmsf.simulate.recipe import ObjectRecipe
+
+if TYPE_CHECKING:
+    from avmsf.mesh.textured_mesh import TexturedMesh
 
 EXAMPLE = ObjectRecipe(
     kind="mug",
@@ -19,3 +23,10 @@ EXAMPLE = ObjectRecipe(
 """`avmsf simulate example` makes it anew; `--surface` adds the mesh."""
 EXAMPLE_FOLDER = Path(__file__).parents[1] / "example"
 """The capture folder that the package ships, made of that recipe: recordings and photographs, no mesh."""
+
+
+def example_mesh() -> "TexturedMesh":
+    """Return the mesh, in its colors, that the example's recordings and photographs were computed from."""
+    from avmsf.simulate.shapes import make_shape, textured
+
+    return textured(make_shape(EXAMPLE.kind, seed=EXAMPLE.seed, size=EXAMPLE.size, wall=EXAMPLE.thickness))

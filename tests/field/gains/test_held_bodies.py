@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from avmsf.fem.block import block
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.elements import SecondOrder
 from avmsf.fem.material import NOMINAL, STEEL
@@ -17,6 +16,7 @@ from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, total_eviden
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from factories.gain_cases import draw
+from oracles.block import block
 
 SIDES = (0.24, 0.16, 0.003)
 CLAMPED = "held along lower edge 3"

@@ -20,8 +20,8 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import extract_modes, extract_once, extract_sounds
 from avmsf.modal.extraction.finders import HighResolution, ShortTime, lowest_frequency
 from avmsf.modal.synthesis import synthesize
-from avmsf.simulate.plate import Plate, PlateModes, plate_modes, sample_contacts, strike
 from factories.raising import raises
+from oracles.plate import Plate, PlateModes, plate_modes, sample_contacts, strike
 
 RATE = 16000.0
 PLATE = Plate(alpha=20.0)

@@ -9,8 +9,8 @@ import scipy.signal
 import torch
 
 from avmsf.errors import PositionError, SimulationError
-from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, ring, sample_contacts, strike
 from factories.raising import raises
+from oracles.plate import Plate, plate_modes, plate_surface_points, ring, sample_contacts, strike
 
 
 def seeded(seed: int = 0) -> torch.Generator:
