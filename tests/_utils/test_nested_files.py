@@ -12,9 +12,7 @@ from avmsf.evaluation.mode_embedding import MaterialSpace
 from avmsf.evaluation.results import IDENTITY, ResultsFolder
 from avmsf.export.packed_arrays import read_manifest
 from avmsf.export.writing import MANIFEST
-from avmsf.pipeline.config import CACHE
 from avmsf.pipeline.stages import StageFolder
-from avmsf.studio.strike_files import JOURNAL, StrikeFiles
 
 NESTED = "[" * 100_000
 
@@ -40,12 +38,6 @@ def test_a_nested_file_is_refused(
     (tmp_path / name).write_text(NESTED)
     with pytest.raises(kind):
         read(tmp_path / name)
-
-
-def test_a_nested_note_of_keys_is_as_good_as_none(tmp_path: Path) -> None:
-    (tmp_path / CACHE).mkdir()
-    (tmp_path / CACHE / JOURNAL).write_text(NESTED)
-    assert StrikeFiles(tmp_path).journal() == {}
 
 
 def test_a_stage_whose_record_is_nested_runs_again(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from avmsf.studio.connections import limited
 from avmsf.studio.guard import LARGEST_UPLOAD, Guard, new_token
 from avmsf.studio.opening import Opened
 from avmsf.studio.routes import make_app
@@ -77,7 +76,7 @@ def served(
     with _listening(0) as listener:
         port = listener.getsockname()[1]
         app = Guard(make_app(studio), token=token, port=port, largest=largest)
-        server = PageServer(limited(app, timeout_graceful_shutdown=1), announce=lambda: None)
+        server = PageServer(app, announce=lambda: None)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
         thread.start()
         try:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from avmsf.studio.guard import LOOPBACK, NOTHING_HERE, Guard, contained, new_token
-from avmsf.studio.refusal import RefusedError
+from avmsf.studio.responses import RequestError
 from avmsf.studio.routes import PAGE
 from event_loop import run_async
 from opened_plate import blow, open_plate
@@ -140,7 +140,7 @@ def test_a_link_leads_nowhere_else(tmp_path: Path) -> None:
     (tmp_path / "in" / "fine.bin").write_text("fine")
     assert contained(tmp_path / "in", "fine.bin").read_text() == "fine"
     for name in ("out.bin", "loop.bin", "pipe.bin", "../out.bin", "/etc/passwd", "", ".", "x" * 5000):
-        with pytest.raises(RefusedError) as refused:
+        with pytest.raises(RequestError) as refused:
             contained(tmp_path / "in", name)
         assert (refused.value.status, str(refused.value)) == (404, NOTHING_HERE)
 

@@ -14,7 +14,7 @@ import pytest
 
 from avmsf.errors import CaptureError
 from avmsf.studio.jobs import Job, Jobs
-from avmsf.studio.refusal import RefusedError
+from avmsf.studio.responses import RequestError
 from avmsf.studio.worker import Voice
 from event_loop import run_async
 from factories.raising import raises
@@ -262,7 +262,7 @@ def test_one_job_runs_at_a_time() -> None:
     async def start_two() -> None:
         jobs = Jobs()
         first = jobs.start("reconstruct", {}, same, script("time.sleep(60)"))
-        with raises(RefusedError, name="job", value="reconstruct") as refused:
+        with raises(RequestError, name="job", value="reconstruct") as refused:
             jobs.start("guided edit", {}, same, script(""))
         assert (refused.value.status, refused.value.more) == (409, {"job": first.identifier})
         assert jobs.current is first
@@ -270,7 +270,7 @@ def test_one_job_runs_at_a_time() -> None:
         second = jobs.start("guided edit", {}, same, script("say(result={})"))
         assert [event async for _, event in second.listen()] == [{"taken": {}}]
         assert jobs.current is None
-        with raises(RefusedError, name="job", value="another"):
+        with raises(RequestError, name="job", value="another"):
             jobs.named("another")
 
     run_async(start_two())

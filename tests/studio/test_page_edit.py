@@ -15,7 +15,7 @@ import torch
 from avmsf.editing.guided import GuidedEditProgress
 from avmsf.export.sampled_field import SampledField
 from avmsf.field.store import load
-from avmsf.studio.refusal import RefusedError
+from avmsf.studio.responses import RequestError
 from avmsf.studio.session import Session
 from avmsf.studio.worker import Voice
 from factories.raising import raises
@@ -611,6 +611,6 @@ def test_words_on_another_tabs_change_hold_no_numbers_of_revisions(edits: Any) -
     move(page, "Pitch")
     page.wait_for_selector("text=Nothing was overwritten: show that change")
     assert "revision" not in words_on(page)
-    with raises(RefusedError, name="base", value=1) as refused:
+    with raises(RequestError, name="base", value=1) as refused:
         Session(Path(), lambda revision: None).expect_current(1)
     assert "revision" not in str(refused.value)

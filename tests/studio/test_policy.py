@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from avmsf.studio.guard import policy_of
 from avmsf.studio.opening import open_target
-from avmsf.studio.policy import policy_of
 from avmsf.studio.routes import PAGE
 from opened_plate import open_plate
 from page_plate import plate_object

@@ -12,16 +12,16 @@ import pytest
 import torch
 
 from avmsf.errors import CaptureError, LocationError, StudioError
-from avmsf.studio.locating import Finder, read_upload
+from avmsf.studio.capture import read_upload
+from avmsf.studio.locate import Finder
 from avmsf.studio.opening import open_target
-from avmsf.studio.refusal import echo
+from avmsf.studio.responses import echo
 from avmsf.studio.server import serve
 from factories.capture_folder import fill
 from factories.raising import raises
 from opened_plate import blow, open_plate, wav
 from served import Answer, Served, served
 
-KEY = {"Idempotency-Key": "k" * 16}
 PLACE = "capture/strikes?x=0.01&y=0.02&z=0"
 
 
@@ -99,7 +99,7 @@ def test_recordings_need_no_temporary_folder(capture: Served, monkeypatch: pytes
     monkeypatch.setattr("tempfile.mkdtemp", full)
     recording = blow(9)
     assert capture.ask("POST", "capture/check", recording).status == 200
-    added = capture.ask("POST", PLACE, recording, headers=KEY)
+    added = capture.ask("POST", PLACE, recording)
     assert added.status == 201
     assert capture.ask("PUT", f"capture/strikes/{added.words['file']}", blow(8)).status == 200
     # There is no field to locate on, which is said after the recording was read.
@@ -137,11 +137,11 @@ def test_a_capture_folder_that_is_gone_is_said_to_be(capture: Served, tmp_path: 
         ("POST", "reconstruct", None),
         ("POST", "object", None),
     ):
-        answer = capture.ask(method, place, body, headers=KEY if body else None)
+        answer = capture.ask(method, place, body)
         assert str(folder) in refused(answer, 503), (method, place)
     assert not folder.exists()
     (tmp_path / "elsewhere").rename(folder)
-    assert capture.ask("POST", PLACE, blow(7), headers=KEY).status == 201
+    assert capture.ask("POST", PLACE, blow(7)).status == 201
 
 
 def test_a_file_name_that_is_not_unicode_is_answered(tmp_path: Path) -> None:
@@ -241,7 +241,7 @@ def test_an_error_ahead_of_time_is_reported_and_the_next_revision_prepared(
             raise LocationError("no mode is left to locate by")
 
     monkeypatch.setattr(Finder, "prepare", prepare)
-    monkeypatch.setattr("avmsf.studio.searches._SETTLED", 0.0)
+    monkeypatch.setattr("avmsf.studio.locate._SETTLED", 0.0)
     for number in (1, 2):
         plate.ask("POST", "edit", {"base": number, "pitch": 1.0 + number / 10})
         end = time.monotonic() + 20

@@ -41,8 +41,8 @@ from avmsf.localization.contact_map import enlarged
 from avmsf.localization.locator import Locator
 from avmsf.localization.multi_impact import locate_impacts
 from avmsf.pipeline.config import CACHE, PRESETS
-from avmsf.studio import leading, locating, server, studio, worker
-from avmsf.studio.locating import Finder
+from avmsf.studio import edit, locate, server, studio, worker
+from avmsf.studio.locate import Finder
 from avmsf.studio.opening import Opened, find_object, open_target
 from avmsf.studio.server import serve
 from avmsf.studio.studio import StudioConfig
@@ -128,8 +128,8 @@ def test_what_is_no_recording_is_said_to_be_none(plate: Served, content: bytes) 
 
 def test_an_edit_is_heard_undone_and_saved(plate: Served) -> None:
     before = plate.manifest()
-    edit = {"base": 1, "material": {"from": "ceramic", "to": "wood"}, "size": 2.0}
-    told = plate.ask("POST", "edit", edit).words
+    words = {"base": 1, "material": {"from": "ceramic", "to": "wood"}, "size": 2.0}
+    told = plate.ask("POST", "edit", words).words
     assert told["revision"] == 2
     assert "Poisson's ratio" in told["remarks"][0]
     after = plate.manifest()
@@ -166,15 +166,6 @@ def test_a_blow_on_an_edited_object_is_located_in_the_pages_frame(plate: Served)
     assert found["position"] == pytest.approx(points[33].tolist(), abs=1e-7)
 
 
-def test_two_tabs_hear_of_each_other(plate: Served) -> None:
-    assert plate.ask("POST", "edit", {"base": 1, "pitch": 1.5}).status == 200
-    late = plate.ask("POST", "edit", {"base": 1, "pitch": 0.5})
-    assert late.status == 409
-    assert late.words["revision"] == 2
-    assert "nothing was overwritten" in late.words["error"]
-    assert plate.manifest()["live"]["sliders"]["pitch"] == 1.5
-
-
 def test_only_the_last_revisions_are_kept_and_all_can_be_undone(plate: Served) -> None:
     for number in range(1, 8):
         plate.ask("POST", "edit", {"base": number, "pitch": 1.0 + 0.01 * number})
@@ -195,8 +186,8 @@ def test_words_need_their_model(plate: Served, monkeypatch: pytest.MonkeyPatch) 
     answer = plate.ask("POST", "edit", {"base": 1, "prompt": "a wooden bowl is hit"})
     assert answer.status == 422
     assert "pip install 'avmsf[text]'" in answer.words["error"]
-    monkeypatch.setattr(leading, "find_spec", lambda name: None)
-    assert leading.words_model("folder") is None
+    monkeypatch.setattr(edit, "find_spec", lambda name: None)
+    assert edit.words_model("folder") is None
 
 
 def test_a_descent_is_asked_for_alone(plate: Served) -> None:
@@ -237,7 +228,7 @@ def test_only_the_current_revision_is_prepared_and_symmetries_once(
 ) -> None:
     prepared: list[int] = []
     searched: list[object] = []
-    search, prepare = locating.symmetries_of, Finder.prepare
+    search, prepare = locate.symmetries_of, Finder.prepare
 
     def counted(field: SoundField) -> Any:
         searched.append(field)
@@ -250,9 +241,9 @@ def test_only_the_current_revision_is_prepared_and_symmetries_once(
         assert edited.wait(20)
         prepare(finder)
 
-    monkeypatch.setattr(locating, "symmetries_of", counted)
+    monkeypatch.setattr(locate, "symmetries_of", counted)
     monkeypatch.setattr(Finder, "prepare", slow)
-    monkeypatch.setattr("avmsf.studio.searches._SETTLED", 0.0)
+    monkeypatch.setattr("avmsf.studio.locate._SETTLED", 0.0)
     for number in range(1, 6):
         plate.ask("POST", "edit", {"base": number, "material": {"from": "ceramic"}, "size": 1.0 + number / 10})
         end = time.monotonic() + 20
@@ -285,8 +276,7 @@ def test_a_larger_object_has_the_same_symmetries_farther_out() -> None:
 
 
 def test_the_capture_is_guarded_by_the_recordings_digest(capture: Served) -> None:
-    place, headers = "capture/strikes?x=0&y=0&z=0.002", {"Idempotency-Key": "strike-0001"}
-    added = capture.ask("POST", place, blow(), headers=headers).words
+    added = capture.ask("POST", "capture/strikes?x=0&y=0&z=0.002", blow()).words
     file = "capture/strikes/001.wav"
     quoted = {"If-Match": f'"{added["digest"]}"'}
     assert capture.ask("PUT", file, blow(1), headers=quoted).status == 200
@@ -314,9 +304,8 @@ def test_a_capture_is_made_of_a_mesh(capture: Served, tmp_path: Path) -> None:
     assert judged.words["onset_seconds"] == pytest.approx(0.1, abs=1e-3)
     for number, place in enumerate(points[np.flatnonzero(top)[:3]].tolist()):
         query = "x={}&y={}&z={}&nx=0&ny=0&nz=-1".format(*place)
-        headers = {"Idempotency-Key": f"strike-{number:04d}"}
         for _ in range(2):
-            answer = capture.ask("POST", f"capture/strikes?{query}", blow(number), headers=headers)
+            answer = capture.ask("POST", f"capture/strikes?{query}", blow(number))
             assert answer.status == 201
             assert answer.words["contact"] == pytest.approx(place)
     told = capture.get("capture").words
@@ -330,7 +319,7 @@ def test_a_capture_is_made_of_a_mesh(capture: Served, tmp_path: Path) -> None:
     assert (tmp_path / "lid" / "impacts.csv").is_file()
     for hidden in (
         "capture/strikes/impacts.csv",
-        "capture/strikes/.avmsf%2Fstudio.json",
+        "capture/strikes/.avmsf%2Fcapture.lock",
         "capture/strikes/surface.obj",
     ):
         assert capture.get(hidden).status == 404
@@ -342,12 +331,12 @@ def test_a_connection_lost_during_a_recording_leaves_nothing_behind(capture: Ser
     content, place = blow(), "capture/strikes?x=0&y=0&z=0.002"
     head = f"POST /{capture.token}/{place} HTTP/1.1\r\nHost: 127.0.0.1:{capture.port}\r\n"
     with socket.create_connection(("127.0.0.1", capture.port)) as link:
-        link.sendall(f"{head}Idempotency-Key: strike-0001\r\nContent-Length: {len(content)}\r\n\r\n".encode())
+        link.sendall(f"{head}Content-Length: {len(content)}\r\n\r\n".encode())
         link.sendall(content[: len(content) // 2])
     time.sleep(0.2)
     assert capture.get("capture").words["strikes"] == []
     assert list((tmp_path / "lid").glob("*.wav")) == []
-    assert capture.ask("POST", place, content, headers={"Idempotency-Key": "strike-0001"}).words["row"] == 0
+    assert capture.ask("POST", place, content).words["row"] == 0
 
 
 def test_a_reconstruction_needs_two_strikes(capture: Served) -> None:
@@ -554,16 +543,6 @@ def test_gaussians_are_opened_as_gaussians(tmp_path: Path) -> None:
     assert manifest["points"] == len(points)
 
 
-def test_hours_of_silence_in_a_few_bytes_are_not_unpacked(plate: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    sound = wav(np.zeros(120 * RATE), subtype="PCM_16", kind="FLAC")
-    monkeypatch.setattr("avmsf.capture.audio.MAX_SAMPLES", 100 * RATE)
-    answer = plate.ask("POST", "locate", sound)
-    assert answer.status == 413
-    assert "800,000" in answer.words["error"]
-    assert "960,000" in answer.words["error"]
-    assert plate.ask("POST", "lead?base=1", sound).status == 413
-
-
 def test_a_picture_that_could_not_be_written_can_be_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -575,7 +554,7 @@ def test_a_picture_that_could_not_be_written_can_be_tried_again(
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patched:
-        patched.setattr("avmsf.studio.showing.json.loads", full)
+        patched.setattr("avmsf.studio.files.json.loads", full)
         with pytest.raises(OSError) as caught:
             fresh.session.open(None)
         assert caught.value.errno == 28

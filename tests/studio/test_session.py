@@ -18,9 +18,9 @@ from avmsf.fem.material import CERAMIC, WOOD
 from avmsf.field.scaled_gains import length_of
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
-from avmsf.studio.editing import REST, Sliders
-from avmsf.studio.refusal import RefusedError
-from avmsf.studio.sampling import resample, sample
+from avmsf.studio.edit import REST, Sliders
+from avmsf.studio.files import resample, sample
+from avmsf.studio.responses import RequestError
 from avmsf.studio.session import Revision, Session, file_name
 from factories.made_fields import FIELDS
 from factories.raising import raises
@@ -89,7 +89,7 @@ def test_sliders_are_read_back_from_what_the_page_is_told() -> None:
     ],
 )
 def test_what_is_no_slider_is_named(words: dict[str, Any], name: str, value: object) -> None:
-    with raises(RefusedError, name=name, value=value) as refused:
+    with raises(RequestError, name=name, value=value) as refused:
         Sliders.read(words)
     assert refused.value.status == 400
     assert len(str(refused.value)) < 300
@@ -124,7 +124,7 @@ def test_undo_goes_back_under_a_new_number(tmp_path: Path) -> None:
     assert (undone.number, undone.sliders, undone.field) == (4, first.sliders, first.field)
     assert session.undo(4).sliders == REST
     assert not session.can_undo
-    with raises(RefusedError, name="undo"):
+    with raises(RequestError, name="undo"):
         session.undo(5)
 
 
@@ -137,7 +137,7 @@ def test_two_tabs_never_overwrite_one_another(tmp_path: Path) -> None:
         lambda: session.save(1, "late"),
         lambda: session.lead(1, plate_field(), ()),
     ):
-        with raises(RefusedError, name="base", value=1) as refused:
+        with raises(RequestError, name="base", value=1) as refused:
             late()
         assert (refused.value.status, refused.value.more) == (409, {"revision": 2})
     assert session.current.sliders.pitch == 2.0
@@ -176,7 +176,7 @@ def test_a_file_that_is_there_is_never_overwritten(tmp_path: Path) -> None:
     (tmp_path / "bowl.safetensors").write_text("precious")
     (tmp_path / "link.safetensors").symlink_to(tmp_path / "elsewhere")
     for name in ("bowl", "bowl.safetensors", "link"):
-        with raises(RefusedError, file=f"{name.removesuffix('.safetensors')}.safetensors") as refused:
+        with raises(RequestError, file=f"{name.removesuffix('.safetensors')}.safetensors") as refused:
             session.save(1, name)
         assert refused.value.status == 409
     assert (tmp_path / "bowl.safetensors").read_text() == "precious"
@@ -213,7 +213,7 @@ def test_a_field_that_cannot_be_written_leaves_no_file(tmp_path: Path) -> None:
     ],
 )
 def test_names_that_lead_elsewhere_are_refused(name: str) -> None:
-    with raises(RefusedError, name="name", value=name) as refused:
+    with raises(RequestError, name="name", value=name) as refused:
         file_name(name)
     assert refused.value.status == 400
 
@@ -221,7 +221,7 @@ def test_names_that_lead_elsewhere_are_refused(name: str) -> None:
 def test_a_name_is_as_long_as_files_names_may_be(tmp_path: Path) -> None:
     session, _ = opened(tmp_path)
     assert session.save(1, "音" * 66)[0].is_file()
-    with raises(RefusedError, name="name", value=201) as refused:
+    with raises(RequestError, name="name", value=201) as refused:
         session.save(2, "音" * 67)
     assert refused.value.status == 400
 
@@ -254,7 +254,7 @@ def test_a_field_that_is_not_heard_is_kept_under_a_free_name(tmp_path: Path) -> 
 def test_before_there_is_a_field_nothing_can_be_edited(tmp_path: Path) -> None:
     session = Session(tmp_path, lambda revision: None)
     session.open(None)
-    with raises(RefusedError, name="field"):
+    with raises(RequestError, name="field"):
         session.edit(1, Sliders(pitch=2.0))
     first = plate_field()
     session.open(first)

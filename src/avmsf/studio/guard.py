@@ -15,8 +15,19 @@ from starlette.responses import RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from avmsf._utils.text_files import parse_json
-from avmsf.studio.policy import NOTHING
-from avmsf.studio.refusal import RefusedError, response_to
+from avmsf.export.policy import directives_of, policy_text
+from avmsf.studio.responses import RequestError, response_to
+
+_FRAMES = {"frame-ancestors": ["'none'"]}
+"""Directive that is valid only in a header."""
+NOTHING = policy_text({"default-src": ["'none'"], **_FRAMES})
+"""Policy of all responses that are not the page: they may run nothing if opened as a page."""
+
+
+def policy_of(page: str) -> str:
+    """Return the Content-Security-Policy of the page's HTML."""
+    return policy_text({**directives_of(page), **_FRAMES})
+
 
 NOTHING_HERE = "there is nothing at this address"
 """By this the page knows that its studio has moved: `server.js` has the same text."""
@@ -59,7 +70,7 @@ class Guard:
         hardened = _hardened(send)
         try:
             rest = self._admit(scope)
-        except RefusedError as refusal:
+        except RequestError as refusal:
             await response_to(refusal)(scope, receive, hardened)
             return
         if not rest:
@@ -70,11 +81,11 @@ class Guard:
         await self.app(inner, self._bounded(receive), hardened)
 
     def _admit(self, scope: Scope) -> str:
-        """Return the path after the token. Raises RefusedError for requests that are not the page's own."""
+        """Return the path after the token. Raises RequestError for requests that are not the page's own."""
         headers = Headers(scope=scope)
         hosts = headers.getlist("host")
         if len(hosts) != 1 or hosts[0].lower() not in self.hosts:
-            raise RefusedError(
+            raise RequestError(
                 403,
                 f"host: expected {' or '.join(LOOPBACK)}, got another; open the address as printed",
                 name="host",
@@ -82,7 +93,7 @@ class Guard:
             )
         origins = headers.getlist("origin")
         if any(each.lower() != f"http://{hosts[0].lower()}" for each in origins):
-            raise RefusedError(403, "origin: expected the studio's own page, got another", name="origin", value=origins)
+            raise RequestError(403, "origin: expected the studio's own page, got another", name="origin", value=origins)
         first, slash, rest = scope["path"].removeprefix("/").partition("/")
         if not secrets.compare_digest(first.encode(), self.token.encode()):
             raise nothing_here()
@@ -95,7 +106,7 @@ class Guard:
         return f"{slash}{rest}"
 
     def _bounded(self, receive: Receive) -> Receive:
-        """Return a `receive` that raises RefusedError as soon as a request exceeds its maximum size."""
+        """Return a `receive` that raises RequestError as soon as a request exceeds its maximum size."""
         taken = 0
 
         async def receive_bounded() -> Message:
@@ -120,15 +131,15 @@ def _hardened(send: Send) -> Send:
     return send_hardened
 
 
-def too_large(largest: int) -> RefusedError:
+def too_large(largest: int) -> RequestError:
     """Return what to raise for a request of more than `largest` bytes."""
-    return RefusedError(
+    return RequestError(
         413, f"expected at most {largest >> 10} KiB in one request, got more; send a shorter recording", name="request"
     )
 
 
 def contained(folder: Path, name: str) -> Path:
-    """Return the file `name` in a folder. Raises RefusedError (404) for no file, and for a link out of the folder."""
+    """Return the file `name` in a folder. Raises RequestError (404) for no file, and for a link out of the folder."""
     home = folder.resolve()
     try:
         path = (home / name).resolve(strict=True)
@@ -141,7 +152,7 @@ def contained(folder: Path, name: str) -> Path:
 
 
 async def read_words(request: Request, *, largest: int = LARGEST_WORDS) -> dict[str, object]:
-    """Return the JSON object of a request. Raises RefusedError for other content, and for more than `largest` bytes."""
+    """Return the JSON object of a request. Raises RequestError for other content, and for more than `largest` bytes."""
     body = bytearray()
     async for part in request.stream():
         body += part
@@ -150,15 +161,15 @@ async def read_words(request: Request, *, largest: int = LARGEST_WORDS) -> dict[
     try:
         words = parse_json(body.decode())
     except ValueError as error:
-        raise RefusedError(
+        raise RequestError(
             400, f"expected a JSON object, got other data ({str(error)[:100]}); reload the page", name="request"
         ) from error
     if not isinstance(words, dict):
         kind = type(words).__name__
-        raise RefusedError(400, f"expected a JSON object, got {kind}; reload the page", name="request", value=kind)
+        raise RequestError(400, f"expected a JSON object, got {kind}; reload the page", name="request", value=kind)
     return words
 
 
-def nothing_here() -> RefusedError:
+def nothing_here() -> RequestError:
     """Return the error for an address that does not exist, or that the request may not access."""
-    return RefusedError(404, NOTHING_HERE)
+    return RequestError(404, NOTHING_HERE)

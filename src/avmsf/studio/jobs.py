@@ -11,12 +11,17 @@ import secrets
 import sys
 import traceback
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from typing import Any
+from functools import partial
+from threading import Lock
+from typing import Any, TypeVar
+
+import anyio
+import anyio.to_thread
 
 from avmsf._utils.children import ending_of
 from avmsf._utils.text import printable
 from avmsf.errors import AvmsfError
-from avmsf.studio.refusal import RefusedError
+from avmsf.studio.responses import RequestError
 
 Event = dict[str, Any]
 Finish = Callable[[Event], Awaitable[Event]]
@@ -163,10 +168,10 @@ class Jobs:
         return "it was stopped" if last.events[-1] == _STOPPED else last.events[-1].get("error")
 
     def expect_none(self) -> None:
-        """Raise RefusedError (409) while a job runs."""
+        """Raise RequestError (409) while a job runs."""
         current = self.current
         if current is not None:
-            raise RefusedError(
+            raise RequestError(
                 409,
                 f"expected no running job, got {current.kind}; wait for it or stop it",
                 name="job",
@@ -175,7 +180,7 @@ class Jobs:
             )
 
     def start(self, kind: str, task: Event, finish: Finish, command: Sequence[str] = WORKER) -> Job:
-        """Start a job. Raises RefusedError (409) while another one runs."""
+        """Start a job. Raises RequestError (409) while another one runs."""
         self.expect_none()
         job = Job(kind, task, finish, command)
         self._jobs[job.identifier] = job
@@ -183,9 +188,9 @@ class Jobs:
         return job
 
     def named(self, identifier: str) -> Job:
-        """Return a job. Raises RefusedError (404)."""
+        """Return a job. Raises RequestError (404)."""
         if identifier not in self._jobs:
-            raise RefusedError(404, "expected a known job, got another; start it again", name="job", value=identifier)
+            raise RequestError(404, "expected a known job, got another; start it again", name="job", value=identifier)
         return self._jobs[identifier]
 
     async def close(self) -> None:
@@ -210,3 +215,46 @@ async def _last_words(stream: asyncio.StreamReader) -> str:
     while part := await stream.read(1 << 16):
         kept = (kept + part.decode(errors="replace"))[-_LAST_WORDS:]
     return kept
+
+
+Result = TypeVar("Result")
+
+
+class Threads:
+    """The threads of one server; each kind waits for its own, so that recordings are taken in while a search runs."""
+
+    def __init__(self) -> None:
+        self._computing, self._preparing = anyio.CapacityLimiter(1), anyio.CapacityLimiter(1)
+        self._writing, self._reading = anyio.CapacityLimiter(1), anyio.CapacityLimiter(1)
+        self._busy, self._lock = 0, Lock()
+
+    @property
+    def busy(self) -> bool:
+        """Whether a thread is computing, which cannot be interrupted."""
+        return self._busy > 0
+
+    async def compute(self, act: Callable[..., Result], *arguments: Any) -> Result:
+        """Do what a page waits for, one edit or search after another."""
+        return await anyio.to_thread.run_sync(partial(self._counted, act, *arguments), limiter=self._computing)
+
+    async def compute_ahead(self, act: Callable[[], Result]) -> Result:
+        """Compute in the background a result that is not needed yet."""
+        return await anyio.to_thread.run_sync(partial(self._counted, act), limiter=self._preparing)
+
+    async def write(self, act: Callable[..., Result], *arguments: Any) -> Result:
+        """Change files."""
+        return await anyio.to_thread.run_sync(partial(act, *arguments), limiter=self._writing)
+
+    async def read(self, act: Callable[..., Result], *arguments: Any) -> Result:
+        """Read files in a thread."""
+        return await anyio.to_thread.run_sync(partial(act, *arguments), limiter=self._reading)
+
+    def _counted(self, act: Callable[..., Result], *arguments: Any) -> Result:
+        """Do something that may outlive the server."""
+        with self._lock:
+            self._busy += 1
+        try:
+            return act(*arguments)
+        finally:
+            with self._lock:
+                self._busy -= 1

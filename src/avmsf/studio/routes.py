@@ -16,10 +16,9 @@ from starlette.routing import Route
 from avmsf._utils.memory import lacks_memory
 from avmsf.errors import AvmsfError
 from avmsf.export.web import MEDIA_TYPES
-from avmsf.studio.guard import contained, nothing_here, read_words
-from avmsf.studio.place import Place
-from avmsf.studio.policy import policy_of
-from avmsf.studio.refusal import FORESEEN_ERRORS, Answer, refusal_of, response_to
+from avmsf.studio.capture import Contact
+from avmsf.studio.guard import contained, nothing_here, policy_of, read_words
+from avmsf.studio.responses import FORESEEN_ERRORS, Answer, refusal_of, response_to
 from avmsf.studio.studio import Studio, unknown_base
 
 PAGE = Path(__file__).parent / "page"
@@ -137,25 +136,24 @@ class Calls:
     async def check(self, request: Request) -> Response:
         """Check a recording without saving it."""
         content = await request.body()
-        return Answer(await self.studio.with_book(lambda book: book.judge(content)))
+        return Answer(await self.studio.with_editor(lambda editor: editor.check(content)))
 
     async def add_strike(self, request: Request) -> Response:
         """Add an impact to the capture."""
-        place, key = Place.read(request.query_params), request.headers.get("idempotency-key", "")
-        content = await request.body()
-        return Answer(await self.studio.with_book(lambda book: book.add(content, place, key=key)), 201)
+        contact, content = Contact.read(request.query_params), await request.body()
+        return Answer(await self.studio.with_editor(lambda editor: editor.add(content, contact)), 201)
 
     async def change_strike(self, request: Request) -> Response:
         """Send, redo or take out one of the capture's recordings."""
         name = request.path_params["path"]
-        match, key = _expected(request), request.headers.get("idempotency-key")
+        match = _expected(request)
         if request.method == "DELETE":
-            await self.studio.with_book(lambda book: book.remove(name, match=match))
+            await self.studio.with_editor(lambda editor: editor.remove(name, match=match))
             return Answer({"removed": name})
         if request.method == "PUT":
             content = await request.body()
-            return Answer(await self.studio.with_book(lambda book: book.redo(name, content, key=key, match=match)))
-        return _file(self.studio.expect_book().folder, request, only=_SOUNDS)
+            return Answer(await self.studio.with_editor(lambda editor: editor.redo(name, content, match=match)))
+        return _file(self.studio.require_editor().folder, request, only=_SOUNDS)
 
     async def reconstruct(self, request: Request) -> Response:
         """Make a field of the capture."""
@@ -202,7 +200,7 @@ async def _send_from(folder: Path, request: Request) -> Response:
 
 
 def _file(folder: Path, request: Request, *, only: Sequence[str] = ()) -> Response:
-    """Return a file of a folder. Raises RefusedError (404) for media types that the page does not use."""
+    """Return a file of a folder. Raises RequestError (404) for media types that the page does not use."""
     path = contained(folder, request.path_params["path"])
     kind = MEDIA_TYPES.get(path.suffix.lower())
     hidden = any(part.startswith(".") for part in path.relative_to(folder.resolve()).parts)

@@ -1,11 +1,9 @@
 """The server of the page: on the loopback interface, at a secret address, until Ctrl-C."""
 
-import asyncio
 import errno
 import os
 import signal
 import socket
-import sys
 import tempfile
 import threading
 import webbrowser
@@ -13,12 +11,11 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
 import uvicorn
+from starlette.types import ASGIApp
 
 from avmsf.errors import StudioError
-from avmsf.studio.connections import limited
 from avmsf.studio.guard import Guard, new_token
 from avmsf.studio.opening import Opened
 from avmsf.studio.routes import make_app
@@ -29,32 +26,28 @@ PORT = 8634
 _HOME = "127.0.0.1"
 _HANGING = 1
 """Seconds that a running response may take when the server ends."""
-_OUT_OF_RESOURCES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 
 class PageServer(uvicorn.Server):
-    """Prints the address once the server responds, and a message when it cannot accept more connections."""
+    """Calls `announce` once the server responds."""
 
-    def __init__(self, config: uvicorn.Config, announce: Callable[[], None]) -> None:
+    def __init__(self, app: ASGIApp, announce: Callable[[], None]) -> None:
+        config = uvicorn.Config(
+            app,
+            ws="none",
+            log_level="critical",
+            access_log=False,
+            server_header=False,
+            timeout_graceful_shutdown=_HANGING,
+        )
         super().__init__(config)
         self.announce = announce
-        self._exhausted = False
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Begin to listen."""
-        asyncio.get_running_loop().set_exception_handler(self._handle)
         await super().startup(sockets)
         if not self.should_exit:
             self.announce()
-
-    def _handle(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """Print what happened outside of any request; of refused connections, the event loop has many a second."""
-        error = context.get("exception")
-        if not (isinstance(error, OSError) and error.errno in _OUT_OF_RESOURCES and "socket" in context):
-            loop.default_exception_handler(context)
-        elif not self._exhausted:
-            self._exhausted = True
-            print(f"cannot accept more connections for now ({error.strerror})", file=sys.stderr)
 
 
 def serve(
@@ -83,10 +76,7 @@ def serve(
                 with suppress(OSError):
                     _open_browser(address, Path(folder))
 
-        server = PageServer(
-            limited(guarded, timeout_graceful_shutdown=_HANGING),
-            announce,
-        )
+        server = PageServer(guarded, announce)
         before = signal.signal(signal.SIGTERM, _interrupt)
         try:
             # The server has ended in order before it passes Ctrl-C on.

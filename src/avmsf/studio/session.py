@@ -15,8 +15,8 @@ from avmsf._utils.files import way_out
 from avmsf.errors import StudioError
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import save
-from avmsf.studio.editing import REST, Sliders
-from avmsf.studio.refusal import RefusedError, bad_request
+from avmsf.studio.edit import REST, Sliders
+from avmsf.studio.responses import RequestError, bad_request
 
 SUFFIX = ".safetensors"
 _NAME = re.compile(r"[\w][\w .()+-]{0,99}")
@@ -48,9 +48,9 @@ class Revision:
     """What it, or what it was made of, was saved as last; None for as it was opened."""
 
     def expect_field(self) -> SoundField:
-        """Return the field that is played. Raises RefusedError (409) without a field."""
+        """Return the field that is played. Raises RequestError (409) without a field."""
         if self.field is None:
-            raise RefusedError(
+            raise RequestError(
                 409, "expected a field, got none yet; record impacts and reconstruct it first", name="field"
             )
         return self.field
@@ -83,7 +83,7 @@ class Session:
             return self._advance(fresh) if before.field is None else self._remember(fresh)
 
     def edit(self, base: int, sliders: Sliders) -> Revision:
-        """Set the sliders. Raises RefusedError (409) if `base` is not the current revision, and the errors of edits."""
+        """Set the sliders. Raises RequestError (409) if `base` is not the current revision, and the errors of edits."""
         with self._lock:
             self.expect_current(base)
             self._current.expect_field()
@@ -100,11 +100,11 @@ class Session:
             return self._remember(led)
 
     def undo(self, base: int) -> Revision:
-        """Undo the last revision, under a new number. Raises RefusedError (409) as `edit`, and if there is no other."""
+        """Undo the last revision, under a new number. Raises RequestError (409) as `edit`, and if there is no other."""
         with self._lock:
             self.expect_current(base)
             if not self._past:
-                raise RefusedError(409, "expected a change to undo, got none since the field was opened", name="undo")
+                raise RequestError(409, "expected a change to undo, got none since the field was opened", name="undo")
             undone = self._advance(self._past[-1])
             self._past.pop()
             return undone
@@ -112,7 +112,7 @@ class Session:
     def save(self, base: int, name: str) -> tuple[Path, Revision]:
         """Write the current field to a new file of the folder, and make the sliders relative to it.
 
-        Raises RefusedError if a file of this name exists (409), or the name is invalid (400).
+        Raises RequestError if a file of this name exists (409), or the name is invalid (400).
         """
         with self._lock:
             self.expect_current(base)
@@ -133,7 +133,7 @@ class Session:
             path = self.home / f"{name}{SUFFIX}"
             try:
                 _write_new(field, path)
-            except RefusedError:
+            except RequestError:
                 continue
             return path
         raise StudioError(
@@ -143,9 +143,9 @@ class Session:
         )
 
     def expect_current(self, base: int) -> None:
-        """Raise RefusedError (409), with the current revision, if `base` is another one."""
+        """Raise RequestError (409), with the current revision, if `base` is another one."""
         if base != self._current.number:
-            raise RefusedError(
+            raise RequestError(
                 409,
                 "expected the current field, got an older one: another tab has changed it; nothing was overwritten; "
                 "make the change again",
@@ -168,11 +168,11 @@ class Session:
 
 
 def _write_new(field: SoundField, path: Path) -> None:
-    """Write a field to a new file. Raises RefusedError (409) if the file exists, and StudioError."""
+    """Write a field to a new file. Raises RequestError (409) if the file exists, and StudioError."""
     try:
         os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     except FileExistsError as error:
-        raise RefusedError(
+        raise RequestError(
             409, f"{path.name}: expected a new name, got an existing file; choose another name", file=path
         ) from error
     except OSError as error:
@@ -186,7 +186,7 @@ def _write_new(field: SoundField, path: Path) -> None:
 
 
 def file_name(name: str) -> str:
-    """Return the file of a name that the user gave. Raises RefusedError (400) for a name with a path."""
+    """Return the file of a name that the user gave. Raises RequestError (400) for a name with a path."""
     stem = name.strip().removesuffix(SUFFIX)
     if not _NAME.fullmatch(stem) or _DEVICES.fullmatch(stem) or stem.endswith((".", " ")):
         raise bad_request("name", "letters, digits, spaces, - and _, such as bowl in wood", name)

@@ -12,17 +12,14 @@ from typing import Any
 from avmsf.editing.edits import EDITS, remarks
 from avmsf.field.store import load, save
 from avmsf.pipeline.config import Preset
-from avmsf.studio.capturing import StrikeBook
-from avmsf.studio.editing import MATERIAL_NAMES, Sliders
-from avmsf.studio.jobs import Event, Job, Jobs
-from avmsf.studio.leading import Wish, is_wish, words_model
-from avmsf.studio.locating import read_upload
+from avmsf.studio.capture import CaptureEditor, read_upload
+from avmsf.studio.edit import MATERIAL_NAMES, Sliders, Wish, is_wish, words_model
+from avmsf.studio.files import Showcase
+from avmsf.studio.jobs import Event, Job, Jobs, Result, Threads
+from avmsf.studio.locate import Searches
 from avmsf.studio.opening import Opened, find_object, shows_more
-from avmsf.studio.refusal import NUMERIC_ERRORS, RefusedError, bad_request, refusal_of
-from avmsf.studio.searches import Searches
+from avmsf.studio.responses import NUMERIC_ERRORS, RequestError, bad_request, refusal_of
 from avmsf.studio.session import Revision, Session
-from avmsf.studio.showing import Showcase
-from avmsf.studio.threads import Result, Threads
 
 MODES = 128
 STEER_STEPS = 150
@@ -54,13 +51,13 @@ class Studio:
         """Open everything; `folder` is for files that end with the server. Raises as the readers do."""
         self.opened, self.folder = opened, folder
         self.config = StudioConfig() if config is None else config
-        self.book = None if opened.capture is None else StrikeBook(opened.capture)
-        self.showcase = Showcase(opened, folder, self.book)
+        self.editor = None if opened.capture is None else CaptureEditor(opened.capture)
+        self.showcase = Showcase(opened, folder, self.editor)
         self.session = Session(opened.home, self.showcase.show)
         self.jobs = Jobs()
         self.model = words_model(self.config.model)
         self.threads = Threads()
-        self.searches = Searches(self.session, self.showcase, self.book, self.threads)
+        self.searches = Searches(self.session, self.showcase, self.editor, self.threads)
         self.session.open(None if opened.field is None else load(opened.field))
 
     @property
@@ -120,51 +117,49 @@ class Studio:
 
     async def capture(self) -> dict[str, Any]:
         """Return the impacts of the capture, and the name of the file that shows its object."""
-        book = self.expect_book()
+        editor = self.require_editor()
         visible = find_object(self.opened)
         running = self.jobs.current
         return {
-            **await self.threads.read(book.describe),
+            **await self.threads.read(editor.describe),
             "object": None if visible is None else visible.name,
             "job": None if running is None else running.identifier,
         }
 
-    async def with_book(self, act: Callable[[StrikeBook], Result]) -> Result:
-        """Change the capture's impacts, one request after another. Raises RefusedError (404) without a capture."""
-        return await self.threads.write(act, self.expect_book())
+    async def with_editor(self, act: Callable[[CaptureEditor], Result]) -> Result:
+        """Change the capture's impacts, one request after another. Raises RequestError (404) without a capture."""
+        return await self.threads.write(act, self.require_editor())
 
-    def expect_book(self) -> StrikeBook:
-        """Return the capture's impacts. Raises RefusedError: 404 without a capture, 503 while its folder is missing."""
-        if self.book is None:
-            raise RefusedError(
+    def require_editor(self) -> CaptureEditor:
+        """Return the capture's impacts. Raises RequestError: 404 without a capture, 503 while its folder is missing."""
+        if self.editor is None:
+            raise RequestError(
                 404, "expected a capture folder, got only a field; start avmsf studio with --capture", name="capture"
             )
-        if not self.book.folder.is_dir():
+        if not self.editor.folder.is_dir():
             # Not 4xx: the page keeps a recording and sends it again.
-            folder = self.book.folder
-            raise RefusedError(
+            folder = self.editor.folder
+            raise RequestError(
                 503, f"{folder}: expected the capture folder, got none; restore it and try again", file=folder
             )
-        return self.book
+        return self.editor
 
     async def reconstruct(self) -> Job:
         """Start to fit a field to the capture, which becomes the current one."""
-        book = self.expect_book()
-        strikes = await self.threads.read(book.strikes)
-        if not strikes:
-            raise RefusedError(
+        editor = self.require_editor()
+        if not await self.threads.read(editor.impacts):
+            raise RequestError(
                 409, "expected one or more recordings, got none; record impacts first", name="recordings", value=0
             )
         # One output is enough: the next job starts when this one's field is open.
         output = str(self.folder / "reconstructed")
         chosen = {"preset": self.config.preset, "modes": self.config.modes}
-        task = {"task": "make_field", "folder": str(book.folder), "output": output, **chosen}
+        task = {"task": "make_field", "folder": str(editor.folder), "output": output, **chosen}
         return self.jobs.start("reconstruct", task, self._take_field)
 
     def make_object(self) -> Job:
         """Begin to make Gaussians of the capture's pictures, to have something to click."""
-        book = self.expect_book()
-        task = {"task": "make_object", "folder": str(book.folder)}
+        task = {"task": "make_object", "folder": str(self.require_editor().folder)}
         return self.jobs.start(_MAKING, task, self._take_object)
 
     async def _lead(self, base: int, wish: Wish) -> dict[str, Any]:
@@ -181,7 +176,7 @@ class Studio:
             raise
 
     async def _compute(self, act: Callable[..., Result], *arguments: Any) -> Result:
-        """Compute with a user's values. Raises RefusedError (422) if they give no result."""
+        """Compute with a user's values. Raises RequestError (422) if they give no result."""
         try:
             return await self.threads.compute(act, *arguments)
         except NUMERIC_ERRORS as error:
@@ -204,7 +199,7 @@ class Studio:
             led = load(result["output"])
             try:
                 revision = self.session.lead(base, led, tuple(remarks(led.origin.report[EDITS][-1:], led)))
-            except RefusedError:
+            except RequestError:
                 # Minutes of work; what the other tab has done since is not to be overwritten either.
                 kept = self.session.keep(led, f"{self.opened.name[:_NAME]} edited")
                 words = (
@@ -230,7 +225,7 @@ class Studio:
         if field is not None:
             abilities += ["locate", "edit", "save", "like", *(["words"] if self.model is not None else [])]
             rows = field.audible.nonzero().flatten().tolist()
-        if self.book is not None:
+        if self.editor is not None:
             abilities += ["capture", "reconstruct"]
         return {
             "revision": revision.number,
@@ -248,13 +243,13 @@ class Studio:
 
 
 def base_of(words: dict[str, Any]) -> int:
-    """Return the revision that a change is based on. Raises RefusedError (400) if the request has none."""
+    """Return the revision that a change is based on. Raises RequestError (400) if the request has none."""
     base = words.get("base")
     if not isinstance(base, int) or isinstance(base, bool):
         raise unknown_base(base)
     return base
 
 
-def unknown_base(base: Any) -> RefusedError:
+def unknown_base(base: Any) -> RequestError:
     """Return the error of a request that does not give the revision which it changes."""
     return bad_request("base", "the number of a revision", base, advice="reload the page")

@@ -37,7 +37,7 @@ from avmsf.pipeline.reconstruct import reconstruct
 from avmsf.pipeline.record import capture_settings_of
 from avmsf.pipeline.scene import ProgressListener, SceneStages
 from avmsf.pipeline.stages import StageFolder
-from avmsf.studio.strike_files import COMMAND
+from avmsf.studio.capture import COMMAND
 
 Values = Mapping[str, Any]
 _RARELY = 10

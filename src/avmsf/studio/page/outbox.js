@@ -97,7 +97,7 @@ export class Outbox {
   async remove(key) {
     this.#entries.delete(key);
     // Also from a store that takes nothing new: what was sent must not come back. Where even this fails, the server
-    // knows the recording by its key, or by what it was to replace.
+    // finds the recording in its folder.
     if (this.#database) await this.#change((store) => store.delete(key)).catch(() => {});
   }
 }

@@ -87,16 +87,15 @@ export const server = {
   capture: () => ask("GET", "capture"),
   checkStrike: (recording) => ask("POST", "capture/check", wav(recording)),
 
-  /** Add a strike; the same key twice adds it once. */
-  addStrike: (recording, { contact, direction, key }) => {
+  /** Add a strike; the same recording and contact twice add it once. */
+  addStrike: (recording, { contact, direction }) => {
     const query = new URLSearchParams();
     ["x", "y", "z"].forEach((axis, place) => query.set(axis, contact[place]));
     if (direction) ["nx", "ny", "nz"].forEach((axis, place) => query.set(axis, direction[place]));
-    return ask("POST", `capture/strikes?${query}`, wav(recording, { "Idempotency-Key": key }));
+    return ask("POST", `capture/strikes?${query}`, wav(recording));
   },
   // With the strike's digest, as `capture` tells it, it is changed only if no other tab was faster.
-  redoStrike: (file, recording, { key, digest }) =>
-    ask("PUT", strikePlace(file), wav(recording, { "Idempotency-Key": key, ...expecting(digest) })),
+  redoStrike: (file, recording, { digest }) => ask("PUT", strikePlace(file), wav(recording, expecting(digest))),
   removeStrike: (file, { digest } = {}) => ask("DELETE", strikePlace(file), { headers: expecting(digest) }),
 
   reconstruct: () => ask("POST", "reconstruct"),

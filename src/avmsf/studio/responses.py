@@ -30,7 +30,7 @@ _repr.maxstring = _repr.maxother = _MAX_ECHO - 2
 _repr.maxlevel = 3
 
 
-class RefusedError(StudioError):
+class RequestError(StudioError):
     """A request that is not done, with its HTTP status and `more` entries for the answer."""
 
     def __init__(
@@ -57,38 +57,38 @@ class Answer(JSONResponse):
 
 
 def response_to(error: AvmsfError) -> Answer:
-    """Return the response: the error's message, and the `more` of a `RefusedError`."""
-    status = error.status if isinstance(error, RefusedError) else UNUSABLE
-    more = error.more if isinstance(error, RefusedError) else {}
+    """Return the response: the error's message, and the `more` of a `RequestError`."""
+    status = error.status if isinstance(error, RequestError) else UNUSABLE
+    more = error.more if isinstance(error, RequestError) else {}
     return Answer({"error": " ".join(str(error).split()), **more}, status)
 
 
-def refusal_of(error: Exception) -> RefusedError:
+def refusal_of(error: Exception) -> RequestError:
     """Return the answer to a request that failed by one of `FORESEEN_ERRORS`, or where there is not enough memory.
 
     The page sends a recording again after a status of 500 or more, and not after a lower one.
     """
     if lacks_memory(error):
-        return RefusedError(503, "expected more free memory; close other programs, or send less", name="memory")
+        return RequestError(503, "expected more free memory; close other programs, or send less", name="memory")
     if isinstance(error, OSError):
         where = "" if error.filename is None else f"{error.filename}: "
         reason = error.strerror or str(error)
-        return RefusedError(
+        return RequestError(
             507 if error.errno in _FULL else 503,
             f"{where}expected a file to read or write, got {reason!r}; {way_out(error)}",
             file=error.filename if isinstance(error.filename, str | Path) else None,
             value=reason,
         )
     if isinstance(error, RecursionError):
-        return RefusedError(400, "expected a request of few levels, got too many; reload the page")
+        return RequestError(400, "expected a request of few levels, got too many; reload the page")
     reason = f"{type(error).__name__}: {str(error)[:_MAX_ECHO]}"
-    return RefusedError(UNUSABLE, f"expected values that give a result, got {reason}; try other values", value=reason)
+    return RequestError(UNUSABLE, f"expected values that give a result, got {reason}; try other values", value=reason)
 
 
-def bad_request(name: str, wanted: str, value: Any, *, got: str | None = None, advice: str = "") -> RefusedError:
+def bad_request(name: str, wanted: str, value: Any, *, got: str | None = None, advice: str = "") -> RequestError:
     """Return the response (400) to an invalid entry; `got` is shown in place of its value."""
     message = f"{name}: expected {wanted}, got {got or echo(value)}{advice and f'; {advice}'}"
-    return RefusedError(400, message, name=name, value=value)
+    return RequestError(400, message, name=name, value=value)
 
 
 def echo(value: Any) -> str:

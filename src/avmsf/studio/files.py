@@ -21,16 +21,16 @@ from avmsf.errors import CaptureError, CaptureWarning, StudioError
 from avmsf.export.bundle import write_bundle
 from avmsf.export.formats import MOST_POINTS
 from avmsf.export.normals import outward_normals
-from avmsf.export.sampled_field import SampledField
+from avmsf.export.sampled_field import SampledField, supporting_columns
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.positions import points_on_object
 from avmsf.field.scaled_gains import fitted_gains, length_of, surface_of
 from avmsf.field.sound_field import SoundField
+from avmsf.field.uncertainty import scale_of
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh.surface import Surface, read_surface
-from avmsf.studio.capturing import StrikeBook
+from avmsf.studio.capture import CaptureEditor
 from avmsf.studio.opening import Opened, find_object, find_reconstructed, is_gaussians
-from avmsf.studio.sampling import resample, sample
 from avmsf.studio.session import Revision
 
 _CLICKED = 8_000
@@ -54,8 +54,8 @@ class Shown:
 class Showcase:
     """The files of the last revisions, in a folder that is removed with the server."""
 
-    def __init__(self, opened: Opened, folder: Path, book: StrikeBook | None) -> None:
-        self.opened, self.folder, self.book = opened, folder, book
+    def __init__(self, opened: Opened, folder: Path, editor: CaptureEditor | None) -> None:
+        self.opened, self.folder, self.editor = opened, folder, editor
         self._shown: OrderedDict[int, Shown] = OrderedDict()
         self._first_of_field: Shown | None = None
         self._lock = Lock()
@@ -159,7 +159,7 @@ class Showcase:
         if path is not None:
             points = read_splats(path).centers
         else:
-            contacts = [] if self.book is None else [strike.contact for strike in self.book.strikes()]
+            contacts = [] if self.editor is None else [impact.contact for impact in self.editor.impacts()]
             if len(contacts) >= 2:
                 points = FeatureField.from_contacts(torch.tensor(contacts, dtype=torch.float64)).points
             else:
@@ -225,3 +225,35 @@ def _thinned(points: Float[Tensor, "points 3"], most: int) -> Float[Tensor, "kep
     if len(points) <= most:
         return points
     return points[torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:most].sort().values]
+
+
+def sample(field: SoundField, points: Float[Tensor, "points 3"], normals: Float[Tensor, "points 3"]) -> SampledField:
+    """Return the table of a field at points of the object that it was fitted to, meters."""
+    sampled = SampledField.of(field, points.double() * length_of(field.gain_field), normals)
+    return replace(sampled, points=points)
+
+
+def resample(sampled: SampledField, before: SoundField, after: SoundField) -> SampledField | None:
+    """Return the table of the field `after` an edit from that of the field `before`.
+
+    None if that is not possible: for another fitted field, another phase, or a mode that was inaudible or muted.
+    """
+    if fitted_gains(before.gain_field) is not fitted_gains(after.gain_field) or not torch.equal(
+        before.phase, after.phase
+    ):
+        return None
+    old, new = scale_of(before), scale_of(after)
+    if bool((after.audible & (~before.audible | ((old == 0) & (new != 0)))).any()):
+        return None
+    heard = torch.nonzero(after.audible).flatten()
+    columns = (torch.cumsum(before.audible.long(), 0) - 1)[heard]
+    factor = torch.where(old[heard] == 0, 0.0, new[heard] / old[heard])
+    change = after.bank.damping[heard] / before.bank.damping[heard]
+    return replace(
+        sampled,
+        frequency=after.bank.frequency[heard],
+        damping=sampled.damping[..., columns] * change,
+        sine=(sampled.sine[:, columns] * factor).float(),
+        cosine=(sampled.cosine[:, columns] * factor).float(),
+        supporting=supporting_columns(after),
+    )

@@ -1,7 +1,11 @@
 """Localization for the page: tables are computed in advance, so that a recording is located at once."""
 
+import asyncio
 import base64
 import dataclasses
+import sys
+import traceback
+from collections import defaultdict
 from dataclasses import dataclass
 from functools import cached_property
 from threading import Lock
@@ -12,14 +16,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.capture.audio import Recording, SoundBytes, decode_recording
+from avmsf._utils.text import printable
+from avmsf.capture.audio import Recording
 from avmsf.capture.settings import CaptureSettings
-from avmsf.errors import RecordingLengthError
+from avmsf.errors import AvmsfError
+from avmsf.field.scaled_gains import length_of
 from avmsf.field.sound_field import SoundField
 from avmsf.localization.contact_map import LEVEL, ContactMap, enlarged, symmetries_of
 from avmsf.localization.locator import Locator
 from avmsf.localization.multi_impact import locate_impacts
-from avmsf.studio.refusal import RefusedError
+from avmsf.studio.capture import CaptureEditor
+from avmsf.studio.files import Showcase
+from avmsf.studio.jobs import Threads
+from avmsf.studio.responses import FORESEEN_ERRORS
+from avmsf.studio.session import Revision, Session
 from avmsf.symmetry.symmetries import Symmetries
 
 
@@ -93,18 +103,63 @@ class Finder:
         }
 
 
-def read_upload(content: bytes, *, name: str = "the recording") -> Recording:
-    """Return a recording that the page has sent.
-
-    Raises CaptureError for a file that is no sound, and RefusedError (413) for one of excessive length: compressed
-    silence of hours takes a few bytes.
-    """
-    try:
-        return decode_recording(SoundBytes(content), name)
-    except RecordingLengthError as error:
-        raise RefusedError(413, str(error), **error.attributes) from error
-
-
 def packed(values: Float[Tensor, " points"]) -> str:
     """Return values as the page unpacks them: base64 of float32, little endian."""
     return base64.b64encode(values.detach().to(torch.float32).numpy().astype(np.dtype("<f4")).tobytes()).decode()
+
+
+_SETTLED = 0.5
+"""Seconds that a revision stays the last one before its tables are made: sliders are dragged."""
+
+
+class Searches:
+    """The finders of one server. Its methods are called on the event loop."""
+
+    def __init__(self, session: Session, showcase: Showcase, editor: CaptureEditor | None, threads: Threads) -> None:
+        self.session, self.showcase, self.editor, self.threads = session, showcase, editor, threads
+        self._finder: tuple[int, Finder] | None = None
+        self._likenesses: defaultdict[int, Likeness] = defaultdict(Likeness)
+        self._ahead: asyncio.Task[None] | None = None
+
+    def finder_of(self, revision: Revision) -> Finder:
+        """Return the locator of a revision; its tables are computed at the first use."""
+        if self._finder is None or self._finder[0] != revision.number:
+            field = revision.expect_field()
+            points = self.showcase.current.sampled.points.double() * length_of(field.gain_field)
+            settings = None if self.editor is None else self.editor.settings
+            likeness = self._likenesses[revision.opening]
+            self._finder = (
+                revision.number,
+                Finder(field, points.float(), length_of(field.gain_field), likeness, settings),
+            )
+        return self._finder[1]
+
+    def prepare_ahead(self) -> None:
+        """Compute the current revision's tables after the running computation, and skip those of older revisions."""
+        if self._ahead is None or self._ahead.done():
+            self._ahead = asyncio.create_task(self._prepare())
+
+    def close(self) -> None:
+        """Start no further computation."""
+        if self._ahead is not None:
+            self._ahead.cancel()
+
+    async def _prepare(self) -> None:
+        # One task for all revisions: one that is cancelled would leave its thread running beside the next one's.
+        prepared = None
+        while (revision := self.session.current) is not prepared and revision.field is not None:
+            await asyncio.sleep(_SETTLED)
+            if self.session.current is revision:
+                try:
+                    await self.threads.compute_ahead(self.finder_of(revision).prepare)
+                except Exception as error:  # the next revision's tables are to be made all the same
+                    _report(error)
+                prepared = revision
+
+
+def _report(error: Exception) -> None:
+    """Print why tables could not be made. A page that asks to locate on this revision gets the same error."""
+    if not isinstance(error, (AvmsfError, *FORESEEN_ERRORS)):
+        traceback.print_exception(error)
+    words = printable(" ".join(str(error).split()))
+    print(f"impacts cannot be located on this revision ({type(error).__name__}: {words})", file=sys.stderr)

@@ -5,10 +5,13 @@ from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import torch
 
+from avmsf.editing.config import STABLE_AUDIO
 from avmsf.editing.edits import EDITS, remarks
 from avmsf.editing.material import LAWS, change_material
 from avmsf.editing.material_before import made_of
@@ -16,7 +19,7 @@ from avmsf.editing.modes import adjust_modes
 from avmsf.errors import EditError
 from avmsf.fem.material import MATERIALS, material_named
 from avmsf.field.sound_field import SoundField
-from avmsf.studio.refusal import RefusedError, bad_request, echo
+from avmsf.studio.responses import RequestError, bad_request, echo
 
 _MATERIAL, _MODE = ("from", "to"), ("mode", "db", "pitch", "decay")
 _OLD_CONTROL = '"Present material"'
@@ -80,7 +83,7 @@ class Sliders:
     def read(cls, words: Mapping[str, Any], *, modes: int | None = None) -> "Sliders":
         """Return the sliders of a request for a field of so many `modes`.
 
-        Raises RefusedError (400), with the name of the entry, for unknown entries, values that are no numbers or
+        Raises RequestError (400), with the name of the entry, for unknown entries, values that are no numbers or
         outside `_LIMITS`, and for more rows than modes.
         """
         known = ("base", "material", "size", "pitch", "decay", "brightness", "law", "modes")
@@ -95,7 +98,7 @@ class Sliders:
         changes = tuple(_mode(row) for row in rows)
         repeated = [mode for mode, count in Counter(change.mode for change in changes).items() if count > 1]
         if repeated:
-            raise RefusedError(
+            raise RequestError(
                 400,
                 f"modes: expected one row per mode, got several of mode {repeated[0]}",
                 row=repeated[0],
@@ -194,7 +197,67 @@ def _number(words: Mapping[str, Any], name: str, rest: float) -> float:
 
 def _name(value: Any, what: str) -> str | None:
     if value is not None and not (isinstance(value, str) and len(value) <= _MAX_NAME):
-        raise RefusedError(
+        raise RequestError(
             400, f'material "{what}": expected a name, got {echo(value)}', name=f"material.{what}", value=value
         )
     return value or None
+
+
+_KEYS = ("base", "prompt")
+_MAX_PROMPT = 2000
+"""Characters, several paragraphs: a description of a sound is a sentence."""
+
+
+@dataclass(frozen=True)
+class Wish:
+    """Target of a guided edit: a recording or a text."""
+
+    like: bytes | None = None
+    """A sound file."""
+    prompt: str | None = None
+
+    @classmethod
+    def read(cls, words: Mapping[str, Any], *, model: str | None) -> "Wish":
+        """Return the target of a request with a text. Raises RequestError (400), and EditError without a `model`."""
+        unknown = sorted(set(words) - set(_KEYS))
+        if unknown:
+            raise RequestError(
+                400,
+                f"expected only {', '.join(_KEYS)}, got {echo(unknown)} too; set the sliders before or after",
+                name="prompt",
+                value=unknown,
+            )
+        if model is None:
+            raise EditError(
+                "expected the extra and the model for edits by text, got none; pip install 'avmsf[text]' and start "
+                "avmsf studio with --model FOLDER",
+                name="model",
+            )
+        prompt = words.get("prompt")
+        if not isinstance(prompt, str) or not prompt.strip() or len(prompt) > _MAX_PROMPT:
+            raise bad_request("prompt", f'1 to {_MAX_PROMPT} characters, such as "a wooden bowl is hit"', prompt)
+        return cls(prompt=prompt)
+
+    def task(self, place: Path, *, steps: int, model: str | None) -> dict[str, Any]:
+        """Return the worker's task, with its files in `place`; the edited field is written there as `field`."""
+        task = {"task": "lead", "field": str(place / "field"), "output": str(place / "led"), "steps": steps}
+        if self.like is None:
+            return {**task, "prompt": self.prompt, "model": model}
+        (place / "like.wav").write_bytes(self.like)
+        return {**task, "recording": str(place / "like.wav")}
+
+
+def is_wish(words: Mapping[str, Any]) -> bool:
+    """Whether an edit asks for a descent and not for sliders."""
+    return words.get("prompt") is not None
+
+
+def words_model(given: str | None) -> str | None:
+    """Return the model for text edits: the given one, or that in the hub's cache; None if there is none."""
+    if any(find_spec(name) is None for name in ("diffusers", "torchsde", "transformers")):
+        return None
+    if given is not None:
+        return given
+    from huggingface_hub import try_to_load_from_cache
+
+    return STABLE_AUDIO if isinstance(try_to_load_from_cache(STABLE_AUDIO, "model_index.json"), str) else None

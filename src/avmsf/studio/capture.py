@@ -1,0 +1,472 @@
+"""Capture mode: impacts added to a capture folder, one recording at a time, each atomically.
+
+The table is read again for every request, because a spreadsheet may change it, and changed under a lock of the folder,
+so that two studios do not overwrite each other's changes. A request that is repeated because its answer was lost finds
+its recording in the folder, and writes nothing twice.
+"""
+
+import csv
+import hashlib
+import io
+import math
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import takewhile
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import soundfile
+
+from avmsf._utils.files import write_whole
+from avmsf._utils.locks import write_lock
+from avmsf._utils.wording import counted
+from avmsf.capture.audio import Recording, SoundBytes, decode_recording, read_recording
+from avmsf.capture.check import CaptureReport, check
+from avmsf.capture.measure import RecordingReport, measure
+from avmsf.capture.prepare import prepare
+from avmsf.capture.settings import CaptureSettings, settings_of
+from avmsf.capture.table import (
+    DIRECTION,
+    FARTHEST,
+    FORCE,
+    REQUIRED,
+    TABLE,
+    Row,
+    Strike,
+    read_cells,
+    read_rows,
+    understand,
+)
+from avmsf.errors import AvmsfError, CaptureError, FolderInUseError, RecordingLengthError
+from avmsf.pipeline.config import CACHE
+from avmsf.studio.responses import RequestError, bad_request
+
+COMMAND = "avmsf studio"
+"""What other processes wait for, in their messages."""
+REMOVED = "removed"
+"""In the capture's cache: the recordings that were replaced or removed."""
+_LOCK_TIMEOUT_SECONDS = 10.0
+"""How long to wait for another studio's change, which takes a fraction of a second."""
+_NUMBERED = re.compile(r"(\d{1,6})\.wav", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Contact, direction and force of one impact."""
+
+    point: tuple[float, float, float]
+    """Object frame, meters."""
+    direction: tuple[float, float, float] | None = None
+    """Along which the hammer moved, into the object; any length but zero."""
+    newtons: float | None = None
+    """Peak force, where it is known."""
+
+    @classmethod
+    def read(cls, query: Mapping[str, str]) -> "Contact":
+        """Return the contact of a query x, y, z and optionally nx, ny, nz, newtons. Raises RequestError (400)."""
+        point = _vector(query, REQUIRED[1:])
+        if point is None:
+            raise bad_request("contact", "x, y and z in meters", None, got="none", advice="click the object first")
+        if max(map(abs, point)) > FARTHEST:
+            raise bad_request("contact", f"a point within {FARTHEST:g} m of the origin", point)
+        direction = _vector(query, DIRECTION)
+        if direction is not None and math.hypot(*direction) == 0:
+            raise bad_request("direction", "a vector nx, ny, nz", direction, got="the zero vector")
+        newtons = _finite(query, "newtons") if "newtons" in query else None
+        if newtons is not None and newtons <= 0:
+            raise bad_request("newtons", "a peak force above 0", newtons, got=f"{newtons:g}")
+        return cls(point, direction, newtons)
+
+
+def _vector(query: Mapping[str, str], names: Sequence[str]) -> tuple[float, float, float] | None:
+    if not any(name in query for name in names):
+        return None
+    x, y, z = (_finite(query, name) for name in names)
+    return (x, y, z)
+
+
+def _finite(query: Mapping[str, str], name: str) -> float:
+    try:
+        value = float(query[name])
+    except (KeyError, ValueError):
+        value = math.nan
+    if not math.isfinite(value):
+        raise bad_request(name, "a number", query.get(name))
+    return value
+
+
+def read_upload(content: bytes, *, name: str = "the recording") -> Recording:
+    """Return a recording that the page has sent.
+
+    Raises CaptureError for a file that is no sound, and RequestError (413) for one of excessive length: compressed
+    silence of hours takes a few bytes.
+    """
+    try:
+        return decode_recording(SoundBytes(content), name)
+    except RecordingLengthError as error:
+        raise RequestError(413, str(error), **error.attributes) from error
+
+
+class ImpactTable:
+    """A capture's `impacts.csv` as it is now. A change keeps columns, comments, separator, unit and decimal commas."""
+
+    def __init__(self, folder: Path) -> None:
+        """Read the table; a folder without one has no rows. Raises CaptureError."""
+        self.path = folder / TABLE
+        lines, self.separator = read_cells(self.path) if self.path.is_file() else ([], ",")
+        self.header = lines[0][1] if lines else []
+        self.cells = [cells for _, cells in lines[1:]]
+        self.rows: list[Row] = read_rows(folder)[0] if self.cells else []
+        missing = [name for name in REQUIRED if lines and name not in self.names]
+        if missing:
+            raise CaptureError.expected(f"the column {missing[0]}", file=self.path, row=1, name=missing[0])
+
+    @property
+    def names(self) -> list[str]:
+        """The columns in lower case."""
+        return [name.lower() for name in self.header]
+
+    def rows_of(self, file: str) -> list[int]:
+        """Return the indices of the rows with this recording."""
+        return [index for index, row in enumerate(self.rows) if file_of(row) == file]
+
+    def check_complete(self, contact: Contact) -> None:
+        """Raise RequestError (422) for an impact without a value that every row of the table has."""
+        for column, value, name in ((DIRECTION[0], contact.direction, "direction"), (FORCE, contact.newtons, "force")):
+            if column in self.names and value is None:
+                raise RequestError(
+                    422, f"{self.path}: expected a {name} as in all rows, got none; add it", file=self.path, name=name
+                )
+
+    def add(self, file: str, contact: Contact, settings: CaptureSettings) -> None:
+        """Append a row; a new table gets columns for the known values of the impact."""
+        numbers = dict(zip(REQUIRED[1:], (value / settings.meters for value in contact.point), strict=True))
+        if contact.direction is not None:
+            length = math.hypot(*contact.direction)
+            numbers |= dict(zip(DIRECTION, (value / length for value in contact.direction), strict=True))
+        if contact.newtons is not None:
+            numbers[FORCE] = contact.newtons
+        self.header = self.header or [REQUIRED[0], *numbers]
+        written = {name: repr(float(value)) for name, value in numbers.items()}
+        if any("," in row.cells.get(name, "") for row in self.rows for name in (*REQUIRED[1:], *DIRECTION, FORCE)):
+            written = {name: text.replace(".", ",") for name, text in written.items()}
+        written[REQUIRED[0]] = file
+        self._write([*self.cells, [written.get(name, "") for name in self.names]])
+
+    def rename(self, index: int, file: str) -> None:
+        """Let a row name another recording."""
+        cells = [list(each) for each in self.cells]
+        cells[index][self.names.index(REQUIRED[0])] = file
+        self._write(cells)
+
+    def remove(self, index: int) -> None:
+        """Remove a row; the table is deleted with its last row."""
+        if len(self.cells) == 1:
+            self.path.unlink()
+        else:
+            self._write([*self.cells[:index], *self.cells[index + 1 :]])
+
+    def _write(self, cells: Sequence[Sequence[str]]) -> None:
+        before = self.path.read_bytes().decode() if self.path.is_file() else ""
+        mark = before[: before.startswith("\ufeff")]
+        memory = io.StringIO()
+        memory.writelines(takewhile(_is_no_row, before.removeprefix(mark).splitlines(keepends=True)))
+        ending = "\r\n" if "\r\n" in before else "\n"
+        csv.writer(memory, delimiter=self.separator, lineterminator=ending).writerows([self.header, *cells])
+        content = f"{mark}{memory.getvalue()}".encode()
+        write_whole(self.path, lambda path: path.write_bytes(content), raising=CaptureError)
+
+
+def _is_no_row(line: str) -> bool:
+    """Whether a line above the header is a comment, or names Excel's separator."""
+    return line.startswith(("#", "sep="))
+
+
+def file_of(row: Row) -> str:
+    """Return the recording that a row names, with forward slashes."""
+    return str(PurePosixPath(row.cells[REQUIRED[0]].replace("\\", "/")))
+
+
+class CaptureEditor:
+    """The impacts of one capture folder. Its methods are thread-safe, and block."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder.resolve()
+
+    @property
+    def settings(self) -> CaptureSettings:
+        """The folder's capture.toml as it is now. Raises CaptureError."""
+        return settings_of(self.folder)
+
+    def describe(self) -> dict[str, Any]:
+        """Return all impacts with their reports of `avmsf check`, and the problems of the whole capture."""
+        settings, table = self.settings, ImpactTable(self.folder)
+        impacts = [self._described(index, row, settings) for index, row in enumerate(table.rows)]
+        problems: list[str] = []
+        ready = False
+        if len(impacts) >= 2:
+            report = _checked(self.folder, tuple(_states(self.folder)), settings)
+            problems, ready = list(report.problems), report.readable and all(each["readable"] for each in impacts)
+        return {"folder": str(self.folder), "strikes": impacts, "problems": problems, "ready": ready}
+
+    def impacts(self) -> list[Strike]:
+        """Return the impacts that are valid and whose recordings exist, in the order of the table."""
+        settings = self.settings
+        found = []
+        for row in ImpactTable(self.folder).rows:
+            try:
+                impact = understand(row, settings)
+                present = self._readable(impact.file).is_file()
+            except AvmsfError:
+                continue
+            if present:
+                found.append(impact)
+        return found
+
+    def check(self, content: bytes) -> dict[str, Any]:
+        """Return the report on a recording, without writing it. Raises CaptureError for what cannot be used."""
+        return _plain(self._check_usable(read_upload(content), newtons=1.0))
+
+    def add(self, content: bytes, contact: Contact) -> dict[str, Any]:
+        """Write an impact and return it; one of the same recording and contact is returned as it is.
+
+        Raises CaptureError for a recording that cannot be used, and RequestError for a missing direction or force.
+        """
+        with self._lock():
+            settings, table = self.settings, ImpactTable(self.folder)
+            digest = hashlib.sha256(content).hexdigest()
+            for index, row in enumerate(table.rows):
+                impact = self._described(index, row, settings)
+                if impact["digest"] == digest and _same(impact["contact"], contact.point):
+                    return impact
+            recording = read_upload(content)
+            self._check_usable(recording, newtons=contact.newtons)
+            table.check_complete(contact)
+            file = self._next_name(table)
+            self._write(file, content, recording)
+            try:
+                table.add(file, contact, settings)
+            except BaseException:
+                (self.folder / file).unlink(missing_ok=True)
+                raise
+            return self._found(file)
+
+    def redo(self, file: str, content: bytes, *, match: str | None = None) -> dict[str, Any]:
+        """Replace the recording of an impact and return the impact; the old recording is moved to the cache.
+
+        The new file is a wav file whatever the old one was. A repeated request changes nothing. Raises RequestError
+        (409) if the digest of the recording is not `match`.
+        """
+        with self._lock():
+            if self._found(file)["digest"] == hashlib.sha256(content).hexdigest():
+                return self._found(file)
+            table, index = self._owned(file, match)
+            recording = read_upload(content)
+            self._check_usable(recording, newtons=1.0, replaced=file)
+            new = file
+            if PurePosixPath(file).suffix.lower() != ".wav":
+                new = str(PurePosixPath(file).with_suffix(".wav"))
+                if os.path.lexists(self.folder / new) or table.rows_of(new):
+                    new = self._next_name(table)
+            self._set_aside(file)
+            self._write(new, content, recording)
+            if new != file:
+                table.rename(index, new)
+                (self.folder / file).unlink(missing_ok=True)
+            return self._found(new)
+
+    def remove(self, file: str, *, match: str | None = None) -> None:
+        """Remove an impact from the table; its recording is moved to the cache.
+
+        Raises RequestError: 404 for no such impact, 409 if the digest of the recording is not `match`.
+        """
+        with self._lock():
+            table, index = self._owned(file, match)
+            # All that needs space on the disk comes before the row goes.
+            self._set_aside(file)
+            table.remove(index)
+            (self.folder / file).unlink(missing_ok=True)
+
+    @contextmanager
+    def _lock(self) -> Iterator[None]:
+        """Lock the table and the recordings against other studios.
+
+        Raises RequestError (503) if another one holds the lock for long; the page then sends the recording again.
+        """
+        with ExitStack() as held:
+            try:
+                lock = write_lock(self.folder / CACHE, "capture", command=COMMAND, wait=_LOCK_TIMEOUT_SECONDS)
+                held.enter_context(lock)
+            except FolderInUseError as error:
+                message = f"{error}, and try again; nothing was changed"
+                raise RequestError(503, message, file=error.file, value=error.value) from error
+            yield
+
+    def _described(self, index: int, row: Row, settings: CaptureSettings) -> dict[str, Any]:
+        values: dict[str, Any] = {"row": index, "file": file_of(row), "contact": None, "direction": None}
+        try:
+            impact = understand(row, settings)
+            values |= {"file": impact.file, "contact": impact.contact, "direction": impact.direction}
+            path = self._readable(impact.file)
+            report, digest = _measured(path, _state(path), impact, settings)
+        except AvmsfError as error:
+            report = RecordingReport(values["file"], row.line, readable=False, problems=(str(error),))
+            digest = None
+        return {**_plain(report), **values, "digest": digest}
+
+    def _found(self, file: str) -> dict[str, Any]:
+        table = ImpactTable(self.folder)
+        for index in table.rows_of(file):
+            return self._described(index, table.rows[index], self.settings)
+        message = f"{TABLE}: expected a row of {file[:80]!r}, got none; reload the page"
+        raise RequestError(404, message, file=TABLE, value=file)
+
+    def _owned(self, file: str, match: str | None) -> tuple[ImpactTable, int]:
+        """Return the table and the row of a recording to change.
+
+        Raises RequestError (409) unless it is the only row, the recording is no link, which may belong to another
+        impact or capture, and its digest is `match`.
+        """
+        self._found(file)
+        table = ImpactTable(self.folder)
+        indices = table.rows_of(file)
+        lines = [table.rows[index].line for index in indices]
+        if len(lines) > 1:
+            raise RequestError(
+                409,
+                f"{TABLE}, rows {', '.join(map(str, lines))}: expected one row of {file}, got {len(lines)}; correct "
+                "the table",
+                file=TABLE,
+                row=lines[1],
+                name=file,
+                value=lines,
+            )
+        path = self.folder / file
+        if path.resolve() != path:
+            message = f"{file}: expected a file, got a link; copy the file there first"
+            raise RequestError(409, message, file=file, value="link")
+        if match is not None and not (path.is_file() and match == hashlib.sha256(path.read_bytes()).hexdigest()):
+            raise RequestError(
+                409,
+                f"{file}: expected the recording that the page shows, got another one from another tab or program; "
+                "nothing was overwritten; play it and repeat the change",
+                file=file,
+                value=match,
+            )
+        return table, indices[0]
+
+    def _readable(self, file: str) -> Path:
+        """Return a recording's path. Raises RequestError (404) for a link out of the folder."""
+        path = (self.folder / file).resolve()
+        if not path.is_relative_to(self.folder):
+            message = f"{file}: expected a file in the capture folder, got one outside; copy it there"
+            raise RequestError(404, message, file=file)
+        return path
+
+    def _check_usable(
+        self, recording: Recording, *, newtons: float | None, replaced: str | None = None
+    ) -> RecordingReport:
+        """Return a recording's report. Raises CaptureError for what would make the capture unreadable.
+
+        `replaced` is the recording that it takes the place of.
+        """
+        settings = self.settings
+        prepared = prepare(recording, settings, newtons=newtons)
+        report = measure(recording, prepared, settings=settings, line=0)
+        rates = []
+        for row in ImpactTable(self.folder).rows:
+            if file_of(row) != replaced:
+                try:
+                    with soundfile.SoundFile(self._readable(understand(row, settings).file)) as other:
+                        rates.append(float(other.samplerate))
+                except (AvmsfError, soundfile.LibsndfileError, OSError):
+                    continue
+        usual = max(set(rates), key=rates.count) if rates else recording.sample_rate
+        if recording.sample_rate != usual:
+            raise CaptureError(
+                f"{recording.name}: expected {usual:g} Hz, as in the {counted(len(rates), 'recording')} before, got "
+                f"{recording.sample_rate:g} Hz; record at that rate, or convert it",
+                file=recording.name,
+                name="sample_rate",
+                value=recording.sample_rate,
+            )
+        return report
+
+    def _next_name(self, table: ImpactTable) -> str:
+        """Return a number that no recording here has, nor a row of the table."""
+        names = [*(path.name for path in self.folder.iterdir()), *map(file_of, table.rows)]
+        numbers = [int(found[1]) for name in names if (found := _NUMBERED.fullmatch(name))]
+        return f"{max(numbers, default=0) + 1:03d}.wav"
+
+    def _write(self, file: str, content: bytes, recording: Recording) -> None:
+        """Write what was sent, to the last bit where it is a wav file, else the same samples as one."""
+        if not (content[:4] == b"RIFF" and content[8:12] == b"WAVE"):
+            memory = io.BytesIO()
+            samples = recording.channels.T.astype(np.float32)
+            soundfile.write(memory, samples, round(recording.sample_rate), subtype="FLOAT", format="WAV")
+            content = memory.getvalue()
+        write_whole(self.folder / file, lambda path: path.write_bytes(content), raising=CaptureError)
+
+    def _set_aside(self, file: str) -> None:
+        """Keep a recording in the cache too: by a hard link, which needs no space, or as a copy."""
+        path = self.folder / file
+        if not path.is_file():
+            return
+        content = path.read_bytes()
+        digest = hashlib.sha256(content).hexdigest()[:12]
+        saved = self.folder / CACHE / REMOVED / f"{path.stem}-{digest}{path.suffix}"
+        if saved.is_file():
+            return
+        try:
+            saved.parent.mkdir(parents=True, exist_ok=True)
+            os.link(path, saved)
+        except OSError:
+            write_whole(saved, lambda path: path.write_bytes(content), raising=CaptureError)
+
+
+def _same(one: tuple[float, ...] | None, other: tuple[float, ...]) -> bool:
+    """Whether two contacts are equal but for the conversion of units."""
+    return one is not None and math.dist(one, other) < 1e-9
+
+
+def _plain(report: RecordingReport) -> dict[str, Any]:
+    """Return what the page shows of a recording."""
+    names = ("readable", "seconds", "sample_rate", "channels", "coding", "peak_db", "noise_db", "onset_seconds")
+    values = {name: getattr(report, name) for name in (*names, "clipped", "double_hit_seconds")}
+    return {"file": report.file, **values, "warnings": list(report.problems)}
+
+
+@lru_cache(maxsize=4096)
+def _measured(path: Path, state: object, impact: Strike, settings: CaptureSettings) -> tuple[RecordingReport, str]:
+    """Return the report on an impact's recording, and its digest. Raises CaptureError for an unreadable one."""
+    recording = read_recording(path, impact.file)
+    prepared = prepare(recording, settings, newtons=impact.newtons)
+    report = measure(recording, prepared, settings=settings, line=impact.line)
+    return report, hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@lru_cache(maxsize=1)
+def _checked(folder: Path, states: object, settings: CaptureSettings) -> CaptureReport:
+    """Return the report on the folder, for which every recording is read once more."""
+    return check(folder, settings)
+
+
+def _state(path: Path) -> tuple[int, int, int] | None:
+    """Return what changes where a file does; None for none."""
+    try:
+        state = path.stat()
+    except OSError:
+        return None
+    return state.st_mtime_ns, state.st_size, state.st_ino
+
+
+def _states(folder: Path) -> Iterator[tuple[str, object]]:
+    """Yield the states of all files of a folder but those of hidden ones, which are not the capture's."""
+    for parent, folders, names in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        yield from ((os.path.join(parent, name), _state(Path(parent, name))) for name in sorted(names))

@@ -1,0 +1,412 @@
+"""Capture mode: what it writes is an ordinary capture folder, whole after every step, and nothing is written twice."""
+
+import csv
+import hashlib
+import io
+import os
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+
+from avmsf._utils.locks import write_lock
+from avmsf.capture import check, read_capture
+from avmsf.errors import CaptureError
+from avmsf.pipeline.config import CACHE
+from avmsf.studio import capture
+from avmsf.studio.capture import CaptureEditor, Contact, ImpactTable
+from avmsf.studio.responses import RequestError
+from factories.capture_folder import fill, ring
+from factories.raising import raises
+from opened_plate import blow, wav
+
+DOWN = (0.0, 0.0, -2.0)
+
+
+def contact(x: float, *, direction: tuple[float, float, float] | None = DOWN) -> Contact:
+    return Contact((x, 0.25, -1e-3), direction)
+
+
+def recorded(folder: Path, count: int) -> CaptureEditor:
+    """Return the editor of a folder with so many impacts."""
+    folder.mkdir(parents=True, exist_ok=True)
+    editor = CaptureEditor(folder)
+    for number in range(count):
+        editor.add(blow(number), contact(0.1 * number))
+    return editor
+
+
+def table(folder: Path) -> list[list[str]]:
+    with open(folder / "impacts.csv", newline="") as file:
+        return list(csv.reader(file))
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def removed(folder: Path) -> list[bytes]:
+    return [path.read_bytes() for path in (folder / CACHE / "removed").iterdir()]
+
+
+def test_recorded_impacts_become_a_capture_that_reads_back(tmp_path: Path) -> None:
+    editor = recorded(tmp_path, 0)
+    assert editor.describe()["strikes"] == []
+    for number in range(3):
+        added = editor.add(blow(number), contact(0.1 * number))
+        assert (added["row"], added["file"]) == (number, f"{number + 1:03d}.wav")
+        assert added["onset_seconds"] == pytest.approx(0.1, abs=1e-3)
+        assert (added["clipped"], added["warnings"]) == (0, [])
+    impacts = read_capture(tmp_path).impacts
+    assert torch.equal(impacts.contacts[:, 0], torch.tensor([0.0, 0.1, 0.2], dtype=torch.float64))
+    assert impacts.directions is not None
+    assert torch.equal(impacts.directions[1], torch.tensor([0.0, 0.0, -1.0]))
+    assert (tmp_path / "002.wav").read_bytes() == blow(1)
+    described = editor.describe()
+    assert (described["ready"], described["problems"]) == (True, [])
+    assert described["strikes"][2]["contact"] == (0.2, 0.25, -0.001)
+
+
+def test_the_report_is_that_of_check_and_checking_writes_nothing(tmp_path: Path) -> None:
+    clipped = np.clip(6 * ring(before=0.1), -1.0, 1.0)
+    recordings = {"a.wav": ring(before=0.1), "b.wav": clipped, "c.wav": ring(noise=0.2, before=0.1)}
+    folder = fill(tmp_path / "filled", replace=recordings)
+    before = contents(folder)
+    editor = CaptureEditor(folder)
+    described = editor.describe()["strikes"]
+    for found, expected in zip(described, check(folder).recordings, strict=True):
+        assert found["warnings"] == list(expected.problems)
+        assert found["peak_db"] == expected.peak_db
+        checked = editor.check((folder / expected.file).read_bytes())
+        for name in ("readable", "seconds", "sample_rate", "peak_db", "clipped", "onset_seconds"):
+            assert checked[name] == found[name]
+    assert described[1]["clipped"] > 10
+    assert contents(folder) == before
+
+
+def test_an_unchanged_folder_is_checked_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    editor, checked = CaptureEditor(fill(tmp_path / "filled")), []
+
+    def counted(*arguments: object) -> object:
+        checked.append(arguments)
+        return check(*arguments)
+
+    monkeypatch.setattr(capture, "check", counted)
+    first = editor.describe()
+    assert editor.describe() == first
+    assert len(checked) == 1
+    editor.add(blow(3), contact(0.5, direction=None))
+    assert len(editor.describe()["strikes"]) == 4
+    assert len(checked) == 2
+
+
+def test_a_repeated_request_writes_nothing_twice(tmp_path: Path) -> None:
+    editor = recorded(tmp_path, 1)
+    first = editor.add(blow(1), contact(0.1))
+    before = contents(tmp_path)
+    # A server that was started anew finds it too.
+    for each in (editor, CaptureEditor(tmp_path)):
+        assert each.add(blow(1), contact(0.1)) == first
+    redone = editor.redo("001.wav", blow(7), match=hashlib.sha256(blow(0)).hexdigest())
+    assert editor.redo("001.wav", blow(7), match=hashlib.sha256(blow(0)).hexdigest()) == redone
+    assert contents(tmp_path).keys() - before.keys() == {next((tmp_path / CACHE / "removed").iterdir())}
+    assert editor.add(blow(1), contact(0.2))["file"] == "003.wav"
+
+
+def test_what_fails_for_want_of_space_leaves_everything_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    editor = recorded(tmp_path, 2)
+    before = contents(tmp_path)
+
+    def fail(*arguments: object) -> None:
+        raise CaptureError("No space left on device") from OSError(28, os.strerror(28))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(ImpactTable, "_write", fail)
+        for change in (lambda: editor.add(blow(2), contact(0.2)), lambda: editor.remove("002.wav")):
+            with pytest.raises(CaptureError):
+                change()
+            assert {path: content for path, content in contents(tmp_path).items() if path.parent == tmp_path} == {
+                path: content for path, content in before.items() if path.parent == tmp_path
+            }
+    assert editor.add(blow(2), contact(0.2))["file"] == "003.wav"
+    inode = (tmp_path / "003.wav").stat().st_ino
+    editor.remove("003.wav")
+    # Set aside by a link, which needs no space.
+    assert inode in [path.stat().st_ino for path in (tmp_path / CACHE / "removed").iterdir()]
+
+
+def test_a_replaced_or_removed_recording_is_set_aside(tmp_path: Path) -> None:
+    editor = recorded(tmp_path, 2)
+    rows = table(tmp_path)
+    assert editor.redo("001.wav", blow(7))["row"] == 0
+    assert (tmp_path / "001.wav").read_bytes() == blow(7)
+    assert table(tmp_path) == rows
+    assert removed(tmp_path) == [blow(0)]
+    with pytest.raises(CaptureError):
+        editor.redo("001.wav", b"hello")
+    assert (tmp_path / "001.wav").read_bytes() == blow(7)
+    for file in ("001.wav", "002.wav"):
+        editor.remove(file)
+        assert not (tmp_path / file).exists()
+    assert sorted(removed(tmp_path)) == sorted([blow(0), blow(1), blow(7)])
+    assert not (tmp_path / "impacts.csv").exists()
+    assert editor.describe()["strikes"] == []
+
+
+@pytest.mark.parametrize("file", ["004.wav", "../a.wav", "/etc/passwd", "capture.toml", "impacts.csv", ""])
+def test_only_recordings_of_the_table_can_be_touched(tmp_path: Path, file: str) -> None:
+    editor = CaptureEditor(fill(tmp_path / "filled", settings="seconds = 0.3"))
+    (tmp_path / "a.wav").write_bytes(blow())
+    for act in (lambda: editor.remove(file), lambda: editor.redo(file, blow())):
+        with raises(RequestError, file="impacts.csv", value=file) as refused:
+            act()
+        assert refused.value.status == 404
+    assert (tmp_path / "a.wav").read_bytes() == blow()
+
+
+def test_a_link_out_of_the_folder_is_neither_read_nor_written(tmp_path: Path) -> None:
+    folder = fill(tmp_path / "filled")
+    outside = tmp_path / "outside.wav"
+    outside.write_bytes(blow(5))
+    (folder / "a.wav").unlink()
+    (folder / "a.wav").symlink_to(outside)
+    editor = CaptureEditor(folder)
+    described = editor.describe()["strikes"][0]
+    assert not described["readable"]
+    assert described["warnings"][0].startswith("a.wav: ")
+    assert [impact.file for impact in editor.impacts()] == ["b.wav", "c.wav"]
+    expect_links_untouched(editor, "a.wav")
+    # Nor does its rate count.
+    outside.write_bytes(wav(ring(rate=16000), rate=16000))
+    for name in ("b.wav", "c.wav"):
+        (folder / name).unlink()
+    assert editor.check(blow())["sample_rate"] == 8000
+
+
+def test_a_link_to_another_recording_is_read_and_never_written_through(tmp_path: Path) -> None:
+    editor = recorded(tmp_path, 1)
+    (tmp_path / "003.wav").symlink_to("001.wav")
+    (tmp_path / "sub").symlink_to(".")
+    rows = "001.wav,0,0,0,0,0,1\n003.wav,0.1,0,0,0,0,1\nsub/001.wav,0.2,0,0,0,0,1\n"
+    (tmp_path / "impacts.csv").write_text(f"file,x,y,z,nx,ny,nz\n{rows}")
+    assert all(impact["readable"] for impact in editor.describe()["strikes"])
+    expect_links_untouched(editor, "003.wav", "sub/001.wav")
+
+
+def expect_links_untouched(editor: CaptureEditor, *files: str) -> None:
+    before = contents(editor.folder)
+    for file in files:
+        changes: list[Callable[[], object]] = [lambda: editor.redo(file, blow(9)), lambda: editor.remove(file)]  # noqa: B023
+        for change in changes:
+            with raises(RequestError, file=file, value="link") as refused:
+                change()
+            assert refused.value.status == 409
+    after = contents(editor.folder)
+    assert {path: after[path] for path in before} == before
+
+
+def test_a_recording_of_two_rows_is_changed_in_neither(tmp_path: Path) -> None:
+    editor = recorded(tmp_path, 1)
+    (tmp_path / "impacts.csv").write_text("file,x,y,z\n001.wav,0,0,0\n001.wav,1,0,0\n")
+    before = contents(tmp_path)
+    for change in (lambda: editor.redo("001.wav", blow(5)), lambda: editor.remove("001.wav")):
+        with raises(RequestError, file="impacts.csv", row=3, name="001.wav", value=[2, 3]):
+            change()
+    assert contents(tmp_path) == before
+
+
+def test_another_tabs_recording_is_neither_overwritten_nor_removed(tmp_path: Path) -> None:
+    editor = recorded(tmp_path, 1)
+    [added] = editor.describe()["strikes"]
+    assert added["digest"] == hashlib.sha256(blow(0)).hexdigest()
+    redone = editor.redo("001.wav", blow(2), match=added["digest"])
+    assert editor.describe()["strikes"][0]["digest"] == redone["digest"] != added["digest"]
+    for change in (
+        lambda: editor.redo("001.wav", blow(3), match=added["digest"]),
+        lambda: editor.remove("001.wav", match=added["digest"]),
+    ):
+        with raises(RequestError, file="001.wav", value=added["digest"]) as refused:
+            change()
+        assert refused.value.status == 409
+    assert (tmp_path / "001.wav").read_bytes() == blow(2)
+    editor.remove("001.wav", match=redone["digest"])
+    assert not (tmp_path / "impacts.csv").exists()
+
+
+def test_a_table_of_the_users_own_keeps_unit_columns_order_and_comments(tmp_path: Path) -> None:
+    header, rows = "Name;file;z;x;y", ("first;a.wav;0;0,1;0", '"second; 2";b.wav;0;0;20', "third;c.wav;30;0;0")
+    folder = fill(tmp_path / "filled", header=header, rows=rows, settings='unit = "cm"')
+    text = f"\ufeff# by Ann\r\n{header}\r\n" + "".join(f"{row}\r\n" for row in rows)
+    (folder / "impacts.csv").write_bytes(text.encode())
+    editor = CaptureEditor(folder)
+    added = editor.add(blow(3), Contact((0.11, 0.02, 0.3)))
+    assert added["contact"] == pytest.approx((0.11, 0.02, 0.3), abs=1e-15)
+    # With decimal commas, as those before it, and in no more digits than it takes.
+    assert (folder / "impacts.csv").read_bytes().decode() == f"{text};001.wav;30,0;11,0;2,0\r\n"
+    editor.remove("001.wav")
+    assert (folder / "impacts.csv").read_bytes().decode() == text
+
+
+def test_every_row_has_what_the_table_has_columns_for(tmp_path: Path) -> None:
+    editor = recorded(tmp_path, 1)
+    with raises(RequestError, file=tmp_path / "impacts.csv", name="direction"):
+        editor.add(blow(), contact(0.2, direction=None))
+    forced = recorded(tmp_path / "forced", 0)
+    forced.add(blow(), Contact((0.1, 0.0, 0.0), None, 12.5))
+    with raises(RequestError, file=tmp_path / "forced" / "impacts.csv", name="force"):
+        forced.add(blow(), contact(0.2, direction=None))
+    assert table(tmp_path / "forced")[1] == ["001.wav", "0.1", "0.0", "0.0", "12.5"]
+
+
+@pytest.mark.parametrize(
+    ("query", "name", "value"),
+    [
+        ({}, "contact", None),
+        ({"x": "1", "y": "2"}, "z", None),
+        ({"x": "=HYPERLINK()", "y": "0", "z": "0"}, "x", "=HYPERLINK()"),
+        ({"x": "nan", "y": "0", "z": "0"}, "x", "nan"),
+        ({"x": "1e9", "y": "0", "z": "0"}, "contact", (1e9, 0.0, 0.0)),
+        ({"x": "0", "y": "0", "z": "0", "nx": "1"}, "ny", None),
+        ({"x": "0", "y": "0", "z": "0", "nx": "0", "ny": "0", "nz": "0"}, "direction", (0.0, 0.0, 0.0)),
+        ({"x": "0", "y": "0", "z": "0", "newtons": "-3"}, "newtons", -3.0),
+    ],
+)
+def test_contacts_are_numbers_and_nothing_else(query: dict[str, str], name: str, value: object) -> None:
+    with raises(RequestError, name=name, value=value) as refused:
+        Contact.read(query)
+    assert refused.value.status == 400
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"RIFF\x00\x00\x00\x00WAVE",
+        b"<html>",
+        wav(np.zeros(4000)),
+        wav(ring(0.01)),
+        wav(np.full(4000, np.nan)),
+        wav(np.stack([ring(seed=0), ring(seed=1)], axis=1)),
+        blow()[:60],
+    ],
+    ids=["empty", "header", "page", "silent", "short", "NaN", "channels", "truncated"],
+)
+def test_a_recording_that_cannot_be_used_is_refused(tmp_path: Path, content: bytes) -> None:
+    editor = recorded(tmp_path, 0)
+    for act in (lambda: editor.check(content), lambda: editor.add(content, contact(0.1))):
+        with pytest.raises(CaptureError):
+            act()
+    assert [path.name for path in contents(tmp_path)] == ["capture.lock"]
+
+
+def test_a_recording_that_is_long_beyond_use_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("avmsf.capture.audio.MAX_SAMPLES", 1000)
+    with pytest.raises(RequestError) as refused:
+        recorded(tmp_path, 0).add(blow(), contact(0.1))
+    assert refused.value.status == 413
+
+
+def test_another_rate_is_refused_at_once(tmp_path: Path) -> None:
+    editor = recorded(tmp_path, 1)
+    with raises(CaptureError, name="sample_rate", value=16000.0):
+        editor.check(wav(ring(rate=16000), rate=16000))
+    # Where it is the only one it may change.
+    assert editor.redo("001.wav", wav(ring(rate=16000), rate=16000))["sample_rate"] == 16000
+
+
+def test_another_format_becomes_a_wav_of_the_same_samples(tmp_path: Path) -> None:
+    sound = np.round(ring(before=0.1) * 32768) / 32768
+    recorded(tmp_path, 0).add(wav(sound, subtype="PCM_16", kind="FLAC"), contact(0.1))
+    content = (tmp_path / "001.wav").read_bytes()
+    assert content[:4] == b"RIFF"
+    samples, rate = soundfile.read(io.BytesIO(content))
+    assert rate == 8000
+    assert np.array_equal(samples, sound)
+
+
+def test_a_recording_of_another_format_is_redone_as_a_wav_of_its_own_name(tmp_path: Path) -> None:
+    before = wav(ring(before=0.1), subtype="PCM_16", kind="FLAC")
+    for name, content in (("hit.flac", before), ("hit2.flac", before), ("hit2.wav", blow(4))):
+        (tmp_path / name).write_bytes(content)
+    (tmp_path / "impacts.csv").write_text("file,x,y,z,note\nhit.flac,0,0,0,a  b\nhit2.flac,0.1,0,0,\n")
+    editor = CaptureEditor(tmp_path)
+    redone = editor.redo("hit.flac", blow(6))
+    assert (redone["file"], redone["row"], redone["readable"]) == ("hit.wav", 0, True)
+    assert (tmp_path / "hit.wav").read_bytes() == blow(6)
+    assert not (tmp_path / "hit.flac").exists()
+    assert removed(tmp_path) == [before]
+    assert editor.redo("hit2.flac", blow(7))["file"] == "001.wav"
+    assert (tmp_path / "hit2.wav").read_bytes() == blow(4)
+    assert (tmp_path / "impacts.csv").read_text().splitlines()[1] == "hit.wav,0,0,0,a  b"
+
+
+@pytest.mark.parametrize("text", ["file,x,y,z\na.wav,1,2\n", "file,x,y\n"])
+def test_a_broken_table_is_left_alone(tmp_path: Path, text: str) -> None:
+    folder = fill(tmp_path / "filled")
+    (folder / "impacts.csv").write_text(text)
+    editor = CaptureEditor(folder)
+    for act in (editor.describe, lambda: editor.add(blow(), contact(0.1)), lambda: editor.remove("a.wav")):
+        with raises(CaptureError, file=folder / "impacts.csv"):
+            act()
+    assert (folder / "impacts.csv").read_text() == text
+
+
+def test_impacts_of_two_studios_at_once_are_all_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    both = threading.Barrier(2)
+    choose = CaptureEditor._next_name
+
+    def choose_at_once(self: CaptureEditor, table: ImpactTable) -> str:
+        name = choose(self, table)
+        try:
+            # Without a lock both are here at the same time, and have chosen the same name.
+            both.wait(0.5)
+        except threading.BrokenBarrierError:
+            both.reset()
+        return name
+
+    monkeypatch.setattr(CaptureEditor, "_next_name", choose_at_once)
+    added: dict[str, bytes] = {}
+
+    def strike(number: int) -> None:
+        added[CaptureEditor(tmp_path).add(blow(number), contact(0.1))["file"]] = blow(number)
+
+    studios = [threading.Thread(target=strike, args=(number,)) for number in range(2)]
+    for each in studios:
+        each.start()
+    for each in studios:
+        each.join()
+    assert sorted(row[0] for row in table(tmp_path)) == ["001.wav", "002.wav", "file"]
+    assert {name: (tmp_path / name).read_bytes() for name in ("001.wav", "002.wav")} == added
+
+
+def test_a_change_that_another_process_does_not_let_through_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(capture, "_LOCK_TIMEOUT_SECONDS", 0.1)
+    held, done = threading.Event(), threading.Event()
+
+    def hold() -> None:
+        with write_lock(tmp_path / CACHE, "capture", command="avmsf studio"):
+            held.set()
+            done.wait()
+
+    other = threading.Thread(target=hold)
+    other.start()
+    try:
+        held.wait()
+        with pytest.raises(RequestError) as refused:
+            CaptureEditor(tmp_path).add(blow(0), contact(0.1))
+    finally:
+        done.set()
+        other.join()
+    assert refused.value.status == 503
+    assert not (tmp_path / "impacts.csv").exists()
+    # Stages that are made meanwhile do not keep impacts out.
+    with write_lock(tmp_path / CACHE, "stages", command="avmsf reconstruct"):
+        assert CaptureEditor(tmp_path).add(blow(0), contact(0.1))["file"] == "001.wav"
