@@ -12,7 +12,7 @@ from avmsf.evaluation.modal_metrics import judge_modes
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.simulate.ground_truth import Truth
-from avmsf.simulate.ringing import recorded
+from avmsf.simulate.simulation import recorded
 
 RATE, COUNT = 8000.0, 10
 FREQUENCY = torch.tensor([310.0, 742.0, 880.0, 1630.0, 2900.0], dtype=torch.float64)

@@ -18,8 +18,7 @@ from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
 from avmsf.simulate.hammer import contact_times, pulse_spectrum
 from avmsf.simulate.imperfections import recording_starts, stream
 from avmsf.simulate.recipe import Hammer, Imperfections, ObjectRecipe
-from avmsf.simulate.ringing import recorded, ring
-from avmsf.simulate.simulation import Simulation, simulate_object
+from avmsf.simulate.simulation import Simulation, recorded, ring, simulate_object
 from avmsf.simulate.simulation_folder import write_simulation
 from factories.made_modes import breathing_sphere
 

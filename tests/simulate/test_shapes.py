@@ -12,8 +12,7 @@ from avmsf.errors import SimulationError
 from avmsf.photographs.mesh_views import UNLIT, orbit_cameras, render_views
 from avmsf.simulate.shapes import KINDS, Shape, make_shape, textured
 from avmsf.simulate.shapes.body import Body
-from avmsf.simulate.shapes.profile import Profile
-from avmsf.simulate.shapes.turned import Turned
+from avmsf.simulate.shapes.turned import Profile, Turned
 from factories.raising import raises
 
 HANDLES = {"mug": 1, "jug": 1, "bracket": 2, "tube": 1}

@@ -10,7 +10,7 @@ import pytest
 import torch
 import trimesh
 
-import avmsf.simulate.simulation_set as simulationset
+import avmsf.simulate.simulation_folder as simulationset
 from avmsf._utils.caching import key_of
 from avmsf.capture import read_capture
 from avmsf.cli import simulate
@@ -23,8 +23,7 @@ from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
 from avmsf.simulate.recipe import Imperfections, ObjectRecipe
 from avmsf.simulate.sim20 import sim20_recipe
 from avmsf.simulate.simulation import Simulation, simulate_object
-from avmsf.simulate.simulation_folder import is_written, write_simulation, write_textured
-from avmsf.simulate.simulation_set import simulate_set
+from avmsf.simulate.simulation_folder import is_written, simulate_set, write_simulation, write_textured
 from avmsf.simulate.strikes import STEEPEST, draw_strikes, nearest_on
 from factories.raising import raises
 

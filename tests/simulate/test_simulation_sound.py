@@ -18,9 +18,7 @@ from avmsf.fem.radiated_sound import AIR_DENSITY, SOUND_SPEED, radiated
 from avmsf.simulate.hammer import contact_times, peak_forces, pulse_spectrum
 from avmsf.simulate.imperfections import damping_matrix, smooth_field, stream, support_places
 from avmsf.simulate.recipe import Hammer, Imperfections
-from avmsf.simulate.ringing import ring
-from avmsf.simulate.room_noise import room_noise
-from avmsf.simulate.sounding_body import SoundingBody
+from avmsf.simulate.simulation import SoundingBody, ring, room_noise
 from factories.made_modes import breathing_sphere, sliding_plate
 from factories.raising import raises
 

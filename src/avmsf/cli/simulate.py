@@ -11,7 +11,7 @@ from avmsf.fem.material import MATERIALS
 from avmsf.simulate.recipe import ObjectRecipe
 from avmsf.simulate.shapes import KINDS
 from avmsf.simulate.sim20 import NON_SYMMETRIC, SET, SIM20
-from avmsf.simulate.simulation_set import SetProgress, simulate_set
+from avmsf.simulate.simulation_folder import SetProgress, simulate_set
 
 
 def run(options: Options) -> int:

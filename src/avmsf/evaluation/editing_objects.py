@@ -40,10 +40,8 @@ from avmsf.modal.extraction.finders import ShortTime
 from avmsf.modal.residual_noise import Residual
 from avmsf.simulate.imperfections import stream
 from avmsf.simulate.recipe import Hammer
-from avmsf.simulate.ringing import ring
 from avmsf.simulate.shapes import make_shape
-from avmsf.simulate.simulation import HIGHEST
-from avmsf.simulate.sounding_body import SoundingBody
+from avmsf.simulate.simulation import HIGHEST, SoundingBody, ring
 
 _CERAMIC = ("3_CeramicKoiBowl", "4_CeramicBowlFish", "9_BowlCeramic", "61_PlanterCeramic", "63_SmallPlanterCeramic",
             "64_CeramicMug", "65_PitcherCeramic")  # fmt: skip

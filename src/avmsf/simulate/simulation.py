@@ -5,8 +5,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
-from jaxtyping import Float32, Float64
+from jaxtyping import Complex128, Float32, Float64
+from scipy.fft import irfft, next_fast_len
 from torch import Tensor
 
 from avmsf.capture.audio import Recording
@@ -15,18 +17,152 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.prepare import prepare
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.starts import cut_together, shorten
-from avmsf.fem.damping import damped
+from avmsf.fem.damping import Vibration, damped
+from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.radiated_sound import radiated, travel_time
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.simulate.bodies import Body, make_body, up_of
 from avmsf.simulate.ground_truth import Truth
+from avmsf.simulate.hammer import contact_times, peak_forces, pulse_spectrum
 from avmsf.simulate.imperfections import damping_matrix, recording_starts, stream
-from avmsf.simulate.recipe import ObjectRecipe
-from avmsf.simulate.ringing import recorded
-from avmsf.simulate.room_noise import room_noise
-from avmsf.simulate.sounding_body import SoundingBody
+from avmsf.simulate.recipe import Hammer, ObjectRecipe
 from avmsf.simulate.strikes import Strikes, draw_strikes
+
+_BLOCK = 512
+"""Samples between which all phases are computed anew."""
+
+
+def recorded(
+    poles: Complex128[Tensor, " modes"],
+    amplitudes: Complex128[Tensor, "contacts modes"],
+    starts: Float64[Tensor, " contacts"],
+    *,
+    sample_rate: float,
+    samples: int,
+) -> Float64[Tensor, "contacts samples"]:
+    """Return what `ring` gives for recordings whose sounds start at the samples `starts`, and zero before.
+
+    Starts may lie between samples: amplitudes are those at the start, and each sample has the sound's exact value at
+    its time after it. Nothing is interpolated. Of a sound that starts before the recording (negative), the rest is
+    heard.
+    """
+    first = starts.ceil().clamp(min=0.0)
+    late = (first - starts) / sample_rate
+    sounds = ring(poles, amplitudes * torch.exp(poles * late[:, None]), sample_rate=sample_rate, samples=samples)
+    whole = torch.zeros_like(sounds)
+    for row, begin in enumerate(first.long().tolist()):
+        whole[row, begin:] = sounds[row, : samples - begin]
+    return whole
+
+
+def ring(
+    poles: Complex128[Tensor, " modes"],
+    amplitudes: Complex128[Tensor, "contacts modes"],
+    *,
+    sample_rate: float,
+    samples: int,
+) -> Float64[Tensor, "contacts samples"]:
+    """Return the real part of the sum over modes of amplitude times exp(pole t), from t = 0.
+
+    Poles are -d + 2 pi i f. exp(s (m K + k) / rate) = exp(s m K / rate) exp(s k / rate): two small tables and one
+    product of matrices.
+    """
+    blocks = math.ceil(samples / _BLOCK)
+    within = torch.exp(poles[:, None] * (torch.arange(_BLOCK, dtype=torch.float64) / sample_rate))
+    starts = torch.exp(poles[None, :] * (_BLOCK * torch.arange(blocks, dtype=torch.float64)[:, None] / sample_rate))
+    weights = (amplitudes[:, None, :] * starts[None]).reshape(-1, len(poles))
+    sounds = torch.cat([weights.real, -weights.imag], dim=1) @ torch.cat([within.real, within.imag])
+    return sounds.reshape(len(amplitudes), -1)[:, :samples].contiguous()
+
+
+PINK, RUMBLE, WHITE = 0.5, 0.4, 0.1
+"""Parts of the noise's power: of the room, of the building, of the recorder."""
+LOWEST = 20.0
+"""Hz below which the spectrum does not grow any more."""
+
+
+def room_noise(
+    count: int, samples: int, *, sample_rate: float, generator: np.random.Generator
+) -> Float64[np.ndarray, "contacts samples"]:
+    """Return Gaussian noise with a root mean square of 1 on average, each row by itself.
+
+    Half of its power is pink, 1/f; four tenths are the rumble of a building, 1/f^3; a tenth is white.
+    """
+    size = next_fast_len(samples, real=True)
+    level = noise_levels(size, sample_rate=sample_rate)
+    # A row at a time: what is drawn for one does not depend on how many follow.
+    rows = []
+    for _ in range(count):
+        spectrum = generator.standard_normal(len(level)) + 1j * generator.standard_normal(len(level))
+        rows.append(irfft(level * spectrum, size)[:samples])
+    return np.stack(rows)
+
+
+def noise_levels(size: int, *, sample_rate: float) -> Float64[np.ndarray, " bins"]:
+    """Return what the bins of `rfft` over `size` samples are multiplied by: no offset, unit power in all."""
+    frequency = np.fft.rfftfreq(size, 1.0 / sample_rate)
+    bounded = np.maximum(frequency, LOWEST)
+    power = np.zeros(len(frequency))
+    for part, exponent in ((PINK, -1.0), (RUMBLE, -3.0), (WHITE, 0.0)):
+        shape = bounded**exponent
+        shape[0] = 0.0
+        power += part * shape / shape.sum()
+    # A bin of unit variance in its real and its imaginary part has 4 / size^2 of power, for it counts twice.
+    return size * np.sqrt(power / 4.0)
+
+
+@dataclass(frozen=True, eq=False)
+class SoundingBody:
+    """Elastic modes, how they die away, and how they are heard."""
+
+    elastic: ElasticModes
+    vibration: Vibration
+    heard: Complex128[Tensor, " modes"]
+    """Pressure of each damped mode for a push of one newton second on it alone, pascals."""
+    hammer: Hammer
+    delay: float = 0.0
+    """Time that sound takes from the nearest point of the surface to the microphone, seconds."""
+
+    def gains(
+        self,
+        places: Float64[Tensor, "contacts 3"],
+        directions: Float64[Tensor, "contacts 3"],
+        *,
+        speeds: Float64[Tensor, " contacts"] | None = None,
+        contact_times: Float64[Tensor, " contacts"] | None = None,
+    ) -> Complex128[Tensor, "contacts modes"]:
+        """Return amplitudes A, pascals per newton of peak force: a blow sounds as the real part of A exp(pole t).
+
+        `places` are taken to the nearest points of the surface; `directions` are unit vectors; `speeds` are relative
+        to the hammer's and `contact_times` to those of these speeds, 1 without them. Time counts from when the sound of
+        the hammer's first touch arrives at the microphone, and the sound is the one that goes on once the hammer has
+        left, continued back to that moment.
+        """
+        times = self.times(self._speeds(places, speeds))
+        if contact_times is not None:
+            times = contact_times * times
+        pushed = self.elastic.gains(places, directions).to(torch.complex128) @ self.vibration.pushes.T
+        return 2.0 * pushed * self.heard * pulse_spectrum(self.hammer, self.vibration.poles, times)
+
+    def times(self, speeds: Float64[Tensor, " contacts"]) -> Float64[Tensor, " contacts"]:
+        """Return how long the hammer stays on the body, seconds, for speeds in m/s."""
+        return contact_times(self.hammer, self.elastic.material, mass=self.elastic.mass, speeds=speeds)
+
+    def forces(
+        self, speeds: Float64[Tensor, " contacts"], contact_times: Float64[Tensor, " contacts"] | None = None
+    ) -> Float64[Tensor, " contacts"]:
+        """Return the peak force of blows of these relative speeds and contact times, newtons."""
+        speeds = self.hammer.speed * speeds
+        times = self.times(speeds) if contact_times is None else contact_times * self.times(speeds)
+        return peak_forces(self.hammer, mass=self.elastic.mass, speeds=speeds, times=times)
+
+    def _speeds(
+        self, places: Float64[Tensor, "contacts 3"], speeds: Float64[Tensor, " contacts"] | None
+    ) -> Float64[Tensor, " contacts"]:
+        relative = torch.ones(len(places), dtype=torch.float64) if speeds is None else speeds
+        return self.hammer.speed * relative
+
 
 HIGHEST = 0.45
 """Frequency over the sample rate up to which modes sound: what an ordinary recorder's filter lets pass."""

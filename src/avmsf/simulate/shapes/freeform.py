@@ -5,10 +5,8 @@ import itertools
 import numpy as np
 
 from avmsf.simulate.shapes.body import Body
-from avmsf.simulate.shapes.maker import Draft, drawn_wall
-from avmsf.simulate.shapes.profile import Profile
-from avmsf.simulate.shapes.shape import Symmetry
-from avmsf.simulate.shapes.turned import Turned
+from avmsf.simulate.shapes.shape import Draft, Symmetry, drawn_wall
+from avmsf.simulate.shapes.turned import Profile, Turned
 
 _CORE, _SHELLS = (10, 5, 3), 3
 """Boxes along each side of a blob's core, and layers around it."""

@@ -14,8 +14,7 @@ from avmsf.mesh.surface import Surface
 from avmsf.simulate.shapes.decor import glaze
 from avmsf.simulate.shapes.freeform import blob, dish
 from avmsf.simulate.shapes.handled import jug, mug, skillet
-from avmsf.simulate.shapes.maker import Draft, Maker
-from avmsf.simulate.shapes.shape import Shape
+from avmsf.simulate.shapes.shape import Draft, Maker, Shape
 from avmsf.simulate.shapes.strips import bracket, platter, spoon, tray
 from avmsf.simulate.shapes.vessels import bell, bowl, fluted, goblet, plate, pot, tube
 

@@ -1,7 +1,9 @@
 """An object made by rule, and what is known of it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
@@ -9,6 +11,7 @@ from torch import Tensor
 from avmsf.fem.solid import Solid
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh
+from avmsf.simulate.shapes.body import Body
 
 
 def _origin() -> Tensor:
@@ -63,3 +66,23 @@ def textured(shape: Shape) -> TexturedMesh:
     """Return a shape's surface in its colors, to render it with `avmsf.photographs.mesh_views.render_views`."""
     faces = shape.surface.faces
     return TexturedMesh.build(shape.surface.vertices, faces, colors=shape.colors[faces])
+
+
+@dataclass(frozen=True, eq=False)
+class Draft:
+    """A shape without its colors."""
+
+    body: Body
+    wall: float
+    """Nominal thickness, meters."""
+    symmetry: Symmetry
+
+
+Maker = Callable[[np.random.Generator, float | None], Draft]
+"""Draws the proportions of one individual; walls as thick as told, meters, or drawn too."""
+
+
+def drawn_wall(random: np.random.Generator, low: float, high: float, wall: float | None) -> float:
+    """Return the wall that was asked for, or one between two bounds, meters; draws in both cases."""
+    drawn = random.uniform(low, high)
+    return drawn if wall is None else wall

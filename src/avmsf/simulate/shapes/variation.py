@@ -11,7 +11,7 @@ from scipy.sparse.linalg import splu
 from avmsf.errors import SimulationError
 from avmsf.fem.solid import Solid
 from avmsf.simulate.imperfections import smooth_field
-from avmsf.simulate.shapes.sheet import mitred_normals
+from avmsf.simulate.shapes.body import mitred_normals
 
 MOST = 0.5
 """Largest variation."""

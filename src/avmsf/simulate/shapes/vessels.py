@@ -6,10 +6,8 @@ import numpy as np
 import torch
 
 from avmsf.simulate.shapes.body import Body
-from avmsf.simulate.shapes.maker import Draft, drawn_wall
-from avmsf.simulate.shapes.profile import Profile
-from avmsf.simulate.shapes.shape import Symmetry
-from avmsf.simulate.shapes.turned import Turned, Warp
+from avmsf.simulate.shapes.shape import Draft, Symmetry, drawn_wall
+from avmsf.simulate.shapes.turned import Profile, Turned, Warp
 
 _UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 _STEM_LAYERS = 16
