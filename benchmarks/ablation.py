@@ -24,8 +24,8 @@ from avmsf.field.gains.estimator import FAMILIES, POSITIONAL, MixtureEstimator
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.recipes import GainCase
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.pipeline.bodies import candidate_bodies, roughened
 from avmsf.pipeline.config import BodyConfig

@@ -37,8 +37,8 @@ from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.localization.locator import Locator
 from avmsf.mesh import Surface
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import extract_modes
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
 from avmsf.simulate.sim20 import sim20_recipe
 from avmsf.simulate.simulation import simulate_object

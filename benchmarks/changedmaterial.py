@@ -23,7 +23,7 @@ from avmsf.field.gains.model import MixtureGains, series_of
 from avmsf.field.gains.positional import Smooth
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from benchmarks.fem import bowl
 from benchmarks.report import Options, Report, Table, log

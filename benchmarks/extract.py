@@ -12,9 +12,9 @@ from avmsf.capture import Impacts
 from avmsf.errors import ExtractionError
 from avmsf.evaluation.metrics import default_fft_sizes, relative_stft_error
 from avmsf.evaluation.simple_methods import floor
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import extract_modes, extract_sounds
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder, ShortTime
+from avmsf.modal.modes import ModalBank
 from benchmarks.material import IMPULSE, clips_in_place
 from benchmarks.report import Options, Report, Table, log
 from tests.oracles.plate import PlateModes, plate_modes

@@ -28,8 +28,8 @@ from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.points import farthest_points
 from avmsf.localization.locator import Locator
 from avmsf.mesh import Surface
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
 from avmsf.pipeline.bodies import roughened

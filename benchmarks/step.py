@@ -26,9 +26,9 @@ from avmsf.field.losses import SpectralTarget
 from avmsf.field.training import Targets, TrainingRun, gain_scale
 from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.fit import SplatProgress, splat
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual, shape_noise
 from avmsf.modal.synthesis import synthesize
 from benchmarks.look import pictures, shape, speckled

@@ -19,7 +19,7 @@ import torch
 from avmsf.export.bundle import write_bundle
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.web import page_files
-from avmsf.modal.pulse import ForcePulse
+from avmsf.modal.modes import ForcePulse
 from avmsf.modal.residual_noise import shape_noise
 from benchmarks.report import Options, Report, Table, show
 

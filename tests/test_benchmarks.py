@@ -15,7 +15,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 # The benchmarks are no part of the package, and `python -m benchmarks` finds them from the repository's root alone.
 sys.path.insert(0, str(REPOSITORY))
 
-from avmsf.modal.bank import ModalBank  # noqa: E402
+from avmsf.modal.modes import ModalBank  # noqa: E402
 from benchmarks import field, speed  # noqa: E402
 from benchmarks.__main__ import main  # noqa: E402
 from benchmarks.extract import Match  # noqa: E402

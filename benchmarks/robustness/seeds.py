@@ -30,7 +30,7 @@ from avmsf.field.store import save
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import write_splats
 from avmsf.mesh import Surface
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 
 RATE = 8000

@@ -22,7 +22,7 @@ import torch
 
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from benchmarks.robustness.seeds import mixture_gains
 

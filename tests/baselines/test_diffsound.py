@@ -26,7 +26,7 @@ from avmsf.fem.body_family import BodyFamily, body_family
 from avmsf.fem.isotropic import isotropic_modes
 from avmsf.fem.material import GLASS
 from avmsf.mesh.surface import Surface
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.modal.spectra import magnitude_stft
 from avmsf.modal.synthesis import synthesize

@@ -25,7 +25,7 @@ from avmsf.fem.material import CERAMIC, GLASS, STEEL, WOOD
 from avmsf.field.gains.family import Sites
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.plotting.edit_spectra import HeardModes
 from factories.made_audio import save_audio

@@ -28,7 +28,7 @@ from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import read_splats, write_splats
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from factories.believing_field import ELASTIC, bar, bar_points
 from factories.capture_folder import fill

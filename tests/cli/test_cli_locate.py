@@ -18,7 +18,7 @@ from avmsf.errors import LocationError
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.localization.locator import Locator
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
 from factories.made_fields import BANK, positional

@@ -8,7 +8,7 @@ import soundfile
 import torch
 
 from avmsf.cli import main
-from avmsf.modal.pulse import ForcePulse
+from avmsf.modal.modes import ForcePulse
 from factories.made_fields import positional, saved, sounding
 
 PLACE = torch.tensor([[0.05, 0.03, 0.002]], dtype=torch.float64)

@@ -15,7 +15,7 @@ from avmsf.fem.material import CERAMIC, WOOD
 from avmsf.field.scaled_gains import ScaledGains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from factories.made_fields import BANK, FIELDS, places
 from factories.raising import raises

@@ -20,7 +20,7 @@ from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.positional import Smooth
 from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
 from avmsf.field.store import load, save
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from factories.raising import raises
 from oracles.block import block

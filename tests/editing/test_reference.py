@@ -17,7 +17,7 @@ from avmsf.editing.start_search import heard_spectrum
 from avmsf.errors import AvmsfWarning, EditError
 from avmsf.fem.material import CERAMIC, WOOD
 from avmsf.field.gain_field import Gains
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from factories.raising import raises, warns
 from factories.ringing_field import RATE, SameGains, ringing_field, sound_of
 

@@ -18,9 +18,9 @@ from avmsf.evaluation.renderer import Renderer, expect_renderer
 from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor, sine_floor
 from avmsf.evaluation.splits import Scores, evaluate, score, split
 from avmsf.gaussians.points import farthest_points
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_gains
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
 from factories.raising import raises

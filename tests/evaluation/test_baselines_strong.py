@@ -11,8 +11,8 @@ from avmsf.errors import EvaluationError
 from avmsf.evaluation.interpolation import SplineGains
 from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform
 from avmsf.evaluation.spectral_mean import MeanSpectra
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from factories.raising import raises
 from oracles.plate import Plate, plate_modes, sample_contacts

@@ -48,9 +48,9 @@ from avmsf.evaluation.mode_features import PitchesAndRings
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import GLASS, MATERIALS, STEEL, WOOD
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import extract_sounds
 from avmsf.modal.extraction.finders import ShortTime
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
 from factories.made_audio import save_audio
 from factories.made_clap import save_clap

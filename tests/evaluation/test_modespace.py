@@ -12,7 +12,7 @@ import torch
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.mode_embedding import MaterialSpace, UmapSettings
 from avmsf.evaluation.mode_features import ModeFeatures, Pitches, PitchesAndRings, features_of
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from factories.raising import raises
 
 FEATURES = (Pitches(), PitchesAndRings())

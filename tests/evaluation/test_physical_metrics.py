@@ -8,7 +8,7 @@ import torch
 
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.modal_metrics import ModalRenderer, judge_modes, match_modes
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
 from avmsf.simulate.ground_truth import Truth
 from factories.raising import raises

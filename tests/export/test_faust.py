@@ -13,7 +13,7 @@ import torch
 from avmsf.errors import ExportError
 from avmsf.export.faust import contacts_path, faust_library, write_faust
 from avmsf.export.sampled_field import SampledField
-from avmsf.modal.pulse import ForcePulse
+from avmsf.modal.modes import ForcePulse
 from factories.made_tables import POINTS, RATE, SAMPLES, apart, table
 from factories.raising import raises
 

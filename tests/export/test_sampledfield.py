@@ -13,8 +13,7 @@ from avmsf.export.sampled_field import SampledField
 from avmsf.field.config import FitConfig
 from avmsf.field.scaled_gains import ScaledGains
 from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
-from avmsf.modal.bank import ModalBank
-from avmsf.modal.pulse import ForcePulse
+from avmsf.modal.modes import ForcePulse, ModalBank
 from avmsf.modal.residual_noise import Residual
 from factories.made_fields import BANK, FIELDS, elastic, places, plate, positional
 from factories.raising import raises

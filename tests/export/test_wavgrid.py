@@ -14,7 +14,7 @@ import torch
 
 from avmsf.errors import ExportError
 from avmsf.export.samples import Grid, Layer, hertz_layers, write_grid
-from avmsf.modal.pulse import ForcePulse
+from avmsf.modal.modes import ForcePulse
 from factories.made_tables import RATE, SAMPLES, apart, table
 from factories.raising import raises
 

@@ -15,7 +15,7 @@ from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.sound_field import Origin, SoundField
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 
 LENGTH, WIDTH = 0.4, 0.1

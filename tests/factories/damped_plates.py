@@ -10,7 +10,7 @@ from torch import Tensor
 from avmsf.field.gain_field import Gains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.localization.locator import Locator
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from factories.unsaved_gains import Unsaved
 from oracles.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike

@@ -14,8 +14,8 @@ from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.localization.contact_map import ContactMap
 from avmsf.localization.locator import Locator
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.least_squares import fit_gains
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from factories.unsaved_gains import Unsaved
 from oracles.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike

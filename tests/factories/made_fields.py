@@ -20,7 +20,7 @@ from avmsf.field.gains.model import MixtureGains
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from factories.made_modes import sliding_plate
 

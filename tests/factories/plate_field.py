@@ -7,8 +7,8 @@ import torch
 from avmsf.capture.impacts import Impacts
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from oracles.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
 

@@ -7,7 +7,7 @@ import torch
 
 from avmsf.field.gain_field import GainField, Gains
 from avmsf.field.sound_field import Origin, SoundField
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 
 RATE = 8000.0

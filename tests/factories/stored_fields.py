@@ -23,8 +23,8 @@ from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.scaled_gains import ScaledGains
 from avmsf.field.sound_field import Origin, SoundField
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.alignment import align
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.symmetry.characters import Group
 from factories.made_modes import breathing_sphere

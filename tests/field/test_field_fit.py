@@ -18,9 +18,9 @@ from avmsf.field.losses import spectral_loss
 from avmsf.field.recipes import Attention
 from avmsf.field.sound_field import SoundField
 from avmsf.field.training import Targets, TrainingRun
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize_phased
 from factories.plate_field import PLATE, QUICK, RATE, plate_extraction, plate_features, plate_impacts
 from factories.raising import raises

@@ -22,7 +22,7 @@ from avmsf.field.uncertainty import (
     unedited_mixture,
 )
 from avmsf.localization.locator import Locator
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.plotting.uncertainty import draw_band, draw_doubt
 from factories.believing_field import (

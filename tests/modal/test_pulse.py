@@ -8,7 +8,7 @@ import torch
 from scipy.integrate import quad
 
 from avmsf.errors import SimulationError
-from avmsf.modal.pulse import ForcePulse
+from avmsf.modal.modes import ForcePulse
 from avmsf.modal.synthesis import synthesize
 from factories.raising import raises
 

@@ -18,9 +18,9 @@ from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.estimator import MixtureEstimator, estimator_for, gain_variance
 from avmsf.field.recipes import GainCase, gain_case
 from avmsf.mesh.surface import Surface
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize_phased
 from avmsf.pipeline.bodies import candidate_bodies

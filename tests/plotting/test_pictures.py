@@ -9,7 +9,7 @@ import torch
 from matplotlib.collections import LineCollection
 
 from avmsf.errors import EvaluationError
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from avmsf.plotting.pictures import draw_gains, draw_modes, draw_scores, draw_spectrograms, save_picture
 from factories.raising import raises
 

@@ -8,8 +8,8 @@ from avmsf.capture import read_capture
 from avmsf.capture.audio import read_sound
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.textured_mesh import TexturedMesh
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.least_squares import fit_gains
+from avmsf.modal.modes import ModalBank
 from avmsf.photographs import read_views
 from avmsf.photographs.mesh_views import MeshTracer
 from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER, example_mesh

@@ -13,7 +13,7 @@ import torch
 from avmsf.export.bundle import make_bundle, write_bundle
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.web import single_file
-from avmsf.modal.pulse import ForcePulse
+from avmsf.modal.modes import ForcePulse
 from avmsf.modal.synthesis import synthesize
 from factories.struck_table import RATE, struck_table
 

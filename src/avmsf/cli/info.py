@@ -25,7 +25,7 @@ from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
 from avmsf.field.uncertainty import has_posterior, relative_gain_std, spectrum_band, training_contacts
 from avmsf.gaussians.points import farthest_points
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from avmsf.pipeline.record import RECORD, modes_words, recorded
 
 _DRAWN_POINTS, _LISTED_POINTS = 4000, 500

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from avmsf._utils.wording import counted
 from avmsf.cli.printing import decimals, figure, table
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.quality import ModeQuality
+from avmsf.modal.modes import ModalBank
 
 _LISTED = 20
 """Modes in a table, those of most energy."""

@@ -18,7 +18,7 @@ from avmsf.cli.writing import Level, write_sound
 from avmsf.errors import PositionWarning
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
-from avmsf.modal.pulse import ForcePulse
+from avmsf.modal.modes import ForcePulse
 
 _MUCH_SOFTER = 20.0
 """Decibels below the recorded impact from which a softer hammer's sound is noted."""

@@ -13,7 +13,7 @@ from avmsf.errors import EditError
 from avmsf.field.scaled_gains import ScaledGains
 from avmsf.field.sound_field import SoundField
 from avmsf.field.uncertainty import scale_of
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 
 EDITS = "edits"
 """Key of a field's report that lists its edits, in order."""

@@ -20,7 +20,7 @@ from avmsf.editing.edits import EDITS, edited, muted
 from avmsf.errors import EditError
 from avmsf.fem.material import Material, material_named
 from avmsf.field.sound_field import Origin, SoundField
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from avmsf.errors import EditError
 from avmsf.fem.material import MATERIALS, Material
 from avmsf.field.probable_body import ProbableBody
 from avmsf.field.sound_field import SoundField
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 
 _CLOSE = 1.2
 """Ratio of the errors up to which the second-best material is as likely."""

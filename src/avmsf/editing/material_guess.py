@@ -10,7 +10,7 @@ from torch import Tensor
 
 from avmsf.editing.material import rayleigh_damping
 from avmsf.fem.material import MATERIALS, Material
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 
 FITS = 1.5
 """By which factor, up or down, the middle one of a field's dampings may miss a law that is said to fit."""

@@ -15,7 +15,7 @@ from avmsf.editing.reference import Reference
 from avmsf.errors import EditError
 from avmsf.fem.material import Material
 from avmsf.field.sound_field import SoundField
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
 
 _QUANTILES = 64

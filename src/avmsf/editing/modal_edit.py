@@ -12,7 +12,7 @@ from avmsf.editing.edits import edited
 from avmsf.errors import EditError
 from avmsf.field.gain_field import Gains
 from avmsf.field.sound_field import SoundField
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize_phased
 
 

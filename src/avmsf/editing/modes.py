@@ -12,7 +12,7 @@ from avmsf.editing.edits import edited
 from avmsf.errors import EditError
 from avmsf.field.scaled_gains import fitted_gains
 from avmsf.field.sound_field import SoundField
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 
 Slider = float | Sequence[float] | Float[Tensor, " modes"]
 """One value for all modes, or one for each."""

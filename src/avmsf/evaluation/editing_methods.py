@@ -22,9 +22,9 @@ from avmsf.evaluation.editing_objects import amplitudes_of, heard_modes
 from avmsf.evaluation.editing_tasks import EditTask
 from avmsf.fem.material import MATERIALS
 from avmsf.field.sound_field import SoundField
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import extract_sounds
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder, ShortTime
+from avmsf.modal.modes import ModalBank
 
 GENERATED = 3.0
 """Seconds of a sound that is generated from a prompt only."""

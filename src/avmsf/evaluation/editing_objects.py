@@ -34,9 +34,9 @@ from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import Attention, GainRecipe
 from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.points import farthest_points
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction, extract_modes, extract_sounds
 from avmsf.modal.extraction.finders import ShortTime
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.simulate.imperfections import stream
 from avmsf.simulate.recipe import Hammer

@@ -11,9 +11,9 @@ from scipy.optimize import minimize_scalar
 from avmsf.capture.impacts import Impacts
 from avmsf.datasets.dataset import Dataset
 from avmsf.errors import EvaluationError
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.least_squares import NormalEquations
 from avmsf.modal.inner_products import poles_of
+from avmsf.modal.modes import ModalBank
 from avmsf.simulate.ground_truth import TRUTH, Truth, read_truth
 
 LONGEST_DELAY = 0.005

@@ -11,8 +11,8 @@ from torch import Tensor
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
 from avmsf.field.recipes import orientation_signs
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import shape_noise
 from avmsf.modal.synthesis import synthesize
 

@@ -26,7 +26,7 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from avmsf.errors import EvaluationError
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from avmsf.simulate.ground_truth import Truth
 
 Amplitudes = Complex128[Tensor, "contacts modes"]

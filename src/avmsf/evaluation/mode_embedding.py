@@ -25,7 +25,7 @@ from avmsf._utils.files import write_whole
 from avmsf._utils.text_files import read_json
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.mode_features import ModeFeatures, Pitches, features_of
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 
 FORMAT = 1
 """Number of the file's format; it grows with every change that older versions could not read."""

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float64
 
 from avmsf.errors import EvaluationError
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 
 
 class ModeFeatures(ABC):

@@ -6,9 +6,9 @@ import torch
 
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import FitError
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.finders import lowest_frequency
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 
 _MAX_FREQUENCY = 0.9

@@ -18,8 +18,8 @@ from avmsf.errors import EvaluationError
 from avmsf.evaluation.modal_baselines import ModalBaseline
 from avmsf.field.gains.family import Sites, nearest_sites
 from avmsf.gaussians.points import nearest_points
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.least_squares import fit_gains, fit_sine_gains
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Float32, Float64, Int
 from torch import Tensor
 
 from avmsf.export.sampled_field import SampledField
-from avmsf.modal.phase import common_phase
+from avmsf.modal.modes import common_phase
 from avmsf.modal.spectra import magnitude_stft
 from avmsf.modal.synthesis import synthesize
 

@@ -17,7 +17,7 @@ from avmsf.field.positions import points_on_object
 from avmsf.field.scaled_gains import ScaledGains
 from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.points import farthest_points, nearest_points
-from avmsf.modal.pulse import ForcePulse
+from avmsf.modal.modes import ForcePulse
 from avmsf.modal.synthesis import synthesize
 
 _BATCH = 1024

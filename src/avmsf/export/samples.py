@@ -17,7 +17,7 @@ from avmsf.errors import ExportError
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.writing import Written, write_folder
 from avmsf.modal.config import PulseShape
-from avmsf.modal.pulse import ForcePulse
+from avmsf.modal.modes import ForcePulse
 
 TABLE, INSTRUMENT, SOUNDS = "samples.csv", "instrument.sfz", "sounds"
 _WHERE = ("x", "y", "z", "nx", "ny", "nz")

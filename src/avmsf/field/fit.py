@@ -29,9 +29,9 @@ from avmsf.field.recipes import GainCase, GainRecipe, along_phase, fingerprint, 
 from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
 from avmsf.field.training import Targets, TrainingRun
 from avmsf.gaussians.points import farthest_points
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_gains
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual, estimate_residual
 from avmsf.modal.spectra import envelope
 

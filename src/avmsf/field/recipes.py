@@ -25,7 +25,7 @@ from avmsf.field.training import gain_scale
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.finders import ShortTime
 from avmsf.modal.extraction.least_squares import fit_sine_gains
-from avmsf.modal.phase import common_phase
+from avmsf.modal.modes import common_phase
 from avmsf.modal.residual_noise import Residual, noise_power
 
 SHARED, PER_CONTACT = "shared", "per-contact"

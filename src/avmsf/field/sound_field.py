@@ -22,9 +22,8 @@ from avmsf.field.gains.model import MixtureGains
 from avmsf.field.positions import expect_near, off_surface, off_surface_gains
 from avmsf.field.probable_body import ProbableBody
 from avmsf.field.scaled_gains import fitted_gains, length_of
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.alignment import Alignment
-from avmsf.modal.pulse import ForcePulse
+from avmsf.modal.modes import ForcePulse, ModalBank
 from avmsf.modal.residual_noise import Residual, low_fluctuation_noise, shape_noise
 from avmsf.modal.synthesis import synthesize_phased
 

@@ -35,8 +35,8 @@ from avmsf.field.header import ADVICE, FORMAT, KEY, UNREADABLE, WHAT, damaged, k
 from avmsf.field.probable_body import ProbableBody
 from avmsf.field.scaled_gains import FITTED, ScaledGains
 from avmsf.field.sound_field import SUPPORTING, FieldQuality, Origin, SoundField
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.alignment import Alignment
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 
 _GAINS, _ALIGNMENT = "gains.", "alignment."

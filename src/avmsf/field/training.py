@@ -16,8 +16,8 @@ from avmsf.capture.impacts import Impacts
 from avmsf.field.config import FitConfig
 from avmsf.field.gain_field import TrainableGains
 from avmsf.field.losses import SpectralTarget, spectral_loss, spectral_target
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual, shape_noise
 from avmsf.modal.synthesis import synthesize_phased
 

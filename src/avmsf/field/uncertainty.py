@@ -17,7 +17,7 @@ from avmsf.field.gains.body import BodyGains
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.scaled_gains import ScaledGains, fitted_gains
 from avmsf.field.sound_field import SoundField
-from avmsf.modal.phase import turned_like
+from avmsf.modal.modes import turned_like
 from avmsf.modal.synthesis import synthesize_phased
 
 LEVEL = 0.9

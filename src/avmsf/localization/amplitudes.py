@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Complex128, Float, Float64, Int64
 from torch import Tensor
 
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.inner_products import gram, poles_of, project
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
 

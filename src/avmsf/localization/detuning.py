@@ -11,8 +11,8 @@ from jaxtyping import Complex128, Float, Float64
 from torch import Tensor
 
 from avmsf.localization.amplitudes import Extractor
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.inner_products import poles_of, project
+from avmsf.modal.modes import ModalBank
 
 DETUNINGS = (0.9, 0.95, 1.05, 1.1)
 """Factors on all frequencies: 5 % is a half-power bandwidth of a mode that turns six times while it falls to 1/e."""

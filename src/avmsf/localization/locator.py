@@ -24,7 +24,7 @@ from avmsf.localization.prediction import calibration_factor, local_variance, pr
 from avmsf.localization.preprocess import not_finite, silent, too_short
 from avmsf.localization.smoothing import distinct_contacts, smoothing_matrix
 from avmsf.localization.tempering import calibrate_tempering
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 
 _UNIT = 1e-3
 """How far a direction's length may be from one."""

@@ -34,7 +34,7 @@ from avmsf.localization.preprocess import (
     read_if_path,
     settings_for,
 )
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
 
 _GUARD_SECONDS = 0.005

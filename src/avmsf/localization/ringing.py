@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Complex128, Float, Float64
 from torch import Tensor
 
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.inner_products import gram, poles_of
+from avmsf.modal.modes import ModalBank
 
 _QUIET = 1e-12
 """Noise over the power of what is fitted, that is assumed at least: rounding."""

@@ -22,7 +22,7 @@ from avmsf.localization.contact_map import ContactMap
 from avmsf.localization.locate import assess_match
 from avmsf.localization.locator import Locator
 from avmsf.localization.ringing import Ringing
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 
 WINDOW_SECONDS = 0.04
 """Length of an impact's sound that its first estimate uses."""

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Complex128, Float, Float64
 from torch import Tensor
 
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 
 _BLOCK = 512
 _DEAD = 1e-12

@@ -2,15 +2,39 @@
 
 import math
 from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
 from typing import Any
 
+import numpy as np
 import scipy.special
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from avmsf._utils.summary import short_repr
-from avmsf.modal.low_fluctuation import white_sequence
+
+PERIOD = 131_072
+"""Samples after which the sequence repeats: 3 s at 44.1 kHz."""
+FILE = "low_fluctuation_noise.npy"
+"""The sequence that the package contains, in float16."""
+
+
+@cache
+def white_sequence() -> Float[Tensor, " samples"]:
+    """Return one period of white noise with little fluctuation of its short-time spectra, `PERIOD` samples.
+
+    STFT magnitudes of two draws of Gaussian noise differ by .586 of their mean; the constant nearest to them is their
+    median, at .419. The magnitudes of this sequence lie closer to the median (docs/decisions/low-fluctuation-noise.md).
+    Do not write into it: all callers share it.
+
+    It is white. Its level is such that its STFT magnitudes are near the median of those of Gaussian white noise of
+    variance one; its root mean square is .78, because the median of a Rayleigh distribution is below its root mean
+    square (sqrt(ln 2) = .83) and because the magnitudes are on average a little below it.
+    """
+    with files(__package__).joinpath(FILE).open("rb") as file:
+        return torch.from_numpy(np.load(file).astype(np.float32))
+
 
 _REFERENCE = 1 << 17
 """Least number of samples of the white noise that the search for the quietest segments is calibrated on."""
@@ -57,7 +81,7 @@ def shape_noise(
 
 
 def low_fluctuation_noise(magnitude: Float[Tensor, " bins"], *, samples: int) -> Float[Tensor, " samples"]:
-    """Return the fixed sequence of `avmsf.modal.low_fluctuation` filtered to `magnitude` as `shape_noise` filters.
+    """Return the fixed `white_sequence` filtered to `magnitude` as `shape_noise` filters.
 
     Its STFT magnitudes are near the median of those of `shape_noise`, and its root mean square is .78 times that of
     `shape_noise`. One period is filtered circularly and repeated without a gap, so that a longer sound begins as a

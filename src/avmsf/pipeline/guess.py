@@ -23,7 +23,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.gains.body import BodyGains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.mesh.surface import Surface, read_surface
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.pipeline.bodies import wall_error
 from avmsf.pipeline.config import BodyConfig

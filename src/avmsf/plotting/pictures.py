@@ -17,8 +17,8 @@ from torch import Tensor
 
 from avmsf._utils.files import write_whole
 from avmsf.errors import EvaluationError
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.config import scaled_fft_size
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.spectra import magnitude_stft
 from avmsf.plotting.style import DIVERGING, FIRST, SECOND, SEQUENTIAL, styled
 

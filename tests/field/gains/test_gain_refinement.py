@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from avmsf.field.gains.refinement import RefinedGains
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from factories.gain_cases import draw, impacts, model
 
 CONTACTS, MODES, RECORDINGS = 14, 5, 17

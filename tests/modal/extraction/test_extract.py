@@ -16,9 +16,9 @@ from avmsf.capture.audio import read_sound
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.onset import find_onset
 from avmsf.errors import ExtractionError
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import extract_modes, extract_once, extract_sounds
 from avmsf.modal.extraction.finders import HighResolution, ShortTime, lowest_frequency
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
 from factories.raising import raises
 from oracles.plate import Plate, PlateModes, plate_modes, sample_contacts, strike

@@ -6,10 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.least_squares import NormalEquations, fit_gains, fit_sine_gains, refine
 from avmsf.modal.inner_products import gram, own_gram, poles_of, project
-from avmsf.modal.phase import common_phase
+from avmsf.modal.modes import ModalBank, common_phase
 from avmsf.modal.synthesis import synthesize
 
 RATE = 8000.0

@@ -3,9 +3,9 @@
 import torch
 
 from avmsf.capture.impacts import Impacts
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.polarity import inverted_recordings
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 
 

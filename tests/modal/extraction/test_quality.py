@@ -6,11 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.esprit import stable_orders
 from avmsf.modal.extraction.extract import Extraction, extract_sounds
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.extraction.quality import ModeQuality, measure_quality
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
 

@@ -7,12 +7,12 @@ import scipy.stats
 import torch
 from torch import Tensor
 
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.esprit import candidates
 from avmsf.modal.extraction.forward import choose
 from avmsf.modal.extraction.least_squares import NormalEquations
 from avmsf.modal.extraction.selection import Candidates, chance_ratio, merge, prune, select
 from avmsf.modal.inner_products import gram, poles_of
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
 
 RATE = 8000.0

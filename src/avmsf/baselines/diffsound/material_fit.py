@@ -27,7 +27,7 @@ from avmsf.fem.body_family import BodyFamily
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.isotropic import IsotropicModes
 from avmsf.fem.material import MATERIALS, Material, material_named
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
 
 MODES = 16

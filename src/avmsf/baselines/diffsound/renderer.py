@@ -35,9 +35,9 @@ from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
 from avmsf.fem.body_family import BodyFamily
 from avmsf.fem.elastic_modes import ElasticModes
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.config import scaled_fft_size
 from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual, low_fluctuation_noise
 from avmsf.modal.spectra import magnitude_stft
 from avmsf.modal.synthesis import synthesize

@@ -8,8 +8,7 @@ from torch import Tensor, nn
 
 from avmsf.field.gain_field import Gains, TrainableGains
 from avmsf.field.gains.model import MixtureGains
-from avmsf.modal.bank import ModalBank
-from avmsf.modal.phase import turned_like
+from avmsf.modal.modes import ModalBank, turned_like
 
 _STEP = 200.0
 """Standard errors that a parameter of one stands for: a learning rate made for networks then moves gains in time."""

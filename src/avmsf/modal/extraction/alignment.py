@@ -32,7 +32,6 @@ from torch import Tensor
 from avmsf._utils.summary import short_repr
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.prepare import margin_length
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.finders import HighResolution
 from avmsf.modal.extraction.phase_likelihood import (
     FIRST_SPREAD,
@@ -41,6 +40,7 @@ from avmsf.modal.extraction.phase_likelihood import (
     background_power,
     occam_factor,
 )
+from avmsf.modal.modes import ModalBank
 
 _MODES = 32
 """Modes to align by, the strongest: more cost time and hardly narrow the posterior."""

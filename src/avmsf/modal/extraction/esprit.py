@@ -15,7 +15,7 @@ from jaxtyping import Complex, Complex128, Float, Float64
 from torch import Tensor
 
 from avmsf._utils.compiled import compiled
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 
 _DEPTH = 512
 """Decimated samples in a band: enough to tell modes apart, few enough for small eigenproblems."""

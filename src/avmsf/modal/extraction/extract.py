@@ -23,11 +23,11 @@ from avmsf._utils.summary import short_repr
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExtractionError
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.alignment import Alignment, align, recording_keys
 from avmsf.modal.extraction.esprit import SHORTEST
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder, lowest_frequency, noise_bins
 from avmsf.modal.extraction.least_squares import fit_gains
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual, estimate_residual
 from avmsf.modal.synthesis import synthesize
 

@@ -9,12 +9,12 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from avmsf.errors import ExtractionError
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.config import ExtractionMethod
 from avmsf.modal.extraction.esprit import SHORTEST, candidates
 from avmsf.modal.extraction.least_squares import refine
 from avmsf.modal.extraction.selection import Candidates, chance_ratio, merge, prune, select
 from avmsf.modal.extraction.stft import Lines
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import noise_power
 
 _EMPTY = ModalBank(torch.zeros(0, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))

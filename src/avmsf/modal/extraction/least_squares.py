@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Complex128, Float, Float64, Int64
 from torch import Tensor
 
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.inner_products import gram, poles_of, project
+from avmsf.modal.modes import ModalBank
 
 _RIDGE = 1e-13
 """Relative to the Gram matrix's diagonal: keeps two modes of one frequency solvable."""

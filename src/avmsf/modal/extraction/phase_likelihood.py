@@ -8,9 +8,9 @@ from jaxtyping import Complex128, Float32, Float64
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.finders import noise_at, noise_bins
 from avmsf.modal.extraction.least_squares import fit_gains
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import noise_power
 
 _CANDIDATES = 8

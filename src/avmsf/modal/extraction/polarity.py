@@ -16,7 +16,7 @@ from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
 from avmsf.modal.extraction.extract import Extraction
-from avmsf.modal.phase import common_phase
+from avmsf.modal.modes import common_phase
 
 _LENGTHS = (0.05, 0.1, 0.2, 0.4, 0.8)
 """Length scales over the diagonal of the contacts' bounding box."""

@@ -31,12 +31,12 @@ from jaxtyping import Bool, Complex128, Float, Float64
 from scipy.special import betaincc, gammaincc
 from torch import Tensor
 
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.esprit import stable_orders
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.finders import noise_at, noise_bins
 from avmsf.modal.extraction.least_squares import NormalEquations
 from avmsf.modal.inner_products import poles_of
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import noise_power
 
 _FALSE_MODES = 0.1

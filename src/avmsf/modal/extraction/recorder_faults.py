@@ -10,9 +10,9 @@ from scipy.special import stdtr
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_gains
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
 
 _RATES_HZ = (8000, 11025, 12000, 16000, 22050, 24000, 32000, 44100, 48000, 88200, 96000, 176400, 192000)

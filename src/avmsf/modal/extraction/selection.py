@@ -8,10 +8,10 @@ from jaxtyping import Float, Float64, Int64
 from scipy.special import gammainccinv
 from torch import Tensor
 
-from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.forward import choose
 from avmsf.modal.extraction.least_squares import NormalEquations
 from avmsf.modal.inner_products import gram, own_gram, poles_of, project
+from avmsf.modal.modes import ModalBank
 
 _CHUNK, _SHARED = 120, 30
 """Candidates judged together, in order of frequency, and how many of them the next chunk judges again."""

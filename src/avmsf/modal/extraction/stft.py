@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Complex, Float, Float64
 from torch import Tensor
 
-from avmsf.modal.bank import ModalBank
+from avmsf.modal.modes import ModalBank
 
 _PEAK_DB = 60.0
 """A bin whose envelope peaks this far below the loudest bin's holds no mode."""

@@ -1,4 +1,4 @@
-// The force of a blow over its contact time, as avmsf.modal.pulse has it: unit impulse, half sine or its power 3/2.
+// The force of a blow over its contact time, as avmsf.modal.modes has it: unit impulse, half sine or its power 3/2.
 
 const EXPONENTS = { "half-sine": 1, hertz: 1.5 };
 // Gauss and Legendre's five points on -1..1.

@@ -1,4 +1,4 @@
-"""The force of an impact over its contact time: with a soft hammer it is long and excites high modes less."""
+"""The modes of an object, which all contacts share; how they start; and the force that excites them."""
 
 import math
 from dataclasses import dataclass
@@ -11,6 +11,53 @@ from torch import Tensor
 
 from avmsf.errors import SimulationError
 from avmsf.modal.config import PulseShape
+
+
+@dataclass(frozen=True, eq=False)
+class ModalBank:
+    """Damped sines that all contacts share (paper, eq. 3): mode i sounds as exp(-d_i t) sin(2 pi f_i t)."""
+
+    frequency: Float64[Tensor, " modes"]
+    """Damped frequencies, Hz, ascending as extracted and fitted; edits keep the order of the modes."""
+    damping: Float64[Tensor, " modes"]
+    """Amplitude decay rates, 1/s, positive."""
+
+    def __repr__(self) -> str:
+        if not len(self):
+            return "ModalBank(0 modes)"
+        ranges = [f"{float(each.min()):.5g} to {float(each.max()):.5g}" for each in (self.frequency, self.damping)]
+        return f"ModalBank({len(self)} modes, {ranges[0]} Hz, damping {ranges[1]} 1/s)"
+
+    def __len__(self) -> int:
+        return self.frequency.shape[0]
+
+
+# A hammer's push takes time and sound takes time to the microphone, so that no recording starts as pure sines. The
+# contact decides a mode's strength and sign; what shifts its phase, pulse and path to the microphone, stays.
+def common_phase(
+    gains: Float[Tensor, "contacts modes"], quadrature: Float[Tensor, "contacts modes"]
+) -> Float64[Tensor, " modes"]:
+    """Return the phase of each mode, radians in (-pi/2, pi/2], that all contacts agree on best.
+
+    Mode k starts at contact i as gains sin + quadrature cos = Im(a_ik exp(i w t)) with a = gains + i quadrature. The
+    phase p that leaves most energy in the real part of a exp(-i p), over all contacts and whatever their signs, is half
+    the argument of the sum over contacts of a^2.
+    """
+    amplitudes = torch.complex(gains.double(), quadrature.double())
+    return torch.angle(amplitudes.square().sum(dim=0)) / 2
+
+
+def turned_like(
+    parts: Float64[Tensor, "contacts modes 2"], others: Float64[Tensor, "contacts modes 2"]
+) -> Float64[Tensor, "contacts modes 2"]:
+    """Return gains in two parts with each mode turned, by one phase for all contacts, to where they suit others best.
+
+    A mode whose frequency has moved a little has turned for a sound as a whole, and has the same gains.
+    """
+    one, other = torch.view_as_complex(parts.contiguous()), torch.view_as_complex(others.contiguous())
+    turn = (one.conj() * other).sum(0)
+    return torch.view_as_real(one * torch.polar(torch.ones_like(turn.real), turn.angle()))
+
 
 _EXPONENTS: dict[str, float] = {"half-sine": 1.0, "hertz": 1.5}
 
