@@ -22,7 +22,7 @@ from typing import Any
 import soundfile
 import torch
 
-from avmsf.export.bundle import write_bundle
+from avmsf.export.bundle import make_bundle
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.web import page_files
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
@@ -206,7 +206,7 @@ def _site(scratch: Path) -> Path:
     start = StartPoints(table.points.float(), (table.normals + 1) / 2, table.normals)
     write_splats(starting_cloud(start, degree=0, scale=1.0, opacity=0.95, flatness=0.2), scratch / "ball.ply")
     site = scratch / "site"
-    write_bundle(table, site, object=scratch / "ball.ply")
+    make_bundle(table, object=scratch / "ball.ply").write(site)
     for name, content in page_files().items():
         (site / name).parent.mkdir(parents=True, exist_ok=True)
         (site / name).write_bytes(content)

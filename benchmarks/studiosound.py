@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from avmsf.export.bundle import write_bundle
+from avmsf.export.bundle import make_bundle
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.web import page_files
 from avmsf.modal.modes import ForcePulse
@@ -171,7 +171,7 @@ class _Quiet(SimpleHTTPRequestHandler):
 def _opened(browser: Any, table: SampledField) -> Iterator[Any]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "page"
-        write_bundle(table, folder)
+        make_bundle(table).write(folder)
         for path, content in page_files().items():
             (folder / path).parent.mkdir(exist_ok=True)
             (folder / path).write_bytes(content)

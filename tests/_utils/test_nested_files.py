@@ -10,7 +10,7 @@ from avmsf.datasets.contact_lists import LISTS, read_contacts
 from avmsf.errors import AvmsfError, DatasetError, EvaluationError, ExportError
 from avmsf.evaluation.mode_embedding import MaterialSpace
 from avmsf.evaluation.results import IDENTITY, ResultsFolder
-from avmsf.export.packed_arrays import read_manifest
+from avmsf.export.paper_demo import read_demo
 from avmsf.export.writing import MANIFEST
 from avmsf.pipeline.stages import StageFolder
 
@@ -29,7 +29,7 @@ def read_lines(path: Path) -> None:
         (LISTS[1], read_lines, DatasetError),
         ("space.json", MaterialSpace.load, EvaluationError),
         (IDENTITY, lambda path: ResultsFolder(path.parent).identity(), EvaluationError),
-        (MANIFEST, lambda path: read_manifest(path.parent), ExportError),
+        (MANIFEST, lambda path: read_demo(path.parent), ExportError),
     ],
 )
 def test_a_nested_file_is_refused(

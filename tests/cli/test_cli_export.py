@@ -109,14 +109,14 @@ def test_faust_gets_what_it_compiles_unless_asked_for_more(
 ) -> None:
     words = [str(field_file), "--to", "faust", "--output", str(tmp_path / "a.dsp")]
     # 64 points of 5 modes with phases and the noise's 1200 samples are 1840 numbers.
-    monkeypatch.setattr("avmsf.export.faust.MOST_NUMBERS", 1500)
+    monkeypatch.setattr("avmsf.export.faust.MAX_NUMBERS", 1500)
     assert main(["export", *words]) == 0
     assert re.search(r"\b30\b", capsys.readouterr().err)
     text = (tmp_path / "a.dsp").read_text()
     assert "points = 30;" in text
     assert "noiseDraw" in text
     # Beside the noise 10 would be left: it is given up.
-    monkeypatch.setattr("avmsf.export.faust.MOST_NUMBERS", 1300)
+    monkeypatch.setattr("avmsf.export.faust.MAX_NUMBERS", 1300)
     words.append("--overwrite")
     assert main(["export", *words]) == 0
     assert "noise" in capsys.readouterr().err

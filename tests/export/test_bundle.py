@@ -14,8 +14,8 @@ import trimesh
 
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import AvmsfError, ExportError
-from avmsf.export.bundle import make_bundle, write_bundle
-from avmsf.export.object_file import read_object
+from avmsf.export.bundle import make_bundle
+from avmsf.export.geometry import read_object
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.web import write_webpage
 from avmsf.gaussians.cloud import GaussianCloud
@@ -40,7 +40,7 @@ def tensors(folder: Path) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("shared", [True, False])
 def test_tensors_are_the_tables_to_the_last_bit(tmp_path: Path, shared: bool) -> None:
     table = struck_table(shared=shared)
-    written = write_bundle(table, tmp_path / "page")
+    written = make_bundle(table).write(tmp_path / "page")
     found = tensors(tmp_path / "page")
     for name in ("points", "normals", "frequency", "damping", "sine", "cosine", "noise"):
         expected = getattr(table, name).numpy()
@@ -57,7 +57,7 @@ def test_tensors_are_the_tables_to_the_last_bit(tmp_path: Path, shared: bool) ->
 
 def test_numbers_lie_where_javascript_can_read_them(tmp_path: Path) -> None:
     """At multiples of their size, whatever the sizes of what comes before."""
-    write_bundle(struck_table(shared=False, points=5, modes=3, seconds=0.0300625), tmp_path / "page")
+    make_bundle(struck_table(shared=False, points=5, modes=3, seconds=0.0300625)).write(tmp_path / "page")
     records = json.loads((tmp_path / "page" / "manifest.json").read_text())["tensors"]
     assert records["noise"]["shape"] == [481]
     for name, record in records.items():
@@ -66,12 +66,12 @@ def test_numbers_lie_where_javascript_can_read_them(tmp_path: Path) -> None:
 
 def test_sines_alone_need_no_cosines(tmp_path: Path) -> None:
     table = struck_table(shared=True)
-    write_bundle(replace(table, cosine=torch.zeros_like(table.cosine)), tmp_path / "page")
+    make_bundle(replace(table, cosine=torch.zeros_like(table.cosine))).write(tmp_path / "page")
     assert "cosine" not in tensors(tmp_path / "page")
 
 
 def test_fewer_contacts_are_kept_with_a_word(tmp_path: Path) -> None:
-    written = write_bundle(struck_table(shared=False, points=50), tmp_path / "page", limit=10)
+    written = make_bundle(struck_table(shared=False, points=50), limit=10).write(tmp_path / "page")
     assert tensors(tmp_path / "page")["damping"].shape == (10, 40)
     (remark,) = written.remarks
     assert "10 of the field's 50" in remark
@@ -81,7 +81,7 @@ def test_strikes_are_heard_as_they_were_recorded(tmp_path: Path) -> None:
     sounds = 3.0 * torch.randn(2, 500, generator=torch.Generator().manual_seed(0))
     contacts = torch.tensor([[0.1, 0.0, 0.0], [0.0, 0.1, 0.0]], dtype=torch.float64)
     strikes = Impacts(contacts, sounds, RATE, ("a.wav", "../b.wav"), directions=-contacts.float() * 10)
-    write_bundle(struck_table(shared=True), tmp_path / "page", strikes=strikes, live={"revision": 1})
+    make_bundle(struck_table(shared=True), strikes=strikes, live={"revision": 1}).write(tmp_path / "page")
     manifest = json.loads((tmp_path / "page" / "manifest.json").read_text())
     assert [each["name"] for each in manifest["strikes"]] == ["a.wav", "../b.wav"]
     assert [each["sound"] for each in manifest["strikes"]] == ["strikes/001.wav", "strikes/002.wav"]
@@ -128,7 +128,7 @@ def ball_table() -> SampledField:
 
 def test_a_surface_becomes_a_glb_of_the_same_triangles(tmp_path: Path) -> None:
     surface = ball_surface()
-    write_bundle(ball_table(), tmp_path / "page", object=surface)
+    make_bundle(ball_table(), object=surface).write(tmp_path / "page")
     loaded = trimesh.load_mesh(tmp_path / "page" / "object.glb", process=False)
     np.testing.assert_allclose(loaded.vertices, surface.vertices.numpy(), rtol=0, atol=1e-7)
     assert np.array_equal(loaded.faces, surface.faces.numpy())
@@ -177,7 +177,7 @@ def test_gaussians_are_kept_as_they_are(tmp_path: Path) -> None:
         torch.zeros(count, 1, 3),
     )
     write_splats(cloud, tmp_path / "ball.ply")
-    write_bundle(ball_table(), tmp_path / "page", object=tmp_path / "ball.ply")
+    make_bundle(ball_table(), object=tmp_path / "ball.ply").write(tmp_path / "page")
     assert (tmp_path / "page" / "object.ply").read_bytes() == (tmp_path / "ball.ply").read_bytes()
     manifest = json.loads((tmp_path / "page" / "manifest.json").read_text())
     assert manifest["object"] == {"kind": "gaussians", "file": "object.ply"}
@@ -221,6 +221,6 @@ def test_objects_that_are_none_are_refused(tmp_path: Path, monkeypatch: pytest.M
     with raises(ExportError, name="center", value=pytest.approx(5.0, rel=1e-2)):
         read_object(replace(ball_surface(), vertices=ball_surface().vertices + torch.tensor([5.0, 0, 0])), points)
     (tmp_path / "huge.stl").touch()
-    monkeypatch.setattr("avmsf.export.object_file.MAX_BYTES", -1)
+    monkeypatch.setattr("avmsf.export.geometry.MAX_BYTES", -1)
     with raises(ExportError, file=tmp_path / "huge.stl", name="size", value=0):
         read_object(tmp_path / "huge.stl", points)

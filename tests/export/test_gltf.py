@@ -11,9 +11,9 @@ import torch
 import trimesh
 
 from avmsf.errors import CaptureError, ExportError
+from avmsf.export.geometry import Look, read_look
 from avmsf.export.gltf import write_gltf
-from avmsf.export.look import Look, read_look
-from avmsf.export.one_phase import deviation
+from avmsf.export.one_phase import approximation_error
 from avmsf.mesh.textured_mesh import TexturedMesh
 from factories.made_tables import MODES, POINTS, apart, summed, table
 from factories.raising import raises
@@ -134,7 +134,7 @@ def test_phases_alone_change_the_waveform_and_hardly_the_spectrum(tmp_path):
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_a_level_that_is_missed_is_told_in_decibels(factor):
     field = table()
-    found = deviation(field, sine=factor * field.sine, cosine=None, damping=field.damping)
+    found = approximation_error(field, sine=factor * field.sine, cosine=None, damping=field.damping)
     assert found.waveform == pytest.approx(abs(factor - 1.0), rel=1e-3)
     assert found.spectrum_db == pytest.approx(6.02, abs=0.1)
 
@@ -201,7 +201,7 @@ def test_a_mesh_too_fine_for_viewers_is_reduced_and_keeps_its_colors(tmp_path, m
     ball.export(tmp_path / "ball.ply")
     whole, remarks = read_look(tmp_path / "ball.ply", table())
     assert (len(whole.faces), remarks) == (5120, ())
-    monkeypatch.setattr("avmsf.export.look.MOST_FACES", 1000)
+    monkeypatch.setattr("avmsf.export.geometry.MAX_FACES", 1000)
     few, (remark,) = read_look(tmp_path / "ball.ply", table())
     assert 500 < len(few.faces) <= 1000
     assert "5,120" in remark

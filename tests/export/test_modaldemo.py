@@ -11,8 +11,7 @@ import pytest
 import torch
 
 from avmsf.errors import ExportError
-from avmsf.export.discs import discs
-from avmsf.export.paper_demo import Demo, is_demo, read_demo, write_demo
+from avmsf.export.paper_demo import Demo, discs, is_demo, read_demo, write_demo
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import read_splats
 from factories.made_tables import MODES, POINTS, RATE, SAMPLES, apart, summed, table

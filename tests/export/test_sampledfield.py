@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from avmsf.errors import ExportError
-from avmsf.export.bundle import write_bundle
-from avmsf.export.normals import outward_normals
-from avmsf.export.sampled_field import SampledField
+from avmsf.export.bundle import make_bundle
+from avmsf.export.sampled_field import SampledField, outward_normals
 from avmsf.field.config import FitConfig
 from avmsf.field.scaled_gains import ScaledGains
 from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
@@ -155,6 +154,6 @@ def test_supporting_poles_are_counted_among_the_modes_that_sound(tmp_path):
     table = SampledField.of(field)
     assert len(table.frequency) == 4
     assert table.supporting == table.take(torch.tensor([3])).supporting == (1,)
-    write_bundle(table, tmp_path / "page")
+    make_bundle(table).write(tmp_path / "page")
     assert json.loads((tmp_path / "page" / "manifest.json").read_text())["supporting"] == [1]
     assert SampledField.of(made).supporting == ()

@@ -9,7 +9,7 @@ import torch
 import trimesh
 
 from avmsf.capture.impacts import Impacts
-from avmsf.export.bundle import write_bundle
+from avmsf.export.bundle import make_bundle
 from avmsf.export.sampled_field import SampledField
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
@@ -82,7 +82,7 @@ def plate_object(kind: str, folder: Path) -> Path | None:
 
 def lay_out(folder: Path, table: SampledField, **bundle: Any) -> Path:
     """Write the page with a field."""
-    write_bundle(table, folder, **bundle)
+    make_bundle(table, **bundle).write(folder)
     shutil.copy(PAGE / "index.html", folder)
     shutil.copytree(PAGE, folder / "page")
     return folder

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from avmsf.export.bundle import make_bundle, write_bundle
+from avmsf.export.bundle import make_bundle
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.web import single_file
 from avmsf.modal.modes import ForcePulse
@@ -43,7 +43,7 @@ window.loaded = loadBundle().then((bundle) => { window.bundle = bundle; });
 
 
 def lay_out(folder: Path, table: SampledField) -> Path:
-    write_bundle(table, folder)
+    make_bundle(table).write(folder)
     (folder / "page").mkdir()
     for module in PAGE.glob("*.js"):
         shutil.copy(module, folder / "page")

@@ -15,7 +15,7 @@ import torch
 from avmsf._utils.files import unwritable
 from avmsf.capture.audio import read_recording
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.location import expect_free
+from avmsf.capture.location import check_free
 from avmsf.capture.measure import RecordingReport, measure, shared_problems
 from avmsf.capture.placement import contacted_part
 from avmsf.capture.prepare import Prepared, prepare
@@ -114,7 +114,7 @@ def write_capture(capture: Capture, folder: str | Path, *, onsets_within: float 
     is not empty, or cannot be written.
     """
     folder = Path(folder)
-    expect_free(folder)
+    check_free(folder)
     begun = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}")
     try:
         begun.mkdir(parents=True)

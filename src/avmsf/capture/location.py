@@ -25,7 +25,7 @@ class Location:
         return CaptureError(f"{self}: {message}", file=self.file, row=self.row, name=name, value=value)
 
 
-def expect_free(folder: Path) -> None:
+def check_free(folder: Path) -> None:
     """Raise CaptureError unless a folder is empty or does not exist."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise CaptureError(

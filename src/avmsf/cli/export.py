@@ -20,15 +20,14 @@ from avmsf.editing.edits import EDITS
 from avmsf.errors import ExportError
 from avmsf.export.faust import contacts_path, fitted, write_faust
 from avmsf.export.formats import PAGE_SUFFIXES, POINTS
+from avmsf.export.geometry import Look, holds_gaussians, read_look, read_object
 from avmsf.export.gltf import write_gltf
-from avmsf.export.look import Look, read_look
-from avmsf.export.object_file import holds_gaussians, read_object
 from avmsf.export.paper_demo import SCENE, is_demo, read_demo, write_demo
 from avmsf.export.sampled_field import SampledField, spread_rows
 from avmsf.export.samples import INSTRUMENT, Grid, Layer, hertz_layers, write_grid
 from avmsf.export.uff import write_universal
 from avmsf.export.web import write_webpage
-from avmsf.export.writing import Written, expect_free, write_file
+from avmsf.export.writing import Written, check_free, write_file
 from avmsf.field.positions import points_on_object
 from avmsf.field.scaled_gains import length_of, surface_of
 from avmsf.field.sound_field import SoundField
@@ -249,7 +248,7 @@ def _gltf(field: SoundField | SampledField, options: Options) -> Written:
     cloud = _gaussians(source, meters, sampled)
     if cloud is not None and isinstance(source, Path):
         beside, content = options.output.with_suffix(".gaussians.ply"), source.read_bytes()
-        expect_free(beside, force=options.overwrite)
+        check_free(beside, force=options.overwrite)
         seen = Look.of_gaussians(cloud, sampled)
         written = write_gltf(sampled, options.output, look=seen, up=options.up, force=options.overwrite)
         copied = write_file(beside, content, force=options.overwrite)

@@ -9,7 +9,7 @@ from avmsf.evaluation.listening import Heard, draw_spectrogram, loudest_of, pict
 from avmsf.evaluation.report_tables import Grid, Section, figure
 from avmsf.evaluation.results import CaseRecord, ObjectRecord, Outcome
 from avmsf.evaluation.sound_metrics import spread
-from avmsf.export.policy import report_directives, with_policy
+from avmsf.export.web import report_directives, with_policy
 
 LARGEST = 13_000_000
 """Maximum number of characters; further contacts are omitted."""

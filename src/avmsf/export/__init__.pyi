@@ -1,4 +1,4 @@
-from .bundle import write_bundle as write_bundle
+from .bundle import make_bundle as make_bundle
 from .faust import write_faust as write_faust
 from .gltf import write_gltf as write_gltf
 from .paper_demo import read_demo as read_demo

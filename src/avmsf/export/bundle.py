@@ -19,10 +19,10 @@ from jaxtyping import Shaped
 
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExportError
-from avmsf.export.formats import MOST_POINTS
-from avmsf.export.object_file import ObjectFile, read_object
+from avmsf.export.formats import MAX_POINTS
+from avmsf.export.geometry import ObjectFile, read_object
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import Written, no_modes, write_folder
+from avmsf.export.writing import Written, no_modes, pack, write_folder
 from avmsf.field.positions import points_on_object
 from avmsf.field.sound_field import SoundField
 from avmsf.mesh.surface import Surface
@@ -43,6 +43,11 @@ class Bundle:
     remarks: tuple[str, ...] = ()
     """Notes on what the page leaves out."""
 
+    def write(self, folder: str | Path, *, force: bool = False) -> Written:
+        """Write a folder, atomically. Raises `ExportError` for one that is not empty, unless `force` is set."""
+        sizes = write_folder(Path(folder), lambda path: write_files(self.files, path), dict(self.manifest), force=force)
+        return Written(sizes, self.remarks)
+
 
 def make_bundle(
     field: SoundField | SampledField,
@@ -51,7 +56,7 @@ def make_bundle(
     meters: float = 1.0,
     surface: Path | Surface | None = None,
     strikes: Impacts | None = None,
-    limit: int = MOST_POINTS,
+    limit: int = MAX_POINTS,
     live: Mapping[str, Any] | None = None,
     mute: bool = False,
 ) -> Bundle:
@@ -73,7 +78,8 @@ def make_bundle(
     if len(sampled.frequency) == 0 and not mute:
         raise no_modes()
     shown = read_object(object, sampled.points, meters=meters)
-    content, tensors = _packed(_tensors(sampled))
+    content, places = pack(_tensors(sampled))
+    tensors = {name: {"file": "field.bin", **place} for name, place in places.items()}
     files = {"field.bin": content}
     if shown.name is not None:
         files[shown.name] = shown.content
@@ -84,32 +90,6 @@ def make_bundle(
     manifest = _manifest(sampled, tensors, shown, records, live)
     manifest["surface"] = {"kind": "mesh", "file": SURFACE} if SURFACE in files else None
     return Bundle(manifest, {**files, **sounds}, remarks + shown.remarks + other.remarks)
-
-
-def write_bundle(
-    field: SoundField | SampledField,
-    folder: str | Path,
-    *,
-    object: Path | Surface | None = None,
-    meters: float = 1.0,
-    surface: Path | Surface | None = None,
-    strikes: Impacts | None = None,
-    limit: int = MOST_POINTS,
-    live: Mapping[str, Any] | None = None,
-    mute: bool = False,
-    force: bool = False,
-) -> Written:
-    """Write a field's bundle as a folder, atomically; the arguments are those of `make_bundle`.
-
-    Raises `ExportError` for a folder that is not empty, unless `force` is set.
-    """
-    bundle = make_bundle(
-        field, object=object, meters=meters, surface=surface, strikes=strikes, limit=limit, live=live, mute=mute
-    )
-    sizes = write_folder(
-        Path(folder), lambda place: write_files(bundle.files, place), dict(bundle.manifest), force=force
-    )
-    return Written(sizes, bundle.remarks)
 
 
 def write_files(files: Mapping[str, bytes], folder: Path) -> None:
@@ -132,29 +112,12 @@ def _tensors(field: SampledField) -> dict[str, Shaped[np.ndarray, "..."]]:
     return {**named, "cosine": field.cosine.numpy()} if bool(field.cosine.any()) else named
 
 
-def _packed(tensors: Mapping[str, Shaped[np.ndarray, "..."]]) -> tuple[bytes, dict[str, Any]]:
-    content, records = bytearray(), {}
-    for name, tensor in tensors.items():
-        records[name] = {
-            "file": "field.bin",
-            "offset": len(content),
-            "dtype": tensor.dtype.name,
-            "shape": list(tensor.shape),
-        }
-        content += np.ascontiguousarray(tensor, dtype=tensor.dtype.newbyteorder("<")).tobytes()
-    return bytes(content), records
-
-
 def _strikes(strikes: Impacts | None, field: SampledField) -> tuple[list[dict[str, Any]], dict[str, bytes]]:
     if strikes is None:
         return [], {}
     if strikes.sample_rate != field.sample_rate:
-        raise ExportError(
-            f"strikes: expected recordings at the field's {field.sample_rate:g} Hz, got {strikes.sample_rate:g} Hz; "
-            "name the capture that the field was fitted to",
-            name="strikes",
-            value=strikes.sample_rate,
-        )
+        wanted, advice = f"the field's {field.sample_rate:g} Hz", "name the capture that the field was fitted to"
+        raise ExportError.expected(wanted, strikes.sample_rate, name="strikes", advice=advice)
     records, files = [], {}
     for row, name in enumerate(strikes.names):
         path, memory = f"strikes/{row + 1:03d}.wav", io.BytesIO()

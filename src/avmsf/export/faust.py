@@ -14,13 +14,13 @@ from torch import Tensor
 from avmsf.errors import ExportError
 from avmsf.export.formats import FAUST_SUFFIXES
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import Written, expect_ending, expect_free, generator, write_file
+from avmsf.export.writing import Written, check_free, check_suffix, generator, write_file
 
 _FEWEST = 16
 """Number of points below which the noise is left out so that more points fit."""
 _ROW = 8
 """Numbers in one line."""
-MOST_NUMBERS = 150_000
+MAX_NUMBERS = 150_000
 """Maximum of all tables together: with 128 modes Faust compiles as many in half a minute."""
 
 
@@ -32,7 +32,7 @@ def write_faust(field: SampledField, path: str | Path, *, noise: bool = True, fo
     time.
     """
     path = Path(path)
-    expect_ending(path, FAUST_SUFFIXES)
+    check_suffix(path, FAUST_SUFFIXES)
     with_noise = noise and bool(field.noise.any())
     text = faust_library(field, noise=with_noise)
     if path.suffix == ".dsp":
@@ -45,7 +45,7 @@ def write_faust(field: SampledField, path: str | Path, *, noise: bool = True, fo
     elif field.noise.any():
         remarks.append("the residual noise is left out")
     table, contacts = contacts_path(path), _contacts(field).encode()
-    expect_free(table, force=force)
+    check_free(table, force=force)
     sizes = write_file(path, text.encode(), force=force) | write_file(table, contacts, force=force)
     return Written(sizes, tuple(remarks))
 
@@ -75,8 +75,8 @@ def fitted(field: SampledField, *, noise: bool = True) -> tuple[SampledField, bo
 
 
 def _fitting(field: SampledField, *, noise: bool) -> int:
-    """Return how many points fit into `MOST_NUMBERS`."""
-    return (MOST_NUMBERS - noise * field.samples) // max(1, _numbers_at_a_point(field))
+    """Return how many points fit into `MAX_NUMBERS`."""
+    return (MAX_NUMBERS - noise * field.samples) // max(1, _numbers_at_a_point(field))
 
 
 def _numbers_at_a_point(field: SampledField) -> int:
@@ -87,13 +87,14 @@ def faust_library(field: SampledField, *, noise: bool) -> str:
     """Return the definitions; `strike(contact, force, contactTime, gate)` is the sound."""
     points, modes = field.sine.shape
     numbers = points * _numbers_at_a_point(field) + noise * field.samples
-    if numbers > MOST_NUMBERS:
-        raise ExportError(
-            f"numbers: expected at most {MOST_NUMBERS}, which Faust compiles in seconds, got {numbers} ({points} points"
-            f", {modes} modes{f', {field.samples} samples of noise' if noise else ''}); ask for fewer points, or leave "
-            "the noise out",
+    if numbers > MAX_NUMBERS:
+        samples = f", {field.samples} samples of noise" if noise else ""
+        raise ExportError.expected(
+            f"at most {MAX_NUMBERS}, which Faust compiles in seconds",
+            numbers,
+            got=f"{numbers} ({points} points, {modes} modes{samples})",
             name="numbers",
-            value=numbers,
+            advice="ask for fewer points, or leave the noise out",
         )
     name = re.sub(r'["\\\x00-\x1f]', "", field.name) or "object"
     parts = [

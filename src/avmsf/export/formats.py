@@ -5,10 +5,10 @@ from typing import Literal
 Format = Literal["web", "gltf", "faust", "avmsf-demo", "wavs", "uff"]
 Precision = Literal["float16", "float32"]
 Axis = Literal["x", "y", "z"]
-MOST_POINTS = 20_000
+MAX_POINTS = 20_000
 """Default number of contacts of a page: 20 MB with 128 modes."""
 POINTS: dict[Format, int] = {
-    "web": MOST_POINTS,
+    "web": MAX_POINTS,
     "gltf": 2000,
     "faust": 64,
     "avmsf-demo": 10_000,

@@ -20,10 +20,10 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from avmsf.export.formats import GLTF_SUFFIXES, Axis
-from avmsf.export.look import Look
-from avmsf.export.one_phase import deviation, importance, shared_dampings, signed_amplitudes
+from avmsf.export.geometry import Look
+from avmsf.export.one_phase import approximation_error, importance, shared_dampings, signed_amplitudes
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import Written, expect_ending, generator, no_modes, write_file
+from avmsf.export.writing import Written, check_suffix, generator, no_modes, write_file
 
 EXTENSION = "KHR_audio_rigid_bodies"
 _FLOAT, _UNSIGNED = 5126, 5125
@@ -47,7 +47,7 @@ def write_gltf(
     `ExportError` for a name that does not end in .glb, and a field without modes.
     """
     path = Path(path)
-    expect_ending(path, GLTF_SUFFIXES)
+    check_suffix(path, GLTF_SUFFIXES)
     if not len(sampled.frequency):
         raise no_modes(path)
     damping = shared_dampings(sampled)
@@ -55,7 +55,7 @@ def write_gltf(
     gains = signed_amplitudes(sampled)
     content = _glb(_document(sampled, look or Look.of_points(sampled), up, order, gains, damping))
     sizes = write_file(path, content, force=force)
-    error = deviation(sampled, sine=gains, cosine=None, damping=damping)
+    error = approximation_error(sampled, sine=gains, cosine=None, damping=damping)
     return Written(sizes, _remarks(sampled), error.waveform, error.spectrum_db)
 
 

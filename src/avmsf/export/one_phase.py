@@ -12,16 +12,16 @@ from avmsf.modal.modes import common_phase
 from avmsf.modal.spectra import magnitude_stft
 from avmsf.modal.synthesis import synthesize
 
-_JUDGED = 8
+_COMPARED_POINTS = 8
 """Number of points at which an export is compared with the field."""
-_WINDOW = 0.04
+_WINDOW_SECONDS = 0.04
 """Window of the short-time spectra, seconds: about the temporal resolution of hearing."""
-_FLOOR = 1e-3
+_MIN_MAGNITUDE_RATIO = 1e-3
 """Magnitude relative to the largest below which spectra are not compared: -60 dB."""
 
 
 @dataclass(frozen=True)
-class Deviation:
+class ApproximationError:
     """Difference between an export's sounds and the field's, at a few points."""
 
     waveform: float
@@ -52,17 +52,17 @@ def shared_dampings(field: SampledField) -> Float64[Tensor, " modes"]:
     return (weights * field.damping).sum(0)
 
 
-def deviation(
+def approximation_error(
     field: SampledField,
     *,
     sine: Float32[Tensor, "points modes"] | None,
     cosine: Float32[Tensor, "points modes"] | None,
     damping: Float64[Tensor, "*points modes"],
-) -> Deviation:
+) -> ApproximationError:
     """Return the difference between these modes, without noise, and the field at a few points."""
-    rows = field.spread(_JUDGED)
+    rows = field.spread(_COMPARED_POINTS)
     zero = torch.zeros(len(rows), len(field.frequency))
-    heard = synthesize(
+    rendered = synthesize(
         zero if sine is None else sine[rows],
         field.frequency,
         damping if damping.ndim == 1 else damping[rows],
@@ -70,8 +70,10 @@ def deviation(
         sample_rate=field.sample_rate,
         quadrature=zero if cosine is None else cosine[rows],
     )
-    true = field.render(rows)
-    return Deviation(_relative(heard, true), _apart_db(heard, true, field.sample_rate))
+    reference = field.render(rows)
+    return ApproximationError(
+        _relative(rendered, reference), _spectrum_difference_db(rendered, reference, field.sample_rate)
+    )
 
 
 def importance(field: SampledField, damping: Float64[Tensor, " modes"]) -> Int[Tensor, " modes"]:
@@ -80,17 +82,17 @@ def importance(field: SampledField, damping: Float64[Tensor, " modes"]) -> Int[T
     return torch.argsort(energy, descending=True, stable=True)
 
 
-def _relative(heard: Tensor, true: Tensor) -> float:
-    peak = float(true.abs().max())
-    return float((heard - true).abs().max()) / peak if peak > 0 else 0.0
+def _relative(rendered: Tensor, reference: Tensor) -> float:
+    peak = float(reference.abs().max())
+    return float((rendered - reference).abs().max()) / peak if peak > 0 else 0.0
 
 
-def _apart_db(
-    heard: Float32[Tensor, "contacts samples"], true: Float32[Tensor, "contacts samples"], sample_rate: float
+def _spectrum_difference_db(
+    rendered: Float32[Tensor, "contacts samples"], reference: Float32[Tensor, "contacts samples"], sample_rate: float
 ) -> float:
-    size = max(4, 2 ** round(math.log2(_WINDOW * sample_rate)))
-    found, expected = (magnitude_stft(each, fft_size=size, hop=size // 4) for each in (heard, true))
-    floor, energy = _FLOOR * float(expected.max()), expected.square()
+    size = max(4, 2 ** round(math.log2(_WINDOW_SECONDS * sample_rate)))
+    found, expected = (magnitude_stft(each, fft_size=size, hop=size // 4) for each in (rendered, reference))
+    floor, energy = _MIN_MAGNITUDE_RATIO * float(expected.max()), expected.square()
     if floor == 0:
         return 0.0
     apart = 20.0 * torch.log10((found + floor) / (expected + floor)).abs()

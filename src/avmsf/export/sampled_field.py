@@ -6,23 +6,26 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Float64, Int
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf.errors import ExportError
-from avmsf.export.normals import outward_normals
 from avmsf.field.gain_field import GainField
 from avmsf.field.gains.body import BodyGains
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.positions import points_on_object
 from avmsf.field.scaled_gains import ScaledGains
 from avmsf.field.sound_field import SoundField
+from avmsf.gaussians.neighborhoods import read_neighborhoods
 from avmsf.gaussians.points import farthest_points, nearest_points
 from avmsf.modal.modes import ForcePulse
 from avmsf.modal.synthesis import synthesize
 
 _BATCH = 1024
 """Points sampled at once; bounds the memory."""
-_RENDERED = 32
+_RENDER_BATCH = 32
 """Contacts rendered at once; bounds the memory."""
 _DRAWN = 4
 """Candidates for each selected point: farthest point sampling of a million points takes too long."""
@@ -90,7 +93,7 @@ class SampledField:
             normals = outward_normals(places)
         if directions is not None:
             normals = torch.where(directions.any(1, keepdim=True), -directions.double(), normals.double())
-        heard = torch.nonzero(sound_field.audible).flatten()
+        audible = torch.nonzero(sound_field.audible).flatten()
         parts = torch.split(places, _BATCH)
         ways = [None] * len(parts) if directions is None else torch.split(directions, _BATCH)
         known = [sound_field.known(part, directions=way) for part, way in zip(parts, ways, strict=True)]
@@ -99,15 +102,15 @@ class SampledField:
         for part in known:
             mean = part.mean.double()
             quadrature = torch.zeros_like(mean) if part.quadrature is None else part.quadrature.double()
-            sines.append((mean * along - quadrature * ahead)[:, heard].float())
-            cosines.append((mean * ahead + quadrature * along)[:, heard].float())
-        damping = sound_field.bank.damping[heard]
-        factors = [part.damping[:, heard] for part in known if part.damping is not None]
+            sines.append((mean * along - quadrature * ahead)[:, audible].float())
+            cosines.append((mean * ahead + quadrature * along)[:, audible].float())
+        damping = sound_field.bank.damping[audible]
+        factors = [part.damping[:, audible] for part in known if part.damping is not None]
         origin = sound_field.origin
         return cls(
             places.detach(),
             torch.nn.functional.normalize(normals.float(), dim=1),
-            sound_field.bank.frequency[heard],
+            sound_field.bank.frequency[audible],
             damping * torch.cat(factors) if factors else damping,
             torch.cat(sines),
             torch.cat(cosines),
@@ -181,7 +184,7 @@ class SampledField:
         length = self.samples if samples is None else samples
         added = torch.nn.functional.pad(self.noise, (0, max(0, length - self.samples)))[:length]
         parts = []
-        for chosen in torch.split(rows, _RENDERED):
+        for chosen in torch.split(rows, _RENDER_BATCH):
             modes = synthesize(
                 self.sine[chosen],
                 self.frequency,
@@ -214,20 +217,80 @@ def _expect_places(
 ) -> None:
     finite = bool(torch.isfinite(places).all()) and (normals is None or bool(torch.isfinite(normals).all()))
     if len(places) == 0 or not finite:
-        found = "none" if len(places) == 0 else "NaN or infinity"
-        raise ExportError(
-            f"points: expected finite points of the object's surface, got {found}; name a mesh or Gaussians of the "
-            "object, or fit the field to features on its surface",
+        raise ExportError.expected(
+            "finite points of the object's surface",
+            len(places),
+            got="none" if len(places) == 0 else "NaN or infinity",
             name="points",
-            value=len(places),
+            advice="name a mesh or Gaussians of the object, or fit the field to features on its surface",
         )
     if normals is not None and normals.shape != places.shape:
         raise ExportError.expected(f"one for each of {len(places)} points", len(normals), name="normals")
     if limit is not None and limit < 1:
-        raise ExportError(f"limit: expected 1 point or more, got {limit}", name="limit", value=limit)
+        raise ExportError.expected("1 point or more", limit, name="limit")
 
 
 def _known_normals(gain_field: GainField, places: Float[Tensor, "points 3"]) -> Float64[Tensor, "points 3"] | None:
     if isinstance(gain_field, ScaledGains):
         return _known_normals(gain_field.field, places.double() / gain_field.length)
     return gain_field.normals(places) if isinstance(gain_field, MixtureGains | BodyGains) else None
+
+
+_NEIGHBORS = 12
+"""Neighbors in the graph along which the orientation is propagated."""
+_VIEWS = 128
+"""Directions in which the outermost points of a component are determined."""
+
+
+def outward_normals(points: Float[Tensor, "points 3"]) -> Float32[Tensor, "points 3"]:
+    """Return outward unit normals of the surface on which points lie.
+
+    Fitted planes have no orientation. It is propagated along the minimum spanning tree of the neighbor graph, weighted
+    by the change of the normal (Hoppe et al. 1992), and each connected component is oriented so that the normals of its
+    outermost points point outwards. The normals of very few points point away from their centroid.
+    """
+    places = points.detach().double().cpu().numpy()
+    if len(places) <= _NEIGHBORS:
+        return torch.from_numpy(_away(places)).float()
+    normals = read_neighborhoods(places, count=_NEIGHBORS).normals
+    _, rows = cKDTree(places).query(places, k=_NEIGHBORS + 1)
+    tails, heads = np.repeat(np.arange(len(places)), _NEIGHBORS), rows[:, 1:].reshape(-1)
+    # Not zero for equal normals: a sparse graph has no edges of weight zero.
+    bend = 1.0 - np.abs(np.einsum("nd,nd->n", normals[tails], normals[heads])) + 1e-9
+    edges = (np.minimum(tails, heads), np.maximum(tails, heads))
+    _, first = np.unique(np.stack(edges, axis=1), axis=0, return_index=True)
+    tree = minimum_spanning_tree(
+        coo_matrix((bend[first], (edges[0][first], edges[1][first])), shape=(len(places),) * 2).tocsr()
+    )
+    count, part = connected_components(tree, directed=False)
+    views = _sphere(_VIEWS)
+    for number in range(count):
+        members = np.flatnonzero(part == number)
+        normals[members] = _propagated(tree, normals, int(members[0]))[members]
+        outermost = members[np.argmax(places[members] @ views.T, axis=0)]
+        if np.einsum("vd,vd->", normals[outermost], views) < 0:
+            normals[members] *= -1.0
+    return torch.from_numpy(normals).float()
+
+
+def _propagated(tree: object, normals: Float[np.ndarray, "points 3"], start: int) -> Float[np.ndarray, "points 3"]:
+    turned = normals.copy()
+    order, parents = breadth_first_order(tree, start, directed=False)
+    for row in order[1:]:
+        if turned[row] @ turned[parents[row]] < 0:
+            turned[row] *= -1.0
+    return turned
+
+
+def _away(places: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
+    offsets = places - places.mean(axis=0)
+    length = np.linalg.norm(offsets, axis=1, keepdims=True)
+    return np.where(length > 0, offsets / np.maximum(length, np.finfo(float).tiny), [0.0, 0.0, 1.0])
+
+
+def _sphere(count: int) -> Float[np.ndarray, "views 3"]:
+    """Return evenly distributed directions: a Fibonacci spiral on the sphere."""
+    height = 1 - (2 * np.arange(count) + 1) / count
+    turn = np.pi * (3 - np.sqrt(5)) * np.arange(count)
+    across = np.sqrt(1 - height**2)
+    return np.stack([across * np.cos(turn), across * np.sin(turn), height], axis=1)

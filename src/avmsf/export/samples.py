@@ -140,31 +140,24 @@ def _soft_to_loud(
 
 def _expect(grid: Grid) -> None:
     most = HIGHEST_NOTE + 1 - LOWEST_NOTE
-    if not 1 <= grid.contacts <= most:
-        raise _setting("contacts", f"1 to {most}, one MIDI note each from {LOWEST_NOTE}", grid.contacts)
-    if not 1 <= len(grid.layers) <= HIGHEST_NOTE:
-        raise _setting("layers", f"1 to {HIGHEST_NOTE} forces", len(grid.layers))
-    for layer in grid.layers:
-        if not (math.isfinite(layer.force) and layer.force > 0):
-            raise _setting("force", "a number above 0", layer.force)
-        if not 0 <= layer.contact_time < 1:
-            raise _setting("contact_time", "0 to 1 s", layer.contact_time)
-    if grid.seconds is not None and not (math.isfinite(grid.seconds) and grid.seconds > 0):
-        raise _setting("seconds", "more than 0", grid.seconds)
-    if not (math.isfinite(grid.level_db) and grid.level_db <= 0):
-        raise _setting("level_db", "0 dB or below", grid.level_db)
-
-
-def _setting(name: str, expected: str, value: float | int) -> ExportError:
-    return ExportError(f"{name}: expected {expected}, got {value:g}", name=name, value=value)
+    seconds = 1.0 if grid.seconds is None else grid.seconds
+    checks = [
+        ("contacts", grid.contacts, 1 <= grid.contacts <= most, f"1 to {most}, a MIDI note each from {LOWEST_NOTE}"),
+        ("layers", len(grid.layers), 1 <= len(grid.layers) <= HIGHEST_NOTE, f"1 to {HIGHEST_NOTE} forces"),
+        *(("force", each.force, 0 < each.force < math.inf, "a number above 0") for each in grid.layers),
+        *(("contact_time", each.contact_time, 0 <= each.contact_time < 1, "0 to 1 s") for each in grid.layers),
+        ("seconds", seconds, 0 < seconds < math.inf, "more than 0"),
+        ("level_db", grid.level_db, -math.inf < grid.level_db <= 0, "0 dB or below"),
+    ]
+    for name, value, valid, wanted in checks:
+        if not valid:
+            raise ExportError.expected(wanted, value, name=name)
 
 
 def _wav(sound: Float32[Tensor, " samples"], rate: int) -> bytes:
     if not bool(sound.isfinite().all()):
-        raise ExportError(
-            "expected finite samples, got NaN or infinity; fit the field again, or export smaller forces",
-            name="samples",
-        )
+        advice = "fit the field again, or export smaller forces"
+        raise ExportError.expected("finite numbers", got="NaN or infinity", name="samples", advice=advice)
     memory = io.BytesIO()
     soundfile.write(memory, sound.numpy(), rate, subtype="FLOAT", format="WAV")
     return memory.getvalue()

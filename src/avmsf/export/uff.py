@@ -22,7 +22,7 @@ from avmsf.errors import ExportError
 from avmsf.export.formats import UNIVERSAL_SUFFIXES
 from avmsf.export.one_phase import shared_dampings
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import Written, expect_ending, generator, write_file
+from avmsf.export.writing import Written, check_suffix, generator, write_file
 
 _NORMAL_MODE, _COMPLEX_MODE = 2, 3
 _TRANSLATION = 2
@@ -30,7 +30,7 @@ _STRAIGHT = 1.0
 """Degrees up to which a normal counts as along an axis."""
 _RESPONSE = 4
 _TIME = re.compile(rb"^\d\d-\w{3}-\d\d \d\d:\d\d:\d\d *$", re.MULTILINE)
-_MOST_LINES = 1 << 16
+_MAX_LINES = 1 << 16
 """Frequencies of a response function, at most."""
 
 
@@ -42,9 +42,9 @@ def write_universal(field: SampledField, path: str | Path, *, functions: int = 1
     or .unv, and where pyuff is missing.
     """
     path = Path(path)
-    expect_ending(path, UNIVERSAL_SUFFIXES)
+    check_suffix(path, UNIVERSAL_SUFFIXES)
     if functions < 0:
-        raise ExportError(f"functions: expected 0 or more, got {functions}", name="functions", value=functions)
+        raise ExportError.expected("0 or more", functions, name="functions")
     pyuff = _pyuff()
     damping = shared_dampings(field)
     sets = [_header(field), _units(), _nodes(field)]
@@ -76,7 +76,7 @@ def write_universal(field: SampledField, path: str | Path, *, functions: int = 1
 
 def response_frequencies(field: SampledField) -> Float64[np.ndarray, " lines"]:
     """Return where response functions are given, Hz: from 0 to about half the rate, as finely as sounds allow."""
-    lines = max(2, min(field.samples // 2 + 1, _MOST_LINES))
+    lines = max(2, min(field.samples // 2 + 1, _MAX_LINES))
     # The format has six digits for the step, from which readers count.
     step = float(f"{0.5 * field.sample_rate / (lines - 1):.5e}")
     return step * np.arange(lines)
@@ -202,7 +202,6 @@ def _pyuff() -> Any:
     try:
         import pyuff
     except ImportError as error:
-        raise ExportError(
-            "pyuff: expected it for the universal file format, got none; run pip install 'avmsf[uff]'", name="pyuff"
-        ) from error
+        advice = "run pip install 'avmsf[uff]'"
+        raise ExportError.expected("the package for the universal file format", name="pyuff", advice=advice) from error
     return pyuff

@@ -3,12 +3,17 @@
 A single file has the page's modules as data: addresses in its import map, and all other files as base64, which the
 modules turn into blobs: a browser does not load other files for a page that was opened from a disk. The libraries three
 and spark go with it, spark where Gaussians are shown: no network is needed.
+
+By its Content-Security-Policy a page runs only the scripts that it was written with. One exception: data: addresses,
+which a policy cannot distinguish, so that a single file would also run a script element with such an address if a flaw
+in the page let data add one. Injected inline scripts and event handlers are blocked there too.
 """
 
 import base64
+import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -17,8 +22,7 @@ from typing import Any
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExportError
 from avmsf.export.bundle import Bundle, make_bundle, write_files
-from avmsf.export.formats import MOST_POINTS, PAGE_SUFFIXES
-from avmsf.export.policy import directives_of, with_policy
+from avmsf.export.formats import MAX_POINTS, PAGE_SUFFIXES
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.writing import Written, generator, write_file, write_folder
 from avmsf.field.sound_field import SoundField
@@ -59,7 +63,7 @@ def write_webpage(
     meters: float = 1.0,
     surface: Path | Surface | None = None,
     strikes: Impacts | None = None,
-    limit: int = MOST_POINTS,
+    limit: int = MAX_POINTS,
     force: bool = False,
 ) -> Written:
     """Write a page that plays the field: one file if `output` ends in .html, otherwise a folder.
@@ -149,3 +153,63 @@ def _once(pattern: re.Pattern[str], text: str, change: Any, what: str) -> str:
     if count != 1:
         raise ExportError.expected(f"one {what}", count, file="index.html", name=what, advice="install avmsf again")
     return changed
+
+
+_INLINE_SCRIPT = re.compile(r"<script(?![^>]*\bsrc=)[^>]*>(.*?)</script>", re.DOTALL)
+_INLINE_STYLE = re.compile(r"<style[^>]*>(.*?)</style>", re.DOTALL)
+_REMOTE = re.compile(r"https://[\w.-]+")
+_HEAD = re.compile(r'(<head>\s*)?<meta charset="[^"]*"\s*/?>|<head>')
+
+
+def directives_of(page: str, *, single: bool = False) -> dict[str, list[str]]:
+    """Return what the studio's page may load, whose inline scripts and styles are known by their content.
+
+    A page that is `single` carries its modules and its audio worklet as data: addresses.
+    """
+    scripts = _INLINE_SCRIPT.findall(page)
+    remote = sorted({address for each in scripts for address in _REMOTE.findall(each)})
+    carried = ["data:"] if single else []
+    return {
+        "default-src": ["'none'"],
+        # Spark computes in WebAssembly.
+        "script-src": ["'self'", "'wasm-unsafe-eval'", *carried, *_hashes(scripts), *remote],
+        "style-src": ["'self'", *_hashes(_INLINE_STYLE.findall(page))],
+        # Spark carries its worker and its WebAssembly within itself, and textures of a mesh become blobs.
+        "worker-src": ["'self'", "blob:"],
+        "connect-src": ["'self'", "blob:", "data:"],
+        "img-src": ["'self'", "blob:", "data:"],
+        "media-src": ["'self'", "blob:"],
+        "base-uri": ["'none'"],
+        "form-action": ["'none'"],
+    }
+
+
+def report_directives(page: str) -> dict[str, list[str]]:
+    """Return what a report may load: its own script and style, and the pictures and sounds that it carries."""
+    return {
+        "default-src": ["'none'"],
+        "script-src": _hashes(_INLINE_SCRIPT.findall(page)),
+        "style-src": _hashes(_INLINE_STYLE.findall(page)),
+        "img-src": ["data:"],
+        "media-src": ["data:"],
+        "base-uri": ["'none'"],
+        "form-action": ["'none'"],
+    }
+
+
+def policy_text(directives: Mapping[str, Sequence[str]]) -> str:
+    """Return directives as a header or a meta element has them."""
+    return "; ".join(" ".join([name, *sources]) for name, sources in directives.items())
+
+
+def with_policy(page: str, directives: Mapping[str, Sequence[str]]) -> str:
+    """Return the page with its policy at the beginning of its head. Raises ExportError for a page without a head."""
+    meta = f'<meta http-equiv="Content-Security-Policy" content="{escape(policy_text(directives))}">'
+    changed, count = _HEAD.subn(lambda found: f"{found[0]}\n{meta}", page, count=1)
+    if not count:
+        raise ExportError("index.html: expected a head, got none; install avmsf again", file="index.html", name="head")
+    return changed
+
+
+def _hashes(contents: Sequence[str]) -> list[str]:
+    return [f"'sha256-{base64.b64encode(hashlib.sha256(each.encode()).digest()).decode()}'" for each in contents]

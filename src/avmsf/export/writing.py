@@ -7,6 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Shaped
 
 from avmsf._utils.files import temporary_path, way_out, write_whole
 from avmsf.errors import ExportError
@@ -38,15 +42,16 @@ def generator() -> str:
     return f"avmsf {version('avmsf')}"
 
 
-def expect_ending(path: Path, endings: Sequence[str]) -> None:
+def check_suffix(path: Path, endings: Sequence[str]) -> None:
     """Raise `ExportError` for a file's name that has none of these endings, dots included."""
     if path.suffix.lower() not in endings:
-        raise ExportError(
-            f"{path}: expected a name that ends in {' or '.join(endings)}, got {path.suffix or 'no ending'}; name it "
-            f"{path.stem if path.suffix[1:].isalpha() else path.name}{endings[0]}",
+        raise ExportError.expected(
+            f"a name that ends in {' or '.join(endings)}",
+            path.suffix,
+            got=path.suffix or "no ending",
             file=path,
             name="suffix",
-            value=path.suffix,
+            advice=f"name it {path.stem if path.suffix[1:].isalpha() else path.name}{endings[0]}",
         )
 
 
@@ -57,30 +62,36 @@ def no_modes(path: Path | None = None) -> ExportError:
     )
 
 
+def pack(arrays: Mapping[str, Shaped[np.ndarray, "..."]]) -> tuple[bytes, dict[str, dict[str, Any]]]:
+    """Return arrays one after another, little endian, each from a multiple of four bytes on; and where each is."""
+    content, records = bytearray(), {}
+    for name, array in arrays.items():
+        content += b"\0" * (-len(content) % 4)
+        records[name] = {"offset": len(content), "dtype": array.dtype.name, "shape": list(array.shape)}
+        content += np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).tobytes()
+    return bytes(content), records
+
+
 def write_file(path: Path, content: bytes, *, force: bool = False) -> dict[Path, int]:
     """Write one file atomically and return its size. Raises `ExportError` if it exists, unless `force` is set."""
-    expect_free(path, force=force)
+    check_free(path, force=force)
     write_whole(path, lambda place: place.write_bytes(content), raising=ExportError)
     return {path: len(content)}
 
 
-def expect_free(path: Path, *, folder: bool = False, force: bool = False) -> None:
+def check_free(path: Path, *, folder: bool = False, force: bool = False) -> None:
     """Raise `ExportError` if `write_file`, or `write_folder`, would for what exists there."""
     if not path.exists():
         return
     if path.is_dir() != folder:
         wanted, found = ("folder", "file") if folder else ("file", "folder")
-        raise ExportError(
-            f"{path}: expected a free name, or a {wanted}, got a {found}; choose another name", file=path, value=found
+        raise ExportError.expected(
+            f"a free name, or a {wanted}", found, got=f"a {found}", file=path, advice="choose another name"
         )
     if not force and not (folder and not any(path.iterdir())):
         found = "a folder with files" if folder else "a file"
-        raise ExportError(
-            f"{path}: expected a free name, got {found}; choose another, or add --overwrite to replace it",
-            file=path,
-            name="--overwrite",
-            value=found,
-        )
+        advice = "choose another, or add --overwrite to replace it"
+        raise ExportError.expected("a free name", found, got=found, file=path, name="--overwrite", advice=advice)
 
 
 def write_folder(
@@ -91,7 +102,7 @@ def write_folder(
     The manifest lists the files. With `force` they replace those of the same names, and others stay. Raises
     `ExportError` for a folder with files, unless `force` is set.
     """
-    expect_free(folder, folder=True, force=force)
+    check_free(folder, folder=True, force=force)
     try:
         temporary = temporary_path(folder.resolve())
         temporary.mkdir(parents=True)

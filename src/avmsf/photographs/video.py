@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from avmsf._utils.files import unwritable
-from avmsf.capture.location import expect_free
+from avmsf.capture.location import check_free
 from avmsf.errors import CaptureError, CaptureWarning
 
 JUDGED = 480
@@ -51,7 +51,7 @@ def pick_frames(
         raise CaptureError(f"count: expected at least 1 frame, got {count}", name="count", value=count)
     if suffix not in (".png", ".jpg"):
         raise CaptureError(f"suffix: expected .png or .jpg, got {suffix!r}", name="suffix", value=suffix)
-    expect_free(folder)
+    check_free(folder)
     claimed = _claimed_frames(path)
     begun = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}")
     try:

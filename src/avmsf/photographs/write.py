@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from avmsf._utils.files import unwritable
-from avmsf.capture.location import expect_free
+from avmsf.capture.location import check_free
 from avmsf.errors import CaptureError
 from avmsf.photographs.cameras import View
 
@@ -27,7 +27,7 @@ def write_views(views: Sequence[View], folder: str | Path) -> None:
     one file, and where it cannot be written.
     """
     folder = Path(folder)
-    expect_free(folder)
+    check_free(folder)
     names = [str(PurePosixPath(view.name).with_suffix(".png")) for view in views]
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:

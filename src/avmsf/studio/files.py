@@ -18,10 +18,9 @@ from torch import Tensor
 from avmsf.capture.folder import read_capture
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import CaptureError, CaptureWarning, StudioError
-from avmsf.export.bundle import write_bundle
-from avmsf.export.formats import MOST_POINTS
-from avmsf.export.normals import outward_normals
-from avmsf.export.sampled_field import SampledField, supporting_columns
+from avmsf.export.bundle import make_bundle
+from avmsf.export.formats import MAX_POINTS
+from avmsf.export.sampled_field import SampledField, outward_normals, supporting_columns
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.positions import points_on_object
 from avmsf.field.scaled_gains import fitted_gains, length_of, surface_of
@@ -77,7 +76,7 @@ class Showcase:
         return self._first_of_field.folder
 
     def show(self, revision: Revision) -> None:
-        """Write a revision's files. Raises the errors of `write_bundle`, and StudioError without geometry."""
+        """Write a revision's files. Raises the errors of `make_bundle`, and StudioError without geometry."""
         with self._lock:
             sampled = self._sampled(revision)
             path = self.folder / f"revision-{revision.number}"
@@ -86,16 +85,8 @@ class Showcase:
             strikes, remarks = self._strikes(revision.field) if fresh else (None, ())
             mute = revision.field is None
             surface = self._surface(revision.field) if fresh else None
-            remarks += write_bundle(
-                sampled,
-                path,
-                object=shown,
-                meters=self.meters,
-                surface=surface,
-                strikes=strikes,
-                mute=mute,
-                force=True,
-            ).remarks
+            bundle = make_bundle(sampled, object=shown, meters=self.meters, surface=surface, strikes=strikes, mute=mute)
+            remarks += bundle.write(path, force=True).remarks
             manifest = json.loads((path / "manifest.json").read_text(encoding="utf-8"))
             manifest["name"] = revision.name or manifest["name"] or self.opened.name
             if fresh:
@@ -140,7 +131,7 @@ class Showcase:
         """Return the table of a field just opened, over its own points, or where it has none, over the object's."""
         own = points_on_object(field.gain_field)
         if len(own):
-            sampled = SampledField.of(field, _thinned(own, MOST_POINTS))
+            sampled = SampledField.of(field, _thinned(own, MAX_POINTS))
             return replace(sampled, points=(sampled.points.double() / length_of(field.gain_field)).float())
         points, normals = self._clickable()
         return sample(field, points, normals)

@@ -15,7 +15,7 @@ from starlette.responses import RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from avmsf._utils.text_files import parse_json
-from avmsf.export.policy import directives_of, policy_text
+from avmsf.export.web import directives_of, policy_text
 from avmsf.studio.responses import RequestError, response_to
 
 _FRAMES = {"frame-ancestors": ["'none'"]}

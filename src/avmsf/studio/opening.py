@@ -11,7 +11,7 @@ from avmsf.capture.filenames import SPLATS, find_surface_file
 from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.table import TABLE
 from avmsf.errors import StudioError
-from avmsf.export.object_file import holds_gaussians
+from avmsf.export.geometry import holds_gaussians
 from avmsf.pipeline.config import CACHE
 from avmsf.pipeline.reconstruct import FIELD, SURFACE
 from avmsf.pipeline.scene import CLOUD

@@ -1,0 +1,221 @@
+"""The object that a page shows: a mesh, Gaussians, or the field's points."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import fast_simplification
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+from trimesh.visual import ColorVisuals
+
+from avmsf.errors import ExportError
+from avmsf.export.sampled_field import SampledField
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.initialize import ZEROTH
+from avmsf.gaussians.ply import read_splats
+from avmsf.mesh.io import MAX_BYTES, load_mesh
+from avmsf.mesh.surface import Surface
+from avmsf.mesh.textured_mesh import TexturedMesh, read_textured_mesh
+
+MAX_FACES = 200_000
+"""Triangles that a browser displays and picks quickly; larger meshes are reduced."""
+_MAX_SIZE_RATIO = 3.0
+"""Ratio of the sizes of object and field above which their units differ."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectFile:
+    """The file of an object's geometry."""
+
+    kind: Literal["mesh", "gaussians", "points"]
+    name: str | None = None
+    """Name of the file; None for points, which are those of the field."""
+    content: bytes = b""
+    remarks: tuple[str, ...] = ()
+    """Notes on differences from the given file."""
+
+
+def read_object(
+    source: Path | Surface | None, points: Float[Tensor, "points 3"], *, meters: float = 1.0, most: int = MAX_FACES
+) -> ObjectFile:
+    """Return an object for a field at `points`: a mesh as `.glb`, Gaussians as they are, or None.
+
+    A file's coordinates count `meters` each; Gaussians are in meters. Meshes of more than `most` triangles are reduced.
+    Raises `ExportError` for a file that is missing, not a mesh, huge, or not in the field's unit.
+    """
+    if source is None:
+        return ObjectFile("points")
+    if isinstance(source, Surface):
+        mesh = trimesh.Trimesh(source.vertices.numpy(), source.faces.numpy(), process=False)
+        return _shown(trimesh.Scene([mesh]), points, None, most)
+    check_readable(source)
+    if source.suffix.lower() == ".ply" and holds_gaussians(source):
+        check_fits(read_splats(source).centers.numpy(), points, source)
+        return ObjectFile("gaussians", "object.ply", source.read_bytes())
+    scene = load_mesh(source, raising=ExportError)
+    scene.apply_scale(meters)  # type: ignore[no-untyped-call]
+    return _shown(scene, points, source, most)
+
+
+def check_readable(path: Path) -> None:
+    """Raise `ExportError` where there is no such file, or one too large to be read: `load_mesh` bounds meshes alone."""
+    if not path.is_file():
+        raise ExportError.expected("a mesh or a .ply of Gaussians", file=path, advice="check the name")
+    size = path.stat().st_size
+    if size > MAX_BYTES:
+        wanted = f"a mesh of at most {MAX_BYTES >> 20} MiB"
+        raise ExportError.expected(wanted, size, got=f"{size >> 20}", file=path, name="size", advice="reduce it first")
+
+
+def holds_gaussians(path: Path) -> bool:
+    """Return whether a .ply's header has the properties of Gaussians."""
+    with path.open("rb") as file:
+        header, _, _ = file.read(1 << 16).partition(b"end_header")
+    return b"scale_0" in header and b"rot_0" in header
+
+
+def _shown(scene: trimesh.Scene, points: Float[Tensor, "points 3"], path: Path | None, most: int) -> ObjectFile:
+    what = path or "the surface"
+    meshes = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    faces = sum(len(mesh.faces) for mesh in meshes)
+    if not meshes:
+        return ObjectFile("points", remarks=(f"{what} has no triangles: the field's points are shown",))
+    places = np.concatenate([np.asarray(mesh.vertices, dtype=np.float64) for mesh in meshes])
+    check_fits(places, points, path)
+    if faces <= most:
+        return ObjectFile("mesh", "object.glb", _as_glb(scene))
+    smaller = trimesh.Scene([reduced(mesh, most / faces) for mesh in meshes])
+    left = sum(len(mesh.faces) for mesh in smaller.geometry.values())
+    remark = f"{what} has {faces:,} triangles, too many for a browser: {left:,} are shown, without its textures"
+    return ObjectFile("mesh", "object.glb", _as_glb(smaller), (remark,))
+
+
+def _as_glb(scene: trimesh.Scene) -> bytes:
+    content = scene.export(file_type="glb")  # type: ignore[no-untyped-call]
+    assert isinstance(content, bytes)
+    return content
+
+
+def reduced(mesh: trimesh.Trimesh, share: float) -> trimesh.Trimesh:
+    """Return a mesh of such a share of the triangles, with vertex colors but no textures."""
+    # Faces without shared corners cannot be merged, and many files have no others.
+    merged = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    merged.merge_vertices(merge_tex=True, merge_norm=True)
+    target = max(4, math.floor(share * len(mesh.faces)))
+    vertices, faces = fast_simplification.simplify(
+        np.asarray(merged.vertices, np.float32), np.asarray(merged.faces), target_count=target
+    )
+    small = trimesh.Trimesh(vertices, faces, process=False)
+    if isinstance(mesh.visual, ColorVisuals) and mesh.visual.kind == "vertex":
+        _, rows = cKDTree(mesh.vertices).query(vertices)
+        small.visual = ColorVisuals(small, vertex_colors=mesh.visual.vertex_colors[rows])
+    return small
+
+
+def check_fits(places: Float[np.ndarray, "places 3"], points: Float[Tensor, "points 3"], path: Path | None) -> None:
+    """Raise `ExportError` for an object, read from `path`, of another size or position than the field."""
+    own = points.double().numpy()
+    size, expected = np.ptp(places, axis=0), np.ptp(own, axis=0)
+    ratio = float(np.linalg.norm(size) / max(float(np.linalg.norm(expected)), 1e-12))
+    apart = float(np.linalg.norm(places.min(axis=0) + size / 2 - own.min(axis=0) - expected / 2))
+    if not 1 / _MAX_SIZE_RATIO < ratio < _MAX_SIZE_RATIO:
+        raise ExportError.expected(
+            f"an object of the field's size, {np.linalg.norm(expected):.3g} m",
+            ratio,
+            got=f"{ratio:.4g} times this",
+            file=path or "the surface",
+            name="size",
+            advice="give the unit of its coordinates, or name the field's object",
+        )
+    if apart > float(np.linalg.norm(expected)):
+        raise ExportError.expected(
+            "the object at the field's points",
+            apart,
+            got=f"its center {apart:.3g} m away",
+            file=path or "the surface",
+            name="center",
+            advice="name a file in the frame of the capture",
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """Geometry to show: triangles with colors, or points."""
+
+    vertices: Float[Tensor, "vertices 3"]
+    """Object frame, meters."""
+    faces: Int[Tensor, "faces 3"]
+    """Rows of `vertices`; empty for points."""
+    normals: Float[Tensor, "vertices 3"]
+    """Outward unit normals."""
+    colors: Float[Tensor, "vertices 3"] | None = None
+    """Red, green, blue as displayed (sRGB), 0 to 1; None for gray."""
+
+    @classmethod
+    def of_points(cls, sampled: SampledField) -> "Look":
+        """Return the field's points."""
+        return cls(sampled.points, torch.zeros(0, 3, dtype=torch.int64), sampled.normals)
+
+    @classmethod
+    def of_mesh(cls, mesh: TexturedMesh) -> "Look":
+        """Return a mesh; a vertex is split if its normal or color differs between faces.
+
+        Textures become vertex colors.
+        """
+        corners = torch.cat([mesh.vertices[mesh.faces], mesh.normals, _corner_colors(mesh)], dim=2).reshape(-1, 9)
+        table, rows = np.unique(corners.numpy(), axis=0, return_inverse=True)
+        kept = torch.from_numpy(table).float()
+        return cls(kept[:, :3], torch.from_numpy(rows.reshape(-1, 3)), kept[:, 3:6], kept[:, 6:])
+
+    @classmethod
+    def of_gaussians(cls, cloud: GaussianCloud, sampled: SampledField) -> "Look":
+        """Return the centers of Gaussians in their colors."""
+        colors = (0.5 + ZEROTH * cloud.harmonics[:, 0]).clamp(0.0, 1.0)
+        normals = sampled.normals[sampled.nearest(cloud.centers)]
+        return cls(cloud.centers, torch.zeros(0, 3, dtype=torch.int64), normals, colors)
+
+
+def read_look(source: Path | Surface, sampled: SampledField, *, meters: float = 1.0) -> tuple[Look, tuple[str, ...]]:
+    """Read a mesh whose coordinates count `meters` each, and notes on differences from the file.
+
+    A `Surface` is in meters. Meshes of more than `MAX_FACES` triangles are reduced. Raises `ExportError` for one that
+    is huge, or not in the field's unit, and `CaptureError` for a file that is not a mesh.
+    """
+    if isinstance(source, Surface):
+        path, mesh = None, TexturedMesh.build(source.vertices, source.faces)
+    else:
+        check_readable(source)
+        path, mesh = source, read_textured_mesh(source, meters=meters)
+    check_fits(mesh.vertices.double().numpy(), sampled.points, path)
+    faces = len(mesh.faces)
+    if faces <= MAX_FACES:
+        return Look.of_mesh(mesh), ()
+    corners = mesh.vertices[mesh.faces].reshape(-1, 3).numpy()
+    painted = (255.0 * _corner_colors(mesh)).round().byte().reshape(-1, 3).numpy()
+    solid = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), vertex_colors=painted, process=False)
+    small = reduced(solid, MAX_FACES / faces)
+    assert isinstance(small.visual, ColorVisuals)
+    corner_rows = torch.from_numpy(np.array(small.faces, dtype=np.int64))
+    shown = torch.from_numpy(np.array(small.visual.vertex_colors[:, :3], dtype=np.float32)) / 255.0
+    vertices = torch.from_numpy(np.array(small.vertices)).float()
+    remark = f"{path or 'the surface'} has {faces:,} triangles, too many for a browser: {len(corner_rows):,} are shown"
+    return Look.of_mesh(TexturedMesh.build(vertices, corner_rows, colors=shown[corner_rows])), (remark,)
+
+
+def _corner_colors(mesh: TexturedMesh) -> Float[Tensor, "faces 3 3"]:
+    """Return each corner's color times that of its texture there."""
+    colors = mesh.colors.clone()
+    for number, texture in enumerate(mesh.textures):
+        chosen = mesh.materials == number
+        height, width = texture.shape[:2]
+        across, up = mesh.coordinates[chosen].unbind(2)
+        column = (across.remainder(1.0) * width).long().clamp(max=width - 1)
+        row = ((1.0 - up.remainder(1.0)) * height).long().clamp(0, height - 1)
+        colors[chosen] *= texture[row, column].float() / 255.0
+    return colors
