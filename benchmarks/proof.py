@@ -1,11 +1,10 @@
-"""What an evaluation stands on: finite elements against theory, what CDPAM costs, and how RealImpact's files open."""
+"""What an evaluation stands on: finite elements against theory, and how RealImpact's files open."""
 
-from benchmarks.cdpam import measure_cdpam
 from benchmarks.datasets import measure_realimpact
 from benchmarks.fem import measure_fem
 from benchmarks.report import Options, Report
 
-PARTS = {"fem": measure_fem, "cdpam": measure_cdpam, "realimpact": measure_realimpact}
+PARTS = {"fem": measure_fem, "realimpact": measure_realimpact}
 
 
 def measure(options: Options) -> Report:

@@ -1,6 +1,5 @@
-"""The baselines that the paper leaves out: splines over contacts, means of spectra, and blows from both sides."""
+"""The baselines that the paper leaves out: splines over contacts, and impacts from both sides."""
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -9,8 +8,7 @@ import torch
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.interpolation import SplineGains
-from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform
-from avmsf.evaluation.spectral_mean import MeanSpectra
+from avmsf.evaluation.simple_methods import MeanGains
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
@@ -155,42 +153,3 @@ def test_modes_of_other_recordings_are_refused():
     impacts, modes, _ = two_sided()
     with raises(EvaluationError, name="extraction", value=14):
         SplineGains(impacts.take(range(4)), modes)
-
-
-def ringing(gains: list[float], phases: list[float], *, samples: int = 3000) -> Impacts:
-    times = torch.arange(samples, dtype=torch.float64) / 22050.0
-    decay = torch.exp(-20.0 * times)
-    sounds = [
-        gain * decay * torch.sin(2 * math.pi * 1500.0 * times + phase)
-        for gain, phase in zip(gains, phases, strict=True)
-    ]
-    contacts = torch.zeros(len(gains), 3, dtype=torch.float64)
-    contacts[:, 0] = torch.arange(len(gains))
-    return Impacts(contacts, torch.stack(sounds).float(), 22050.0, tuple(map(str, range(len(gains)))))
-
-
-@pytest.mark.parametrize("samples", [3000, 4096, 701])
-def test_the_mean_spectrum_of_equal_sounds_is_the_sound(samples):
-    train = ringing([1.0, 1.0, 1.0], [0.4] * 3, samples=samples)
-    found = MeanSpectra(train).render(train.contacts)
-    assert torch.allclose(found, train.sounds, rtol=0, atol=1e-5)
-    noise = torch.randn(1, samples, generator=torch.Generator().manual_seed(0))
-    alone = replace(train.take([0]), sounds=noise)
-    assert torch.allclose(MeanSpectra(alone, count=1).render(train.contacts), noise.expand(3, -1), rtol=0, atol=1e-4)
-
-
-def test_phases_do_not_cancel_in_spectra():
-    opposed = ringing([1.0, 3.0], [0.0, math.pi])
-    asked = opposed.contacts[:1] + 0.1
-    found = MeanSpectra(opposed, count=2).render(asked)
-    # The magnitudes' mean is two, in the phase of the nearest, whose waveforms' mean would be minus one.
-    assert torch.allclose(found, 2.0 * opposed.sounds[:1], rtol=0, atol=1e-4)
-    assert torch.allclose(MeanWaveform(opposed, count=2).render(asked), -opposed.sounds[:1], rtol=0, atol=1e-5)
-
-
-def test_means_of_too_many_spectra_are_refused():
-    train = ringing([1.0, 1.0], [0.0, 0.0])
-    with raises(EvaluationError, name="count", value=3):
-        MeanSpectra(train)
-    with raises(EvaluationError, name="fft_size", value=8):
-        MeanSpectra(train, count=2, fft_size=8)

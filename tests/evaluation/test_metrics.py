@@ -11,12 +11,11 @@ from corpus import make as corpus
 
 from avmsf.errors import ArrayError, EvaluationError
 from avmsf.evaluation.cdpam import Cdpam
-from avmsf.evaluation.conventions import OBJECTFOLDER, PAPER
 from avmsf.evaluation.metrics import (
+    PAPER,
     default_fft_sizes,
     envelope_distance,
     log_mel_distance,
-    objectfolder_distance,
     relative_stft_error,
     resampled,
     spectrogram_distance,
@@ -33,7 +32,6 @@ METRICS = {
     "l1": lambda a, b: spectrogram_distance(a, b, fft_size=512, hop=128),
     "l1_log": lambda a, b: log_mel_distance(a, b, sample_rate=RATE, fft_size=512, hop=128, mel_count=40, floor=1e-5),
     "envelope": envelope_distance,
-    "objectfolder": lambda a, b: objectfolder_distance(a, b, sample_rate=RATE),
 }
 every_metric = pytest.mark.parametrize("metric", METRICS.values(), ids=METRICS.keys())
 
@@ -60,7 +58,7 @@ def test_more_noise_is_farther(metric):
     assert bool((distances.diff(dim=0) > 0).all())
 
 
-@pytest.mark.parametrize("name", ["l1", "l1_log", "envelope", "objectfolder"])
+@pytest.mark.parametrize("name", ["l1", "l1_log", "envelope"])
 def test_distances_are_the_same_from_both_sides(name):
     a, b = clips(seed=1), clips(seed=2).flip(0)
     assert torch.allclose(METRICS[name](a, b), METRICS[name](b, a), rtol=1e-12)
@@ -146,37 +144,6 @@ def test_the_papers_white_noise_is_where_the_paper_has_it():
     assert ratio == pytest.approx(12.3, rel=0.01)
 
 
-def test_objectfolder_is_decibels_over_a_hundred_squared():
-    # Noise, as loud as to keep all bands between the clip points at -80 and +20 dB, and 5 dB more of it.
-    noise = 0.05 * torch.randn(2, 48000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    louder = noise * 10 ** (5 / 20)
-    assert objectfolder_distance(louder, noise, sample_rate=RATE).tolist() == pytest.approx([0.0025] * 2, rel=1e-3)
-    # Against silence, at the floor of 1e-5, so -100 - 20 dB, clipped to zero.
-    against_silence = objectfolder_distance(noise, 0 * noise, sample_rate=RATE)
-    assert bool(((against_silence > 0.05) & (against_silence < 1.0)).all())
-
-
-def test_objectfolder_hears_what_lies_in_its_band_alone():
-    times = torch.arange(48000, dtype=torch.float64) / 48000.0
-    # Fades in and out, so that no click spreads over the band.
-    fade = torch.sin(math.pi * times) ** 2
-
-    def heard(frequency: float) -> float:
-        tone = (0.1 * fade * torch.sin(2 * math.pi * frequency * times))[None]
-        return float(objectfolder_distance(tone, 0 * tone, sample_rate=48000.0))
-
-    assert heard(1000.0) > 0.01
-    # Above half of 22,050 Hz: the resampler takes it away, where decimation would fold it to 6050 Hz.
-    assert heard(16000.0) < 1e-3 * heard(1000.0)
-
-
-def test_objectfolder_compares_ten_seconds():
-    long = torch.zeros(1, round(11.5 * 22050), dtype=torch.float64)
-    late = long.clone()
-    late[:, -22050:] = 0.1
-    assert float(objectfolder_distance(late, long, sample_rate=22050.0)) == 0.0
-
-
 @pytest.mark.parametrize(
     ("sample_rate", "sizes"),
     [
@@ -200,11 +167,6 @@ def test_the_papers_convention_holds_at_any_rate(sample_rate):
     scores = PAPER.scores(a, b, sample_rate=sample_rate)
     assert set(scores) == {"l1", "l1_log", "envelope"}
     assert all(bool((values > 0).all()) for values in scores.values())
-
-
-def test_objectfolders_convention_has_its_own_two():
-    scores = OBJECTFOLDER.scores(clips(), clips().flip(0), sample_rate=RATE)
-    assert set(scores) == {"spectrogram", "envelope"}
 
 
 @every_metric
@@ -282,7 +244,5 @@ def test_nothing_is_relative_to_silence():
 
 
 def test_rates_without_sense_are_refused():
-    with raises(EvaluationError, name="sample_rate", value=400.0):
-        objectfolder_distance(clips(), clips(), sample_rate=400.0)
     with raises(ArrayError, name="sample_rate", value=-1.0):
         scaled_fft_size(1024, sample_rate=-1.0)

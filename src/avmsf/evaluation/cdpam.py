@@ -2,81 +2,237 @@
 
 Manocha, Jin, Zhang and Finkelstein, "CDPAM: Contrastive learning for perceptual audio similarity", ICASSP 2021; the
 network and its weights are those of their package `cdpam`, at 22,050 Hz. It is not free of level, and two scalings of
-one and the same sound are in use, whose figures differ by orders of magnitude:
+one and the same sound are in use, whose values differ by orders of magnitude:
 
-- `benchmark`: sounds as fractions of full scale, -1 to 1. The ObjectFolder benchmark calls it so, and figures near
+- `benchmark`: sounds as fractions of full scale, -1 to 1. The ObjectFolder benchmark calls it so, and values near
   1e-4, as the paper has them, come about in no other way. [inferred]
 - `authors`: samples as 16-bit integers, so the same times 32768 and rounded, as the network was trained.
 """
 
 import hashlib
-from collections.abc import Sequence
+import importlib.util
+import pickle
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from types import SimpleNamespace
+from typing import IO, Any, Literal
 
-import numpy as np
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
+from torch.nn.functional import conv1d, leaky_relu, normalize
 
-from avmsf._utils.files import write_whole
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.cdpam_network import FEATURES, CdpamNetwork
-from avmsf.evaluation.cdpam_weights import find_weights, read_weights
-from avmsf.evaluation.conventions import Convention
-from avmsf.evaluation.convolution import Workspace
 from avmsf.evaluation.metrics import PerContact, resampled, validate, validate_sounds
 
 Scaling = Literal["benchmark", "authors"]
 SAMPLE_RATE = 22050.0
 """Hz that sounds are resampled to (polyphase)."""
-KEYS: dict[Scaling, str] = {"benchmark": "cdpam", "authors": "cdpam_scaled"}
-"""What a report calls the distance in each scaling."""
 _FULL_SCALE = 32768.0
-_ARITHMETIC = "1"
-"""Part of the names of kept embeddings; another number where they are computed otherwise than before."""
+_LAYERS = 16
+"""Convolutions of the encoder; every fourth keeps every second sample and has twice as many channels."""
+_TAPS = 15
+_HEAD_SIZES = (512, 256, 64, 16, 4)
+"""Features before and after each layer of the distance."""
+_NORM_EPSILON = 1e-5
+"""What batch normalization adds to a variance."""
+_SLOPE, _HEAD_SLOPE = 0.1, 0.01
+"""Slopes of the rectifiers below zero, in the encoder and in the distance."""
+_SILENCE = 1024
+"""Samples of silence in whose middle, after all layers, the ends are not felt: they reach 27 of 64."""
+_FILE = Path("CDPAM_trained", "scratchJNDdefault_best_model.pth")
+_INSTALL = "install them again: pip install --force-reinstall 'cdpam==0.0.6'"
+_ALLOWED = {
+    ("torch._utils", "_rebuild_tensor_v2"),
+    ("torch", "FloatStorage"),
+    ("torch", "LongStorage"),
+    ("collections", "OrderedDict"),
+}
+"""All that the weights' file consists of besides numbers and strings."""
 
 
 @dataclass(frozen=True, eq=False)
-class Cdpam(Convention):
-    """The network, and what it made of every sound so far; `Cdpam.load()` makes one.
+class CdpamWeights:
+    """The authors' trained weights, by their names in their code."""
+
+    tensors: Mapping[str, Tensor]
+
+    def take(self, name: str, *shape: int) -> Tensor:
+        """Return a tensor in float64. Raises EvaluationError where there is none of this name and shape."""
+        tensor = self.tensors.get(name)
+        if not isinstance(tensor, Tensor) or tuple(tensor.shape) != shape:
+            found = list(tensor.shape) if isinstance(tensor, Tensor) else None
+            raise EvaluationError(
+                f"weights of the package cdpam: expected a tensor {name} of the shape {list(shape)}, got {found}; "
+                f"{_INSTALL}",
+                name=name,
+                value=found,
+            )
+        return tensor.double()
+
+
+def find_weights() -> Path:
+    """Return where the installed package keeps its weights. Raises EvaluationError where it is not installed."""
+    # Importing the package would fail: it needs modules that it does not install, and names that numpy has dropped.
+    found = importlib.util.find_spec("cdpam")
+    if found is None or not found.submodule_search_locations:
+        raise EvaluationError.expected(
+            "an installed package", name="cdpam", advice="pip install 'avmsf[eval]', or omit CDPAM with --no-cdpam"
+        )
+    return Path(found.submodule_search_locations[0]) / _FILE
+
+
+def read_weights(path: Path) -> CdpamWeights:
+    """Read a weights file. Raises EvaluationError where it is missing, damaged, or holds anything but tensors."""
+    # The file is pickled the way of Python 2, with an opcode that torch's own `weights_only` does not know. So what may
+    # be made while it is read is listed here, by the same principle.
+    pickles = SimpleNamespace(__name__=__name__, Unpickler=_TensorUnpickler, load=_load)
+    unreadable = OSError, EOFError, RuntimeError, ValueError, LookupError, TypeError, pickle.UnpicklingError
+    try:
+        stored = torch.load(path, map_location="cpu", weights_only=False, pickle_module=pickles)
+    except unreadable as error:
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise EvaluationError(
+            f"{path}: expected the trained weights of CDPAM, got {reason}; {_INSTALL}", file=path
+        ) from error
+    tensors = stored.get("state") if isinstance(stored, Mapping) else None
+    if not isinstance(tensors, Mapping):
+        raise EvaluationError.expected(
+            "the trained weights of CDPAM under 'state'", file=path, name="state", advice=_INSTALL
+        )
+    return CdpamWeights(tensors)
+
+
+class _TensorUnpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in _ALLOWED:
+            raise pickle.UnpicklingError(f"{module}.{name} in place of tensors")
+        return super().find_class(module, name)
+
+
+def _load(file: IO[bytes], **options: Any) -> Any:
+    return _TensorUnpickler(file, **options).load()
+
+
+@dataclass(frozen=True, eq=False)
+class CdpamNetwork:
+    """The encoder with its batch normalization folded in, and the layers of the distance.
+
+    Sixteen convolutions, each followed by a leaky rectifier. Of the mean over time the first half, the authors'
+    acoustic part, is scaled to length one. The distance sums weighted absolute differences after each of four layers,
+    so that of features that are weighted beforehand it is the L1 distance.
+
+    What passes through the encoder is the difference from its response to silence. Sounds as fractions of full scale
+    change that response by so little that the rounding of 32-bit sums would be a part of the distance.
+    """
+
+    convolutions: tuple[tuple[Float[Tensor, "outputs inputs taps"], Float[Tensor, "outputs 1"]], ...]
+    """Of each layer of the encoder: weights and bias."""
+    head_layers: tuple[tuple[Float64[Tensor, "_ _"], Float64[Tensor, " _"], Float64[Tensor, " _"]], ...]
+    """Of each layer of the distance: weights, bias, and what its differences are multiplied by."""
+    _silences: dict[int, tuple[Float[Tensor, "outputs samples"], ...]] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def of(cls, weights: CdpamWeights) -> "CdpamNetwork":
+        """Fold trained weights. Raises EvaluationError where they are not those of this network."""
+        head_layers = tuple(
+            (
+                weights.take(f"model_dist.convs.{layer}.0.weight", after, before),
+                weights.take(f"model_dist.convs.{layer}.0.bias", after),
+                weights.take(f"model_dist.chan_w.{layer}", after).abs(),
+            )
+            for layer, (before, after) in enumerate(pairwise(_HEAD_SIZES))
+        )
+        return cls(tuple(_folded(weights, layer) for layer in range(_LAYERS)), head_layers)
+
+    def features(self, sound: Float[Tensor, " samples"]) -> Float64[Tensor, " features"]:
+        """Return the weighted features of a sound of any length at 22,050 Hz, float32."""
+        difference, mean = sound[None], torch.zeros(1)
+        silences = self._silence(len(sound))
+        for layer, silence in enumerate(silences):
+            difference = conv1d(difference, self.convolutions[layer][0], stride=_stride(layer), padding=_TAPS // 2)
+            level = _lengthened(silence, difference.shape[1])
+            # While the sum keeps the level's sign, its slope is the level's; beyond zero it is the other one.
+            sign = torch.where(level > 0.0, 1.0, -1.0)
+            beyond = torch.addcmul(-level.abs(), -sign, difference).relu_()
+            difference = difference * torch.where(level > 0.0, 1.0, _SLOPE) + (1 - _SLOPE) * beyond
+            mean = leaky_relu(level.double(), _SLOPE).mean(dim=1) if layer == _LAYERS - 1 else mean
+        return self.head(mean + difference.mean(dim=1, dtype=torch.float64))
+
+    def head(self, mean: Float64[Tensor, " dim"]) -> Float64[Tensor, " features"]:
+        """Return the weighted features of an encoder's mean over time."""
+        values = normalize(mean, dim=0)
+        features = []
+        for number, (matrix, offset, importance) in enumerate(self.head_layers, start=1):
+            values = matrix @ values + offset
+            # The last layer has no rectifier.
+            if number < len(self.head_layers):
+                values = leaky_relu(values, _HEAD_SLOPE)
+            features.append(importance * values)
+        return torch.cat(features)
+
+    def _silence(self, samples: int) -> tuple[Float[Tensor, "outputs samples"], ...]:
+        """Return every convolution's response to a silence, which is shorter where its middle is constant."""
+        # The strides halve the length four times; the ends look alike for lengths with the same remainder.
+        length = samples if samples < _SILENCE else _SILENCE + (samples - _SILENCE) % 16
+        if length not in self._silences:
+            signal, responses = torch.zeros(1, length), []
+            for layer, (weights, bias) in enumerate(self.convolutions):
+                responses.append(conv1d(signal, weights, stride=_stride(layer), padding=_TAPS // 2) + bias)
+                signal = leaky_relu(responses[-1], _SLOPE)
+            self._silences[length] = tuple(responses)
+        return self._silences[length]
+
+
+def _stride(layer: int) -> int:
+    return 2 if layer % 4 == 3 else 1
+
+
+def _lengthened(response: Float[Tensor, "outputs short"], samples: int) -> Float[Tensor, "outputs samples"]:
+    """Return a short silence's response as that of a longer one: its middle is repeated."""
+    half, added = response.shape[1] // 2, samples - response.shape[1]
+    middle = response[:, half : half + 1].expand(-1, added)
+    return torch.cat([response[:, :half], middle, response[:, half:]], dim=1)
+
+
+def _folded(
+    weights: CdpamWeights, layer: int
+) -> tuple[Float[Tensor, "outputs inputs taps"], Float[Tensor, "outputs 1"]]:
+    """Return a convolution's weights and bias, batch normalization included."""
+    outputs, inputs = 64 * 2 ** ((layer + 1) // 4), 1 if layer == 0 else 64 * 2 ** (layer // 4)
+    kernel = weights.take(f"base_encoder.encoder.{layer}.weight", outputs, inputs, _TAPS)
+    bias = weights.take(f"base_encoder.encoder.{layer}.bias", outputs)
+    scale, shift, mean, variance = (
+        weights.take(f"base_encoder.ebatch.{layer}.{name}", outputs)
+        for name in ("weight", "bias", "running_mean", "running_var")
+    )
+    factor = scale / (variance + _NORM_EPSILON).sqrt()
+    kernel, bias = kernel * factor[:, None, None], (bias - mean) * factor + shift
+    # The second half of the last layer is the content part, which the distance does not use.
+    used = outputs // 2 if layer == _LAYERS - 1 else outputs
+    return kernel[:used].float(), bias[:used, None].float()
+
+
+@dataclass(frozen=True, eq=False)
+class Cdpam:
+    """The network, and the embeddings of all sounds so far; `Cdpam.load()` makes one.
 
     Two sounds' distance is the sum of the absolute differences of their embeddings, so that each sound is embedded
     once, however many others it is compared with.
     """
 
     network: CdpamNetwork
-    digest: str
-    """SHA-256 of the weights' file."""
-    folder: Path | None = None
-    """Where embeddings outlive the process, 3 kB a sound; any number of processes may share it. None keeps none."""
-    scalings: Sequence[Scaling] = ("benchmark", "authors")
-    """Those that `scores` has; each costs an embedding a sound."""
-    _made: dict[str, Float64[Tensor, " features"]] = field(default_factory=dict, repr=False)
+    _embeddings: dict[str, Float64[Tensor, " features"]] = field(default_factory=dict, repr=False)
 
     @classmethod
-    def load(cls, folder: Path | None = None, *, scalings: Sequence[Scaling] = ("benchmark", "authors")) -> "Cdpam":
-        """Read the installed package's weights, half a gigabyte once they are arranged.
+    def load(cls) -> "Cdpam":
+        """Read the installed package's weights.
 
         Raises EvaluationError where the package is missing or its weights are not those known here.
         """
-        weights = read_weights(find_weights())
-        return cls(CdpamNetwork.of(weights), weights.digest, folder, scalings)
-
-    @property
-    def name(self) -> str:
-        """What a report calls the convention."""
-        return "cdpam"
-
-    def scores(
-        self, predicted: Float[Tensor, "..."], truth: Float[Tensor, "..."], *, sample_rate: float
-    ) -> dict[str, PerContact]:
-        """Return `cdpam` and `cdpam_scaled` of every contact, or that of them which `scalings` has."""
-        return {
-            KEYS[scaling]: self.distance(predicted, truth, sample_rate=sample_rate, scaling=scaling)
-            for scaling in self.scalings
-        }
+        return cls(CdpamNetwork.of(read_weights(find_weights())))
 
     def distance(
         self,
@@ -94,62 +250,32 @@ class Cdpam(Convention):
     def embed(
         self, sounds: Float[Tensor, "..."], *, sample_rate: float, scaling: Scaling = "benchmark"
     ) -> Float64[Tensor, "contacts features"]:
-        """Return the features that the distance compares; they are remembered by the sounds' samples.
+        """Return the features that the distance compares; they are cached by the sounds' samples.
 
         Sounds [contacts, samples] are fractions of full scale. Raises EvaluationError for sounds that are empty or not
         finite, and for a rate that is not positive.
         """
         validate_sounds(sounds)
-        workspace = Workspace()
-        return torch.stack(
-            [self._embed_one(sound, sample_rate, scaling, workspace) for sound in sounds.detach().cpu().double()]
-        )
+        rows = []
+        for sound in sounds.detach().cpu().double():
+            key = hashlib.sha256(f"{scaling} {float(sample_rate)!r} ".encode() + sound.numpy().tobytes()).hexdigest()
+            if key not in self._embeddings:
+                self._embeddings[key] = self._computed(sound, sample_rate, scaling)
+            rows.append(self._embeddings[key])
+        return torch.stack(rows)
 
-    def _embed_one(
-        self, sound: Float64[Tensor, " samples"], sample_rate: float, scaling: Scaling, workspace: Workspace
+    def _computed(
+        self, sound: Float64[Tensor, " samples"], sample_rate: float, scaling: Scaling
     ) -> Float64[Tensor, " features"]:
-        what = f"{_ARITHMETIC} {self.digest} {scaling} {float(sample_rate)!r} ".encode()
-        key = hashlib.sha256(what + sound.numpy().tobytes()).hexdigest()
-        if key not in self._made:
-            kept = None if self.folder is None else _read(self.folder / f"{key}.npy")
-            if kept is None:
-                kept = self._compute(sound, sample_rate, scaling, workspace)
-                if self.folder is not None:
-                    _keep(self.folder / f"{key}.npy", kept)
-            self._made[key] = kept
-        return self._made[key]
-
-    def _compute(
-        self, sound: Float64[Tensor, " samples"], sample_rate: float, scaling: Scaling, workspace: Workspace
-    ) -> Float64[Tensor, " features"]:
-        heard = resampled(sound[None], sample_rate=sample_rate, wanted=SAMPLE_RATE)[0]
+        scaled = resampled(sound[None], sample_rate=sample_rate, wanted=SAMPLE_RATE)[0]
         if scaling == "authors":
-            heard = torch.round(heard * _FULL_SCALE)
-        with torch.inference_mode():
-            features = self.network.features(heard.float(), workspace)
+            scaled = torch.round(scaled * _FULL_SCALE)
+        with torch.no_grad():
+            features = self.network.features(scaled.float())
         if not bool(torch.isfinite(features).all()):
             raise EvaluationError(
                 f"expected sounds as fractions of full scale, 1, got a peak of {float(sound.abs().max()):g}",
                 name="sounds",
                 value=float(sound.abs().max()),
             )
-        return features.clone()
-
-
-def _read(path: Path) -> Float64[Tensor, " features"] | None:
-    """Return a kept embedding; None where there is none or it is damaged."""
-    try:
-        values = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError):
-        return None
-    if values.shape != (FEATURES,) or values.dtype != np.float64 or not np.isfinite(values).all():
-        return None
-    return torch.from_numpy(values)
-
-
-def _keep(path: Path, features: Float64[Tensor, " features"]) -> None:
-    def write(place: Path) -> None:
-        with open(place, "wb") as file:
-            np.save(file, features.numpy(), allow_pickle=False)
-
-    write_whole(path, write, raising=EvaluationError)
+        return features

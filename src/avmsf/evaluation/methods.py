@@ -19,7 +19,6 @@ from avmsf.evaluation.recorded import Recorded
 from avmsf.evaluation.renderer import Renderer
 from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, RandomImpact, WhiteNoise
 from avmsf.evaluation.sonicgauss_method import SmallSonicGaussMethod, SonicGaussMethod
-from avmsf.evaluation.spectral_mean import MeanSpectra
 from avmsf.evaluation.task import Look, Method, Task
 from avmsf.field.config import GainModel
 from avmsf.field.sound_field import SoundField
@@ -99,10 +98,6 @@ def _mean_gains(task: Task) -> MeanGains:
     return MeanGains(task.train, task.modes(), count=_count(task), noise=True, seed=task.seed)
 
 
-def _mean_spectra(task: Task) -> MeanSpectra:
-    return MeanSpectra(task.train, count=_count(task))
-
-
 def _spline_gains(task: Task) -> SplineGains:
     return SplineGains(task.train, task.modes(), noise=True, seed=task.seed)
 
@@ -114,7 +109,6 @@ BASELINES = (
     Baseline("knn3", _mean_waveform),
     Baseline("knn3-directions", _directed_mean_waveform),
     Baseline("knn-gains", _mean_gains),
-    Baseline("knn-spectra", _mean_spectra),
     Baseline("spline-gains", _spline_gains),
 )
 """The paper's baselines that need nothing but data, then the strong ones that it leaves out. Those that share modes
@@ -205,6 +199,6 @@ def report_of(renderer: Renderer) -> dict[str, Any]:
         return dict(renderer.report)
     if isinstance(renderer, SplineGains | DiffSound):
         return renderer.report
-    if isinstance(renderer, MeanGains | MeanSpectra | MeanWaveform):
+    if isinstance(renderer, MeanGains | MeanWaveform):
         return {"neighbors": renderer.count}
     return {}

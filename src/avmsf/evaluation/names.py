@@ -25,7 +25,6 @@ METHOD_NAMES = (
     "knn3",
     "knn3-directions",
     "knn-gains",
-    "knn-spectra",
     "spline-gains",
     "diffsound",
     "diffsound-weighted",

@@ -18,7 +18,6 @@ _TABLE = (
     BASELINE,
     "knn3-directions",
     "knn-gains",
-    "knn-spectra",
     "spline-gains",
     "field",
     "field-elastic",

@@ -1,7 +1,7 @@
 """The paper's own figures, to print beside those that are computed here.
 
 Its metrics are described in words only, so that the convention ours are taken in is an inference
-(`avmsf.evaluation.conventions`): ratios between methods may be compared, absolute figures may not.
+(`avmsf.evaluation.metrics`): ratios between methods may be compared, absolute figures may not.
 """
 
 from collections.abc import Mapping

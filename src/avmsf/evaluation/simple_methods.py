@@ -28,7 +28,7 @@ class WhiteNoise:
     """Gaussian white noise at the mean level of the training sounds, different for each contact.
 
     The level is the root mean square over the sound. (The paper says the same of its white noise, but its values are
-    those of noise of peak one: see `avmsf.evaluation.conventions`.)
+    those of noise of peak one: see `avmsf.evaluation.metrics`.)
     """
 
     train: Impacts

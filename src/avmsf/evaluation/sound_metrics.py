@@ -9,7 +9,7 @@ from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.conventions import PAPER, Convention
+from avmsf.evaluation.metrics import PAPER, PaperConvention
 from avmsf.evaluation.modal_metrics import ModalRenderer, judge_modes
 from avmsf.evaluation.renderer import Renderer
 from avmsf.evaluation.splits import score
@@ -33,7 +33,7 @@ class Judgement:
 class Judging:
     """Which metrics are computed."""
 
-    convention: Convention = PAPER
+    convention: PaperConvention = PAPER
     level: Literal["full-scale", "raw"] = "full-scale"
     """full-scale: all sounds of an object times one factor, so that its loudest recording has a peak of one and L1, ENV
     and CDPAM of different objects can be averaged; methods do not depend on it. raw: in the unit of the recordings,
@@ -114,4 +114,4 @@ def _modal_figures(renderer: Renderer, test: Impacts, truth: Truth) -> dict[str,
 def _cdpam() -> "Cdpam":
     from avmsf.evaluation.cdpam import Cdpam
 
-    return Cdpam.load(scalings=("benchmark",))
+    return Cdpam.load()

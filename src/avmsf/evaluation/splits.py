@@ -15,8 +15,14 @@ from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, ExtractionError, FitError, PositionWarning
 from avmsf.evaluation.cases import Places
-from avmsf.evaluation.conventions import PAPER, Convention
-from avmsf.evaluation.metrics import PerContact, default_fft_sizes, relative_stft_error, validate
+from avmsf.evaluation.metrics import (
+    PAPER,
+    PaperConvention,
+    PerContact,
+    default_fft_sizes,
+    relative_stft_error,
+    validate,
+)
 from avmsf.evaluation.renderer import Renderer, expect_renderer
 from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.points import farthest_points
@@ -34,7 +40,7 @@ class Scores:
         return f"Scores({counted(len(self.names), 'recording')}: {means})"
 
     convention: str
-    """Name of the convention that the metrics follow, `relative_stft` apart, which is the same in all."""
+    """Name of the convention that the metrics follow, except for `relative_stft`."""
     names: tuple[str, ...]
     """Name of each scored recording."""
     values: Mapping[str, PerContact]
@@ -102,7 +108,7 @@ def evaluate(
     test: Capture | Impacts,
     *,
     train: Capture | Impacts | None = None,
-    convention: Convention = PAPER,
+    convention: PaperConvention = PAPER,
     fft_sizes: Sequence[int] | None = None,
 ) -> Scores:
     """Score the sounds that `renderer` renders at the contacts of recordings against these recordings.
@@ -178,7 +184,7 @@ def score(
     sounds: ArrayLike,
     impacts: Impacts,
     *,
-    convention: Convention = PAPER,
+    convention: PaperConvention = PAPER,
     fft_sizes: Sequence[int] | None = None,
 ) -> Scores:
     """Score sounds that were made otherwise than by a renderer, row for row of the impacts.

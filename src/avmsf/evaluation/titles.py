@@ -11,7 +11,6 @@ TITLES: Mapping[str, str] = MappingProxyType(
         "knn3": "mean waveform of the three nearest recordings (the paper's KNN)",
         "knn3-directions": "mean waveform of the three nearest recordings, by position and impact direction",
         "knn-gains": "modal gains averaged over the three nearest recordings",
-        "knn-spectra": "spectra averaged over the three nearest recordings",
         "spline-gains": "modal gains by thin-plate splines",
         "diffsound": "reimplementation of DiffSound, as in the paper",
         "diffsound-weighted": "DiffSound with a fitted weight for each mode",

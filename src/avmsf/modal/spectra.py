@@ -57,7 +57,7 @@ def log_mel(
 ) -> Float[Tensor, "contacts mels frames"]:
     """Return the natural logarithm of filtered magnitudes, which are taken as `floor` where they lie below it.
 
-    `filters` as `htk_filters` or `slaney_filters` make them for the same `fft_size`.
+    `filters` as `htk_filters` makes them for the same `fft_size`.
     """
     return torch.log(torch.clamp(filters @ magnitude_stft(sounds, fft_size=fft_size, hop=hop), min=floor))
 
@@ -74,25 +74,6 @@ def htk_filters(
     mels = torch.linspace(ends[0], ends[1], count + 2, dtype=torch.float64)
     edges = 700.0 * (10.0 ** (mels / 2595.0) - 1.0)
     return _triangles(edges, fft_size=fft_size, sample_rate=sample_rate)
-
-
-def slaney_filters(
-    count: int, *, fft_size: int, sample_rate: float, lowest: float, highest: float
-) -> Float[Tensor, "mels bins"]:
-    """Return triangles of unit area over frequency (1 / Hz), evenly spaced on Slaney's mel scale.
-
-    That scale is linear below 1 kHz, 3 mels in 200 Hz, and logarithmic above, 27 mels for each factor of 6.4.
-    Frequencies in Hz; float64. Raises as `htk_filters`.
-    """
-    break_hz, break_mel, step = 1000.0, 15.0, math.log(6.4) / 27.0
-    ends = [
-        frequency * 3.0 / 200.0 if frequency < break_hz else break_mel + math.log(frequency / break_hz) / step
-        for frequency in (lowest, highest)
-    ]
-    mels = torch.linspace(ends[0], ends[1], count + 2, dtype=torch.float64)
-    edges = torch.where(mels < break_mel, mels * 200.0 / 3.0, break_hz * torch.exp(step * (mels - break_mel)))
-    triangles = _triangles(edges, fft_size=fft_size, sample_rate=sample_rate)
-    return triangles * (2.0 / (edges[2:] - edges[:-2]))[:, None]
 
 
 def _triangles(edges: Float[Tensor, " edges"], *, fft_size: int, sample_rate: float) -> Float[Tensor, "mels bins"]:
