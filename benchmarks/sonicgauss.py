@@ -1,4 +1,4 @@
-"""The small SonicGauss: its training from scratch, by one command, and the method beside the others."""
+"""The small SonicGauss: its training from scratch, by one command."""
 
 import time
 from pathlib import Path
@@ -7,7 +7,6 @@ from avmsf.baselines.sonicgauss.objects import training_objects, training_recipe
 from avmsf.baselines.sonicgauss.pretraining import PretrainingConfig, pretrain
 from avmsf.baselines.sonicgauss.small import SmallConfig
 from avmsf.baselines.sonicgauss.tuning import TrainingConfig
-from avmsf.evaluation.sonicgauss_method import SmallSonicGaussMethod
 from benchmarks.report import Report, Table, log
 
 OBJECTS = 40
@@ -33,8 +32,3 @@ def train_small(weights: Path, *, cache: Path | None, quick: bool) -> Report:
     }
     title = f"sonicgauss-small: loss by part of {found.report['steps']} steps, {found.report['clips']} recordings"
     return Report(tables=(Table(title, ("steps", "loss"), rows),), figures=figures)
-
-
-def small_method(weights: Path) -> tuple[SmallSonicGaussMethod, ...]:
-    """Return the method of weights that have been made."""
-    return (SmallSonicGaussMethod(weights),) if weights.is_file() else ()

@@ -1,9 +1,8 @@
-"""What a field is for: finding blows, other materials by physics, and edits towards a sound."""
+"""What a field is for: other materials by physics, and edits towards a sound."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
-from benchmarks import editing, locating
+from benchmarks import editing
 from benchmarks.changedmaterial import changed_material_report
 from benchmarks.report import Options, Report
 
@@ -16,17 +15,5 @@ def measure(options: Options) -> Report:
     return report
 
 
-def _edit(options: Options) -> Report:
-    return editing.measure(replace(options, parts=editing.PARTS))
-
-
-def _locate(part: str) -> Callable[[Options], Report]:
-    return lambda options: locating.measure(replace(options, parts=(part,)))
-
-
-_RUNNERS: dict[str, Callable[[Options], Report]] = {
-    **{part: _locate(part) for part in locating.PARTS},
-    "change-material": changed_material_report,
-    "edit": _edit,
-}
+_RUNNERS: dict[str, Callable[[Options], Report]] = {"change-material": changed_material_report, "edit": editing.measure}
 PARTS = tuple(_RUNNERS)

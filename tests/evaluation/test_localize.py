@@ -15,12 +15,10 @@ from avmsf.baselines.diffsound.renderer import DiffSound
 from avmsf.capture import Impacts, read_capture
 from avmsf.cli import main
 from avmsf.errors import LocationError
-from avmsf.evaluation import localization_methods as locatingmethods
-from avmsf.evaluation import report
+from avmsf.evaluation import localization, report
 from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.grid_field import GridField
-from avmsf.evaluation.localization_baselines import random_distance
-from avmsf.evaluation.localization_methods import MAX_VERTICES, located
+from avmsf.evaluation.localization import MAX_VERTICES, located, random_distance
 from avmsf.evaluation.object_features import ObjectLooks
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.simple_methods import NearestRecording, WhiteNoise
@@ -91,7 +89,7 @@ def test_the_published_form_takes_the_least_cosine_distance_and_refuses_no_noise
     size = float((points.amax(0) - points.amin(0)).norm())
     noise = torch.randn(test.sounds[0].shape, generator=torch.Generator().manual_seed(1))
     test = replace(test, sounds=torch.cat([test.sounds[:-1], noise[None]]))
-    found = located(field, train, test, points, published=True, kept=(0, len(test) - 1))
+    found = located(field, train, test, points, published=True, map_rows=(0, len(test) - 1))
     locator = PublishedLocator.of(field, points)
     for row, rmed in enumerate(found.errors["rmed"]):
         place = points[int(locator.distance(test.sounds[row]).argmin())]
@@ -109,7 +107,7 @@ def test_diffsound_searches_the_vertices_of_the_mesh(monkeypatch: pytest.MonkeyP
         searched.append(points)
         return SimpleNamespace(place=lambda sound: points[0])
 
-    monkeypatch.setattr(locatingmethods.DiffSoundLocator, "of", simulated)
+    monkeypatch.setattr(localization.DiffSoundLocator, "of", simulated)
     train, points = plate_impacts(), plate_features().points
     vertices = torch.rand(MAX_VERTICES + 5000, 3, generator=torch.Generator().manual_seed(0))
     renderer = object.__new__(DiffSound)

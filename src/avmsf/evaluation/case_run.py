@@ -14,11 +14,10 @@ from avmsf._utils.caching import Given, Result
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.cases import Case
-from avmsf.evaluation.contact_maps import write_map
 from avmsf.evaluation.field_methods import configured
 from avmsf.evaluation.ground_truth import truth_at
 from avmsf.evaluation.listening import keep_sound, listening_gain
-from avmsf.evaluation.localization_methods import located
+from avmsf.evaluation.localization import located, write_map
 from avmsf.evaluation.methods import report_of
 from avmsf.evaluation.plan import Evaluation
 from avmsf.evaluation.renderer import Renderer, expect_renderer
@@ -149,7 +148,7 @@ class CaseRun:
             points,
             vertices=self.vertices,
             published=published,
-            kept=self.listened,
+            map_rows=self.listened,
         )
         maps = {}
         for row, each in found.maps.items():

@@ -1,260 +1,201 @@
-"""Localization errors of several methods for each recording, and the coverage of credible regions.
+"""Localization as an experiment of `evaluate`: how far off methods locate recordings, and the maps of some of them."""
 
-Conventions. Errors are relative to the diagonal of the box around the object's points (`rmed`), once from the true
-contact and once from the nearest of its images under the object's symmetries (`rmed_modulo`), for a symmetric object
-may sound the same at all of them. The methods:
-
-- `random`: a uniformly distributed point of the object, by its expected error;
-- `nearest`: the contact of the training recording with the most similar spectrum;
-- `cosine`: the point whose gains have the least cosine distance from the sound's (the paper);
-- `diffsound`: the point whose gains, simulated by DiffSound, have the least cosine distance from the sound's; where its
-  locator is given;
-- `posterior`: the most probable point under the noise and the predictive uncertainty, with a credible region.
-
-A recording that the locator rejects counts as a random point, and its row has the reason.
-"""
-
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from importlib.metadata import version
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
-from jaxtyping import Bool, Float, Float64
+import torch
+from jaxtyping import Float, Float64
+from safetensors.torch import save
 from torch import Tensor
 
+from avmsf._utils.files import write_whole
+from avmsf._utils.state import read_tensors
 from avmsf.baselines.diffsound.locator import DiffSoundLocator
+from avmsf.baselines.diffsound.renderer import DiffSound
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, LocationError
-from avmsf.evaluation.localization_baselines import NearestSpectrum, random_distance
-from avmsf.evaluation.results import write_json
-from avmsf.evaluation.symmetric_contacts import Images
+from avmsf.evaluation.renderer import Renderer
+from avmsf.evaluation.simple_methods import NearestRecording
+from avmsf.field.sound_field import SoundField
+from avmsf.gaussians.points import farthest_points
 from avmsf.localization.contact_map import ContactMap
 from avmsf.localization.locator import Locator
+from avmsf.localization.published import PublishedLocator
+from avmsf.modal.config import scaled_fft_size
 
-METHODS = ("random", "nearest", "cosine", "posterior")
-DIFFSOUND = "diffsound"
-LEVEL = 0.9
-"""Probability of the region whose coverage is evaluated."""
-
-
-@dataclass(frozen=True)
-class StrikeRow:
-    """One test recording by one method."""
-
-    recording: str
-    method: str
-    place: tuple[float, float, float] | None
-    """Located contact, meters; None where the error is that of a random point."""
-    truth: tuple[float, float, float]
-    rmed: float
-    rmed_modulo: float
-    covered: bool | None = None
-    """Whether the region contains the true contact; None for methods without a region."""
-    covered_modulo: bool | None = None
-    """Whether it contains any of its images."""
-    region: float | None = None
-    """The region's fraction of the surface, 0 to 1."""
-    explained: float | None = None
-    """Fraction of the sound's energy that the field explains."""
-    refusal: str | None = None
-    """Reason why the recording was not located."""
-
-
-@dataclass(frozen=True)
-class LocatingScores:
-    """Localization errors of one object's test recordings."""
-
-    name: str
-    """Name of the object."""
-    rows: tuple[StrikeRow, ...]
-    """By recording, then in the order of the methods."""
-    diagonal: float
-    """Of the box around the object's points, meters."""
-    scale: float
-    """Size that contact errors are relative to in the ObjectFolder benchmark, meters; by default the diagonal."""
-    level: float
-    """Probability of the regions."""
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    """Seed and settings of the evaluation, as plain values."""
-
-    def figures(self, method: str) -> dict[str, float]:
-        """Return a method's means: `rmed`, `rmed_modulo`, `contact_error`, `refused`, the fraction of rejected
-        recordings, which count as random points, and, of the regions of the others, `covered`, `covered_modulo` and
-        `region`. Raises EvaluationError for a method without rows."""
-        rows = [row for row in self.rows if row.method == method]
-        if not rows:
-            judged = ", ".join(dict.fromkeys(row.method for row in self.rows))
-            raise EvaluationError(
-                f"{self.name}: expected a method of {judged}, got {method!r}", name="method", value=method
-            )
-        means = {name: _mean([getattr(row, name) for row in rows]) for name in ("rmed", "rmed_modulo")}
-        means["contact_error"] = means["rmed"] * self.diagonal / self.scale
-        means["refused"] = _mean([float(row.refusal is not None) for row in rows])
-        sure = [row for row in rows if row.region is not None]
-        if sure:
-            for name in ("covered", "covered_modulo", "region"):
-                means[name] = _mean([float(getattr(row, name)) for row in sure])
-        return means
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values, rows included, and the package's version."""
-        methods = dict.fromkeys(row.method for row in self.rows)
-        means = {method: self.figures(method) for method in methods}
-        return {"version": version("avmsf"), **asdict(self), "means": means}
-
-    def write(self, path: Path) -> None:
-        """Write everything as JSON. Raises EvaluationError where that cannot be."""
-        write_json(path, self.to_dict())
-
-
-def judge_locating(
-    locator: Locator,
-    train: Impacts,
-    test: Impacts,
-    *,
-    name: str,
-    images: Images | None = None,
-    truth: Float[Tensor, "contacts 3"] | None = None,
-    methods: Sequence[str] = METHODS,
-    diffsound: DiffSoundLocator | None = None,
-    level: float = LEVEL,
-    scale: float | None = None,
-    settings: Mapping[str, Any] | None = None,
-) -> LocatingScores:
-    """Locate every recording of `test` by every method and compute the errors.
-
-    `images` are those of the object's symmetries; `truth` are the true contacts, meters, if known better than by the
-    recordings' table; `diffsound` is needed for the method of this name; contact errors are relative to `scale`,
-    meters, by default the diagonal.
-    Raises EvaluationError for unknown methods, sounds at another rate than the field's, and objects without a size.
-    """
-    known = METHODS if diffsound is None else (*METHODS, DIFFSOUND)
-    unknown = [method for method in methods if method not in known]
-    if unknown or not methods:
-        raise EvaluationError(
-            f"expected methods of {', '.join(known)}, got {', '.join(unknown) or 'none'}",
-            name="methods",
-            value=tuple(unknown),
-        )
-    if test.sample_rate != locator.field.sample_rate:
-        raise EvaluationError(
-            f"{name}: expected recordings at the field's {locator.field.sample_rate:g} Hz, got {test.sample_rate:g} Hz",
-            name="sample_rate",
-            value=test.sample_rate,
-        )
-    if truth is not None and len(truth) != len(test):
-        raise EvaluationError(
-            f"{name}: expected a true contact for each of {len(test)} recordings, got {len(truth)}",
-            name="truth",
-            value=len(truth),
-        )
-    right = test.contacts if truth is None else truth
-    ground = Ground(locator.points.double(), Images.none() if images is None else images, level)
-    size = ground.diagonal if scale is None else scale
-    if not (ground.diagonal > 0.0 and math.isfinite(size) and size > 0.0):
-        raise EvaluationError(
-            f"{name}: expected a positive diagonal and scale, got {ground.diagonal:g} m and {size:g} m",
-            name="scale",
-            value=(ground.diagonal, size),
-        )
-    alike = NearestSpectrum(train)
-    rows: list[StrikeRow] = []
-    for row in sorted(range(len(test)), key=lambda each: test.names[each]):
-        sound, place = test.sounds[row], right[row].double()
-        rows += _located(
-            locator, alike, ground, sound, place, name=test.names[row], methods=methods, diffsound=diffsound
-        )
-    return LocatingScores(name, tuple(rows), ground.diagonal, size, level, dict(settings or {}))
+CANDIDATES = 2000
+"""Candidate points: 2 % of the diagonal apart, which is less than the smallest errors."""
+MAX_VERTICES = 20_000
+"""Vertices of a mesh that DiffSound searches, at most; of more, evenly spaced rows. The archive of ObjectFolder Real's
+meshes is called mesh_16k."""
+_FFT_SIZE = 4096
+"""Samples of a Hann window at 44.1 and 48 kHz: its bins part modes some twenty hertz apart."""
+_POWER_FLOOR = 1e-6
+"""Power over the loudest bin's below which differences do not count: -60 dB."""
+_MAP_KEY = "avmsf-contact-map"
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
-    """An object's points, and what is as right as a true place."""
+class Located:
+    """Where a method locates recordings."""
 
-    points: Float64[Tensor, "points 3"]
-    """Object frame, meters."""
-    images: Images
-    level: float
-    """Probability of regions."""
+    errors: Mapping[str, tuple[float, ...]]
+    """Distances from the true contacts over the diagonal of the object's points, a value for each recording.
 
-    @property
-    def diagonal(self) -> float:
-        """Of the box around the points, meters."""
-        return float((self.points.amax(0) - self.points.amin(0)).norm())
-
-    def errors(self, place: Float64[Tensor, " 3"], truth: Float64[Tensor, " 3"]) -> tuple[float, float]:
-        """Return `rmed` and `rmed_modulo` of a place."""
-        apart = (self.images.at(truth) - place).norm(dim=1)
-        return float((truth - place).norm()) / self.diagonal, float(apart.min()) / self.diagonal
-
-    def random_errors(self, truth: Float64[Tensor, " 3"]) -> tuple[float, float]:
-        """Return what is expected of both for a point drawn evenly."""
-        return (
-            random_distance(self.points, truth[None]) / self.diagonal,
-            random_distance(self.points, self.images.at(truth)) / self.diagonal,
-        )
-
-    def holds(self, region: Bool[Tensor, " points"], place: Float64[Tensor, " 3"]) -> bool:
-        """Return whether the point nearest to a place is in the region."""
-        return bool(region[(self.points - place).norm(dim=1).argmin()])
+    `rmed`: at the point of least cosine distance between gains (the paper), of fields and DiffSound; at the contact of
+    the training recording with the most similar spectrum, of the nearest recording. `rmed_posterior`, of fields: at the
+    most probable point. What a method cannot locate counts as a random point, as do all recordings of a method that
+    locates nothing.
+    """
+    maps: Mapping[int, ContactMap] = field(default_factory=dict)
+    """Maps of fields by the rows of recordings, of those that were asked for and could be located."""
 
 
-def _located(
-    locator: Locator,
-    alike: NearestSpectrum,
-    ground: Ground,
-    sound: Float[Tensor, " samples"],
-    truth: Float64[Tensor, " 3"],
+_Places = tuple[dict[str, Float64[Tensor, " 3"]], ContactMap | None]
+
+
+def located(
+    renderer: Renderer,
+    train: Impacts,
+    test: Impacts,
+    points: Float[Tensor, "points 3"],
     *,
-    name: str,
-    methods: Sequence[str],
-    diffsound: DiffSoundLocator | None,
-) -> list[StrikeRow]:
-    """Return one strike's rows."""
-    found: ContactMap | LocationError | None = None
-    if {"cosine", "posterior"} & set(methods):
+    vertices: Float[Tensor, "vertices 3"] | None = None,
+    published: bool = False,
+    map_rows: Collection[int] = (),
+) -> Located:
+    """Locate each recording of `test` by a method, among `CANDIDATES` of the object's points.
+
+    DiffSound searches the `vertices` of the object's mesh where they are given, as in the paper. With `published`,
+    `rmed` of a field is that of `PublishedLocator`; otherwise its gains are compared at the best delay and without
+    their expected noise. Maps are returned of the recordings `map_rows`.
+    """
+    points = points[farthest_points(points, min(CANDIDATES, len(points)))].double()
+    diagonal = float((points.amax(0) - points.amin(0)).norm())
+    if isinstance(renderer, SoundField):
+        find = _by_field(renderer, points, published)
+    else:
+        find = _finder(renderer, train, points if vertices is None else _fewer(vertices.double()))
+    names = ("rmed", "rmed_posterior") if isinstance(renderer, SoundField) else ("rmed",)
+    rows, maps = [], {}
+    for row, (sound, truth) in enumerate(zip(test.sounds, test.contacts.double(), strict=True)):
+        try:
+            places, found = find(sound)
+        except (LocationError, EvaluationError):
+            places, found = {}, None
+        chance = random_distance(points, truth[None])
+        distances = [float((truth - places[name]).norm()) if name in places else chance for name in names]
+        rows.append([distance / diagonal for distance in distances])
+        if found is not None and row in map_rows:
+            maps[row] = found
+    return Located({name: tuple(row[number] for row in rows) for number, name in enumerate(names)}, maps)
+
+
+def _by_field(
+    field: SoundField, points: Float64[Tensor, "points 3"], published: bool
+) -> Callable[[Float[Tensor, " samples"]], _Places]:
+    """Return what locates a sound by a field."""
+    locator = Locator.of(field, points=points)
+    plain = PublishedLocator.of(field, points) if published else None
+
+    def find(sound: Float[Tensor, " samples"]) -> _Places:
+        distance = None if plain is None else plain.distance(sound)
         try:
             found = locator.locate(sound)
-        except LocationError as error:
-            found = error
-    rows = []
-    for method in methods:
-        place: Float64[Tensor, " 3"] | None = None
-        more: dict[str, Any] = {}
-        if method == "nearest":
-            if bool(sound.any()):
-                place = alike.place(sound)
-            else:
-                more = {"refusal": "the recording is silent"}
-        elif method == DIFFSOUND and diffsound is not None:
-            try:
-                place = diffsound.place(sound)
-            except LocationError as error:
-                more = {"refusal": " ".join(str(error).split())}
-        elif method != "random" and isinstance(found, ContactMap):
-            place = ground.points[int(found.distance.argmin())] if method == "cosine" else found.position.double()
-            more = {"explained": found.explained_energy}
-            more |= _regions(found, ground, truth) if method == "posterior" else {}
-        elif method != "random":
-            more = {"refusal": " ".join(str(found).split())}
-        errors = ground.random_errors(truth) if place is None else ground.errors(place, truth)
-        there = None if place is None else _plain(place)
-        rows.append(StrikeRow(name, method, there, _plain(truth), *errors, **more))
-    return rows
+        except LocationError:
+            # Eq. 15 knows no recording that is too noisy.
+            return {} if distance is None else {"rmed": points[int(distance.argmin())]}, None
+        if distance is not None:
+            found = replace(found, distance=distance)
+        return {"rmed": points[found.best], "rmed_posterior": found.position.double()}, found
+
+    return find
 
 
-def _regions(found: ContactMap, ground: Ground, truth: Float64[Tensor, " 3"]) -> dict[str, Any]:
-    region = found.region(ground.level)
-    inside = [ground.holds(region, image) for image in ground.images.at(truth)]
-    return {"covered": inside[0], "covered_modulo": any(inside), "region": float(region.double().mean())}
+def _finder(
+    renderer: Renderer, train: Impacts, points: Float64[Tensor, "points 3"]
+) -> Callable[[Float[Tensor, " samples"]], _Places]:
+    """Return what locates a sound by another method; nothing for methods that cannot."""
+    if isinstance(renderer, DiffSound):
+        simulated = DiffSoundLocator.of(renderer, points)
+        return lambda sound: ({"rmed": simulated.place(sound)}, None)
+    if isinstance(renderer, NearestRecording):
+        similar = NearestSpectrum(train)
+        return lambda sound: ({"rmed": similar.place(sound)}, None)
+    return lambda sound: ({}, None)
 
 
-def _plain(place: Float64[Tensor, " 3"]) -> tuple[float, float, float]:
-    across, along, up = place.tolist()
-    return across, along, up
+def _fewer(vertices: Float64[Tensor, "vertices 3"]) -> Float64[Tensor, "points 3"]:
+    count = min(MAX_VERTICES, len(vertices))
+    return vertices[torch.linspace(0, len(vertices) - 1, count, dtype=torch.float64).round().long()]
 
 
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values)
+@dataclass(frozen=True, eq=False)
+class NearestSpectrum:
+    """The contact of the training recording with the most similar spectrum, independent of level."""
+
+    train: Impacts
+
+    def row(self, sound: Float[Tensor, " samples"]) -> int:
+        """Return the training recording's row.
+
+        Training recordings that are silent are never the nearest. Raises EvaluationError for a sound that is silent.
+        """
+        if not bool(sound.any()):
+            raise EvaluationError("expected a recording, got silence; omit it", name="sound", value=0.0)
+        similarity = self._signatures @ self._signature(sound)
+        return int(torch.where(self.train.sounds.any(dim=1), similarity, -torch.inf).argmax())
+
+    def place(self, sound: Float[Tensor, " samples"]) -> Float64[Tensor, " 3"]:
+        """Return the contact of that recording, meters."""
+        return self.train.contacts[self.row(sound)].double()
+
+    @cached_property
+    def _signatures(self) -> Float64[Tensor, "contacts bins"]:
+        return torch.stack([self._signature(sound) for sound in self.train.sounds])
+
+    def _signature(self, sound: Float[Tensor, " samples"]) -> Float64[Tensor, " bins"]:
+        """Return the log of the mean power spectrum, of mean zero and norm one: products are correlations.
+
+        Zero for silence.
+        """
+        size = scaled_fft_size(_FFT_SIZE, sample_rate=self.train.sample_rate)
+        padded = torch.nn.functional.pad(sound.double(), (0, max(0, size - len(sound))))
+        window = torch.hann_window(size, dtype=torch.float64)
+        # Frames from before the onset on, so that its window weighs the beginning of the sound too.
+        frames = torch.nn.functional.pad(padded, (size // 2, size // 2)).unfold(0, size, size // 4)
+        power = torch.fft.rfft(frames * window).abs().square().mean(dim=0)
+        if not float(power.max()) > 0.0:
+            return torch.zeros_like(power)
+        level = torch.log(power.clamp_min(_POWER_FLOOR * float(power.max())))
+        centered = level - level.mean()
+        return centered / centered.norm().clamp_min(torch.finfo(torch.float64).tiny)
+
+
+def random_distance(points: Float[Tensor, "points 3"], right: Float[Tensor, "images 3"]) -> float:
+    """Return how far a point drawn evenly from an object's points is expected to be from the nearest right place."""
+    nearest = [torch.cdist(part.double(), right.double()).amin(dim=1) for part in torch.split(points, 1024)]
+    return float(torch.cat(nearest).mean())
+
+
+def write_map(path: Path, found: ContactMap, *, truth: Float[Tensor, " 3"]) -> None:
+    """Write a map, and the true contact (meters). Raises EvaluationError where that cannot be."""
+    tensors = {"points": found.points, "distance": found.distance, "probability": found.probability, "truth": truth}
+    energies = torch.tensor([found.explained_energy, found.modal_energy, found.null_energy], dtype=torch.float64)
+    content = save(
+        {name: each.contiguous() for name, each in {**tensors, "energies": energies}.items()}, {_MAP_KEY: "1"}
+    )
+    write_whole(path, lambda place: place.write_bytes(content), raising=EvaluationError)
+
+
+def read_map(path: Path) -> tuple[ContactMap, Float[Tensor, " 3"]]:
+    """Return a map that `write_map` wrote, and the true contact. Raises EvaluationError where there is none."""
+    advice = "delete the object's file to compute it again"
+    _, tensors = read_tensors(path, _MAP_KEY, what="the map of a contact", advice=advice, raising=EvaluationError)
+    try:
+        truth, energies = tensors.pop("truth"), tensors.pop("energies").tolist()
+        return ContactMap(tensors["points"], tensors["distance"], tensors["probability"], *energies), truth
+    except (KeyError, TypeError) as error:
+        raise EvaluationError.expected("the map of a contact", got=str(error), file=path, advice=advice) from error

@@ -9,8 +9,8 @@ error. Every metric calls `validate` first, which raises EvaluationError with th
   perfect, 1 is silence. The measure that objects and methods are compared by here.
 - `spectrogram_distance` (L1), `log_mel_distance` (L1-log) and `envelope_distance` (ENV): the paper's three.
 
-CDPAM is in `avmsf.evaluation.cdpam`; modes are compared with true ones in `avmsf.evaluation.modal_metrics`, positions
-with true ones in `avmsf.evaluation.localization`. `PAPER` names the parameters of the paper's three.
+CDPAM is in `avmsf.evaluation.cdpam`; modes are compared with true ones in `avmsf.evaluation.modal_metrics`.
+`PAPER` names the parameters of the paper's three.
 """
 
 import math

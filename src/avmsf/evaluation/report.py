@@ -8,8 +8,8 @@ from torch import Tensor
 
 from avmsf._utils.files import write_whole
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.contact_maps import read_map
 from avmsf.evaluation.listening import Heard
+from avmsf.evaluation.localization import read_map
 from avmsf.evaluation.markdown import markdown
 from avmsf.evaluation.page import heard_contacts, page
 from avmsf.evaluation.report_tables import Section, sections

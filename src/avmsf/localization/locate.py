@@ -84,8 +84,7 @@ def assess_match(found: ContactMap) -> ContactMap:
     A sound is rejected where an object's modes do not fit it, and where the field explains its gains, over all
     positions, no better than noise would. The thresholds of the mismatch ratio come from simulated plates of wood,
     plastic, ceramic and steel, a measured aircraft and a recorded bowl: their own sounds have ratios of .3 at most, as
-    long as noise is no louder than they are, and 98 in 100 of others more than .5. `python -m benchmarks.locating
-    --parts other-objects` reports what is rejected of other sounds and of an object's own.
+    long as noise is no louder than they are, and 98 in 100 of others more than .5.
     """
     modal, null, ratio = 100 * found.modal_energy, 100 * found.null_energy, found.mismatch_ratio
     share = f"with free gains the object's modes explain {modal:.0f} % of it, modes of shifted frequencies {null:.0f} %"
