@@ -4,6 +4,7 @@ import json
 
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from avmsf.errors import SimulationError
@@ -12,8 +13,6 @@ from avmsf.fem.elastic_store import load_modes, save_modes
 from avmsf.fem.material import GLASS
 from factories.raising import raises
 from oracles.block import block
-
-TENSORS = {"frequency", "nodes", "triangles", "shapes", "stiffness", "mass", "poisson"}
 
 
 @pytest.fixture(scope="module")
@@ -46,28 +45,24 @@ def test_files_that_hold_no_modes(modes, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "name", "value"),
+    "change",
     [
-        (lambda record, tensors: record.update(format=9), "format", 9),
-        (lambda record, tensors: record.pop("mass"), "header", "KeyError('mass')"),
-        (lambda record, tensors: tensors.pop("poisson"), "tensors", sorted(TENSORS - {"poisson"})),
-        (lambda record, tensors: tensors.pop("nodes"), "tensors", sorted(TENSORS - {"nodes"})),
-        (lambda record, tensors: tensors["triangles"].fill_(-1), "triangles", [-1, -1]),
-        (lambda record, tensors: tensors["triangles"].fill_(10_000), "triangles", [10_000, 10_000]),
+        lambda record, tensors: record.pop("mass"),
+        lambda record, tensors: record["sizes"].update(nodes=-1),
+        lambda record, tensors: tensors.pop("poisson"),
+        lambda record, tensors: tensors.pop("nodes"),
+        lambda record, tensors: tensors.update(shapes=tensors["shapes"].float()),
+        lambda record, tensors: tensors["triangles"].fill_(-1),
+        lambda record, tensors: tensors["triangles"].fill_(10_000),
+        lambda record, tensors: tensors["frequency"].fill_(0.0),
     ],
 )
-def test_files_that_were_changed(modes, tmp_path, change, name, value):
+def test_files_that_were_changed(modes, tmp_path, change):
     path = tmp_path / "modes.safetensors"
     save_modes(modes, path)
     tensors = load_file(path)
-    record = json.loads(header_of(path))
+    record = json.loads(safe_open(path, "pt").metadata()["avmsf_elastic"])
     change(record, tensors)
     save_file(tensors, path, {"avmsf_elastic": json.dumps(record)})
-    with raises(SimulationError, file=path, name=name, value=value):
+    with raises(SimulationError, file=path, name="modes"):
         load_modes(path)
-
-
-def header_of(path) -> str:
-    content = path.read_bytes()
-    length = int.from_bytes(content[:8], "little")
-    return json.loads(content[8 : 8 + length])["__metadata__"]["avmsf_elastic"]

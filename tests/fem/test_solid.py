@@ -12,9 +12,8 @@ import trimesh
 from avmsf.errors import SimulationError
 from avmsf.fem import shell as shells
 from avmsf.fem import tetrahedra
-from avmsf.fem.coarsening import coarsen
 from avmsf.fem.shell import shell
-from avmsf.fem.skin import Skin
+from avmsf.fem.skin import Skin, coarsen
 from avmsf.fem.solid import Solid
 from avmsf.fem.tetrahedra import fill
 from avmsf.mesh.closest_point import ClosestPoints

@@ -17,8 +17,7 @@ from avmsf.export import SampledField
 from avmsf.fem.damping import Vibration
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.material import STEEL
-from avmsf.fem.radiated_sound import AIR_DENSITY, SOUND_SPEED
-from avmsf.fem.radiation import radiated_pressure
+from avmsf.fem.radiation import AIR_DENSITY, SOUND_SPEED, radiated_pressure
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
 from avmsf.field.suggest import suggest

@@ -13,7 +13,7 @@ from avmsf.capture import read_capture
 from avmsf.capture.audio import read_sound
 from avmsf.capture.onset import find_onset
 from avmsf.fem.material import CERAMIC
-from avmsf.fem.radiated_sound import SOUND_SPEED, travel_time
+from avmsf.fem.radiation import SOUND_SPEED, travel_time
 from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
 from avmsf.simulate.hammer import contact_times, pulse_spectrum
 from avmsf.simulate.imperfections import recording_starts, stream

@@ -14,7 +14,7 @@ import torch
 from avmsf.errors import SimulationError
 from avmsf.fem.damping import damped, rayleigh
 from avmsf.fem.material import CERAMIC, STEEL, WOOD
-from avmsf.fem.radiated_sound import AIR_DENSITY, SOUND_SPEED, radiated
+from avmsf.fem.radiation import AIR_DENSITY, SOUND_SPEED, radiated
 from avmsf.simulate.hammer import contact_times, peak_forces, pulse_spectrum
 from avmsf.simulate.imperfections import damping_matrix, smooth_field, stream, support_places
 from avmsf.simulate.recipe import Hammer, Imperfections

@@ -26,7 +26,7 @@ from avmsf.fem.candidate_bodies import NominalBodies, NominalBody
 from avmsf.fem.damping import damped, rayleigh
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.material import MATERIALS, Material
-from avmsf.fem.radiated_sound import radiated
+from avmsf.fem.radiation import radiated
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.bodies import CandidateBodies

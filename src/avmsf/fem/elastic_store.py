@@ -1,16 +1,17 @@
-"""Elastic modes as one file: safetensors with the tensors of `ElasticModes`, and one JSON in the header for the rest.
+"""Elastic modes as tensors: in files of fields with shapes in float32, and to the last bit in files of a cache.
 
-{"format": 2, "version": "0.1.0", "mass": 0.31,
- "sizes": {"modes": 64, "nodes": 9000, "triangles": 4400, "fields": null},
+A file of a cache has the tensors of `ElasticModes` and in its header one JSON:
+
+{"mass": 0.31, "sizes": {"shapes": 64, "nodes": 9000, "triangles": 4400}, "fields": null,
  "material": {"name": "ceramic", "density": 2700.0, "young": 7.2e10, "poisson": 0.19, "alpha": 6.0, "beta": 1e-7}}
 """
 
 import json
 import os
-from collections.abc import Callable
-from dataclasses import asdict
-from importlib.metadata import version
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors.torch import save as to_bytes
@@ -18,45 +19,72 @@ from torch import Tensor
 
 from avmsf._utils.caching import keep_if_possible
 from avmsf._utils.files import write_whole
+from avmsf._utils.records import count_of
 from avmsf._utils.state import read_tensors
 from avmsf._utils.text_files import parse_json
 from avmsf.errors import SimulationError
 from avmsf.fem.elastic_modes import ElasticModes
-from avmsf.fem.material import Material
+from avmsf.fem.material import NOMINAL, Material
 from avmsf.fem.perturbation import Perturbations
 
-FORMAT = 2
-"""Number of this format; it grows with every change that older versions could not read."""
 _KEY = "avmsf_elastic"
 _PERTURBATIONS = ("stiffness", "mass", "poisson")
 
 
-def save_modes(modes: ElasticModes, path: str | Path) -> None:
+def mode_sizes(modes: ElasticModes) -> dict[str, int]:
+    """Return the sizes of the tensors."""
+    return {"nodes": len(modes.nodes), "triangles": len(modes.triangles), "shapes": len(modes)}
+
+
+def mode_tensors(modes: ElasticModes) -> dict[str, Tensor]:
+    """Return the tensors by name, as files of fields hold them."""
+    named = {name: getattr(modes, name) for name in ("frequency", "nodes", "triangles")}
+    return named | {"shapes": modes.shapes.float()}
+
+
+def mode_skeleton(sizes: Mapping[str, Any], *, shapes_dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
+    """Return tensors on the device `meta`, of the shapes and dtypes that belong to sizes.
+
+    Raises ValueError, TypeError or KeyError for what are no sizes.
+    """
+    nodes, triangles, shapes = (count_of(sizes[name], name) for name in ("nodes", "triangles", "shapes"))
+    return {
+        "frequency": torch.empty(shapes, dtype=torch.float64, device="meta"),
+        "nodes": torch.empty(nodes, 3, dtype=torch.float64, device="meta"),
+        "triangles": torch.empty(triangles, 6, dtype=torch.int64, device="meta"),
+        "shapes": torch.empty(nodes, shapes, 3, dtype=shapes_dtype, device="meta"),
+    }
+
+
+def restored_modes(tensors: Mapping[str, Tensor], prefix: str) -> ElasticModes:
+    """Return the modes, of the nominal material and no mass, of tensors whose names begin with `prefix`.
+
+    Raises ValueError for values that no modes have.
+    """
+    frequency, nodes, rows, shapes = (
+        tensors[f"{prefix}{name}"] for name in ("frequency", "nodes", "triangles", "shapes")
+    )
+    if not bool((frequency > 0).all()):
+        raise ValueError(f"expected {prefix}frequency above 0, got {float(frequency.min()):g}")
+    if rows.numel() and not 0 <= int(rows.min()) <= int(rows.max()) < len(nodes):
+        raise ValueError(
+            f"expected corners of triangles from 0 to {len(nodes) - 1}, got {int(rows.min())} to {int(rows.max())}"
+        )
+    return ElasticModes(frequency, nodes, rows, shapes.double(), NOMINAL, mass=0.0)
+
+
+def save_modes(modes: ElasticModes, path: Path) -> None:
     """Write modes to one file, which `load_modes` reads back to the last bit.
 
     A file that is there stays whole until the new one is. Raises SimulationError where it cannot be written.
     """
-    path = Path(path)
-    tensors = {
-        "frequency": modes.frequency,
-        "nodes": modes.nodes,
-        "triangles": modes.triangles,
-        "shapes": modes.shapes,
-    }
+    tensors = mode_tensors(modes) | {"shapes": modes.shapes}
+    fields = None if modes.perturbations is None else len(modes.perturbations.stiffness)
     if modes.perturbations is not None:
         tensors |= {name: torch.from_numpy(getattr(modes.perturbations, name)) for name in _PERTURBATIONS}
     record = {
-        "format": FORMAT,
-        "version": version("avmsf"),
-        "mass": modes.mass,
-        "sizes": {
-            "modes": len(modes),
-            "nodes": len(modes.nodes),
-            "triangles": len(modes.triangles),
-            "fields": None if modes.perturbations is None else len(modes.perturbations.stiffness),
-        },
-        "material": asdict(modes.material),
-    }
+        "mass": modes.mass, "sizes": mode_sizes(modes), "fields": fields, "material": asdict(modes.material)
+    }  # fmt: skip
     content = to_bytes(
         {name: tensor.cpu().clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()},
         {_KEY: json.dumps(record, allow_nan=False)},
@@ -64,62 +92,38 @@ def save_modes(modes: ElasticModes, path: str | Path) -> None:
     write_whole(path, lambda place: place.write_bytes(content), raising=SimulationError)
 
 
-def load_modes(path: str | Path) -> ElasticModes:
+def load_modes(path: Path) -> ElasticModes:
     """Read modes that `save_modes` wrote.
 
-    Raises SimulationError for a file that is missing, cut short, of another kind or of another format, and where its
-    tensors are not those that its header speaks of.
+    Raises SimulationError for a file that is missing, cut short or of another kind, and where its tensors are not those
+    that its header states.
     """
-    path = Path(path)
-    words, tensors = _read(path)
+    words, tensors = read_tensors(
+        path, _KEY, what="elastic modes", advice="compute them again", raising=SimulationError
+    )
     try:
         record = parse_json(words)
-        found, writer = record["format"], record["version"]
-        if found != FORMAT:
-            raise SimulationError(
-                f"{path}: expected elastic modes of format {FORMAT}, got format {found}, written by avmsf {writer} "
-                f"(this is avmsf {version('avmsf')}); compute them again",
-                file=path,
-                name="format",
-                value=found,
-            )
-        sizes, material, weight = record["sizes"], Material(**record["material"]), float(record["mass"])
-        expected = {
-            "frequency": ((sizes["modes"],), torch.float64),
-            "nodes": ((sizes["nodes"], 3), torch.float64),
-            "triangles": ((sizes["triangles"], 6), torch.int64),
-            "shapes": ((sizes["nodes"], sizes["modes"], 3), torch.float64),
-        }
-        square, fields = (sizes["modes"], sizes["modes"]), sizes["fields"]
-        if fields is not None:
-            each = ((fields, *square), (fields, *square), square)
-            expected |= {name: (shape, torch.float64) for name, shape in zip(_PERTURBATIONS, each, strict=True)}
+        expected = mode_skeleton(record["sizes"], shapes_dtype=torch.float64)
+        if record["fields"] is not None:
+            fields, modes = count_of(record["fields"], "fields"), len(expected["frequency"])
+            sizes = ((fields, modes, modes), (fields, modes, modes), (modes, modes))
+            for name, size in zip(_PERTURBATIONS, sizes, strict=True):
+                expected[name] = torch.empty(size, dtype=torch.float64, device="meta")
+        stated, found = (
+            {name: (tuple(each.shape), each.dtype) for name, each in sorted(named.items())}
+            for named in (expected, tensors)
+        )
+        if stated != found:
+            raise ValueError(f"tensors {found} instead of {stated}")
+        changes = None
+        if record["fields"] is not None:
+            changes = Perturbations(*(tensors[name].numpy() for name in _PERTURBATIONS))
+        material, mass = Material(**record["material"]), float(record["mass"])
+        return replace(restored_modes(tensors, ""), material=material, mass=mass, perturbations=changes)
     except (ValueError, TypeError, KeyError) as error:
-        raise SimulationError(
-            f"{path}: expected the header of elastic modes, got {error!r}; compute the modes again",
-            file=path,
-            name="header",
-            value=repr(error),
+        raise SimulationError.expected(
+            "elastic modes", repr(error), file=path, name="modes", advice="compute them again"
         ) from error
-    present = {name: (tuple(tensor.shape), tensor.dtype) for name, tensor in tensors.items()}
-    if present != expected:
-        raise SimulationError(
-            f"{path}: expected the tensors {_told(expected)}, got {_told(present)}; compute the modes again",
-            file=path,
-            name="tensors",
-            value=sorted(present),
-        )
-    rows = tensors["triangles"]
-    if len(rows) and (int(rows.min()) < 0 or int(rows.max()) >= sizes["nodes"]):
-        raise SimulationError(
-            f"{path}: expected triangles of nodes 0 to {sizes['nodes'] - 1}, got {int(rows.min())} to "
-            f"{int(rows.max())}; compute the modes again",
-            file=path,
-            name="triangles",
-            value=[int(rows.min()), int(rows.max())],
-        )
-    changes = None if fields is None else Perturbations(*(tensors[name].numpy() for name in _PERTURBATIONS))
-    return ElasticModes(tensors["frequency"], tensors["nodes"], rows, tensors["shapes"], material, weight, changes)
 
 
 def modes_once(path: Path | None, compute: Callable[[], ElasticModes], *, log: Callable[[str], None]) -> ElasticModes:
@@ -137,11 +141,3 @@ def modes_once(path: Path | None, compute: Callable[[], ElasticModes], *, log: C
     if path is not None:
         keep_if_possible(lambda: save_modes(modes, path), path)
     return modes
-
-
-def _read(path: Path) -> tuple[str, dict[str, Tensor]]:
-    return read_tensors(path, _KEY, what="elastic modes", advice="compute them again", raising=SimulationError)
-
-
-def _told(tensors: dict[str, tuple[tuple[int, ...], torch.dtype]]) -> str:
-    return ", ".join(f"{name} {list(shape)} {dtype}" for name, (shape, dtype) in sorted(tensors.items()))

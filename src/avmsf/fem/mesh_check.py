@@ -1,18 +1,176 @@
 """A surface as people have them made fit for walls and tetrahedra, or the reason why it is not."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
+import fast_simplification
 import numpy as np
+import scipy.optimize
 import scipy.sparse
 from jaxtyping import Float64, Int
+from scipy.sparse.linalg import splu
 
 from avmsf.errors import SimulationError
-from avmsf.fem.mesh_smoothing import denoised, roughness
-from avmsf.fem.mesh_thinning import thinned
-from avmsf.fem.skin import Skin
+from avmsf.fem.skin import Skin, components
+from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.surface import Surface
+
+ROUGH = 20.0
+"""Degrees that neighboring triangles differ by on the mean, in a mesh that is likelier noisy than finely shaped."""
+_FINE = 0.06
+"""Mean edge over the body's size from which on a mesh is too coarse to tell noise from form: a box turns by 60."""
+_PROBES = 8
+"""Random vectors that estimate the number of degrees of freedom left, within a per cent for thousands of vertices."""
+_WEAKEST, _STRONGEST = -3.0, 5.0
+"""Decimal logarithms of the strengths to choose from."""
+_KEPT = 0.8
+"""Part of the vertices' degrees of freedom that a mesh without noise would keep."""
+
+
+def roughness(skin: Skin) -> float:
+    """Return the mean angle between the normals of neighboring triangles, degrees; 0 for a mesh of few long edges."""
+    one, other, ends = skin.neighbors
+    lengths = np.linalg.norm(skin.points[ends[:, 0]] - skin.points[ends[:, 1]], axis=1)
+    if not len(ends) or lengths.mean() > _FINE * skin.size:
+        return 0.0
+    normals = skin.face_normals
+    angles = np.arccos(np.clip((normals[one] * normals[other]).sum(axis=1), -1.0, 1.0))
+    return math.degrees(float(angles.mean()))
+
+
+def denoised(skin: Skin) -> tuple[Skin, float]:
+    """Return a noisy mesh without its noise, and how far that moved the vertices, meters, root mean square.
+
+    A scan's noise is drawn afresh at each vertex, while a surface runs on from one vertex to the next. Of the surfaces
+    that balance closeness to the vertices against bending, (1 + strength L L) places = vertices with L the mean
+    difference from the neighbors, generalized cross-validation takes the one that predicts left-out vertices best.
+    A mesh that is not rough, or whose vertices predict each other no better when smoothed, comes back as it is, with
+    0. The volume of a closed one stays.
+    """
+    if roughness(skin) < ROUGH:
+        return skin, 0.0
+    bending = _bending(skin)
+    probes = np.random.default_rng(0).choice([-1.0, 1.0], size=(len(skin.points), _PROBES))
+    identity = scipy.sparse.eye_array(len(skin.points), format="csc")
+
+    def smooth(exponent: float) -> tuple[Float64[np.ndarray, "points 3"], float]:
+        solve = splu(
+            identity + 10.0**exponent * bending, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
+        ).solve
+        return solve(skin.points), float((probes * solve(probes)).sum(axis=0).mean() / len(probes))
+
+    def error(exponent: float) -> float:
+        points, kept = smooth(exponent)
+        return math.log(float(((points - skin.points) ** 2).mean()) / (1.0 - kept) ** 2)
+
+    found = scipy.optimize.minimize_scalar(error, bounds=(_WEAKEST, _STRONGEST), options={"xatol": 0.05})
+    points, kept = smooth(float(found.x))
+    if kept > _KEPT:
+        return skin, 0.0
+    smoothed = _as_large(Skin(points, skin.faces), skin)
+    return smoothed, float(np.sqrt(((smoothed.points - skin.points) ** 2).sum(axis=1).mean()))
+
+
+def averaged(skin: Skin, rounds: int) -> Skin:
+    """Return a skin whose points were moved, so many times, to the mean of themselves and their neighbors.
+
+    The volume of a closed one stays.
+    """
+    step = _averaging(_joined(skin) + scipy.sparse.eye_array(len(skin.points)))
+    points = skin.points
+    for _ in range(rounds):
+        points = step @ points
+    return _as_large(Skin(points, skin.faces), skin)
+
+
+def _bending(skin: Skin) -> scipy.sparse.csc_array:
+    """Return the squared difference of each point from the mean of its neighbors, as a matrix."""
+    difference = scipy.sparse.eye_array(len(skin.points)) - _averaging(_joined(skin))
+    return (difference.T @ difference).tocsc()
+
+
+def _averaging(joined: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
+    """Return what takes the mean over the points that each is joined to."""
+    return scipy.sparse.diags_array(1.0 / joined.sum(axis=1)) @ joined
+
+
+def _joined(skin: Skin) -> scipy.sparse.csr_array:
+    """Return 1 for points that share an edge."""
+    count = len(skin.points)
+    ends = skin.faces[:, [[0, 1], [1, 2], [2, 0], [1, 0], [2, 1], [0, 2]]].reshape(-1, 2)
+    joined = scipy.sparse.csr_array((np.ones(len(ends)), ends.T), shape=(count, count))
+    joined.data[:] = 1.0
+    return joined
+
+
+def _as_large(smoothed: Skin, skin: Skin) -> Skin:
+    """Return a closed skin grown evenly from its middle to the volume it had, for smoothing shrinks what is round."""
+    if skin.open_edges or smoothed.volume == 0.0 or skin.volume / smoothed.volume <= 0.0:
+        return smoothed
+    middle = smoothed.points.mean(axis=0)
+    factor = float(np.cbrt(skin.volume / smoothed.volume))
+    return Skin(middle + factor * (smoothed.points - middle), skin.faces)
+
+
+MOST = 60_000
+"""Triangles beyond which a mesh is simplified even where that changes its form."""
+ENOUGH = 16_000
+"""Triangles beyond which it is simplified as far as its form stays: finite-element models have some thousand on their
+surface."""
+_TOLERANCE = 0.01
+"""Root mean square distance of the simplified mesh from the given one, over the mean thickness, twice the volume over
+the area. Frequencies of a thin wall go with its thickness. Chosen on a twisted blade."""
+_ROUNDS = 4
+"""Averages taken of a noisy mesh over the thinning, so that they reach little farther than an edge that stays."""
+
+
+def thinned(skin: Skin, *, log: Callable[[str], None]) -> Skin:
+    """Return a skin of at most `MOST` triangles, fewer within the tolerance, and tell what was done to a larger one.
+
+    More are left where fewer would open a seam or share an edge among three.
+    """
+    count = len(skin.faces)
+    if count <= ENOUGH:
+        return skin
+    log(f"checking a mesh of {count} triangles")
+    rough = roughness(skin)
+    # Quadrics follow each noisy corner, and tie the skin into knots.
+    even = averaged(skin, math.ceil(_ROUNDS * count / MOST)) if rough >= ROUGH else skin
+    tolerance, places = _TOLERANCE * 2.0 * abs(even.volume) / float(even.areas.sum()), even.spread()
+    for most in (ENOUGH, 2 * ENOUGH, MOST):
+        found = simplified(even, most, like=skin)
+        distances = ClosestPoints(found.points[found.faces])(places).distances
+        if float(np.sqrt((distances**2).mean())) <= tolerance:
+            break
+    if found is even:
+        return skin
+    noise = "" if even is skin else f", after smoothing its noise of {rough:.0f} degrees"
+    log(f"mesh simplified to {len(found.faces)} triangles{noise}")
+    return found
+
+
+def simplified(skin: Skin, count: int, *, like: Skin | None = None, most: float = math.inf) -> Skin:
+    """Return a skin of about `count` triangles by quadrics, its volume about the same; as it is if it has no more.
+
+    More, up to `most`, are left where fewer would open a seam or share an edge among three, compared with the skin that
+    it is `like`. Where more than `most` would be, it has about `count` that share some.
+    """
+    reference = skin if like is None else like
+    opened, crowded, count = reference.open_edges, reference.crowded_edges, max(count, 4)
+    knotted = None
+    while count < len(skin.faces):
+        points, faces = fast_simplification.simplify(skin.points, skin.faces, target_count=count)
+        found = Skin.compact(points.astype(np.float64), faces.astype(np.int64))
+        if len(found.faces) >= 4 and found.open_edges <= opened and found.crowded_edges <= crowded:
+            return found
+        knotted = found if knotted is None and found.open_edges <= opened else knotted
+        count *= 2
+        if knotted is not None and min(count, len(skin.faces)) > most:
+            return knotted
+    return skin
+
 
 _LIDS = 0.25
 """Part of the closed surface that lids over holes may make up, as `fill` has it."""
@@ -160,11 +318,9 @@ def _turned(skin: Skin) -> tuple[Skin, int]:
 
 def _parts(skin: Skin) -> Int[np.ndarray, " faces"]:
     """Return the number of the part that each triangle belongs to, the widest first."""
-    count = len(skin.points)
     ends = skin.faces[:, [[0, 1], [1, 2]]].reshape(-1, 2)
-    joined = scipy.sparse.csr_array((np.ones(len(ends)), ends.T), shape=(count, count))
-    found, label = scipy.sparse.csgraph.connected_components(joined, directed=False)
-    label = label[skin.faces[:, 0]]
+    label = components(ends, len(skin.points))[skin.faces[:, 0]]
+    found = int(label.max()) + 1
     area = np.bincount(label, weights=skin.areas, minlength=found)
     rank = np.empty(found, dtype=np.int64)
     rank[np.argsort(-area, kind="stable")] = np.arange(found)
@@ -184,8 +340,7 @@ def _lids(skin: Skin) -> Float64[np.ndarray, "lids 3 3"]:
         return np.zeros((0, 3, 3))
     used, ends = np.unique(rim, return_inverse=True)
     ends = ends.reshape(-1, 2)
-    joined = scipy.sparse.csr_array((np.ones(len(ends)), ends.T), shape=(len(used), len(used)))
-    label = scipy.sparse.csgraph.connected_components(joined, directed=False)[1]
+    label = components(ends, len(used))
     middles = np.stack(
         [np.bincount(label, weights=skin.points[used, axis]) / np.bincount(label) for axis in range(3)], axis=1
     )

@@ -11,8 +11,7 @@ import torch
 
 from avmsf.errors import SimulationError
 from avmsf.fem.elements import SecondOrder
-from avmsf.fem.mesh_check import CheckedSurface
-from avmsf.fem.mesh_thinning import simplified
+from avmsf.fem.mesh_check import CheckedSurface, simplified
 from avmsf.fem.shell import shell
 from avmsf.fem.skin import Skin
 from avmsf.fem.solid import Solid

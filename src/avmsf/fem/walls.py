@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float64, Int
 
 from avmsf.errors import SimulationError
 from avmsf.fem.shell import prisms
-from avmsf.fem.skin import Skin, unit
+from avmsf.fem.skin import Skin, components
 from avmsf.fem.solid import Solid
 from avmsf.mesh.closest_point import ClosestPoints
 
@@ -158,7 +158,7 @@ def wall_of(skin: Skin, thickness: float | None = None) -> Wall | None:
     # Sides are found over edges of two triangles each.
     if skin.open_edges or skin.crowded_edges or skin.volume <= 0.0:
         return None
-    normals = _normals(skin)
+    normals = skin.face_normals
     areas, total = skin.areas, float(skin.areas.sum())
     reach, cosine, behind = _Behind(skin)(skin.points[skin.faces].mean(axis=1), normals)
     facing = (cosine < _OPPOSITE) & (reach < _THICKER * 2.0 * skin.volume / total)
@@ -181,20 +181,10 @@ def _sides(
     skin: Skin, normals: Float64[np.ndarray, "faces 3"], facing: Bool[np.ndarray, " faces"]
 ) -> Int[np.ndarray, " faces"]:
     """Return the number of the smooth connected part of the triangles `facing` that each is in; -1 for the others."""
-    ends = np.sort(skin.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    order = np.argsort(ends[:, 0] * len(skin.points) + ends[:, 1], kind="stable")
-    one, other = order[::2] // 3, order[1::2] // 3
+    one, other, _ = skin.neighbors
     joined = facing[one] & facing[other] & ((normals[one] * normals[other]).sum(axis=1) > _CREASE)
-    graph = scipy.sparse.csr_array(
-        (np.ones(int(joined.sum())), (one[joined], other[joined])), shape=(len(skin.faces),) * 2
-    )
-    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    label = components(np.stack([one, other], axis=1)[joined], len(skin.faces))
     return np.where(facing, label, -1)
-
-
-def _normals(skin: Skin) -> Float64[np.ndarray, "faces 3"]:
-    corners = skin.points[skin.faces]
-    return unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
 
 
 class _Behind:
@@ -202,7 +192,7 @@ class _Behind:
 
     def __init__(self, skin: Skin) -> None:
         # Embree counts in float32: the mesh is moved to the origin and given size 1.
-        self._middle, self._size, self._normals = skin.points.mean(axis=0), skin.size, _normals(skin)
+        self._middle, self._size, self._normals = skin.points.mean(axis=0), skin.size, skin.face_normals
         self._scene = EmbreeScene()
         self._mesh = TriangleMesh(
             self._scene, ((skin.points - self._middle)[skin.faces] / skin.size).astype(np.float32)

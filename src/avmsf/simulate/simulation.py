@@ -19,7 +19,7 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.starts import cut_together, shorten
 from avmsf.fem.damping import Vibration, damped
 from avmsf.fem.elastic_modes import ElasticModes
-from avmsf.fem.radiated_sound import radiated, travel_time
+from avmsf.fem.radiation import radiated, travel_time
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.simulate.bodies import Body, make_body, up_of

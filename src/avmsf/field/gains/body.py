@@ -11,7 +11,7 @@ from torch import Tensor
 from avmsf._utils.records import count_of
 from avmsf._utils.summary import short_repr
 from avmsf.fem.elastic_modes import ElasticModes
-from avmsf.fem.mode_tensors import mode_sizes, mode_skeleton, mode_tensors, restored_modes
+from avmsf.fem.elastic_store import mode_sizes, mode_skeleton, mode_tensors, restored_modes
 from avmsf.field.gain_field import GainField, Gains
 from avmsf.field.gains.family import sites_along
 

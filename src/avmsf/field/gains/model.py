@@ -15,7 +15,7 @@ from avmsf._utils.records import RecordError, count_of, like
 from avmsf._utils.summary import short_repr
 from avmsf.capture.places import places_of
 from avmsf.fem.elastic_modes import ElasticModes
-from avmsf.fem.mode_tensors import mode_sizes, mode_skeleton, mode_tensors, restored_modes
+from avmsf.fem.elastic_store import mode_sizes, mode_skeleton, mode_tensors, restored_modes
 from avmsf.field.gain_field import GainField, Gains
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import Family, KernelFamily, Sites, nearest_sites, sites_along

@@ -1,0 +1,255 @@
+"""Surfaces made fit: what faces inwards is turned, noise goes, holes are measured, dense meshes are thinned."""
+
+import math
+
+import fast_simplification
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy import ndimage
+
+from avmsf.errors import SimulationError
+from avmsf.fem import mesh_check
+from avmsf.fem.candidate_bodies import nominal_bodies
+from avmsf.fem.mesh_check import ROUGH, CheckedSurface, checked, denoised, roughness, simplified, thinned
+from avmsf.fem.skin import Skin
+from avmsf.fem.tetrahedra import fill
+from avmsf.mesh.closest_point import ClosestPoints
+from avmsf.mesh.level_set import enclose
+from avmsf.mesh.surface import Surface
+from factories.raising import raises
+
+
+def surface_of(mesh: trimesh.Trimesh) -> Surface:
+    return Surface(torch.from_numpy(np.array(mesh.vertices)).float(), torch.from_numpy(np.array(mesh.faces)))
+
+
+def surface_in(skin: Skin) -> Surface:
+    return Surface(torch.from_numpy(skin.points).float(), torch.from_numpy(skin.faces))
+
+
+def skin_of(mesh: trimesh.Trimesh) -> Skin:
+    return Skin.of(surface_of(mesh))
+
+
+def cup(below: float) -> Skin:
+    """Return the part of a ball of radius 1 below this height."""
+    angles = np.linspace(0.0, math.acos(-below), 40)
+    return skin_of(trimesh.creation.revolve(np.stack([np.sin(angles), -np.cos(angles)], axis=1), sections=64))
+
+
+def test_an_inverted_part_is_turned_and_the_wall_of_a_void_is_not():
+    outer, inner, beside = (trimesh.creation.icosphere(2, radius=radius) for radius in (1.0, 0.8, 0.5))
+    inner.invert()
+    beside.apply_translation((3.0, 0.0, 0.0))
+    beside.invert()
+    truth = (1.0 - 0.8**3 + 0.5**3) * trimesh.creation.icosphere(2).volume
+    messages: list[str] = []
+    found = checked(surface_of(trimesh.util.concatenate([outer, inner, beside])), log=messages.append)
+    assert found.skin.volume == pytest.approx(truth, rel=1e-5)
+    assert len(messages) == 1
+    assert messages[0].startswith("320 of 960 triangles")
+    # All of it inside out: the void goes with the body around it.
+    every = trimesh.util.concatenate([outer, inner])
+    every.invert()
+    assert checked(surface_of(every), log=messages.append).skin.volume == pytest.approx(
+        (1.0 - 0.8**3) * trimesh.creation.icosphere(2).volume, rel=1e-5
+    )
+
+
+@pytest.mark.parametrize(("below", "vessel"), [(0.05, True), (0.9, True), (-0.995, False)])
+def test_an_open_vessel_that_faces_inwards_is_told_and_stays(below: float, vessel: bool):
+    skin = cup(below)
+    outwards = surface_in(skin)
+    for surface, expected in ((outwards, False), (Surface(outwards.vertices, outwards.faces.flip(1)), vessel)):
+        messages: list[str] = []
+        found = checked(surface, log=messages.append).skin
+        # A dish a twentieth as deep as its radius has no inside worth the name.
+        assert any("inwards" in message for message in messages) == expected
+        assert (found.volume > 0) == (Skin.of(surface).volume > 0)
+
+
+def test_lids_are_measured_as_they_would_close_the_holes():
+    half = CheckedSurface(cup(0.05))
+    # The disc on a dome of height h on a ball of radius 1 is (2 - h) / (4 - h) of all.
+    assert half.lids == pytest.approx((2 - 1.05) / (4 - 1.05), abs=0.005)
+    with raises(SimulationError, name="mesh", value=half.lids):
+        half.expect_filling()
+    assert half.mean_thickness is None
+    nearly = CheckedSurface(cup(0.9))
+    nearly.expect_filling()
+    held = nearly.mean_thickness
+    assert held is not None
+    assert held == pytest.approx(2 * 4 / 3 * math.pi / (4 * math.pi), rel=0.05)
+
+
+def test_no_wall_is_guessed_where_the_surface_holds_little_more_than_it():
+    whole = CheckedSurface(skin_of(trimesh.creation.icosphere(4)))
+    # Twice the volume over the area is two thirds of the radius, of which a wall may be a sixth.
+    whole.expect_hollow(0.110)
+    with raises(SimulationError, name="wall", value=0.112):
+        whole.expect_hollow(0.112)
+    CheckedSurface(cup(0.05)).expect_hollow(0.3)
+
+
+def test_noise_is_taken_out_of_a_mesh_by_as_much_as_it_has():
+    clean = skin_of(trimesh.creation.icosphere(4))
+    for part in (0.01, 0.02):
+        noise = part * clean.size * np.random.default_rng(0).standard_normal(clean.points.shape) / math.sqrt(3)
+        found, moved = denoised(Skin(clean.points + noise, clean.faces))
+        assert moved == pytest.approx(part * clean.size, rel=0.1)
+        surface = ClosestPoints(clean.points[clean.faces])
+        before = np.sqrt((surface(clean.points + noise).distances ** 2).mean())
+        assert np.sqrt((surface(found.points).distances ** 2).mean()) < 0.35 * before
+        assert roughness(found) < 8.0
+        assert found.volume == pytest.approx(Skin(clean.points + noise, clean.faces).volume, rel=1e-9)
+
+
+def test_what_is_not_noisy_stays_as_it_is():
+    box = skin_of(trimesh.creation.box((1.0, 0.2, 0.01)))
+    for skin in (box, box.remeshed(0.03), skin_of(trimesh.creation.icosphere(4)), cup(0.3)):
+        assert roughness(skin) < ROUGH
+        found, moved = denoised(skin)
+        assert found is skin
+        assert moved == 0.0
+
+
+def test_a_rough_form_that_is_no_noise_stays():
+    # Each vertex lies on a wave that its neighbors predict, though triangles turn by more than noise would make them.
+    x, y = np.meshgrid(np.linspace(0, 1, 49), np.linspace(0, 1, 49), indexing="ij")
+    rows = np.arange(x.size).reshape(x.shape)
+    a, b, c, d = (part.ravel() for part in (rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    heights = 0.12 * np.sin(12 * math.pi * x.ravel()) * np.sin(12 * math.pi * y.ravel())
+    waves = Skin(np.stack([x.ravel(), y.ravel(), heights], axis=1), faces)
+    assert roughness(waves) > ROUGH
+    assert denoised(waves)[0] is waves
+
+
+def test_smoothing_is_told():
+    clean = skin_of(trimesh.creation.icosphere(3))
+    noise = 0.02 * clean.size * np.random.default_rng(0).standard_normal(clean.points.shape)
+    messages: list[str] = []
+    rough = Surface(torch.from_numpy(clean.points + noise).float(), torch.from_numpy(clean.faces))
+    checked(rough, log=messages.append)
+    assert len(messages) == 1
+    assert f"{roughness(Skin.of(rough)):.0f} degrees" in messages[0]
+
+
+def test_corners_a_millionth_of_the_size_apart_are_one() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
+    corners = np.array(ball.triangles).reshape(-1, 3)
+    corners += 1e-7 * np.random.default_rng(0).uniform(-1, 1, corners.shape)
+    faces = torch.arange(len(corners)).reshape(-1, 3)
+    skin = Skin.of(Surface(torch.from_numpy(corners), faces))
+    assert (len(skin.points), len(skin.faces)) == (len(ball.vertices), len(ball.faces))
+
+
+def limit(monkeypatch: pytest.MonkeyPatch, triangles: int) -> None:
+    for name in ("MOST", "ENOUGH"):
+        monkeypatch.setattr(mesh_check, name, triangles)
+
+
+def ellipsoid(subdivisions: int) -> Skin:
+    """Return one with half axes of 60, 45 and 30 mm."""
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
+    return Skin(np.array(mesh.vertices) * [0.060, 0.045, 0.030], np.array(mesh.faces))
+
+
+def vessel(sections: int) -> Skin:
+    """Return the part of a ball of 5 cm from its bottom to 115 degrees."""
+    angles = np.linspace(0.0, 2.0, sections // 2)
+    mesh = trimesh.creation.revolve(0.05 * np.stack([np.sin(angles), -np.cos(angles)], axis=1), sections=sections)
+    return skin_of(mesh)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("dense", "coarse"), [(ellipsoid(5), ellipsoid(4)), (vessel(160), vessel(70))])
+def test_a_dense_mesh_vibrates_as_a_coarse_one_of_the_same_shape(
+    dense: Skin, coarse: Skin, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Those that the wall is made of are far fewer.
+    limit(monkeypatch, 6000)
+    messages: list[str] = []
+    found, known = (
+        nominal_bodies(surface_in(skin), walls=[0.002], count=4, dofs=8000, log=messages.append).bodies[0].elastic
+        for skin in (dense, coarse)
+    )
+    assert f"{len(dense.faces)} triangles" in messages[0]
+    assert "6000 triangles" in messages[1]
+    assert sum("6000 triangles" in message for message in messages) == 1
+    # Without thinning, elements that differ change frequencies by 1.5 % at this size.
+    assert found.frequency.numpy() == pytest.approx(known.frequency.numpy(), rel=0.03)
+    assert found.mass == pytest.approx(known.mass, rel=0.01)
+
+
+def test_a_noisy_mesh_is_thinned_without_its_noise_and_stays_a_skin(monkeypatch: pytest.MonkeyPatch) -> None:
+    clean = ellipsoid(5)
+    noise = 0.01 * clean.size * np.random.default_rng(0).standard_normal(clean.points.shape) / 3**0.5
+    messages: list[str] = []
+    limit(monkeypatch, 4000)
+    found = thinned(Skin(clean.points + noise, clean.faces), log=messages.append)
+    assert len(found.faces) == 4000
+    assert (found.open_edges, found.crowded_edges) == (0, 0)
+    surface = ClosestPoints(clean.points[clean.faces])
+    before = np.sqrt((surface(clean.points + noise).distances ** 2).mean())
+    assert np.sqrt((surface(found.points).distances ** 2).mean()) < 0.35 * before
+    assert found.volume == pytest.approx(clean.volume, rel=0.01)
+    assert messages[-1].endswith("degrees")
+
+
+def test_a_thinned_sheet_keeps_its_rim(monkeypatch: pytest.MonkeyPatch) -> None:
+    side = np.linspace(0.0, 1.0, 61)
+    rows = np.arange(61 * 61).reshape(61, 61)
+    a, b, c, d = (part.ravel() for part in (rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:]))
+    points = np.stack([*(each.ravel() for each in np.meshgrid(side, side, indexing="ij")), np.zeros(61 * 61)], axis=1)
+    sheet = Skin(points, np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]))
+    limit(monkeypatch, 1000)
+    found = thinned(sheet, log=lambda words: None)
+    assert len(found.faces) <= 1000
+    # Each corner may lose a triangle, with sides of about .045 now.
+    assert found.areas.sum() == pytest.approx(1.0, abs=4 * 0.045**2 / 2)
+    assert np.ptp(found.points, axis=0) == pytest.approx([1.0, 1.0, 0.0], abs=1e-6)
+    assert 0 < found.open_edges < sheet.open_edges
+
+
+def test_more_triangles_are_left_where_fewer_would_tear_the_skin(monkeypatch: pytest.MonkeyPatch) -> None:
+    ball = ellipsoid(4)
+
+    def tearing(points: np.ndarray, faces: np.ndarray, *, target_count: int) -> tuple[np.ndarray, np.ndarray]:
+        return points, faces if target_count >= 4000 else faces[:target_count]
+
+    monkeypatch.setattr(fast_simplification, "simplify", tearing)
+    limit(monkeypatch, 1000)
+    found = thinned(ball, log=lambda words: None)
+    assert np.array_equal(found.faces, ball.faces)
+    limit(monkeypatch, 3000)
+    assert thinned(ball, log=lambda words: None) is ball
+
+
+def test_fewer_triangles_of_a_thin_shell_keep_its_volume() -> None:
+    outer, inner = ellipsoid(4), ellipsoid(4)
+    count = len(outer.points)
+    shell = Skin(
+        np.concatenate([outer.points, 0.95 * inner.points]), np.concatenate([outer.faces, count + inner.faces[:, ::-1]])
+    )
+    found = simplified(shell, 1200)
+    assert 1000 < len(found.faces) <= 1200
+    assert found.open_edges == 0
+    assert found.volume == pytest.approx(shell.volume, rel=0.05)
+
+
+def test_a_knotted_skin_shares_a_few_edges_rather_than_keep_its_triangles_and_is_filled() -> None:
+    values = ndimage.gaussian_filter(np.random.default_rng(0).standard_normal((40, 40, 40)), 2.0)
+    values /= values.std()
+    radius = np.linalg.norm(np.meshgrid(*[np.linspace(-1, 1, 40)] * 3), axis=0)
+    sponge = np.minimum(values + 0.5, 4 * (0.85 - radius)).astype(np.float32)
+    skin = Skin.of(enclose(sponge, 0.0, lowest=np.zeros(3), spacing=0.01))
+    assert len(simplified(skin, 1000).faces) > 10_000
+    found = simplified(skin, 1000, most=4000)
+    assert len(found.faces) <= 1000
+    assert found.open_edges == 0
+    assert found.volume == pytest.approx(skin.volume, rel=0.02)
+    filled = fill(surface_in(found), detail=0.1)
+    assert float(filled.volumes.sum()) == pytest.approx(skin.volume, rel=0.05)
