@@ -19,7 +19,7 @@ from avmsf.features.feature_field import FeatureField
 from avmsf.fem.candidate_bodies import nominal_bodies
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
-from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.field.gains.elastic import CandidateBodies
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import Attention
 from avmsf.field.sound_field import SoundField

@@ -12,7 +12,7 @@ from avmsf.evaluation.splits import evaluate, split
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
-from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.field.gains.elastic import CandidateBodies
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import along_phase
 from avmsf.field.sound_field import SoundField

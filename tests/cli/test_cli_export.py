@@ -23,7 +23,7 @@ from avmsf.errors import AvmsfError, CaptureWarning
 from avmsf.export.paper_demo import read_demo
 from avmsf.export.sampled_field import SampledField
 from avmsf.field.config import FitConfig
-from avmsf.field.gains.body import BodyGains
+from avmsf.field.scaled_gains import BodyGains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.gaussians.cloud import GaussianCloud

@@ -12,12 +12,12 @@ from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.field.attention import AttentionGains
 from avmsf.field.config import AttentionShape
 from avmsf.field.gain_field import GainField
-from avmsf.field.gains.body import BodyGains
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import KernelFamily, Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
+from avmsf.field.scaled_gains import BodyGains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
 from avmsf.modal.modes import ModalBank

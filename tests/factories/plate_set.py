@@ -10,7 +10,7 @@ from avmsf.errors import SceneError, SimulationError
 from avmsf.evaluation.task import Look
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.body_family import BodyFamily
-from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.field.gains.elastic import CandidateBodies
 from avmsf.mesh import Surface
 from avmsf.simulate.ground_truth import TRUTH, Truth, write_truth
 from oracles.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike

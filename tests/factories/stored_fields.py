@@ -15,13 +15,12 @@ from avmsf.capture import Impacts
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.attention import AttentionGains, AttentionShape
 from avmsf.field.gain_field import GainField
-from avmsf.field.gains.body import BodyGains
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.symmetry import Symmetric
-from avmsf.field.scaled_gains import ScaledGains
+from avmsf.field.scaled_gains import BodyGains, ScaledGains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.modal.extraction.alignment import align
 from avmsf.modal.modes import ModalBank

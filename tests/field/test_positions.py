@@ -2,9 +2,8 @@
 
 import torch
 
-from avmsf.field.gains.body import BodyGains
 from avmsf.field.positions import off_surface, off_surface_gains, points_on_object
-from avmsf.field.scaled_gains import ScaledGains, surface_of
+from avmsf.field.scaled_gains import BodyGains, ScaledGains, surface_of
 from factories.believing_field import LENGTH, bar, bar_points
 from factories.made_fields import positional
 

@@ -14,7 +14,7 @@ from avmsf.fem.candidate_bodies import NominalBodies, NominalBody
 from avmsf.fem.supports import Support
 from avmsf.field.config import FitConfig, GainModel
 from avmsf.field.fit import fit
-from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.field.gains.elastic import CandidateBodies
 from avmsf.field.gains.estimator import MixtureEstimator, estimator_for, gain_variance
 from avmsf.field.recipes import GainCase, gain_case
 from avmsf.mesh.surface import Surface

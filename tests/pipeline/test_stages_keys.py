@@ -16,7 +16,7 @@ from avmsf.errors import CaptureError, SimulationError
 from avmsf.fem import candidate_bodies as nominal
 from avmsf.field import recipes
 from avmsf.field.config import FitConfig
-from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.field.gains.elastic import CandidateBodies
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import fingerprint, gain_case
 from avmsf.field.store import load

@@ -19,8 +19,7 @@ from avmsf.evaluation.splits import evaluate
 from avmsf.features.header import holds_features
 from avmsf.field.attention import AttentionGains
 from avmsf.field.config import NETWORK
-from avmsf.field.gains.body import BodyGains
-from avmsf.field.scaled_gains import surface_of
+from avmsf.field.scaled_gains import BodyGains, surface_of
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
 from avmsf.field.uncertainty import has_posterior, relative_gain_std, spectrum_band, training_contacts

@@ -27,7 +27,7 @@ from avmsf.evaluation.splits import align_split
 from avmsf.evaluation.task import Look, Method, Task
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.body_family import BodyFamily
-from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.field.gains.elastic import CandidateBodies
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.modal.extraction.finders import ModeFinder

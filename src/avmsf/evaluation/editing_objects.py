@@ -29,7 +29,7 @@ from avmsf.fem.material import MATERIALS, Material
 from avmsf.fem.radiation import radiated
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import fit
-from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.field.gains.elastic import CandidateBodies
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import Attention, GainRecipe
 from avmsf.field.sound_field import SoundField

@@ -8,7 +8,7 @@ from avmsf.baselines.diffsound.material_fit import MODES as DIFFSOUND_MODES
 from avmsf.datasets.dataset import Dataset
 from avmsf.errors import SceneError
 from avmsf.fem.body_family import BodyFamily, body_family
-from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.field.gains.elastic import CandidateBodies
 from avmsf.mesh.surface import Surface
 from avmsf.pipeline.bodies import candidate_bodies, roughened
 from avmsf.pipeline.config import BodyConfig, Geometry, SceneConfig, ViewsConfig

@@ -13,7 +13,7 @@ from avmsf.evaluation.sound_metrics import Judging
 from avmsf.evaluation.task import Look, Looking, Method
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.body_family import BodyFamily
-from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.field.gains.elastic import CandidateBodies
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder
 

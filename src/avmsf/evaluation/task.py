@@ -12,7 +12,7 @@ from avmsf.errors import EvaluationError
 from avmsf.evaluation.renderer import Renderer
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.body_family import BodyFamily
-from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.field.gains.elastic import CandidateBodies
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.modal.extraction.extract import Extraction
 

@@ -13,10 +13,9 @@ from torch import Tensor
 
 from avmsf.errors import ExportError
 from avmsf.field.gain_field import GainField
-from avmsf.field.gains.body import BodyGains
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.positions import points_on_object
-from avmsf.field.scaled_gains import ScaledGains
+from avmsf.field.scaled_gains import BodyGains, ScaledGains
 from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.neighborhoods import read_neighborhoods
 from avmsf.gaussians.points import farthest_points, nearest_points

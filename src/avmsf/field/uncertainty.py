@@ -13,9 +13,8 @@ from torch import Tensor
 
 from avmsf._utils.arrays import Seed, generator_of
 from avmsf.errors import FitError
-from avmsf.field.gains.body import BodyGains
 from avmsf.field.gains.model import MixtureGains
-from avmsf.field.scaled_gains import ScaledGains, fitted_gains
+from avmsf.field.scaled_gains import BodyGains, ScaledGains, fitted_gains
 from avmsf.field.sound_field import SoundField
 from avmsf.modal.modes import turned_like
 from avmsf.modal.synthesis import synthesize_phased

@@ -12,7 +12,7 @@ from avmsf.capture.placement import expect_placed, surface_points
 from avmsf.errors import SimulationError
 from avmsf.fem.candidate_bodies import NominalBody, Shape, nominal_bodies, refined, supported, with_wall
 from avmsf.fem.supports import Support
-from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.field.gains.elastic import CandidateBodies
 from avmsf.mesh.surface import Surface
 from avmsf.pipeline.config import BodyConfig
 

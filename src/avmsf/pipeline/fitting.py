@@ -19,7 +19,7 @@ from avmsf.errors import FitError
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import AUTO, GainModel
 from avmsf.field.fit import Progress, fit
-from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.field.gains.elastic import CandidateBodies
 from avmsf.field.gains.estimator import estimator_for
 from avmsf.field.sound_field import SoundField
 from avmsf.modal.extraction.extract import Extraction, extract_modes, extract_once

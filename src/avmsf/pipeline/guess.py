@@ -20,7 +20,7 @@ from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.material import Material, material_named
 from avmsf.fem.radiation import radiated_pressure
 from avmsf.field.config import FitConfig
-from avmsf.field.gains.body import BodyGains
+from avmsf.field.scaled_gains import BodyGains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.mesh.surface import Surface, read_surface
 from avmsf.modal.modes import ModalBank

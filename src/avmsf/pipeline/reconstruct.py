@@ -21,8 +21,7 @@ from avmsf.features.feature_field import FeatureField
 from avmsf.features.store import load_features, read_report
 from avmsf.field.config import NETWORK
 from avmsf.field.fit import Progress, fit
-from avmsf.field.gains.bodies import CandidateBodies
-from avmsf.field.gains.elastic import Elastic
+from avmsf.field.gains.elastic import CandidateBodies, Elastic
 from avmsf.field.gains.estimator import estimator_for
 from avmsf.field.gains.positional import Visual
 from avmsf.field.store import load, save

@@ -23,8 +23,7 @@ from avmsf.fem.supports import FREE, FREE_PRIOR
 from avmsf.fem.thickness import search_thickness
 from avmsf.fem.updating import update
 from avmsf.field.config import AUTO, NETWORK, GainModel
-from avmsf.field.gains.bodies import CandidateBodies
-from avmsf.field.gains.elastic import Elastic
+from avmsf.field.gains.elastic import CandidateBodies, Elastic
 from avmsf.field.gains.family import KernelFamily, Sites, sites_along
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, matched, total_evidence
 from avmsf.field.gains.mixture import NOISE_SHARES
