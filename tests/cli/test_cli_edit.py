@@ -16,10 +16,9 @@ from avmsf.cli.edit import run
 from avmsf.cli.edit_material import old_material
 from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.edit import parse
-from avmsf.editing.edits import EDITS
 from avmsf.editing.material import RATIO_ONLY, change_material, rayleigh_damping
 from avmsf.editing.material_statistics import MaterialStatistics
-from avmsf.editing.modes import adjust_modes
+from avmsf.editing.modal_edit import EDITS, adjust_modes
 from avmsf.errors import AvmsfError, EditError
 from avmsf.fem.material import CERAMIC, GLASS, STEEL, WOOD
 from avmsf.field.gains.family import Sites

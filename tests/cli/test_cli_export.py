@@ -18,7 +18,7 @@ from avmsf.cli import main
 from avmsf.cli.export import run
 from avmsf.cli.options.export import parse
 from avmsf.editing.material import change_material
-from avmsf.editing.modes import adjust_modes
+from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import AvmsfError, CaptureWarning
 from avmsf.export.paper_demo import read_demo
 from avmsf.export.sampled_field import SampledField

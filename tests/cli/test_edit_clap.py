@@ -10,8 +10,7 @@ from test_cli_edit import PLACES, RATE, Echo, ceramic
 from avmsf.cli import edit, main, steering
 from avmsf.cli.edit import run
 from avmsf.cli.options.edit import parse
-from avmsf.editing.edits import EDITS
-from avmsf.editing.modes import adjust_modes
+from avmsf.editing.modal_edit import EDITS, adjust_modes
 from avmsf.errors import AvmsfError
 from avmsf.evaluation.clap import Clap
 from avmsf.field.store import load, save

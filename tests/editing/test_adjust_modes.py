@@ -6,10 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from avmsf.editing.material import change_material, rayleigh_damping
-from avmsf.editing.material_before import made_of
-from avmsf.editing.material_guess import guess_materials
-from avmsf.editing.modes import adjust_modes, brightness_center
+from avmsf.editing.material import change_material, guess_materials, infer_material, rayleigh_damping
+from avmsf.editing.modal_edit import adjust_modes, brightness_center
 from avmsf.errors import EditError
 from avmsf.fem.material import CERAMIC, WOOD
 from avmsf.field.scaled_gains import ScaledGains
@@ -139,9 +137,9 @@ def test_adjusted_modes_keep_the_material():
     frequency = torch.tensor([1600.0, 2500.0, 4100.0, 6000.0, 9000.0], dtype=torch.float64)
     damping = rayleigh_damping(2.0 * math.pi * frequency, CERAMIC)
     ceramic = replace(field(), bank=ModalBank(frequency, damping), sample_rate=48000.0)
-    assert made_of(ceramic, option="--from").material == CERAMIC
+    assert infer_material(ceramic, option="--from").material == CERAMIC
     lower = adjust_modes(adjust_modes(ceramic, pitch=0.25), decay=torch.linspace(0.1, 0.5, 5), brightness_db=3.0)
     assert guess_materials(lower.bank)[0].material != CERAMIC
-    assert made_of(lower, option="--from").material == CERAMIC
+    assert infer_material(lower, option="--from").material == CERAMIC
     wooden = change_material(lower, CERAMIC, WOOD)
-    assert made_of(adjust_modes(wooden, pitch=2.0), option="--from").material == WOOD
+    assert infer_material(adjust_modes(wooden, pitch=2.0), option="--from").material == WOOD

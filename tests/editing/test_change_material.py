@@ -6,11 +6,17 @@ from dataclasses import replace
 import pytest
 import torch
 
-from avmsf.editing.edits import silenced
-from avmsf.editing.material import ACCELERATION, DISPLACEMENT, LAWS, RATIO_ONLY, VELOCITY, change_material
-from avmsf.editing.material_before import made_of
-from avmsf.editing.material_guess import guess_materials
-from avmsf.editing.modes import adjust_modes
+from avmsf.editing.material import (
+    ACCELERATION,
+    DISPLACEMENT,
+    LAWS,
+    RATIO_ONLY,
+    VELOCITY,
+    change_material,
+    guess_materials,
+    infer_material,
+)
+from avmsf.editing.modal_edit import adjust_modes, silenced
 from avmsf.errors import EditError, SimulationError
 from avmsf.fem.damping import rayleigh
 from avmsf.fem.elastic_modes import elastic_modes
@@ -279,9 +285,9 @@ def test_the_material_is_guessed_by_its_dampings(material):
     best, second, *_ = guess_materials(ModalBank(field.bank.frequency, field.bank.damping * off))
     assert best.material is material
     # A normal deviation of .1 has its middle at .067; one mode that is quite off counts for little.
-    assert 1.02 < best.off < 1.12
+    assert 1.02 < best.ratio < 1.12
     assert best.fits
-    assert second.off > best.off
+    assert second.ratio > best.ratio
     assert not guess_materials(ModalBank(field.bank.frequency, 30 * field.bank.frequency))[0].fits
 
 
@@ -292,7 +298,7 @@ def test_supporting_poles_say_nothing_about_the_material():
     damping[supporting] *= 30.0
     report = {SUPPORTING: supporting}
     mixed = replace(field, bank=ModalBank(field.bank.frequency, damping), origin=Origin("plate", report=report))
-    assert made_of(mixed, option="--from").material == STEEL
+    assert infer_material(mixed, option="--from").material == STEEL
 
 
 def test_a_body_too_stiff_for_a_material_excludes_it():
@@ -300,12 +306,12 @@ def test_a_body_too_stiff_for_a_material_excludes_it():
     body = {"body": "solid body", "wall_thickness": None, "frequency_factor": math.sqrt(RATIO[STEEL] / RATIO[NOMINAL])}
     origin = Origin("plate", report={"credibility": {"credible": True}, "bodies": [body]})
     steel = replace(plate_field(STEEL), origin=origin)
-    assert made_of(steel, option="--from").material == STEEL
+    assert infer_material(steel, option="--from").material == STEEL
     with raises(EditError, name="--from"):
-        made_of(replace(plate_field(WOOD), origin=origin), option="--from")
+        infer_material(replace(plate_field(WOOD), origin=origin), option="--from")
 
 
 def test_a_material_that_is_assumed_and_new_is_said():
     wooden = plate_field(WOOD)
-    known = [made_of(wooden, option="--from", new=new) for new in (None, STEEL, WOOD)]
+    known = [infer_material(wooden, option="--from", new=new) for new in (None, STEEL, WOOD)]
     assert ["changes nothing" in each.words for each in known] == [False, False, True]

@@ -8,10 +8,8 @@ import torch
 
 from avmsf.editing.clips import level
 from avmsf.editing.config import GuidedEditConfig
-from avmsf.editing.guided import Guide, edit_towards
-from avmsf.editing.modal_edit import ModalEdit
-from avmsf.editing.modes import adjust_modes
-from avmsf.editing.parameters import HIERARCHICAL, INDEPENDENT, PUBLISHED, SEARCHED
+from avmsf.editing.guided import HIERARCHICAL, INDEPENDENT, PUBLISHED, SEARCHED, Guide, edit_towards
+from avmsf.editing.modal_edit import ModalEdit, adjust_modes
 from avmsf.editing.reference import Reference
 from avmsf.errors import EditError
 from factories.raising import raises

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from avmsf.editing.modal_edit import ModalEdit, Struck
+from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
 from avmsf.errors import EditError
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save
@@ -76,7 +76,7 @@ def test_what_is_optimized_is_what_the_edited_field_renders(pitch):
     # At 2.5 times the pitch two modes lie above half the rate, and are silent in both.
     field, edit = made_field(), made_edit(pitch=pitch)
     contacts = made_fields.places(4, seed=6)
-    sounds = Struck.at(field, contacts, samples=field.samples).sounds(edit)
+    sounds = FieldAtContacts.at(field, contacts, samples=field.samples).sounds(edit)
     rendered = edit.of(field).render(contacts)
     torch.testing.assert_close(sounds, rendered, rtol=0, atol=2e-6 * float(rendered.abs().max()))
 
@@ -85,7 +85,7 @@ def test_the_gradient_reaches_all_five():
     field = made_field()
     edit = replace(made_edit(), **{name: getattr(made_edit(), name).requires_grad_() for name in vars(made_edit())})
     contacts = made_fields.places(2, seed=6)
-    Struck.at(field, contacts, samples=800).sounds(edit).square().sum().backward()
+    FieldAtContacts.at(field, contacts, samples=800).sounds(edit).square().sum().backward()
     for name, value in vars(edit).items():
         assert float(value.grad.abs().min()) > 0, name
 
@@ -94,12 +94,12 @@ def test_a_mode_above_half_the_rate_has_no_slope_but_the_others_have():
     field = made_field()
     scale = torch.zeros(5, dtype=torch.float64, requires_grad=True)
     edit = replace(ModalEdit.none(field.bank, pitch=math.log(2.0)), scale=scale)
-    Struck.at(field, made_fields.places(2, seed=6), samples=800).sounds(edit).square().sum().backward()
+    FieldAtContacts.at(field, made_fields.places(2, seed=6), samples=800).sounds(edit).square().sum().backward()
     assert (scale.grad != 0).tolist() == [True, True, True, True, False]
 
 
 def test_an_edited_field_saves_loads_and_is_edited_again(tmp_path):
-    once = made_edit().of(made_field(), told={"prompt": "wood"})
+    once = made_edit().of(made_field(), settings={"prompt": "wood"})
     save(once, tmp_path / "edited.safetensors")
     again = made_edit().of(load(tmp_path / "edited.safetensors"))
     direct = made_edit().of(once)
@@ -116,14 +116,14 @@ def test_an_edited_field_saves_loads_and_is_edited_again(tmp_path):
 
 def test_the_loudest_modes_by_energy():
     field = made_field()
-    struck = Struck.at(field, made_fields.places(9, seed=3), samples=4000)
+    struck = FieldAtContacts.at(field, made_fields.places(9, seed=3), samples=4000)
     known = struck.known
     atoms = []
     for mode in range(5):
         alone = torch.zeros(5, dtype=torch.float64)
         alone[:] = -40.0
         alone[mode] = 0.0
-        sounds = Struck(field.bank, field.phase, known, RATE, 40000).sounds(
+        sounds = FieldAtContacts(field.bank, field.phase, known, RATE, 40000).sounds(
             replace(ModalEdit.none(field.bank), scale=alone)
         )
         atoms.append(float(sounds.double().square().sum(1).mean()) / RATE)

@@ -11,9 +11,9 @@ import torch
 
 from avmsf.editing.clips import lasting, level, levelled, resampled
 from avmsf.editing.material_statistics import MaterialStatistics
-from avmsf.editing.modal_edit import ModalEdit, Struck
+from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
 from avmsf.editing.reference import Reference
-from avmsf.editing.start_search import heard_spectrum
+from avmsf.editing.start_search import band_spectrum
 from avmsf.errors import AvmsfWarning, EditError
 from avmsf.fem.material import CERAMIC, WOOD
 from avmsf.field.gain_field import Gains
@@ -28,9 +28,9 @@ def write(path: Path, sound: torch.Tensor, *, rate: float = RATE, before: int = 
     return path
 
 
-def struck(**change: float) -> Struck:
+def struck(**change: float) -> FieldAtContacts:
     field = ringing_field(**change)
-    return Struck.at(field, field.gain_field.points, samples=field.samples)
+    return FieldAtContacts.at(field, field.gain_field.points, samples=field.samples)
 
 
 def test_a_recording_begins_at_its_onset_at_the_fields_rate(tmp_path):
@@ -42,8 +42,8 @@ def test_a_recording_begins_at_its_onset_at_the_fields_rate(tmp_path):
     path = write(tmp_path / "hit.wav", fast, rate=4 * RATE, before=3200)
     reference = Reference.read(path, sample_rate=RATE)
     assert reference.lengths[0] == pytest.approx(4000, abs=4)
-    found = heard_spectrum(reference.clips[:, :3990])
-    torch.testing.assert_close(found, heard_spectrum(sound_of(field)[:, :3990]), rtol=0, atol=2e-3)
+    found = band_spectrum(reference.clips[:, :3990])
+    torch.testing.assert_close(found, band_spectrum(sound_of(field)[:, :3990]), rtol=0, atol=2e-3)
 
 
 def test_references_are_told_apart_by_every_sample():
@@ -64,7 +64,7 @@ def test_several_clips_each_sound_has_its_nearest(tmp_path):
     torch.testing.assert_close(level(targets, sample_rate=RATE), level(heard, sample_rate=RATE))
     wanted = torch.cat([sound_of(ringing_field(pitch=pitch)) for pitch in pitches])
     # Onsets lie within a sample or two of where the files begin.
-    torch.testing.assert_close(heard_spectrum(targets), heard_spectrum(wanted), rtol=0, atol=2e-3)
+    torch.testing.assert_close(band_spectrum(targets), band_spectrum(wanted), rtol=0, atol=2e-3)
 
 
 def test_where_a_clip_ends_nothing_is_asked():
@@ -103,11 +103,11 @@ def test_the_start_of_what_is_there_already():
 
 
 def test_heard_spectra_shift_with_pitch_and_ignore_level():
-    one, double = (heard_spectrum(sound_of(ringing_field(pitch=pitch, damping=pitch))) for pitch in (0.5, 1.0))
+    one, double = (band_spectrum(sound_of(ringing_field(pitch=pitch, damping=pitch))) for pitch in (0.5, 1.0))
     torch.testing.assert_close(one.sum(1), torch.ones(1))
     # An octave is 24 bands; each mode's width doubles with its frequency.
     torch.testing.assert_close(one.roll(24, 1)[:, 60:], double[:, 60:], rtol=0, atol=3e-3)
-    loud = heard_spectrum(1e3 * sound_of(ringing_field()))
+    loud = band_spectrum(1e3 * sound_of(ringing_field()))
     torch.testing.assert_close(loud, double, rtol=1e-4, atol=1e-7)
 
 
@@ -159,8 +159,8 @@ def test_of_two_blows_the_first_is_taken_and_that_is_said(tmp_path):
     assert caught[0].message.value == pytest.approx((0.1, 0.35), abs=0.005)
     # The second blow is found to half a window of 10 ms, and none of it is left.
     assert reference.lengths[0] == pytest.approx(2000, abs=40)
-    found = heard_spectrum(reference.clips[:, :1950])
-    torch.testing.assert_close(found, heard_spectrum(first[None, :1950]), rtol=0, atol=2e-3)
+    found = band_spectrum(reference.clips[:, :1950])
+    torch.testing.assert_close(found, band_spectrum(first[None, :1950]), rtol=0, atol=2e-3)
 
 
 def test_a_clipped_reference_is_said(tmp_path):

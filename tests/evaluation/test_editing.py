@@ -16,7 +16,7 @@ from avmsf.datasets.dataset import DatasetReport, ObjectFacts
 from avmsf.datasets.numbering import REALIMPACT_NAMES, material_in, number_of
 from avmsf.datasets.realimpact import SELF_INTERSECTING
 from avmsf.editing.config import DistillationConfig
-from avmsf.editing.parameters import HIERARCHICAL, INDEPENDENT
+from avmsf.editing.guided import HIERARCHICAL, INDEPENDENT
 from avmsf.editing.reference import Reference
 from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import AvmsfWarning, EditError, EvaluationError

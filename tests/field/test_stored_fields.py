@@ -7,10 +7,8 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from avmsf.editing.edits import EDITS
-from avmsf.editing.material import change_material
-from avmsf.editing.material_before import made_of
-from avmsf.editing.modes import adjust_modes
+from avmsf.editing.material import change_material, infer_material
+from avmsf.editing.modal_edit import EDITS, adjust_modes
 from avmsf.errors import FieldFileError
 from avmsf.fem.material import GLASS, WOOD
 from avmsf.field.header import FORMAT
@@ -52,7 +50,7 @@ def test_edits_of_earlier_versions_have_the_present_names(tmp_path):
     kinds = [entry["edit"] for entry in read.origin.report[EDITS]]
     assert kinds == ["change_material", "adjust_modes", "guided", "change_material"]
     assert read.origin.report[EDITS][:2] == entries
-    assert made_of(read, option="--from").material == WOOD
+    assert infer_material(read, option="--from").material == WOOD
 
 
 @pytest.mark.parametrize(

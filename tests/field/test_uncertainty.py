@@ -7,7 +7,7 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
-from avmsf.editing.modes import adjust_modes
+from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import FitError
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.scaled_gains import ScaledGains

@@ -5,7 +5,7 @@ from typing import ClassVar
 import pytest
 import torch
 
-from avmsf.editing.modes import adjust_modes
+from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import LocationError
 from avmsf.field.gain_field import Gains
 from avmsf.field.sound_field import Origin

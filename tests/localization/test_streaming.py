@@ -10,7 +10,7 @@ import torch
 from scipy.signal import sosfreqz
 from torch import Tensor
 
-from avmsf.editing.modes import adjust_modes
+from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import LocationError
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.localization.locator import Locator

@@ -11,7 +11,7 @@ import trimesh
 
 from avmsf.capture import CaptureSettings
 from avmsf.cli import main
-from avmsf.editing.material_before import made_of
+from avmsf.editing.material import infer_material
 from avmsf.errors import FitError, SimulationError
 from avmsf.export import SampledField
 from avmsf.fem.damping import Vibration
@@ -142,7 +142,7 @@ def test_a_guess_is_kept_whole_and_says_what_it_is(tmp_path: Path):
     assert read.origin.trained_on == ()
     with raises(FitError, name="field", value="body"):
         suggest(read)
-    assert made_of(read, option="--from").material == STEEL
+    assert infer_material(read, option="--from").material == STEEL
     assert SampledField.of(read, limit=20).sine.shape == (20, 12)
 
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from avmsf.capture import CaptureSettings, read_capture
-from avmsf.editing import guided_checkpoint
+from avmsf.editing import guided
 from avmsf.errors import CaptureError, SimulationError
 from avmsf.fem import candidate_bodies as nominal
 from avmsf.field import recipes
@@ -73,7 +73,7 @@ def fit_key() -> str:
 
 def edit_key() -> dict[str, str]:
     field = ringing_field()
-    return guided_checkpoint.asked(field, field.gain_field.points[:2], {}, {})
+    return guided.checkpoint_identity(field, field.gain_field.points[:2], {}, {})
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ def edit_key() -> dict[str, str]:
         (recipe, lambda: recipe.ObjectRecipe().elastic_values()),
         (nominal, body_key),
         (recipes, fit_key),
-        (guided_checkpoint, edit_key),
+        (guided, edit_key),
     ],
     ids=["elastic modes", "body", "fit", "edit"],
 )

@@ -30,7 +30,7 @@ from avmsf._utils.files import copy_whole
 from avmsf.capture.filenames import SPLATS
 from avmsf.cli import main
 from avmsf.editing.material import change_material
-from avmsf.editing.modes import adjust_modes
+from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import AvmsfError, StudioError
 from avmsf.fem.material import CERAMIC, WOOD
 from avmsf.field.sound_field import SoundField

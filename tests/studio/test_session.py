@@ -11,7 +11,7 @@ import torch
 
 from avmsf._utils.files import way_out
 from avmsf.editing.material import change_material
-from avmsf.editing.modes import adjust_modes
+from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import EditError, FieldFileError, SimulationError, StudioError
 from avmsf.export.sampled_field import SampledField
 from avmsf.fem.material import CERAMIC, WOOD

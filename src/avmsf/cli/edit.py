@@ -21,8 +21,7 @@ from avmsf.cli.options.edit import AFTER, BEFORE, CURVE, MODES, SPECTROGRAMS, Mo
 from avmsf.cli.printing import console, decimals, figure, next_command, print_json, say, table
 from avmsf.cli.steering import Steering, beside
 from avmsf.cli.writing import Level, write_sound
-from avmsf.editing.edits import EDITS, remarks, silenced
-from avmsf.editing.modes import adjust_modes
+from avmsf.editing.modal_edit import EDITS, adjust_modes, remarks, silenced
 from avmsf.errors import EditError
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
@@ -150,7 +149,7 @@ class _Edit:
 def _edited(options: Options, asked: _Edit, field: SoundField) -> SoundField:
     named = field.bank.frequency
     needed = asked.change.asked or asked.steering.like_material is not None
-    old = asked.change.made_of(field) if needed else None
+    old = asked.change.infer_material(field) if needed else None
     if asked.change.asked and old is not None:
         field, old = asked.change.apply(field, old=old), asked.change.target(old)
     if asked.sliders.asked:

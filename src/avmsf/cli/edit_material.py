@@ -4,8 +4,7 @@ from dataclasses import dataclass, replace
 
 from avmsf.cli.options.edit import MaterialOptions
 from avmsf.cli.printing import say
-from avmsf.editing.material import LAWS, change_material
-from avmsf.editing.material_before import made_of
+from avmsf.editing.material import LAWS, change_material, infer_material
 from avmsf.fem.material import Material, material_named
 from avmsf.field.sound_field import SoundField
 
@@ -14,7 +13,7 @@ from avmsf.field.sound_field import SoundField
 class MaterialChange(MaterialOptions):
     """Another material and size, by the laws of linear modal analysis: the shape stays."""
 
-    def made_of(self, field: SoundField) -> Material:
+    def infer_material(self, field: SoundField) -> Material:
         """Return a field's material before the change; prints its source where it is not given.
 
         Raises `SimulationError` first for an unknown new material.
@@ -36,6 +35,6 @@ class MaterialChange(MaterialOptions):
 
 def old_material(field: SoundField, *, new: Material | None = None) -> Material:
     """Return a field's material, and print its source. Raises `EditError` where no material fits."""
-    known = made_of(field, option="--from", new=new)
+    known = infer_material(field, option="--from", new=new)
     say(known.words)
     return known.material

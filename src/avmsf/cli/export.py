@@ -16,7 +16,7 @@ from avmsf.capture.settings import METRES, settings_of
 from avmsf.cli.contacts import given_contacts, note_off, refuse_far
 from avmsf.cli.options.export import Options, unused_options
 from avmsf.cli.printing import figure, next_step, print_result, say
-from avmsf.editing.edits import EDITS
+from avmsf.editing.modal_edit import EDITS
 from avmsf.errors import ExportError
 from avmsf.export.faust import contacts_path, fitted, write_faust
 from avmsf.export.formats import PAGE_SUFFIXES, POINTS

@@ -14,10 +14,9 @@ from avmsf.cli.options.edit import GuideOptions
 from avmsf.cli.printing import console, figure, say
 from avmsf.cli.writing import Level, write_sound
 from avmsf.editing.distillation import DecoderDistillation
-from avmsf.editing.edits import EDITS
-from avmsf.editing.guided import Guide, GuidedEditProgress, edit_towards
+from avmsf.editing.guided import PARAMETERISATIONS, Guide, GuidedEditProgress, edit_towards
 from avmsf.editing.material_statistics import MaterialStatistics
-from avmsf.editing.parameters import PARAMETERISATIONS
+from avmsf.editing.modal_edit import EDITS
 from avmsf.editing.reference import Reference
 from avmsf.editing.stable_audio import StableAudio
 from avmsf.evaluation.clap import Clap

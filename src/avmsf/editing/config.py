@@ -85,7 +85,7 @@ def _unfit(settings: GuidedEditConfig | DistillationConfig, name: str, expected:
     return EditError(f"{name}: expected {expected}, got {value}", name=name, value=value)
 
 
-def expect_prompt(prompt: str) -> str:
+def check_prompt(prompt: str) -> str:
     """Return a prompt without surrounding blanks. Raises `EditError` for an empty one."""
     if not prompt.strip():
         raise EditError(

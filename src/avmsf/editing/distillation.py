@@ -15,8 +15,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.editing.clips import lasting, levelled, resampled
-from avmsf.editing.config import DistillationConfig, expect_prompt
-from avmsf.editing.modal_edit import ModalEdit, Struck
+from avmsf.editing.config import DistillationConfig, check_prompt
+from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
 from avmsf.errors import AvmsfWarning, EditError
 
 
@@ -130,7 +130,7 @@ class DecoderDistillation:
 
         Raises `EditError` for an empty prompt.
         """
-        self.model, self.prompt, self.negative = model, expect_prompt(prompt), negative
+        self.model, self.prompt, self.negative = model, check_prompt(prompt), negative
         self.sample_rate = sample_rate
         self.config = DistillationConfig() if config is None else config
         self.batch = self.config.batch
@@ -148,9 +148,9 @@ class DecoderDistillation:
             "noise_levels": [self.config.lowest, self.config.highest],
         }
 
-    def start(self, struck: Struck) -> ModalEdit:
+    def start(self, rendered: FieldAtContacts) -> ModalEdit:
         """Return the field as it is: Audio-SDS starts from the object's own sound."""
-        return ModalEdit.none(struck.bank)
+        return ModalEdit.none(rendered.bank)
 
     def targets(
         self, sounds: Float[Tensor, "contacts samples"], step: int, generator: torch.Generator
@@ -161,7 +161,7 @@ class DecoderDistillation:
         `EditError` where one sound does not fit, and for sounds too long for the model.
         """
         with torch.no_grad():
-            heard = resampled(sounds, sample_rate=self.sample_rate, wanted=self.model.sample_rate)
+            clips = resampled(sounds, sample_rate=self.sample_rate, wanted=self.model.sample_rate)
             lowest, highest = self.config.lowest, self.config.highest
             level = lowest + (highest - lowest) * torch.rand(len(sounds), generator=generator)
             # One seed a sound, so that the noise depends neither on the batch nor on the device.
@@ -170,7 +170,7 @@ class DecoderDistillation:
             while len(made) < len(sounds):
                 rows = slice(len(made), len(made) + self.batch)
                 try:
-                    made += self._cleaned(heard[rows], level[rows], seeds[rows]).unbind()
+                    made += self._cleaned(clips[rows], level[rows], seeds[rows]).unbind()
                     continue
                 except torch.OutOfMemoryError as error:
                     if self.batch == 1:
@@ -187,15 +187,15 @@ class DecoderDistillation:
             return levelled(lasting(back.to(sounds), sounds.shape[1]), sounds, sample_rate=self.sample_rate)
 
     def _cleaned(
-        self, heard: Float[Tensor, "batch heard"], level: Float[Tensor, " batch"], seeds: list[int]
-    ) -> Float[Tensor, "batch heard"]:
-        model, samples = self.model, heard.shape[1]
+        self, clips: Float[Tensor, "batch samples"], level: Float[Tensor, " batch"], seeds: list[int]
+    ) -> Float[Tensor, "batch samples"]:
+        model, samples = self.model, clips.shape[1]
         if self._conditioning is None or self._conditioning[0] != samples:
             words = model.embed(self.prompt, self.negative, seconds=samples / model.sample_rate)
             self._conditioning = (samples, words)
         # The model was trained on audio at full scale: the peak becomes .5.
-        peak = heard.abs().amax(dim=1, keepdim=True).clamp_min(torch.finfo(heard.dtype).tiny)
-        waveforms = (0.5 * heard / peak)[:, None].expand(-1, model.channels, -1).to(model.device)
+        peak = clips.abs().amax(dim=1, keepdim=True).clamp_min(torch.finfo(clips.dtype).tiny)
+        waveforms = (0.5 * clips / peak)[:, None].expand(-1, model.channels, -1).to(model.device)
         latents = model.encode(waveforms)
         draws = [torch.randn(latents.shape[1:], generator=torch.Generator().manual_seed(seed)) for seed in seeds]
         level = level.to(latents)

@@ -1,34 +1,157 @@
 """Guided editing: a field's modes are optimized towards a guide's target sounds, with one edit for all contacts."""
 
+import hashlib
+import json
 import math
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
+from avmsf._utils.caching import source_digest
 from avmsf._utils.state import read_checkpoint, write_checkpoint
 from avmsf.editing.clips import level
 from avmsf.editing.config import GuidedEditConfig
-from avmsf.editing.guided_checkpoint import asked
-from avmsf.editing.modal_edit import ModalEdit, Struck
-from avmsf.editing.parameters import HIERARCHICAL, EditVariables, Parameterization
+from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
 from avmsf.errors import AvmsfWarning, EditError
 from avmsf.field.losses import spectral_loss, spectral_target
 from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.points import farthest_points
 from avmsf.modal.config import scaled_fft_size
 
-_PROBES = 16
+_QUANTITIES = ("pitch", "shift", "damping", "damping_shift", "scale")
+
+
+@dataclass(frozen=True)
+class Parameterization:
+    """Rates are those of Adam, in logarithms a step, falling to a twentieth; 0 fixes a quantity at its initial value.
+
+    The penalty on a quantity of single modes is half the mean square over modes of its value over its standard
+    deviation, times `stiffness`, in the unit of the loss, which is a relative error.
+    """
+
+    name: str
+    """Name in the edit's report."""
+    pitch_rate: float
+    """Of the common factor on frequencies."""
+    damping_rate: float
+    """Of the common factor on dampings."""
+    shift_rate: float
+    """Of each frequency."""
+    damping_shift_rate: float
+    """Of each damping."""
+    scale_rate: float
+    """Of each gain factor."""
+    stiffness: float
+    """Weight of the penalty on single modes."""
+    shift_deviation: float = 0.05
+    """Standard deviation of single frequencies, logarithm: .05 is almost a semitone."""
+    damping_shift_deviation: float = 0.3
+    """Standard deviation of single dampings, logarithm."""
+    scale_deviation: float = 1.0
+    """Standard deviation of gain factors, logarithm, without the common level."""
+    searches: bool = True
+    """Whether the guide proposes the initial edit; otherwise the unedited object."""
+    gains_follow: bool = False
+    """Whether gains of a mode from f1 to f2 Hz are multiplied by f1 / f2 when the edit ends (paper, section 3.6)."""
+
+
+HIERARCHICAL = Parameterization("hierarchical", 0.02, 0.02, 0.003, 0.01, 0.02, 0.05)
+"""The paper's factor on all frequencies, and ours: one on all dampings, penalties on single modes, a search first."""
+PUBLISHED = Parameterization("published", 0.02, 0.0, 0.003, 0.01, 0.02, 0.0, searches=False, gains_follow=True)
+"""The paper's: f = exp(log alpha + log f0 + delta), dampings and gains of single modes, no penalty.
+
+The rates, which the paper does not state, are those of `HIERARCHICAL`.
+"""
+INDEPENDENT = Parameterization("independent", 0.0, 0.0, 0.02, 0.02, 0.02, 0.0, searches=False)
+"""The paper's baseline, after Audio-SDS: independent frequencies, dampings and gains, no common factors.
+
+The rates are this package's, those of the common factors above; Audio-SDS states .05 for its parameters.
+"""
+SEARCHED = replace(INDEPENDENT, name="searched", searches=True)
+"""Independent modes, initialized by the search for common factors: what remains is the effect of the hierarchy."""
+
+PARAMETERISATIONS = {each.name: each for each in (HIERARCHICAL, PUBLISHED, INDEPENDENT, SEARCHED)}
+"""All of them, by name."""
+
+
+class EditVariables:
+    """The variables of an edit, and their optimizer."""
+
+    def __init__(self, start: ModalEdit, edited: Int[Tensor, " edited"], parameters: Parameterization) -> None:
+        """Begin at `start`; the modes `edited` move by themselves, the others follow the common factors alone.
+
+        Quantities whose rate is 0 stay where they begin.
+        """
+        self.parameters, self.modes, self.edited = parameters, len(start.shift), edited
+        self.values: dict[str, Float64[Tensor, "*edited"]] = {}
+        groups = []
+        for name in _QUANTITIES:
+            value: Tensor = getattr(start, name).detach().to(edited.device)
+            rate = getattr(parameters, f"{name}_rate")
+            chosen = value if value.ndim == 0 else value[edited]
+            self.values[name] = chosen.clone().requires_grad_(rate > 0)
+            if rate > 0:
+                groups.append({"params": [self.values[name]], "lr": rate, "rate": rate})
+        # Targets change from step to step: a long memory of the gradient's square would brake what chance once pushed.
+        self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
+
+    def edit(self) -> ModalEdit:
+        """Return the edit as it stands, differentiable in the values."""
+        whole = {
+            name: value if value.ndim == 0 else value.new_zeros(self.modes).index_put((self.edited,), value)
+            for name, value in self.values.items()
+        }
+        return ModalEdit(**whole)
+
+    def penalty(self) -> Float64[Tensor, ""]:
+        """Return the penalty on single modes, in the unit of the loss."""
+        parameters, scale = self.parameters, self.values["scale"]
+        parts = (
+            self.values["shift"] / parameters.shift_deviation,
+            self.values["damping_shift"] / parameters.damping_shift_deviation,
+            (scale - scale.mean()) / parameters.scale_deviation,
+        )
+        return 0.5 * parameters.stiffness * torch.stack([part.square().mean() for part in parts]).sum()
+
+    def differentiate(self, loss: Float[Tensor, ""]) -> bool:
+        """Take the gradient of a loss and the penalty; return whether it is finite."""
+        self.optimizer.zero_grad()
+        torch.autograd.backward(loss + self.penalty())
+        moving = [value.grad for value in self.values.values() if value.grad is not None]
+        return all(bool(torch.isfinite(gradient).all()) for gradient in moving)
+
+    def move(self, *, done: float) -> None:
+        """Take a step of the optimizer; `done` is the fraction of finished steps."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["rate"] * (0.525 + 0.475 * math.cos(math.pi * done))
+        self.optimizer.step()
+
+    def state(self) -> dict[str, Any]:
+        """Return the complete state: tensors, numbers, containers of these."""
+        values = {name: value.detach().cpu().clone() for name, value in self.values.items()}
+        return {"values": values, "optimizer": self.optimizer.state_dict()}
+
+    def resume(self, state: dict[str, Any]) -> None:
+        """Restore what `state` returned."""
+        with torch.no_grad():
+            for name, value in self.values.items():
+                value.copy_(state["values"][name])
+        self.optimizer.load_state_dict(state["optimizer"])
+
+
+_MAX_PROBES = 16
 """Contacts, far apart, for the strongest modes, the start and the level."""
-_LISTENED = 2000
+_MAX_POINTS = 2000
 """Maximum number of points of the surface that are used as contacts."""
-_SPOILT = 20
+_MAX_FAILED_STEPS = 20
 """Consecutive steps without a finite target after which the edit ends with an error."""
 _CHECKPOINT_SECONDS = 30.0
 
@@ -46,7 +169,7 @@ class Guide(Protocol):
         """Return its identifying settings, as plain values, for the edit's report and checkpoint."""
         ...
 
-    def start(self, struck: Struck) -> ModalEdit:
+    def start(self, rendered: FieldAtContacts) -> ModalEdit:
         """Return the initial edit, given the field at contacts far apart."""
         ...
 
@@ -100,11 +223,11 @@ def edit_towards(
     edit, and where the guide's targets or the loss are not finite.
     """
     config = GuidedEditConfig() if config is None else config
-    run = _Steering(field, guide, config, parameters, None if checkpoint is None else Path(checkpoint), device)
-    return run.to_the_end(progress)
+    run = _Optimization(field, guide, config, parameters, None if checkpoint is None else Path(checkpoint), device)
+    return run.finish(progress)
 
 
-class _Steering:
+class _Optimization:
     """The state of an edit."""
 
     def __init__(
@@ -117,45 +240,41 @@ class _Steering:
         device: torch.device | str,
     ) -> None:
         if guide.sample_rate != field.sample_rate:
-            raise EditError(
-                f"guide: expected the field's sample rate of {field.sample_rate:g} Hz, got {guide.sample_rate:g} Hz",
-                name="sample_rate",
-                value=guide.sample_rate,
-            )
+            raise EditError.expected(f"the field's {field.sample_rate:g} Hz", guide.sample_rate, name="sample_rate")
         self.field, self.guide, self.config, self.parameters = field, guide, config, parameters
         self.checkpoint, self.device, self.saved_at = checkpoint, torch.device(device), time.monotonic()
         points = field.gain_field.points
-        self.places = (
-            points[farthest_points(points, min(len(points), _LISTENED))] if len(points) > _LISTENED else points
-        )
-        probes = self.places[farthest_points(self.places, min(len(self.places), _PROBES))]
-        self.probes = self._struck(probes)
-        self.loudness = self._expect_sound()
+        self.points = points if len(points) <= _MAX_POINTS else points[farthest_points(points, _MAX_POINTS)]
+        probes = self.points[farthest_points(self.points, min(len(self.points), _MAX_PROBES))]
+        self.probes = self._at(probes)
+        self.loudness = self._check_audible()
         self.loudest_place = probes[int(self.loudness.argmax())]
         self.sizes = [scaled_fft_size(size, sample_rate=field.sample_rate) for size in config.fft_sizes]
-        self.told = {**guide.describe(), "parameters": parameters.name, **asdict(config)}
-        self.step, self.spoilt = 0, 0
-        self.whole = True
+        self.settings = {**guide.describe(), "parameters": parameters.name, **asdict(config)}
+        self.step, self.failed = 0, 0
+        self.consistent = True
         """False while parameters are being moved: an interruption then leaves a state that nothing can go on from."""
         settings = {**asdict(config), **asdict(parameters)}
         # The interval of previews does not change the result.
         del settings["preview_every"]
-        self.asked = asked(field, probes, guide.describe(), settings)
+        self.identity = checkpoint_identity(field, probes, guide.describe(), settings)
         state = (
-            None if checkpoint is None else read_checkpoint(checkpoint, self.asked, what="an edit", raising=EditError)
+            None
+            if checkpoint is None
+            else read_checkpoint(checkpoint, self.identity, what="an edit", raising=EditError)
         )
         searching = state is None and parameters.searches
         start = guide.start(self.probes) if searching else ModalEdit.none(self.probes.bank)
         self.variables = EditVariables(start, self.probes.loudest(config.free_modes), parameters)
         if state is not None:
             self.variables.resume(state["variables"])
-            self.step, self.spoilt = state["step"], state["spoilt"]
+            self.step, self.failed = state["step"], state["failed"]
 
-    def to_the_end(self, progress: Callable[[GuidedEditProgress], None] | None) -> SoundField:
+    def finish(self, progress: Callable[[GuidedEditProgress], None] | None) -> SoundField:
         """Take the steps that are left and return the edited field."""
         try:
             while self.step < self.config.steps:
-                loss = self._advance()
+                loss = self._take_step()
                 if progress is not None:
                     edit, every = self.variables.edit(), self.config.preview_every
                     due = every > 0 and (self.step % every == 0 or self.step == self.config.steps)
@@ -166,62 +285,58 @@ class _Steering:
                     self._save()
         except KeyboardInterrupt:
             # Amid a step's changes there is nothing to keep but what was saved before.
-            if self.whole:
+            if self.consistent:
                 self._save()
             raise
         self._save()
-        return self._levelled().of(self.field, told=self.told)
+        return self._normalized_edit().of(self.field, settings=self.settings)
 
-    def _advance(self) -> float:
+    def _take_step(self) -> float:
         """Take one step and return the loss before it."""
         # All chance of a step hangs on its number, so that an edit goes on as if it had never been interrupted.
         generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
-        rows = torch.randperm(len(self.places), generator=generator)[: self.config.contacts_per_step]
-        struck = self._struck(self.places[rows])
-        before = level(struck.sounds(ModalEdit.none(struck.bank)), sample_rate=struck.sample_rate)
-        sounds = struck.sounds(self.variables.edit())
-        after = level(sounds, sample_rate=struck.sample_rate)
+        rows = torch.randperm(len(self.points), generator=generator)[: self.config.contacts_per_step]
+        rendered = self._at(self.points[rows])
+        before = level(rendered.sounds(ModalEdit.none(rendered.bank)), sample_rate=rendered.sample_rate)
+        sounds = rendered.sounds(self.variables.edit())
+        after = level(sounds, sample_rate=rendered.sample_rate)
         sounds = sounds * (before.square().sum() / after.square().sum()).sqrt()
         with torch.no_grad():
             targets = self.guide.targets(sounds.detach(), self.step, generator).to(sounds)
         usable = torch.isfinite(targets).all(dim=1)
         loss = math.nan
         if bool(usable.any()):
-            loss = self._descend(sounds[usable], targets[usable])
-            self.spoilt = 0
+            loss = self._update(sounds[usable], targets[usable])
+            self.failed = 0
         else:
-            self.spoilt += 1
-            if self.spoilt >= _SPOILT:
-                raise EditError(
-                    f"expected finite target sounds, got NaN or inf in {self.spoilt} consecutive steps; lower the "
-                    "guidance, or compute in float32",
+            self.failed += 1
+            if self.failed >= _MAX_FAILED_STEPS:
+                raise EditError.expected(
+                    "finite sounds",
+                    self.failed,
+                    got=f"NaN or inf in {self.failed} consecutive steps",
                     name="targets",
-                    value=self.spoilt,
+                    advice="lower the guidance, or compute in float32",
                 )
         self.step += 1
-        self.whole = True
+        self.consistent = True
         return loss
 
-    def _descend(self, sounds: Float[Tensor, "usable samples"], targets: Float[Tensor, "usable samples"]) -> float:
+    def _update(self, sounds: Float[Tensor, "usable samples"], targets: Float[Tensor, "usable samples"]) -> float:
         target = spectral_target(targets, fft_sizes=self.sizes, hops=[size // 4 for size in self.sizes])
         error = spectral_loss(sounds, target) / len(self.sizes)
         if not (self.variables.differentiate(error) and bool(torch.isfinite(error))):
-            raise EditError(
-                f"step {self.step}: expected a finite loss and gradient, got a loss of {float(error)}; lower the "
-                "learning rates",
-                row=self.step,
-                name="loss",
-                value=float(error),
-            )
-        self.whole = False
+            wanted, advice = "a finite value and gradient", "lower the learning rates"
+            raise EditError.expected(wanted, float(error), row=self.step, name="loss", advice=advice)
+        self.consistent = False
         self.variables.move(done=self.step / self.config.steps)
         return float(error.detach())
 
     def _preview(self) -> Float[Tensor, " samples"]:
         """Return the edited field's sound, noise and all, where the unedited one is loudest."""
-        return self._levelled().of(self.field).render(self.loudest_place[None])[0]
+        return self._normalized_edit().of(self.field).render(self.loudest_place[None])[0]
 
-    def _levelled(self) -> ModalEdit:
+    def _normalized_edit(self) -> ModalEdit:
         """Return the edit as it stands, as loud at the probes as the field was."""
         with torch.no_grad():
             edit = self.variables.edit()
@@ -231,32 +346,49 @@ class _Steering:
             factor = (self.loudness.square().sum() / after.square().sum()).sqrt()
             return edit.louder(factor).to("cpu")
 
-    def _struck(self, contacts: Float[Tensor, "contacts 3"]) -> Struck:
+    def _at(self, contacts: Float[Tensor, "contacts 3"]) -> FieldAtContacts:
         seconds = self.config.seconds
         samples = self.field.samples if seconds is None else round(seconds * self.field.sample_rate)
-        return Struck.at(self.field, contacts, samples=max(1, samples), device=self.device)
+        return FieldAtContacts.at(self.field, contacts, samples=max(1, samples), device=self.device)
 
-    def _expect_sound(self) -> Float[Tensor, " contacts"]:
+    def _check_audible(self) -> Float[Tensor, " contacts"]:
         sounds = self.probes.sounds(ModalEdit.none(self.probes.bank))
         if not bool(torch.isfinite(sounds).all()) or float(sounds.abs().max()) == 0.0:
-            raise EditError(
-                "field: expected audible modes, got silence at all contacts; fit it again", name="field", value=0.0
-            )
+            got = "silence at all contacts"
+            raise EditError.expected("audible modes", 0.0, got=got, name="field", advice="fit it again")
         return level(sounds, sample_rate=self.field.sample_rate)
 
     def _save(self) -> None:
         if self.checkpoint is None:
             return
-        state = {
-            "variables": self.variables.state(),
-            "step": self.step,
-            "spoilt": self.spoilt,
-        }
+        state = {"variables": self.variables.state(), "step": self.step, "failed": self.failed}
         try:
-            write_checkpoint(self.checkpoint, state, self.asked, raising=EditError)
+            write_checkpoint(self.checkpoint, state, self.identity, raising=EditError)
         except EditError as error:
             # A full disk costs the checkpoint, not the edit.
             warnings.warn(
                 AvmsfWarning(f"the edit continues without a checkpoint: {error}", **error.attributes), stacklevel=2
             )
         self.saved_at = time.monotonic()
+
+
+def checkpoint_identity(
+    field: SoundField, contacts: Tensor, guide: dict[str, Any], settings: dict[str, Any]
+) -> dict[str, str]:
+    """Return a digest of each thing that decides an edit's result, by what errors call it.
+
+    `contacts` are places at which the field's gains are looked at; `guide` and `settings` plain values.
+    """
+    known = field.known(contacts)
+    tensors = [field.bank.frequency, field.bank.damping, field.phase, known.mean, field.gain_field.points]
+    digest = hashlib.sha256(json.dumps([field.sample_rate, field.samples]).encode())
+    for tensor in (*tensors, *(each for each in (known.quadrature, known.damping) if each is not None)):
+        digest.update(f"{tensor.dtype} {tuple(tensor.shape)}".encode())
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    words = {
+        "guide": guide,
+        "settings": settings,
+        "version of avmsf": [version("avmsf"), source_digest("avmsf.editing.guided")],
+    }
+    plain = {name: json.dumps(each, sort_keys=True).encode() for name, each in words.items()}
+    return {"field": digest.hexdigest(), **{name: hashlib.sha256(each).hexdigest() for name, each in plain.items()}}

@@ -8,6 +8,7 @@ frequency where that is a displacement.
 """
 
 import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -16,9 +17,10 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from avmsf._utils.wording import counted
-from avmsf.editing.edits import EDITS, edited, muted
+from avmsf.editing.modal_edit import EDITS, edited, muted
 from avmsf.errors import EditError
-from avmsf.fem.material import Material, material_named
+from avmsf.fem.material import MATERIALS, Material, material_named
+from avmsf.field.probable_body import ProbableBody
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.modal.modes import ModalBank
 
@@ -141,15 +143,123 @@ def _remarks(old: Material, new: Material, bank: ModalBank, dead: Bool[Tensor, "
 def _expect(old: Material, new: Material, size: float) -> None:
     if not 0.0 < size < math.inf:
         raise EditError.expected("the ratio of new to old lengths, above 0, such as 1.5", size, name="size")
-    if _damps(old) and not _damps(new):
-        raise EditError(
-            f"new material {new.name}: expected alpha (1/s) or beta (s) above 0, got 0 and 0",
-            name="new",
-            value=(new.alpha, new.beta),
+    for name, material, other in (("new", new, old), ("old", old, new)):
+        if _damps(other) and not _damps(material):
+            wanted = f"alpha (1/s) or beta (s) of {material.name} above 0, as for {other.name}"
+            raise EditError.expected(wanted, (material.alpha, material.beta), name=name)
+
+
+MAX_MISFIT_RATIO = 1.5
+"""By which factor, up or down, the middle one of a field's dampings may miss a law that is said to fit."""
+
+
+@dataclass(frozen=True)
+class Guess:
+    """A material, and how well its damping fits."""
+
+    material: Material
+    ratio: float
+    """Factor, up or down, by which modes of half the weight miss the law, or by more; 1 is a perfect fit."""
+
+    @property
+    def fits(self) -> bool:
+        """Whether it is near enough to be taken for the field's material."""
+        return self.ratio <= MAX_MISFIT_RATIO
+
+
+def guess_materials(
+    bank: ModalBank,
+    weight: Float64[Tensor, " modes"] | None = None,
+    *,
+    materials: Iterable[Material] = tuple(MATERIALS.values()),
+) -> tuple[Guess, ...]:
+    """Return a guess for each material that damps at all, the best one first.
+
+    By each mode's damping over that of the material's Rayleigh law at its frequency, of which the middle one counts, by
+    weight (equal without one): a few modes that lose their energy elsewhere are no matter. Dampings alone tell some
+    materials badly apart, as ceramic and iron, so that the second guess matters too.
+    """
+    omega = torch.hypot(2.0 * math.pi * bank.frequency, bank.damping)
+    guesses = []
+    for material in materials:
+        if material.alpha > 0 or material.beta > 0:
+            misses, order = (bank.damping / rayleigh_damping(omega, material)).log().abs().sort()
+            below = (torch.ones_like(misses) if weight is None else weight[order]).cumsum(0)
+            middle = int(torch.searchsorted(below, 0.5 * below[-1]))
+            guesses.append(Guess(material, math.exp(float(misses[middle]))))
+    return tuple(sorted(guesses, key=lambda guess: guess.ratio))
+
+
+_AMBIGUOUS_RATIO = 1.2
+"""Ratio of the errors up to which the second-best material is as likely."""
+_MAX_POINTS = 256
+"""Points of the object that energies are taken over, about."""
+
+
+@dataclass(frozen=True)
+class KnownMaterial:
+    """A material, and how it is known."""
+
+    material: Material
+    words: str
+    """The message."""
+
+
+def infer_material(field: SoundField, *, option: str, new: Material | None = None) -> KnownMaterial:
+    """Return a field's material: that of its last material edit or of its guess, or the one nearest to its dampings.
+
+    The nearest among those that may be as stiff as the field's body, if it has one, by the modes weighted by energy.
+    `option` is the option for the material, named in messages, which also say where what is assumed is `new`. Raises
+    `EditError` where no material fits.
+    """
+    report = field.origin.report
+    bank, last = _before_adjustments(field.bank, report.get(EDITS, []))
+    if last is not None and last["edit"] == "change_material":
+        known = Material(**last["to"])
+        return KnownMaterial(known, f"old material: {known.name}, from the last material edit")
+    if "guess" in report and last is None:
+        guessed = Material(**report["material"])
+        return KnownMaterial(guessed, f"old material: {guessed.name}, for which the field was guessed")
+    body = ProbableBody.of(report)
+    stiff = "" if body is None else f", and the most probable body has {body.specific_stiffness}"
+    guesses = guess_materials(bank, _weight(field), materials=MATERIALS.values() if body is None else body.materials)
+    best, second = guesses[0] if guesses else None, guesses[1] if len(guesses) > 1 else None
+    if best is None or not best.fits:
+        nearest = (
+            "" if best is None else f": the nearest, {best.material.name}, differs by a factor of {best.ratio:.3g}"
         )
-    if _damps(new) and not _damps(old):
-        raise EditError(
-            f"old material {old.name}: expected alpha (1/s) or beta (s) above 0, as for {new.name}, got 0 and 0",
-            name="old",
-            value=(old.alpha, old.beta),
+        raise EditError.expected(
+            f"the present material, as none has the dampings of the modes{nearest}{stiff}",
+            None if best is None else best.material.name,
+            got="none",
+            name=option,
+            advice=f"give {option}",
         )
+    words = (
+        f"old material: {best.material.name} assumed, whose dampings differ by a median factor of {best.ratio:.3g} "
+        f"from those of the modes{stiff}"
+    )
+    if second is not None and second.ratio < _AMBIGUOUS_RATIO * best.ratio:
+        words += f"; {second.material.name} fits equally well ({second.ratio:.3g}) and would give another level"
+    if best.material == new:
+        words += "; it is the new material too, which changes nothing"
+    return KnownMaterial(best.material, f"{words}; give {option} if known")
+
+
+def _weight(field: SoundField) -> Float64[Tensor, " modes"]:
+    """Return the modes' energies over the object; next to nothing for supporting poles."""
+    points = field.gain_field.points
+    energy = field.known(points[:: max(1, len(points) // _MAX_POINTS)]).energy(field.bank.damping)
+    return torch.where(field.is_mode, energy.double(), 0.0).clamp_min(torch.finfo(torch.float64).tiny)
+
+
+def _before_adjustments(
+    bank: ModalBank, edits: Sequence[Mapping[str, Any]]
+) -> tuple[ModalBank, Mapping[str, Any] | None]:
+    """Return the modes before the last adjustments of pitch and decay, and the edit before these, if there is one."""
+    for entry in reversed(edits):
+        if entry["edit"] != "adjust_modes":
+            return bank, entry
+        pitch, decay = (torch.tensor(entry[name], dtype=torch.float64) for name in ("pitch", "decay"))
+        bank = ModalBank(bank.frequency / pitch, bank.damping * decay)
+    return bank, None

@@ -57,27 +57,14 @@ class MaterialStatistics:
         if not banks or any(len(bank) == 0 for bank in banks):
             raise EditError.expected(f"modes of every object of {name}", 0, got="none", name="banks")
         if len(banks) != len(gains):
-            raise EditError(
-                f"{name}: expected gains of all {len(banks)} objects, got those of {len(gains)}",
-                name="gains",
-                value=len(gains),
-            )
+            raise EditError.expected(f"those of all {len(banks)} objects of {name}", len(gains), name="gains")
         for row, (bank, size) in enumerate(zip(banks, gains, strict=True)):
             if len(bank) != len(size):
-                raise EditError(
-                    f"{name}, object {row}: expected a gain for each of {len(bank)} modes, got {len(size)}",
-                    row=row,
-                    name="gains",
-                    value=len(size),
-                )
+                raise EditError.expected(f"one for each of {len(bank)} modes", len(size), row=row, name="gains")
             if not (bool(torch.isfinite(size).all()) and bool(size.any())):
-                raise EditError(
-                    f"{name}, object {row}: expected finite gains, not all zero, got a sum of "
-                    f"{float(size.abs().sum()):g}; omit the object",
-                    row=row,
-                    name="gains",
-                    value=float(size.abs().sum()),
-                )
+                total = float(size.abs().sum())
+                got, advice = f"a sum of {total:g}", "omit the object"
+                raise EditError.expected("some above 0", total, got=got, row=row, name="gains", advice=advice)
         sizes = [size.double().abs() / size.double().abs().sum() for size in gains]
         frequency, damping = (torch.cat([getattr(bank, each) for bank in banks]) for each in ("frequency", "damping"))
         weight = torch.cat(sizes)
@@ -133,12 +120,8 @@ class MaterialStatistics:
             scatter = torch.randn(_MODES, generator=generator)
             heard = frequency < 0.5 * sample_rate
             if not bool(heard.any()):
-                raise EditError(
-                    f"{self.name}: expected modes below half the sample rate of {sample_rate:g} Hz, got "
-                    f"{float(self.frequency[0]):.4g} Hz and above",
-                    name="frequency",
-                    value=float(self.frequency[0]),
-                )
+                lowest, wanted = float(self.frequency[0]), f"some below half the sample rate of {sample_rate:g} Hz"
+                raise EditError.expected(wanted, lowest, got=f"{lowest:.4g} Hz and above", name="frequency")
             octave = torch.log2(frequency / frequency[0])
             size = torch.exp(_SCATTER * scatter) * 10 ** (self.brightness * octave / 20)
             damping = 0.5 * (self.alpha + self.beta * (2 * math.pi * frequency).square()).clamp_min(1e-3)

@@ -18,8 +18,8 @@ from avmsf.capture.onset import find_second_impact
 from avmsf.capture.prepare import prepare, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
 from avmsf.editing.clips import lasting, levelled, resampled
-from avmsf.editing.modal_edit import ModalEdit, Struck
-from avmsf.editing.start_search import heard_spectrum, search_start
+from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
+from avmsf.editing.start_search import band_spectrum, search_start
 from avmsf.errors import AvmsfWarning, CaptureError, EditError
 
 _HELD = 0.9
@@ -46,26 +46,15 @@ class Reference:
 
     def __post_init__(self) -> None:
         if not len(self.clips) or len(self.lengths) != len(self.clips):
-            raise EditError(
-                f"{self.name}: expected a length for each of {len(self.clips)} clips, got {len(self.lengths)}",
-                name="lengths",
-                value=len(self.lengths),
-            )
+            raise EditError.expected(f"one for each of {len(self.clips)} clips", len(self.lengths), name="lengths")
         if not bool(torch.isfinite(self.clips).all()):
             row = int(torch.nonzero(~torch.isfinite(self.clips))[0, 0])
-            raise EditError(
-                f"{self.name}, clip {row}: expected finite samples, got NaN or inf; record it again",
-                row=row,
-                name="clips",
-            )
+            advice = f"record {self.name} again"
+            raise EditError.expected("finite samples", got="NaN or inf", row=row, name="clips", advice=advice)
         silent = [row for row, clip in enumerate(self.clips) if float(clip.abs().max()) == 0.0]
         if silent:
-            raise EditError(
-                f"{self.name}, clip {silent[0]}: expected a sound, got silence; omit it",
-                row=silent[0],
-                name="clips",
-                value=0.0,
-            )
+            advice = f"omit it from {self.name}"
+            raise EditError.expected("sounds", 0.0, got="silence", row=silent[0], name="clips", advice=advice)
 
     @classmethod
     def of(cls, sounds: Float[Tensor, "clips samples"], *, sample_rate: float, name: str = "reference") -> "Reference":
@@ -92,9 +81,9 @@ class Reference:
         digest = hashlib.sha256(self.clips.detach().cpu().contiguous().numpy().tobytes()).hexdigest()
         return {"reference": self.name, "lengths": list(self.lengths), "samples_sha256": digest}
 
-    def start(self, struck: Struck) -> ModalEdit:
+    def start(self, rendered: FieldAtContacts) -> ModalEdit:
         """Return the common pitch and decay with which the field comes nearest, from a search over both."""
-        return search_start(struck, self._nearest)
+        return search_start(rendered, self._nearest)
 
     def targets(
         self, sounds: Float[Tensor, "contacts samples"], step: int, generator: torch.Generator
@@ -109,7 +98,7 @@ class Reference:
         """Return the nearest clip of each sound, and its share in the target: 1, and falling to 0 before its end."""
         samples = sounds.shape[1]
         clips = lasting(self.clips, samples).to(sounds)
-        distance = torch.cdist(heard_spectrum(sounds), heard_spectrum(clips), p=1.0)
+        distance = torch.cdist(band_spectrum(sounds), band_spectrum(clips), p=1.0)
         chosen = distance.argmin(dim=1)
         targets = levelled(clips[chosen], sounds, sample_rate=self.sample_rate)
         ends = torch.tensor(self.lengths, device=sounds.device)[chosen, None]

@@ -5,12 +5,15 @@ scheduler words the same with sigma = tan(a) in the latents z + sigma noise, and
 that a pipeline with another scheduler of that family is taken at its word.
 """
 
+import hashlib
+import json
 import math
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import torch
 from jaxtyping import Float
@@ -18,9 +21,9 @@ from torch import Tensor, nn
 
 from avmsf._utils.arrays import Seed, generator_of
 from avmsf._utils.device import usable_device
+from avmsf._utils.hub import is_hub_name, why_not
 from avmsf.editing.clips import lasting
-from avmsf.editing.config import STABLE_AUDIO, expect_prompt
-from avmsf.editing.stable_audio_files import digest, load_pipeline
+from avmsf.editing.config import STABLE_AUDIO, check_prompt
 from avmsf.errors import EditError
 
 
@@ -72,7 +75,7 @@ class StableAudio:
         """
         place = usable_device(device, raising=EditError)
         precision = dtype or (torch.bfloat16 if place.type == "cuda" else torch.float32)
-        pipeline, name = load_pipeline(source, precision)
+        pipeline, name = _load_pipeline(source, precision)
         try:
             pipeline = pipeline.to(place)
         except torch.OutOfMemoryError as error:
@@ -110,7 +113,7 @@ class StableAudio:
 
     @cached_property
     def _digest(self) -> str:
-        return digest(self.pipeline)
+        return _digest_of(self.pipeline)
 
     @property
     def _denoiser(self) -> nn.Module:
@@ -212,7 +215,7 @@ class StableAudio:
 
         Raises `EditError` for an empty prompt, more seconds than the model has, and where memory runs out.
         """
-        words = expect_prompt(prompt)
+        words = check_prompt(prompt)
         self._frames_of(seconds)
         try:
             latents = self._sampled(words, seconds, seed, negative=negative, steps=steps, guidance=guidance)
@@ -271,3 +274,120 @@ def _reach(strides: list[int]) -> int:
     """
     rates = [math.prod(strides[:level]) for level in range(len(strides) + 1)]
     return math.ceil((3 + sum(39 * rate for rate in rates[:-1]) + sum(rates[1:]) + 3 * rates[-1]) / rates[-1])
+
+
+_NETWORKS: Final = ("vae", "text_encoder", "projection_model", "transformer")
+_PRECONDITIONING: Final = ("precondition_inputs", "precondition_noise", "precondition_outputs")
+_SAMPLED = 64
+"""Numbers of each weight that a digest looks at, evenly spaced."""
+_ON_SAVING: Final = ("architectures", "dtype", "torch_dtype", "transformers_version")
+"""Settings that transformers adds when it saves: they say nothing that the weights do not."""
+_HOW_TO_GET = (
+    "accept the license at https://huggingface.co/{name}, create a token at https://huggingface.co/settings/tokens and "
+    "run hf auth login; or, on a computer with a network, run hf download {name} --local-dir FOLDER --exclude "
+    "'model.*', copy FOLDER here and give its path"
+)
+
+
+def _load_pipeline(source: str | Path, dtype: torch.dtype) -> tuple[Any, str]:
+    """Return a `StableAudioPipeline` on the CPU and what it is to be called. Raises `EditError`.
+
+    All but its autoencoder is in `dtype`: in bfloat16 a waveform would have eight bits.
+    """
+    kind = _pipeline_class()
+    folder = Path(source).expanduser()
+    named = not folder.is_dir()
+    if named and not is_hub_name(source):
+        wanted = f"a folder with a {kind.__name__}, or a name of the hub such as {STABLE_AUDIO}"
+        advice = "check the path"
+        raise EditError.expected(wanted, str(source), got="no such folder", file=folder, name="source", advice=advice)
+    name = str(source) if named else folder.resolve().name
+    folder = _download(kind, name) if named else folder
+    try:
+        with warnings.catch_warnings():
+            # No user of this package can fix it.
+            warnings.filterwarnings("ignore", message="`torch.nn.utils.weight_norm` is deprecated")
+            pipeline = kind.from_pretrained(folder, local_files_only=True, use_safetensors=True)
+        preconditions = [hasattr(pipeline.scheduler, each) for each in _PRECONDITIONING]
+        missing = {part: _missing_weights(folder / part, getattr(pipeline, part)) for part in _NETWORKS}
+    except Exception as error:  # whatever is wrong with the files, the libraries have their own errors
+        raise _unusable(folder, kind, " ".join(str(error).split())[:300]) from error
+    if not all(preconditions):
+        raise _unusable(folder, kind, f"the scheduler {type(pipeline.scheduler).__name__}, not of the EDM family")
+    for part, weights in missing.items():
+        if weights:
+            raise _unusable(folder, kind, f"{part} without {weights[0]} and {len(weights) - 1} other weights")
+    for part in _NETWORKS:
+        # By hand, for how a pipeline is told its precision changed between versions of diffusers.
+        getattr(pipeline, part).to(torch.float32 if part == "vae" else dtype)
+    return pipeline, name
+
+
+def _download(kind: Any, name: str) -> Path:
+    """Return the folder of a pipeline in the hub's cache, after downloading it where it is not there."""
+    try:
+        return Path(kind.download(name, local_files_only=True))
+    except Exception:  # not there, or not complete; the client raises whatever it does
+        pass
+    try:
+        return Path(kind.download(name))
+    except Exception as error:  # the hub's client raises whatever the network beneath it does
+        raise EditError(
+            f"{name}: expected a model in the cache or one that can be downloaded, got neither ({why_not(error)}); "
+            f"{_HOW_TO_GET.format(name=name)}",
+            name="source",
+            value=name,
+        ) from error
+
+
+def _unusable(folder: Path, kind: Any, found: str) -> EditError:
+    wanted = f"a complete {kind.__name__} of diffusers"
+    advice = f"copy it again; {_HOW_TO_GET.format(name=STABLE_AUDIO)}"
+    return EditError.expected(wanted, got=found, file=folder, name="source", advice=advice)
+
+
+def _missing_weights(folder: Path, network: nn.Module) -> list[str]:
+    """Return the names of a network's weights that its files lack: they would be left random."""
+    from safetensors import safe_open
+
+    there: set[str] = set()
+    for path in sorted(folder.glob("*.safetensors")):
+        with safe_open(path, framework="pt") as file:
+            there |= set(file.keys())
+    held = network.state_dict(keep_vars=True)
+    stored = {held[name].data_ptr() for name in there & held.keys()}
+    # What shares its memory with a weight that is there is another name of it.
+    return sorted(name for name, weight in held.items() if name not in there and weight.data_ptr() not in stored)
+
+
+def _digest_of(pipeline: Any) -> str:
+    """Return what tells a pipeline from others wherever its files are: of its settings and samples of its weights."""
+    found = hashlib.sha256()
+    for part in (*_NETWORKS, "scheduler"):
+        config = getattr(pipeline, part).config
+        settings = config if isinstance(config, dict) else config.to_dict()
+        # Those that begin with an underscore name the folder and the libraries' versions.
+        plain = {name: each for name, each in settings.items() if not name.startswith("_") and name not in _ON_SAVING}
+        found.update(f"{part} {json.dumps(plain, sort_keys=True, default=str)}".encode())
+    for part in _NETWORKS:
+        for name, weight in getattr(pipeline, part).state_dict().items():
+            rows = torch.linspace(0, weight.numel() - 1, min(weight.numel(), _SAMPLED), dtype=torch.float64).long()
+            sampled = weight.flatten()[rows.to(weight.device)].cpu().double()
+            found.update(f"{part} {name} {weight.dtype} {tuple(weight.shape)}".encode())
+            found.update(sampled.numpy().tobytes())
+    return found.hexdigest()
+
+
+def _pipeline_class() -> Any:
+    try:
+        from diffusers import StableAudioPipeline
+
+        if find_spec("torchsde") is None:  # the scheduler imports it late, and its error names no remedy
+            raise ImportError("no module named 'torchsde'")
+    except (ImportError, RuntimeError) as error:  # RuntimeError: one of its own optional packages is broken
+        raise EditError(
+            f"text prompts: expected the packages diffusers, transformers and torchsde, got {error}; "
+            "pip install 'avmsf[text]', or edit towards a recording",
+            name="diffusers",
+        ) from error
+    return StableAudioPipeline

@@ -15,11 +15,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.editing.modal_edit import ModalEdit, Struck
+from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
 from avmsf.field.losses import spectral_loss, spectral_target
 from avmsf.modal.config import scaled_fft_size
 
-Wanted = Callable[
+TargetFunction = Callable[
     [Float[Tensor, "contacts samples"]], tuple[Float[Tensor, "contacts samples"], Float[Tensor, "contacts samples"]]
 ]
 """Gives the targets of sounds, and the weight of each sample, 0 where there is no target, at most 1."""
@@ -28,15 +28,15 @@ _OCTAVES = 9
 _PER_OCTAVE = 24
 _WIDTH = 3.0
 """Standard deviation of the smoothing, in bands: an eighth of an octave."""
-_MOST = math.log(8.0)
+_MAX_LOG_PITCH = math.log(8.0)
 """Largest change of the pitch, logarithm."""
-_MOST_DAMPING = math.log(64.0)
-_STRUCK = 6
+_MAX_LOG_DAMPING = math.log(64.0)
+_MAX_CONTACTS = 6
 """Contacts of the search."""
 _FFT_SIZES = (2048, 1024, 512, 256)
 
 
-def heard_spectrum(sounds: Float[Tensor, "contacts samples"]) -> Float[Tensor, "contacts bands"]:
+def band_spectrum(sounds: Float[Tensor, "contacts samples"]) -> Float[Tensor, "contacts bands"]:
     """Return the share of each band, 24 an octave, in a sound's amplitudes: nine octaves up to half the sample rate.
 
     Smoothed over an eighth of an octave; sums to one, so that level and unit do not matter.
@@ -55,33 +55,33 @@ def heard_spectrum(sounds: Float[Tensor, "contacts samples"]) -> Float[Tensor, "
     return amplitude / amplitude.sum(dim=1, keepdim=True).clamp_min(torch.finfo(amplitude.dtype).tiny)
 
 
-def search_start(struck: Struck, wanted: Wanted) -> ModalEdit:
+def search_start(rendered: FieldAtContacts, targets_of: TargetFunction) -> ModalEdit:
     """Return the edit by a common pitch and damping alone, up to 8 and 64 times either way, of least spectral error."""
-    struck = struck.first(_STRUCK)
+    rendered = rendered.first(_MAX_CONTACTS)
     best = (math.inf, 0.0, 0.0)
-    for pitch in _pitches(struck, wanted):
-        step, damping = _MOST_DAMPING / 4, 0.0
+    for pitch in _pitches(rendered, targets_of):
+        step, damping = _MAX_LOG_DAMPING / 4, 0.0
         tried: dict[float, float] = {}
         # Nine places over the whole range, then three refinements about the best.
         around = [step * place for place in range(-4, 5)]
         for _ in range(4):
             for each in around:
                 if round(each, 9) not in tried:
-                    tried[round(each, 9)] = _error(struck, wanted, pitch, each)
+                    tried[round(each, 9)] = _error(rendered, targets_of, pitch, each)
             damping, step = min(tried, key=lambda each: tried[each]), step / 2
-            around = [max(-_MOST_DAMPING, damping - step), min(_MOST_DAMPING, damping + step)]
+            around = [max(-_MAX_LOG_DAMPING, damping - step), min(_MAX_LOG_DAMPING, damping + step)]
         best = min(best, (tried[damping], pitch, damping))
-    return ModalEdit.none(struck.bank, pitch=best[1], damping=best[2])
+    return ModalEdit.none(rendered.bank, pitch=best[1], damping=best[2])
 
 
-def _pitches(struck: Struck, wanted: Wanted) -> list[float]:
+def _pitches(rendered: FieldAtContacts, targets_of: TargetFunction) -> list[float]:
     """Return proposals of log alpha: that of no change, and those by quantiles and overlap."""
-    sounds = struck.sounds(ModalEdit.none(struck.bank))
-    targets, weight = wanted(sounds)
-    own, aim = (heard_spectrum(weight * each).mean(dim=0) for each in (sounds, targets))
-    differences = (_quantiles(aim) - _quantiles(own)).clamp(-_MOST, _MOST)
+    sounds = rendered.sounds(ModalEdit.none(rendered.bank))
+    targets, weight = targets_of(sounds)
+    own, aim = (band_spectrum(weight * each).mean(dim=0) for each in (sounds, targets))
+    differences = (_quantiles(aim) - _quantiles(own)).clamp(-_MAX_LOG_PITCH, _MAX_LOG_PITCH)
     # Moved by whole bands along the logarithmic axis, spectra overlap more or less.
-    most = round(_MOST / math.log(2.0) * _PER_OCTAVE)
+    most = round(_MAX_LOG_PITCH / math.log(2.0) * _PER_OCTAVE)
     padded = torch.nn.functional.pad(own, (most, most))
     moved = padded.unfold(0, len(own), 1).flip(0)
     overlap = (moved - aim).abs().sum(dim=1)
@@ -97,11 +97,11 @@ def _quantiles(spectrum: Float[Tensor, " bands"]) -> Float[Tensor, " quantiles"]
     return band.to(spectrum) * (math.log(2.0) / _PER_OCTAVE)
 
 
-def _error(struck: Struck, wanted: Wanted, pitch: float, damping: float) -> float:
-    sounds = struck.sounds(ModalEdit.none(struck.bank, pitch=pitch, damping=damping))
+def _error(rendered: FieldAtContacts, targets_of: TargetFunction, pitch: float, damping: float) -> float:
+    sounds = rendered.sounds(ModalEdit.none(rendered.bank, pitch=pitch, damping=damping))
     if float(sounds.abs().max()) == 0.0:
         return math.inf
-    sizes = [scaled_fft_size(size, sample_rate=struck.sample_rate) for size in _FFT_SIZES]
-    targets, weight = wanted(sounds)
+    sizes = [scaled_fft_size(size, sample_rate=rendered.sample_rate) for size in _FFT_SIZES]
+    targets, weight = targets_of(sounds)
     target = spectral_target(weight * targets, fft_sizes=sizes, hops=[size // 4 for size in sizes])
     return float(spectral_loss(weight * sounds, target)) / len(sizes)

@@ -14,9 +14,17 @@ from avmsf.capture.prepare import prepare
 from avmsf.capture.settings import CaptureSettings
 from avmsf.editing.config import DistillationConfig, GuidedEditConfig
 from avmsf.editing.distillation import AudioDiffusion, DecoderDistillation
-from avmsf.editing.guided import Guide, GuidedEditProgress, edit_towards
+from avmsf.editing.guided import (
+    HIERARCHICAL,
+    INDEPENDENT,
+    PUBLISHED,
+    SEARCHED,
+    Guide,
+    GuidedEditProgress,
+    Parameterization,
+    edit_towards,
+)
 from avmsf.editing.material import change_material
-from avmsf.editing.parameters import HIERARCHICAL, INDEPENDENT, PUBLISHED, SEARCHED, Parameterization
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.editing_objects import amplitudes_of, heard_modes
 from avmsf.evaluation.editing_tasks import EditTask

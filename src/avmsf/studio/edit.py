@@ -12,10 +12,8 @@ from typing import Any
 import torch
 
 from avmsf.editing.config import STABLE_AUDIO
-from avmsf.editing.edits import EDITS, remarks
-from avmsf.editing.material import LAWS, change_material
-from avmsf.editing.material_before import made_of
-from avmsf.editing.modes import adjust_modes
+from avmsf.editing.material import LAWS, change_material, infer_material
+from avmsf.editing.modal_edit import EDITS, adjust_modes, remarks
 from avmsf.errors import EditError
 from avmsf.fem.material import MATERIALS, material_named
 from avmsf.field.sound_field import SoundField
@@ -128,7 +126,7 @@ class Sliders:
         if self.material is not None or self.size != 1.0:
             if self.old is None:
                 wanted = None if self.material is None else material_named(self.material)
-                known = made_of(ground, option=_OLD_CONTROL, new=wanted)
+                known = infer_material(ground, option=_OLD_CONTROL, new=wanted)
                 old = known.material
                 words.append(known.words)
             else:

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from avmsf.editing.edits import EDITS, remarks
+from avmsf.editing.modal_edit import EDITS, remarks
 from avmsf.field.store import load, save
 from avmsf.pipeline.config import Preset
 from avmsf.studio.capture import CaptureEditor, read_upload

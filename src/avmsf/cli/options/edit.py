@@ -12,7 +12,7 @@ import tyro
 from avmsf.cli.options.checks import OutputError, expect_device, expect_writable
 from avmsf.cli.options.common import Printing, Unit, option_of, parse_options
 from avmsf.cli.options.paths import NEW_TENSORS, FieldFile, NewFile, PlotsFolder
-from avmsf.editing.config import STABLE_AUDIO, DistillationConfig, GuidedEditConfig, expect_prompt
+from avmsf.editing.config import STABLE_AUDIO, DistillationConfig, GuidedEditConfig, check_prompt
 from avmsf.errors import EditError
 from avmsf.fem.material import material_named
 
@@ -155,7 +155,7 @@ class GuideOptions:
             own = [name for name in _changed(self) if name in _OF_THE_MODEL]
             _expect_unchanged([*own, *_changed(self.distillation)], "--prompt")
             return
-        expect_prompt(self.prompt)
+        check_prompt(self.prompt)
         if self.clap is not None and self.config.preview_every == 0:
             raise EditError.expected("--preview-every 1 or more with it, such as 50", 0, got="0", name="--clap")
         if self.model_seconds is not None and not 0 < self.model_seconds < math.inf:
