@@ -8,7 +8,7 @@ from torch import Tensor
 
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.material import NOMINAL
-from avmsf.field.gains.elastic import PERTURBATIONS, REMAINDERS, WIDTHS, Elastic
+from avmsf.field.gains.elastic import PERTURBATIONS, RESIDUALS, WIDTHS, Elastic
 from avmsf.field.gains.family import KernelFamily, Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
@@ -72,9 +72,9 @@ def impacts(contacts: Tensor) -> Sites:
 
 def rows_of(perturbation: float = PERTURBATION, remainder: float = REMAINDER) -> Tensor:
     """Return the rows of the elastic kernels in which each mode is the elastic one of the same row, perturbed."""
-    profiles, shapes, remainders = len(PERTURBATIONS) + len(WIDTHS), len(ELASTIC), len(REMAINDERS)
+    profiles, shapes, remainders = len(PERTURBATIONS) + len(WIDTHS), len(ELASTIC), len(RESIDUALS)
     rows = torch.arange(profiles * shapes * remainders).reshape(profiles, shapes, remainders)
-    return rows[PERTURBATIONS.index(perturbation), : len(BANK), REMAINDERS.index(remainder)]
+    return rows[PERTURBATIONS.index(perturbation), : len(BANK), RESIDUALS.index(remainder)]
 
 
 def drawn_gains(contacts: Tensor, *, seed: int, noise: float = NOISE) -> Tensor:

@@ -108,7 +108,7 @@ def elastic() -> MixtureGains:
     """Return a model with the plate's own mode shapes, fitted to gains a little off the measured ones."""
     impacts, values = struck(9)
     body = Elastic(impacts, DIAGONAL, plate())
-    return mixture(impacts, 1.1 * values, body, directional=True).judged_by(values)
+    return mixture(impacts, 1.1 * values, body, directional=True).with_measured(values)
 
 
 def body() -> BodyGains:

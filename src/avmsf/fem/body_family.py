@@ -108,20 +108,20 @@ def body_family(
 
     Raises SimulationError for points without triangles, and where no body can be made, with the reason.
     """
-    told = log or (lambda words: None)
+    report = log or (lambda words: None)
     if not isinstance(surface, Surface):
-        return _of_shape(surface, count, dofs, solid_dofs, told)
-    found = checked(surface, log=told)
+        return _of_shape(surface, count, dofs, solid_dofs, report)
+    found = checked(surface, log=report)
     if found.lids > _HOLES:
         make = wall_solids(found, dofs)
         thicknesses = [part * found.skin.size for part in WALLS if part * found.skin.size < found.width]
-        return _of_walls(make, thicknesses, count, told)
+        return _of_walls(make, thicknesses, count, report)
     wall = wall_of(found.skin)
     scaled = None if wall is None else _scaled(wall, dofs)
     if wall is None or scaled is None:
-        return _solid_body(found, count, solid_dofs, told)
+        return _solid_body(found, count, solid_dofs, report)
     mean = wall.thickness
-    return _of_walls(lambda thickness: scaled(thickness / mean), [mean * scale for scale in _SCALES], count, told)
+    return _of_walls(lambda thickness: scaled(thickness / mean), [mean * scale for scale in _SCALES], count, report)
 
 
 def _of_shape(shape: Shape, count: int, dofs: int, solid_dofs: int, log: Callable[[str], None]) -> BodyFamily:

@@ -125,8 +125,8 @@ def nominal_bodies(
     Raises SimulationError for a surface of points, and where no body can be had, with the reason for each: by the name
     "surface", or by that of the reason where only memory, time or the mesher stood against it.
     """
-    told = log or (lambda words: None)
-    maker = _Maker(surface, count, cache, told, material)
+    report = log or (lambda words: None)
+    maker = _Maker(surface, count, cache, report, material)
     _expect_settings(count, dofs, walls)
     guessed = walls is None
     wanted: list[float | None] = maker.guesses() if walls is None else list(dict.fromkeys(walls))
@@ -150,7 +150,7 @@ def nominal_bodies(
             value=reasons,
         )
     for reason in reasons:
-        told(_without(reason))
+        report(_without(reason))
     if len(bodies) == 1 and not bodies[0].fine:
         bodies = [refined(surface, bodies[0], dofs=dofs, cache=cache, log=log)]
     return NominalBodies(tuple(bodies), MappingProxyType({wall: str(error) for wall, error in refused.items()}))
@@ -169,11 +169,11 @@ def with_wall(
 
     `log` is called with the reason.
     """
-    told = log or (lambda words: None)
+    report = log or (lambda words: None)
     try:
-        return _Maker(surface, count, cache, told).body(wall, dofs, fine=False)
+        return _Maker(surface, count, cache, report).body(wall, dofs, fine=False)
     except SimulationError as error:
-        told(_without(f"{body_name(wall)}: {error}"))
+        report(_without(f"{body_name(wall)}: {error}"))
         return None
 
 
@@ -193,16 +193,16 @@ def refined(
     """
     if body.fine:
         return body
-    told = log or (lambda words: None)
+    report = log or (lambda words: None)
     _expect_settings(len(body.elastic), dofs, [body.wall])
     try:
-        maker = _Maker(surface, len(body.elastic), cache, told, body.elastic.material)
+        maker = _Maker(surface, len(body.elastic), cache, report, body.elastic.material)
         if body.support is None:
             return maker.body(body.wall, dofs, fine=True)
         modes = maker.held(body.wall, dofs, maker.solid(body.wall, dofs), body.support, perturbed=True)
         return replace(body, elastic=modes, fine=True)
     except SimulationError as error:
-        told(f"{body.name}: using the coarse mesh: {error}")
+        report(f"{body.name}: using the coarse mesh: {error}")
         return body
 
 
@@ -220,10 +220,10 @@ def supported(
     makes the chosen one fine, without a check of its convergence. Those whose modes cannot be computed are left out,
     and `log` is called with the reason; none are returned if the free one's cannot.
     """
-    told = log or (lambda words: None)
+    report = log or (lambda words: None)
     trial = TRIAL if isinstance(surface, Surface) else WALL_TRIAL
     few = min(dofs, trial)
-    maker, bodies = _Maker(surface, len(body.elastic), cache, told, body.elastic.material), []
+    maker, bodies = _Maker(surface, len(body.elastic), cache, report, body.elastic.material), []
     try:
         solid = maker.solid(body.wall, few)
         for support in (None, *supports_of(SecondOrder.of(solid))):
@@ -233,9 +233,9 @@ def supported(
             except SimulationError as error:
                 if support is None:
                     raise
-                told(_without(f"{body.name}, {support.name}: {error}"))
+                report(_without(f"{body.name}, {support.name}: {error}"))
     except SimulationError as error:
-        told(f"{body.name}: no supports tested: {error}")
+        report(f"{body.name}: no supports tested: {error}")
     return tuple(bodies)
 
 

@@ -71,8 +71,8 @@ def damped(
     # Rows of the inverse, not the vectors again, are what belongs to two modes that share a pole.
     inverse = torch.linalg.inv(vectors)
     ringing = (poles.imag > 0.0) & (-poles.real <= MOST_DAMPED * poles.abs())
-    heard = torch.nonzero(ringing & (poles.imag <= 2.0 * math.pi * highest)).flatten()
-    if len(heard) == 0:
+    audible = torch.nonzero(ringing & (poles.imag <= 2.0 * math.pi * highest)).flatten()
+    if len(audible) == 0:
         lowest = float(frequency.min())
         raise SimulationError(
             f"expected damped modes up to {highest:g} Hz, got none of {count}, the lowest at {lowest:.4g} Hz undamped; "
@@ -80,7 +80,7 @@ def damped(
             name="frequency",
             value=lowest,
         )
-    heard = heard[torch.argsort(poles.imag[heard])]
+    audible = audible[torch.argsort(poles.imag[audible])]
     return Vibration(
-        poles[heard], vectors[count:, heard] * poles[heard], inverse[heard, count:].resolve_conj().contiguous()
+        poles[audible], vectors[count:, audible] * poles[audible], inverse[audible, count:].resolve_conj().contiguous()
     )

@@ -62,15 +62,15 @@ def radiated(
     facing = (outward * towards).sum(dim=1) / (area * distance).clamp(min=1e-300)
     delay = retardation * (distance - nearest) / SOUND_SPEED
     strength = AIR_DENSITY * area / (4.0 * math.pi * distance)
-    heard = []
+    pressures = []
     # A mode at a time: the table of all patches and modes would be larger than all else.
     for pole, accelerations in zip(vibration.poles, vibration.accelerations.T, strict=True):
         kernel = (
             strength * (1.0 + facing * (1.0 + SOUND_SPEED / (pole * distance))) * torch.exp(-1j * pole.imag * delay)
         )
         sources = torch.complex(kernel.real @ motion, kernel.imag @ motion)
-        heard.append(sources @ accelerations)
-    return torch.stack(heard)
+        pressures.append(sources @ accelerations)
+    return torch.stack(pressures)
 
 
 def travel_time(modes: ElasticModes, microphone: Float64[Tensor, " 3"]) -> float:

@@ -16,7 +16,7 @@ from avmsf.mesh.surface import Surface
 
 _STEPS = 30
 """Most times that the wall is turned and thinned where prisms are folded."""
-_LEANING = 0.1
+_TILT = 0.1
 """How far a folded triangle turns the wall towards its own inside, each time."""
 _THINNING = 0.85
 """Factor on the wall's thickness at folded prisms, each time."""
@@ -81,16 +81,16 @@ def _offsets(skin: Skin, thickness: Float64[np.ndarray, " points"]) -> Float64[n
     """Return the way from each point through the wall, or None where some prisms stay folded."""
     directions, lengths = -skin.normals, thickness.copy()
     ends = skin.faces[:, [[0, 1], [1, 2], [2, 0], [1, 0], [2, 1], [0, 2]]].reshape(-1, 2)
-    slack = _SLOPE * np.linalg.norm(skin.points[ends[:, 0]] - skin.points[ends[:, 1]], axis=1)
+    tolerance = _SLOPE * np.linalg.norm(skin.points[ends[:, 0]] - skin.points[ends[:, 1]], axis=1)
     for _ in range(_STEPS):
         folded = _folded(skin, lengths[:, None] * directions)
         if not folded.any():
             thin = lengths[skin.faces].mean(axis=1) < 0.5 * thickness[skin.faces].mean(axis=1)
             return lengths[:, None] * directions if thin @ skin.areas <= _SPARED * skin.areas.sum() else None
-        directions = _leaned(skin, directions, folded)
+        directions = _tilted(skin, directions, folded)
         lengths[np.unique(skin.faces[folded])] *= _THINNING
         # A wall that thins within one triangle would fold the next.
-        np.minimum.at(lengths, ends[:, 0], lengths[ends[:, 1]] + slack)
+        np.minimum.at(lengths, ends[:, 0], lengths[ends[:, 1]] + tolerance)
     return None
 
 
@@ -109,16 +109,16 @@ def _both_sides(skin: Skin, thickness: float) -> Surface:
     return Surface(torch.from_numpy(points).float(), torch.from_numpy(faces))
 
 
-def _leaned(skin: Skin, directions: np.ndarray, folded: np.ndarray) -> np.ndarray:
+def _tilted(skin: Skin, directions: np.ndarray, folded: np.ndarray) -> np.ndarray:
     """Return directions that lean towards the inside of the folded triangles around each vertex.
 
     Where there is a direction that all triangles around a vertex see from outside, this finds one in the end.
     """
-    leaned = directions.copy()
+    tilted = directions.copy()
     corners = skin.points[skin.faces[folded]]
     inward = -unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
-    np.add.at(leaned, skin.faces[folded], _LEANING * inward[:, None])
-    return unit(leaned)
+    np.add.at(tilted, skin.faces[folded], _TILT * inward[:, None])
+    return unit(tilted)
 
 
 def _folded(skin: Skin, offsets: np.ndarray) -> np.ndarray:

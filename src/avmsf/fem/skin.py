@@ -90,12 +90,12 @@ class _Collapse:
             before = self._normal(face)
             moved = tuple(stays if corner == gone else corner for corner in face)
             after = self._normal(moved)
-            alike = sum(p * q for p, q in zip(before, after, strict=True))
+            product = sum(p * q for p, q in zip(before, after, strict=True))
             area, later = sum(p * p for p in before) ** 0.5, sum(q * q for q in after) ** 0.5
             # A sliver's normal says little of the form, and slivers shall go.
             sliver = area < _SLIVER * self._longest(face) ** 2
             flat = later < _FLAT * self._longest(moved) ** 2
-            if flat or (alike < self._turn * area * later and not sliver):
+            if flat or (product < self._turn * area * later and not sliver):
                 return False
             # Small turns add up; the normals of the surface as it was do not.
             if self._facing(after, moved) < min(_FACING * later, self._facing(before, face) * later / (area or 1.0)):

@@ -25,7 +25,7 @@ _STRAIGHT = 0.3
 """Least length of a straight lower edge over the body's size: the outline of a round base has no such side."""
 _BENT = 0.002
 """Distance over the body's size of a corner from the line between its neighbors, below which that line is straight."""
-_ALIKE = 0.5
+_MIN_LENGTH_RATIO = 0.5
 """Least length of an edge over the longest one's."""
 _EDGES = 4
 """Edges that are tried at most: a rectangular plate has so many."""
@@ -94,7 +94,7 @@ def _lower_edges(
     sides = [(corners[row - 1], corners[row]) for row in range(len(corners))]
     lengths = [float(np.linalg.norm(end - start)) for start, end in sides]
     order = np.argsort(np.negative(lengths), kind="stable")[:_EDGES]
-    least = max(_STRAIGHT * size, _ALIKE * max(lengths))
+    least = max(_STRAIGHT * size, _MIN_LENGTH_RATIO * max(lengths))
     return [sides[row] for row in order if lengths[row] >= least]
 
 

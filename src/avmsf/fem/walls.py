@@ -38,7 +38,7 @@ _EVEN_VOLUME = 0.05
 """The same where the thickness is known: facets that cut across a curved wall leave out area, but no thickness. A tube
 with facets of a third of its radius has 2.4 % less, and its lowest modes are 4 to 8 % too high; tetrahedra as many made
 them 6 to 33 % too high, each mode by another factor."""
-_ASTRAY = 0.02
+_MAX_DISTANT_PART = 0.02
 """Part of either surface that may be farther from the other than half the wall's thickness; than the whole thickness
 where that is known."""
 _INSIDE = 1e-5
@@ -145,7 +145,7 @@ class Wall:
         return all(
             float(
                 (ClosestPoints(one.points[one.faces])(other.spread()).distances > away * self.thickness).mean()
-            ) <= _ASTRAY
+            ) <= _MAX_DISTANT_PART
             for one, other in ((outside, self.skin), (self.skin, outside))
         )  # fmt: skip
 

@@ -123,7 +123,7 @@ def _finished(network: TrainableGains, order: Int[Tensor, " modes"], bank: Modal
     if not isinstance(network, RefinedGains):
         return network.finished(order)
     parts = along_phase(*fit_gains(case.train.sounds, bank, sample_rate=case.train.sample_rate), case.phase[order])
-    return network.judged(order, torch.view_as_complex(parts.contiguous()))
+    return network.finished_with(order, torch.view_as_complex(parts.contiguous()))
 
 
 def _with_measured_residual(field: SoundField, train: Impacts) -> SoundField:

@@ -207,12 +207,12 @@ def _reachable(
     where none can be struck.
     """
     body = gains.body
-    judge = (
+    access = (
         PointAccess(gains.points.double().numpy())
         if body is None
         else MeshAccess(body.nodes.double().numpy(), body.triangles[:, :3].numpy())
     )
-    reached, places, axes = judge(points.numpy())
+    reached, places, axes = access(points.numpy())
     if not reached.any():
         raise FitError(
             f"candidates: expected positions that a hammer of {1000 * HAMMER_DIAMETER:g} mm reaches from outside, got "

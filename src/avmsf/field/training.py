@@ -269,8 +269,8 @@ def _on(modes: Extraction, device: torch.device) -> Extraction:
 
 
 def _mode_weight(bank: ModalBank, gains: Float[Tensor, "contacts modes"], config: FitConfig) -> Float[Tensor, " modes"]:
-    alike = config.warmup_weights == "equal"
-    energy = (torch.ones_like(bank.damping) if alike else 1 / (4 * bank.damping)).to(gains.dtype)
+    equal = config.warmup_weights == "equal"
+    energy = (torch.ones_like(bank.damping) if equal else 1 / (4 * bank.damping)).to(gains.dtype)
     total = (gains.square().mean(0) * energy).sum()
     return energy / total.clamp_min(torch.finfo(gains.dtype).tiny)
 

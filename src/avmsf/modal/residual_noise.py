@@ -1,4 +1,4 @@
-"""What is heard beside the modes: noise of one color, the same at every contact (paper, section 3.4)."""
+"""Noise in addition to the modes, of one color, the same at every contact (paper, section 3.4)."""
 
 import math
 from dataclasses import dataclass
@@ -125,11 +125,11 @@ def _quietest_power(
     # Whole runs up to the end: the end is where a sound that dies away is quietest.
     segments = power[:, power.shape[1] - runs * count :].reshape(len(power), runs, count, -1).mean(2)
     kept = max(1, round(quietest * runs))
-    quiet = torch.sort(segments, dim=1).values[:, :kept].mean(1)
+    power = torch.sort(segments, dim=1).values[:, :kept].mean(1)
     # At 0 Hz and half the rate the spectrum is real and scatters twice as widely: its quietest lie too low.
-    quiet[:, 0] = torch.maximum(quiet[:, 0], quiet[:, 1])
-    quiet[:, -1] = torch.maximum(quiet[:, -1], quiet[:, -2])
-    return quiet
+    power[:, 0] = torch.maximum(power[:, 0], power[:, 1])
+    power[:, -1] = torch.maximum(power[:, -1], power[:, -2])
+    return power
 
 
 def estimate_residual(

@@ -114,11 +114,11 @@ def noise_levels(size: int, *, sample_rate: float) -> Float64[np.ndarray, " bins
 
 @dataclass(frozen=True, eq=False)
 class SoundingBody:
-    """Elastic modes, how they die away, and how they are heard."""
+    """Elastic modes, how they decay, and the pressure of each at the microphone."""
 
     elastic: ElasticModes
     vibration: Vibration
-    heard: Complex128[Tensor, " modes"]
+    pressures: Complex128[Tensor, " modes"]
     """Pressure of each damped mode for a push of one newton second on it alone, pascals."""
     hammer: Hammer
     delay: float = 0.0
@@ -143,7 +143,7 @@ class SoundingBody:
         if contact_times is not None:
             times = contact_times * times
         pushed = self.elastic.gains(places, directions).to(torch.complex128) @ self.vibration.pushes.T
-        return 2.0 * pushed * self.heard * pulse_spectrum(self.hammer, self.vibration.poles, times)
+        return 2.0 * pushed * self.pressures * pulse_spectrum(self.hammer, self.vibration.poles, times)
 
     def times(self, speeds: Float64[Tensor, " contacts"]) -> Float64[Tensor, " contacts"]:
         """Return how long the hammer stays on the body, seconds, for speeds in m/s."""
@@ -224,8 +224,8 @@ def sounding_body(recipe: ObjectRecipe, body: Body) -> SoundingBody:
     vibration = damped(body.elastic.frequency, matrix, highest=HIGHEST * recipe.sample_rate)
     vertices = body.surface.vertices.double()
     microphone = 0.5 * (vertices.amax(0) + vertices.amin(0)) + torch.tensor(recipe.microphone, dtype=torch.float64)
-    heard = radiated(body.elastic, vibration, microphone, retardation=recipe.imperfections.retardation)
-    return SoundingBody(body.elastic, vibration, heard, recipe.hammer, travel_time(body.elastic, microphone))
+    pressures = radiated(body.elastic, vibration, microphone, retardation=recipe.imperfections.retardation)
+    return SoundingBody(body.elastic, vibration, pressures, recipe.hammer, travel_time(body.elastic, microphone))
 
 
 def record(

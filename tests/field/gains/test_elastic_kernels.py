@@ -15,8 +15,8 @@ from avmsf.field.gains.elastic import (
     PERTURBATIONS,
     PROFILE_PRIOR,
     REACH,
-    REMAINDER_PRIOR,
-    REMAINDERS,
+    RESIDUAL_PRIOR,
+    RESIDUALS,
     WIDTHS,
     Elastic,
     frequency_log_prior,
@@ -38,7 +38,7 @@ def family(count: int = 10) -> Elastic:
 
 
 def row_of(profile: int, shape: int, remainder: int) -> int:
-    return (profile * SHAPES + shape) * len(REMAINDERS) + remainder
+    return (profile * SHAPES + shape) * len(RESIDUALS) + remainder
 
 
 def error_elsewhere(model: MixtureGains) -> torch.Tensor:
@@ -60,15 +60,15 @@ def test_kernels_are_the_written_ones():
     squares = (given.reference.points[:, None] - given.reference.points).square().sum(2)
     smooth = torch.exp(-0.5 * squares / (REACH * SIZE) ** 2) * given.reference.cosine(given.reference)
     kernels = given.kernels()
-    assert len(kernels) == PROFILES * SHAPES * len(REMAINDERS)
-    for profile, shape, remainder in product(range(PROFILES), range(SHAPES), range(len(REMAINDERS))):
+    assert len(kernels) == PROFILES * SHAPES * len(RESIDUALS)
+    for profile, shape, remainder in product(range(PROFILES), range(SHAPES), range(len(RESIDUALS))):
         apart = torch.log(frequency / frequency[shape])
         if profile < len(PERTURBATIONS):
             nearness = 1.0 / (1.0 + (2.0 * apart / PERTURBATIONS[profile]) ** 2)
         else:
             nearness = torch.exp(-0.5 * (apart / WIDTHS[profile - len(PERTURBATIONS)]) ** 2) + 1e-3
         mixed = (shapes * nearness) @ shapes.T
-        share = REMAINDERS[remainder]
+        share = RESIDUALS[remainder]
         expected = (1.0 - share) * mixed / mixed.trace() * len(mixed) + share * smooth
         assert torch.allclose(kernels[row_of(profile, shape, remainder)], expected, rtol=1e-5, atol=1e-5)
 
@@ -91,8 +91,8 @@ def test_kernels_do_not_depend_on_the_memory(monkeypatch, memory):
 
 def test_kernels_of_a_profile_and_a_remainder_share_a_category():
     categories = family().categories().tolist()
-    rows = product(range(PROFILES), range(SHAPES), range(len(REMAINDERS)))
-    assert categories == [profile * len(REMAINDERS) + remainder for profile, _, remainder in rows]
+    rows = product(range(PROFILES), range(SHAPES), range(len(RESIDUALS)))
+    assert categories == [profile * len(RESIDUALS) + remainder for profile, _, remainder in rows]
 
 
 def test_a_shape_known_at_few_places_is_known_everywhere():
@@ -168,7 +168,7 @@ def test_a_frequency_alone_tells_which_of_two_alike_shapes_a_mode_is():
     """With one contact gains say nothing: the kernels whose center is nearest in frequency are most probable."""
     given = family(1)
     given.frequency_weights = torch.where(torch.arange(len(given.frequency_weights)) == UNCHANGED, 1.0, 0.0).double()
-    prior = given.log_prior(torch.log(plate().frequency)).reshape(PROFILES, SHAPES, len(REMAINDERS), SHAPES)
+    prior = given.log_prior(torch.log(plate().frequency)).reshape(PROFILES, SHAPES, len(RESIDUALS), SHAPES)
     assert torch.equal(prior[0, :, 0].argmax(0), torch.arange(SHAPES))
     assert torch.equal(prior, prior[:1, :, :1].expand_as(prior))
 
@@ -196,7 +196,7 @@ def test_the_density_of_a_measured_frequency_integrates_to_one():
     width = float(grid[-1] - grid[0]) + 0.2
     total = torch.trapezoid(given.match(grid)[UNCHANGED].exp(), grid) / width
     assert total.tolist() == pytest.approx([1.0 / SHAPES] * SHAPES, rel=1e-3)
-    prior = given.log_prior(grid).reshape(PROFILES, SHAPES, len(REMAINDERS), -1)[0, :, 0]
+    prior = given.log_prior(grid).reshape(PROFILES, SHAPES, len(RESIDUALS), -1)[0, :, 0]
     assert float(torch.trapezoid(prior.exp().sum(0), grid)) / width == pytest.approx(1.0, rel=1e-3)
 
 
@@ -237,14 +237,13 @@ def test_categories_are_probable_as_their_profile_and_remainder_are():
     assert abs(float(prior.sum()) - 1.0) < 1e-12
     assert float(prior.min()) >= EQUAL_PRIOR / len(prior)
     remainder = given.shares[:, -1]
-    for row, other in product(range(len(REMAINDERS)), repeat=2):
+    for row, other in product(range(len(RESIDUALS)), repeat=2):
         # Among kernels of one profile: what is not the equal share goes as the typical shares do.
         typical = [
-            prior[categories[torch.isclose(remainder, torch.tensor(REMAINDERS[each]).double())]]
-            for each in (row, other)
+            prior[categories[torch.isclose(remainder, torch.tensor(RESIDUALS[each]).double())]] for each in (row, other)
         ]
         ratio = (typical[0] - EQUAL_PRIOR / len(prior)) / (typical[1] - EQUAL_PRIOR / len(prior))
-        assert torch.allclose(ratio, torch.full_like(ratio, REMAINDER_PRIOR[row] / REMAINDER_PRIOR[other]))
+        assert torch.allclose(ratio, torch.full_like(ratio, RESIDUAL_PRIOR[row] / RESIDUAL_PRIOR[other]))
     narrowest = given.shares[categories == int(prior.argmax())]
     shapes = narrowest[:, :-1] * given._known.square().mean(0)
     assert PROFILE_PRIOR.index(max(PROFILE_PRIOR)) == 0
@@ -274,7 +273,7 @@ def test_a_shape_without_motion_at_the_impacts_is_not_visible():
     size = given._known.square().mean(0)
     narrowest = given.categories() == 0
     found = given.visibility()[narrowest]
-    assert torch.allclose(found, (1.0 - REMAINDERS[0]) * size / size.mean() + REMAINDERS[0], rtol=0.1, atol=0.02)
+    assert torch.allclose(found, (1.0 - RESIDUALS[0]) * size / size.mean() + RESIDUALS[0], rtol=0.1, atol=0.02)
     assert float(found.mean()) == pytest.approx(1.0, rel=1e-9)
 
 
@@ -284,7 +283,7 @@ def test_one_impact_tells_a_visible_shape_from_one_that_does_not_move_there():
     given, gains = Elastic(sites, SIZE, plate()), measured(sites, noise=0.0)
     gains.values[:] = 1.0 + 0.3j
     # The least remainder, which moves everywhere.
-    seen = torch.where(given.shares[:, -1] == REMAINDERS[0], given.visibility(), torch.nan)
+    seen = torch.where(given.shares[:, -1] == RESIDUALS[0], given.visibility(), torch.nan)
     typical, hidden = (int((seen - each).abs().nan_to_num(torch.inf).argmin()) for each in (1.0, 0.0))
     evidence = WeighedFamily.of(given, gains, NOISE_SHARES).evidence[:, 0]
     plain = log_evidence(given.kernels(), series_of(gains.values), gains.floor)[:, 0]

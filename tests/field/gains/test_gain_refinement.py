@@ -97,6 +97,6 @@ def test_the_finished_model_is_judged_by_the_measured_gains_of_its_recordings():
     turn = torch.exp(1j * torch.tensor([0.3, -2.0, 1.0], dtype=torch.float64))
     measured = torch.view_as_complex(draw(RECORDINGS, len(ORDER), 2, seed=12))
     measured[USED] = finished.values * turn
-    judged = gains.judged(ORDER, measured)
+    judged = gains.finished_with(ORDER, measured)
     assert torch.equal(judged.values, finished.values)
     assert torch.allclose(judged.measured, finished.values, rtol=1e-9)

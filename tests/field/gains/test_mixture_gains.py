@@ -197,7 +197,7 @@ def test_standardized_errors_judge_the_measured_gains():
     given = model()
     errors = given.standardized_errors()
     assert errors.shape == (14, MODES, 2)
-    moved = given.with_values(2.0 * given.values).judged_by(given.values)
+    moved = given.with_values(2.0 * given.values).with_measured(given.values)
     assert torch.equal(moved.leave_one_out(), given.leave_one_out())
     assert torch.equal(moved.standardized_errors(), errors)
 
@@ -259,7 +259,7 @@ def test_smoother_and_noise_go_with_their_modes_and_parts():
 
 
 def test_take_takes_modes_in_their_order():
-    given, rows = model().judged_by(2.0 * model().values), torch.tensor([3, 0, 4])
+    given, rows = model().with_measured(2.0 * model().values), torch.tensor([3, 0, 4])
     taken = given.take(rows)
     assert torch.equal(taken.values, given.values[:, rows])
     assert torch.equal(taken.measured, given.measured[:, rows])
@@ -271,7 +271,7 @@ def test_take_takes_modes_in_their_order():
 
 
 def test_without_contacts_the_rest_predicts():
-    given = model().judged_by(2.0 * model().values)
+    given = model().with_measured(2.0 * model().values)
     none = given.without(torch.zeros(14, dtype=torch.bool))
     assert torch.allclose(gains_at(none), gains_at(given), rtol=1e-6, atol=1e-7)
     left_out = torch.arange(14) % 3 == 1
@@ -324,7 +324,7 @@ def test_a_model_that_knows_no_directions_takes_none():
 
 @pytest.mark.parametrize("elastic", [True, False])
 def test_a_model_comes_back_from_its_tensors_to_the_last_bit(elastic):
-    given = replace(model(elastic=elastic).judged_by(1.1 * model(elastic=elastic).values), spread_share=0.75)
+    given = replace(model(elastic=elastic).with_measured(1.1 * model(elastic=elastic).values), spread_share=0.75)
     record = json.loads(json.dumps(given.record()))
     tensors = {name: tensor.detach().clone().contiguous() for name, tensor in given.tensors().items()}
     skeleton = MixtureGains.skeleton(record)

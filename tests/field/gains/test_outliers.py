@@ -18,8 +18,8 @@ from avmsf.field.gains.outliers import (
     Fit,
     Outlier,
     PredictiveRatios,
+    assess_contacts,
     better_order,
-    judge_contacts,
     predicts_better,
     set_aside,
 )
@@ -80,7 +80,7 @@ def _places() -> Sites:
 
 
 def _found(sites: Sites, measured: MeasuredGains) -> tuple[Outlier, ...]:
-    return judge_contacts(_fit(sites, measured), None, sites, _places(), measured).outliers
+    return assess_contacts(_fit(sites, measured), None, sites, _places(), measured).outliers
 
 
 def _exchanged(sites: Sites, one: int, other: int) -> Sites:
@@ -212,7 +212,7 @@ def test_noise_accuses_nobody() -> None:
         size = 10.0 ** torch.randint(0, 2, (CONTACTS, 1), generator=generator)
         noise = torch.randn(CONTACTS, MODES, dtype=torch.complex128, generator=generator) * size
         gains = MeasuredGains(noise, measured.variance, measured.frequency, measured.damping)
-        judgment = judge_contacts(_fit(sites, gains), None, sites, _places(), gains)
+        judgment = assess_contacts(_fit(sites, gains), None, sites, _places(), gains)
         assert judgment.outliers == ()
         assert not judgment.informative
 

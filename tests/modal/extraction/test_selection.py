@@ -57,7 +57,7 @@ def test_chance_is_the_tail_of_chi_squared(contacts: int):
 def test_noise_explains_what_chance_says():
     sounds = torch.randn(3, SAMPLES, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     everywhere = bank_of(torch.linspace(50, 3950, 800).tolist(), [5.0] * 800)
-    energy, ratio = Candidates.of(sounds, everywhere, flat(1.0, everywhere, 3), sample_rate=RATE).judge(
+    energy, ratio = Candidates.of(sounds, everywhere, flat(1.0, everywhere, 3), sample_rate=RATE).score(
         samples=SAMPLES, sample_rate=RATE
     )
     # The mean of 800 chi-squared variables with 6 degrees of freedom scatters by 2 %.

@@ -36,12 +36,12 @@ PERTURBATIONS = (0.003, 0.01, 0.03, 0.1, 0.3)
 """Relative perturbations tau of stiffness and mass."""
 WIDTHS = (0.05, 0.1, 0.2, 0.4)
 """Standard deviations w of the broad profiles, in log frequency."""
-REMAINDERS = (0.03, 0.1, 0.3, 0.6)
+RESIDUALS = (0.03, 0.1, 0.3, 0.6)
 """Shares p of what no shape has."""
 PROFILE_PRIOR = (0.56, 0.28, 0.1, 0.027, 0.003, 0.015, 0.004, 0.008, 0.007)
 """Typical share of the modes of a body with each of `PERTURBATIONS`, then of `WIDTHS`."""
-REMAINDER_PRIOR = (0.96, 0.04, 7e-4, 1e-4)
-"""Typical share of the modes of a body with each of `REMAINDERS`.
+RESIDUAL_PRIOR = (0.96, 0.04, 7e-4, 1e-4)
+"""Typical share of the modes of a body with each of `RESIDUALS`.
 
 Both are of an earlier measurement whose script was not kept: narrower than the mean posterior probabilities over the
 modes of seven simulated objects with 8 impacts each as they are printed now (docs/decisions/few-impacts.md)."""
@@ -91,14 +91,14 @@ class Elastic(KernelFamily):
         profile, diagonal = torch.stack(profiles), self._known.square().T
         self._sizes = profile @ diagonal.mean(1)
         elastic = scaled(profile.flatten(0, 1), diagonal)
-        share = torch.tensor(REMAINDERS, dtype=torch.float64)[None, :, None]
+        share = torch.tensor(RESIDUALS, dtype=torch.float64)[None, :, None]
         both = [(1.0 - share) * elastic[:, None], share.expand(len(elastic), -1, 1)]
         self.shares = torch.cat(both, dim=2).flatten(0, 1)
 
     def basis(self, sites: Sites, others: Sites) -> Float64[Tensor, "basis sites others"]:
         """Return the product of both impacts' components of each shape, and the remainder's kernel."""
         one, other = self._along(sites), self._along(others)
-        return torch.cat([one.T[:, :, None] * other.T[:, None], self._remainder(sites, others)[None]])
+        return torch.cat([one.T[:, :, None] * other.T[:, None], self._residual_kernel(sites, others)[None]])
 
     def diagonal(self, sites: Sites) -> Float64[Tensor, "basis sites"]:
         """Return the squared components of each shape, and ones."""
@@ -108,7 +108,7 @@ class Elastic(KernelFamily):
         """Return some kernels between two sets of impacts."""
         one, other = self._along(sites), self._along(others)
         shares, size = self.shares[kept], len(sites) * len(others)
-        found = self._remainder(sites, others) * shares[:, -1, None, None]
+        found = self._residual_kernel(sites, others) * shares[:, -1, None, None]
         # As one product where few impacts make it small, else kernel by kernel: the basis would be far larger.
         if size * one.shape[1] <= _MEMORY:
             pairs = (one.T[:, :, None] * other.T[:, None]).flatten(1)
@@ -119,7 +119,7 @@ class Elastic(KernelFamily):
 
     def factors(self, sites: Sites, known: Sites) -> Float64[Tensor, "sites factors"]:
         """Return the components of each shape, and the remainder's kernel with each known impact."""
-        return torch.cat([self._along(sites), self._remainder(sites, known)], dim=1)
+        return torch.cat([self._along(sites), self._residual_kernel(sites, known)], dim=1)
 
     def loadings(self, known: Sites, kept: Int[Tensor, " kept"]) -> Float64[Tensor, "kept known factors"]:
         """Return the components of each shape at the known impacts, and one for each of these, times their shares."""
@@ -131,17 +131,17 @@ class Elastic(KernelFamily):
     ) -> Float64[Tensor, "sites series"]:
         """Return the family's part of the means: the sum over the known impacts comes before the places."""
         weights = torch.einsum("cj,jcs->js", self._along(known), coefficients[:-1])
-        return self._along(sites) @ weights + self._remainder(sites, known) @ coefficients[-1]
+        return self._along(sites) @ weights + self._residual_kernel(sites, known) @ coefficients[-1]
 
     def categories(self) -> Int[Tensor, " kernels"]:
         """Return one category for each profile and remainder: the shape that is its center has a prior of its own."""
         profiles, shapes = len(PERTURBATIONS) + len(WIDTHS), len(self.modes)
-        one = torch.arange(profiles * len(REMAINDERS)).reshape(profiles, 1, len(REMAINDERS))
+        one = torch.arange(profiles * len(RESIDUALS)).reshape(profiles, 1, len(RESIDUALS))
         return one.expand(-1, shapes, -1).flatten()
 
     def category_prior(self) -> Float64[Tensor, " categories"]:
         """Return the probability of each profile and remainder before any measurement; one or two impacts keep it."""
-        typical = torch.outer(torch.tensor(PROFILE_PRIOR).double(), torch.tensor(REMAINDER_PRIOR).double()).flatten()
+        typical = torch.outer(torch.tensor(PROFILE_PRIOR).double(), torch.tensor(RESIDUAL_PRIOR).double()).flatten()
         return (1.0 - EQUAL_PRIOR) * typical / typical.sum() + EQUAL_PRIOR / len(typical)
 
     def visibility(self) -> Float64[Tensor, " kernels"]:
@@ -151,7 +151,7 @@ class Elastic(KernelFamily):
         than others to be measured.
         """
         ratio = (self._sizes / self._sizes.mean(1, keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)).flatten()
-        share = torch.tensor(REMAINDERS, dtype=torch.float64)
+        share = torch.tensor(RESIDUALS, dtype=torch.float64)
         return ((1.0 - share) * ratio[:, None] + share).flatten()
 
     def log_prior(self, log_frequency: Float64[Tensor, " modes"]) -> Float64[Tensor, "kernels modes"]:
@@ -161,7 +161,7 @@ class Elastic(KernelFamily):
         """
         profiles = len(PERTURBATIONS) + len(WIDTHS)
         shared = self.shape_log_prior(log_frequency)[None, :, None]
-        return shared.expand(profiles, -1, len(REMAINDERS), -1).flatten(0, 2)
+        return shared.expand(profiles, -1, len(RESIDUALS), -1).flatten(0, 2)
 
     def shape_log_prior(self, log_frequency: Float64[Tensor, " modes"]) -> Float64[Tensor, "shapes modes"]:
         """Return the log probability that a mode is each shape, times the density of its frequency if it is.
@@ -186,7 +186,7 @@ class Elastic(KernelFamily):
     def shape_evidence(self, evidence: Float64[Tensor, "kernels noises series"]) -> Float64[Tensor, "shapes series"]:
         """Return the log evidence of each shape as center, over profiles and remainders by their `category_prior`."""
         noises = evidence.shape[1]
-        shape = (len(PERTURBATIONS) + len(WIDTHS), len(self.modes), len(REMAINDERS), noises, -1)
+        shape = (len(PERTURBATIONS) + len(WIDTHS), len(self.modes), len(RESIDUALS), noises, -1)
         prior = self.category_prior().log().reshape(shape[0], 1, shape[2], 1, 1)
         each = (evidence.reshape(shape) + prior).transpose(0, 1).flatten(1, 3)
         return torch.logsumexp(each, dim=1) - math.log(noises)
@@ -242,7 +242,7 @@ class Elastic(KernelFamily):
             self._latest = (*latest[-1:], (sites, found))
         return found
 
-    def _remainder(self, sites: Sites, others: Sites) -> Float64[Tensor, "sites others"]:
+    def _residual_kernel(self, sites: Sites, others: Sites) -> Float64[Tensor, "sites others"]:
         return squared_exponential(sites.points, others.points, self._reach)[0] * sites.cosine(others)
 
 

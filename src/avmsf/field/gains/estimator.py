@@ -28,7 +28,7 @@ from avmsf.field.gains.family import KernelFamily, Sites, sites_along
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, matched, total_evidence
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.model import MixtureGains
-from avmsf.field.gains.outliers import Fit, Judgment, better_order, judge_contacts, predicts_better
+from avmsf.field.gains.outliers import Fit, Judgment, assess_contacts, better_order, predicts_better
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.gains.symmetry import Symmetric
@@ -129,7 +129,7 @@ class MixtureEstimator(GainRecipe):
             if best is not None and fine is not None:
                 bodies[best] = fine
                 continue
-            judgment, used = _judged(fit, model, None if best is None else bodies[best]), every
+            judgment, used = _assessed(fit, model, None if best is None else bodies[best]), every
             if best is None or hold is None or not self._may_be_held(judgment):
                 break
             rows = _without(every, judgment)
@@ -152,7 +152,7 @@ class MixtureEstimator(GainRecipe):
                 families = fit.families(used, bodies)
                 model = fit(used, families)
         weights = _body_weights(model, families, fit.measured)
-        report = _report(bodies, families, weights, missing) | _judgment_report(judgment, case, used)
+        report = _report(bodies, families, weights, missing) | _outlier_report(judgment, case, used)
         report["thickness"] = None if thickness is None else asdict(thickness)
         report["order"] = None if judgment.informative else _better_order(fit, bodies)
         return replace(model, report=report), used
@@ -345,7 +345,7 @@ def _sites(case: GainCase, bodies: Sequence[NominalBody]) -> Sites:
     return sites_along(points, given, otherwise)
 
 
-def _judged(fit: _Fit, model: MixtureGains, body: NominalBody | None) -> Judgment:
+def _assessed(fit: _Fit, model: MixtureGains, body: NominalBody | None) -> Judgment:
     """Return what contradicts the other contacts; the body is the most probable one."""
     points = model.points[farthest_points(model.points, min(_PLACES, len(model.points)))]
 
@@ -353,7 +353,7 @@ def _judged(fit: _Fit, model: MixtureGains, body: NominalBody | None) -> Judgmen
         return lambda rows, noise_shares: fit(rows, fit.families(rows, bodies), noise_shares)
 
     elastic = None if body is None else fitted([body])
-    return judge_contacts(fitted([]), elastic, fit.sites, model.sites(points), fit.measured)
+    return assess_contacts(fitted([]), elastic, fit.sites, model.sites(points), fit.measured)
 
 
 def _better_order(fit: _Fit, bodies: Sequence[NominalBody]) -> str | None:
@@ -419,7 +419,7 @@ def _report(
     return {"bodies": sorted(found, key=lambda each: -each["weight"]), "unavailable": missing}
 
 
-def _judgment_report(judgment: Judgment, case: GainCase, used: Int[Tensor, " used"]) -> dict[str, Any]:
+def _outlier_report(judgment: Judgment, case: GainCase, used: Int[Tensor, " used"]) -> dict[str, Any]:
     names, contacts, credibility = case.train.names, case.train.contacts, judgment.credibility
     kept = set(used.tolist())
     with_body, given = credibility is not None and credibility.credible, case.train.directions

@@ -198,7 +198,7 @@ class MixtureGains(GainField):
         """Return the model of other gains at the same contacts, its hypotheses weighed as before."""
         return replace(self, mixture=self.mixture.with_values(series_of(values)))
 
-    def judged_by(self, measured: Complex128[Tensor, "contacts modes"]) -> "MixtureGains":
+    def with_measured(self, measured: Complex128[Tensor, "contacts modes"]) -> "MixtureGains":
         """Return the same model, which judges itself by these gains."""
         return replace(self, measured=measured)
 

@@ -290,7 +290,7 @@ class _Search:
         return float(self.ratios.without(self.aside)[0].nanmean())
 
 
-def judge_contacts(plain: Fit, elastic: Fit | None, sites: Sites, places: Sites, measured: MeasuredGains) -> Judgment:
+def assess_contacts(plain: Fit, elastic: Fit | None, sites: Sites, places: Sites, measured: MeasuredGains) -> Judgment:
     """Return the contacts that the others contradict, and whether the body is credible.
 
     `plain` fits the gain model without elastic families, `elastic` with them, where there is a body. Contacts are

@@ -71,14 +71,16 @@ class RefinedGains(TrainableGains):
         moved = (self.noise * _STEP * self.shift).detach().double()
         return self.model.with_values(self.model.values + torch.view_as_complex(moved.contiguous())).take(order)
 
-    def judged(self, order: Int[Tensor, " modes"], measured: Complex128[Tensor, "contacts modes"]) -> MixtureGains:
+    def finished_with(
+        self, order: Int[Tensor, " modes"], measured: Complex128[Tensor, "contacts modes"]
+    ) -> MixtureGains:
         """Return the finished model, judging itself by the gains that its modes, in order, have in the recordings.
 
         Frequencies that moved end to end have turned their modes, which says nothing of the gains.
         """
         finished = self.finished(order)
         turned = turned_like(*(torch.view_as_real(each) for each in (measured[self.used], finished.values)))
-        return finished.judged_by(torch.view_as_complex(turned.contiguous()))
+        return finished.with_measured(torch.view_as_complex(turned.contiguous()))
 
 
 def _applied(smoother: Tensor, values: Float64[Tensor, "contacts modes 2"] | Tensor) -> Tensor:

@@ -22,7 +22,7 @@ from avmsf.field.gains.family import KernelFamily, Sites
 from avmsf.field.gains.positional import ThinPlate
 from avmsf.symmetry.characters import Group
 
-REMAINDERS = (0.1, 0.3)
+RESIDUALS = (0.1, 0.3)
 """Shares p of what is not symmetric."""
 _MIN_PART = 0.01
 """Least part of the variance at the contacts that a character must have: where all contacts lie on a mirror plane
@@ -54,12 +54,12 @@ class Symmetric(KernelFamily):
         own = self.diagonal(reference).mean(1)
         seen = symmetric @ own > _MIN_PART * (whole @ own)
         symmetric, whole = (each[seen] / (each[seen] @ own)[:, None] for each in (symmetric, whole))
-        self.shares = torch.cat([(1.0 - share) * symmetric + share * whole for share in REMAINDERS])
+        self.shares = torch.cat([(1.0 - share) * symmetric + share * whole for share in RESIDUALS])
         group_of = torch.repeat_interleave(torch.tensor([len(each) for each in characters]))
         category = (group_of[:, None] * kernels + torch.arange(kernels)).flatten()[seen]
         known = torch.unique(category, return_inverse=True)[1]
         count = int(known.max()) + 1
-        self._category = torch.cat([known + step * count for step in range(len(REMAINDERS))])
+        self._category = torch.cat([known + step * count for step in range(len(RESIDUALS))])
 
     def basis(self, sites: Sites, others: Sites) -> Float64[Tensor, "basis sites others"]:
         """Return the kernels between the impacts and each image of the others, group by group."""

@@ -18,7 +18,7 @@ from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import noise_power
 
 _EMPTY = ModalBank(torch.zeros(0, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
-_QUIET = 1e-12
+_MIN_NOISE_POWER = 1e-12
 """Least power of the noise, of sounds of mean power one: rounding of what is recorded without any."""
 _LEAST_FALL = 0.3
 """A mode that falls by fewer nepers over the whole sound is not told from hum."""
@@ -69,7 +69,7 @@ class HighResolution:
             return _EMPTY
         lowest = max(self.lowest_hertz, lowest_frequency(samples, sample_rate))
         chance = chance_ratio(len(sounds), trials=samples)
-        noise = noise_power(sounds, bins=noise_bins(samples)).clamp_min(_QUIET)
+        noise = noise_power(sounds, bins=noise_bins(samples)).clamp_min(_MIN_NOISE_POWER)
         pairs = candidates(sounds, noise, sample_rate=sample_rate, lowest=lowest, significance=chance)
         found = merge(*pairs, duration=samples / sample_rate)
         bank = self._sift(sounds.to(torch.float64), found, noise, sample_rate, lowest)

@@ -82,7 +82,7 @@ def measure_quality(
     amplitudes = amplitudes[audible] / level[audible, None]
     noise = noise_at(noise_power(scaled, bins=noise_bins(sounds.shape[1])), bank, sample_rate)
     pitched = bank.damping < bank.frequency
-    standing = torch.nonzero(pitched & _stands_out(explained, moves.misfit(), noise)).flatten()
+    standing = torch.nonzero(pitched & _stands_out(explained, moves.unexplained(), noise)).flatten()
     # A double of what is no mode itself may be the mode that both are of.
     part = ModalBank(bank.frequency[standing], bank.damping[standing])
     double = _doubles(part, amplitudes[:, standing], explained[:, standing].sum(0), level=_FALSE_MODES / len(bank))
@@ -107,7 +107,7 @@ class _OwnMoves:
     hessian: Float64[Tensor, "contacts modes 2 2"]
     slope: Float64[Tensor, "contacts modes 2"]
 
-    def misfit(self) -> Float64[Tensor, "contacts modes"]:
+    def unexplained(self) -> Float64[Tensor, "contacts modes"]:
         """Return the energy that each recording gains by its own move."""
         return (self.slope * _times(_inverse(self.hessian), self.slope)).sum(-1)
 
@@ -125,12 +125,12 @@ class _OwnMoves:
         bent = (others * _times(self.hessian, others)).sum(-1)
         # Never less than nothing: a recording may give the mode no amplitude.
         left_out = (explained + 2 * (alone * others).sum(-1) - bent).clamp_min(0)
-        return left_out.sum(0) / (explained + self.misfit()).sum(0)
+        return left_out.sum(0) / (explained + self.unexplained()).sum(0)
 
 
 def _stands_out(
     explained: Float64[Tensor, "contacts modes"],
-    misfit: Float64[Tensor, "contacts modes"],
+    unexplained: Float64[Tensor, "contacts modes"],
     noise: Float64[Tensor, "contacts modes"],
 ) -> Bool[Tensor, " modes"]:
     """Return which poles explain more than their misfit, or have no more misfit than the noise, given its power.
@@ -140,10 +140,10 @@ def _stands_out(
     """
     contacts, modes = explained.shape
     level = _FALSE_MODES / modes
-    logarithms = torch.log1p(explained / misfit.clamp_min(torch.finfo(torch.float64).tiny)).sum(0)
-    by_misfit = torch.from_numpy(gammaincc(contacts, logarithms.numpy())) < level
-    only_noise = torch.from_numpy(gammaincc(contacts, (misfit / noise).sum(0).numpy() / 2)) > level
-    return by_misfit | only_noise
+    logarithms = torch.log1p(explained / unexplained.clamp_min(torch.finfo(torch.float64).tiny)).sum(0)
+    by_energy = torch.from_numpy(gammaincc(contacts, logarithms.numpy())) < level
+    only_noise = torch.from_numpy(gammaincc(contacts, (unexplained / noise).sum(0).numpy() / 2)) > level
+    return by_energy | only_noise
 
 
 def _doubles(

@@ -93,7 +93,7 @@ class Candidates:
             torch.cat([self.noise, other.noise], dim=1),
         )
 
-    def judge(self, *, samples: int, sample_rate: float) -> tuple[Float64[Tensor, " candidates"], ...]:
+    def score(self, *, samples: int, sample_rate: float) -> tuple[Float64[Tensor, " candidates"], ...]:
         """Return the energy of all sounds that each explains on its own, and how many times what it would of noise."""
         own = own_gram(poles_of(self.bank, sample_rate), samples)
         energy = _explained(own, self.products.permute(2, 1, 0))
@@ -117,7 +117,7 @@ def select(
     """
     if len(found.bank) == 0:
         return known.bank
-    energy, ratio = found.judge(samples=samples, sample_rate=sample_rate)
+    energy, ratio = found.score(samples=samples, sample_rate=sample_rate)
     # Few lie high enough for the first, coarse rounds; with all of them each would take as long as the last.
     able = (ratio > significance) & (energy >= energy.amax() * 10 ** (-range_db / 10))
     both = known.join(found.take(torch.nonzero(able).flatten()))
@@ -127,10 +127,10 @@ def select(
     first = 0
     while True:
         rows = torch.arange(first, min(len(both.bank), first + _CHUNK))
-        judged = both.take(rows)
-        inner = gram(poles_of(judged.bank, sample_rate), samples, power=0)
+        chosen = both.take(rows)
+        inner = gram(poles_of(chosen.bank, sample_rate), samples, power=0)
         gained = choose(
-            inner, judged.products, judged.noise, given[rows], significance=significance, reach=10 ** (-range_db / 10)
+            inner, chosen.products, chosen.noise, given[rows], significance=significance, reach=10 ** (-range_db / 10)
         )
         energy[rows] = torch.maximum(energy[rows], gained)
         if first + _CHUNK >= len(both.bank):

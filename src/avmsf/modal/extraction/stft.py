@@ -151,8 +151,8 @@ def _regress(
     # While the windows straddle the onset the envelope has their shape and the phase turns at the bin's own pace: the
     # line starts when they have passed, unless the mode has died by then.
     later = torch.clamp(peak, min=min(settling, frames - 1))
-    lasting = envelope.gather(-1, later[:, None])[:, 0] > 2 * noise
-    begin = torch.where(lasting, later, peak)[:, None]
+    sustained = envelope.gather(-1, later[:, None])[:, 0] > 2 * noise
+    begin = torch.where(sustained, later, peak)[:, None]
     floor = torch.maximum(envelope.gather(-1, begin) * 10 ** (-_REGRESSED_DB / 20), noise[:, None])
     after = torch.arange(frames) >= begin
     fallen = after & (envelope < floor)

@@ -130,7 +130,7 @@ def jug(random: np.random.Generator, wall: float | None) -> Draft:
     """Make a jug that leans and pours to the side, a quarter turn or so from its handle: no symmetry."""
     radius, tall = random.uniform(0.04, 0.055), random.uniform(2.2, 2.8)
     neck, lip = random.uniform(0.6, 0.75), random.uniform(0.5, 0.65)
-    aside, lean = math.radians(random.uniform(75.0, 130.0)), random.uniform(0.2, 0.3)
+    aside, tilt = math.radians(random.uniform(75.0, 130.0)), random.uniform(0.2, 0.3)
     wall = drawn_wall(random, 0.0035, 0.005, wall)
     height = tall * radius
 
@@ -138,8 +138,8 @@ def jug(random: np.random.Generator, wall: float | None) -> Draft:
         apart = np.angle(np.exp(1j * (angles - aside)))
         near = np.exp(-((apart / 0.5) ** 2)) - 0.25 * np.exp(-((apart / 1.0) ** 2))
         part = np.clip((along - 0.7) / 0.3, 0.0, 1.0) ** 2
-        leaning = lean * radius * np.cos(apart) * np.clip((along - 0.3) / 0.7, 0.0, 1.0) ** 2
-        return values[:, 0] * (1.0 + lip * part * near) + leaning, values[:, 1] + 0.12 * radius * part * near
+        tilted = tilt * radius * np.cos(apart) * np.clip((along - 0.3) / 0.7, 0.0, 1.0) ** 2
+        return values[:, 0] * (1.0 + lip * part * near) + tilted, values[:, 1] + 0.12 * radius * part * near
 
     body = Body()
     turned = Turned.lay(

@@ -17,7 +17,7 @@ MOST = 0.5
 """Largest variation."""
 _SQUEEZED = 0.02
 """Part of its volume below which a tetrahedron is moved as a whole instead."""
-_MENDINGS = 30
+_MAX_REPAIRS = 30
 _APART = 1e-4
 """How far inside of the surface rays start, in object diagonals."""
 
@@ -46,7 +46,7 @@ def vary_thickness(solid: Solid, part: float, *, generator: np.random.Generator)
     np.minimum.at(walls, triangles, _thickness(places, triangles, solid.size)[:, None])
     moved = 0.5 * ((factor - 1.0) * walls)[:, None] * mitred_normals(places, triangles)
     motion = _carried(solid, rows, moved)
-    return Solid.build(solid.points + torch.from_numpy(_mended(solid, motion)), solid.cells)
+    return Solid.build(solid.points + torch.from_numpy(_repaired(solid, motion)), solid.cells)
 
 
 def _spread(
@@ -100,10 +100,10 @@ def _carried(
     return motion
 
 
-def _mended(solid: Solid, motion: Float64[np.ndarray, "points 3"]) -> Float64[np.ndarray, "points 3"]:
+def _repaired(solid: Solid, motion: Float64[np.ndarray, "points 3"]) -> Float64[np.ndarray, "points 3"]:
     """Return the motion with the corners of tetrahedra that it would crush moved alike instead."""
     before, cells = solid.volumes.numpy(), solid.cells.numpy()
-    for _ in range(_MENDINGS):
+    for _ in range(_MAX_REPAIRS):
         corners = (solid.points.numpy() + motion)[cells]
         crushed = cells[np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0 < _SQUEEZED * before]
         if not len(crushed):

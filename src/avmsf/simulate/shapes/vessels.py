@@ -194,8 +194,8 @@ def _stand(body: Body, turned: Turned, radius: float, height: float) -> None:
     """Put a wall that turns on a foot of about this radius."""
     distance = np.hypot(*turned.sheet.middle[turned.rings.starts[:-1], :2].T)
     counts = np.diff(turned.rings.starts)
-    alike = np.flatnonzero(counts[1:-1] == counts[2:]) + 1
-    ring = int(alike[np.argmin(np.abs(distance[alike] - radius))])
+    equal = np.flatnonzero(counts[1:-1] == counts[2:]) + 1
+    ring = int(equal[np.argmin(np.abs(distance[equal] - radius))])
     below = turned.sheet.middle[:, 2] - turned.sheet.offsets[:, 2]
     turned.add_foot(body, ring, float(below.min()) - height)
 
