@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean
 
+from avmsf.datasets import open_dataset
 from avmsf.datasets.dataset import Dataset
-from avmsf.datasets.recognize import open_dataset
 from avmsf.editing.config import GuidedEditConfig
 from avmsf.editing.reference import Reference
 from avmsf.editing.stable_audio import StableAudio

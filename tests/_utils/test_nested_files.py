@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from avmsf.cli.demo_folder import RECORD, replaced_whole
-from avmsf.datasets.contact_lists import LISTS, read_contacts
+from avmsf.datasets.objectfolder import CONTACT_LISTS, read_contacts
 from avmsf.errors import AvmsfError, DatasetError, EvaluationError, ExportError
 from avmsf.evaluation.mode_embedding import MaterialSpace
 from avmsf.evaluation.results import IDENTITY, ResultsFolder
@@ -19,14 +19,14 @@ NESTED = "[" * 100_000
 
 def read_lines(path: Path) -> None:
     path.write_text(f'{{"a": {NESTED}')
-    read_contacts(path)
+    read_contacts([path])
 
 
 @pytest.mark.parametrize(
     ("name", "read", "kind"),
     [
-        (LISTS[0], read_contacts, DatasetError),
-        (LISTS[1], read_lines, DatasetError),
+        (CONTACT_LISTS[0], lambda path: read_contacts([path]), DatasetError),
+        (CONTACT_LISTS[1], read_lines, DatasetError),
         ("space.json", MaterialSpace.load, EvaluationError),
         (IDENTITY, lambda path: ResultsFolder(path.parent).identity(), EvaluationError),
         (MANIFEST, lambda path: read_demo(path.parent), ExportError),

@@ -13,7 +13,7 @@ from avmsf.capture import CaptureSettings, check, read_capture
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.prepare import margin_length, prepare
 from avmsf.capture.starts import start_with_impact
-from avmsf.datasets.recordings import Blow, gather
+from avmsf.datasets.recordings import DatasetRecording, build_capture
 from factories.capture_folder import RATE, fill, ring
 from oracles.plate import Plate, sample_contacts, strike
 
@@ -205,8 +205,8 @@ def test_a_force_channel_says_where_an_impulse_response_starts(tmp_path: Path) -
 
 def test_a_dataset_s_recordings_have_margins_in_the_sounds_unit() -> None:
     files = pre_triggered(40, 300, 1000)
-    blows = [
-        Blow(
+    recordings = [
+        DatasetRecording(
             name,
             Recording(name, each.astype(np.float64)[None], float(RATE), "FLOAT"),
             np.full(3, 1.0 + row),
@@ -215,7 +215,7 @@ def test_a_dataset_s_recordings_have_margins_in_the_sounds_unit() -> None:
         for row, (name, each) in enumerate(files.items())
     ]
     settings = CaptureSettings(seconds=0.3)
-    impacts = gather(blows, name="cup", origin="set", settings=settings, recorded=False).impacts
+    impacts = build_capture(recordings, name="cup", origin="set", settings=settings, recorded=False).impacts
     for row, each in enumerate(files.values()):
         assert impacts.before is not None
         assert impacts.after is not None
@@ -223,6 +223,8 @@ def test_a_dataset_s_recordings_have_margins_in_the_sounds_unit() -> None:
         whole = whole[~whole.isnan()].numpy()
         start = int(np.argmin(np.abs(each[:1001] / 10 - whole[0])))
         np.testing.assert_allclose(whole, each[start : start + len(whole)] / 10, rtol=2e-7)
-    final = gather(blows, name="cup", origin="set", settings=replace(settings, align=False), recorded=False).impacts
+    final = build_capture(
+        recordings, name="cup", origin="set", settings=replace(settings, align=False), recorded=False
+    ).impacts
     assert final.before is None
     assert math.isclose(final.duration, 0.3)

@@ -1,5 +1,6 @@
 """Folders in the layouts of published datasets, with their names, types, shapes and quirks, as the tests need them."""
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -48,7 +49,7 @@ def write_strike(folder: Path, *, newtons: float = 5.0, gain: float = 18.0, pad:
 
 
 def write_raw(folder: Path, objects: Mapping[str, Sequence[str]], *, contacts: bool = True) -> Path:
-    """Write objects of the raw layout, each blow of another force and gain, and perhaps the contacts as arrays."""
+    """Write objects of the raw layout, each impact of another force and gain, and perhaps a list of the contacts."""
     for identifier, names in objects.items():
         for order, contact in enumerate(names):
             write_strike(
@@ -58,16 +59,17 @@ def write_raw(folder: Path, objects: Mapping[str, Sequence[str]], *, contacts: b
                 pad=int(order != 2),
                 seed=int(contact),
             )
-        if contacts:
-            write_contacts(folder, identifier, names)
+    if contacts:
+        write_contacts(folder, objects)
     return folder
 
 
-def write_contacts(folder: Path, identifier: str, names: Sequence[str]) -> None:
-    """Write contacts, an array each."""
-    (folder / "contacts" / identifier).mkdir(parents=True, exist_ok=True)
-    for contact in names:
-        np.save(folder / "contacts" / identifier / f"{contact}.npy", place(identifier, contact))
+def write_contacts(folder: Path, objects: Mapping[str, Sequence[str]], *, lines: bool = True) -> Path:
+    """Write the contacts as one of SonicGauss's lists, an object a line or all in one array."""
+    path = folder / "objectfolder_real_train.json"
+    rows = [record for identifier, names in objects.items() for record in records(identifier, names)]
+    path.write_text("\n".join(map(json.dumps, rows)) if lines else json.dumps(rows))
+    return path
 
 
 def records(identifier: str, names: Sequence[str]) -> list[dict[str, object]]:

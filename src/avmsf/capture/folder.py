@@ -20,7 +20,7 @@ from avmsf.capture.measure import RecordingReport, measure, shared_problems
 from avmsf.capture.placement import contacted_part
 from avmsf.capture.prepare import Prepared, prepare
 from avmsf.capture.settings import SETTINGS, CaptureSettings, settings_of
-from avmsf.capture.starts import cut_together, shorten
+from avmsf.capture.starts import build_impacts, shorten
 from avmsf.capture.table import DIRECTION, FORCE, REQUIRED, TABLE, Strike, in_folder, read_strikes
 from avmsf.capture.together import common_rate, find_surface, judge_contacts, judge_levels, judge_surface
 from avmsf.errors import CaptureError, CaptureWarning
@@ -77,21 +77,17 @@ def _read_capture(folder: Path, settings: CaptureSettings) -> Capture:
     names = [strike.file for strike in strikes]
     remarks += judge_levels(peaks, names)
     rate = common_rate([report.sample_rate or 0.0 for report in reports], names)
-    cut = cut_together(recordings, names, rate=rate, settings=settings)
-    for remark in remarks + cut.remarks + _summary(reports, folder):
-        warnings.warn(remark, stacklevel=3)
     directions = [strike.direction for strike in strikes]
-    forces = [each.newtons for each in recordings]
-    impacts = Impacts(
-        contacts=torch.tensor([strike.contact for strike in strikes], dtype=torch.float64),
-        sounds=cut.sounds,
-        sample_rate=rate * settings.playback_speed,
-        names=tuple(names),
+    impacts, warned = build_impacts(
+        recordings,
+        torch.tensor([strike.contact for strike in strikes], dtype=torch.float64),
+        names=names,
+        rate=rate,
+        settings=settings,
         directions=None if None in directions else torch.tensor(directions, dtype=torch.float32),
-        forces=None if None in forces else torch.tensor(forces, dtype=torch.float32),
-        before=cut.before,
-        after=cut.after,
     )
+    for remark in remarks + warned + _summary(reports, folder):
+        warnings.warn(remark, stacklevel=3)
     return Capture(settings.name or folder.resolve().name, impacts, surface, settings)
 
 

@@ -1,13 +1,14 @@
 """Where the sounds of one capture start in their files: decided for all of its recordings together."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
+from avmsf.capture.impacts import Impacts
 from avmsf.capture.prepare import MIN_MARGIN, Prepared, margin_length
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.together import common_length
@@ -20,17 +21,6 @@ level (a tenth of the peak) from which `find_onset` counts a swing as the impact
 MAX_START_SECONDS = 0.001
 """By when `find_onset` must see every recording that starts with the impact. Where modes cancel at first it takes up to
 .3 ms (a plate of 43 modes at 96 kHz) and 5 samples (the aircraft at 400 Hz); delays of 1 ms are found on alignment."""
-
-
-@dataclass(frozen=True, eq=False)
-class Sounds:
-    """The sounds of one capture, cut to one length, as `Impacts` holds them."""
-
-    sounds: Float[Tensor, "contacts samples"]
-    before: Float[Tensor, "contacts lead"] | None
-    after: Float[Tensor, "contacts tail"] | None
-    remarks: list[CaptureWarning]
-    """Of a common length that one short recording causes."""
 
 
 def latest_start(rate: float) -> int:
@@ -87,30 +77,46 @@ def settle_starts(recordings: Sequence[Prepared], *, rate: float, settings: Capt
 
 
 def shorten(prepared: Prepared, *, rate: float, settings: CaptureSettings) -> Prepared:
-    """Return a recording in float32 with no more of it than `cut_together` can use, so that many fit in memory."""
+    """Return a recording in float32 with no more of it than `build_impacts` can use, so that many fit in memory."""
     most = round(settings.kept_seconds(rate) * rate) + margin_length(rate)
     sound, before = (part.astype(np.float32) for part in (prepared.sound[:most], prepared.before))
     return replace(prepared, sound=sound, before=before)
 
 
-def cut_together(
-    recordings: Sequence[Prepared], names: Sequence[str], *, rate: float, settings: CaptureSettings
-) -> Sounds:
-    """Return the sounds from their starts on, cut to one length, and what the files hold on either side of them.
+def build_impacts(
+    recordings: Sequence[Prepared],
+    contacts: Float64[Tensor, "contacts 3"],
+    *,
+    names: Sequence[str],
+    rate: float,
+    settings: CaptureSettings,
+    directions: Float[Tensor, "contacts 3"] | None = None,
+) -> tuple[Impacts, list[CaptureWarning]]:
+    """Return the impacts, their sounds from their starts on cut to one length, and warnings of what shortens them.
 
-    Without `align`, or from the peaks on, nothing will be moved later, so that both sides are None. Raises
-    `CaptureError` as `common_length`.
+    Without `align`, or from the peaks on, nothing will be moved later, so that `before` and `after` are None. `rate` is
+    the files' in Hz. Raises `CaptureError` as `common_length`.
     """
     settled = settle_starts(recordings, rate=rate, settings=settings)
     length, remarks = common_length([len(each.sound) for each in settled], names, rate=rate, settings=settings)
-    sounds = torch.from_numpy(np.stack([each.sound[:length] for each in settled]).astype(np.float32))
-    if not settings.align or settings.from_peaks:
-        return Sounds(sounds, None, None, remarks)
-    size = margin_length(rate)
-    before = np.full((len(settled), size), np.nan, dtype=np.float32)
-    after = before.copy()
-    for row, each in enumerate(settled):
-        before[row, size - len(each.before) :] = each.before
-        rest = each.sound[length : length + size]
-        after[row, : len(rest)] = rest
-    return Sounds(sounds, torch.from_numpy(before), torch.from_numpy(after), remarks)
+    before = after = None
+    if settings.align and not settings.from_peaks:
+        size = margin_length(rate)
+        before = torch.full((len(settled), size), torch.nan)
+        after = before.clone()
+        for row, each in enumerate(settled):
+            rest = each.sound[length : length + size].astype(np.float32)
+            before[row, size - len(each.before) :] = torch.from_numpy(each.before.astype(np.float32))
+            after[row, : len(rest)] = torch.from_numpy(rest)
+    forces = [each.newtons for each in recordings]
+    impacts = Impacts(
+        contacts=contacts,
+        sounds=torch.from_numpy(np.stack([each.sound[:length] for each in settled]).astype(np.float32)),
+        sample_rate=rate * settings.playback_speed,
+        names=tuple(names),
+        directions=directions,
+        forces=None if None in forces else torch.tensor(forces, dtype=torch.float32),
+        before=before,
+        after=after,
+    )
+    return impacts, remarks

@@ -12,7 +12,7 @@ UNREADABLE = 2
 
 def run(options: Options) -> int:
     """Print the report; return 2 where no object can be read."""
-    report = open_dataset(options.dataset, contacts=options.contact_data, table=options.table).check()
+    report = open_dataset(options.dataset, contacts=options.contact_data).check()
     screen = console(errors=options.json)
     screen.print(_table(report, f"{report.dataset} in {options.dataset}"))
     for line in _lines(report):

@@ -52,10 +52,8 @@ def run(options: Options) -> int:
     methods = tuple(method_named(name) for name in words_of(options.methods) or protocol.methods)
     workers = Workers(options.workers, options.ray)
     # All paths are made absolute: workers may run in folders of their own.
-    contacts, table_of_names = (
-        None if path is None else path.resolve() for path in (options.contact_data, options.table)
-    )
-    opened = partial(open_dataset, options.data.resolve(), contacts=contacts, table=table_of_names)
+    contacts = None if options.contact_data is None else options.contact_data.resolve()
+    opened = partial(open_dataset, options.data.resolve(), contacts=contacts)
     dataset = opened(time_zero=options.time_zero)
     title = title_of(dataset, options.data)
     objects = choose_objects(dataset, protocol, words_of(options.objects))

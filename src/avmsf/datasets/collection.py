@@ -1,4 +1,4 @@
-"""Capture folders side by side in one folder, read as one dataset; a single capture is a collection of one."""
+"""Capture folders side by side in one folder, read as one dataset; and any dataset opened by what its folder holds."""
 
 from functools import cached_property
 from pathlib import Path
@@ -8,15 +8,36 @@ import soundfile
 from avmsf.capture.filenames import PICTURE_SUFFIXES, find_surface_file
 from avmsf.capture.folder import Capture, read_capture
 from avmsf.capture.settings import CaptureSettings, settings_of
-from avmsf.capture.table import TABLE, read_rows, refuse_repeated_files, understand
+from avmsf.capture.table import TABLE, read_strikes
 from avmsf.capture.together import common_rate
-from avmsf.datasets.dataset import DatasetReport, Look, ObjectFacts, ObjectReport
+from avmsf.datasets.dataset import Dataset, DatasetReport, Look, ObjectFacts, ObjectReport
+from avmsf.datasets.detect import detect_dataset
 from avmsf.datasets.numbering import in_order, refuse_unknown
+from avmsf.datasets.objectfolder import ObjectFolderRaw
+from avmsf.datasets.realimpact import RealImpact
 from avmsf.errors import CaptureError, DatasetError
 from avmsf.photographs.colmap import find_model
 
 _SEEN_IN = ("*.mp4", "*.mov", "*.m4v", "*.avi", "*.mkv", "*.webm", "splats.ply", "point_cloud.ply", "transforms.json")
 """Files other than meshes, photographs and COLMAP's models that show what an object looks like."""
+
+
+def open_dataset(path: str | Path, *, contacts: str | Path | None = None, time_zero: str | None = None) -> Dataset:
+    """Return the dataset that a folder holds, recognized by its files.
+
+    `contacts` is the path of ObjectFolder Real's contacts (`ObjectFolderRaw`). `time_zero` is where sounds start,
+    `onset` or `peak`; None leaves that to the dataset or the captures. Raises DatasetError for a folder that holds none
+    and for options that the dataset does not take.
+    """
+    folder = Path(path)
+    kind = detect_dataset(folder)
+    if kind == "ObjectFolder Real":
+        return ObjectFolderRaw(folder, contacts=contacts, time_zero=time_zero)
+    if contacts is not None:
+        raise DatasetError.expected(
+            f"no `contacts` with {kind}", str(contacts), got=str(contacts), file=folder, name="contacts"
+        )
+    return (CaptureCollection if kind == "captures" else RealImpact)(folder, time_zero=time_zero)
 
 
 class CaptureCollection:
@@ -38,7 +59,7 @@ class CaptureCollection:
 
     def facts(self, identifier: str) -> ObjectFacts:
         """Return what the capture is called. Raises DatasetError for an unknown one."""
-        folder = self._expect(identifier)
+        folder = self._folder_of(identifier)
         try:
             return ObjectFacts(identifier, settings_of(folder).name or identifier)
         except CaptureError:
@@ -47,7 +68,7 @@ class CaptureCollection:
 
     def capture(self, identifier: str) -> Capture:
         """Read one capture by `read_capture`. Raises DatasetError for an unknown or unreadable one."""
-        folder = self._expect(identifier)
+        folder = self._folder_of(identifier)
         try:
             return read_capture(folder, settings_of(folder).starting(self._time_zero))
         except CaptureError as error:
@@ -56,7 +77,7 @@ class CaptureCollection:
     def look(self, identifier: str) -> Look | None:
         """Return the capture's folder where there is anything in it to see. Raises DatasetError for an unknown one and
         for settings that cannot be read."""
-        folder = self._expect(identifier)
+        folder = self._folder_of(identifier)
         try:
             settings = settings_of(folder)
             return Look(folder, settings) if _shows(folder, settings) else None
@@ -78,7 +99,7 @@ class CaptureCollection:
         found = {path.name: path for path in _visible(self.folder) if (path / TABLE).is_file()}
         return {name: found[name] for name in in_order(found)}
 
-    def _expect(self, identifier: str) -> Path:
+    def _folder_of(self, identifier: str) -> Path:
         if identifier not in self._folders:
             refuse_unknown(identifier, self._folders, str(self.folder))
         return self._folders[identifier]
@@ -86,37 +107,17 @@ class CaptureCollection:
     def _report(self, identifier: str) -> ObjectReport:
         folder = self._folders[identifier]
         facts = self.facts(identifier)
-        problems, files, rates = [], [], []
         try:
             settings = settings_of(folder)
-            rows, _ = read_rows(folder)
-        except CaptureError as error:
+            files = [strike.file for strike in read_strikes(folder, settings)[0]]
+            common_rate([float(soundfile.info(str(folder / file)).samplerate) for file in files], files)
+            surface = find_surface_file(folder, settings)
+            if surface is not None and not surface.is_file():
+                raise CaptureError(f"{surface.name}: the surface of capture.toml is missing", file=surface)
+        except (CaptureError, soundfile.LibsndfileError, OSError) as error:
+            # One row that cannot be read makes `read_capture` refuse the folder.
             return ObjectReport(facts, 0, (str(error),))
-        strikes = []
-        for row in rows:
-            try:
-                strikes.append(understand(row, settings))
-                header = soundfile.info(str(folder / strikes[-1].file))
-            except CaptureError as error:
-                problems.append(str(error))
-            except (soundfile.LibsndfileError, OSError):
-                there = (folder / strikes[-1].file).is_file()
-                got = "an unreadable one; export it again as wav" if there else "none; copy it there"
-                problems.append(f"{strikes[-1].file}: expected a sound file, got {got}")
-            else:
-                files.append(strikes[-1].file)
-                rates.append(float(header.samplerate))
-        try:
-            refuse_repeated_files(strikes)
-            if rates:
-                common_rate(rates, files)
-        except CaptureError as error:
-            problems.append(str(error))
-        surface = find_surface_file(folder, settings)
-        if surface is not None and not surface.is_file():
-            problems.append(f"{surface.name}: the surface of capture.toml is missing")
-        # One row that cannot be read makes `read_capture` refuse the folder.
-        return ObjectReport(facts, 0 if problems else len(files), tuple(problems))
+        return ObjectReport(facts, len(files))
 
 
 def _visible(folder: Path) -> list[Path]:

@@ -1,4 +1,4 @@
-"""How the objects of ObjectFolder Real and RealImpact are numbered, and what the numbers say of an object."""
+"""Numbers, names and subsets of the objects of ObjectFolder Real and RealImpact."""
 
 import re
 from collections.abc import Collection, Iterable
@@ -19,6 +19,13 @@ REALIMPACT_NAMES = (
     "93_GreenGoblet", "94_GlassGoblet", "96_Bowl", "97_PlasticScoop", "100_Frisbee",
 )  # fmt: skip
 """All objects of RealImpact, as its archives and folders are called."""
+ABLATION = ("1", "11", "28", "38", "41", "44", "52", "57", "66", "75")
+"""Objects of ObjectFolder Real in the paper's ablations, and in its few-shot, sampling and input-view studies
+(supplement, implementation details)."""
+NON_SYMMETRIC = (
+    "1", "14", "17", "24", "39", "40", "41", "44", "45", "52", "54", "55", "57", "66", "79", "91",
+)  # fmt: skip
+"""Objects of the case study without symmetry and of contact localization (the same place)."""
 _FIRST_WORDS = ("ceramic", "iron", "wood", "glass")
 _LAST_WORDS = ("ceramic", "iron", "wood")
 
@@ -55,12 +62,6 @@ def shared_remarks(names: Collection[str], other: str) -> list[str]:
     ]
 
 
-def realimpact_name(number: int) -> str | None:
-    """Return what RealImpact calls the object of this number, in words; None where it has none."""
-    found = next((name for name in REALIMPACT_NAMES if number_of(name) == number), None)
-    return None if found is None else in_words(found)
-
-
 def in_words(name: str) -> str:
     """Return a folder's name as words: `wood plate square` of `28_WoodPlateSquare`."""
     return " ".join(_words(name)) or name
@@ -78,21 +79,6 @@ def material_in(name: str) -> str | None:
     if words[0] in _FIRST_WORDS:
         return words[0]
     return words[-1] if words[-1] in _LAST_WORDS else None
-
-
-def folder_number(published: int, present: Collection[int]) -> int | None:
-    """Return the folder's number of an object that the published list of 100 counts as `published`.
-
-    The list has no gaps, the folders have. Its 96th object is 98 or 99: whichever of the two is present alone. None
-    where that is open, and beyond 100. The mapping was concluded from names that agree; nobody states it.
-    """
-    if published == 96:
-        candidates = [number for number in (98, 99) if number in present]
-        return candidates[0] if len(candidates) == 1 else None
-    for last, shift in ((71, 0), (80, 1), (95, 2), (100, 3)):
-        if published <= last:
-            return published + shift
-    return None
 
 
 def refuse_unknown(identifier: str, known: Collection[str], dataset: str) -> NoReturn:

@@ -1,4 +1,4 @@
-"""RealImpact: 50 objects, each struck at 5 vertices and heard by 600 microphones, of which the closest is taken."""
+"""RealImpact: 50 objects, each struck at 5 vertices and recorded by 600 microphones, of which the closest is taken."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -7,14 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float64, Int64
+from scipy.spatial import cKDTree
 
 from avmsf.capture.audio import Recording
 from avmsf.capture.folder import Capture
 from avmsf.capture.settings import CaptureSettings
-from avmsf.datasets.arrays import ArrayForm, judge_array, read_array
 from avmsf.datasets.dataset import DatasetReport, Look, ObjectFacts, ObjectReport
-from avmsf.datasets.detect import FOLDER, SOUNDS
-from avmsf.datasets.listeners import closest_rows
 from avmsf.datasets.numbering import (
     REALIMPACT_NAMES,
     in_order,
@@ -24,29 +23,34 @@ from avmsf.datasets.numbering import (
     refuse_unknown,
     shared_remarks,
 )
-from avmsf.datasets.recordings import Blow, gather
+from avmsf.datasets.recordings import DatasetRecording, build_capture
 from avmsf.errors import CaptureError, DatasetError
 from avmsf.mesh.surface import Surface, read_surface
 
-RATE = 48_000.0
+SAMPLE_RATE_HZ = 48_000.0
 """Of all recordings, Hz; no file tells it."""
 ROWS = 3000
 MESH = "transformed.obj"
-FORMS = {
-    SOUNDS: ArrayForm("float32", (ROWS, None)),
-    "vertexID.npy": ArrayForm("int64", (ROWS,)),
-    "vertexXYZ.npy": ArrayForm("float64", (ROWS, 3)),
-    "listenerXYZ.npy": ArrayForm("float64", (ROWS, 3)),
-    "angle.npy": ArrayForm("int64", (ROWS,)),
-    "distance.npy": ArrayForm("int64", (ROWS,)),
-    "micID.npy": ArrayForm("int64", (ROWS,)),
+FOLDER, SOUNDS = "preprocessed", "deconvolved_0db.npy"
+"""An object's folder of arrays, and its sounds."""
+FORMS: dict[str, tuple[str, tuple[int | None, ...]]] = {
+    SOUNDS: ("float32", (ROWS, None)),
+    "vertexID.npy": ("int64", (ROWS,)),
+    "vertexXYZ.npy": ("float64", (ROWS, 3)),
+    "listenerXYZ.npy": ("float64", (ROWS, 3)),
+    "angle.npy": ("int64", (ROWS,)),
+    "distance.npy": ("int64", (ROWS,)),
+    "micID.npy": ("int64", (ROWS,)),
 }
+"""Types and shapes of the arrays; None for any length."""
 NEEDED = (SOUNDS, "vertexID.npy", "vertexXYZ.npy", "listenerXYZ.npy")
 """The arrays that a capture is made of; the others repeat where the microphones stood."""
+SAME_POSITION_M = 1e-3
+"""Distance within which two microphone positions are equal."""
 DOWNLOAD = "http://downloads.cs.stanford.edu/viscam/RealImpact"
 SELF_INTERSECTING = (37, 51, 73, 83)
 """Objects whose meshes intersect themselves."""
-OFF_MESH = 1e-3
+MAX_MESH_DISTANCE_M = 1e-3
 """Meters that a struck vertex may lie off the mesh's vertices."""
 SETTINGS = CaptureSettings(normalize="none", align=False)
 
@@ -72,7 +76,7 @@ class RealImpact:
     def facts(self, identifier: str) -> ObjectFacts:
         """Return what is known of an object; its material is inferred from its name. Raises DatasetError for an unknown
         one."""
-        self._expect(identifier)
+        self._check_known(identifier)
         material = material_in(identifier)
         return ObjectFacts(identifier, in_words(identifier), material, inferred=material is not None)
 
@@ -81,25 +85,25 @@ class RealImpact:
 
         Raises DatasetError for an unknown object, and for files that are missing, cut short or of another form.
         """
-        self._expect(identifier)
+        self._check_known(identifier)
         origin = f"{self.name}, {identifier}"
         surface = self._mesh(identifier)
-        vertices, places, listeners = (self._array(identifier, name) for name in NEEDED[1:])
+        vertices, positions, microphones = (self._array(identifier, name) for name in NEEDED[1:])
         corners = surface.vertices.double().numpy()
-        rows, common = closest_rows(vertices, listeners, corners)
-        contacts = torch.from_numpy(places[rows])
+        rows, common = closest_rows(vertices, microphones, corners)
+        contacts = torch.from_numpy(positions[rows])
         off = torch.cdist(contacts, surface.vertices.double()).amin(dim=1)
-        if float(off.max()) > OFF_MESH:
+        if float(off.max()) > MAX_MESH_DISTANCE_M:
             raise DatasetError(
-                f"{origin}: expected vertexXYZ.npy within {OFF_MESH:g} m of the vertices of {MESH}, got "
+                f"{origin}: expected vertexXYZ.npy within {MAX_MESH_DISTANCE_M:g} m of the vertices of {MESH}, got "
                 f"{float(off.max()):.3g} m; unpack the archive again",
                 file=self.folder / identifier / FOLDER / "vertexXYZ.npy",
                 row=rows[int(off.argmax())],
                 value=float(off.max()),
             )
         remarks = [] if common else ["no microphone position is common to all impacts: each has its closest one"]
-        capture = gather(
-            self._blows(identifier, rows, vertices=vertices, places=places),
+        capture = build_capture(
+            self._recordings(identifier, rows, vertices=vertices, positions=positions),
             name=in_words(identifier),
             origin=origin,
             settings=self._settings,
@@ -110,7 +114,7 @@ class RealImpact:
 
     def look(self, identifier: str) -> Look | None:
         """Return the object's textured mesh; None where it is missing."""
-        self._expect(identifier)
+        self._check_known(identifier)
         folder = self.folder / identifier / FOLDER
         return Look(folder, CaptureSettings(surface=MESH)) if (folder / MESH).is_file() else None
 
@@ -135,13 +139,12 @@ class RealImpact:
     def _objects(self) -> tuple[str, ...]:
         return in_order(path.name for path in self.folder.iterdir() if (path / FOLDER).is_dir() and path.name[0] != ".")
 
-    def _expect(self, identifier: str) -> None:
+    def _check_known(self, identifier: str) -> None:
         if identifier not in self.objects():
             refuse_unknown(identifier, self.objects(), self.name)
 
-    def _array(self, identifier: str, name: str, *, lazily: bool = False) -> np.ndarray:
-        shown = f"{identifier}/{FOLDER}/{name}"
-        return read_array(self.folder / shown, FORMS[name], shown=shown, lazily=lazily)
+    def _array(self, identifier: str, name: str) -> np.ndarray:
+        return open_array(self.folder / identifier / FOLDER / name)
 
     def _mesh(self, identifier: str) -> Surface:
         shown = f"{identifier}/{FOLDER}/{MESH}"
@@ -154,8 +157,10 @@ class RealImpact:
         except CaptureError as error:
             raise DatasetError(str(error), **error.attributes) from error
 
-    def _blows(self, identifier: str, rows: list[int], *, vertices: np.ndarray, places: np.ndarray) -> Iterator[Blow]:
-        sounds = self._array(identifier, SOUNDS, lazily=True)
+    def _recordings(
+        self, identifier: str, rows: list[int], *, vertices: np.ndarray, positions: np.ndarray
+    ) -> Iterator[DatasetRecording]:
+        sounds = self._array(identifier, SOUNDS)
         for row in rows:
             name = f"{identifier}/{FOLDER}/{SOUNDS}, row {row}"
             sound = np.array(sounds[row], dtype=np.float64)
@@ -165,16 +170,90 @@ class RealImpact:
                     file=self.folder / identifier / FOLDER / SOUNDS,
                     row=row,
                 )
-            recording = Recording(name, sound[None], RATE, "FLOAT")
-            yield Blow(f"vertex_{vertices[row]}.wav", recording, places[row])
+            recording = Recording(name, sound[None], SAMPLE_RATE_HZ, "FLOAT")
+            yield DatasetRecording(f"vertex_{vertices[row]}.wav", recording, positions[row])
 
     def _report(self, identifier: str) -> ObjectReport:
         folder = self.folder / identifier / FOLDER
-        problems = {name: judge_array(folder / name, form, shown=f"{FOLDER}/{name}") for name, form in FORMS.items()}
-        wrong = [str(problem) for problem in problems.values() if problem is not None]
-        usable = not any(problems[name] for name in NEEDED)
+        problems, unusable = [], set()
+        for name in FORMS:
+            try:
+                self._array(identifier, name)
+            except DatasetError as error:
+                problems.append(str(error))
+                unusable.add(name)
         if not (folder / MESH).is_file():
-            wrong.append(f"{FOLDER}/{MESH}: expected a file to find the closest microphone, got none; unpack it again")
-            usable = False
-        count = len(np.unique(self._array(identifier, "vertexID.npy"))) if usable else 0
-        return ObjectReport(self.facts(identifier), count, tuple(wrong))
+            problems.append(
+                f"{FOLDER}/{MESH}: expected a file to find the closest microphone, got none; unpack it again"
+            )
+            unusable.add(NEEDED[0])
+        count = 0 if unusable & set(NEEDED) else len(np.unique(self._array(identifier, "vertexID.npy")))
+        return ObjectReport(self.facts(identifier), count, tuple(problems))
+
+
+def open_array(path: Path) -> np.ndarray:
+    """Return the array of a file of `FORMS`, mapped into memory: only its header is read.
+
+    Raises DatasetError unless it is whole and of its form.
+    """
+    dtype, shape = FORMS[path.name]
+    shown, advice = "/".join(path.parts[-3:]), "download or unpack it again"
+    if not path.is_file():
+        raise DatasetError(f"{shown}: expected a file, got none; {advice}", file=path)
+    try:
+        array = np.lib.format.open_memmap(path, mode="r")
+    except (OSError, ValueError) as error:
+        size = path.stat().st_size
+        raise DatasetError(
+            f"{shown}: expected a whole NumPy array, got {size} bytes ({error}); {advice}",
+            file=path,
+            name="size",
+            value=size,
+        ) from error
+    if (
+        array.dtype != dtype
+        or len(shape) != array.ndim
+        or any(map(lambda a, b: a not in (None, b), shape, array.shape))
+    ):
+        wanted = ", ".join("any" if length is None else str(length) for length in shape)
+        raise DatasetError(
+            f"{shown}: expected {dtype} ({wanted}), got {array.dtype} {array.shape}; take the published file",
+            file=path,
+            name="shape",
+            value=(str(array.dtype), *array.shape),
+        )
+    if not array.flags.c_contiguous:
+        raise DatasetError(
+            f"{shown}: expected row-major order, got column-major; take the published file",
+            file=path,
+            name="order",
+            value="F",
+        )
+    return array
+
+
+def closest_rows(
+    vertices: Int64[np.ndarray, " rows"],
+    microphones: Float64[np.ndarray, "rows 3"],
+    surface: Float64[np.ndarray, "points 3"],
+) -> tuple[list[int], bool]:
+    """Return, for each impact vertex in the order of the rows, the row of the microphone closest to the object.
+
+    The closest is the one with the smallest distance to the nearest point of the surface among the microphone positions
+    that all vertices have in common, so that the sounds differ by the contact only. The second value is whether there
+    are such positions; otherwise each vertex has its own closest microphone. Of equally close ones the first row is
+    taken.
+    """
+    tree = cKDTree(surface)
+    groups = [np.flatnonzero(vertices == vertex) for vertex in dict.fromkeys(vertices.tolist())]
+    first = groups[0]
+    matches = np.empty((len(groups), len(first)), dtype=np.int64)
+    common = np.ones(len(first), dtype=bool)
+    for index, group in enumerate(groups):
+        distance, nearest = cKDTree(microphones[group]).query(microphones[first])
+        matches[index] = group[nearest]
+        common &= distance <= SAME_POSITION_M
+    if not common.any():
+        return [int(group[np.argmin(tree.query(microphones[group])[0])]) for group in groups], False
+    best = int(np.argmin(np.where(common, tree.query(microphones[first])[0], np.inf)))
+    return [int(row) for row in matches[:, best]], True

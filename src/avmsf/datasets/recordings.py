@@ -15,20 +15,20 @@ from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.measure import measure, shared_problems
 from avmsf.capture.placement import judge_placement, surface_points
-from avmsf.capture.prepare import prepare
+from avmsf.capture.prepare import Prepared, prepare
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.starts import cut_together, shorten
+from avmsf.capture.starts import build_impacts, shorten
 from avmsf.capture.together import common_rate
 from avmsf.errors import CaptureError, CaptureWarning, DatasetError
 from avmsf.mesh.surface import Surface
 
-FEWEST = 2
-_SHOWN = 5
+MIN_RECORDINGS = 2
+MAX_SHOWN = 5
 
 
 @dataclass(frozen=True, eq=False)
-class Blow:
-    """One recording of a dataset, with what is known of the blow."""
+class DatasetRecording:
+    """One recording of a dataset, with what is known of the impact."""
 
     name: str
     """What the capture calls it."""
@@ -41,8 +41,8 @@ class Blow:
     """By how much the recorder made the sound louder, which is divided out."""
 
 
-def gather(
-    blows: Iterable[Blow],
+def build_capture(
+    recordings: Iterable[DatasetRecording],
     *,
     name: str,
     origin: str,
@@ -51,48 +51,43 @@ def gather(
     remarks: Sequence[str] = (),
     recorded: bool = True,
 ) -> Capture:
-    """Prepare an object's blows one after the other, as `read_capture` does, and return the object's capture.
+    """Prepare an object's recordings one after the other, as `read_capture` does, and return the object's capture.
 
-    `blows` may be read as it is asked for: only what is kept stays in memory. A recording that cannot be used (silent,
+    `recordings` may be read as they are asked for: only what is kept stays in memory. One that cannot be used (silent,
     too short after its impact) is left out. A `CaptureWarning` lists these, suspicious recordings, contacts off the
     surface or with several impacts, and the `remarks`. Computed sounds, not `recorded`, are not searched for clipping,
     noise and second impacts. Raises DatasetError, which names the `origin`, where fewer than two recordings
     remain or they do not fit together, and where contacts and surface count different units.
     """
-    kept: list[tuple[str, str, float, np.ndarray]] = []
-    recordings, reports, remarks = [], [], list(remarks)
+    kept: list[tuple[str, float, np.ndarray, Prepared]] = []
+    reports, remarks = [], list(remarks)
     try:
-        for blow in blows:
+        for each in recordings:
             try:
-                prepared = prepare(blow.recording, settings, newtons=blow.newtons)
+                prepared = prepare(each.recording, settings, newtons=each.newtons)
             except CaptureError as error:
                 remarks.append(f"left out: {error}")
                 continue
+            rate = each.recording.sample_rate
             if recorded:
                 # Clipping shows only before the amplifier's gain is divided out.
-                reports.append(measure(blow.recording, prepared, settings=settings, line=len(kept) + 1))
-            gain = 10 ** (-blow.gain_db / 20)
+                reports.append(measure(each.recording, prepared, settings=settings, line=len(kept) + 1))
+            gain = 10 ** (-each.gain_db / 20)
             prepared = replace(prepared, sound=prepared.sound * gain, before=prepared.before * gain)
-            recordings.append(shorten(prepared, rate=blow.recording.sample_rate, settings=settings))
-            kept.append((blow.name, blow.recording.name, blow.recording.sample_rate, blow.contact))
+            kept.append((each.name, rate, each.contact, shorten(prepared, rate=rate, settings=settings)))
         remarks += shared_problems(reports)
         refuse_few(len(kept), origin=origin, reasons=remarks)
-        names, files, rates, contacts = zip(*kept, strict=True)
-        rate = common_rate(rates, files)
-        cut = cut_together(recordings, files, rate=rate, settings=settings)
+        names, rates, contacts, parts = zip(*kept, strict=True)
+        impacts, warned = build_impacts(
+            parts,
+            torch.from_numpy(np.stack(contacts).astype(np.float64)),
+            names=names,
+            rate=common_rate(rates, names),
+            settings=settings,
+        )
     except CaptureError as error:
         raise DatasetError(f"{origin}: {error}", **error.attributes) from error
-    forces = [each.newtons for each in recordings]
-    impacts = Impacts(
-        contacts=torch.from_numpy(np.stack(contacts).astype(np.float64)),
-        sounds=cut.sounds,
-        sample_rate=rate * settings.playback_speed,
-        names=names,
-        forces=None if None in forces else torch.tensor(forces, dtype=torch.float32),
-        before=cut.before,
-        after=cut.after,
-    )
-    remarks += [str(each) for each in cut.remarks] + _repeated(impacts) + _misplaced(impacts, surface, origin=origin)
+    remarks += [str(each) for each in warned] + _repeated(impacts) + _misplaced(impacts, surface, origin=origin)
     if remarks:
         warnings.warn(CaptureWarning(f"{origin}: {listed(remarks)}", name=origin, value=tuple(remarks)), stacklevel=3)
     return Capture(name, impacts, surface)
@@ -100,13 +95,13 @@ def gather(
 
 def refuse_few(count: int, *, origin: str, reasons: Sequence[str]) -> None:
     """Raise DatasetError with the reasons where fewer than two recordings can be used."""
-    if count < FEWEST:
+    if count < MIN_RECORDINGS:
         raise DatasetError.expected(
-            f"at least {FEWEST} usable recordings with contacts", count, name=origin, advice=listed(reasons)
+            f"at least {MIN_RECORDINGS} usable recordings with contacts", count, name=origin, advice=listed(reasons)
         )
 
 
-def judge_wav(path: Path, *, shown: str, rate: float, frames: int) -> DatasetError | None:
+def check_wav(path: Path, *, shown: str, rate: float, frames: int) -> DatasetError | None:
     """Return the error of a sound file, from its header alone, whose message calls it `shown`; or None.
 
     Expected is one channel of at least so many frames at the rate, Hz.
@@ -141,8 +136,8 @@ def judge_wav(path: Path, *, shown: str, rate: float, frames: int) -> DatasetErr
 
 def listed(sentences: Sequence[str]) -> str:
     """Return the first messages, and how many more there are."""
-    more = f"; and {len(sentences) - _SHOWN} more" if len(sentences) > _SHOWN else ""
-    return "; ".join(sentences[:_SHOWN]) + more
+    more = f"; and {len(sentences) - MAX_SHOWN} more" if len(sentences) > MAX_SHOWN else ""
+    return "; ".join(sentences[:MAX_SHOWN]) + more
 
 
 def _repeated(impacts: Impacts) -> list[str]:
@@ -150,7 +145,7 @@ def _repeated(impacts: Impacts) -> list[str]:
     for name, contact in zip(impacts.names, impacts.contacts.tolist(), strict=True):
         places.setdefault(tuple(round(value, 6) for value in contact), []).append(name)
     repeated = [", ".join(names) for names in places.values() if len(names) > 1]
-    return [f"impacts at the same contact: {' and '.join(repeated[:_SHOWN])}"] if repeated else []
+    return [f"impacts at the same contact: {' and '.join(repeated[:MAX_SHOWN])}"] if repeated else []
 
 
 def _misplaced(impacts: Impacts, surface: Surface | None, *, origin: str) -> list[str]:

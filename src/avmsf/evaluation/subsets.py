@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 from avmsf.datasets import CaptureCollection
 from avmsf.datasets.dataset import Dataset
-from avmsf.datasets.subsets import ABLATION, NON_SYMMETRIC
+from avmsf.datasets.numbering import ABLATION, NON_SYMMETRIC
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.ground_truth import simulated
 from avmsf.evaluation.protocols import EvaluationProtocol

@@ -13,10 +13,9 @@ from torch import Tensor
 
 from avmsf.capture.audio import Recording
 from avmsf.capture.folder import Capture
-from avmsf.capture.impacts import Impacts
 from avmsf.capture.prepare import prepare
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.starts import cut_together, shorten
+from avmsf.capture.starts import build_impacts, shorten
 from avmsf.fem.damping import Vibration, damped
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.radiation import radiated, travel_time
@@ -282,16 +281,13 @@ def _captured(
     for file, force, sound in zip(truth.names, forces.tolist(), recordings, strict=True):
         recording = Recording(file, sound.double().numpy()[None], rate, "FLOAT")
         prepared.append(shorten(prepare(recording, settings, newtons=force), rate=rate, settings=settings))
-    cut = cut_together(prepared, truth.names, rate=rate, settings=settings)
-    impacts = Impacts(
-        contacts=strikes.written_places,
-        sounds=cut.sounds,
-        sample_rate=rate,
+    impacts, _ = build_impacts(
+        prepared,
+        strikes.written_places,
         names=truth.names,
+        rate=rate,
+        settings=settings,
         directions=strikes.written_directions.float(),
-        forces=forces,
-        before=cut.before,
-        after=cut.after,
     )
     return Capture(name, impacts, surface, settings)
 

@@ -9,7 +9,7 @@ import tyro
 
 from avmsf.cli.options.common import Printing
 from avmsf.cli.options.paths import Existing
-from avmsf.datasets.detect import expect_signs
+from avmsf.datasets.detect import detect_dataset
 
 
 @dataclass(frozen=True)
@@ -27,14 +27,12 @@ class Options(Printing):
     contact_data: Annotated[
         Path | None, tyro.conf.arg(metavar="FOLDER"), Existing("ObjectFolder Real's contacts", ("a folder",))
     ] = None
-    """ObjectFolder Real's contacts: a folder of arrays, or one of SonicGauss's lists."""
-    table: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), Existing("a table of objects", ())] = None
-    """A CSV or JSON list id, name, material of ObjectFolder Real's objects, numbered as published."""
+    """ObjectFolder Real's contacts: SonicGauss's lists in a folder, or one of them."""
 
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
-        expect_signs(self.dataset)
+        detect_dataset(self.dataset)
 
 
 def parse(words: Sequence[str]) -> Options:

@@ -10,7 +10,7 @@ import tyro
 from avmsf.cli.options.checks import expect_device, expect_modes
 from avmsf.cli.options.common import Flag, Printing, parse_options, spelled
 from avmsf.cli.options.paths import CacheFolder, Existing, OutputFolder
-from avmsf.datasets.detect import expect_signs
+from avmsf.datasets.detect import detect_dataset
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.names import expect_method, expect_protocol, expect_suited
 from avmsf.gaussians.config import SplatConfig
@@ -92,9 +92,7 @@ class Options(Printing):
     contact_data: Annotated[
         Path | None, tyro.conf.arg(metavar="FOLDER"), Existing("ObjectFolder Real's contacts", ("a folder",))
     ] = None
-    """ObjectFolder Real's contacts, for its raw form."""
-    table: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), Existing("a table of objects", ())] = None
-    """The published table of ObjectFolder Real's names and materials."""
+    """ObjectFolder Real's contacts: SonicGauss's lists in a folder, or one of them."""
     figures: Flag = False
     """Also draw figures/OBJECT.png in the folder of results: spectrograms of the recording and of all methods, 20 Hz to
     20 kHz, first second; with localize also each field's heat maps of three recordings, with the true contact
@@ -113,12 +111,12 @@ class Options(Printing):
             )
         expect_device(self.device, raising=EvaluationError)
         expect_modes(self.modes)
-        expect_signs(self.data)
+        detect_dataset(self.data)
 
 
 _NO_MATTER = (
     *("protocol", "data", "methods", "objects", "output", "cache", "metric", "workers", "ray", "device"),
-    *("contact_data", "table", "figures", "json", "quiet", "verbose"),
+    *("contact_data", "figures", "json", "quiet", "verbose"),
 )
 """Options that do not decide a result, or that a folder of results has as something else than an option."""
 

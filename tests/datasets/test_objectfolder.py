@@ -11,8 +11,7 @@ import torch
 
 from avmsf.capture import Capture
 from avmsf.datasets import ObjectFolderRaw
-from avmsf.datasets.annotations import Gains, read_gains, read_newtons
-from avmsf.datasets.contact_lists import read_contacts
+from avmsf.datasets.objectfolder import read_contacts, read_gain_db, read_newtons
 from avmsf.errors import CaptureWarning, DatasetError
 from factories.dataset_folders import (
     AUDIO_CONTACTS,
@@ -20,6 +19,7 @@ from factories.dataset_folders import (
     place,
     records,
     transfer,
+    write_contacts,
     write_mesh,
     write_raw,
     write_strike,
@@ -83,43 +83,33 @@ def test_the_deprecated_contact_is_passed_over(tmp_path: Path) -> None:
     assert dataset.check().objects[0].problems == ()
 
 
-def test_a_missing_note_of_the_gain_is_told_and_the_usual_gain_taken(tmp_path: Path) -> None:
+def test_a_missing_note_of_the_gain_is_named_and_the_usual_gain_taken(tmp_path: Path) -> None:
     for contact in ("34", "35", "36"):
         write_strike(tmp_path / "92" / "audio" / contact, gain=24.0, seed=35)
-    write_raw(tmp_path / "more", {"92": ()})
     (tmp_path / "92" / "audio" / "35" / "metadata.yaml").unlink()
-    dataset = ObjectFolderRaw(tmp_path, contacts=lists(tmp_path, "92", ("34", "35", "36")))
+    dataset = ObjectFolderRaw(tmp_path, contacts=write_contacts(tmp_path, {"92": ("34", "35", "36")}))
     capture, remarks = read_silently(dataset, "92")
     assert "metadata.yaml is missing for contact 35" in remarks
-    assert "24 dB less 20 dB by the pad" in remarks
+    assert "assumed to be 4 dB" in remarks
     assert torch.equal(capture.impacts.sounds[0], capture.impacts.sounds[1])
     (report,) = dataset.check().objects
     assert (report.recordings, len(report.problems)) == (3, 1)
 
 
-def lists(folder: Path, identifier: str, names: tuple[str, ...], *, lines: bool = True) -> Path:
-    path = folder / "objectfolder_real_train.json"
-    rows = records(identifier, names)
-    path.write_text("\n".join(map(json.dumps, rows)) if lines else json.dumps(rows))
-    return path
-
-
 @pytest.mark.parametrize("lines", [True, False])
-def test_lists_of_contacts_serve_as_arrays_do(folder: Path, tmp_path: Path, lines: bool) -> None:
-    path = lists(tmp_path, "2", AUDIO_CONTACTS, lines=lines)
-    listed = ObjectFolderRaw(folder, contacts=path)
-    for contact in AUDIO_CONTACTS:
-        assert np.array_equal(read_contacts(path).place("2", contact), place("2", contact))
-    assert listed.check().objects[0].recordings == 4
-    assert "contact 0 in objectfolder_real_train.json" in listed.check().objects[1].problems[0]
+def test_contacts_of_a_list_are_read_in_both_forms(folder: Path, tmp_path: Path, lines: bool) -> None:
+    path = write_contacts(tmp_path, {"2": AUDIO_CONTACTS}, lines=lines)
+    assert read_contacts([path]) == {("2", contact): tuple(place("2", contact)) for contact in AUDIO_CONTACTS}
+    for given in (path, tmp_path):
+        reports = ObjectFolderRaw(folder, contacts=given).check().objects
+        assert reports[0].recordings == 4
+        assert "contact coordinates in objectfolder_real_train.json" in reports[1].problems[0]
 
 
 def test_contacts_beside_the_folder_are_found(tmp_path: Path) -> None:
-    write_raw(tmp_path / "audio_tree", {"3": ("1", "2")}, contacts=False)
-    lists(tmp_path, "3", ("1", "2"))
-    assert (
-        ObjectFolderRaw(tmp_path / "audio_tree").capture("3").impacts.contacts[0].tolist() == place("3", "1").tolist()
-    )
+    dataset = ObjectFolderRaw(write_raw(tmp_path / "audio_tree", {"3": ("1", "2")}, contacts=False))
+    write_contacts(tmp_path, {"3": ("1", "2")})
+    assert dataset.capture("3").impacts.contacts[0].tolist() == place("3", "1").tolist()
 
 
 @pytest.mark.parametrize(
@@ -136,22 +126,21 @@ def test_lists_that_cannot_be_meant_are_refused(
 ) -> None:
     (tmp_path / "list.json").write_text(json.dumps(record) if isinstance(record, dict) else f"\n{json.dumps([record])}")
     with raises(DatasetError, file="list.json", row=row, name=name, value=value):
-        read_contacts(tmp_path / "list.json")
+        read_contacts([tmp_path / "list.json"])
 
 
 def test_one_contact_in_two_places_is_refused(tmp_path: Path) -> None:
     first, second = records("3", ("5", "6"))
     (tmp_path / "list.json").write_text(json.dumps([first, {**second, "location": first["location"]}]))
     with raises(DatasetError, file="list.json", row=1, name="5", value=tuple(second["contact"])):
-        read_contacts(tmp_path / "list.json")
+        read_contacts([tmp_path / "list.json"])
 
 
 def test_both_ways_to_write_the_notes(tmp_path: Path) -> None:
     (tmp_path / "block.yaml").write_bytes(b"gain:\r\n- 12\r\n- 18\r\npad:\r\n- 1\r\n- 0\r\n")
     (tmp_path / "flow.yaml").write_bytes(b"gain: [12, 18]\r\npad: [1, 0]\r\n")
-    for name in ("block.yaml", "flow.yaml"):
-        assert read_gains(tmp_path / name) == Gains((12.0, 18.0), (True, False))
-    assert read_gains(tmp_path / "flow.yaml").microphone_db == 18.0
+    (tmp_path / "pad.yaml").write_bytes(b"gain: [12, 18]\r\npad: [1, 1]\r\n")
+    assert [read_gain_db(tmp_path / f"{name}.yaml") for name in ("block", "flow", "pad")] == [18.0, 18.0, -2.0]
     for text in (b"- striking_force_newtons: 41.5\r\n", b"[{striking_force_newtons: 4.15e1}]"):
         (tmp_path / "force.yaml").write_bytes(text)
         assert read_newtons(tmp_path / "force.yaml") == 41.5
@@ -169,11 +158,11 @@ def test_both_ways_to_write_the_notes(tmp_path: Path) -> None:
 def test_notes_that_cannot_be_meant_are_refused(tmp_path: Path, text: str, name: str, value: object) -> None:
     (tmp_path / "metadata.yaml").write_text(f"{text}\n")
     with raises(DatasetError, file="metadata.yaml", name=name, value=value):
-        read_gains(tmp_path / "metadata.yaml")
+        read_gain_db(tmp_path / "metadata.yaml")
 
 
 def test_a_real_note_reads(shared: Path) -> None:
-    assert read_gains(shared / "bowl_clips" / "metadata.yaml") == Gains((12.0, 18.0), (True, True))
+    assert read_gain_db(shared / "bowl_clips" / "metadata.yaml") == -2.0
 
 
 def test_what_cannot_be_used_is_left_out_and_named(tmp_path: Path) -> None:
@@ -182,8 +171,8 @@ def test_what_cannot_be_used_is_left_out_and_named(tmp_path: Path) -> None:
     (audio / "1" / "Force.wav").unlink()
     (audio / "2" / "striking_force.yaml").unlink()
     (audio / "3" / "striking_force.yaml").write_text("- striking_force_newtons: 0\n")
-    (tmp_path / "contacts" / "7" / "4.npy").unlink()
-    np.save(tmp_path / "contacts" / "7" / "5.npy", np.zeros(3, dtype=np.float32))
+    write_contacts(tmp_path, {"7": ("0", "1", "2", "3", "5", "6", "7", "8", "9")})
+    (audio / "5" / "metadata.yaml").write_text("gain: [12]\n")
     samples = soundfile.read(audio / "6" / "mic.wav", dtype="int16")[0]
     soundfile.write(audio / "6" / "mic.wav", samples, 44_100, subtype="PCM_16")
     soundfile.write(audio / "7" / "mic.wav", samples[:200_000], RATE, subtype="PCM_16")
@@ -194,8 +183,8 @@ def test_what_cannot_be_used_is_left_out_and_named(tmp_path: Path) -> None:
         ("7/audio/1/Force.wav", "got none"),
         ("7/audio/2/striking_force.yaml", "got none"),
         ("7/audio/3/striking_force.yaml", "got 0"),
-        ("contacts/7/4.npy", "got none"),
-        ("contacts/7/5.npy", "got float32 (3,)"),
+        ("7/audio/4: expected contact coordinates in objectfolder_real_train.json", "got none"),
+        ("7/audio/5/metadata.yaml", "got 'gain: [12]'"),
         ("7/audio/6/mic.wav", "got 44100"),
         ("7/audio/7/mic.wav", "got 200000"),
     )
@@ -220,7 +209,7 @@ def test_without_contacts_check_says_where_to_get_them(tmp_path: Path) -> None:
     dataset = ObjectFolderRaw(write_raw(tmp_path / "of", {"7": ("0", "1")}, contacts=False))
     report = dataset.check()
     assert report.objects[0].recordings == 0
-    assert report.missing[0].startswith("contact coordinates, which the audio archives do not hold: put contacts/")
+    assert report.missing[0].startswith("contact coordinates, which the audio archives do not hold: put SonicGauss")
     with raises(DatasetError, name="ObjectFolder Real, object 7", value=0):
         dataset.capture("7")
 

@@ -111,7 +111,7 @@ def test_a_folder_that_is_empty_or_none_is_refused(place: Path, path: str, value
         (["100_Frisbee.zip", "10_bowl.zip"], ("100_Frisbee.zip", "10_bowl.zip"), "`unzip 100_Frisbee.zip`"),
         (["audio_data_1_10.tar.gz"], ("audio_data_1_10.tar.gz",), "`tar -xf audio_data_1_10.tar.gz`"),
         (["43_IronMortar/preprocessed/"], "preprocessed/", "RealImpact"),
-        (["1/vision/a.mp4", "2/vision/b.mp4"], ("1", "2"), "audio_data_1_10.tar.gz"),
+        (["1/vision/a.mp4", "2/vision/b.mp4"], ("1/", "2/"), "audio_data_1_10.tar.gz"),
         (["1/audio/0/"], "audio/", "audio archives"),
         (["readme.txt", "model.pth"], ("model.pth", "readme.txt"), "model.pth"),
     ],
@@ -130,8 +130,8 @@ def test_what_is_there_instead_is_named(tmp_path: Path, files: list[str], found:
 def test_options_of_another_dataset_are_refused(place: Path) -> None:
     with raises(DatasetError, file="impact/RI", name="contacts", value=str(place)):
         open_dataset(place / "impact/RI", contacts=place)
-    with raises(DatasetError, file="own/captures", name="table", value=str(place)):
-        open_dataset(place / "own/captures", table=place)
+    with raises(DatasetError, file="own/captures", name="contacts", value=str(place)):
+        open_dataset(place / "own/captures", contacts=place)
     with raises(DatasetError, file=place, name="contacts"):
         open_dataset(place / "raw/of", contacts=place).check()
 
@@ -172,7 +172,7 @@ def test_a_collection_s_check_reads_no_sound(tmp_path: Path, monkeypatch: pytest
     a, b, c, d = CaptureCollection(tmp_path).check().objects
     assert (a.recordings, a.problems) == (3, ())
     assert (b.recordings, len(b.problems)) == (0, 1)
-    assert b.problems[0].startswith("b.wav")
+    assert "b.wav: expected a sound file, got none" in b.problems[0]
     assert "'miles'" in c.problems[0]
     assert len(d.problems) == 1
     assert d.problems[0].startswith("shape.obj")

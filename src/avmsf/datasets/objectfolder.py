@@ -1,0 +1,378 @@
+"""ObjectFolder Real as it is published: a folder a contact, with the microphone, the hammer's force and two notes."""
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avmsf._utils.text_files import parse_json, read_text
+from avmsf.capture.audio import Recording, read_recording
+from avmsf.capture.folder import Capture
+from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.together import find_surface
+from avmsf.datasets.dataset import DatasetReport, Look, ObjectFacts, ObjectReport
+from avmsf.datasets.numbering import (
+    REALIMPACT_NAMES,
+    in_order,
+    in_words,
+    material_in,
+    number_of,
+    refuse_unknown,
+    shared_remarks,
+)
+from avmsf.datasets.recordings import DatasetRecording, build_capture, check_wav, refuse_few
+from avmsf.errors import CaptureError, DatasetError
+
+SAMPLE_RATE_HZ = 48_000.0
+"""Of all recordings of ObjectFolder Real."""
+FRAMES = 288_000
+"""Of each recording: 6 s, one of them before the impact."""
+PAD_DB = 20.0
+"""What the recorder's pad switch takes away."""
+DOWNLOAD = "https://download.cs.stanford.edu/viscam/ObjectFolder_Real"
+SETTINGS = CaptureSettings(force_channel=1, response_channel=2, normalize="peak")
+CONTACT_LISTS = ("objectfolder_real_train.json", "objectfolder_real_val.json")
+"""SonicGauss's lists of recordings with their contacts."""
+MESH_FOLDERS = ("mesh_16k", "mesh_64k", "mesh_full")
+"""The same scans in three resolutions, preferred in this order: about 16,000 faces are plenty to see where an impact
+was and to render pictures, and are read the fastest."""
+_MESH_SUFFIXES = (".obj", ".ply", ".glb", ".stl")
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_LISTED = re.compile(r"(?:^|/)(\d+)_(\d+)_[^/]*\.wav$")
+
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A contact's folder that can be used."""
+
+    contact: str
+    folder: Path
+    newtons: float
+    gain_db: float | None
+    """By how much the recorder made the sound louder; None where the note is missing."""
+
+
+class ObjectFolderRaw:
+    """ObjectFolder Real, unpacked from its audio archives: `<object>/audio/<contact>/mic.wav` and so on.
+
+    The archives hold no contacts: these come from SonicGauss's lists (`read_contacts`). `contacts` names one of them or
+    a folder with them; by default they are sought in the folder and its parent, and so are meshes (`find_mesh`).
+
+    Sounds start at the force's onset, or with `time_zero` "peak" at their peaks, as in the paper. They are divided by
+    the peak force in newtons and by the recorder's gain, so that one is the microphone's full scale at 0 dB of gain,
+    per newton.
+    """
+
+    name = "ObjectFolder Real"
+
+    def __init__(self, folder: str | Path, *, contacts: str | Path | None = None, time_zero: str | None = None) -> None:
+        self.folder = Path(folder)
+        self._settings = SETTINGS.starting(time_zero)
+        self._given_contacts = None if contacts is None else Path(contacts)
+
+    def objects(self) -> tuple[str, ...]:
+        """Return the numbers of all objects with recordings, in their order."""
+        return tuple(self._folders)
+
+    def facts(self, identifier: str) -> ObjectFacts:
+        """Return RealImpact's name and material for an object of this number, inferred; else its number alone.
+
+        Raises DatasetError for an unknown object.
+        """
+        self._check_known(identifier)
+        name = next((each for each in REALIMPACT_NAMES if number_of(each) == int(identifier)), None)
+        if name is None:
+            return ObjectFacts(identifier, identifier)
+        return ObjectFacts(identifier, in_words(name), material_in(name), inferred=True)
+
+    def capture(self, identifier: str) -> Capture:
+        """Read one object's recordings, in the order of their numbers. Raises DatasetError for an unknown object, and
+        where fewer than two recordings can be used; a warning names those that were left out."""
+        self._check_known(identifier)
+        entries, problems = self._examine(identifier)
+        origin = f"{self.name}, object {identifier}"
+        refuse_few(len(entries), origin=origin, reasons=problems or [self._no_contacts])
+        look = self.look(identifier)
+        try:
+            surface = None if look is None else find_surface(look.folder, look.settings)
+        except CaptureError as error:
+            raise DatasetError(f"{origin}: {error}", **error.attributes) from error
+        return build_capture(
+            self._recordings(identifier, entries),
+            name=self.facts(identifier).name,
+            origin=origin,
+            settings=self._settings,
+            surface=surface,
+            remarks=problems,
+        )
+
+    def look(self, identifier: str) -> Look | None:
+        """Return the object's scanned mesh; None where the meshes' archive was not unpacked here."""
+        self._check_known(identifier)
+        return find_mesh(self.folder, identifier)
+
+    def check(self) -> DatasetReport:
+        """Report which files are there and which are missing, from names and headers alone."""
+        reports = []
+        for identifier in self.objects():
+            entries, problems = self._examine(identifier)
+            reports.append(ObjectReport(self.facts(identifier), len(entries), tuple(problems)))
+        missing, remarks = self._missing_archives(), shared_remarks(self.objects(), "RealImpact")
+        if not mesh_folders(self.folder):
+            mesh = f"meshes, the only visual input: unpack {DOWNLOAD}/mesh/mesh_16k.tar.gz in {self.folder}"
+            missing.insert(0, mesh)
+        if self._contact_files:
+            remarks.insert(0, f"contacts are read from {', '.join(map(str, self._contact_files))}")
+        else:
+            missing.insert(0, self._no_contacts)
+        remarks.append("names are inferred from RealImpact's numbers")
+        return DatasetReport(self.name, tuple(reports), tuple(missing), tuple(remarks))
+
+    @cached_property
+    def _folders(self) -> dict[str, Path]:
+        """The `audio` folder of each object."""
+        found = {path.name: path / "audio" for path in self.folder.iterdir() if path.name.isdecimal()}
+        return {name: found[name] for name in in_order(found) if any(found[name].glob("[0-9]*/*.wav"))}
+
+    @cached_property
+    def _contact_files(self) -> tuple[Path, ...]:
+        return find_contacts(self.folder, self._given_contacts)
+
+    @cached_property
+    def _contacts(self) -> Mapping[tuple[str, str], Point]:
+        return read_contacts(self._contact_files)
+
+    @property
+    def _no_contacts(self) -> str:
+        return (
+            "contact coordinates, which the audio archives do not hold: put SonicGauss's "
+            f"{' and '.join(CONTACT_LISTS)} into {self.folder} or its parent"
+        )
+
+    def _check_known(self, identifier: str) -> None:
+        if identifier not in self._folders:
+            refuse_unknown(identifier, self._folders, self.name)
+
+    def _examine(self, identifier: str) -> tuple[list[_Entry], list[str]]:
+        """Return the usable recordings, and a message for each problem or assumption."""
+        entries, problems, unknown_gains = [], [], []
+        for folder in sorted(
+            self._folders[identifier].iterdir(), key=lambda path: (number_of(path.name) or 0, path.name)
+        ):
+            contact = folder.name
+            if not folder.is_dir() or contact.startswith(".") or contact.endswith("_deprecated"):
+                continue
+            if not contact.isdecimal():
+                problems.append(f"audio/{contact}: expected a contact's number as name; it is left out")
+                continue
+            wrong, newtons, gain_db = self._check_folder(identifier, contact, folder)
+            if wrong:
+                problems += wrong
+                continue
+            if gain_db is None:
+                unknown_gains.append(contact)
+            entries.append(_Entry(contact, folder, newtons, gain_db))
+        if unknown_gains:
+            assumed = _usual_gain(entries)
+            taken = "0 dB" if assumed is None else f"{assumed:g} dB, the most frequent of the object's recordings"
+            problems.append(
+                f"metadata.yaml is missing for contact {', '.join(unknown_gains)}: the recorder's gain is assumed to "
+                f"be {taken}"
+            )
+        return entries, problems
+
+    def _check_folder(self, identifier: str, contact: str, folder: Path) -> tuple[list[str], float, float | None]:
+        """Return why a contact's recording cannot be used, a message for each reason; its force and its gain."""
+        shown = f"{identifier}/audio/{contact}"
+        found = [
+            check_wav(folder / name, shown=f"{shown}/{name}", rate=SAMPLE_RATE_HZ, frames=FRAMES)
+            for name in ("mic.wav", "Force.wav")
+        ]
+        wrong = [str(error) for error in found if error is not None]
+        newtons, gain_db = math.nan, None
+        try:
+            gain_db = read_gain_db(folder / "metadata.yaml") if (folder / "metadata.yaml").is_file() else None
+            newtons = read_newtons(folder / "striking_force.yaml")
+        except DatasetError as error:
+            wrong.append(str(error))
+        if (identifier, contact) not in self._contacts and (self._contact_files or not wrong):
+            files = ", ".join(path.name for path in self._contact_files)
+            wrong.append(f"{shown}: expected contact coordinates{files and f' in {files}'}, got none")
+        return wrong, newtons, gain_db
+
+    def _recordings(self, identifier: str, entries: list[_Entry]) -> Iterator[DatasetRecording]:
+        usual = _usual_gain(entries) or 0.0
+        for entry in entries:
+            force, sound = (read_recording(entry.folder / name) for name in ("Force.wav", "mic.wav"))
+            frames = min(force.frames, sound.frames)
+            channels = np.stack([force.channels[0, :frames], sound.channels[0, :frames]])
+            name = f"{identifier}/audio/{entry.contact}/mic.wav"
+            yield DatasetRecording(
+                name=f"{entry.contact}.wav",
+                recording=Recording(name, channels, sound.sample_rate, sound.subtype),
+                contact=np.array(self._contacts[identifier, entry.contact]),
+                newtons=entry.newtons,
+                gain_db=usual if entry.gain_db is None else entry.gain_db,
+            )
+
+    def _missing_archives(self) -> list[str]:
+        present = {int(name) for name in self._folders}
+        missing = []
+        for first in range(1, 100, 10):
+            archive = f"audio_data_{first}_{first + 9}.tar.gz"
+            if not present & set(range(first, first + 10)):
+                packed = (self.folder / archive).is_file()
+                source = archive if packed else f"{DOWNLOAD}/audio/{archive}"
+                missing.append(f"objects {first} to {first + 9}: unpack {source} in {self.folder}")
+        return missing
+
+
+def _usual_gain(entries: list[_Entry]) -> float | None:
+    """Return the commonest gain, the first of several; None where none is known."""
+    known = Counter(entry.gain_db for entry in entries if entry.gain_db is not None)
+    return known.most_common(1)[0][0] if known else None
+
+
+def find_mesh(folder: Path, identifier: str) -> Look | None:
+    """Return an object's mesh from the dataset's folder, a `mesh` folder in it, or beside it; None where there is none.
+
+    How the archives are laid out inside is not known for certain, so a mesh may be called `<object>.obj`, or be the one
+    mesh in a folder `<object>`, however deep.
+    """
+    for place in mesh_folders(folder):
+        flat = [place / f"{identifier}{suffix}" for suffix in _MESH_SUFFIXES]
+        deep = sorted(path for path in (place / identifier).rglob("*") if path.suffix.lower() in _MESH_SUFFIXES)
+        for path in (*flat, *deep):
+            if path.is_file():
+                return Look(path.parent, CaptureSettings(surface=path.name))
+    return None
+
+
+def mesh_folders(folder: Path) -> list[Path]:
+    """Return the folders of meshes that there are, the preferred first."""
+    places = [folder, folder / "mesh", folder.resolve().parent, folder.resolve().parent / "mesh"]
+    return [place / name for name in MESH_FOLDERS for place in places if (place / name).is_dir()]
+
+
+def find_contacts(folder: Path, given: Path | None = None) -> tuple[Path, ...]:
+    """Return the lists of contacts in the folder or its parent, or those that are `given`: one, or a folder with some.
+
+    Raises DatasetError where nothing `given` is there.
+    """
+    if given is not None and given.is_file():
+        return (given,)
+    for place in (folder, folder.resolve().parent) if given is None else (given,):
+        found = tuple(place / name for name in CONTACT_LISTS if (place / name).is_file())
+        if found:
+            return found
+    if given is not None:
+        got = "a folder without them" if given.is_dir() else "no file or folder"
+        raise DatasetError(
+            f"{given}: expected {' and '.join(CONTACT_LISTS)}, or one of these lists, got {got}",
+            file=given,
+            name="contacts",
+        )
+    return ()
+
+
+def read_contacts(files: Sequence[Path]) -> dict[tuple[str, str], Point]:
+    """Return the contacts of lists by object and contact, meters in the mesh's frame.
+
+    A list is one JSON array of objects, or has an object a line. Raises DatasetError for a list of another form, and
+    where a contact has two positions.
+    """
+    places: dict[tuple[str, str], Point] = {}
+    for path in files:
+        for row, record in _records(path):
+            key, place = _parse_record(record, path, row)
+            if places.setdefault(key, place) != place:
+                raise DatasetError(
+                    f"{path}, row {row}: expected one position of contact {key[1]} of object {key[0]}, got {place} "
+                    f"and {places[key]}; delete one",
+                    file=path,
+                    row=row,
+                    name=key[1],
+                    value=place,
+                )
+    return places
+
+
+def _records(path: Path) -> list[tuple[int, Any]]:
+    """Return a list's records with their rows: indices of one JSON list, or lines, from 1, with an object each."""
+    try:
+        text = read_text(path)
+        if text.lstrip().startswith("["):
+            return list(enumerate(parse_json(text)))
+        return [(row, parse_json(line)) for row, line in enumerate(text.splitlines(), start=1) if line.strip()]
+    except (OSError, ValueError) as error:
+        raise DatasetError(f"{path}: expected a JSON list of contacts, got {error}", file=path) from error
+
+
+def _parse_record(record: Any, path: Path, row: int) -> tuple[tuple[str, str], Point]:
+    location = record.get("location") if isinstance(record, dict) else None
+    found = _LISTED.search(location) if isinstance(location, str) else None
+    if found is None:
+        raise DatasetError.expected(
+            "a location that ends in OBJECT_CONTACT_3sec_48000hz.wav", location, file=path, row=row, name="location"
+        )
+    contact = record.get("contact")
+    numbers = isinstance(contact, list) and all(type(value) in (int, float) for value in contact)
+    if not numbers or len(contact) != 3 or not np.isfinite(contact).all():
+        raise DatasetError.expected("a contact of three numbers, meters", contact, file=path, row=row, name="contact")
+    x, y, z = map(float, contact)
+    return (str(int(found[1])), str(int(found[2]))), (x, y, z)
+
+
+def read_gain_db(path: Path) -> float:
+    """Return by how much the recorder made the microphone's sound louder, by its amplifier less its pad, dB.
+
+    A `metadata.yaml` has two lists, `gain` and `pad`, of the force and the microphone, in either of YAML's ways to
+    write lists. Raises DatasetError where the file holds anything else.
+    """
+    text = _read_note(path)
+    gain, pad = _pair(text, "gain", path), _pair(text, "pad", path)
+    if not set(pad) <= {0.0, 1.0}:
+        raise DatasetError.expected(
+            "pad 0 or 1 for each channel", pad, got=f"{pad[0]:g} and {pad[1]:g}", file=path, name="pad"
+        )
+    return gain[1] - PAD_DB * pad[1]
+
+
+def read_newtons(path: Path) -> float:
+    """Read the peak force of a `striking_force.yaml`, newtons. Raises DatasetError where it holds no force above 0."""
+    found = re.findall(rf"\bstriking_force_newtons['\"]?\s*:\s*({_NUMBER})[\s,}}\]]", _read_note(path) + "\n")
+    if len(found) != 1 or not 0 < float(found[0]) < math.inf:
+        raise DatasetError(
+            f"{path}: expected one striking_force_newtons above 0, got {', '.join(found) if found else 'none'}",
+            file=path,
+            name="striking_force_newtons",
+            value=tuple(map(float, found)),
+        )
+    return float(found[0])
+
+
+def _pair(text: str, key: str, path: Path) -> tuple[float, float]:
+    # Either `gain: [12, 18]`, or the key alone and below it a line `- 12` for each number.
+    flow = rf"\[\s*({_NUMBER})\s*,\s*({_NUMBER})\s*\]"
+    block = rf"\n\s*-\s*({_NUMBER})[ \t]*\n\s*-\s*({_NUMBER})(?![ \t]*\n\s*-)"
+    found = re.search(rf"^{key}[ \t]*:[ \t]*(?:{flow}|{block})[ \t]*$", text, flags=re.MULTILINE)
+    if found is None:
+        raise DatasetError.expected(f"{key} with a list of two numbers", text.strip()[:80], file=path, name=key)
+    first, second = (float(number) for number in found.groups() if number is not None)
+    return first, second
+
+
+def _read_note(path: Path) -> str:
+    try:
+        return read_text(path)
+    except (OSError, ValueError) as error:
+        got = "none" if isinstance(error, FileNotFoundError) else "a file that cannot be read"
+        raise DatasetError.expected("a text", got=got, file=path, advice="unpack or download it again") from error
