@@ -28,7 +28,7 @@ from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.sound_field import SoundField
 from avmsf.localization.contact_map import ContactMap
-from avmsf.localization.published import PublishedLocator
+from avmsf.localization.cosine_distance import PublishedLocator
 from avmsf.modal.extraction.finders import ShortTime
 from factories.plate_field import QUICK, plate_extraction, plate_features, plate_impacts
 from factories.plate_set import PlateLooks, fill_plates

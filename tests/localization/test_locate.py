@@ -12,7 +12,7 @@ from avmsf.field.sound_field import Origin
 from avmsf.localization.likelihood import Force
 from avmsf.localization.locate import MIN_EXPLAINED, REJECT_ABOVE, WARN_ABOVE, assess_match, locate
 from avmsf.localization.locator import Locator
-from avmsf.localization.smoothing import distinct_contacts
+from avmsf.localization.prediction import distinct_contacts
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.synthesis import synthesize_phased
 from factories.believing_field import bar_contacts, drawn_gains, elastic_field, sound_field

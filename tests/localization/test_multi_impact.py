@@ -8,8 +8,8 @@ import torch
 from avmsf.capture.audio import Recording
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
+from avmsf.localization.locate import detect_onsets, locate_impacts, predict_ringing
 from avmsf.localization.locator import Locator
-from avmsf.localization.multi_impact import detect_onsets, locate_impacts, predict_ringing
 from factories.located_plate import PLATE, RATE, locator_of, missed, struck, true_field
 from factories.raising import raises
 

@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from avmsf.localization.amplitudes import Extractor
-from avmsf.localization.locate import REJECT_ABOVE, WARN_ABOVE, locate
-from avmsf.localization.multi_impact import locate_impacts
+from avmsf.localization.locate import REJECT_ABOVE, WARN_ABOVE, locate, locate_impacts
 from avmsf.localization.streaming import StreamingLocalizer
 from factories.damped_plates import RATE, damped_blows, damped_field, damped_locator
 

@@ -14,8 +14,7 @@ from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import LocationError
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.localization.locator import Locator
-from avmsf.localization.ringing import Ringing
-from avmsf.localization.streaming import WINDOW_SECONDS, LocatedImpact, StreamingLocalizer
+from avmsf.localization.streaming import WINDOW_SECONDS, LocatedImpact, Ringing, StreamingLocalizer
 from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
 from factories.made_fields import BANK, positional

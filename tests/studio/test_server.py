@@ -38,8 +38,8 @@ from avmsf.field.store import load, save
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
 from avmsf.localization.contact_map import enlarged
+from avmsf.localization.locate import locate_impacts
 from avmsf.localization.locator import Locator
-from avmsf.localization.multi_impact import locate_impacts
 from avmsf.pipeline.config import CACHE, PRESETS
 from avmsf.studio import edit, locate, server, studio, worker
 from avmsf.studio.locate import Finder

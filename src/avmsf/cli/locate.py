@@ -24,9 +24,8 @@ from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
 from avmsf.localization.contact_map import ContactMap, not_located, symmetries_of
 from avmsf.localization.likelihood import Force
-from avmsf.localization.locate import locate
+from avmsf.localization.locate import locate, locate_impacts
 from avmsf.localization.locator import Locator
-from avmsf.localization.multi_impact import locate_impacts
 from avmsf.symmetry.symmetries import Symmetries
 
 UNLOCATED = 2

@@ -21,8 +21,8 @@ from avmsf.evaluation.simple_methods import NearestRecording
 from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.points import farthest_points
 from avmsf.localization.contact_map import ContactMap
+from avmsf.localization.cosine_distance import PublishedLocator
 from avmsf.localization.locator import Locator
-from avmsf.localization.published import PublishedLocator
 from avmsf.modal.config import scaled_fft_size
 
 CANDIDATES = 2000

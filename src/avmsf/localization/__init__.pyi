@@ -3,7 +3,7 @@ from .contact_map import EquivalentPoint as EquivalentPoint
 from .contact_map import Peak as Peak
 from .likelihood import Force as Force
 from .locate import locate as locate
+from .locate import locate_impacts as locate_impacts
 from .locator import Locator as Locator
-from .multi_impact import locate_impacts as locate_impacts
 from .streaming import LocatedImpact as LocatedImpact
 from .streaming import StreamingLocalizer as StreamingLocalizer

@@ -190,3 +190,40 @@ def _steady(cells: Float64[Tensor, "frames bands"]) -> float:
 def _at(values: Float64[Tensor, " bins"], count: int) -> Float64[Tensor, " bands"]:
     """Return values spread evenly over a band, at `count` evenly spread places of it."""
     return torch.nn.functional.interpolate(values[None, None], size=count, mode="linear", align_corners=True)[0, 0]
+
+
+DETUNINGS = (0.9, 0.95, 1.05, 1.1)
+"""Factors on all frequencies: 5 % is a half-power bandwidth of a mode that turns six times while it falls to 1/e."""
+
+
+@dataclass(frozen=True, eq=False)
+class DetunedModes:
+    """A bank's modes at each of `DETUNINGS`, for sounds of one length."""
+
+    poles: tuple[Complex128[Tensor, " _modes"], ...]
+    """Of each detuning, apart: their products with a sound are faster one after the other than all at once."""
+    inverses: tuple[Float64[Tensor, "_two_modes _two_modes"], ...]
+    """As `Extractor.inverse`."""
+
+    @classmethod
+    def of(cls, bank: ModalBank, *, sample_rate: float, samples: int, highest: float) -> "DetunedModes":
+        """Return it for sounds at `sample_rate` Hz, of the modes that stay below `highest` Hz.
+
+        A detuning that leaves no mode below is left out; those downwards leave all that are below in tune.
+        """
+        poles, inverses = [], []
+        for factor in DETUNINGS:
+            kept = torch.nonzero(factor * bank.frequency < highest).flatten()
+            if len(kept):
+                moved = ModalBank(factor * bank.frequency[kept], bank.damping[kept])
+                poles.append(poles_of(moved, sample_rate))
+                inverses.append(Extractor.of(moved, sample_rate=sample_rate, samples=samples).inverse)
+        return cls(tuple(poles), tuple(inverses))
+
+    def fitted(self, sound: Float[Tensor, " samples"]) -> Float64[Tensor, " detunings"]:
+        """Return the energy of a sound that the modes explain at each detuning, noise included."""
+        energies = []
+        for poles, inverse in zip(self.poles, self.inverses, strict=True):
+            products = project(sound[None], poles)[0][0]
+            energies.append(products @ inverse @ products)
+        return torch.stack(energies)

@@ -96,11 +96,8 @@ class Force:
     def __post_init__(self) -> None:
         for name, value in (("expected", self.expected), ("spread_db", self.spread_db)):
             if not (math.isfinite(value) and value > 0.0):
-                raise LocationError(
-                    f"force.{name}: expected a number above 0, got {value:g}; leave the force out if it is not known",
-                    name=f"force.{name}",
-                    value=value,
-                )
+                advice = "leave the force out if it is not known"
+                raise LocationError.expected("a number above 0", value, name=f"force.{name}", advice=advice)
 
 
 @dataclass(frozen=True, eq=False)

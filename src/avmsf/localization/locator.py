@@ -12,17 +12,20 @@ from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_floats
 from avmsf._utils.summary import short_repr
-from avmsf.capture.prepare import shortest_allowed
 from avmsf.errors import LocationError
 from avmsf.field.sound_field import SoundField
-from avmsf.localization.amplitudes import Amplitudes, Extractor
+from avmsf.localization.amplitudes import Amplitudes, DetunedModes, Extractor
 from avmsf.localization.contact_map import ContactMap
 from avmsf.localization.cosine_distance import cosine_distance
-from avmsf.localization.detuning import DetunedModes
 from avmsf.localization.likelihood import Force, LikelihoodResult, PredictedGains, evaluate_likelihood
-from avmsf.localization.prediction import calibration_factor, local_variance, predict
-from avmsf.localization.preprocess import not_finite, silent, too_short
-from avmsf.localization.smoothing import distinct_contacts, smoothing_matrix
+from avmsf.localization.prediction import (
+    calibration_factor,
+    distinct_contacts,
+    local_variance,
+    predict,
+    smoothing_matrix,
+)
+from avmsf.localization.preprocess import check_sound
 from avmsf.localization.tempering import calibrate_tempering
 from avmsf.modal.modes import ModalBank
 
@@ -119,7 +122,7 @@ class Locator:
         """
         known = None if force is None else Force.of(force)
         used = sound.detach().cpu()[: self.field.samples]
-        self._expect_sound(used)
+        check_sound(used.numpy()[None], self.field.sample_rate)
         length = self._length(len(used), float("inf") if highest is None else highest)
         amplitudes = length.extractor.extract(used, color=self.field.residual if self.use_noise_model else None)
         detuned = length.detuned.fitted(used)
@@ -167,17 +170,6 @@ class Locator:
     def _tempering_factor(self) -> float:
         return calibrate_tempering(self.field)
 
-    def _expect_sound(self, sound: Float[Tensor, " samples"]) -> None:
-        rate = self.field.sample_rate
-        least = shortest_allowed(rate)
-        if len(sound) < least:
-            raise too_short(None, len(sound), least, rate)
-        wrong = int((~torch.isfinite(sound)).sum())
-        if wrong:
-            raise not_finite(None, wrong)
-        if float(sound.max()) == float(sound.min()):
-            raise silent(None)
-
     def _length(self, samples: int, highest: float) -> "_Length":
         key = (samples, highest)
         with self._lock:
@@ -210,12 +202,9 @@ class _Length:
         highest = min(highest, 0.5 * rate)
         modes = torch.nonzero(whole.frequency < highest).flatten()
         if not len(modes):
-            raise LocationError(
-                f"expected modes below {highest:g} Hz, got {len(whole)} from {float(whole.frequency.min()):g} Hz on; "
-                "record at a higher sample rate",
-                name="modes",
-                value=highest,
-            )
+            got = f"{len(whole)} from {float(whole.frequency.min()):g} Hz on"
+            advice = "record at a higher sample rate"
+            raise LocationError.expected(f"some below {highest:g} Hz", highest, got=got, name="modes", advice=advice)
         bank = ModalBank(whole.frequency[modes].double(), whole.damping[modes].double())
         extractor = Extractor.of(bank, sample_rate=rate, samples=samples, highest=highest)
         gains = locator.gains[:, modes]
@@ -315,11 +304,12 @@ def _expect_more_than_noise(values: Complex128[Tensor, " modes"], noise: Float64
     modes = len(values)
     chance, clear = 1.0 + 5.0 / modes**0.5, 12.0 + float(torch.log(torch.tensor(float(modes))))
     if float(surplus.mean()) < chance and float(surplus.max()) < clear:
-        raise LocationError(
-            f"expected the object's {modes} modes at {chance:.2g} times the noise or more, got "
-            f"{float(surplus.mean()):.2g} times; record it louder, or with less noise",
+        raise LocationError.expected(
+            f"the object's {modes} modes at {chance:.2g} times it or more",
+            float(surplus.mean()),
+            got=f"{float(surplus.mean()):.2g} times",
             name="noise",
-            value=float(surplus.mean()),
+            advice="record the impact louder, or with less noise",
         )
 
 
@@ -330,12 +320,8 @@ def _expect_points(
 ) -> None:
     if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not bool(torch.isfinite(points).all()):
         wrong, shape = int((~torch.isfinite(points)).sum()), list(points.shape)
-        raise LocationError(
-            f"points: expected finite positions [points, 3], got the shape {shape} with {wrong} values that are not "
-            "finite",
-            name="points",
-            value=shape,
-        )
+        got = f"the shape {shape} with {wrong} values that are not finite"
+        raise LocationError.expected("finite positions [points, 3]", shape, got=got, name="points")
     if directions is not None and directions.shape != points.shape:
         raise LocationError.expected(
             f"the shape of the points, {list(points.shape)}", list(directions.shape), name="directions"
@@ -346,15 +332,15 @@ def _expect_points(
         bad = torch.nonzero(~((length - 1.0).abs() <= _UNIT)).flatten()
         if len(bad):
             row = int(bad[0])
-            raise LocationError(
-                f"directions, row {row}: expected a unit vector, got {directions[row].tolist()} of length "
-                f"{float(length[row]):g}; divide each by its length",
-                name="directions",
+            raise LocationError.expected(
+                "unit vectors",
+                float(length[row]),
+                got=f"a length of {float(length[row]):g}",
                 row=row,
-                value=float(length[row]),
+                name="directions",
+                advice="divide each by its length",
             )
     fit = areas is None or (areas.shape == points.shape[:1] and bool((areas > 0).all() & torch.isfinite(areas).all()))
     if not fit:
-        raise LocationError(
-            f"areas: expected a number above 0 for each of {len(points)} points; leave areas out", name="areas"
-        )
+        wanted = f"a number above 0 for each of {len(points)} points"
+        raise LocationError.expected(wanted, got="others", name="areas", advice="leave areas out")

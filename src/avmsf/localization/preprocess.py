@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import scipy
 import torch
-from jaxtyping import Float32, Float64
+from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_floats, as_rate
@@ -108,42 +108,20 @@ def as_recording(
     if not isinstance(recording, Recording):
         samples = as_floats(recording, "recording").double().numpy()
         if samples.ndim != 1:
-            shape = list(samples.shape)
-            raise LocationError(
-                f"recording: expected the samples of one channel, got the shape {shape}; give one channel, or a "
-                "Recording",
-                name="recording",
-                value=shape,
-            )
+            shape, advice = list(samples.shape), "give one channel, or a Recording"
+            raise LocationError.expected("samples of one channel, in shape", shape, name="recording", advice=advice)
         try:
             rate = field.sample_rate if sample_rate is None else as_rate(sample_rate)
         except ArrayError as error:
             raise LocationError(str(error), **error.attributes) from error
         recording = Recording("the recording", samples[None], rate, "FLOAT")
     elif sample_rate is not None and sample_rate != recording.sample_rate:
-        raise LocationError(
-            f"{recording.name}: expected the recording's sample rate, {recording.sample_rate:g} Hz, got sample_rate = "
-            f"{sample_rate:g} Hz; leave sample_rate out",
-            file=recording.name,
-            name="sample_rate",
-            value=sample_rate,
-        )
+        wanted, advice = f"its own sample rate, {recording.sample_rate:g} Hz", "leave sample_rate out"
+        raise LocationError.expected(wanted, sample_rate, file=recording.name, name="sample_rate", advice=advice)
     if not (math.isfinite(recording.sample_rate) and recording.sample_rate > 0.0):
-        raise LocationError(
-            f"{recording.name}: expected a sample rate above 0, got {recording.sample_rate:g} Hz",
-            file=recording.name,
-            name="sample_rate",
-            value=recording.sample_rate,
-        )
-    channels = recording.channels
-    least = shortest_allowed(recording.sample_rate)
-    if recording.frames < least:
-        raise too_short(recording.name, recording.frames, least, recording.sample_rate)
-    wrong = int((~np.isfinite(channels)).sum())
-    if wrong:
-        raise not_finite(recording.name, wrong)
-    if not np.ptp(channels, axis=1).any():
-        raise silent(recording.name)
+        rate = recording.sample_rate
+        raise LocationError.expected("a sample rate above 0", rate, file=recording.name, name="sample_rate")
+    check_sound(recording.channels, recording.sample_rate, file=recording.name)
     return recording
 
 
@@ -152,35 +130,21 @@ def location_error(error: AvmsfError) -> LocationError:
     return LocationError(str(error), **error.attributes)
 
 
-def too_short(recording: str | None, samples: int, least: int, sample_rate: float) -> LocationError:
-    """Return the error for a sound with too few samples."""
-    return LocationError(
-        f"{recording or 'the sound'}: expected {least} samples or more, got {samples} "
-        f"({1e3 * samples / sample_rate:.3g} ms); record the impact until it has decayed",
-        file=recording,
-        name="samples",
-        value=samples,
-    )
-
-
-def not_finite(recording: str | None, count: int) -> LocationError:
-    """Return the error for a sound of which `count` samples are NaN or infinite."""
-    return LocationError(
-        f"{recording or 'the sound'}: expected finite samples, got {count} that are not; export it again",
-        file=recording,
-        name="finite",
-        value=count,
-    )
-
-
-def silent(recording: str | None) -> LocationError:
-    """Return the error for a sound that does not vary."""
-    return LocationError(
-        f"{recording or 'the sound'}: expected a sound, got silence; record the impact again",
-        file=recording,
-        name="sound",
-        value="silence",
-    )
+def check_sound(
+    channels: Float[np.ndarray, "channels samples"], sample_rate: float, *, file: str | None = None
+) -> None:
+    """Raise LocationError for a sound that is too short, not finite, or does not vary."""
+    samples, least = channels.shape[1], shortest_allowed(sample_rate)
+    if samples < least:
+        got, advice = f"{samples} ({1e3 * samples / sample_rate:.3g} ms)", "record the impact until it has decayed"
+        wanted = f"{least} samples or more"
+        raise LocationError.expected(wanted, samples, got=got, file=file, name="samples", advice=advice)
+    wrong = int((~np.isfinite(channels)).sum())
+    if wrong:
+        got = f"{wrong} samples that are not"
+        raise LocationError.expected("finite", wrong, got=got, file=file, name="finite", advice="export it again")
+    if not np.ptp(channels, axis=1).any():
+        raise LocationError.expected("a sound", "silence", file=file, name="sound", advice="record the impact again")
 
 
 def describe(recording: Recording, settings: CaptureSettings) -> list[str]:

@@ -21,7 +21,7 @@ from avmsf.errors import LocationError
 from avmsf.localization.contact_map import ContactMap
 from avmsf.localization.locate import assess_match
 from avmsf.localization.locator import Locator
-from avmsf.localization.ringing import Ringing
+from avmsf.modal.inner_products import gram, poles_of
 from avmsf.modal.modes import ModalBank
 
 WINDOW_SECONDS = 0.04
@@ -128,34 +128,24 @@ class StreamingLocalizer:
         field = locator.field
         rate = field.sample_rate
         if sample_rate is not None and sample_rate != rate:
-            raise LocationError(
-                f"sample_rate: expected the field's {rate:g} Hz, got {sample_rate:g} Hz; open the stream at this rate, "
-                "or locate finished recordings, which are resampled",
-                name="sample_rate",
-                value=sample_rate,
-            )
+            advice = "open the stream at this rate, or locate finished recordings, which are resampled"
+            wanted = f"the field's {rate:g} Hz"
+            raise LocationError.expected(wanted, sample_rate, name="sample_rate", advice=advice)
         if not 0.0 < window < 10.0:
-            raise LocationError(f"window: expected 0 to 10 s, got {window:g} s", name="window", value=window)
+            raise LocationError.expected("0 to 10 s", window, name="window")
         if not (later is None or window < later < 10.0):
-            raise LocationError(f"later: expected {window:g} s to 10 s, got {later:g} s", name="later", value=later)
+            raise LocationError.expected(f"{window:g} s to 10 s", later, name="later")
         lowest = min(_HIGHPASS_RATIO * float(field.bank.frequency.min()), _MAX_HIGHPASS_HZ)
         cut = lowest if highpass is None else highpass
         if not 0.0 <= cut < rate / 2:
-            raise LocationError.expected(
-                f"0 for no filter, or less than {rate / 2:g} Hz", cut, got=f"{cut:g} Hz", name="highpass"
-            )
+            raise LocationError.expected(f"0 for no filter, or less than {rate / 2:g} Hz", cut, name="highpass")
         if round(window * rate) < shortest_allowed(rate):
-            raise LocationError(
-                f"window: expected {shortest_allowed(rate)} samples or more to resolve the modes, got "
-                f"{round(window * rate)} ({window:g} s)",
-                name="window",
-                value=window,
-            )
+            wanted = f"{shortest_allowed(rate)} samples or more to resolve the modes"
+            got = f"{round(window * rate)} ({window:g} s)"
+            raise LocationError.expected(wanted, window, got=got, name="window")
         audible = torch.nonzero(field.audible).flatten()
         if not len(audible):
-            raise LocationError(
-                f"field: expected modes below {rate / 2:g} Hz, got none of {len(field.bank)}", name="field", value=0
-            )
+            raise LocationError.expected(f"modes below {rate / 2:g} Hz", 0, got="none", name="field")
         self.locator, self.rate = locator, rate
         self.hop = max(_MIN_HOP_SAMPLES, round(_HOP_SECONDS * rate))
         self.window = min(round(window * rate), field.samples)
@@ -165,11 +155,8 @@ class StreamingLocalizer:
         strength = locator.gains[:, audible].abs().square().mean(0).sqrt()
         bank = ModalBank(field.bank.frequency[audible], field.bank.damping[audible])
         self._modes = Ringing.of(bank, strength, sample_rate=rate, hop=self.hop, window=self.window)
-        self._kept_samples = (
-            (self.later or self.window)
-            + self.hop * (_MEMORY_HOPS + 2 * _SKIPPED_HOPS)
-            + round(_ONSET_SEARCH_SECONDS * rate)
-        )
+        memory = self.hop * (_MEMORY_HOPS + 2 * _SKIPPED_HOPS) + round(_ONSET_SEARCH_SECONDS * rate)
+        self._kept_samples = (self.later or self.window) + memory
         self.state = self._silence()
         locator.prepare(*(each for each in (self.window, self.later) if each is not None))
 
@@ -180,9 +167,8 @@ class StreamingLocalizer:
         """
         begun = time.perf_counter()
         if not bool(torch.isfinite(block).all()):
-            raise LocationError(
-                "block: expected finite samples, got NaN or infinity; leave them out or send zeros", name="block"
-            )
+            advice = "leave them out or send zeros"
+            raise LocationError.expected("finite samples", got="NaN or infinity", name="block", advice=advice)
         clear, highpass = self._filtered(block.detach().double().cpu(), self.state.highpass)
         state = replace(self.state, waiting=torch.cat([self.state.waiting, clear]), highpass=highpass)
         came = state.clock + len(state.waiting)
@@ -303,3 +289,66 @@ class StreamingLocalizer:
             return block, state
         passed, after = scipy.signal.sosfilt(self.filter, block.numpy(), zi=state.numpy())
         return torch.from_numpy(passed), torch.from_numpy(after)
+
+
+_QUIET = 1e-12
+"""Noise over the power of what is fitted, that is assumed at least: rounding."""
+_FAINTEST = 1e-3
+"""Strength over the strongest mode's, that every mode has at least beforehand."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ringing:
+    """An object's modes at one sample rate, and how strong each is beforehand."""
+
+    poles: Complex128[Tensor, " modes"]
+    window: Complex128[Tensor, "window modes"]
+    """Powers of the poles."""
+    hop: Complex128[Tensor, " modes"]
+    """The poles' powers by a hop."""
+    scale: Float64[Tensor, " two_modes"]
+    """Standard deviation of the sines' and cosines' amplitudes over the object's surface."""
+    vectors: Float64[Tensor, "two_modes two_modes"]
+    values: Float64[Tensor, " two_modes"]
+    """Eigenvectors and -values of the Gram matrix over a window, of amplitudes in units of `scale`: with these the fit
+    with any amount of noise is two small products."""
+
+    @classmethod
+    def of(
+        cls, bank: ModalBank, size: Float[Tensor, " modes"], *, sample_rate: float, hop: int, window: int
+    ) -> "Ringing":
+        """Return the ringing of modes that are as strong as `size` on average over the object, in any unit."""
+        poles = poles_of(bank, sample_rate)
+        relative = size.double() / size.double().max().clamp_min(torch.finfo(torch.float64).tiny)
+        scale = relative.clamp_min(_FAINTEST).repeat(2)
+        values, vectors = torch.linalg.eigh(gram(poles, window, power=0) * scale[:, None] * scale)
+        powers = poles ** torch.arange(window)[:, None]
+        return cls(poles, powers, poles**hop, scale, vectors, values.clamp_min(0.0))
+
+    def render(self, amplitudes: Complex128[Tensor, " modes"], length: int) -> Float64[Tensor, " samples"]:
+        """Return so many samples of what rings with amplitudes."""
+        if length <= len(self.window):
+            return (self.window[:length] @ amplitudes).imag
+        starts = range(0, length, len(self.window))
+        return torch.cat([(self.window[: length - n] @ self.after(amplitudes, n)).imag for n in starts])
+
+    def after(self, amplitudes: Complex128[Tensor, " modes"], samples: int) -> Complex128[Tensor, " modes"]:
+        """Return the amplitudes so many samples later."""
+        return amplitudes * self.poles**samples
+
+    def fit(self, sound: Float64[Tensor, " window"], noise: float) -> Complex128[Tensor, " modes"]:
+        """Return the likeliest amplitudes at a window's beginning, with white noise of this variance beside them.
+
+        Beforehand the modes are as strong as over the object's surface, all by one factor, which the sound's energy
+        beyond the noise gives: modes that a window is too short to part do not cancel each other.
+        """
+        energy = float(sound.square().sum())
+        modal = energy - noise * len(sound)
+        if not modal > 0.0:
+            return torch.zeros_like(self.poles)
+        factor = modal / float(self.values.sum())
+        share = max(noise, _QUIET * energy / len(sound)) / factor
+        products = sound.to(torch.complex128) @ self.window
+        both = torch.cat([products.imag, products.real]) * self.scale
+        sine, cosine = (self.scale * (self.vectors @ ((both @ self.vectors) / (self.values + share)))).chunk(2)
+        return torch.complex(sine, cosine)

@@ -20,8 +20,15 @@ from avmsf.field.sound_field import SoundField
 from avmsf.field.uncertainty import fitted_mixture, scale_of
 from avmsf.gaussians.points import farthest_points
 from avmsf.localization.likelihood import PredictedGains, evaluate_likelihood
-from avmsf.localization.prediction import calibration_factor, can_self_calibrate, local_variance, predict
-from avmsf.localization.smoothing import distinct_contacts, point_areas, smoothing_matrix
+from avmsf.localization.prediction import (
+    calibration_factor,
+    can_self_calibrate,
+    distinct_contacts,
+    local_variance,
+    point_areas,
+    predict,
+    smoothing_matrix,
+)
 
 _MAX_HOLDOUT = 12
 """Contacts that are left out, at most: those farthest apart."""

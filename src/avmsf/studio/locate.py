@@ -23,8 +23,8 @@ from avmsf.errors import AvmsfError
 from avmsf.field.scaled_gains import length_of
 from avmsf.field.sound_field import SoundField
 from avmsf.localization.contact_map import LEVEL, ContactMap, enlarged, symmetries_of
+from avmsf.localization.locate import locate_impacts
 from avmsf.localization.locator import Locator
-from avmsf.localization.multi_impact import locate_impacts
 from avmsf.studio.capture import CaptureEditor
 from avmsf.studio.files import Showcase
 from avmsf.studio.jobs import Threads
