@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from avmsf.errors import FitError
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.attention import AttentionGains, encode
 from avmsf.field.config import AttentionShape
@@ -128,13 +127,6 @@ def test_gains_do_not_depend_on_where_the_object_lies_or_on_how_large_it_is():
     torch.testing.assert_close(there.at(moved).mean, here.at(points()).mean, rtol=0, atol=1e-4)
 
 
-def test_contacts_in_float64_are_read_as_they_are():
-    net, contacts = network(), points(70)[60:]
-    gains = net.at(contacts.double()).mean
-    assert gains.dtype == torch.float32
-    assert torch.equal(gains, net.at(contacts).mean)
-
-
 def test_features_and_scales_in_float64_make_a_float32_network():
     single = features()
     double = FeatureField(single.points.double(), single.features.double(), "test")
@@ -167,23 +159,6 @@ def test_an_untrained_networks_gains_are_of_the_scale_it_was_given():
     assert float(size[2]) == 0
     assert bool((size[[0, 1, 3]] > 0.02).all())
     assert bool((size[[0, 1, 3]] < 5).all())
-
-
-@pytest.mark.parametrize("spatial", [False, True])
-def test_modes_put_in_another_order_are_the_same_modes(spatial):
-    net, order = network(replace(SHAPE, spatial_damping=spatial)), torch.tensor([2, 0, 3, 1])
-    before = net.at(points())
-    net.reorder(order)
-    after = net.at(points())
-    torch.testing.assert_close(after.mean, before.mean[:, order], rtol=1e-5, atol=1e-6)
-    if spatial:
-        torch.testing.assert_close(after.damping, before.damping[:, order], rtol=1e-5, atol=1e-6)
-
-
-def test_more_clusters_than_points_are_refused_with_the_most_that_there_can_be():
-    with pytest.raises(FitError) as caught:
-        network(replace(SHAPE, clusters=61))
-    assert all(each in str(caught.value) for each in ("clusters", "61", "60"))
 
 
 def test_encoding_in_closed_form():

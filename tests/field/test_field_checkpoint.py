@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from avmsf._utils.state import read_checkpoint, write_checkpoint
+from avmsf._utils.state import write_checkpoint
 from avmsf.errors import AvmsfWarning, FieldFileError, FitError
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import Progress, fit
@@ -253,12 +253,3 @@ def test_what_is_no_checkpoint_is_refused_and_kept(tmp_path, kind):
     # Torch's own words advise to switch its safety off.
     assert "weights_only" not in str(caught.value)
     assert checkpoint.read_bytes() == before
-
-
-def test_no_checkpoint_is_none(tmp_path):
-    assert read_checkpoint(tmp_path / "nowhere", {"fit": "x"}, what="a fit", raising=FieldFileError) is None
-
-
-def test_a_folder_is_no_checkpoint(tmp_path):
-    with raises(FieldFileError, file=tmp_path, value=None):
-        read_checkpoint(tmp_path, {"fit": "x"}, what="a fit", raising=FieldFileError)

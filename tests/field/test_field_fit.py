@@ -117,11 +117,6 @@ def test_recordings_in_float64_give_the_same_field():
     assert field.residual.magnitude.dtype == torch.float32
 
 
-def test_contacts_in_float32_and_float64_meet_the_same_points():
-    impacts = plate_impacts()
-    assert same(fitted(SHORT, train=replace(impacts, contacts=impacts.contacts.float())), short_fit())
-
-
 def flipped(modes: Extraction) -> Extraction:
     order = torch.arange(len(modes.bank)).flip(0)
     return Extraction(

@@ -7,7 +7,6 @@ from functools import cache
 import pytest
 import torch
 
-from avmsf.evaluation.renderer import Renderer
 from avmsf.field.fit import fit
 from avmsf.field.recipes import Attention
 from avmsf.field.sound_field import SoundField
@@ -104,10 +103,6 @@ def test_a_contacts_sound_does_not_depend_on_its_company(rows):
     torch.testing.assert_close(field().render(CONTACTS[rows]), sounds[rows], rtol=0, atol=1e-6 * loudest)
 
 
-def test_no_contacts_make_no_sounds():
-    assert field().render(CONTACTS[:0]).shape == (0, 2400)
-
-
 def test_force_scales_all_of_the_sound():
     sounds = field().render(CONTACTS)
     assert torch.equal(field().render(CONTACTS, forces=4.0), 4.0 * sounds)
@@ -126,12 +121,6 @@ def test_modes_of_a_longer_sound_begin_as_those_of_a_shorter_one(samples):
     assert field().render(CONTACTS, samples=samples).shape == (40, samples)
 
 
-def test_contacts_in_float32_and_float64_sound_alike():
-    sounds = field().render(CONTACTS)
-    assert sounds.dtype == torch.float32
-    assert torch.equal(field().render(CONTACTS.float()), sounds)
-
-
 def test_rendering_keeps_no_gradients_and_changes_no_chance():
     before = torch.get_rng_state()
     in_training = replace(field(), gain_field=deepcopy(field().gain_field).requires_grad_(True))
@@ -140,10 +129,3 @@ def test_rendering_keeps_no_gradients_and_changes_no_chance():
     assert not in_training.dampings(CONTACTS).requires_grad
     assert not any(parameter.requires_grad for parameter in field().gain_field.parameters())
     assert torch.equal(torch.get_rng_state(), before)
-
-
-def test_a_field_is_a_renderer():
-    assert isinstance(field(), Renderer)
-    assert field().samples == 2400
-    assert field().sample_rate == RATE
-    assert field().origin.per_newton is True

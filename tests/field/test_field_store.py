@@ -3,21 +3,17 @@
 import errno
 import json
 import os
-import random
 import resource
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-import numpy as np
 import pytest
-import soundfile
 import torch
 from safetensors import safe_open
 from safetensors.torch import load as from_bytes
@@ -28,7 +24,7 @@ from avmsf.errors import FieldFileError
 from avmsf.field.fit import fit
 from avmsf.field.header import FORMAT
 from avmsf.field.recipes import Attention
-from avmsf.field.sound_field import Origin, SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
 from factories.plate_field import PLATE, QUICK, plate_extraction, plate_features, plate_impacts
 from factories.raising import raises
@@ -91,16 +87,11 @@ def test_a_file_names_its_tensors_and_itself(tmp_path):
     assert record["origin"]["per_newton"] is True
 
 
-def test_saving_twice_gives_the_same_bytes(tmp_path):
+def test_saving_twice_gives_the_same_bytes_and_leaves_chance_alone(tmp_path):
+    before = torch.get_rng_state()
     save(field(), tmp_path / "one")
     save(load(tmp_path / "one"), tmp_path / "two")
     assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
-
-
-def test_loading_and_saving_leave_chance_alone(tmp_path):
-    before = torch.get_rng_state()
-    save(field(), tmp_path / "plate")
-    load(tmp_path / "plate")
     assert torch.equal(torch.get_rng_state(), before)
 
 
@@ -120,15 +111,6 @@ def test_missing_folders_are_made_and_what_is_there_is_replaced(tmp_path):
     save(other_field(), path)
     assert torch.equal(load(path).bank.damping, other_field().bank.damping)
     assert [each.name for each in path.parent.iterdir()] == ["plate.safetensors"]
-
-
-def test_a_saved_file_may_be_read_by_whom_the_umask_lets(tmp_path):
-    mask = os.umask(0o022)
-    try:
-        save(field(), tmp_path / "plate")
-    finally:
-        os.umask(mask)
-    assert (tmp_path / "plate").stat().st_mode & 0o777 == 0o644
 
 
 @pytest.mark.parametrize("place", ["file/plate", "."])
@@ -182,26 +164,6 @@ def test_a_full_disk_leaves_the_old_file_and_nothing_else(tmp_path):
     assert [each.name for each in tmp_path.iterdir()] == ["plate.safetensors"]
 
 
-@pytest.mark.slow
-def test_a_kill_while_saving_leaves_one_whole_field_or_the_other(tmp_path):
-    source, folder = tmp_path / "source", tmp_path / "there"
-    path = folder / "plate.safetensors"
-    save(field(), source)
-    save(other_field(), path)
-    # Saving again and again, so that the kill falls at any moment of it.
-    process = in_another_process("print('now', flush=True)\nwhile True: save(field, path)", source, path)
-    assert process.stdout is not None
-    with process:
-        assert process.stdout.readline() == "now\n"
-        time.sleep(random.Random(0).uniform(0.02, 0.05))
-        process.send_signal(signal.SIGKILL)
-    assert torch.equal(load(path).bank.frequency, field().bank.frequency)
-    left = {each.name for each in folder.iterdir()} - {path.name}
-    assert all(name.startswith(".plate.safetensors.") and name.endswith(".part") for name in left)
-    save(other_field(), path)
-    assert torch.equal(load(path).bank.damping, other_field().bank.damping)
-
-
 def test_a_kill_before_the_last_moment_leaves_the_old_field(tmp_path):
     source, path = tmp_path / "source", tmp_path / "there" / "plate.safetensors"
     save(field(), source)
@@ -236,44 +198,33 @@ def changed(tmp_path: Path, change: Change) -> Path:
     return path
 
 
-def test_a_file_written_again_unchanged_is_read(tmp_path):
-    assert torch.equal(load(changed(tmp_path, lambda *_: None)).render(CONTACTS), field().render(CONTACTS))
-
-
-@pytest.mark.parametrize("kept", [0, 5, 9, 100, 3000, -1])
-def test_a_file_cut_short_is_refused(tmp_path, kept):
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        *(lambda whole, kept=kept: whole[:kept] for kept in (0, 5, 9, 100, 3000, -1)),
+        lambda whole: b"a long text about bowls\n" * 9,
+        lambda whole: bytes(200),
+        lambda whole: b"RIFF" + bytes(2000),
+        lambda whole: to_bytes({"bank.frequency": torch.ones(3)}),
+        lambda whole: to_bytes({"bank.frequency": torch.ones(3)}, {"format": "pt"}),
+        *(
+            lambda whole, words=words: to_bytes(from_bytes(whole), {"avmsf": words})
+            for words in ("", "[]", "{", '"avmsf"', f'{{"format": {FORMAT}}}')
+        ),
+    ],
+)
+def test_a_file_cut_short_or_of_another_kind_is_refused(tmp_path, damaged):
     path = tmp_path / "plate.safetensors"
     save(field(), path)
-    path.write_bytes(path.read_bytes()[:kept])
+    path.write_bytes(damaged(path.read_bytes()))
     with raises(FieldFileError, file="plate.safetensors"):
         load(path)
 
 
-@pytest.mark.parametrize("kind", ["wav", "text", "pickle", "zeros"])
-def test_a_file_of_another_kind_is_refused(tmp_path, kind):
-    path = tmp_path / "something"
-    if kind == "wav":
-        soundfile.write(path, np.zeros(1000), 44100, format="WAV")
-    elif kind == "pickle":
-        torch.save({"bank.frequency": torch.ones(3)}, path)
-    else:
-        path.write_bytes({"text": b"a long text about bowls\n" * 9, "zeros": bytes(200)}[kind])
-    with raises(FieldFileError, file="something"):
-        load(path)
-
-
-def test_someone_elses_safetensors_are_refused(tmp_path):
-    for number, metadata in enumerate([None, {"format": "pt"}]):
-        (tmp_path / f"{number}").write_bytes(to_bytes({"bank.frequency": torch.ones(3)}, metadata))
-        with raises(FieldFileError, file=tmp_path / f"{number}", name="avmsf"):
-            load(tmp_path / f"{number}")
-
-
 def test_a_missing_file_and_a_folder_are_refused(tmp_path):
-    with raises(FieldFileError, file="nowhere"):
-        load(tmp_path / "nowhere")
-    with raises(FieldFileError, file=tmp_path):
-        load(tmp_path)
+    for path in (tmp_path / "nowhere", tmp_path):
+        with raises(FieldFileError, file=path):
+            load(path)
 
 
 def test_a_newer_format_is_refused_by_name(tmp_path):
@@ -343,16 +294,8 @@ def test_tensors_of_another_form_or_of_impossible_values_are_refused(tmp_path, n
         (("gains", "shape", "clusters"), 9, "gains.centers"),
         (("gains", "shape", "width"), 10**7, "gains.head.0.weight"),
         (("gains", "shape", "spatial_damping"), True, "gains.to_dampings.bias"),
-    ],
-)
-def test_a_record_that_is_not_of_these_tensors_is_refused(tmp_path, keys, value, name):
-    with raises(FieldFileError, file="plate.safetensors", name=name):
-        load(changed(tmp_path, lambda _, record: put(record, keys, value)))
-
-
-@pytest.mark.parametrize(
-    ("keys", "value", "name"),
-    [
+        (("origin", "settings", "highpass"), -1.0, ...),
+        (("origin", "report", "quality"), {"positions": 9, "error": 0.3, "nearest_mean": 0.7, "errors": 0.3}, ...),
         (("format",), "1", "format"),
         (("sample_rate",), "44100", "sample_rate"),
         (("sample_rate",), -1.0, "sample_rate"),
@@ -376,22 +319,9 @@ def test_a_record_that_is_not_of_these_tensors_is_refused(tmp_path, keys, value,
 )
 def test_a_damaged_record_is_refused_with_what_is_wrong(tmp_path, keys, value, name):
     path = changed(tmp_path, lambda _, record: put(record, keys, value))
-    with raises(FieldFileError, file="plate.safetensors", name=name):
-        load(path)
-
-
-@pytest.mark.parametrize(
-    ("keys", "value"),
-    [
-        (("origin", "settings", "highpass"), -1.0),
-        (("origin", "report", "quality"), {"positions": 9, "error": 0.3, "nearest_mean": 0.7, "errors": 0.3}),
-    ],
-)
-def test_a_damaged_origin_is_refused(tmp_path, keys, value):
-    path = changed(tmp_path, lambda _, record: put(record, keys, value))
     with raises(FieldFileError, file="plate.safetensors") as caught:
         load(path)
-    assert ("highpass" if "highpass" in keys else "errors") in str(caught.value)
+    assert name in (..., caught.value.name)
 
 
 @pytest.mark.parametrize(
@@ -407,15 +337,6 @@ def test_nothing_that_a_record_lacks_is_made_up(tmp_path, keys):
         load(changed(tmp_path, change))
     assert caught.value.name is not None
     assert caught.value.name.split(".")[-1] == keys[-1]
-
-
-@pytest.mark.parametrize("words", ["", "[]", "{", '"avmsf"', f'{{"format": {FORMAT}}}'])
-def test_a_record_that_is_none_is_refused(tmp_path, words):
-    path = tmp_path / "plate.safetensors"
-    save(field(), path)
-    path.write_bytes(to_bytes(from_bytes(path.read_bytes()), {"avmsf": words}))
-    with raises(FieldFileError, file="plate.safetensors"):
-        load(path)
 
 
 def put(record: dict, keys: tuple[str, ...], value: object) -> None:
@@ -434,8 +355,3 @@ def test_what_could_not_be_read_back_is_not_written(tmp_path):
         with raises(FieldFileError, file=path, name="origin.report"):
             save(replace(field(), origin=origin), path)
     assert not path.exists()
-
-
-def test_an_origin_that_says_nothing_is_kept(tmp_path):
-    save(replace(field(), origin=Origin()), tmp_path / "plate")
-    assert load(tmp_path / "plate").origin == Origin()

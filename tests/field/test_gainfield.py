@@ -292,9 +292,3 @@ def test_gains_of_other_modes_than_the_banks_are_not_saved(tmp_path):
     with raises(FieldFileError, name="gains.modes", value=3):
         save(sound_field(field), tmp_path / "plate")
     assert not list(tmp_path.iterdir())
-
-
-def test_an_unknown_kind_of_gain_field_is_refused(tmp_path):
-    path = changed("positional", tmp_path, {}, {"gains": {"kind": "wavelets"}})
-    with raises(FieldFileError, file="plate.safetensors", name="gains.kind", value="wavelets"):
-        load(path)

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from avmsf._utils.records import RecordError
-from avmsf.errors import FieldFileError
 from avmsf.field.scaled_gains import ScaledGains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save
@@ -68,10 +67,3 @@ def test_lengths_and_inner_fields_that_cannot_be_are_refused():
     record = ScaledGains(inner, FACTORS).record()
     with raises(RecordError, name="fitted_kind", value="scaled"):
         ScaledGains.skeleton(record | {"fitted_kind": "scaled"})
-
-
-def test_a_file_whose_factors_are_no_numbers_is_refused(tmp_path):
-    broken = ScaledGains(FIELDS["positional"](), FACTORS * torch.nan)
-    field = SoundField(BANK, broken, torch.zeros(5).double(), Residual(torch.zeros(9)), 8e3, 9, Origin())
-    with raises(FieldFileError, file=tmp_path / "one", name="gains.mode_factors"):
-        save(field, tmp_path / "one")
