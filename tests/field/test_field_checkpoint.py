@@ -192,40 +192,27 @@ def test_a_full_disk_costs_the_checkpoint_and_not_the_fit(tmp_path, monkeypatch)
         expect_same(fitted(tmp_path / "fit.checkpoint"), uninterrupted())
 
 
-def _louder(impacts, features, modes):
-    return replace(impacts, sounds=impacts.sounds * 1.5), features, modes, CONFIG
+def _bank(modes, factor):
+    return replace(modes, bank=replace(modes.bank, damping=modes.bank.damping * factor))
 
 
-def _faster(impacts, features, modes):
-    return replace(impacts, sample_rate=9000.0), features, modes, CONFIG
+def _noise(modes, factor):
+    return replace(modes, residual=replace(modes.residual, magnitude=modes.residual.magnitude * factor))
 
 
-def _turned(impacts, features, modes):
-    return replace(impacts, directions=-impacts.directions), features, modes, CONFIG
-
-
-def _undirected(impacts, features, modes):
-    return replace(impacts, directions=None), features, modes, CONFIG
-
-
-def _coarser(impacts, features, modes):
-    return impacts, plate_features(50), modes, CONFIG
-
-
-def _duller(impacts, features, modes):
-    return impacts, features, replace(modes, bank=replace(modes.bank, damping=modes.bank.damping * 2)), CONFIG
-
-
-def _hissing(impacts, features, modes):
-    residual = replace(modes.residual, magnitude=modes.residual.magnitude * 2)
-    return impacts, features, replace(modes, residual=residual), CONFIG
-
-
-def _seeded(impacts, features, modes):
-    return impacts, features, modes, replace(CONFIG, seed=1)
-
-
-@pytest.mark.parametrize("other", [_louder, _faster, _turned, _undirected, _coarser, _duller, _hissing, _seeded])
+@pytest.mark.parametrize(
+    "other",
+    [
+        lambda impacts, features, modes: (replace(impacts, sounds=impacts.sounds * 1.5), features, modes, CONFIG),
+        lambda impacts, features, modes: (replace(impacts, sample_rate=9000.0), features, modes, CONFIG),
+        lambda impacts, features, modes: (replace(impacts, directions=-impacts.directions), features, modes, CONFIG),
+        lambda impacts, features, modes: (replace(impacts, directions=None), features, modes, CONFIG),
+        lambda impacts, features, modes: (impacts, plate_features(50), modes, CONFIG),
+        lambda impacts, features, modes: (impacts, features, _bank(modes, 2), CONFIG),
+        lambda impacts, features, modes: (impacts, features, _noise(modes, 2), CONFIG),
+        lambda impacts, features, modes: (impacts, features, modes, replace(CONFIG, seed=1)),
+    ],
+)
 def test_a_checkpoint_of_other_arguments_is_refused_and_kept(tmp_path, other):
     checkpoint, impacts = tmp_path / "fit.checkpoint", plate_impacts(6, seconds=0.1)
     with pytest.raises(KeyboardInterrupt):

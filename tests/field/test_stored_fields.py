@@ -54,32 +54,24 @@ def test_edits_of_earlier_versions_have_the_present_names(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("entry", "name"),
+    ("report", "name"),
     [
-        ("x", "origin.report.edits.0"),
-        ({"a": 1}, "origin.report.edits.0.edit"),
-        ({"edit": "change_material"}, "origin.report.edits.0.to"),
-        ({"edit": "recast", "to": {"name": "wood"}}, "origin.report.edits.0.to.density"),
-        ({"edit": "adjust_modes", "decay": 1.0}, "origin.report.edits.0.pitch"),
-        ({"edit": "adjust_modes", "pitch": 0.0, "decay": 1.0}, "origin.report.edits.0.pitch"),
-        ({"edit": "adjust_modes", "pitch": [1.0], "decay": 1.0}, "origin.report.edits.0.pitch"),
+        ({EDITS: ["x"]}, "edits.0"),
+        ({EDITS: [{"a": 1}]}, "edits.0.edit"),
+        ({EDITS: [{"edit": "change_material"}]}, "edits.0.to"),
+        ({EDITS: [{"edit": "recast", "to": {"name": "wood"}}]}, "edits.0.to.density"),
+        ({EDITS: [{"edit": "adjust_modes", "decay": 1.0}]}, "edits.0.pitch"),
+        ({EDITS: [{"edit": "adjust_modes", "pitch": 0.0, "decay": 1.0}]}, "edits.0.pitch"),
+        ({EDITS: [{"edit": "adjust_modes", "pitch": [1.0], "decay": 1.0}]}, "edits.0.pitch"),
+        ({"supporting_poles": 3}, "supporting_poles"),
+        ({"supporting_poles": [[1]]}, "supporting_poles.0"),
+        ({"supporting_poles": [0, 1.0]}, "supporting_poles.1"),
+        ({"supporting_poles": [-1]}, "supporting_poles.0"),
+        ({"supporting_poles": [10_000]}, "supporting_poles.0"),
     ],
 )
-def test_what_is_no_edit_is_refused(entry, name, tmp_path):
+def test_edits_and_supporting_poles_that_cannot_be_are_refused(report, name, tmp_path):
     field = fields()["mixture"]
-    report = {**field.origin.report, EDITS: [entry]}
-    with raises(FieldFileError, name=name):
-        replace(field, origin=replace(field.origin, report=report)).save(tmp_path / "field.safetensors")
-        load(tmp_path / "field.safetensors")
-
-
-@pytest.mark.parametrize(
-    ("rows", "name"),
-    [(3, ""), ([[1]], ".0"), ([True], ".0"), ([0, 1.0], ".1"), ([-1], ".0"), ([10_000], ".0")],
-)
-def test_supporting_poles_that_are_no_rows_are_refused(rows, name, tmp_path):
-    field = fields()["mixture"]
-    report = {**field.origin.report, "supporting_poles": rows}
-    with raises(FieldFileError, name=f"origin.report.supporting_poles{name}"):
-        replace(field, origin=replace(field.origin, report=report)).save(tmp_path / "field.safetensors")
-        load(tmp_path / "field.safetensors")
+    damaged = replace(field, origin=replace(field.origin, report={**field.origin.report, **report}))
+    with raises(FieldFileError, name=f"origin.report.{name}"):
+        damaged.save(tmp_path / "field.safetensors")

@@ -135,14 +135,6 @@ def test_what_is_not_known_of_places_has_no_negative_variance(made: type, count:
         assert float(torch.linalg.eigvalsh(each.covariance).min()) > -1e-9 * size
 
 
-def test_of_one_hypothesis_the_covariances_are_those_of_the_deviation() -> None:
-    gains = of_one_hypothesis(8).gain_field
-    assert isinstance(gains, MixtureGains)
-    places = bar_contacts(30, seed=5)
-    variances = torch.stack([torch.diagonal(each.covariance) for each in gains.covariances(places, None)], dim=1)
-    torch.testing.assert_close(variances, gains.deviation(places).double().square().sum(2), rtol=1e-4, atol=1e-9)
-
-
 def test_gains_of_unknown_uncertainty_are_refused() -> None:
     impacts = plate_impacts()
     modes = plate_extraction(impacts)
@@ -159,6 +151,7 @@ ONE = torch.tensor([[0.4, 0.1, 0.0]])
     ("count", "candidates", "directions", "fault"),
     [
         (0, None, None, {"name": "count", "value": 0}),
+        *((count, None, None, {"name": "count"}) for count in (np.array([1, 2]), torch.tensor([1, 2]), True)),
         (1, torch.zeros(0, 3), None, {"name": "candidates", "value": 0}),
         (1, torch.tensor([[0.0, 0, 0], [0.0, float("nan"), 0]]), None, {"name": "candidates", "row": 1}),
         (1, torch.tensor([[0.4, 0.1, 0.2]]), None, {"name": "candidates", "row": 0, "value": [0.4, 0.1, 0.2]}),
@@ -171,16 +164,10 @@ ONE = torch.tensor([[0.4, 0.1, 0.0]])
     ],
 )
 def test_arguments_that_no_contact_can_be_suggested_for_are_refused(
-    count: int, candidates: Tensor | None, directions: Tensor | None, fault: dict[str, Any]
+    count: SupportsIndex, candidates: Tensor | None, directions: Tensor | None, fault: dict[str, Any]
 ) -> None:
     with raises(ArrayError if "row" in fault and "value" not in fault else FitError, **fault):
         suggest(of_one_hypothesis(), count, candidates=candidates, directions=directions)
-
-
-@pytest.mark.parametrize("count", [np.array([1, 2]), torch.tensor([1, 2]), True])
-def test_a_count_that_is_no_whole_number_is_refused(count: SupportsIndex) -> None:
-    with raises(FitError, name="count"):
-        suggest(of_one_hypothesis(), count)
 
 
 def test_a_place_that_was_struck_is_not_suggested_again() -> None:

@@ -221,15 +221,6 @@ def test_amplitudes_at_a_later_start_are_those_of_the_sounds_cut_there() -> None
     assert torch.allclose(read.turned(delays), cut.amplitude, rtol=0, atol=1e-3 * float(read.amplitude.abs().max()))
 
 
-def test_coherence_is_one_for_one_phase_modulo_pi_and_small_for_any() -> None:
-    generator = torch.Generator().manual_seed(2)
-    size = torch.randn(40, 6, dtype=torch.float64, generator=generator)
-    phase = torch.rand(6, dtype=torch.float64, generator=generator)
-    assert coherence(torch.polar(torch.ones_like(size), phase.expand(40, 6)) * size, DAMPING) == pytest.approx(1.0)
-    anywhere = 2 * math.pi * torch.rand(4000, 6, dtype=torch.float64, generator=generator)
-    assert coherence(torch.polar(torch.ones_like(anywhere), anywhere), DAMPING) < 0.05
-
-
 @pytest.mark.skipif(not (SHARED / "tree43").is_dir(), reason="needs the measured data: set AVMSF_SHARED")
 def test_measured_impulse_responses_cut_by_a_threshold_get_their_starts_back() -> None:
     files = sorted((SHARED / "tree43" / "impacts").glob("*.wav")) or sorted((SHARED / "tree43").glob("**/*.wav"))
