@@ -94,7 +94,8 @@ def test_both_sides_of_a_wall_are_filled_and_given_no_wall():
     outer, inner = trimesh.creation.icosphere(3, radius=0.06), trimesh.creation.icosphere(3, radius=0.054)
     inner.invert()
     messages: list[str] = []
-    found = nominal_bodies(surface_of(trimesh.util.concatenate([outer, inner])), count=8, dofs=8000, log=messages.append)
+    both = surface_of(trimesh.util.concatenate([outer, inner]))
+    found = nominal_bodies(both, count=8, dofs=8000, log=messages.append)
     assert [body.wall for body in found.bodies] == [None]
     # One line for all walls that are too thick, another for the surface's two parts.
     assert sum("not tried" in message for message in messages) == 2
