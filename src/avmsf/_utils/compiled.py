@@ -5,15 +5,13 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
 _CACHE_BYTES = 50_000_000
 """Several times what all compiled loops take."""
-_BEFORE_THE_FIRST: list[Callable[[], None]] = []
-"""Called once numba is imported."""
 MAX_LANES = 8
 """Most threads that one kernel runs on: with more, handing out the work costs what they save (kernels take ms)."""
 
@@ -47,8 +45,8 @@ class _Compiled:
     def made(self) -> Callable[..., Any]:
         import numba
 
-        while _BEFORE_THE_FIRST:
-            _BEFORE_THE_FIRST.pop()()
+        if _announcer is not None:
+            _announcer.listen()
         try:
             made: Callable[..., Any] = numba.njit(cache=_has_space(), **self.options)(self.function)
         except RuntimeError:
@@ -64,51 +62,57 @@ def _has_space() -> bool:
     return shutil.disk_usage(existing).free > _CACHE_BYTES
 
 
+class _Announcer:
+    """Reports what numba compiles from the moment that it listens, which imports numba."""
+
+    def __init__(self, log: Callable[[str], None], meanwhile: Callable[[str], AbstractContextManager[None]]) -> None:
+        self.log, self.meanwhile, self.told, self.listening = log, meanwhile, set[str](), False
+        # A function is compiled within another that calls it; numba compiles in one thread at a time.
+        self.running: list[AbstractContextManager[None]] = []
+
+    def listen(self) -> None:
+        if not self.listening:
+            from numba.core import event
+
+            event.Listener.register(_Announcer)
+            event.register("numba:compile", self)  # type: ignore[no-untyped-call]
+            self.listening = True
+
+    def notify(self, event: Any) -> None:
+        if not event.is_start:
+            self.running.pop().__exit__(None, None, None)
+            return
+        package, _, rest = event.data["dispatcher"].py_func.__module__.partition(".")
+        part, ours = rest.partition(".")[0], package == __package__.partition(".")[0]
+        message = f"compiling {_PARTS.get(part, part)} for this processor (once; the result is cached)"
+        self.running.append(self.meanwhile(message) if ours else nullcontext())
+        self.running[-1].__enter__()
+        if ours and part not in self.told:
+            self.told.add(part)
+            self.log(message)
+
+
+_announcer: _Announcer | None = None
+
+
 @contextmanager
 def announced(log: Callable[[str], None], meanwhile: Callable[[str], AbstractContextManager[None]]) -> Iterator[None]:
     """Report what is compiled: to `log` once for each part of the package, and by `meanwhile` for as long as it takes.
 
     Nothing is reported where all is cached.
     """
-    with ExitStack() as stack:
-
-        def listen() -> None:
+    global _announcer
+    _announcer = announcer = _Announcer(log, meanwhile)
+    if "numba" in sys.modules:
+        announcer.listen()
+    try:
+        yield
+    finally:
+        _announcer = None
+        if announcer.listening:
             from numba.core import event
 
-            event.Listener.register(_Announcer)
-            stack.enter_context(event.install_listener("numba:compile", _Announcer(log, meanwhile)))
-
-        if "numba" in sys.modules:
-            listen()
-        else:
-            _BEFORE_THE_FIRST.append(listen)
-        try:
-            yield
-        finally:
-            _BEFORE_THE_FIRST.clear()
-
-
-class _Announcer:
-    def __init__(self, log: Callable[[str], None], meanwhile: Callable[[str], AbstractContextManager[None]]) -> None:
-        self.log, self.meanwhile, self.told = log, meanwhile, set[str]()
-        # A function is compiled within another that calls it; numba compiles in one thread at a time.
-        self.running: list[AbstractContextManager[None]] = []
-
-    def notify(self, event: Any) -> None:
-        if event.is_start:
-            self.on_start(event)
-        else:
-            self.running.pop().__exit__(None, None, None)
-
-    def on_start(self, event: Any) -> None:
-        package, _, rest = event.data["dispatcher"].py_func.__module__.partition(".")
-        part, ours = rest.partition(".")[0], package == __package__.partition(".")[0]
-        words = f"compiling {_PARTS.get(part, part)} for this processor (once; the result is cached)"
-        self.running.append(self.meanwhile(words) if ours else nullcontext())
-        self.running[-1].__enter__()
-        if ours and part not in self.told:
-            self.told.add(part)
-            self.log(words)
+            event.unregister("numba:compile", announcer)  # type: ignore[no-untyped-call]
 
 
 _PARTS = {
