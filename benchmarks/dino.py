@@ -104,7 +104,7 @@ def _fit(*, quick_look: bool) -> dict[str, Any]:
     cloud = splat(train, config, rasterizer=rasterizer, progress=look)
     seconds = time.perf_counter() - began - judging
     figures = judge(cloud, held, rasterizer=rasterizer)
-    symmetries = find_symmetries(cloud.centers, seed=0, missing=0.1)
+    symmetries = find_symmetries(cloud.centers, seed=0)
     figures |= {"seconds": masking + seconds, "gigabytes": peak_gigabytes(), "gaussians": float(len(cloud))}
     return {
         "figures": figures,

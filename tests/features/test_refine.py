@@ -12,9 +12,9 @@ from avmsf.features.pooling import orbit_spread, refine
 from avmsf.symmetry.symmetries import MirrorSymmetry, RotationalSymmetry, Symmetries
 from factories.raising import raises
 
-SIXFOLD = RotationalSymmetry(torch.tensor([0.0, 0.0, 1.0]).double(), torch.zeros(3).double(), 6, 0.0, 0.0)
-ROUND = RotationalSymmetry(SIXFOLD.axis, SIXFOLD.point, None, 0.0, 0.0)
-UPRIGHT = MirrorSymmetry(torch.tensor([1.0, 0.0, 0.0]).double(), torch.zeros(3).double(), 0.0, 0.0)
+SIXFOLD = RotationalSymmetry(torch.tensor([0.0, 0.0, 1.0]).double(), torch.zeros(3).double(), 6, 0.0)
+ROUND = RotationalSymmetry(SIXFOLD.axis, SIXFOLD.point, None, 0.0)
+UPRIGHT = MirrorSymmetry(torch.tensor([1.0, 0.0, 0.0]).double(), torch.zeros(3).double(), 0.0)
 
 
 def symmetries(*found: RotationalSymmetry | MirrorSymmetry) -> Symmetries:

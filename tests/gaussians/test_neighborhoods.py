@@ -13,18 +13,12 @@ def ball(count: int = 4000) -> np.ndarray:
     return points / np.linalg.norm(points, axis=1, keepdims=True)
 
 
-def test_a_planes_normals_spacing_and_edges():
+def test_a_planes_normals_and_spacing():
     surface = read_neighborhoods(0.01 * GRID)
     assert np.allclose(np.abs(surface.normals[:, 2]), 1.0)
     inner = (np.abs(GRID[:, :2] - 19.5) < 10).all(axis=1)
     # The 24th neighbor's circle need not hold 24 cells exactly: between its rings of neighbors it is 10 % off.
     assert np.allclose(surface.spacing[inner], 0.01, rtol=0.1)
-    # Ties among equally far neighbors make the rest uneven.
-    assert np.linalg.norm(surface.openings[inner], axis=1).max() < 0.12
-    edge = surface.openings[(GRID[:, 0] == 0) & (np.abs(GRID[:, 1] - 19.5) < 10)]
-    # A half disc's mean lies 4 / (3 pi) radii inside its straight edge; a coarse grid adds its own column on the edge.
-    assert np.allclose(edge[:, 0], -4 / (3 * np.pi), atol=0.08)
-    assert np.abs(edge[:, 1:]).max() < 0.05
 
 
 def test_a_balls_normals_are_radial_and_noise_is_averaged_away():

@@ -22,8 +22,8 @@ def axis(number: int) -> torch.Tensor:
 
 
 def plate_symmetries() -> Symmetries:
-    mirrors = tuple(MirrorSymmetry(axis(number), middle(), 0.1, 0.0) for number in (0, 1))
-    return Symmetries((RotationalSymmetry(axis(2), middle(), 2, 0.1, 0.0),), mirrors, 0.005, 0.38, math.inf)
+    mirrors = tuple(MirrorSymmetry(axis(number), middle(), 0.1) for number in (0, 1))
+    return Symmetries((RotationalSymmetry(axis(2), middle(), 2, 0.1),), mirrors, 0.005, 0.38, math.inf)
 
 
 def made(probability: list[float]) -> ContactMap:
@@ -144,7 +144,7 @@ def test_a_place_that_no_symmetry_reaches_is_not_explained():
 
 
 def test_any_turn_is_found_for_a_round_object():
-    turns = Symmetries((RotationalSymmetry(axis(2), torch.zeros(3).double(), None, 0.1, 0.0),), (), 0.005, 0.38, 1.0)
+    turns = Symmetries((RotationalSymmetry(axis(2), torch.zeros(3).double(), None, 0.1),), (), 0.005, 0.38, 1.0)
     place, other = torch.tensor([0.1, 0.0, 0.05]), torch.tensor([0.0, 0.1, 0.05])
     named = EquivalentPoint.of(place, other, turns, probability=0.4, tolerance=0.01)
     assert named.angle == pytest.approx(math.pi / 2, abs=0.02)

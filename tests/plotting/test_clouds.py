@@ -18,8 +18,8 @@ from factories.raising import raises
 GENERATOR = torch.Generator().manual_seed(0)
 POINTS = torch.rand(300, 3, generator=GENERATOR) * torch.tensor([0.2, 0.1, 0.3])
 FOUND = Symmetries(
-    (RotationalSymmetry(torch.tensor([0.0, 0.0, 1.0]).double(), torch.tensor([0.1, 0.05, 0.0]).double(), 4, 0.1, 0.0),),
-    (MirrorSymmetry(torch.tensor([1.0, 0.0, 0.0]).double(), torch.tensor([0.1, 0.0, 0.0]).double(), 0.1, 0.0),),
+    (RotationalSymmetry(torch.tensor([0.0, 0.0, 1.0]).double(), torch.tensor([0.1, 0.05, 0.0]).double(), 4, 0.1),),
+    (MirrorSymmetry(torch.tensor([1.0, 0.0, 0.0]).double(), torch.tensor([0.1, 0.0, 0.0]).double(), 0.1),),
     0.01,
     0.35,
     1.0,

@@ -1,4 +1,4 @@
-"""Symmetries of clouds: closed-form shapes in any pose, noisy and cut, what is not symmetric, and a scanned bowl."""
+"""Symmetries of clouds: closed-form shapes in any pose, noisy and uneven, what is not symmetric, and a scanned bowl."""
 
 import math
 from pathlib import Path
@@ -103,17 +103,6 @@ def test_noise_and_uneven_cover_hide_no_symmetry():
     found = find(points)
     assert [each.order for each in found.rotations] == [2, 2, 2]
     assert len(found.mirrors) == 3
-    assert max(min(degrees(each.normal, axis) for axis in np.eye(3)) for each in found.mirrors) < 2.0
-
-
-@pytest.mark.slow
-def test_a_hole_kills_no_symmetry():
-    points = draw(trimesh.creation.box((1.0, 0.7, 0.4)), count=6000)
-    distance = np.linalg.norm(points - np.array([0.5, 0.35, 0.2]), axis=1)
-    found = find(points[distance > np.quantile(distance, 0.3)])
-    # The eighth of the box about one corner is gone, and 30 % of its points.
-    assert len(found.mirrors) == 3
-    assert max(each.missing for each in found.mirrors) > 0.3
     assert max(min(degrees(each.normal, axis) for axis in np.eye(3)) for each in found.mirrors) < 2.0
 
 

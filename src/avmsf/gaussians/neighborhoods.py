@@ -1,4 +1,4 @@
-"""What the surface is like about the points of a cloud: its normals, spacing and open edges, and shape descriptors.
+"""What the surface is like about the points of a cloud: its normals and spacing, and shape descriptors.
 
 A cloud knows no faces. A plane through a point's nearest points stands for the surface there, so that the normals have
 no side, and what is smaller than such a neighborhood is smoothed away. Nothing here depends on the object's pose.
@@ -12,8 +12,6 @@ from scipy.spatial import cKDTree
 
 NEIGHBORS = 24
 """Points that a plane is laid through: few enough for detail, enough to average noise away."""
-_WIDER = 2
-"""How many times more points open edges are judged by: chance moves the mean of a few points about."""
 _SHELLS = (0.08, 0.16, 0.28)
 """Radii in which descriptors see the surface, in diagonals of the object."""
 
@@ -28,27 +26,20 @@ class Neighborhoods:
     """Unit normals, of either sign."""
     spacing: Float[np.ndarray, " points"]
     """Side of the square of surface that falls to one point, in the unit of the points."""
-    openings: Float[np.ndarray, "points 3"]
-    """Which way the surface ends: the neighbors' mean seen from the point, reversed, within the plane, in radii of the
-    neighborhood: about 0 within a surface, .42 at a straight open edge."""
 
 
 def read_neighborhoods(points: Float[np.ndarray, "points 3"], *, count: int = NEIGHBORS) -> Neighborhoods:
     """Lay a plane through every point's `count` nearest points, itself among them."""
-    distances, rows = cKDTree(points).query(points, k=min(_WIDER * count, len(points)))
-    wide = points[rows] - points[:, None]
-    offsets = wide[:, :count]
+    distances, rows = cKDTree(points).query(points, k=min(count, len(points)))
+    offsets = points[rows] - points[:, None]
     means = offsets.mean(axis=1)
     centered = offsets - means[:, None]
     _, directions = np.linalg.eigh(np.einsum("nki,nkj->nij", centered, centered))
     normals = directions[:, :, 0]
     along = np.einsum("ni,ni->n", means, normals)[:, None] * normals
     # A disc of surface holds the neighbors: its area divided among them is what falls to each.
-    spacing = distances[:, offsets.shape[1] - 1] * np.sqrt(np.pi / offsets.shape[1])
-    lean = wide.mean(axis=1)
-    lean -= np.einsum("ni,ni->n", lean, normals)[:, None] * normals
-    openings = -lean / np.maximum(distances[:, -1:], np.finfo(float).tiny)
-    return Neighborhoods(points + along, normals, spacing, openings)
+    spacing = distances[:, -1] * np.sqrt(np.pi / offsets.shape[1])
+    return Neighborhoods(points + along, normals, spacing)
 
 
 def describe_neighborhoods(

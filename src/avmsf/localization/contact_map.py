@@ -36,8 +36,6 @@ _ANGLES = 360
 """Angles tried for a rotation about an axis that allows any."""
 _SYMMETRY_POINTS = 600
 """Points of the object in which symmetries are searched."""
-_MISSING = 0.02
-"""Fraction of the points that may have no image: a field's points cover their object."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,7 +315,7 @@ def not_located(reason: str) -> dict[str, Any]:
 def symmetries_of(field: SoundField) -> Symmetries | None:
     """Return the symmetries of a field's points; None where these are too few."""
     try:
-        return find_symmetries(field.gain_field.points, seed=0, missing=_MISSING, limit=_SYMMETRY_POINTS)
+        return find_symmetries(field.gain_field.points, seed=0, limit=_SYMMETRY_POINTS)
     except AvmsfError:
         return None
 

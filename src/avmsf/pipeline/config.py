@@ -73,9 +73,6 @@ class LiftConfig:
     """Principal components of the features to use; 0 uses the features unchanged."""
     symmetry: bool = True
     """Average the features over the symmetries of the object's shape."""
-    missing: float = 0.1
-    """Part of the object's surface that may have its counterpart in a hole of the points, for a symmetry to count: more
-    where large parts of the object are in no view, up to .45."""
     iterations: int = 3
     """How often features are pooled over the symmetries (paper: T)."""
     angles: int = 36
@@ -97,8 +94,6 @@ class LiftConfig:
         for name, least in {"longest": 1, "components": 0, "iterations": 1, "angles": 2, "points": 100}.items():
             if getattr(self, name) < least:
                 raise _scene_error(name, getattr(self, name), f"{least} or more")
-        if not 0 <= self.missing <= 0.45:
-            raise _scene_error("missing", self.missing, "0 to 0.45")
         if not 0 <= self.reach < math.inf:
             raise _scene_error("reach", self.reach, "a number of point spacings, or 0 for any distance")
         if not 0 < self.feature_size < math.inf:

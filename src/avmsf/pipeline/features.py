@@ -129,7 +129,7 @@ def finish_features(lifted: Lifted, config: LiftConfig) -> MadeFeatures:
     symmetries = None
     if config.symmetry:
         generator = torch.Generator().manual_seed(config.seed)
-        symmetries = find_symmetries(features.points, seed=generator, missing=config.missing)
+        symmetries = find_symmetries(features.points, seed=generator)
         report["symmetries"] = symmetries.to_dict()
         if symmetries:
             pooled = refine(

@@ -1,6 +1,6 @@
-"""How well a motion carries a cloud onto itself.
+"""Motions of space, how well they carry a cloud onto itself, and where they do so best.
 
-The cloud is divided by chance into two halves, and a motion is judged by how it carries points of the one onto the
+The cloud is divided at random into two halves, and a motion is scored by how it carries points of the one onto the
 surface that the other one samples. A symmetry does that as well as leaving the points where they are: what noise and
 uneven cover do to distances, they do to both, and it is taken away.
 """
@@ -9,33 +9,63 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from avmsf.gaussians.neighborhoods import Neighborhoods, read_neighborhoods
-from avmsf.symmetry.motions import Motion
 
-_REACH = 3.0
+_MAX_DISTANCE = 3.0
 """Distance in spacings from which on a point has no counterpart; counted distances end here."""
-_STRAY = 1.0
-"""Distance in spacings from which on a point is looked at together with the others that stray."""
-_CONTINUING = 0.45
-"""Part of a stray piece's border that has to continue the surface beyond an open edge for the piece to fill a hole."""
-_OPEN = 0.22
-"""Length of `Neighborhoods.openings` from which on a point lies at an edge of what was seen."""
+
+Vector = Float[np.ndarray, " 3"]
 
 
-@dataclass(frozen=True)
-class Alignment:
-    """How well a motion carries the cloud onto itself."""
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A reflection in a plane, or a turn about an axis."""
 
-    error: float
-    """Root mean square distance of moved points to the surface, without what noise alone makes, in spacings. Distances
-    count up to 3 spacings, and those of points that fall into a hole not at all."""
-    missing: float
-    """Part of the points that fall into a hole."""
+    direction: Vector
+    """Unit normal of the plane, or unit vector along the axis; of either sign."""
+    point: Vector
+    """A point of the plane or axis."""
+    angle: float | None
+    """Radians; None for a reflection."""
+
+    @property
+    def linear(self) -> Float[np.ndarray, "3 3"]:
+        """The motion without its shift."""
+        if self.angle is None:
+            return np.eye(3) - 2 * np.outer(self.direction, self.direction)
+        return Rotation.from_rotvec(self.angle * self.direction).as_matrix()
+
+    def apply(self, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
+        """Return where the points go."""
+        return (points - self.point) @ self.linear.T + self.point
+
+    def shifted(self, turn: Vector, shift: Vector) -> "Motion":
+        """Return the motion whose plane or axis is turned about the origin (rotation vector) and then shifted."""
+        carried = Rotation.from_rotvec(turn)
+        return replace(self, direction=carried.apply(self.direction), point=carried.apply(self.point) + shift)
+
+    def with_angle(self, angle: float) -> "Motion":
+        """Return a turn about the same axis by another angle."""
+        return replace(self, angle=angle)
+
+    def conjugated_by(self, other: "Motion") -> "Motion":
+        """Return the symmetry that follows from this and another one: the other's image of this plane or axis."""
+        return replace(self, direction=other.linear @ self.direction, point=other.apply(self.point[None])[0])
+
+    def centered(self) -> "Motion":
+        """Return the same motion, its point the one nearest to the origin."""
+        along = (self.point @ self.direction) * self.direction
+        return replace(self, point=along if self.angle is None else self.point - along)
+
+    def separation(self, other: "Motion") -> tuple[float, float]:
+        """Return the angle between two planes or axes, degrees, and how far apart they pass the origin."""
+        cosine = min(1.0, abs(float(self.direction @ other.direction)))
+        gap = self.centered().point - other.centered().point
+        return math.degrees(math.acos(cosine)), float(np.linalg.norm(gap))
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +79,6 @@ class Halves:
     """Median spacing of the target, or what stands for it, in the unit of the points: that of the errors."""
     noise: float
     """Mean square distance of queries that are not moved, in spacings squared."""
-    edge: float
-    """Part of the queries that, not moved, lie beyond an open edge."""
 
     @classmethod
     def of(
@@ -64,68 +92,81 @@ class Halves:
         """Divide a cloud, and draw `count` queries from one half; errors are in spacings, kept within `bounds`."""
         order = generator.permutation(len(points))
         moved, target = (read_neighborhoods(points[order[part::2]]) for part in (0, 1))
-        areas = moved.spacing**2
-        # Some points in a cloud lie alone: they would stand for much more than they show.
-        areas = np.minimum(areas, 4 * np.median(areas))
-        chosen = generator.choice(len(areas), min(count, len(areas)), replace=False, p=areas / areas.sum())
+        chosen = draw_by_area(moved, count, generator)
         spacing = float(np.clip(np.median(target.spacing), *bounds))
-        blank = cls(moved.points[chosen], target, cKDTree(target.points), spacing, noise=0.0, edge=0.0)
-        distance, missing = blank.compare(blank.queries)
-        return replace(blank, noise=float((distance[~missing] ** 2).mean()), edge=float(missing.mean()))
+        halves = cls(moved.points[chosen], target, cKDTree(target.points), spacing, noise=0.0)
+        return replace(halves, noise=halves.mean_square_distance(halves.queries))
 
-    def compare(
-        self, moved: Float[np.ndarray, "queries 3"]
-    ) -> tuple[Float[np.ndarray, " queries"], Bool[np.ndarray, " queries"]]:
-        """Return distances to the surface in spacings, up to 3, and which points fall into holes.
+    def mean_square_distance(self, moved: Float[np.ndarray, "queries 3"]) -> float:
+        """Return the mean square distance to the surface in spacings squared, distances counted up to 3 spacings.
 
-        Where there is a counterpart the distance is taken along the normal, since nothing marks a place within a
+        Where there is a counterpart the distance is taken along the normal, since nothing marks a position within a
         surface.
         """
-        reach, row = self.tree.query(moved)
-        normal = np.abs(np.einsum("ni,ni->n", moved - self.target.points[row], self.target.normals[row]))
-        lost = reach > _REACH * np.maximum(self.target.spacing[row], self.spacing)
-        distance = np.where(lost, _REACH, np.minimum(normal / self.spacing, _REACH))
-        return distance, _in_holes(moved, self.target, row, distance > _STRAY)
+        distance, index = self.tree.query(moved)
+        normal = np.abs(np.einsum("ni,ni->n", moved - self.target.points[index], self.target.normals[index]))
+        lost = distance > _MAX_DISTANCE * np.maximum(self.target.spacing[index], self.spacing)
+        counted = np.where(lost, _MAX_DISTANCE, np.minimum(normal / self.spacing, _MAX_DISTANCE))
+        return float((counted**2).mean())
 
-    def align(self, motion: Motion) -> Alignment:
-        """Judge a motion."""
-        distance, missing = self.compare(motion.apply(self.queries))
-        square = float((distance[~missing] ** 2).mean()) if not missing.all() else _REACH**2
-        return Alignment(math.sqrt(max(square - self.noise, 0.0)), max(0.0, float(missing.mean()) - self.edge))
+    def error(self, motion: Motion) -> float:
+        """Return the root mean square distance of moved points, without what noise alone makes, in spacings."""
+        return math.sqrt(max(self.mean_square_distance(motion.apply(self.queries)) - self.noise, 0.0))
 
 
-def _in_holes(
-    moved: Float[np.ndarray, "queries 3"],
-    target: Neighborhoods,
-    row: Int[np.ndarray, " queries"],
-    stray: Bool[np.ndarray, " queries"],
-) -> Bool[np.ndarray, " queries"]:
-    """Return which points fall beyond an open edge of the surface, where it may have been before a hole was left.
+def draw_by_area(
+    surface: Neighborhoods, count: int, generator: np.random.Generator, *, max_ratio: float = 4.0
+) -> Int[np.ndarray, " drawn"]:
+    """Return the indices of at most `count` points, drawn by the area that falls to each.
 
-    Stray points that hang together share a verdict, made where they border on the surface: points of a hole's filling
-    follow on from an edge, within the plane that the surface has there; those of a part that the object has on one side
-    only, a mug's handle, stand on the midst of the surface or off its plane.
+    Some points in a cloud lie alone, and would stand for much more than they show: an area counts up to `max_ratio`
+    times the median.
     """
-    away = moved - target.points[row]
-    reach = np.linalg.norm(away, axis=1)
-    opening, normal = target.openings[row], target.normals[row]
-    length = np.linalg.norm(opening, axis=1)
-    onward = (length > _OPEN) & (np.einsum("ni,ni->n", away, opening) > 0.5 * reach * length)
-    level = np.abs(np.einsum("ni,ni->n", away, normal)) < 0.45 * reach
-    missing = onward & (reach > target.spacing[row])
-    rows = np.flatnonzero(stray)
-    if len(rows) == 0:
-        return missing
-    piece = _pieces(moved[rows], link=6.0 * float(np.median(cKDTree(moved).query(moved, k=2)[0][:, 1])))
-    bordering = reach[rows] < 2.0 * _REACH * target.spacing[row[rows]]
-    continuing = np.bincount(piece, weights=bordering & (onward & level)[rows])
-    borders = np.bincount(piece, weights=bordering)
-    missing[rows] = (continuing > _CONTINUING * np.maximum(borders, 1.0))[piece]
-    return missing
+    areas = surface.spacing**2
+    areas = np.minimum(areas, max_ratio * np.median(areas))
+    return generator.choice(len(areas), min(count, len(areas)), replace=False, p=areas / areas.sum())
 
 
-def _pieces(points: Float[np.ndarray, "points 3"], *, link: float) -> Int[np.ndarray, " points"]:
-    """Return the number of the piece that each point belongs to; points nearer than `link` hang together."""
-    pairs = cKDTree(points).query_pairs(link, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
-    return connected_components(graph, directed=False)[1].astype(np.int64)
+def fit_motion(
+    motion: Motion,
+    halves: Halves,
+    *,
+    angles: tuple[float, ...] = (),
+    queries: int = 600,
+    steps: int = 14,
+    width: float = 0.05,
+) -> Motion:
+    """Return the motion with its plane or axis where moved points lie nearest to the surface.
+
+    Gauss-Newton on the distances along the target's normals: turning the plane or axis by w about the origin and
+    shifting it by v moves the image q = L p + t of p by w x q + v - L (w x p + v). Turns are fitted at all `angles`
+    together, their own by default. Distances are weighted down (Geman and McClure) beyond a width that shrinks from
+    `width` to half a spacing, so that one-sided parts lose their pull.
+    """
+    points = halves.queries[:queries]
+    turns = [motion.angle] if motion.angle is None or not angles else list(angles)
+    least = 0.5 * halves.spacing
+    scales: list[float] = np.geomspace(max(width, least), least, steps).tolist()
+    for scale in scales:
+        left, right = np.zeros((6, 6)), np.zeros(6)
+        for angle in turns:
+            moved_by = Motion(motion.direction, motion.point, angle)
+            linear, moved = moved_by.linear, moved_by.apply(points)
+            distance, index = halves.tree.query(moved, distance_upper_bound=3 * scale + 3 * halves.spacing)
+            met = np.isfinite(distance)
+            image, source, near = moved[met], points[met], index[met]
+            normal = halves.target.normals[near]
+            residual = np.einsum("ni,ni->n", image - halves.target.points[near], normal)
+            back = normal @ linear
+            slopes = np.c_[np.cross(image, normal) - np.cross(source, back), normal - back]
+            weights = (scale**2 / (scale**2 + distance[met] ** 2)) ** 2
+            left += slopes.T @ (weights[:, None] * slopes)
+            right -= slopes.T @ (weights * residual)
+        # Turning a plane within itself or an axis about itself changes nothing: those directions stay unmoved.
+        values, vectors = np.linalg.eigh(left)
+        kept = values > 1e-4 * values[-1]
+        step = vectors[:, kept] @ ((vectors[:, kept].T @ right) / values[kept])
+        length = float(np.linalg.norm(step))
+        step *= min(1.0, 0.15 / max(length, 1e-12))
+        motion = motion.shifted(step[:3], step[3:])
+    return motion

@@ -13,12 +13,11 @@ from jaxtyping import Float, Int
 from scipy.ndimage import distance_transform_edt
 
 from avmsf.gaussians.neighborhoods import Neighborhoods, describe_neighborhoods
-from avmsf.symmetry.motions import Motion
+from avmsf.symmetry.alignment import Motion, draw_by_area
 
 _CELLS = 56
 _DESCRIBED, _COUNTED, _PARTNERS = 900, 1800, 24
-_ALIKE_DEGREES, _ALIKE_GAP = 9.0, 0.05
-
+_SAME_DEGREES, _SAME_GAP = 9.0, 0.05
 
 Pairs = tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]
 """Rows of the first and of the second points of pairs."""
@@ -140,22 +139,19 @@ def turns_of_pairs(surface: Neighborhoods, pairs: Pairs, *, coarse: CoarseCloud,
 def distinct(motions: list[Motion], *, most: int) -> list[Motion]:
     """Return the first motions whose planes or axes differ from those before them."""
     chosen: list[Motion] = []
-    middle = np.zeros(3)
     for motion in motions:
         if len(chosen) == most:
             break
-        gaps = (motion.apart(other, middle) for other in chosen)
-        if not any(degrees < _ALIKE_DEGREES and gap < _ALIKE_GAP for degrees, gap in gaps):
+        gaps = (motion.separation(other) for other in chosen)
+        if not any(degrees < _SAME_DEGREES and gap < _SAME_GAP for degrees, gap in gaps):
             chosen.append(motion)
     return chosen
 
 
 def matching_pairs(surface: Neighborhoods, *, generator: np.random.Generator) -> Pairs:
     """Return rows of points that are far from one another and about which the surface is alike."""
-    areas = np.minimum(surface.spacing**2, 4 * np.median(surface.spacing**2))
-    shares = areas / areas.sum()
-    rows = generator.choice(len(areas), min(_DESCRIBED, len(areas)), replace=False, p=shares)
-    counted = generator.choice(len(areas), min(_COUNTED, len(areas)), replace=False)
+    rows = draw_by_area(surface, _DESCRIBED, generator)
+    counted = generator.choice(len(surface.points), min(_COUNTED, len(surface.points)), replace=False)
     described = describe_neighborhoods(surface, rows, counted, diagonal=1.0)
     squares = (described**2).sum(axis=1)
     unlike = squares[:, None] + squares - 2 * described @ described.T

@@ -17,10 +17,7 @@ from avmsf.symmetry.symmetries import MirrorSymmetry, RotationalSymmetry, Symmet
 
 TURNS = 12
 """Order that stands for a turn by any angle: waves up to half as many around the axis are told apart."""
-HOLES = 0.05
-"""Part of the surface that may have its counterpart in a hole, for a symmetry to count. Of the 20 simulated objects and
-two captures true ones have at most .02, those that a thin or open shape only seems to have from .12 on."""
-_ALIKE = math.sin(math.radians(7.5))
+_MAX_SINE = math.sin(math.radians(7.5))
 """Sine of the angle up to which lines are parallel or perpendicular: axes of groups up to order 12 are 15 degrees
 apart, so that no other lies nearer."""
 
@@ -37,8 +34,7 @@ class Group:
 
 def groups_of(symmetries: Symmetries) -> tuple[Group, ...]:
     """Return the groups that an object's symmetries form; none where it has none beyond doubt."""
-    mirrors = [each for each in symmetries.mirrors if each.missing <= HOLES]
-    turns = [each for each in symmetries.rotations if each.missing <= HOLES]
+    mirrors, turns = symmetries.mirrors, symmetries.rotations
     if not (mirrors or turns):
         return ()
     center = _center([*mirrors, *turns])
@@ -90,10 +86,10 @@ def _pairs(flips: Sequence[tuple[Float64[Tensor, " 3"], float]]) -> list[list[Fl
     found: list[list[Tensor]] = []
     for (line, sign), (other, other_sign) in itertools.combinations(flips, 2):
         cosine = float(line @ other)
-        if abs(cosine) <= _ALIKE:
+        if abs(cosine) <= _MAX_SINE:
             left, _, right = torch.linalg.svd(torch.stack([line, other]), full_matrices=False)
             one, two = left @ right
-        elif 1.0 - cosine**2 <= _ALIKE**2:
+        elif 1.0 - cosine**2 <= _MAX_SINE**2:
             one = two = torch.nn.functional.normalize(line + math.copysign(1.0, cosine) * other, dim=0)
         else:
             continue
@@ -106,7 +102,7 @@ def _pairs(flips: Sequence[tuple[Float64[Tensor, " 3"], float]]) -> list[list[Fl
 
 def _same(group: Sequence[Tensor], other: Sequence[Tensor]) -> bool:
     """Return whether two groups hold the same motions, up to how well their lines are known."""
-    return all(any(float((each - one).norm()) < 4.0 * _ALIKE for one in other) for each in group)
+    return all(any(float((each - one).norm()) < 4.0 * _MAX_SINE for one in other) for each in group)
 
 
 def _center(symmetries: Sequence[MirrorSymmetry | RotationalSymmetry]) -> Float64[Tensor, " 3"]:
@@ -116,7 +112,7 @@ def _center(symmetries: Sequence[MirrorSymmetry | RotationalSymmetry]) -> Float6
     side = (across @ points[..., None]).flatten()
     # The least change to the mean of their points: along what none of them fixes, it stays there.
     middle, matrix = points.mean(0), across.flatten(0, 1)
-    return middle + torch.linalg.pinv(matrix, rtol=_ALIKE) @ (side - matrix @ middle)
+    return middle + torch.linalg.pinv(matrix, rtol=_MAX_SINE) @ (side - matrix @ middle)
 
 
 def _across(symmetry: MirrorSymmetry | RotationalSymmetry) -> Float64[Tensor, "3 3"]:

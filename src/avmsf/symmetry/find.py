@@ -1,4 +1,4 @@
-"""Finding the symmetries of a cloud: candidates, each moved to its best place, judged, and completed by one another."""
+"""Finding the symmetries of a cloud: candidates, refined, tested, and completed by one another."""
 
 import math
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ from torch import Tensor
 from avmsf._utils.arrays import Seed, generator_of
 from avmsf.errors import SceneError
 from avmsf.gaussians.neighborhoods import NEIGHBORS, Neighborhoods, read_neighborhoods
-from avmsf.symmetry.alignment import Halves
+from avmsf.symmetry.alignment import Halves, Motion, draw_by_area
 from avmsf.symmetry.candidates import (
     CoarseCloud,
     distinct,
@@ -20,20 +20,18 @@ from avmsf.symmetry.candidates import (
     principal_motions,
     turns_of_pairs,
 )
-from avmsf.symmetry.group import Group, follows
-from avmsf.symmetry.motions import Motion
-from avmsf.symmetry.score import MISSING, Judge, Judged
+from avmsf.symmetry.group import Group, ScoredMotion, SymmetryTest, follows
 from avmsf.symmetry.symmetries import MirrorSymmetry, RotationalSymmetry, Symmetries
 
 TOLERANCE = 0.38
 """Largest error of a symmetry, in point spacings; see `find_symmetries`."""
 LIMIT = 8000
-"""Points of a cloud that are looked at."""
+"""Most points of a cloud that are used."""
 _QUERIES = 1500
 _SPACINGS = (0.01, 0.016)
 """Bounds of the spacing that errors are measured in, in diagonals: things are not made, nor scanned, more exactly than
 the first lets pass, and what is off by more than the second lets pass is so however few points there are."""
-_FEWEST = 10 * NEIGHBORS
+_MIN_POINTS = 10 * NEIGHBORS
 _PRIMES = (2, 3, 5, 7, 11)
 _MIRRORS, _AXES, _TURNS = 24, 30, 40
 """Candidates from matching pairs, and turns about the axes among them, that are fitted."""
@@ -44,14 +42,13 @@ def find_symmetries(
     *,
     seed: Seed = None,
     tolerance: float = TOLERANCE,
-    missing: float = MISSING,
     limit: int = LIMIT,
 ) -> Symmetries:
     """Return the rotations and mirror planes that carry a cloud of an object's surface onto itself.
 
-    The cloud may be noisy, cover the object unevenly, lie in any pose, and lack parts. At most `limit` points are
-    used, drawn so that dense parts lose most. Candidates come from the principal axes, from pairs of points with
-    similar surfaces around them, and from compositions of symmetries already found; each is refined to its best fit.
+    The cloud may be noisy, cover the object unevenly, and lie in any pose. At most `limit` points are used, drawn so
+    that dense parts lose most. Candidates come from the principal axes, from pairs of points with similar surfaces
+    around them, and from compositions of symmetries already found; each is refined to its best fit.
 
     **The tolerance.** One half of the points is moved onto the surface that the other half samples. The error is the
     root mean square of their distances from it, without what the distances are when nothing is moved (noise), in
@@ -59,16 +56,8 @@ def find_symmetries(
     up to 3 spacings. So `tolerance` lets the whole surface be off by that many spacings, or a part of
     (tolerance / 3)^2 of it, 1.6 % at the usual .38, have no counterpart at all.
 
-    **Holes.** Moved points without a surface near them are grouped into connected pieces. A piece is in a hole, and is
-    not counted, if it continues the surface: at least 45 % of its border lies beyond an open edge, within the plane
-    that the surface has there. Otherwise it is a part that the object has on one side only, like a mug's handle, and
-    is counted. At most the part `missing` may be in holes (43 % of an object of which 30 % are lost); the tolerance
-    decreases by the part that is. A cloud that covers its object needs far less, and a lower value gives
-    fewer false symmetries: where walls are no thicker than a few spacings, their rims resemble the edges of holes.
-    Compositions of two symmetries may have twice the error. A hole that is symmetric itself, under a rotation or two
-    planes, is an opening of the shape, like a cup's, and a motion that would fill it is not a symmetry. Nor is one that
-    fills holes and contradicts a symmetry that does not. So an object whose only asymmetric part was cut off is found
-    symmetric, and a symmetry whose every counterpart was cut off is not found.
+    So an object that is damaged, or of which large parts are in no view, has only the symmetries of what is there.
+    Compositions of two symmetries may have 1.15 times the error.
 
     Orders 2 to 12 are distinguished; an axis is continuous if every angle holds and no order holds better than the
     angles between its turns. Planes that contain a continuous axis and half turns across it follow from it and are not
@@ -76,20 +65,21 @@ def find_symmetries(
     line, and for a tolerance that is not positive.
     """
     if not tolerance > 0.0:
-        raise SceneError(f"tolerance: expected a number above 0, got {tolerance:g}", name="tolerance", value=tolerance)
-    if limit < _FEWEST:
-        raise SceneError(f"limit: expected at least {_FEWEST} points, got {limit}", name="limit", value=limit)
+        raise SceneError.expected("a number above 0", tolerance, name="tolerance")
+    if limit < _MIN_POINTS:
+        raise SceneError.expected(f"at least {_MIN_POINTS} points", limit, name="limit")
     random = np.random.default_rng(int(torch.randint(2**31 - 1, (1,), generator=generator_of(seed))))
     places, middle, diagonal = _normalized(points)
-    places = _evened(places, limit, random)
+    if len(places) > limit:
+        places = places[draw_by_area(read_neighborhoods(places), limit, random, max_ratio=9.0)]
     surface = read_neighborhoods(places)
     halves = Halves.of(places, _QUERIES, bounds=_SPACINGS, generator=random)
     coarse = CoarseCloud.of(surface, halves.queries[:150])
-    group = Group(Judge(halves, tolerance, missing))
+    group = Group(SymmetryTest(halves, tolerance))
     for motion in _candidates(surface, coarse, random):
         group.consider(motion)
-    for step in (group.leave_openings, group.leave_contradictions, group.complete, group.leave_openings):
-        step()
+    group.drop_crowded_mirrors()
+    group.complete()
     return _symmetries(group, halves.spacing, middle, diagonal)
 
 
@@ -99,7 +89,7 @@ def _candidates(surface: Neighborhoods, coarse: CoarseCloud, random: np.random.G
     axes = distinct([motion for motion in principal if motion.angle is not None], most=9)
     pairs = matching_pairs(surface, generator=random)
     axes += turns_of_pairs(surface, pairs, coarse=coarse, most=_AXES)
-    turns = [axis.turning(2 * math.pi / prime) for axis in axes for prime in _PRIMES]
+    turns = [axis.with_angle(2 * math.pi / prime) for axis in axes for prime in _PRIMES]
     yield from (turns[row] for row in np.argsort(-coarse.score_motions(turns))[:_TURNS])
     # Planes that contain an axis of any angle follow from it: axes are looked for first.
     yield from (motion for motion in principal if motion.angle is None)
@@ -114,17 +104,17 @@ def _symmetries(group: Group, spacing: float, middle: Float[np.ndarray, " 3"], d
         if not group.knows(each.motion) and not follows(each.motion, group.continuous)
     ]
 
-    def vectors(judged: Judged) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
-        point = middle + diagonal * judged.motion.centered(np.zeros(3)).point
-        return torch.from_numpy(_pointing(judged.motion.direction)), torch.from_numpy(point)
+    def vectors(found: ScoredMotion) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
+        point = middle + diagonal * found.motion.centered().point
+        return torch.from_numpy(_pointing(found.motion.direction)), torch.from_numpy(point)
 
     turns = sorted(group.turns, key=lambda each: (not each.continuous, -(each.order or 0), each.error))
     mirrors = sorted(group.mirrors, key=lambda each: each.error)
     return Symmetries(
-        tuple(RotationalSymmetry(*vectors(each), each.order, each.error, each.missing) for each in turns),
-        tuple(MirrorSymmetry(*vectors(each), each.error, each.missing) for each in mirrors),
+        tuple(RotationalSymmetry(*vectors(each), each.order, each.error) for each in turns),
+        tuple(MirrorSymmetry(*vectors(each), each.error) for each in mirrors),
         spacing * diagonal,
-        group.judge.tolerance,
+        group.test.tolerance,
         min(rejected, default=math.inf),
     )
 
@@ -133,47 +123,30 @@ def _normalized(
     points: Float[Tensor, "points 3"],
 ) -> tuple[Float[np.ndarray, "points 3"], Float[np.ndarray, " 3"], float]:
     """Return the points about their middle in units of their diagonal, and both."""
-    if len(points) < _FEWEST:
-        raise SceneError(
-            f"expected at least {_FEWEST} points of a surface to find symmetries, got {len(points)}; draw more points "
-            "from it, or reconstruct with more Gaussians",
+    if len(points) < _MIN_POINTS:
+        raise SceneError.expected(
+            f"at least {_MIN_POINTS} points of a surface to find symmetries",
+            len(points),
             name="points",
-            value=len(points),
+            advice="draw more points from it, or reconstruct with more Gaussians",
         )
     wrong = torch.nonzero(~torch.isfinite(points).all(dim=1)).flatten()
     if len(wrong):
         row = int(wrong[0])
-        raise SceneError(
-            f"points, row {row}: expected finite coordinates, got {points[row].tolist()} ({len(wrong)} of "
-            f"{len(points)} are not finite); remove these",
-            row=row,
-            name="points",
-            value=points[row].tolist(),
-        )
+        raise SceneError.expected("finite coordinates", points[row].tolist(), row=row, name="points")
     places = points.detach().double().cpu().numpy()
     middle = places.mean(axis=0)
     _, extent, axes = np.linalg.svd(places - middle, full_matrices=False)
     if extent[1] < 1e-3 * extent[0] or extent[0] == 0.0:
-        raise SceneError(
-            f"expected points all over an object's surface, got {len(points)} on one line or at one position (extent "
-            f"{extent[0]:.3g}, {extent[1]:.3g} and {extent[2]:.3g} m)",
+        raise SceneError.expected(
+            "points all over an object's surface, not on one line or at one position",
+            extent.tolist(),
+            got=f"{len(points)} with an extent of {extent[0]:.3g}, {extent[1]:.3g} and {extent[2]:.3g} m",
             name="points",
-            value=extent.tolist(),
         )
     # A box along the principal axes: the diagonal must not depend on how the object lies.
     diagonal = float(np.linalg.norm(np.ptp((places - middle) @ axes.T, axis=0)))
     return (places - middle) / diagonal, middle, diagonal
-
-
-def _evened(
-    places: Float[np.ndarray, "points 3"], limit: int, random: np.random.Generator
-) -> Float[np.ndarray, "chosen 3"]:
-    """Return at most `limit` points, drawn by the area that falls to each, so that dense parts give up most."""
-    if len(places) <= limit:
-        return places
-    areas = read_neighborhoods(places).spacing ** 2
-    areas = np.minimum(areas, 9 * np.median(areas))
-    return places[random.choice(len(places), limit, replace=False, p=areas / areas.sum())]
 
 
 def _pointing(direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:

@@ -25,9 +25,6 @@ class RotationalSymmetry:
     the axis mirrors the object too, and is not listed."""
     error: float
     """How far turned points lie from the surface, root mean square, in point spacings; see `find_symmetries`."""
-    missing: float
-    """Part of the surface, 0 to 1, whose counterpart lies in a hole of the cloud, so that nothing speaks for or against
-    it."""
 
     @property
     def continuous(self) -> bool:
@@ -62,8 +59,6 @@ class MirrorSymmetry:
     """The point of the plane nearest to the object's middle, meters."""
     error: float
     """As for a rotation."""
-    missing: float
-    """As for a rotation."""
 
     def reflect(self, points: Float[Tensor, "points 3"]) -> Float[Tensor, "points 3"]:
         """Return the points' mirror images."""
@@ -93,39 +88,30 @@ class Symmetries:
     def summary(self) -> str:
         """Return sentences on the symmetries found, their errors, and how clear these are."""
         found: list[RotationalSymmetry | MirrorSymmetry] = [*self.rotations, *self.mirrors]
-        against = (
-            f"the best of what was not accepted, for its error or for holes, has an error of {self.rejected:.2f}"
-            if math.isfinite(self.rejected)
-            else "there was no other candidate"
-        )
         measure = f"in point spacings of {1000 * self.spacing:.2g} mm; accepted up to {self.tolerance:g}"
+        nearest = f"the best rejected candidate has an error of {self.rejected:.2f}"
+        if not math.isfinite(self.rejected):
+            nearest = "there was no other candidate"
         if not found:
-            nearest = (
-                f"the nearest candidate has an error of {self.rejected:.2f}" if math.isfinite(self.rejected) else ""
-            )
-            return f"no symmetry found{': ' + nearest if nearest else ''} ({measure})"
-        lines = [
-            f"{each}: error {each.error:.2f}, {_sureness(each.error, self.tolerance, self.rejected)}"
-            + (
-                f"; {100 * each.missing:.0f} % of the surface is symmetric to a hole in the points"
-                if each.missing >= 0.02
-                else ""
-            )
-            for each in found
-        ]
-        return "\n".join([*lines, f"errors are {measure}; {against}"])
+            return f"no symmetry found: {nearest} ({measure})"
+        lines = [f"{each}: error {each.error:.2f}, {self._confidence(each.error)}" for each in found]
+        return "\n".join([*lines, f"errors are {measure}; {nearest}"])
+
+    def _confidence(self, error: float) -> str:
+        if error > 0.7 * self.tolerance:
+            return "close to the limit"
+        clear = self.rejected > 2 * max(error, 0.5 * self.tolerance)
+        return "sure" if clear else "likely, but other candidates come close"
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers, lists and strings, as JSON holds them; `from_dict` reads them back to the last bit."""
         return {
             "rotations": [
-                {"axis": each.axis.tolist(), "point": each.point.tolist(), "order": each.order}
-                | {"error": each.error, "missing": each.missing}
+                {"axis": each.axis.tolist(), "point": each.point.tolist(), "order": each.order, "error": each.error}
                 for each in self.rotations
             ],
             "mirrors": [
-                {"normal": each.normal.tolist(), "point": each.point.tolist()}
-                | {"error": each.error, "missing": each.missing}
+                {"normal": each.normal.tolist(), "point": each.point.tolist(), "error": each.error}
                 for each in self.mirrors
             ],
             "spacing": self.spacing,
@@ -136,35 +122,25 @@ class Symmetries:
 
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> "Symmetries":
-        """Read what `to_dict` returned. Raises SceneError for anything else, and names the entry."""
+        """Read what `to_dict` returned, now or earlier. Raises SceneError for anything else, and names the entry."""
         rotations = [
             RotationalSymmetry(
-                _unit(each, "axis", place),
+                _vector(each, "axis", place, unit=True),
                 _vector(each, "point", place),
                 _order(each, place),
                 _number(each, "error", place),
-                _number(each, "missing", place),
             )
             for each, place in _entries(stored, "rotations")
         ]
         mirrors = [
             MirrorSymmetry(
-                _unit(each, "normal", place),
-                _vector(each, "point", place),
-                _number(each, "error", place),
-                _number(each, "missing", place),
+                _vector(each, "normal", place, unit=True), _vector(each, "point", place), _number(each, "error", place)
             )
             for each, place in _entries(stored, "mirrors")
         ]
         rejected = math.inf if stored.get("rejected", 0) is None else _number(stored, "rejected", "symmetries")
         spacing, tolerance = (_number(stored, name, "symmetries") for name in ("spacing", "tolerance"))
         return cls(tuple(rotations), tuple(mirrors), spacing, tolerance, rejected)
-
-
-def _sureness(error: float, tolerance: float, rejected: float) -> str:
-    if error > 0.7 * tolerance:
-        return "close to the limit"
-    return "sure" if rejected > 2 * max(error, 0.5 * tolerance) else "likely, but other candidates come close"
 
 
 def _numbers(values: Float[Tensor, " 3"]) -> str:
@@ -186,19 +162,13 @@ def _number(entry: Mapping[str, Any], name: str, place: str) -> float:
     return float(value)
 
 
-def _vector(entry: Mapping[str, Any], name: str, place: str) -> Float[Tensor, " 3"]:
+def _vector(entry: Mapping[str, Any], name: str, place: str, *, unit: bool = False) -> Float[Tensor, " 3"]:
     value = entry.get(name)
     numbers = value if isinstance(value, Sequence) and not isinstance(value, str) else []
-    if len(numbers) != 3 or not all(isinstance(each, int | float) and math.isfinite(each) for each in numbers):
-        raise _damaged(place, name, "three numbers", value)
+    finite = len(numbers) == 3 and all(isinstance(each, int | float) and math.isfinite(each) for each in numbers)
+    if not finite or (unit and abs(math.hypot(*numbers) - 1.0) > 1e-6):
+        raise _damaged(place, name, "a unit vector" if unit else "three numbers", value)
     return torch.tensor(numbers, dtype=torch.float64)
-
-
-def _unit(entry: Mapping[str, Any], name: str, place: str) -> Float[Tensor, " 3"]:
-    vector = _vector(entry, name, place)
-    if abs(float(vector.norm()) - 1.0) > 1e-6:
-        raise _damaged(place, name, "a unit vector", vector.tolist())
-    return vector
 
 
 def _order(entry: Mapping[str, Any], place: str) -> int | None:
@@ -208,6 +178,7 @@ def _order(entry: Mapping[str, Any], place: str) -> int | None:
     return value
 
 
-def _damaged(place: str, name: str, expected: str, value: Any) -> SceneError:
-    name = f"{place}.{name}"
-    return SceneError(f"{name}: expected {expected}, got {value!r}; find the symmetries again", name=name, value=value)
+def _damaged(place: str, name: str, wanted: str, value: Any) -> SceneError:
+    return SceneError.expected(
+        wanted, value, got=repr(value), name=f"{place}.{name}", advice="find the symmetries again"
+    )

@@ -21,8 +21,8 @@ def vector(*numbers: float) -> torch.Tensor:
     return torch.tensor(numbers, dtype=torch.float64)
 
 
-def mirror(normal: torch.Tensor, point: torch.Tensor, missing: float = 0.0) -> MirrorSymmetry:
-    return MirrorSymmetry(normal, point, 0.0, missing)
+def mirror(normal: torch.Tensor, point: torch.Tensor) -> MirrorSymmetry:
+    return MirrorSymmetry(normal, point, 0.0)
 
 
 def of(*found: MirrorSymmetry | RotationalSymmetry) -> Symmetries:
@@ -34,8 +34,8 @@ def of(*found: MirrorSymmetry | RotationalSymmetry) -> Symmetries:
 CENTER = vector(0.1, -0.2, 0.3)
 X = mirror(vector(1, 0, 0), CENTER)
 Y = mirror(vector(0, 1, 0), CENTER)
-TURN = RotationalSymmetry(vector(0, 0, 1), CENTER, 4, 0.0, 0.0)
-ROUND = RotationalSymmetry(vector(0, 0, 1), CENTER, None, 0.0, 0.0)
+TURN = RotationalSymmetry(vector(0, 0, 1), CENTER, 4, 0.0)
+ROUND = RotationalSymmetry(vector(0, 0, 1), CENTER, None, 0.0)
 
 
 def impacts(count: int, seed: int = 0) -> Sites:
@@ -146,10 +146,6 @@ def test_a_model_that_was_saved_says_the_same() -> None:
     torch.testing.assert_close(
         read.at(places.points, places.directions).mean, model.at(places.points, places.directions).mean
     )
-
-
-def test_what_only_holes_allow_is_no_symmetry() -> None:
-    assert groups_of(of(mirror(vector(1, 0, 0), CENTER, missing=0.4))) == ()
 
 
 def test_functions_that_vanish_at_all_contacts_are_left_out() -> None:
