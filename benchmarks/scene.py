@@ -16,7 +16,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.store import load
 from avmsf.gaussians.config import SplatConfig
 from avmsf.mesh.textured_mesh import TexturedMesh
-from avmsf.photographs.write import write_views
+from avmsf.photographs.folder import write_views
 from avmsf.pipeline.config import LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
 from avmsf.pipeline.reconstruct import reconstruct
 from avmsf.pipeline.scene import ProgressListener

@@ -180,7 +180,7 @@ def test_contacts_of_another_object_are_not_explained() -> None:
         placement = judge_placement(contacts, CLOUD)
         assert not placement.on_surface
         explained += placement.mistake is not None
-        assert (placement.mistake is None) == ("align_similarity" in placement.describe())
+        assert (placement.mistake is None) == ("in different frames" in placement.describe())
     # 48 axes, 13 units and a shift explain a few random contacts now and then.
     assert explained <= 1
 

@@ -21,9 +21,8 @@ from avmsf.cli import main
 from avmsf.cli.visuals import VisualInputs, visual_inputs
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
-from avmsf.photographs.folder import find_shots
+from avmsf.photographs.folder import find_shots, write_views
 from avmsf.photographs.shots import without_camera
-from avmsf.photographs.write import write_views
 from factories.capture_folder import fill
 from factories.plate_capture import fill_plate
 from factories.small_scene import slab, slab_views, write_surface_file

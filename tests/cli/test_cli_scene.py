@@ -20,7 +20,7 @@ from avmsf.gaussians.fit import SplatProgress
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh import Surface
 from avmsf.mesh.surface import write_surface
-from avmsf.photographs.write import write_views
+from avmsf.photographs.folder import write_views
 from avmsf.plotting.clouds import save_turntable
 from factories.plate_capture import PLATE, TINY, fill_plate
 from factories.small_scene import SMALL_SPLAT, THICKNESS, slab_views, write_surface_file

@@ -16,7 +16,7 @@ from avmsf.cli.options.surface import parse
 from avmsf.errors import EvaluationError
 from avmsf.field.store import save
 from avmsf.mesh import Surface, read_surface
-from avmsf.photographs.write import write_views
+from avmsf.photographs.folder import write_views
 from avmsf.plotting.surfaces import draw_surface
 from factories.believing_field import bar_contacts, drawn_gains, elastic_field, positional_field, sound_field
 from factories.plate_capture import PLATE, TINY, fill_plate

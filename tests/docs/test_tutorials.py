@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from avmsf.cli import main
-from avmsf.photographs.write import write_views
+from avmsf.photographs.folder import write_views
 from factories.plate_capture import fill_plate
 from factories.plate_set import fill_plates
 from factories.small_scene import slab_views

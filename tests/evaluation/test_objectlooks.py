@@ -16,7 +16,7 @@ from avmsf.features.feature_field import FeatureField
 from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh.surface import Surface
-from avmsf.photographs.write import write_views
+from avmsf.photographs.folder import write_views
 from avmsf.pipeline.config import PRESETS, LiftConfig, SceneConfig, ViewsConfig
 from avmsf.pipeline.sources import find_source
 from factories.raising import raises

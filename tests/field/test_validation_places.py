@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from avmsf.capture.places import rows_by_place
+from avmsf.capture.impacts import rows_by_place
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.fit import fit, held_out
 from avmsf.field.recipes import Attention

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from avmsf.errors import CaptureError
-from avmsf.photographs import colmap_binary, colmap_text, read_sparse_points, read_views
+from avmsf.photographs import read_sparse_points, read_views
 from avmsf.photographs.cameras import View
-from avmsf.photographs.colmap import MODELS, read_colmap
+from avmsf.photographs.colmap import MODELS, read_binary_cameras, read_colmap, read_text_cameras
 from factories.raising import raises
 from factories.views_folder import (
     HEIGHT,
@@ -179,7 +179,7 @@ def test_truncated_binary_files_are_named_wherever_they_end(tmp_path: Path, file
             read()
 
 
-@pytest.mark.parametrize("read", [colmap_binary.read_cameras, colmap_text.read_cameras])
+@pytest.mark.parametrize("read", [read_binary_cameras, read_text_cameras])
 def test_what_is_no_readable_file_is_named(tmp_path: Path, read: Callable[[Path], object]) -> None:
     with raises(CaptureError, file=tmp_path, value="Is a directory"):
         read(tmp_path)

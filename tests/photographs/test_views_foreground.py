@@ -11,9 +11,9 @@ import torch
 import trimesh
 
 from avmsf.errors import CaptureError, CaptureWarning
-from avmsf.photographs import background_color, find_foreground
+from avmsf.photographs import find_foreground
 from avmsf.photographs.cameras import Camera, View
-from avmsf.photographs.coarse_hull import carve
+from avmsf.photographs.segmentation import carve
 from factories.raising import raises, warns
 
 WIDTH, HEIGHT = 120, 90
@@ -103,9 +103,6 @@ def test_outlines_and_the_hole_are_found(name: str) -> None:
     for row in steep:
         column, line = cameras()[row].project(torch.zeros(1, 3))[0][0].int().tolist()
         assert not views[row].mask[line, column]
-    middle = background_color(views)
-    # The median of a wall that falls off by at most a quarter lies within an eighth of its brightness.
-    assert torch.allclose(middle, torch.tensor(wall) / 255, atol=0.02, rtol=falloff / 2)
 
 
 def test_a_shadow_as_dark_as_the_wall_is_filled_and_spots_are_dropped() -> None:
@@ -157,17 +154,6 @@ def test_what_touches_the_object_in_one_view_alone_is_dropped() -> None:
     assert mask[stand].mean() < 0.3
 
 
-def test_the_background_color_is_taken_outside_the_masks_alone() -> None:
-    view = photographs((40.0, 80.0, 120.0), (220.0, 215.0, 205.0), noise=0.0)[0]
-    image, mask = view.image.clone(), torch.zeros(HEIGHT, WIDTH, dtype=torch.uint8)
-    image[:] = torch.tensor([40, 80, 120], dtype=torch.uint8)
-    image[:, 20:], mask[:, 20:] = 255, 255
-    # The column next to the mask is a mixture, and two columns are left of it.
-    image[:, 18:20] = 200
-    color = background_color([replace(view, image=image, mask=mask)])
-    assert torch.allclose(color, torch.tensor([40.0, 80.0, 120.0]) / 255)
-
-
 def test_given_masks_stay() -> None:
     views = photographs((2.0, 2.0, 2.0), (220.0, 215.0, 205.0))
     given = torch.from_numpy(seen(5)[0].astype(np.uint8) * np.uint8(200))
@@ -214,8 +200,6 @@ def test_few_views_and_masks_without_background_are_refused() -> None:
     views = photographs((2.0, 2.0, 2.0), (220.0, 215.0, 205.0))
     with raises(CaptureError, name="views", value=2):
         find_foreground(views[:2])
-    with raises(CaptureError, name="background", value=0):
-        background_color(views)
     blank = [painted(view, np.ones((HEIGHT, WIDTH), dtype=bool), (9.0, 9.0, 9.0)) for view in views]
     with raises(CaptureError, name="object", value=0):
         find_foreground(blank)

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import fsolve
 
-from avmsf.capture.location import Location
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, Location
 from avmsf.photographs import read_views
 from avmsf.photographs.cameras import View
 from avmsf.photographs.images import Picture

@@ -7,8 +7,7 @@ import torch
 
 from avmsf.errors import CaptureError
 from avmsf.photographs.cameras import Camera, View
-from avmsf.photographs.folder import read_views
-from avmsf.photographs.write import write_views
+from avmsf.photographs.folder import read_views, write_views
 from factories.raising import raises
 
 

@@ -14,8 +14,8 @@ from avmsf.errors import CaptureError
 from avmsf.mesh import Surface
 from avmsf.mesh.surface import write_surface
 from avmsf.mesh.textured_mesh import TexturedMesh
+from avmsf.photographs.folder import write_views
 from avmsf.photographs.mesh_views import MeshTracer
-from avmsf.photographs.write import write_views
 from avmsf.pipeline.frame_check import compare_outlines, expect_contacts_in_views, judge_outlines
 from factories.plate_capture import fill_plate
 from factories.raising import raises

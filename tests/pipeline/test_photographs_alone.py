@@ -12,7 +12,7 @@ from avmsf.field.gains.elastic import Elastic
 from avmsf.field.store import load
 from avmsf.mesh import read_surface
 from avmsf.mesh.closest_point import ClosestPoints
-from avmsf.photographs.write import write_views
+from avmsf.photographs.folder import write_views
 from avmsf.pipeline.config import CACHE
 from avmsf.pipeline.reconstruct import SURFACE
 from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER

@@ -4,7 +4,8 @@ import errno
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 from avmsf.errors import AvmsfError, FieldFileError
@@ -77,3 +78,26 @@ def write_whole(path: Path, write: Callable[[Path], object], *, raising: type[Av
 def copy_whole(source: Path, path: Path, *, raising: type[AvmsfError] = FieldFileError) -> None:
     """Copy a file as `write_whole` writes one. Raises `raising`."""
     write_whole(path, lambda place: shutil.copyfile(source, place), raising=raising)
+
+
+@contextmanager
+def new_folder(folder: Path, *, raising: type[AvmsfError]) -> Iterator[Path]:
+    """Yield a temporary folder, which in the end takes the name `folder`: that is complete or absent.
+
+    Raises `raising` where the folder exists and is not empty, or cannot be written.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise raising.expected(
+            "a new or empty folder", got="an existing one", file=folder, advice="choose another name or remove it"
+        )
+    begun = temporary_path(folder)
+    try:
+        begun.mkdir(parents=True)
+        yield begun
+        if folder.exists():
+            folder.rmdir()
+        os.rename(begun, folder)
+    except OSError as error:
+        raise unwritable(folder, error, raising=raising) from error
+    finally:
+        shutil.rmtree(begun, ignore_errors=True)

@@ -2,9 +2,6 @@
 
 import csv
 import io
-import os
-import shutil
-import uuid
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -12,10 +9,9 @@ from pathlib import Path, PurePosixPath
 import soundfile
 import torch
 
-from avmsf._utils.files import unwritable
+from avmsf._utils.files import new_folder
 from avmsf.capture.audio import read_recording
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.location import check_free
 from avmsf.capture.measure import RecordingReport, measure, shared_problems
 from avmsf.capture.placement import contacted_part
 from avmsf.capture.prepare import Prepared, prepare
@@ -110,18 +106,8 @@ def write_capture(capture: Capture, folder: str | Path, *, onsets_within: float 
     is not empty, or cannot be written.
     """
     folder = Path(folder)
-    check_free(folder)
-    begun = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}")
-    try:
-        begun.mkdir(parents=True)
+    with new_folder(folder, raising=CaptureError) as begun:
         _write_files(capture, begun, onsets_within=onsets_within)
-        if folder.exists():
-            folder.rmdir()
-        os.rename(begun, folder)
-    except (OSError, soundfile.LibsndfileError) as error:
-        raise unwritable(folder, error, raising=CaptureError) from error
-    finally:
-        shutil.rmtree(begun, ignore_errors=True)
 
 
 def _write_files(capture: Capture, folder: Path, *, onsets_within: float | None) -> None:

@@ -1,5 +1,6 @@
-"""Quality of one recording: its length, level, noise, clipping, onset and second impacts."""
+"""Quality of one recording: its length, level, noise, clipping, onset and second impacts; and whether it is of one."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,11 +12,15 @@ from avmsf.capture.audio import EIGHT_BIT, LOSSLESS, Recording, clipped_samples
 from avmsf.capture.onset import SECONDS_BEFORE, find_second_impact, find_second_push
 from avmsf.capture.prepare import Prepared, remove_rumble
 from avmsf.capture.settings import CaptureSettings
+from avmsf.errors import CaptureError
 
 HIGHEST_NOISE_DB = -20.0
 """Noise above this, against the peak, leaves too little of the decay to measure."""
 LOWEST_PEAK_DB = -50.0
 """An integer file below this uses so few of its steps that it was recorded too softly."""
+
+_MIN_RISE = 10 ** (6.0 / 20.0)
+"""How far the loudest hundredth of a second must stand above the quietest, 6 dB: the least that an impact does."""
 
 
 @dataclass(frozen=True)
@@ -137,3 +142,36 @@ def noise_level(response: Float64[np.ndarray, " frames"], onset: int, rate: floa
 def decibels(ratio: float) -> float:
     """Return the level of an amplitude ratio; silence is 200 dB down, so that it stays a number."""
     return float(20 * np.log10(max(ratio, 1e-10)))
+
+
+def check_impulsive(sound: Float64[np.ndarray, " samples"], *, sample_rate: float, name: str) -> None:
+    """Raise `CaptureError` for a sound that neither rises nor falls: a hum, or noise.
+
+    Sounds shorter than 80 ms are too short to tell.
+    """
+    size = max(64, math.ceil(0.01 * sample_rate))
+    if len(sound) < 8 * size:
+        return
+    frames = sound[: len(sound) // size * size].reshape(-1, size)
+    levels = np.sqrt(np.mean((frames - frames.mean(axis=1, keepdims=True)) ** 2, axis=1))
+    loudest, quietest = float(levels.max()), float(np.quantile(levels, 0.1))
+    if loudest < _MIN_RISE * quietest:
+        level = 20 * math.log10(loudest / quietest)
+        raise CaptureError(
+            f"{name}: expected an impact, its loudest 10 ms at least 6 dB above its quietest, got {level:.1f} dB; "
+            "record a single impact with silence before or after it",
+            file=name,
+            value=level,
+        )
+
+
+def find_clipping(response: Float64[np.ndarray, " frames"], *, name: str) -> str | None:
+    """Return a message on how much of a sound is clipped; None where nothing is."""
+    clipped = clipped_samples(response)
+    if not clipped:
+        return None
+    share = 100.0 * clipped / len(response)
+    return (
+        f"{name}: {clipped} samples ({share:.2g} %) are clipped at {np.abs(response).max():.3g}, which no mode can "
+        "explain; turn the gain down and record it again"
+    )

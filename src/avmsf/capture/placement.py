@@ -179,7 +179,7 @@ class Placement:
             return f"{found}; check that both are in one frame and unit"
         return (
             f"{found}, and no change of unit, axes or origin explains it: the {what} and the contacts are in different "
-            "frames; give both in one (structure from motion chooses its own: see `align_similarity`; nerfstudio "
+            "frames; give both in one (structure from motion chooses its own: see docs/visual-inputs.md; nerfstudio "
             "writes how it moved the object to dataparser_transforms.json, to be laid beside)"
         )
 

@@ -15,9 +15,8 @@ from pathlib import Path, PurePosixPath
 from avmsf._utils.files import is_lfs_pointer
 from avmsf._utils.text_files import read_text
 from avmsf.capture.filenames import missing_recording
-from avmsf.capture.location import Location
 from avmsf.capture.settings import METRES, CaptureSettings
-from avmsf.errors import CaptureError, CaptureWarning
+from avmsf.errors import CaptureError, CaptureWarning, Location
 
 TABLE = "impacts.csv"
 REQUIRED = ("file", "x", "y", "z")

@@ -11,12 +11,11 @@ import torch
 
 from avmsf._utils.wording import counted
 from avmsf.capture.filenames import find_surface_file
-from avmsf.capture.location import Location
 from avmsf.capture.placement import Placement, contacted_part, judge_placement, surface_points
 from avmsf.capture.prepare import shortest_allowed
 from avmsf.capture.settings import METRES, CaptureSettings
 from avmsf.capture.table import TABLE, Strike, fitting_units, read_rows, understand
-from avmsf.errors import CaptureError, CaptureWarning
+from avmsf.errors import CaptureError, CaptureWarning, Location
 from avmsf.mesh.surface import Surface, read_surface
 
 WIDEST = 10.0

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from avmsf._utils.wording import counted
 from avmsf.capture import Impacts
-from avmsf.capture.places import places_of
+from avmsf.capture.impacts import places_of
 from avmsf.cli.heartbeat import verbosity
 from avmsf.cli.printing import figure, table
 from avmsf.evaluation.renderer import Renderer

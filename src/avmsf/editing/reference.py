@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.capture.audio import read_recording
-from avmsf.capture.impulse_checks import check_impulsive, find_clipping
+from avmsf.capture.measure import check_impulsive, find_clipping
 from avmsf.capture.onset import find_second_impact
 from avmsf.capture.prepare import prepare, shortest_allowed
 from avmsf.capture.settings import CaptureSettings

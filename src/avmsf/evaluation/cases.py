@@ -12,8 +12,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf._utils.wording import counted
-from avmsf.capture.impacts import Impacts
-from avmsf.capture.places import rows_by_place
+from avmsf.capture.impacts import Impacts, rows_by_place
 from avmsf.errors import EvaluationError
 from avmsf.gaussians.points import closest_points, farthest_points
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
-from avmsf.capture.impacts import Impacts
-from avmsf.capture.places import rows_by_place
+from avmsf.capture.impacts import Impacts, rows_by_place
 from avmsf.evaluation.field_methods import FieldVariant
 from avmsf.evaluation.task import Task
 from avmsf.field.config import FitConfig

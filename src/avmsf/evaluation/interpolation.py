@@ -10,7 +10,7 @@ from jaxtyping import Float, Float64
 from scipy.interpolate import RBFInterpolator
 from torch import Tensor
 
-from avmsf.capture.places import places_of
+from avmsf.capture.impacts import places_of
 from avmsf.evaluation.modal_baselines import ModalBaseline
 from avmsf.field.gains.positional import Axes
 

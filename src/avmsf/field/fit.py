@@ -14,8 +14,7 @@ from torch import Tensor
 
 from avmsf._utils.device import TRAINABLE, steps_between_losses, usable_device
 from avmsf._utils.state import read_checkpoint, write_checkpoint
-from avmsf.capture.impacts import Impacts
-from avmsf.capture.places import rows_by_place
+from avmsf.capture.impacts import Impacts, rows_by_place
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import AvmsfWarning, FieldFileError, FitError
 from avmsf.features.feature_field import FeatureField

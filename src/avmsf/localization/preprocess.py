@@ -14,7 +14,7 @@ from torch import Tensor
 from avmsf._utils.arrays import ArrayLike, as_floats, as_rate
 from avmsf._utils.wording import counted
 from avmsf.capture.audio import Recording, read_recording
-from avmsf.capture.impulse_checks import check_impulsive, find_clipping
+from avmsf.capture.measure import check_impulsive, find_clipping
 from avmsf.capture.onset import Pulse, find_second_impact, find_second_push
 from avmsf.capture.prepare import prepare, shortest_allowed
 from avmsf.capture.settings import CaptureSettings

@@ -1,21 +1,30 @@
-"""Folders of photographs with cameras, read into views."""
+"""Folders of photographs with cameras, read into views and written from them; and the points that cameras came with."""
 
+import json
 import math
 import warnings
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from typing import Any
 
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from avmsf._utils.files import new_folder
 from avmsf._utils.wording import counted
 from avmsf.errors import CaptureError, Remark
-from avmsf.photographs.cameras import View
-from avmsf.photographs.colmap import PLACES, find_model, read_colmap
-from avmsf.photographs.nerf_json import read_transforms
-from avmsf.photographs.poses import judge_cameras
-from avmsf.photographs.shots import Shot, Shots, listed, without_camera
-from avmsf.photographs.single import Findings, read_view
+from avmsf.mesh.io import load_parts
+from avmsf.photographs.cameras import Camera, View
+from avmsf.photographs.colmap import PLACES, find_model, read_colmap, read_points
+from avmsf.photographs.nerf_json import load_record, read_transforms
+from avmsf.photographs.shots import Findings, Shot, Shots, listed, read_view, without_camera
 
-FEWEST = 3
+MIN_VIEWS = 3
+_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def read_views(
@@ -63,7 +72,7 @@ def read_views(
             progress(done, len(shots))
     remarks = findings.summary()
     _refuse_few(views, shots, findings, found.origin)
-    for remark in remarks + judge_cameras([view.camera for view in views]):
+    for remark in remarks + check_cameras([view.camera for view in views]):
         warnings.warn(remark.about(found.origin), stacklevel=2)
     return tuple(views)
 
@@ -109,7 +118,7 @@ def _refuse_repeated(shots: Sequence[Shot], origin: Path) -> None:
 
 
 def _refuse_few(views: Sequence[View], shots: Sequence[Shot], findings: Findings, origin: Path) -> None:
-    if len(views) >= FEWEST:
+    if len(views) >= MIN_VIEWS:
         return
     if shots and len(findings.empty) == len(shots):
         raise CaptureError(
@@ -120,9 +129,133 @@ def _refuse_few(views: Sequence[View], shots: Sequence[Shot], findings: Findings
         )
     reasons = "".join(f"; {remark.message}" for remark in findings.summary())
     raise CaptureError(
-        f"{origin}: expected at least {FEWEST} views, got {len(views)} of {len(shots)} that can be used{reasons}"
+        f"{origin}: expected at least {MIN_VIEWS} views, got {len(views)} of {len(shots)} that can be used{reasons}"
         + (f" (expected {shots[0].image} and so on)" if findings.lost else ""),
         file=origin,
         name="views",
         value=len(views),
     )
+
+
+def check_cameras(cameras: Sequence[Camera]) -> list[Remark]:
+    """Return remarks on the positions and axes of the cameras together."""
+    positions = np.array([camera.position.tolist() for camera in cameras])
+    axes = np.array([camera.world_to_camera[2, :3].tolist() for camera in cameras])
+    spread = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).max())
+    if spread <= 1e-6 * float(np.linalg.norm(positions, axis=1).max()) + 1e-12:
+        position = np.round(positions[0], 6).tolist()
+        message = f"expected cameras at several positions, got all {len(cameras)} at {position}; check the camera file"
+        return [Remark(message, name="positions", value=position)]
+    center = _common_point(positions, axes)
+    if center is None:
+        return []
+    behind = int((np.einsum("ij,ij->i", axes, center - positions) < 0).sum())
+    if behind <= len(cameras) / 2:
+        return []
+    message = (
+        f"{behind} of {len(cameras)} cameras point away from the point where their axes meet, "
+        f"{np.round(center, 4).tolist()}: the axes are probably OpenCV's where OpenGL's are expected or the other way "
+        "round, or the poses are inverted"
+    )
+    return [Remark(message, name="axes", value=behind)]
+
+
+def _common_point(
+    positions: Float[np.ndarray, "cameras 3"], axes: Float[np.ndarray, "cameras 3"]
+) -> Float[np.ndarray, " 3"] | None:
+    """Return the point nearest to all lines of sight by least squares; None where these are parallel."""
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    total = across.sum(axis=0)
+    if np.linalg.eigvalsh(total)[0] < 1e-4 * len(axes):
+        return None
+    return np.linalg.solve(total, np.einsum("ijk,ik->j", across, positions))
+
+
+def read_sparse_points(
+    folder: str | Path, *, meters: float = 1.0
+) -> tuple[Float[Tensor, "points 3"], UInt8[Tensor, "points 3"]] | None:
+    """Return the points that structure from motion found and their colors; None where there are none.
+
+    Meters, float64. They lie in the frame of `read_views`' cameras: the COLMAP model's own points, or with a
+    `transforms.json` the file that it names as `ply_file_path`. Raises CaptureError where such a file cannot be read.
+    """
+    folder = Path(folder)
+    transforms = folder if folder.suffix.lower() == ".json" else folder / "transforms.json"
+    if transforms.is_file():
+        found = _read_ply(transforms)
+    else:
+        model = find_model(folder)
+        found = None if model is None else read_points(model)
+    if found is None:
+        return None
+    return torch.from_numpy(found[0] * meters), torch.from_numpy(found[1])
+
+
+def _read_ply(transforms: Path) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the points of the file that transforms.json names, gray where it has no colors."""
+    named = load_record(transforms).get("ply_file_path")
+    if not isinstance(named, str) or not named:
+        return None
+    path = transforms.parent / named.replace("\\", "/")
+    clouds: list[Any] = load_parts(path)
+    if len(clouds) != 1:
+        raise CaptureError(
+            f"{path} (ply_file_path of {transforms.name}): expected one point cloud, got {len(clouds)} parts",
+            file=path,
+            name="ply_file_path",
+            value=len(clouds),
+        )
+    points = np.asarray(clouds[0].vertices, dtype=np.float64)
+    colors = np.full((len(points), 3), 128, dtype=np.uint8)
+    painted = np.asarray(getattr(clouds[0].visual, "vertex_colors", colors))
+    if painted.shape[:1] == points.shape[:1]:
+        colors = painted[:, :3].astype(np.uint8)
+    return (points, colors) if len(points) else None
+
+
+def write_views(views: Sequence[View], folder: str | Path) -> None:
+    """Write `transforms.json`, `images/NAME.png` and, for views that have one, `masks/NAME.png`.
+
+    `read_views` reads back the same pixels, masks and names except for the names' suffixes, and cameras to rounding.
+    The folder is complete or absent. Raises CaptureError where it exists and is not empty, where two views would have
+    one file, and where it cannot be written.
+    """
+    folder = Path(folder)
+    names = [str(PurePosixPath(view.name).with_suffix(".png")) for view in views]
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise CaptureError.expected(
+            "views with different names", repeated, got=f"several for {repeated[0]}", file=folder, name=repeated[0]
+        )
+    with new_folder(folder, raising=CaptureError) as begun:
+        for name, view in zip(names, views, strict=True):
+            _write_image(begun / "images" / name, view.image.cpu().numpy()[..., ::-1])
+            if view.mask is not None:
+                _write_image(begun / "masks" / name, view.mask.cpu().numpy())
+        frames = [_frame(name, view) for name, view in zip(names, views, strict=True)]
+        (begun / "transforms.json").write_text(json.dumps({"camera_model": "PINHOLE", "frames": frames}, indent=1))
+
+
+def _frame(name: str, view: View) -> dict[str, Any]:
+    camera = view.camera
+    pose = np.linalg.inv(camera.world_to_camera.cpu().numpy()) @ _OPENCV_FROM_OPENGL
+    frame = {
+        "file_path": f"images/{name}",
+        "transform_matrix": pose.tolist(),
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.focal[0],
+        "fl_y": camera.focal[1],
+        "cx": camera.principal[0],
+        "cy": camera.principal[1],
+    }
+    return frame if view.mask is None else frame | {"mask_path": f"masks/{name}"}
+
+
+def _write_image(path: Path, pixels: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Low compression is several times faster, and these files are read once or twice.
+    written, content = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    if not written:
+        raise OSError(f"{path}: the image could not be encoded as PNG")
+    path.write_bytes(content.tobytes())

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.capture.location import Location
+from avmsf.errors import Location
 from avmsf.photographs.cameras import Camera
 from avmsf.photographs.images import Picture
 

@@ -10,18 +10,21 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from avmsf._utils.text_files import read_json
 from avmsf.capture.filenames import PICTURE_SUFFIXES
-from avmsf.capture.location import Location
 from avmsf.capture.placement import Mistake
-from avmsf.errors import CaptureError, Remark
+from avmsf.errors import CaptureError, Location, Remark
 from avmsf.photographs.lenses import Lens
-from avmsf.photographs.poses import TOLERANCE, opencv_from_opengl, rigid
 from avmsf.photographs.shots import Shot, Shots, listed, refuse_many
 
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+
+# Poses written with four digits and rotations that drifted by rounding pass; shears and scales do not.
+MAX_SCALE_DEVIATION = 1e-3
 
 
 def read_transforms(path: Path) -> Shots:
@@ -48,7 +51,7 @@ def read_transforms(path: Path) -> Shots:
         pose, scale = rigid(_matrix(frame, where), where)
         image = _with_suffix(path.parent / file)
         name = _name(file, image)
-        if abs(scale - 1) > TOLERANCE:
+        if abs(scale - 1) > MAX_SCALE_DEVIATION:
             scaled.append(f"{name} ({scale:.4g})")
         settings = ChainMap(frame, common)
         mask = path.parent / _text(frame, "mask_path", where) if frame.get("mask_path") else None
@@ -198,3 +201,58 @@ def _name(file: str, image: Path) -> str:
     if parts and parts[0] == "images":
         parts = parts[1:]
     return "/".join([*parts, image.name])
+
+
+def rigid(matrix: Float[np.ndarray, "rows columns"], where: Location) -> tuple[Float[np.ndarray, "4 4"], float]:
+    """Return a camera-to-world matrix made exactly rigid, and the scale that its rotation had.
+
+    `matrix` is 4 x 4, or 3 x 4 without the last row. A scale that is the same along all axes does not move the camera
+    and is removed; the caller warns of it. Raises CaptureError, at `where`, for anything else that is not a rotation
+    with a position.
+    """
+    key = "transform_matrix"
+    if matrix.shape not in ((4, 4), (3, 4)):
+        raise where.error(
+            f"expected a pose of 4 x 4 numbers, got {matrix.shape[0]} x {matrix.shape[1]}",
+            name=key,
+            value=list(matrix.shape),
+        )
+    if not np.isfinite(matrix).all():
+        value = float(matrix[~np.isfinite(matrix)][0])
+        raise where.error(f"expected a finite pose, got {value}; estimate this camera again", name=key, value=value)
+    if matrix.shape[0] == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise where.error(
+            f"expected 0 0 0 1 as the pose's last row, got {matrix[3].tolist()}; perhaps the matrix is transposed",
+            name=key,
+            value=matrix[3].tolist(),
+        )
+    determinant = float(np.linalg.det(matrix[:3, :3]))
+    if determinant < -1e-12:
+        raise where.error(
+            f"expected a pose with right-handed axes, got determinant {determinant:.3g}. transforms.json has OpenGL's "
+            "axes: x right, y up, z backward. With y up and z forward (Unity, DirectX), negate the third column; with "
+            "x right, y down and z forward (OpenCV), negate the second and the third",
+            name=key,
+            value=determinant,
+        )
+    left, stretches, right = np.linalg.svd(matrix[:3, :3])
+    scale = float(stretches.mean())
+    if scale < 1e-9 or np.abs(stretches / scale - 1).max() > MAX_SCALE_DEVIATION:
+        raise where.error(
+            f"expected a rotation in the pose, got a matrix with the scales "
+            f"{', '.join(f'{stretch:.4g}' for stretch in stretches)} along its axes; remove the scales",
+            name=key,
+            value=stretches.tolist(),
+        )
+    rigid_pose = np.eye(4)
+    rigid_pose[:3, :3], rigid_pose[:3, 3] = left @ right, matrix[:3, 3]
+    return rigid_pose, scale
+
+
+def opencv_from_opengl(camera_to_world: Float[np.ndarray, "4 4"]) -> Float[Tensor, "4 4"]:
+    """Return world to camera with OpenCV's axes from a rigid camera-to-world matrix with OpenGL's."""
+    turned = camera_to_world * np.array([1.0, -1.0, -1.0, 1.0])
+    inverse = np.eye(4)
+    inverse[:3, :3] = turned[:3, :3].T
+    inverse[:3, 3] = -turned[:3, :3].T @ turned[:3, 3]
+    return torch.from_numpy(inverse)

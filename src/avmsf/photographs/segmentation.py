@@ -1,36 +1,45 @@
-"""The object told from a plain background: by color in each image, then by what all views agree on."""
+"""Masks of an object before a plain background: by color in each image, then by a coarse visual hull of all views.
+
+The background's color may change smoothly over an image.
+"""
 
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
-from torch import Tensor
+from jaxtyping import Bool, Float, Int, UInt8
 
 from avmsf._utils.wording import counted
 from avmsf.errors import CaptureError, CaptureWarning
-from avmsf.photographs.background import distances_from_background, threshold
 from avmsf.photographs.cameras import Camera, View
-from avmsf.photographs.coarse_hull import carve, silhouette
 from avmsf.photographs.shots import listed
 
-FEWEST = 3
+MIN_VIEWS = 3
 # Parts of a first mask smaller than this against its largest are taken for spots in the background.
-_PART = 0.01
+MIN_PART = 0.01
 # Views that may miss a place of the object, of all views: for filling shadows, and for what may be object at all.
-_FEW, _MANY = 0.03, 0.15
-_ROUNDS = 2
+MAX_MISSING_LIKELY, MAX_MISSING_POSSIBLE = 0.03, 0.15
+ROUNDS = 2
 # Of all images' borders, what may differ from the background: cloth's folds, and an object that leaves the image.
-_BUSY = 0.3
+MAX_BORDER_DIFFERENCE = 0.3
 # Levels of 255 that no plain background differs from itself, whatever the cut.
-_MOTLEY = 64
+MAX_BACKGROUND_DIFFERENCE = 64
 # Of the first masks' pixels, what the hull must explain: less, and cameras or masks are wrong.
-_EXPLAINED = 0.7
+MIN_EXPLAINED = 0.7
 # Pixels over which a lens blurs an object's edge, to be given back to the background.
-_BLUR = 2
+BLUR_PIXELS = 2
+# Levels of 255 that even a perfectly plain background is allowed: sensor noise and JPEG blocks.
+MIN_NOISE = 4.0
+# The share of an image's shorter side that counts as its border.
+BORDER = 0.02
+# Cubes of the hull on its first and its second grid.
+COARSE_CELLS, FINE_CELLS = 40**3, 80**3
+# Of the views that could see a place, so many at least must be there to say anything of it.
+MIN_SEEING = 1 / 3
 
 
 def find_foreground(views: Sequence[View]) -> tuple[View, ...]:
@@ -46,23 +55,24 @@ def find_foreground(views: Sequence[View]) -> tuple[View, ...]:
     Warns with CaptureWarning of views left out because no object was found in them, and where the views agree on no
     shape. Raises CaptureError for fewer than three views and where no plain background is found.
     """
-    if len(views) < FEWEST:
-        raise CaptureError(
-            f"expected at least {FEWEST} views, got {len(views)}; photograph more sides", name="views", value=len(views)
+    if len(views) < MIN_VIEWS:
+        raise CaptureError.expected(
+            f"at least {MIN_VIEWS} views", len(views), name="views", advice="photograph more sides"
         )
     bare = [index for index, view in enumerate(views) if view.mask is None]
     if not bare:
         return tuple(views)
-    distances = dict(zip(bare, distances_from_background([views[index] for index in bare]), strict=True))
-    cut = threshold(list(distances.values()))
-    _refuse_busy([distances[index] > min(cut, _MOTLEY) for index in bare], [views[index].name for index in bare])
+    distances = dict(zip(bare, _background_distances([views[index] for index in bare]), strict=True))
+    cut = _background_threshold(list(distances.values()))
+    different = [distances[index] > min(cut, MAX_BACKGROUND_DIFFERENCE) for index in bare]
+    _check_plain(different, [views[index].name for index in bare])
     masks = [
         _large_parts(distances[index] > cut) if view.mask is None else view.mask.numpy() > 127
         for index, view in enumerate(views)
     ]
     _refuse_few([view.name for view, mask in zip(views, masks, strict=True) if mask.any()], len(views))
     cameras = [view.camera for view in views]
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         outlines = _outlines(masks, cameras)
         if outlines is None:
             message = (
@@ -78,34 +88,12 @@ def find_foreground(views: Sequence[View]) -> tuple[View, ...]:
     return _masked(views, masks)
 
 
-def background_color(views: Sequence[View]) -> Float[Tensor, " 3"]:
-    """Return the median color outside the masks, 0 to 1, each channel on its own; float32.
-
-    Views without a mask do not count, nor do the pixels next to a mask's edge, where object and background mix.
-    Raises CaptureError where no pixel lies outside.
-    """
-    counts = np.zeros((3, 256), dtype=np.int64)
-    for view in views:
-        if view.mask is not None:
-            near = cv2.dilate(view.mask.numpy(), np.ones((5, 5), np.uint8))
-            outside = view.image.numpy()[near == 0]
-            counts += np.stack([np.bincount(outside[:, channel], minlength=256) for channel in range(3)])
-    if not counts.any():
-        raise CaptureError(
-            "expected views whose masks leave some background, got none; find their foreground first",
-            name="background",
-            value=0,
-        )
-    middle = (np.cumsum(counts, axis=1) >= counts.sum(axis=1, keepdims=True) / 2).argmax(axis=1)
-    return torch.from_numpy(middle.astype(np.float32) / np.float32(255))
-
-
 def _large_parts(mask: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
     """Return the mask without parts that are small beside its largest."""
     count, labels, statistics, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     areas = statistics[:, cv2.CC_STAT_AREA].copy()
     areas[0] = 0
-    return (areas >= _PART * areas.max())[labels] & mask if count > 1 else mask
+    return (areas >= MIN_PART * areas.max())[labels] & mask if count > 1 else mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,8 +114,8 @@ def _outlines(masks: Sequence[Bool[np.ndarray, "height width"]], cameras: Sequen
     if hull is None:
         return None
     # With few views a single one that sees the background weighs: each carves.
-    few = hull.occupied(missing=max(int(_FEW * hull.views), 1) if hull.views >= 8 else 0)
-    many = hull.occupied(missing=max(int(_MANY * hull.views), 1))
+    few = hull.occupied(missing=max(int(MAX_MISSING_LIKELY * hull.views), 1) if hull.views >= 8 else 0)
+    many = hull.occupied(missing=max(int(MAX_MISSING_POSSIBLE * hull.views), 1))
     outlines, explained = [], 0
     for mask, camera in zip(masks, cameras, strict=True):
         likely, cube = silhouette(hull, few, camera)
@@ -135,7 +123,7 @@ def _outlines(masks: Sequence[Bool[np.ndarray, "height width"]], cameras: Sequen
         near, possible = _grown(likely, cube), _grown(possible, cube)
         explained += int((mask & possible).sum())
         outlines.append(_Outline(likely, possible, near))
-    return outlines if explained >= _EXPLAINED * sum(int(mask.sum()) for mask in masks) else None
+    return outlines if explained >= MIN_EXPLAINED * sum(int(mask.sum()) for mask in masks) else None
 
 
 def _agreed(
@@ -163,8 +151,8 @@ def _trimmed(
 
     The cut is low, for the sake of shadows, and would leave a rim of mixed colors around all that is bright.
     """
-    inner = cv2.erode(mask.astype(np.uint8), _disc(_BLUR), borderValue=1) > 0
-    brightest = cv2.dilate(np.where(mask, distance, 0).astype(np.uint8), _disc(_BLUR))
+    inner = cv2.erode(mask.astype(np.uint8), _disc(BLUR_PIXELS), borderValue=1) > 0
+    brightest = cv2.dilate(np.where(mask, distance, 0).astype(np.uint8), _disc(BLUR_PIXELS))
     trimmed = mask & (inner | (2 * distance.astype(np.int32) >= brightest))
     return cv2.medianBlur(trimmed.astype(np.uint8), 3) > 0
 
@@ -185,11 +173,11 @@ def _disc(radius: int) -> np.ndarray:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
 
 
-def _refuse_busy(different: Sequence[Bool[np.ndarray, "height width"]], names: Sequence[str]) -> None:
+def _check_plain(different: Sequence[Bool[np.ndarray, "height width"]], names: Sequence[str]) -> None:
     """Raise CaptureError where much of the images' borders is no background."""
     borders = [np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]) for mask in different]
     share = float(np.concatenate(borders).mean())
-    if share > _BUSY:
+    if share > MAX_BORDER_DIFFERENCE:
         raise CaptureError(
             f"expected a plain background, got {share:.0%} of the images' borders in other colors ({listed(names)}); "
             "give masks, or photograph the object in front of one color with a margin around it",
@@ -199,9 +187,9 @@ def _refuse_busy(different: Sequence[Bool[np.ndarray, "height width"]], names: S
 
 
 def _refuse_few(found: Sequence[str], count: int) -> None:
-    if len(found) < FEWEST:
+    if len(found) < MIN_VIEWS:
         raise CaptureError(
-            f"expected an object in front of a plain background in at least {FEWEST} views, got {len(found)} of "
+            f"expected an object in front of a plain background in at least {MIN_VIEWS} views, got {len(found)} of "
             f"{count}; give masks",
             name="object",
             value=len(found),
@@ -222,3 +210,186 @@ def _masked(views: Sequence[View], masks: Sequence[np.ndarray]) -> tuple[View, .
         message = f"{counted(len(empty), 'view')} not used, without an object: {listed(empty)}"
         warnings.warn(CaptureWarning(message, name="object", value=empty), stacklevel=3)
     return tuple(found)
+
+
+def _background_distances(views: Sequence[View]) -> list[UInt8[np.ndarray, "height width"]]:
+    """Return for each pixel how far its color is from the background's: the largest channel's difference, of 255.
+
+    Each image's background is a quadratic in the pixel's place, fitted to its border and to that of all images: so
+    that light falling off to the corners is no object, and an object that covers a whole border no background.
+    """
+    common = np.median(np.concatenate([_border(view.image.numpy()) for view in views]), axis=0)
+    return [_distance(view.image.numpy(), common) for view in views]
+
+
+def _background_threshold(distances: Sequence[UInt8[np.ndarray, "height width"]]) -> int:
+    """Return the greatest distance that is still background, by Otsu's criterion on logarithms, all images together.
+
+    Logarithms, because an object's own colors spread far wider than a background's noise: on the plain scale the dark
+    half of a white object in raking light is cut away.
+    """
+    borders = np.concatenate([_border(distance[..., None]) for distance in distances])
+    noise = max(MIN_NOISE, 2 * float(np.median(borders)))
+    counts = np.sum([np.bincount(distance.ravel(), minlength=256) for distance in distances], axis=0)
+    logarithms = np.log(np.arange(256) + noise)
+    below, sums = np.cumsum(counts)[:-1], np.cumsum(counts * logarithms)[:-1]
+    total, mean = counts.sum(), (counts * logarithms).sum() / counts.sum()
+    between = (mean * below - sums) ** 2 / np.maximum(below * (total - below), 1)
+    return max(int(between.argmax()), round(noise))
+
+
+def _border(image: np.ndarray) -> np.ndarray:
+    """Return the pixels along the image's edges."""
+    wide = max(1, round(BORDER * min(image.shape[:2])))
+    strips = (image[:wide], image[-wide:], image[wide:-wide, :wide], image[wide:-wide, -wide:])
+    return np.concatenate([strip.reshape(-1, image.shape[2]) for strip in strips])
+
+
+def _distance(image: np.ndarray, common: Float[np.ndarray, " 3"]) -> UInt8[np.ndarray, "height width"]:
+    terms = _terms(*image.shape[:2])
+    at, colors = _border(terms), _border(image).astype(np.float64)
+    background = np.broadcast_to(common, image.shape)
+    expected = np.broadcast_to(common, colors.shape)
+    for tolerance in (48.0, 24.0, 24.0):
+        # Colors far from what is expected belong to the object, where it leaves the image.
+        plain = np.abs(colors - expected).max(axis=1) < tolerance
+        if plain.sum() < 0.25 * len(colors):
+            break
+        weights = np.linalg.lstsq(at[plain], colors[plain], rcond=None)[0]
+        expected, background = at @ weights, np.clip(terms @ weights.astype(np.float32), 0, 255)
+    # The median takes noise out and leaves edges where they are.
+    smooth = cv2.medianBlur(image, 3)
+    return np.round(np.abs(smooth - background.astype(np.float32)).max(axis=2)).astype(np.uint8)
+
+
+@lru_cache(maxsize=1)
+def _terms(height: int, width: int) -> Float[np.ndarray, "height width terms"]:
+    """Return 1, x, y, x², xy, y² at each pixel, x and y from -1 to 1."""
+    y, x = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Hull:
+    """Cubes around an object with the votes of the views on each."""
+
+    centers: Float[np.ndarray, "places 3"]
+    """Object frame, meters."""
+    edge: float
+    """Of a cube, meters."""
+    seeing: Int[np.ndarray, " places"]
+    """How many views have the place inside their image."""
+    agreeing: Int[np.ndarray, " places"]
+    """How many of these show object there."""
+    views: int
+    """How many views voted."""
+
+    def occupied(self, *, missing: int) -> Bool[np.ndarray, " places"]:
+        """Return which places are object, where up to `missing` views, of as many as voted, may say otherwise."""
+        allowed = np.floor(missing * self.seeing / self.views)
+        enough = self.seeing >= max(2.0, MIN_SEEING * self.views)
+        return enough & (self.agreeing >= self.seeing - allowed)
+
+
+def carve(masks: Sequence[Bool[np.ndarray, "height width"]], cameras: Sequence[Camera]) -> Hull | None:
+    """Return the hull of the masks; None where they and their cameras agree on no place at all."""
+    bounds = _bounds(masks, cameras)
+    if bounds is None:
+        return None
+    coarse = _vote(*_cubes(*bounds, COARSE_CELLS), masks, cameras)
+    inside = coarse.occupied(missing=len(masks) // 6)
+    if not inside.any():
+        return None
+    low = coarse.centers[inside].min(axis=0) - 1.5 * coarse.edge
+    high = coarse.centers[inside].max(axis=0) + 1.5 * coarse.edge
+    return _vote(*_cubes(low, high, FINE_CELLS), masks, cameras)
+
+
+def silhouette(
+    hull: Hull, places: Bool[np.ndarray, " places"], camera: Camera
+) -> tuple[Bool[np.ndarray, "height width"], float]:
+    """Return where the given places lie in the camera's image, and how large a cube is there, pixels.
+
+    The outline is as coarse as the cubes.
+    """
+    across, down, depth = _pixels(hull.centers[places], camera)
+    ahead = depth > 0
+    if not ahead.any():
+        return np.zeros((camera.height, camera.width), dtype=bool), 1.0
+    footprint = max(camera.focal) * hull.edge / float(np.median(depth[ahead]))
+    # A cube covers at most one pixel of an image this small, so that neighbors leave no gap that closing leaves open.
+    shrink = max(1.0, footprint)
+    width, height = int(np.ceil(camera.width / shrink)), int(np.ceil(camera.height / shrink))
+    columns, rows = np.floor(across / shrink), np.floor(down / shrink)
+    seen = ahead & (columns >= 0) & (rows >= 0) & (columns < width) & (rows < height)
+    small = np.zeros((height, width), dtype=np.uint8)
+    small[rows[seen].astype(int), columns[seen].astype(int)] = 1
+    closed = cv2.morphologyEx(small, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    column = np.minimum((np.arange(camera.width) + 0.5) / shrink, width - 1).astype(int)
+    row = np.minimum((np.arange(camera.height) + 0.5) / shrink, height - 1).astype(int)
+    return closed[row[:, None], column[None, :]] > 0, footprint
+
+
+def _bounds(
+    masks: Sequence[Bool[np.ndarray, "height width"]], cameras: Sequence[Camera]
+) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]] | None:
+    """Return the corners of a box that holds the object: the middles of the masks looked at from all sides."""
+    directions, positions, angles = [], [], []
+    for mask, camera in zip(masks, cameras, strict=True):
+        rows, columns = np.nonzero(mask)
+        if not len(rows):
+            continue
+        across = (columns + 0.5 - camera.principal[0]) / camera.focal[0]
+        down = (rows + 0.5 - camera.principal[1]) / camera.focal[1]
+        ray = camera.world_to_camera[:3, :3].numpy().T @ (across.mean(), down.mean(), 1.0)
+        directions.append(ray / np.linalg.norm(ray))
+        positions.append(camera.position.numpy())
+        angles.append(float(np.hypot(across - across.mean(), down - down.mean()).max()))
+    if len(directions) < 2:
+        return None
+    lines, places = np.array(directions), np.array(positions)
+    beside = np.eye(3) - lines[:, :, None] * lines[:, None, :]
+    if np.linalg.eigvalsh(beside.sum(axis=0))[0] < 1e-6 * len(lines):
+        return None
+    center = np.linalg.solve(beside.sum(axis=0), np.einsum("ijk,ik->j", beside, places))
+    # The median, for a mask that leaked into the background is far too large.
+    radius = 1.25 * float(np.median(np.array(angles) * np.linalg.norm(places - center, axis=1)))
+    return center - radius, center + radius
+
+
+def _cubes(
+    low: Float[np.ndarray, " 3"], high: Float[np.ndarray, " 3"], count: int
+) -> tuple[Float[np.ndarray, "places 3"], float]:
+    """Return the centers of about `count` cubes that fill a box, and their edge."""
+    edge = float(np.prod(high - low) / count) ** (1 / 3)
+    steps = np.maximum(1, np.ceil((high - low) / edge)).astype(int)
+    axes = [low[axis] + (np.arange(steps[axis]) + 0.5) * edge for axis in range(3)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3), edge
+
+
+def _vote(
+    centers: Float[np.ndarray, "places 3"],
+    edge: float,
+    masks: Sequence[Bool[np.ndarray, "height width"]],
+    cameras: Sequence[Camera],
+) -> Hull:
+    seeing, agreeing = np.zeros(len(centers), dtype=np.int64), np.zeros(len(centers), dtype=np.int64)
+    for mask, camera in zip(masks, cameras, strict=True):
+        across, down, depth = _pixels(centers, camera)
+        seen = (depth > 0) & (across >= 0) & (down >= 0) & (across < camera.width) & (down < camera.height)
+        rows, columns = down[seen].astype(np.int32), across[seen].astype(np.int32)
+        seeing += seen
+        agreeing[seen] += mask[rows, columns]
+    return Hull(centers, edge, seeing, agreeing, len(masks))
+
+
+def _pixels(
+    points: Float[np.ndarray, "points 3"], camera: Camera
+) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
+    """Return columns, rows and depths of points; single precision, which is a thousandth of a pixel here."""
+    pose = camera.world_to_camera.numpy().astype(np.float32)
+    inside = points.astype(np.float32) @ pose[:3, :3].T + pose[:3, 3]
+    depth = np.where(inside[:, 2] > 0, inside[:, 2], np.float32(1.0))
+    across = inside[:, 0] / depth * np.float32(camera.focal[0]) + np.float32(camera.principal[0])
+    down = inside[:, 1] / depth * np.float32(camera.focal[1]) + np.float32(camera.principal[1])
+    return across, down, inside[:, 2]

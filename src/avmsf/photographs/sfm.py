@@ -89,7 +89,7 @@ def estimate_cameras(
     cameras to the last bit with `threads=1`, and to about one part in 100,000 with more; None takes all cores.
 
     The work runs in a process of its own, which ends with this call, whether that returns, raises, or is interrupted;
-    `sparse/0` is whole or absent. Frame and scale of the result are arbitrary: see `align_similarity`. Warns with
+    `sparse/0` is whole or absent. Frame and scale of the result are arbitrary. Warns with
     CaptureWarning of images that could not be read, that got no camera, or that form a model apart. Raises
     CaptureError where pycolmap is missing, `sparse/0` exists, images differ in size but share a camera, the work takes
     more than `timeout` seconds or crashes, or less than the part `least` of the images gets a camera.

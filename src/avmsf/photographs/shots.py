@@ -1,15 +1,19 @@
-"""What a camera file says of one photograph, before any pixel is read."""
+"""What a camera file says of a photograph, and its image, mask and lens made into the view of one pinhole."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf._utils.wording import counted
 from avmsf.capture.filenames import pictures_in
 from avmsf.errors import CaptureError, Remark
-from avmsf.photographs.lenses import Lens
+from avmsf.photographs.cameras import View
+from avmsf.photographs.images import Picture, PictureSizeError, read_mask, read_picture, read_upright, scale
+from avmsf.photographs.lenses import Lens, straighten
 
 MAX_SHOTS = 10_000
 """Photographs of one object: a video of five minutes, frame by frame. Splatting uses some hundreds."""
@@ -81,3 +85,119 @@ def listed(names: Sequence[str], *, most: int = 5) -> str:
     """Return the first names and how many more there are."""
     more = len(names) - most
     return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+
+
+@dataclass
+class Findings:
+    """Problems of single images, reported together."""
+
+    remarks: list[Remark]
+    lost: list[str] = field(default_factory=list)
+    empty: list[str] = field(default_factory=list)
+    resized: list[str] = field(default_factory=list)
+    turned: list[str] = field(default_factory=list)
+    unmasked: list[str] = field(default_factory=list)
+    stretched: list[str] = field(default_factory=list)
+
+    def summary(self) -> list[Remark]:
+        """Return one remark for each kind of finding; its name is the kind, its value the images."""
+        kinds = (
+            ("missing images", "image", "missing or corrupt, not used", self.lost),
+            ("empty masks", "image", "with an empty mask, not used", self.empty),
+            ("image sizes", "image", "of another size than the camera, whose intrinsics were scaled", self.resized),
+            ("orientations", "image", "rotated by the orientation tag to fit the camera", self.turned),
+            ("missing masks", "mask", "missing or corrupt; the images are used without", self.unmasked),
+            ("mask sizes", "mask", "scaled from another size to that of the image", self.stretched),
+        )
+        return self.remarks + [
+            Remark(f"{counted(len(images), thing)} {message}: {listed(images)}", name=name, value=images)
+            for name, thing, message, images in kinds
+            if images
+        ]
+
+
+def read_view(shot: Shot, base: Path, longest: int | None, meters: float, findings: Findings) -> View | None:
+    """Read one shot's image and mask into a pinhole's view; None, and a finding, where there is nothing to see."""
+    try:
+        picture = read_picture(shot.image)
+    except PictureSizeError:
+        raise
+    except CaptureError:
+        findings.lost.append(shot.name)
+        return None
+    picture, lens = _fit(shot, picture, findings)
+    picture = _with_mask(shot, base, picture, findings)
+    picture, lens = straighten(picture, lens)
+    if longest is not None and max(picture.size) > longest:
+        width, height = (max(1, round(side * longest / max(picture.size))) for side in picture.size)
+        picture, lens = picture.scaled(width, height), lens.resized(width, height)
+    if picture.mask is not None and not picture.mask.any():
+        findings.empty.append(shot.name)
+        return None
+    pose = shot.world_to_camera.clone()
+    pose[:3, 3] *= meters
+    mask = None if picture.mask is None else torch.from_numpy(picture.mask)
+    return View(shot.name, torch.from_numpy(picture.color), lens.camera(pose), mask)
+
+
+def _fit(shot: Shot, picture: Picture, findings: Findings) -> tuple[Picture, Lens]:
+    """Return picture and lens of one size; raises CaptureError where their shapes differ."""
+    lens = shot.lens_of(*picture.size)
+    if picture.size == (lens.width, lens.height):
+        return picture, lens
+    if picture.mask is None:
+        upright = read_upright(shot.image)
+        if upright.size != picture.size and _same_shape(upright.size, (lens.width, lens.height)):
+            picture = upright
+            findings.turned.append(shot.name)
+    width, height = picture.size
+    if (width, height) == (lens.width, lens.height):
+        return picture, lens
+    if not _same_shape((width, height), (lens.width, lens.height)):
+        raise CaptureError(
+            f"{shot.image}: expected an image of its camera's shape, {lens.width} x {lens.height} ({lens.origin}), got "
+            f"{width} x {height}; give the images of which the cameras were estimated, not cropped or rotated",
+            file=shot.image,
+            name="image",
+            value=[width, height],
+        )
+    findings.resized.append(f"{shot.name} ({width} x {height} instead of {lens.width} x {lens.height})")
+    return picture, lens.resized(width, height)
+
+
+def _with_mask(shot: Shot, base: Path, picture: Picture, findings: Findings) -> Picture:
+    """Return the picture with the mask that lies in a file, where it has none of its own."""
+    if picture.mask is not None:
+        return picture
+    path = next((place for place in mask_places(shot, base) if place.is_file()), None)
+    if path is None:
+        if shot.mask is not None:
+            findings.unmasked.append(shot.name)
+        return picture
+    try:
+        mask = read_mask(path)
+    except PictureSizeError:
+        raise
+    except CaptureError:
+        findings.unmasked.append(shot.name)
+        return picture
+    width, height = picture.size
+    if mask.shape != (height, width):
+        if not _same_shape((mask.shape[1], mask.shape[0]), (width, height)):
+            raise CaptureError(
+                f"{path}: expected a mask of its image's shape, {width} x {height}, got {mask.shape[1]} x "
+                f"{mask.shape[0]}; make the mask of this image",
+                file=path,
+                name="mask",
+                value=[mask.shape[1], mask.shape[0]],
+            )
+        findings.stretched.append(f"{shot.name} ({mask.shape[1]} x {mask.shape[0]} for {width} x {height})")
+        mask = scale(mask, width, height)
+    return Picture(picture.color, mask)
+
+
+def _same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two sizes are one picture at two scales, up to a pixel of rounding in the smaller."""
+    small, large = sorted((one, other))
+    factor = large[0] / small[0]
+    return abs(large[1] / factor - small[1]) <= 1

@@ -1,8 +1,5 @@
 """Photographs out of a video: from each stretch of time its sharpest frame."""
 
-import os
-import shutil
-import uuid
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,11 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from avmsf._utils.files import unwritable
-from avmsf.capture.location import check_free
+from avmsf._utils.files import new_folder
 from avmsf.errors import CaptureError, CaptureWarning
 
-JUDGED = 480
+SHARPNESS_PIXELS = 480
 """Pixels of the longer side on which sharpness is judged: less would hide a slight blur, more measures the noise."""
 
 
@@ -51,16 +47,11 @@ def pick_frames(
         raise CaptureError(f"count: expected at least 1 frame, got {count}", name="count", value=count)
     if suffix not in (".png", ".jpg"):
         raise CaptureError(f"suffix: expected .png or .jpg, got {suffix!r}", name="suffix", value=suffix)
-    check_free(folder)
     claimed = _claimed_frames(path)
-    begun = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}")
-    try:
-        begun.mkdir(parents=True)
-        total = claimed
-        if total < count:
-            total = _read(path, lambda number, frame: None, progress, claimed)
+    with new_folder(folder, raising=CaptureError) as begun:
+        total = claimed if claimed >= count else _read(path, lambda number, frame: None, progress, claimed)
         while True:
-            _expect_enough(path, total, count)
+            _check_enough(path, total, count)
             read, picked = _pick(path, begun, total=total, count=count, suffix=suffix, progress=progress)
             if read == total:
                 break
@@ -68,13 +59,6 @@ def pick_frames(
             for frame in picked:
                 frame.path.unlink(missing_ok=True)
             total = read
-        if folder.exists():
-            folder.rmdir()
-        os.rename(begun, folder)
-    except OSError as error:
-        raise unwritable(folder, error, raising=CaptureError) from error
-    finally:
-        shutil.rmtree(begun, ignore_errors=True)
     if total < 0.95 * claimed:
         message = (
             f"{path}: expected {claimed} frames as its header says, got {total}; the frames are selected from these"
@@ -84,14 +68,14 @@ def pick_frames(
 
 
 def sharpness(frame: np.ndarray) -> float:
-    """Return the variance of the Laplacian of a picture's brightness, 0 to 255, on a copy of `JUDGED` pixels at most.
+    """Return the variance of the Laplacian of a picture's brightness, 0 to 255.
 
-    The picture is [height, width, 3] in 8 bits, blue first.
+    The picture is [height, width, 3] in 8 bits, blue first; a copy of `SHARPNESS_PIXELS` at most is measured.
     """
     gray = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
     height, width = gray.shape
-    if max(height, width) > JUDGED:
-        factor = JUDGED / max(height, width)
+    if max(height, width) > SHARPNESS_PIXELS:
+        factor = SHARPNESS_PIXELS / max(height, width)
         smaller = (max(1, round(width * factor)), max(1, round(height * factor)))
         gray = cv2.resize(gray, smaller, interpolation=cv2.INTER_AREA)
     return float(cv2.Laplacian(gray, cv2.CV_32F).var())
@@ -172,7 +156,7 @@ def _open(path: Path) -> cv2.VideoCapture:
     return video
 
 
-def _expect_enough(path: Path, total: int, count: int) -> None:
+def _check_enough(path: Path, total: int, count: int) -> None:
     if total == 0:
         raise CaptureError(
             f"{path}: expected a video with frames, got none that can be read; convert it to MP4 (H.264)",

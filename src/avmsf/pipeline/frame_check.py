@@ -19,9 +19,9 @@ from avmsf.gaussians.points import farthest_points
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import Camera, View
-from avmsf.photographs.coarse_hull import Hull, carve
+from avmsf.photographs.folder import check_cameras
 from avmsf.photographs.mesh_views import MeshTracer
-from avmsf.photographs.poses import judge_cameras
+from avmsf.photographs.segmentation import Hull, carve
 
 MAX_VIEWS = 12
 """Views that are compared, as far apart as they stand."""
@@ -126,7 +126,7 @@ def expect_contacts_in_views(
             words: _share_inside(contacts, mended) * bool(_hull(mended)) for words, mended in _conventions(chosen)
         }
         likely = max(shares, key=shares.__getitem__)
-        found = [remark.message for remark in judge_cameras([view.camera for view in chosen])]
+        found = [remark.message for remark in check_cameras([view.camera for view in chosen])]
         found += [f"they show the contacts once {likely}"] if 2 * shares[likely] > 1 else []
         # Cubes may miss what is thin: by itself that says nothing.
         if found:

@@ -16,10 +16,10 @@ from avmsf.mesh.textured_mesh import read_textured_mesh
 from avmsf.photographs import find_foreground, read_views
 from avmsf.photographs.cameras import View
 from avmsf.photographs.colmap import find_model
+from avmsf.photographs.folder import write_views
 from avmsf.photographs.mesh_views import orbit_cameras, render_views
 from avmsf.photographs.sfm import FEWEST, estimate_cameras
 from avmsf.photographs.video import pick_frames
-from avmsf.photographs.write import write_views
 from avmsf.pipeline.config import ViewsConfig
 from avmsf.pipeline.stages import Kept, StageFolder, digest_files
 

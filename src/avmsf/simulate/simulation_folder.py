@@ -14,8 +14,8 @@ from PIL import Image
 from avmsf.capture.folder import write_capture
 from avmsf.errors import CaptureError, SimulationError
 from avmsf.mesh.textured_mesh import TexturedMesh
+from avmsf.photographs.folder import write_views
 from avmsf.photographs.mesh_views import orbit_cameras, render_views
-from avmsf.photographs.write import write_views
 from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
 from avmsf.simulate.recipe import AXES, ObjectRecipe
 from avmsf.simulate.simulation import Simulation, simulate_object

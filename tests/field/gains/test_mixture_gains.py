@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from avmsf.capture.places import SAME_PLACE, places_of
+from avmsf.capture.impacts import SAME_PLACE, places_of
 from avmsf.field.gains import model as module
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import fit_mixture

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from avmsf._utils.records import RecordError, count_of, like
 from avmsf._utils.summary import short_repr
-from avmsf.capture.places import places_of
+from avmsf.capture.impacts import places_of
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.elastic_store import mode_sizes, mode_skeleton, mode_tensors, restored_modes
 from avmsf.field.gain_field import GainField, Gains

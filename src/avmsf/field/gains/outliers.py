@@ -42,7 +42,7 @@ from torch import Tensor
 
 from avmsf._utils.wording import counted
 from avmsf.capture.filenames import number_key
-from avmsf.capture.places import places_of
+from avmsf.capture.impacts import places_of
 from avmsf.field.gains.family import KernelFamily, Sites
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, total_evidence
 from avmsf.field.gains.mixture import NOISE_SHARES
