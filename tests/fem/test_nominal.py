@@ -11,7 +11,7 @@ import trimesh
 from avmsf.errors import SimulationError
 from avmsf.fem import candidate_bodies as nominal
 from avmsf.fem import mesh_filling as nominalsolid
-from avmsf.fem.candidate_bodies import NominalBody, nominal_bodies, refined
+from avmsf.fem.candidate_bodies import BodyMaker, NominalBody, nominal_bodies
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import NOMINAL
 from avmsf.mesh.surface import Surface, read_surface
@@ -61,10 +61,10 @@ def test_walls_of_a_sheet_are_tried_coarsely_and_the_chosen_one_made_fine(monkey
     assert any("42 open edges" in message for message in messages)
     assert "42 open edges" in found.refused[None]
     body = found.bodies[1]
-    fine = refined(sheet(), body, dofs=4000)
+    fine = BodyMaker(sheet(), count=6, dofs=4000).refine(body)
     assert fine.fine
     assert fine.wall == body.wall
-    assert refined(sheet(), fine) is fine
+    assert BodyMaker(sheet()).refine(fine) is fine
     assert len(fine.elastic.nodes) > 2 * len(body.elastic.nodes)
     # Triangles of the coarse one are a sixth of the sheet long: against a regular mesh it is 3 and 6 % too high.
     assert float((fine.elastic.frequency / body.elastic.frequency - 1).abs()[:2].max()) < 0.07
@@ -194,10 +194,9 @@ def test_a_body_stays_coarse_where_a_finer_one_does_not_fit_into_the_memory(
 ):
     monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 1e9)
     messages: list[str] = []
-    assert refined(sheet(), coarse, dofs=400_000, log=messages.append) is coarse
+    assert BodyMaker(sheet(), count=4, dofs=400_000, log=messages.append).refine(coarse) is coarse
     assert messages[-1].startswith("wall of 4 mm: ")
     assert "400000" in messages[-1]
-    assert refined(sheet(), coarse, dofs=400_000) is coarse
 
 
 @pytest.mark.parametrize(
@@ -211,7 +210,7 @@ def test_a_body_stays_coarse_where_a_finer_one_fails(
 
     monkeypatch.setattr(nominal, "elastic_modes", fail)
     messages: list[str] = []
-    assert refined(sheet(), coarse, dofs=3000, log=messages.append) is coarse
+    assert BodyMaker(sheet(), count=4, dofs=3000, log=messages.append).refine(coarse) is coarse
     assert messages[-1].startswith("wall of 4 mm: ")
     assert reason in messages[-1]
 

@@ -127,20 +127,20 @@ def test_a_body_of_too_coarse_elements_is_made_finer_and_its_error_told(monkeypa
 
     def made(error: float) -> tuple[list[int], list[str]]:
         asked: list[int] = []
-        heard: list[str] = []
+        messages: list[str] = []
 
         def found(maker: object, wall: float | None, dofs: int, **others: object) -> ElasticModes:
             asked.append(dofs)
             return modes(dofs, error)
 
-        monkeypatch.setattr("avmsf.fem.candidate_bodies._Maker._modes", found)
-        nominal_bodies(box(0.1, 0.1, 0.1), walls=[None], count=8, dofs=40_000, log=heard.append)
-        return asked, heard
+        monkeypatch.setattr("avmsf.fem.candidate_bodies.BodyMaker._modes", found)
+        nominal_bodies(box(0.1, 0.1, 0.1), walls=[None], count=8, dofs=40_000, log=messages.append)
+        return asked, messages
 
     assert max(made(0.03)[0]) == 40_000
-    asked, heard = made(0.08)
+    asked, messages = made(0.08)
     assert max(asked) == 80_000
-    assert not heard
+    assert not messages
     # A third of .3 and more is left with twice as many.
     [words] = made(0.3)[1]
     assert f"{0.3 / 2**1.5 / (1 + 0.3 / 2**1.5):.0%}" in words

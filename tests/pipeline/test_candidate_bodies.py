@@ -42,15 +42,11 @@ def estimator(*known: NominalBody, finer: "Finer | None" = None, kinds: tuple[st
 class Finer:
     """Makes bodies finer in name alone, and remembers which."""
 
-    fineness: str = ""
     asked: list[NominalBody] = field(default_factory=list)
 
     def __call__(self, body: NominalBody) -> NominalBody:
         self.asked.append(body)
         return replace(body, fine=True)
-
-    def digest(self) -> str:
-        return self.fineness
 
 
 def features() -> FeatureField:
@@ -135,9 +131,6 @@ class Held:
         self.asked.append(body)
         return body, replace(self.body, support=Support("held at its lowest face"))
 
-    def digest(self) -> str:
-        return ""
-
 
 @pytest.mark.parametrize("free", [0, 1])
 def test_a_held_body_is_named_if_it_is_more_probable_than_the_free_one(free: int) -> None:
@@ -166,7 +159,9 @@ def test_a_fine_body_is_not_computed_again() -> None:
 
 def test_estimators_of_other_bodies_or_elements_have_other_digests() -> None:
     assert estimator().digest() == estimator().digest()
-    made = (estimator(), estimator(*bodies()[:2]), *(estimator(finer=Finer(each)) for each in ("20000", "40000")))
+    candidates = CandidateBodies(NominalBodies(bodies(), {}), Finer())
+    finer = (MixtureEstimator(bodies=replace(candidates, dofs=each)) for each in (20_000, 40_000))
+    made = (estimator(), estimator(*bodies()[:2]), *finer)
     assert len({each.digest() for each in made}) == len(made)
 
 

@@ -8,7 +8,7 @@ import torch
 import trimesh
 
 from avmsf.errors import SceneError
-from avmsf.fem.candidate_bodies import nominal_bodies, with_wall
+from avmsf.fem.candidate_bodies import BodyMaker, nominal_bodies
 from avmsf.mesh.boolean import difference
 from avmsf.mesh.surface import Surface
 from avmsf.pipeline.bodies import candidate_bodies
@@ -59,7 +59,7 @@ def test_walls_that_cannot_be_had_are_left_out() -> None:
     found = nominal_bodies(Cup(most=0.01), count=6, dofs=4000)
     assert [body.wall is None or body.wall <= 0.01 for body in found.bodies] == [True] * len(found.bodies)
     assert {wall for wall in found.refused if wall is not None and wall > 0.01} == set(found.refused)
-    assert with_wall(Cup(most=0.01), 0.011, count=6, dofs=4000) is None
+    assert BodyMaker(Cup(most=0.01), count=6, dofs=4000).thicken(0.011) is None
 
 
 @pytest.mark.slow

@@ -62,7 +62,7 @@ def test_other_code_makes_a_stage_again(tmp_path: Path, monkeypatch: pytest.Monk
 
 def body_key() -> Path | None:
     surface = Surface(torch.eye(3), torch.tensor([[0, 1, 2]]))
-    return nominal._Maker(surface, 6, Path("bodies"), print)._kept(None, 1200, perturbed=False)
+    return nominal.BodyMaker(surface, count=6, cache=Path("bodies"), log=print)._kept(None, 1200, perturbed=False)
 
 
 def fit_key() -> str:

@@ -1,7 +1,7 @@
 """Guesses at what lies behind an object's surface, each with the shapes in which such a body would vibrate."""
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -40,6 +40,8 @@ _FORMAT = 3
 """Number of the way in which bodies are made; kept files of another are not read."""
 _THICKNESSES = 5
 """Thicknesses that are computed at first of a shape whose wall is not known."""
+_REMESHING = Lock()
+"""Held while the skin of a wall is remeshed, which several threads wait for."""
 _MEANS = frozenset({"memory", "timeout", "pytetwild"})
 """Names of errors that are no fault of a surface or its wall."""
 
@@ -78,7 +80,7 @@ class NominalBody:
     elastic: ElasticModes
     """Nominal material."""
     fine: bool = True
-    """Whether its elements are as many as were asked for; `refined` makes those finer that were made to be compared."""
+    """Whether its elements are as many as were asked for; of those that were made to be compared there are fewer."""
     support: Support | None = None
     """Where it is held; None for a free body."""
     updated: float | None = None
@@ -118,195 +120,182 @@ def nominal_bodies(
     and walls of `WALLS` times the surface's size where the surface is a sheet or holds much more than the wall would;
     of a `Shape`, walls all over its range of thickness. Where one body is left, it has about `dofs` degrees of
     freedom, at most a fifth more; of several each has at most `TRIAL`, or `WALL_TRIAL`, enough to choose by, and
-    `refined` makes the chosen one fine. Dense, noisy and inverted surfaces are repaired, and `log` is called with a
-    note; the wall of an open one lies behind its triangles, whichever way they face. Modes are kept by content in the
-    folder `cache`, for they take most of the time; a damaged file is made again.
+    `BodyMaker.refine` makes the chosen one fine. Dense, noisy and inverted surfaces are repaired, and `log` is called
+    with a note; the wall of an open one lies behind its triangles, whichever way they face. Modes are kept by content
+    in the folder `cache`, for they take most of the time; a damaged file is made again.
 
     Raises SimulationError for a surface of points, and where no body can be had, with the reason for each: by the name
     "surface", or by that of the reason where only memory, time or the mesher stood against it.
     """
-    report = log or (lambda words: None)
-    maker = _Maker(surface, count, cache, report, material)
-    _expect_settings(count, dofs, walls)
-    guessed = walls is None
-    wanted: list[float | None] = maker.guesses() if walls is None else list(dict.fromkeys(walls))
-    refused: dict[float | None, SimulationError] = {}
-    likely: list[float | None] = []
-    for wall in wanted:
-        try:
-            maker.expect_likely(wall, guessed=guessed)
-            likely.append(wall)
-        except SimulationError as error:
-            refused[wall] = error
-    bodies = maker.bodies(likely, dofs, refused)
-    reasons = _grouped(refused)
-    if not bodies:
-        causes = {str(error.name) for error in refused.values()}
-        other = "give the wall thickness in meters" if guessed else "give another wall thickness, or none"
-        raise SimulationError(
-            f"expected a surface with a finite-element model, got none ({'; '.join(reasons)}); repair the mesh, or "
-            f"{other}",
-            name=min(causes) if causes <= _MEANS else "surface",
-            value=reasons,
-        )
-    for reason in reasons:
-        report(_without(reason))
-    if len(bodies) == 1 and not bodies[0].fine:
-        bodies = [refined(surface, bodies[0], dofs=dofs, cache=cache, log=log)]
-    return NominalBodies(tuple(bodies), MappingProxyType({wall: str(error) for wall, error in refused.items()}))
+    maker = BodyMaker(surface, count=count, dofs=dofs, material=material, cache=cache, log=log)
+    return maker.nominal(walls)
 
 
-def with_wall(
-    surface: Surface | Shape,
-    wall: float,
-    *,
-    count: int = 80,
-    dofs: int = 40_000,
-    cache: Path | None = None,
-    log: Callable[[str], None] | None = None,
-) -> NominalBody | None:
-    """Return the body with a wall of this thickness, meters, coarse as those of `nominal_bodies`; None if that fails.
+class BodyMaker:
+    """Makes the bodies of one surface or shape, each once, and does once what all of them need.
 
-    `log` is called with the reason.
+    Arguments as those of `nominal_bodies`. Raises SimulationError for a count or degrees of freedom that cannot be.
     """
-    report = log or (lambda words: None)
-    try:
-        return _Maker(surface, count, cache, report).body(wall, dofs, fine=False)
-    except SimulationError as error:
-        report(_without(f"{body_name(wall)}: {error}"))
-        return None
-
-
-def refined(
-    surface: Surface | Shape,
-    body: NominalBody,
-    *,
-    dofs: int = 40_000,
-    cache: Path | None = None,
-    log: Callable[[str], None] | None = None,
-) -> NominalBody:
-    """Return a body of `nominal_bodies` computed with about `dofs` degrees of freedom; a fine one as it is.
-
-    Where that fails, for want of memory or because it cannot be filled so finely, the coarser one is returned, which
-    was good enough to choose by, and `log` is called with the reason. Raises SimulationError for settings that cannot
-    be meant.
-    """
-    if body.fine:
-        return body
-    report = log or (lambda words: None)
-    _expect_settings(len(body.elastic), dofs, [body.wall])
-    try:
-        maker = _Maker(surface, len(body.elastic), cache, report, body.elastic.material)
-        if body.support is None:
-            return maker.body(body.wall, dofs, fine=True)
-        modes = maker.held(body.wall, dofs, maker.solid(body.wall, dofs), body.support, perturbed=True)
-        return replace(body, elastic=modes, fine=True)
-    except SimulationError as error:
-        report(f"{body.name}: using the coarse mesh: {error}")
-        return body
-
-
-def supported(
-    surface: Surface | Shape,
-    body: NominalBody,
-    *,
-    dofs: int = 40_000,
-    cache: Path | None = None,
-    log: Callable[[str], None] | None = None,
-) -> tuple[NominalBody, ...]:
-    """Return a free body of `nominal_bodies`, and held where an object may be: at its lowest face or point, or an edge.
-
-    All have the same tetrahedra, of `TRIAL` or `WALL_TRIAL` degrees of freedom at most, enough to choose by; `refined`
-    makes the chosen one fine, without a check of its convergence. Those whose modes cannot be computed are left out,
-    and `log` is called with the reason; none are returned if the free one's cannot.
-    """
-    report = log or (lambda words: None)
-    trial = TRIAL if isinstance(surface, Surface) else WALL_TRIAL
-    few = min(dofs, trial)
-    maker, bodies = _Maker(surface, len(body.elastic), cache, report, body.elastic.material), []
-    try:
-        solid = maker.solid(body.wall, few)
-        for support in (None, *supports_of(SecondOrder.of(solid))):
-            try:
-                modes = maker.held(body.wall, few, solid, support, perturbed=dofs <= trial)
-                bodies.append(NominalBody(body.wall, modes, dofs <= trial, support))
-            except SimulationError as error:
-                if support is None:
-                    raise
-                report(_without(f"{body.name}, {support.name}: {error}"))
-    except SimulationError as error:
-        report(f"{body.name}: no supports tested: {error}")
-    return tuple(bodies)
-
-
-class _Maker:
-    """Makes the bodies of one surface or shape, and does once what all of them need."""
 
     def __init__(
         self,
         surface: Surface | Shape,
-        count: int,
-        cache: Path | None,
-        log: Callable[[str], None],
+        *,
+        count: int = 80,
+        dofs: int = 40_000,
         material: Material = NOMINAL,
+        cache: Path | None = None,
+        log: Callable[[str], None] | None = None,
     ) -> None:
+        _expect_settings(count, dofs)
         self._given = surface
         self._shape = None if isinstance(surface, Surface) else surface
-        self._count, self._cache, self._tell, self._material = count, cache, log, material
+        self._count, self._dofs, self._material, self._cache = count, dofs, material, cache
+        self._log = log or (lambda words: None)
+        self._trial = min(dofs, TRIAL if self._shape is None else WALL_TRIAL)
         self._walls: dict[int, Callable[[float], Solid]] = {}
-        self._lock = Lock()
+        self._refined: dict[tuple[float | None, Support | None], NominalBody] = {}
+        self._held: dict[float | None, tuple[NominalBody, ...]] = {}
+        self._thickened: dict[float, NominalBody | None] = {}
+
+    def nominal(self, walls: Sequence[float | None] | None) -> NominalBodies:
+        """Return the bodies with these walls. Raises as `nominal_bodies`."""
+        _expect_walls(walls)
+        guessed = walls is None
+        wanted: list[float | None] = self._guesses() if walls is None else list(dict.fromkeys(walls))
+        refused: dict[float | None, SimulationError] = {}
+        likely: list[float | None] = []
+        for wall in wanted:
+            try:
+                self._expect_likely(wall, guessed=guessed)
+                likely.append(wall)
+            except SimulationError as error:
+                refused[wall] = error
+        bodies = self._bodies(likely, refused)
+        reasons = _grouped(refused)
+        if not bodies:
+            causes = {str(error.name) for error in refused.values()}
+            other = "give the wall thickness in meters" if guessed else "give another wall thickness, or none"
+            raise SimulationError(
+                f"expected a surface with a finite-element model, got none ({'; '.join(reasons)}); repair the mesh, or "
+                f"{other}",
+                name=min(causes) if causes <= _MEANS else "surface",
+                value=reasons,
+            )
+        for reason in reasons:
+            self._log(_without(reason))
+        if len(bodies) == 1 and not bodies[0].fine:
+            bodies = [self.refine(bodies[0])]
+        return NominalBodies(tuple(bodies), MappingProxyType({wall: str(error) for wall, error in refused.items()}))
+
+    def refine(self, body: NominalBody) -> NominalBody:
+        """Return a body computed with about all the degrees of freedom that were asked for; a fine one as it is.
+
+        Where that fails, for want of memory or because it cannot be filled so finely, the coarser one is returned,
+        which was good enough to choose by, and `log` is called with the reason.
+        """
+        key = body.wall, body.support
+        if body.fine or key in self._refined:
+            return self._refined.get(key, body)
+        try:
+            if body.support is None:
+                fine = self._body(body.wall, fine=True)
+            else:
+                solid = self._solid(body.wall, self._dofs)
+                fine = replace(body, elastic=self._solved_once(body.wall, self._dofs, solid, body.support), fine=True)
+        except SimulationError as error:
+            self._log(f"{body.name}: using the coarse mesh: {error}")
+            fine = body
+        self._refined[key] = fine
+        return fine
+
+    def hold(self, body: NominalBody) -> tuple[NominalBody, ...]:
+        """Return a free body, and held where an object may be: at its lowest face or point, or an edge.
+
+        All have the same tetrahedra, of `TRIAL` or `WALL_TRIAL` degrees of freedom at most, enough to choose by;
+        `refine` makes the chosen one fine, without a check of its convergence. Those whose modes cannot be computed are
+        left out, and `log` is called with the reason; none are returned if the free one's cannot.
+        """
+        if body.wall not in self._held:
+            self._held[body.wall] = tuple(self._supported(body))
+        return self._held[body.wall]
+
+    def thicken(self, wall: float) -> NominalBody | None:
+        """Return the body with a wall of this thickness, meters, coarse as of several; None if that fails.
+
+        `log` is called with the reason.
+        """
+        if wall not in self._thickened:
+            try:
+                self._thickened[wall] = self._body(wall, fine=False)
+            except SimulationError as error:
+                self._log(_without(f"{body_name(wall)}: {error}"))
+                self._thickened[wall] = None
+        return self._thickened[wall]
+
+    def _supported(self, body: NominalBody) -> Iterator[NominalBody]:
+        few, fine = self._trial, self._dofs <= self._trial
+        try:
+            solid = self._solid(body.wall, few)
+            for support in (None, *supports_of(SecondOrder.of(solid))):
+                try:
+                    modes = self._solved_once(body.wall, few, solid, support, perturbed=fine)
+                    yield NominalBody(body.wall, modes, fine, support)
+                except SimulationError as error:
+                    if support is None:
+                        raise
+                    self._log(_without(f"{body.name}, {support.name}: {error}"))
+        except SimulationError as error:
+            self._log(f"{body.name}: no supports tested: {error}")
 
     @cached_property
     def _seen(self) -> Surface:
         return self._given if isinstance(self._given, Surface) else self._given.as_seen()
 
     @cached_property
-    def checked(self) -> CheckedSurface:
+    def _checked(self) -> CheckedSurface:
         """The surface, mended."""
-        return checked(self._seen, log=self._tell)
+        return checked(self._seen, log=self._log)
 
-    def guesses(self) -> list[float | None]:
+    def _guesses(self) -> list[float | None]:
         """Return the walls to try; None for what the surface encloses."""
         if self._shape is None:
-            return [None, *(part * self.checked.skin.size for part in WALLS)]
+            return [None, *(part * self._checked.skin.size for part in WALLS)]
         between = self._shape.thickness_range
         return [None] if between is None else [None, *np.geomspace(*between, _THICKNESSES).tolist()]
 
-    def expect_likely(self, wall: float | None, *, guessed: bool) -> None:
+    def _expect_likely(self, wall: float | None, *, guessed: bool) -> None:
         """Raise SimulationError where a body is out of the question before tetrahedra are made."""
         if wall is None:
-            self.checked.expect_filling()
-        elif wall >= self.checked.width:
+            self._checked.expect_filling()
+        elif wall >= self._checked.width:
             raise SimulationError(
-                f"expected a wall thinner than the object's width of {_millimeters(self.checked.width, 3)}, got "
+                f"expected a wall thinner than the object's width of {_millimeters(self._checked.width, 3)}, got "
                 f"{_millimeters(wall, 3)}; give a thinner wall",
                 name="wall",
                 value=wall,
             )
         elif guessed and self._shape is None:
-            self.checked.expect_hollow(wall)
+            self._checked.expect_hollow(wall)
 
-    def body(self, wall: float | None, dofs: int, *, fine: bool) -> NominalBody:
-        """Return one body with so many degrees of freedom, or with at most `TRIAL` where it need not be fine."""
-        trial = TRIAL if self._shape is None else WALL_TRIAL
-        if not fine and dofs > trial:
+    def _body(self, wall: float | None, *, fine: bool) -> NominalBody:
+        """Return one body with so many degrees of freedom, or with few of them where it need not be fine."""
+        if not fine and self._dofs > self._trial:
             try:
-                return NominalBody(wall, self._modes(wall, trial, perturbed=False), fine=False)
+                return NominalBody(wall, self._modes(wall, self._trial, perturbed=False), fine=False)
             except SimulationError as error:
                 # Thin walls are lost in few tetrahedra. A shape has other thicknesses, and the thinnest is a bound.
                 if self._shape is not None:
                     raise
-                self._tell(f"retrying with more tetrahedra ({error})")
-        return NominalBody(wall, self._converged(wall, dofs))
+                self._log(f"retrying with more tetrahedra ({error})")
+        return NominalBody(wall, self._converged(wall))
 
-    def bodies(
-        self, walls: Sequence[float | None], dofs: int, refused: dict[float | None, SimulationError]
-    ) -> list[NominalBody]:
+    def _bodies(self, walls: Sequence[float | None], refused: dict[float | None, SimulationError]) -> list[NominalBody]:
         """Return the bodies with these walls, fine if it is one; `refused` gets the errors of those that fail."""
         bodies = []
         # Most of the time goes to factorizations, which release the interpreter's lock and keep a processor busy each.
         with ThreadPoolExecutor(lane_count()) as pool:
-            pending = {wall: pool.submit(self.body, wall, dofs, fine=len(walls) == 1) for wall in walls}
+            pending = {wall: pool.submit(self._body, wall, fine=len(walls) == 1) for wall in walls}
             try:
                 for wall, body in pending.items():
                     try:
@@ -317,8 +306,9 @@ class _Maker:
                 pool.shutdown(cancel_futures=True)
         return bodies
 
-    def _converged(self, wall: float | None, dofs: int) -> ElasticModes:
+    def _converged(self, wall: float | None) -> ElasticModes:
         """Return modes of one body, of twice as many degrees of freedom where their frequencies still change much."""
+        dofs = self._dofs
         modes = self._modes(wall, dofs, perturbed=True)
         # The thickness of a shape's wall is found with such elements, and makes up for their stiffness.
         if dofs <= TRIAL or (self._shape is not None and wall is not None):
@@ -326,42 +316,41 @@ class _Maker:
         try:
             error = _frequency_error(self._modes(wall, TRIAL, perturbed=False), modes)
         except SimulationError as failure:
-            self._tell(f"{body_name(wall)}: mesh convergence not checked ({failure})")
+            self._log(f"{body_name(wall)}: mesh convergence not checked ({failure})")
             return modes
         if error > LARGEST_ERROR:
             try:
                 finer = self._modes(wall, 2 * dofs, perturbed=True)
                 modes, error = finer, _frequency_error(modes, finer)
             except SimulationError as failure:
-                self._tell(f"{body_name(wall)}: no finer mesh ({failure})")
+                self._log(f"{body_name(wall)}: no finer mesh ({failure})")
         if error > LARGEST_ERROR:
-            self._tell(
+            self._log(
                 f"{body_name(wall)}: mesh too coarse, relative error of the lowest frequencies about {error:.0%}; "
                 f"allow {4 * dofs} degrees of freedom (--body.dofs)"
             )
         return modes
 
-    def held(
-        self, wall: float | None, dofs: int, solid: Solid, support: Support | None, *, perturbed: bool
+    def _solved_once(
+        self, wall: float | None, dofs: int, solid: Solid, support: Support | None, *, perturbed: bool = True
     ) -> ElasticModes:
         """Return the modes of tetrahedra that are held, or free without a support, read from where they are kept."""
         fixed = None if support is None else support.nodes(SecondOrder.of(solid))
         kept = self._kept(wall, dofs, support, perturbed=perturbed)
-        return modes_once(kept, lambda: self._solved(solid, dofs, fixed, perturbed=perturbed), log=self._tell)
+        return modes_once(kept, lambda: self._solved(solid, dofs, fixed, perturbed=perturbed), log=self._log)
 
     def _modes(self, wall: float | None, dofs: int, *, perturbed: bool) -> ElasticModes:
         """Return the modes of one free body, read from where they are kept."""
         kept = self._kept(wall, dofs, perturbed=perturbed)
-        return modes_once(kept, lambda: self._computed(wall, dofs, perturbed=perturbed), log=self._tell)
-
-    def _computed(self, wall: float | None, dofs: int, *, perturbed: bool) -> ElasticModes:
-        return self._solved(self.solid(wall, dofs), dofs, None, perturbed=perturbed)
+        return modes_once(
+            kept, lambda: self._solved(self._solid(wall, dofs), dofs, None, perturbed=perturbed), log=self._log
+        )
 
     def _solved(
         self, solid: Solid, dofs: int, fixed: Int[np.ndarray, " fixed"] | None, *, perturbed: bool
     ) -> ElasticModes:
         size = count_dofs(solid)
-        self._tell(f"{self._count} elastic modes of {size} degrees of freedom")
+        self._log(f"{self._count} elastic modes of {size} degrees of freedom")
         try:
             return elastic_modes(solid, self._material, count=self._count, fixed=fixed, perturbed=perturbed)
         except MemoryError as error:
@@ -372,21 +361,21 @@ class _Maker:
                 value=size,
             ) from error
 
-    def solid(self, wall: float | None, dofs: int) -> Solid:
+    def _solid(self, wall: float | None, dofs: int) -> Solid:
         """Return tetrahedra with about so many degrees of freedom."""
         expect_memory(dofs)
-        self._tell(f"dividing the {body_name(wall)} into tetrahedra")
+        self._log(f"dividing the {body_name(wall)} into tetrahedra")
         if wall is None:
-            return filled_solid(self.checked, dofs)
+            return filled_solid(self._checked, dofs)
         if self._shape is not None:
             try:
                 surface = self._shape.shell(wall, faces=round(0.5 * TRIANGLES * dofs))
             except SceneError as error:
                 raise SimulationError(str(error), **error.attributes) from error
-            return filled_solid(checked(surface, log=self._tell), dofs, wall=wall)
-        with self._lock:
+            return filled_solid(checked(surface, log=self._log), dofs, wall=wall)
+        with _REMESHING:
             if dofs not in self._walls:
-                self._walls[dofs] = wall_solids(self.checked, dofs)
+                self._walls[dofs] = wall_solids(self._checked, dofs)
         return self._walls[dofs](wall)
 
     def _kept(self, wall: float | None, dofs: int, support: Support | None = None, *, perturbed: bool) -> Path | None:
@@ -430,11 +419,14 @@ def _frequency_error(coarse: ElasticModes, fine: ElasticModes) -> float:
     return change / max((len(fine.nodes) / len(coarse.nodes)) ** 1.5 - 1.0, 1.0)
 
 
-def _expect_settings(count: int, dofs: int, walls: Sequence[float | None] | None) -> None:
+def _expect_settings(count: int, dofs: int) -> None:
     if count < 1:
         raise SimulationError(f"count: expected 1 mode or more, got {count}", name="count", value=count)
     if dofs < FEWEST:
         raise SimulationError(f"dofs: expected {FEWEST} or more, got {dofs}", name="dofs", value=dofs)
+
+
+def _expect_walls(walls: Sequence[float | None] | None) -> None:
     if walls is not None and not len(walls):
         raise SimulationError(
             "walls: expected thicknesses in meters, or None for a solid body, got an empty list",

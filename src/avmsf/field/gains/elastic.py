@@ -19,10 +19,10 @@ one or two impacts these tell which shape each mode is.
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, Protocol, TypeVar, runtime_checkable
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float64, Int
@@ -259,42 +259,28 @@ def frequency_log_prior(largest: float = math.inf) -> Float64[Tensor, " pairs"]:
     return density.repeat_interleave(len(FREQUENCY_ERRORS))
 
 
-Given = TypeVar("Given", contravariant=True)
-Made = TypeVar("Made", covariant=True)
-
-
-@runtime_checkable
-class MakesBodies(Protocol[Given, Made]):
-    """Computes more bodies of the same object."""
-
-    def __call__(self, given: Given, /) -> Made:
-        """Return what `CandidateBodies` says."""
-        ...
-
-    def digest(self) -> str:
-        """Return what distinguishes its bodies from another's."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class CandidateBodies:
     """Bodies of which each is a hypothesis."""
 
     bodies: NominalBodies
     """Coarse ones where there are several."""
-    refine: MakesBodies[NominalBody, NominalBody] | None = None
+    refine: Callable[[NominalBody], NominalBody] | None = None
     """Returns a body with finer elements, or itself where it is fine already or that fails."""
-    hold: MakesBodies[NominalBody, Sequence[NominalBody]] | None = None
+    hold: Callable[[NominalBody], Sequence[NominalBody]] | None = None
     """Returns a free body and, of the same elements, with each support; nothing where they cannot be computed."""
     always_hold: bool = False
     """Whether that is tried even if the free body's evidence is good."""
-    thicken: MakesBodies[float, NominalBody | None] | None = None
+    thicken: Callable[[float], NominalBody | None] | None = None
     """Returns the body with a wall of a thickness in meters, None where that fails; None: no thickness is searched."""
+
+    dofs: int = 0
+    """Degrees of freedom of bodies that are computed more finely, about; for the digest."""
 
     def digest(self) -> str:
         """Return a digest of the bodies."""
-        makers = [None if each is None else each.digest() for each in (self.refine, self.hold, self.thicken)]
-        digest = hashlib.sha256(f"{makers} {self.always_hold}".encode())
+        makers = [each is not None for each in (self.refine, self.hold, self.thicken)]
+        digest = hashlib.sha256(f"{makers} {self.always_hold} {self.dofs}".encode())
         for body in self.bodies.bodies:
             digest.update(body.name.encode())
             for tensor in (body.elastic.frequency, body.elastic.nodes, body.elastic.shapes):
