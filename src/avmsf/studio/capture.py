@@ -139,9 +139,8 @@ class ImpactTable:
         """Raise RequestError (422) for an impact without a value that every row of the table has."""
         for column, value, name in ((DIRECTION[0], contact.direction, "direction"), (FORCE, contact.newtons, "force")):
             if column in self.names and value is None:
-                raise RequestError(
-                    422, f"{self.path}: expected a {name} as in all rows, got none; add it", file=self.path, name=name
-                )
+                wanted = f"a {name} as in all rows"
+                raise bad_request(name, wanted, got="none", advice="add it", status=422, file=self.path)
 
     def add(self, file: str, contact: Contact, settings: CaptureSettings) -> None:
         """Append a row; a new table gets columns for the known values of the impact."""
@@ -323,8 +322,8 @@ class CaptureEditor:
         table = ImpactTable(self.folder)
         for index in table.rows_of(file):
             return self._described(index, table.rows[index], self.settings)
-        message = f"{TABLE}: expected a row of {file[:80]!r}, got none; reload the page"
-        raise RequestError(404, message, file=TABLE, value=file)
+        wanted = f"a row of {file[:80]!r}"
+        raise bad_request("file", wanted, file, got="none", advice="reload the page", status=404, file=TABLE)
 
     def _owned(self, file: str, match: str | None) -> tuple[ImpactTable, int]:
         """Return the table and the row of a recording to change.
@@ -348,24 +347,20 @@ class CaptureEditor:
             )
         path = self.folder / file
         if path.resolve() != path:
-            message = f"{file}: expected a file, got a link; copy the file there first"
-            raise RequestError(409, message, file=file, value="link")
+            advice = "copy the file there first"
+            raise bad_request("file", "a file", "link", got="a link", advice=advice, status=409, file=file)
         if match is not None and not (path.is_file() and match == hashlib.sha256(path.read_bytes()).hexdigest()):
-            raise RequestError(
-                409,
-                f"{file}: expected the recording that the page shows, got another one from another tab or program; "
-                "nothing was overwritten; play it and repeat the change",
-                file=file,
-                value=match,
-            )
+            wanted, got = "the recording that the page shows", "another one from another tab or program"
+            advice = "nothing was overwritten; play it and repeat the change"
+            raise bad_request("digest", wanted, match, got=got, advice=advice, status=409, file=file)
         return table, indices[0]
 
     def _readable(self, file: str) -> Path:
         """Return a recording's path. Raises RequestError (404) for a link out of the folder."""
         path = (self.folder / file).resolve()
         if not path.is_relative_to(self.folder):
-            message = f"{file}: expected a file in the capture folder, got one outside; copy it there"
-            raise RequestError(404, message, file=file)
+            got, wanted = "one outside", "a file in the capture folder"
+            raise bad_request("file", wanted, got=got, advice="copy it there", status=404, file=file)
         return path
 
     def _check_usable(

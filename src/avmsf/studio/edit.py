@@ -17,7 +17,7 @@ from avmsf.editing.modal_edit import EDITS, adjust_modes, remarks
 from avmsf.errors import EditError
 from avmsf.fem.material import MATERIALS, material_named
 from avmsf.field.sound_field import SoundField
-from avmsf.studio.responses import RequestError, bad_request, echo
+from avmsf.studio.responses import bad_request
 
 _MATERIAL, _MODE = ("from", "to"), ("mode", "db", "pitch", "decay")
 _OLD_CONTROL = '"Present material"'
@@ -96,12 +96,7 @@ class Sliders:
         changes = tuple(_mode(row) for row in rows)
         repeated = [mode for mode, count in Counter(change.mode for change in changes).items() if count > 1]
         if repeated:
-            raise RequestError(
-                400,
-                f"modes: expected one row per mode, got several of mode {repeated[0]}",
-                row=repeated[0],
-                name="modes",
-            )
+            raise bad_request("modes", "one row per mode", repeated, got=f"several of mode {repeated[0]}")
         law = words.get("law", "displacement")
         if not isinstance(law, str) or law not in LAWS:
             raise bad_request("law", f"one of {', '.join(LAWS)}", law)
@@ -195,9 +190,7 @@ def _number(words: Mapping[str, Any], name: str, rest: float) -> float:
 
 def _name(value: Any, what: str) -> str | None:
     if value is not None and not (isinstance(value, str) and len(value) <= _MAX_NAME):
-        raise RequestError(
-            400, f'material "{what}": expected a name, got {echo(value)}', name=f"material.{what}", value=value
-        )
+        raise bad_request(f"material.{what}", "a name", value)
     return value or None
 
 
@@ -207,7 +200,7 @@ _MAX_PROMPT = 2000
 
 
 @dataclass(frozen=True)
-class Wish:
+class GuidedEditTarget:
     """Target of a guided edit: a recording or a text."""
 
     like: bytes | None = None
@@ -215,22 +208,14 @@ class Wish:
     prompt: str | None = None
 
     @classmethod
-    def read(cls, words: Mapping[str, Any], *, model: str | None) -> "Wish":
+    def read(cls, words: Mapping[str, Any], *, model: str | None) -> "GuidedEditTarget":
         """Return the target of a request with a text. Raises RequestError (400), and EditError without a `model`."""
         unknown = sorted(set(words) - set(_KEYS))
         if unknown:
-            raise RequestError(
-                400,
-                f"expected only {', '.join(_KEYS)}, got {echo(unknown)} too; set the sliders before or after",
-                name="prompt",
-                value=unknown,
-            )
+            raise bad_request("prompt", f"only {', '.join(_KEYS)}", unknown, advice="set the sliders before or after")
         if model is None:
-            raise EditError(
-                "expected the extra and the model for edits by text, got none; pip install 'avmsf[text]' and start "
-                "avmsf studio with --model FOLDER",
-                name="model",
-            )
+            advice = "pip install 'avmsf[text]' and start avmsf studio with --model FOLDER"
+            raise EditError.expected("the extra and the model for edits by text", name="model", advice=advice)
         prompt = words.get("prompt")
         if not isinstance(prompt, str) or not prompt.strip() or len(prompt) > _MAX_PROMPT:
             raise bad_request("prompt", f'1 to {_MAX_PROMPT} characters, such as "a wooden bowl is hit"', prompt)
@@ -245,7 +230,7 @@ class Wish:
         return {**task, "recording": str(place / "like.wav")}
 
 
-def is_wish(words: Mapping[str, Any]) -> bool:
+def is_guided(words: Mapping[str, Any]) -> bool:
     """Whether an edit asks for a descent and not for sliders."""
     return words.get("prompt") is not None
 

@@ -157,10 +157,8 @@ class Showcase:
                 # Until the capture's pictures have become something to click.
                 points = torch.zeros(0 if self.opened.capture is None else 1, 3)
         if not len(points):
-            raise StudioError(
-                f"{self.opened.name}: expected the object's geometry, got none; give a mesh or Gaussians by --object",
-                name="object",
-            )
+            advice = f"give a mesh or Gaussians of {self.opened.name} by --object"
+            raise StudioError.expected("its geometry", name="object", advice=advice)
         points = _thinned(points.float(), _CLICKED)
         return points, outward_normals(points)
 

@@ -16,7 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from avmsf._utils.text_files import parse_json
 from avmsf.export.web import directives_of, policy_text
-from avmsf.studio.responses import RequestError, response_to
+from avmsf.studio.responses import RequestError, bad_request, response_to
 
 _FRAMES = {"frame-ancestors": ["'none'"]}
 """Directive that is valid only in a header."""
@@ -85,15 +85,11 @@ class Guard:
         headers = Headers(scope=scope)
         hosts = headers.getlist("host")
         if len(hosts) != 1 or hosts[0].lower() not in self.hosts:
-            raise RequestError(
-                403,
-                f"host: expected {' or '.join(LOOPBACK)}, got another; open the address as printed",
-                name="host",
-                value=hosts,
-            )
+            wanted, advice = " or ".join(LOOPBACK), "open the address as printed"
+            raise bad_request("host", wanted, hosts, got="another", advice=advice, status=403)
         origins = headers.getlist("origin")
         if any(each.lower() != f"http://{hosts[0].lower()}" for each in origins):
-            raise RequestError(403, "origin: expected the studio's own page, got another", name="origin", value=origins)
+            raise bad_request("origin", "the studio's own page", origins, got="another", status=403)
         first, slash, rest = scope["path"].removeprefix("/").partition("/")
         if not secrets.compare_digest(first.encode(), self.token.encode()):
             raise nothing_here()
@@ -133,9 +129,8 @@ def _hardened(send: Send) -> Send:
 
 def too_large(largest: int) -> RequestError:
     """Return what to raise for a request of more than `largest` bytes."""
-    return RequestError(
-        413, f"expected at most {largest >> 10} KiB in one request, got more; send a shorter recording", name="request"
-    )
+    wanted, advice = f"at most {largest >> 10} KiB", "send a shorter recording"
+    return bad_request("request", wanted, got="more", advice=advice, status=413)
 
 
 def contained(folder: Path, name: str) -> Path:
@@ -161,12 +156,11 @@ async def read_words(request: Request, *, largest: int = LARGEST_WORDS) -> dict[
     try:
         words = parse_json(body.decode())
     except ValueError as error:
-        raise RequestError(
-            400, f"expected a JSON object, got other data ({str(error)[:100]}); reload the page", name="request"
-        ) from error
+        got = f"other data ({str(error)[:100]})"
+        raise bad_request("request", "a JSON object", got=got, advice="reload the page") from error
     if not isinstance(words, dict):
         kind = type(words).__name__
-        raise RequestError(400, f"expected a JSON object, got {kind}; reload the page", name="request", value=kind)
+        raise bad_request("request", "a JSON object", kind, advice="reload the page")
     return words
 
 

@@ -21,7 +21,7 @@ import anyio.to_thread
 from avmsf._utils.children import ending_of
 from avmsf._utils.text import printable
 from avmsf.errors import AvmsfError
-from avmsf.studio.responses import RequestError
+from avmsf.studio.responses import bad_request
 
 Event = dict[str, Any]
 Finish = Callable[[Event], Awaitable[Event]]
@@ -47,7 +47,7 @@ class Job:
         self.events: list[Event] = []
         self.ended = False
         self._cancelled = self._finishing = False
-        self._heard = asyncio.Condition()
+        self._changed_events = asyncio.Condition()
         self._task: asyncio.Task[Any] | None = None
 
     async def run(self) -> None:
@@ -77,16 +77,16 @@ class Job:
             self._cancelled = True
             if self._task is not None:
                 self._task.cancel()
-        async with self._heard:
-            await self._heard.wait_for(lambda: self.ended)
+        async with self._changed_events:
+            await self._changed_events.wait_for(lambda: self.ended)
         return self._cancelled
 
     async def listen(self, *, after: int = 0) -> AsyncIterator[tuple[int, Event]]:
         """Yield the events from number `after` on, counted from 0, until the last one."""
         while True:
-            async with self._heard:
+            async with self._changed_events:
                 while len(self.events) <= after and not self.ended:
-                    await self._heard.wait()
+                    await self._changed_events.wait()
                 new = self.events[after:]
             for event in new:
                 yield after, event
@@ -142,10 +142,10 @@ class Job:
         return await self.finish(result["result"])
 
     async def _tell(self, event: Event, *, last: bool = False) -> None:
-        async with self._heard:
+        async with self._changed_events:
             self.events.append(event)
             self.ended = last
-            self._heard.notify_all()
+            self._changed_events.notify_all()
 
 
 class Jobs:
@@ -171,13 +171,8 @@ class Jobs:
         """Raise RequestError (409) while a job runs."""
         current = self.current
         if current is not None:
-            raise RequestError(
-                409,
-                f"expected no running job, got {current.kind}; wait for it or stop it",
-                name="job",
-                value=current.kind,
-                more={"job": current.identifier},
-            )
+            advice, running = "wait for it or stop it", current.identifier
+            raise bad_request("job", "none that runs", current.kind, advice=advice, status=409, job=running)
 
     def start(self, kind: str, task: Event, finish: Finish, command: Sequence[str] = WORKER) -> Job:
         """Start a job. Raises RequestError (409) while another one runs."""
@@ -190,7 +185,7 @@ class Jobs:
     def named(self, identifier: str) -> Job:
         """Return a job. Raises RequestError (404)."""
         if identifier not in self._jobs:
-            raise RequestError(404, "expected a known job, got another; start it again", name="job", value=identifier)
+            raise bad_request("job", "a known one", identifier, got="another", advice="start it again", status=404)
         return self._jobs[identifier]
 
     async def close(self) -> None:

@@ -33,7 +33,7 @@ from avmsf.studio.session import Revision, Session
 from avmsf.symmetry.symmetries import Symmetries
 
 
-class Likeness:
+class CachedSymmetries:
     """The symmetries of one object, which an edit that makes it larger leaves as they are but for their lengths."""
 
     def __init__(self) -> None:
@@ -58,7 +58,7 @@ class Finder:
     """The page's points, on the object as the field has it now, meters."""
     length: float
     """Lengths on that object over those of the page's picture."""
-    likeness: "Likeness" = dataclasses.field(default_factory=lambda: Likeness())
+    cached_symmetries: "CachedSymmetries" = dataclasses.field(default_factory=lambda: CachedSymmetries())
     """The symmetries of the object, whose search other revisions need not repeat."""
     settings: CaptureSettings | None = None
     """How the capture's recordings are read, where it is known."""
@@ -72,7 +72,7 @@ class Finder:
     @property
     def symmetries(self) -> Symmetries | None:
         """The reason why several positions sound the same."""
-        return self.likeness.on(self.field, self.length)
+        return self.cached_symmetries.on(self.field, self.length)
 
     def prepare(self) -> None:
         """Compute the tables, once for all threads."""
@@ -118,7 +118,7 @@ class Searches:
     def __init__(self, session: Session, showcase: Showcase, editor: CaptureEditor | None, threads: Threads) -> None:
         self.session, self.showcase, self.editor, self.threads = session, showcase, editor, threads
         self._finder: tuple[int, Finder] | None = None
-        self._likenesses: defaultdict[int, Likeness] = defaultdict(Likeness)
+        self._symmetries: defaultdict[int, CachedSymmetries] = defaultdict(CachedSymmetries)
         self._ahead: asyncio.Task[None] | None = None
 
     def finder_of(self, revision: Revision) -> Finder:
@@ -127,10 +127,10 @@ class Searches:
             field = revision.expect_field()
             points = self.showcase.current.sampled.points.double() * length_of(field.gain_field)
             settings = None if self.editor is None else self.editor.settings
-            likeness = self._likenesses[revision.opening]
+            cached_symmetries = self._symmetries[revision.opening]
             self._finder = (
                 revision.number,
-                Finder(field, points.float(), length_of(field.gain_field), likeness, settings),
+                Finder(field, points.float(), length_of(field.gain_field), cached_symmetries, settings),
             )
         return self._finder[1]
 

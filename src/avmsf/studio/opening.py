@@ -51,20 +51,14 @@ def open_target(target: Path, *, object: Path | None = None, capture: Path | Non
     `capture`, a mesh with a name that captures use (surface.*, splats.ply, point_cloud.ply) opens its own folder.
     """
     if object is not None and not object.is_file():
-        raise StudioError(
-            f"{object}: expected a mesh or Gaussians, got no such file; check --object", file=object, name="object"
-        )
+        raise StudioError.expected("a mesh or Gaussians", file=object, name="object", advice="check --object")
     if capture is not None and target.suffix.lower() not in MESHES and not capture.is_dir():
         raise StudioError.expected("a capture folder", file=capture, name="capture", advice="check --capture")
     if target.is_dir():
         return _open_folder(target, object)
     if not target.is_file():
-        raise StudioError(
-            f"{target}: expected a field, a capture folder, a folder of images or a mesh, got no such file; check the "
-            "path",
-            file=target,
-            name="target",
-        )
+        wanted = "a field, a capture folder, a folder of images or a mesh"
+        raise StudioError.expected(wanted, file=target, name="target", advice="check the path")
     if target.suffix.lower() in MESHES:
         return _open_mesh(target, object, capture)
     kept = target.resolve().parent.name == CACHE
@@ -109,24 +103,17 @@ def _open_folder(folder: Path, object: Path | None) -> Opened:
     field = folder / CACHE / FIELD
     opened = Opened(folder.name, folder, field if field.is_file() else None, folder, object)
     if not ((folder / TABLE).is_file() or find_object(opened) is not None or shows_more(opened)):
-        raise StudioError(
-            f"{folder}: expected a capture folder with {TABLE}, images/, a video, "
-            f"{', '.join(f'surface{suffix}' for suffix in MESHES)} or splats.ply, got none of these; add one",
-            file=folder,
-            name=TABLE,
-        )
+        surfaces = ", ".join(f"surface{suffix}" for suffix in MESHES)
+        wanted = f"a capture folder with {TABLE}, images/, a video, {surfaces} or splats.ply"
+        raise StudioError.expected(wanted, got="none of these", file=folder, name=TABLE, advice="add one")
     return opened
 
 
 def _open_mesh(mesh: Path, object: Path | None, capture: Path | None) -> Opened:
     size = mesh.stat().st_size
     if size > LARGEST_MESH:
-        raise StudioError(
-            f"{mesh}: expected a mesh of at most {LARGEST_MESH >> 20} MiB, got {size >> 20}; reduce it to a hundred "
-            "thousand triangles",
-            file=mesh,
-            value=size,
-        )
+        wanted, advice = f"a mesh of at most {LARGEST_MESH >> 20} MiB", "reduce it to a hundred thousand triangles"
+        raise StudioError.expected(wanted, size, got=f"{size >> 20}", file=mesh, advice=advice)
     if capture is None and (mesh.stem == "surface" or mesh.name in SPLATS):
         return _open_folder(mesh.resolve().parent, object)
     folder = mesh.with_suffix("") if capture is None else capture
@@ -138,13 +125,9 @@ def _open_mesh(mesh: Path, object: Path | None, capture: Path | None) -> Opened:
             "a capture folder or none", got="a file", file=folder, name="capture", advice="name a folder by --capture"
         )
     if others and not (surface in others and _same(surface, mesh)):
-        raise StudioError(
-            f"{folder}: expected a capture of this mesh, got one of {others[0].name}; open the folder, or name another "
-            "by --capture",
-            file=folder,
-            name="capture",
-            value=others[0].name,
-        )
+        advice = "open the folder, or name another by --capture"
+        wanted = "a capture of this mesh"
+        raise StudioError.expected(wanted, others[0].name, file=folder, name="capture", advice=advice)
     if not others:
         _copy(_named_by(mesh), folder)
         copy_whole(mesh, surface, raising=StudioError)
@@ -173,12 +156,8 @@ def _copy(files: Iterable[Path], folder: Path) -> None:
         if not (place.exists() or place.is_symlink()):
             lacking[place] = path
         elif not _same(place, path):
-            raise StudioError(
-                f"{place}: expected no file, or the mesh's own {path.name}, got another one; move it away, or name "
-                "another folder by --capture",
-                file=place,
-                name="capture",
-            )
+            wanted, advice = f"no file, or the mesh's own {path.name}", "name another folder by --capture"
+            raise StudioError.expected(wanted, got="another one", file=place, name="capture", advice=advice)
     for place, path in lacking.items():
         copy_whole(path, place, raising=StudioError)
 

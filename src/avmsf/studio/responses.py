@@ -69,7 +69,7 @@ def refusal_of(error: Exception) -> RequestError:
     The page sends a recording again after a status of 500 or more, and not after a lower one.
     """
     if lacks_memory(error):
-        return RequestError(503, "expected more free memory; close other programs, or send less", name="memory")
+        return bad_request("memory", "more", got="too little", advice="close other programs, or send less", status=503)
     if isinstance(error, OSError):
         where = "" if error.filename is None else f"{error.filename}: "
         reason = error.strerror or str(error)
@@ -85,10 +85,20 @@ def refusal_of(error: Exception) -> RequestError:
     return RequestError(UNUSABLE, f"expected values that give a result, got {reason}; try other values", value=reason)
 
 
-def bad_request(name: str, wanted: str, value: Any, *, got: str | None = None, advice: str = "") -> RequestError:
-    """Return the response (400) to an invalid entry; `got` is shown in place of its value."""
-    message = f"{name}: expected {wanted}, got {got or echo(value)}{advice and f'; {advice}'}"
-    return RequestError(400, message, name=name, value=value)
+def bad_request(
+    name: str,
+    wanted: str,
+    value: Any = None,
+    *,
+    got: str | None = None,
+    advice: str = "",
+    status: int = 400,
+    file: Path | str | None = None,
+    **more: Any,
+) -> RequestError:
+    """Return the response to an invalid entry, or one of a file; `got` is shown in place of its value."""
+    message = f"{file or name}: expected {wanted}, got {got or echo(value)}{advice and f'; {advice}'}"
+    return RequestError(status, message, file=file, name=name, value=value, more=more)
 
 
 def echo(value: Any) -> str:

@@ -62,7 +62,7 @@ def make_app(studio: Studio) -> Starlette:
         Route("/capture/strikes/{path:path}", calls.change_strike, methods=["GET", "PUT", "DELETE"]),
         Route("/reconstruct", calls.reconstruct, methods=["POST"]),
         Route("/object", calls.make_object, methods=["POST"]),
-        _get("/jobs/{job}/events", calls.hear_job),
+        _get("/jobs/{job}/events", calls.send_job_events),
         Route("/jobs/{job}", calls.cancel_job, methods=["DELETE"]),
     ]
     app = Starlette(
@@ -163,7 +163,7 @@ class Calls:
         """Make something to click of the capture's pictures, once more where that has failed."""
         return Answer({"job": self.studio.make_object().identifier}, 202)
 
-    async def hear_job(self, request: Request) -> Response:
+    async def send_job_events(self, request: Request) -> Response:
         """The events of a job, as server-sent events; a page that reconnects gets the events that it has missed."""
         job = self.studio.jobs.named(request.path_params["job"])
         last = request.headers.get("last-event-id", "")

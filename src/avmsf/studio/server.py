@@ -92,12 +92,8 @@ def _temporary_folder() -> tempfile.TemporaryDirectory[str]:
     try:
         return tempfile.TemporaryDirectory(prefix="avmsf-studio-")
     except OSError as error:
-        raise StudioError(
-            f"expected a temporary folder, got {error.strerror or error}; free some space, or set the environment "
-            "variable TMPDIR to another folder",
-            name="TMPDIR",
-            value=error.strerror or str(error),
-        ) from error
+        reason, advice = error.strerror or str(error), "free some space, or set this environment variable"
+        raise StudioError.expected("a temporary folder", reason, name="TMPDIR", advice=advice) from error
 
 
 def _open_browser(address: str, folder: Path) -> None:
@@ -123,12 +119,9 @@ def _listening(port: int | None) -> socket.socket:
             listener.close()
             if error.errno == errno.EADDRINUSE and number == PORT and port is None:
                 continue
-            raise StudioError(
-                f"port {number}: expected a free port, got {error.strerror!r}; leave --port out, or give --port 0 for "
-                "any free one",
-                name="port",
-                value=number,
-            ) from error
+            advice = "leave --port out, or give --port 0 for any free one"
+            got = f"{error.strerror!r} at {number}"
+            raise StudioError.expected("a free one", number, got=got, name="port", advice=advice) from error
         except OverflowError as error:
             listener.close()
             raise StudioError.expected("0 to 65535", number, name="port", advice="leave --port out") from error

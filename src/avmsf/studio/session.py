@@ -50,9 +50,8 @@ class Revision:
     def expect_field(self) -> SoundField:
         """Return the field that is played. Raises RequestError (409) without a field."""
         if self.field is None:
-            raise RequestError(
-                409, "expected a field, got none yet; record impacts and reconstruct it first", name="field"
-            )
+            advice = "record impacts and reconstruct it first"
+            raise bad_request("field", "one", got="none yet", advice=advice, status=409)
         return self.field
 
 
@@ -104,7 +103,7 @@ class Session:
         with self._lock:
             self.expect_current(base)
             if not self._past:
-                raise RequestError(409, "expected a change to undo, got none since the field was opened", name="undo")
+                raise bad_request("undo", "a change", got="none since the field was opened", status=409)
             undone = self._advance(self._past[-1])
             self._past.pop()
             return undone
@@ -136,22 +135,20 @@ class Session:
             except RequestError:
                 continue
             return path
-        raise StudioError(
-            f"{self.home}: expected fewer than {_MOST_ALIKE} files called {stem}, got more; move them away",
-            file=self.home,
-            name=stem,
-        )
+        wanted = f"fewer than {_MOST_ALIKE} files called {stem}"
+        raise StudioError.expected(wanted, got="more", file=self.home, name=stem, advice="move them away")
 
     def expect_current(self, base: int) -> None:
         """Raise RequestError (409), with the current revision, if `base` is another one."""
         if base != self._current.number:
-            raise RequestError(
-                409,
-                "expected the current field, got an older one: another tab has changed it; nothing was overwritten; "
-                "make the change again",
-                name="base",
-                value=base,
-                more={"revision": self._current.number},
+            raise bad_request(
+                "base",
+                "the current field",
+                base,
+                got="an older one: another tab has changed it",
+                advice="nothing was overwritten; make the change again",
+                status=409,
+                revision=self._current.number,
             )
 
     def _remember(self, revision: Revision) -> Revision:

@@ -13,7 +13,7 @@ from avmsf.editing.modal_edit import EDITS, remarks
 from avmsf.field.store import load, save
 from avmsf.pipeline.config import Preset
 from avmsf.studio.capture import CaptureEditor, read_upload
-from avmsf.studio.edit import MATERIAL_NAMES, Sliders, Wish, is_wish, words_model
+from avmsf.studio.edit import MATERIAL_NAMES, GuidedEditTarget, Sliders, is_guided, words_model
 from avmsf.studio.files import Showcase
 from avmsf.studio.jobs import Event, Job, Jobs, Result, Threads
 from avmsf.studio.locate import Searches
@@ -22,7 +22,7 @@ from avmsf.studio.responses import NUMERIC_ERRORS, RequestError, bad_request, re
 from avmsf.studio.session import Revision, Session
 
 MODES = 128
-STEER_STEPS = 150
+GUIDED_EDIT_STEPS = 150
 """Steps of a descent in the page: half of the command line's, after which little changes."""
 _MAKING = "reconstruct the object from its images"
 """The kind of job that has something to click for its result."""
@@ -38,7 +38,7 @@ class StudioConfig:
     """Folder or name of a Stable Audio pipeline for text edits; by default that in the hub's cache."""
     modes: int = MODES
     """Maximum number of modes of a reconstruction."""
-    steps: int = STEER_STEPS
+    steps: int = GUIDED_EDIT_STEPS
     """Steps of an optimization towards a recording or a text."""
     preset: Preset = "default"
     """Settings of a reconstruction."""
@@ -92,8 +92,8 @@ class Studio:
     async def edit(self, words: dict[str, Any]) -> dict[str, Any]:
         """Set the sliders, or start to optimize the field towards a recording or a text. Raises the errors of edits."""
         base = base_of(words)
-        if is_wish(words):
-            return await self._lead(base, Wish.read(words, model=self.model))
+        if is_guided(words):
+            return await self._lead(base, GuidedEditTarget.read(words, model=self.model))
         sliders = Sliders.read(words, modes=len(self.session.current.expect_field().bank))
         return self._changed(await self._compute(self.session.edit, base, sliders))
 
@@ -101,7 +101,7 @@ class Studio:
         """Start to optimize the field towards a recording. Raises CaptureError for one that cannot be used."""
         self.session.expect_current(base)
         await self.threads.read(read_upload, content)
-        return await self._lead(base, Wish(like=content))
+        return await self._lead(base, GuidedEditTarget(like=content))
 
     async def undo(self, words: dict[str, Any]) -> dict[str, Any]:
         """Go back by one revision."""
@@ -133,24 +133,19 @@ class Studio:
     def require_editor(self) -> CaptureEditor:
         """Return the capture's impacts. Raises RequestError: 404 without a capture, 503 while its folder is missing."""
         if self.editor is None:
-            raise RequestError(
-                404, "expected a capture folder, got only a field; start avmsf studio with --capture", name="capture"
-            )
+            advice = "start avmsf studio with --capture"
+            raise bad_request("capture", "a folder", got="only a field", advice=advice, status=404)
         if not self.editor.folder.is_dir():
             # Not 4xx: the page keeps a recording and sends it again.
-            folder = self.editor.folder
-            raise RequestError(
-                503, f"{folder}: expected the capture folder, got none; restore it and try again", file=folder
-            )
+            folder, advice = self.editor.folder, "restore it and try again"
+            raise bad_request("capture", "the capture folder", got="none", advice=advice, status=503, file=folder)
         return self.editor
 
     async def reconstruct(self) -> Job:
         """Start to fit a field to the capture, which becomes the current one."""
         editor = self.require_editor()
         if not await self.threads.read(editor.impacts):
-            raise RequestError(
-                409, "expected one or more recordings, got none; record impacts first", name="recordings", value=0
-            )
+            raise bad_request("recordings", "one or more", 0, advice="record impacts first", status=409)
         # One output is enough: the next job starts when this one's field is open.
         output = str(self.folder / "reconstructed")
         chosen = {"preset": self.config.preset, "modes": self.config.modes}
@@ -162,7 +157,7 @@ class Studio:
         task = {"task": "make_object", "folder": str(self.require_editor().folder)}
         return self.jobs.start(_MAKING, task, self._take_object)
 
-    async def _lead(self, base: int, wish: Wish) -> dict[str, Any]:
+    async def _lead(self, base: int, wish: GuidedEditTarget) -> dict[str, Any]:
         self.session.expect_current(base)
         field = self.session.current.expect_field()
         self.jobs.expect_none()

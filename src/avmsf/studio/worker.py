@@ -44,20 +44,20 @@ _RARELY = 10
 """Steps of a fit between two progress events."""
 
 
-class Voice:
+class EventWriter:
     """Sends progress events to the server."""
 
     def __init__(self, stream: TextIO) -> None:
         self.stream = stream
 
-    def say(self, event: Values) -> None:
+    def write(self, event: Values) -> None:
         """Write one event."""
         self.stream.write(json.dumps(event) + "\n")
         self.stream.flush()
 
     def step(self, stage: str, done: int, total: int, words: str, **numbers: float | None) -> None:
         """Send the progress of a stage; `numbers` are for programs, in addition to the text."""
-        self.say({"stage": stage, "done": done, "total": total, "words": words, **numbers})
+        self.write({"stage": stage, "done": done, "total": total, "words": words, **numbers})
 
     def log(self, words: str) -> None:
         """Send that a stage begins: its name before the colon, a description after it."""
@@ -81,7 +81,7 @@ class Voice:
         if progress.step % _RARELY == 0 or progress.step == progress.steps:
             self.step("fit", progress.step, progress.steps, f"{progress.stage}, loss {progress.loss:.3g}")
 
-    def steering(self, progress: GuidedEditProgress) -> None:
+    def guided_edit(self, progress: GuidedEditProgress) -> None:
         """Send the progress of an edit's optimization."""
         words = f"loss {progress.loss:.3g}, pitch x {progress.pitch:.4g}"
         # In JSON there is no NaN.
@@ -89,7 +89,7 @@ class Voice:
         self.step("edit", progress.step, progress.steps, words, loss=loss, pitch=progress.pitch)
 
 
-def make_field(task: Values, voice: Voice) -> Values:
+def make_field(task: Values, events: EventWriter) -> Values:
     """Reconstruct the capture `folder`, copy its field to `output`, and return the notes on it.
 
     The copy is the field of this reconstruction, even if another one replaces `field` meanwhile.
@@ -97,7 +97,7 @@ def make_field(task: Values, voice: Voice) -> Values:
     folder = Path(task["folder"])
     config = replace(PRESETS[task["preset"]], modes=int(task["modes"]))
     settings = capture_settings_of(config, settings_of(folder))
-    voice.log("capture: reading the recordings")
+    events.log("capture: reading the recordings")
     capture = read_capture(folder, settings)
     with StageFolder(folder / CACHE).lock(COMMAND):
         made = reconstruct(
@@ -107,8 +107,8 @@ def make_field(task: Values, voice: Voice) -> Values:
             config,
             cache=folder / CACHE,
             settings=settings,
-            listener=voice.listener,
-            fitting=voice.fitting,
+            listener=events.listener,
+            fitting=events.fitting,
         )
         copy_whole(made.field, Path(task["output"]))
     return {
@@ -118,32 +118,32 @@ def make_field(task: Values, voice: Voice) -> Values:
     }
 
 
-def make_object(task: Values, voice: Voice) -> Values:
+def make_object(task: Values, events: EventWriter) -> Values:
     """Make Gaussians of what the capture `folder` shows of its object, and return their file."""
     folder = Path(task["folder"])
     stages = StageFolder(folder / CACHE)
-    scene = SceneStages(folder, stages, SceneConfig(), settings=settings_of(folder), listener=voice.listener)
+    scene = SceneStages(folder, stages, SceneConfig(), settings=settings_of(folder), listener=events.listener)
     scene.expect_any()
     with stages.lock(COMMAND):
         return {"object": str(scene.cloud.path)}
 
 
-def lead(task: Values, voice: Voice) -> Values:
+def lead(task: Values, events: EventWriter) -> Values:
     """Optimize a field towards a recording or a text, and return the file of the edited one."""
     field = load(task["field"])
     guide: Guide
     if "recording" in task:
         guide = Reference.read(task["recording"], sample_rate=field.sample_rate)
     else:
-        voice.log("model: loading")
+        events.log("model: loading")
         model = StableAudio.load(task["model"])
         guide = DecoderDistillation(model, task["prompt"], sample_rate=field.sample_rate)
     config = GuidedEditConfig(steps=int(task["steps"]), preview_every=0)
-    save(edit_towards(field, guide, config=config, progress=voice.steering), task["output"])
+    save(edit_towards(field, guide, config=config, progress=events.guided_edit), task["output"])
     return {"output": task["output"]}
 
 
-TASKS: Mapping[str, Callable[[Values, Voice], Values]] = {
+TASKS: Mapping[str, Callable[[Values, EventWriter], Values]] = {
     "make_field": make_field,
     "make_object": make_object,
     "lead": lead,
@@ -152,7 +152,7 @@ TASKS: Mapping[str, Callable[[Values, Voice], Values]] = {
 
 def main() -> int:
     """Do the task of the standard input's first line."""
-    voice = Voice(os.fdopen(os.dup(1), "w", encoding="utf-8"))
+    events = EventWriter(os.fdopen(os.dup(1), "w", encoding="utf-8"))
     # What libraries print is no event.
     os.dup2(2, 1)
     task = json.loads(sys.stdin.readline())
@@ -161,16 +161,16 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with warnings.catch_warnings():
         warnings.simplefilter("always", CaptureWarning)
-        warnings.showwarning = lambda message, *rest, **more: voice.say({"stage": "note", "words": str(message)})
+        warnings.showwarning = lambda message, *rest, **more: events.write({"stage": "note", "words": str(message)})
         try:
-            voice.say({"result": TASKS[task["task"]](task, voice)})
+            events.write({"result": TASKS[task["task"]](task, events)})
         except AvmsfError as error:
-            voice.say({"error": " ".join(str(error).split())})
+            events.write({"error": " ".join(str(error).split())})
             return 2
         except Exception as error:
             if not lacks_memory(error):
                 raise
-            voice.say({"error": NO_MEMORY})
+            events.write({"error": NO_MEMORY})
             return 2
     return 0
 
