@@ -25,7 +25,6 @@ from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.positional import Smooth
 from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
-from avmsf.field.store import load, save
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from factories.raising import raises
@@ -245,15 +244,6 @@ def test_another_poissons_ratio_is_said_with_what_it_would_do_to_a_plate():
     )
 
 
-def test_a_field_of_another_material_is_a_field_like_any_other(tmp_path):
-    found = change_material(plate_field(STEEL), STEEL, WOOD, size=0.5)
-    save(found, tmp_path / "wood.safetensors")
-    loaded = load(tmp_path / "wood.safetensors")
-    assert torch.equal(loaded.render(0.5 * CONTACTS), found.render(0.5 * CONTACTS))
-    assert loaded.origin.report == found.origin.report
-    assert loaded.origin.report["edits"][0]["to"]["name"] == "wood"
-
-
 def test_where_neither_material_damps_dampings_stay():
     bare = [replace(each, alpha=0.0, beta=0.0) for each in (STEEL, OTHER)]
     field = plate_field(STEEL)
@@ -309,9 +299,3 @@ def test_a_body_too_stiff_for_a_material_excludes_it():
     assert infer_material(steel, option="--from").material == STEEL
     with raises(EditError, name="--from"):
         infer_material(replace(plate_field(WOOD), origin=origin), option="--from")
-
-
-def test_a_material_that_is_assumed_and_new_is_said():
-    wooden = plate_field(WOOD)
-    known = [infer_material(wooden, option="--from", new=new) for new in (None, STEEL, WOOD)]
-    assert ["changes nothing" in each.words for each in known] == [False, False, True]

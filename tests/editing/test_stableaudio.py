@@ -2,10 +2,8 @@
 
 import math
 import shutil
-import threading
 import warnings
 from dataclasses import replace
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import pytest
@@ -260,40 +258,6 @@ def test_weights_that_are_not_here(monkeypatch, tmp_path):
     assert "hf auth login" in str(caught.value)
     with raises(EditError, file=tmp_path / "nowhere", name="source"):
         StableAudio.load(tmp_path / "nowhere")
-
-
-def test_a_refusal_of_the_hub_is_told_with_the_way_in(monkeypatch, tmp_path):
-    asked = []
-
-    class Gate(BaseHTTPRequestHandler):
-        """Answers as the hub does for a gated model and nobody's token."""
-
-        def do_GET(self):
-            asked.append(self.path)
-            self.send_response(401)
-            self.send_header("X-Error-Code", "GatedRepo")
-            self.send_header("Content-Length", "0")
-            self.end_headers()
-
-        def do_HEAD(self):
-            self.do_GET()
-
-        def log_message(self, *_):
-            return
-
-    monkeypatch.delenv("HF_HUB_OFFLINE")
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
-    with HTTPServer(("127.0.0.1", 0), Gate) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        here = f"http://127.0.0.1:{server.server_port}"
-        monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", here)
-        monkeypatch.setattr("huggingface_hub.hf_api.api.endpoint", here)
-        with raises(EditError, name="source", value=STABLE_AUDIO) as caught:
-            StableAudio.load()
-        assert "hf auth login" in str(caught.value)
-        server.shutdown()
-    assert {path for path in asked if STABLE_AUDIO in path} == {f"/api/models/{STABLE_AUDIO}"}
 
 
 def copied(folder: Path, place: Path) -> Path:

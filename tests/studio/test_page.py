@@ -2,8 +2,6 @@
 
 import base64
 import io
-import json
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +19,6 @@ pytestmark = pytest.mark.page
 
 SPACING = SIDES[0] / 30
 """Between neighboring contacts, meters."""
-LIVE_CAPTURE = {"revision": 1, "undo": False, "abilities": ["capture", "reconstruct"], "mode": "capture", "job": None}
 
 
 def last_place(page: "Page") -> torch.Tensor:
@@ -188,118 +185,6 @@ def test_a_dropped_recording_is_located_and_painted(visit: Open) -> None:
     assert 0 < box["x"] - x < 30
 
 
-class CaptureServer:
-    """Answers capture mode as the studio does; `broken` cuts the line after the strike was written."""
-
-    def __init__(self, page: "Page") -> None:
-        self.strikes: dict[str, dict[str, Any]] = {}
-        self.asked: list[tuple[str, str]] = []
-        self.broken = False
-        page.route("**/capture", lambda route: answer(route, self.describe()))
-        page.route("**/capture/check", lambda route: answer(route, self.report()))
-        page.route("**/capture/strikes**", self.hear)
-        page.route("**/capture/strikes/**", self.change)
-        page.route("**/reconstruct", lambda route: answer(route, {"job": "j1"}, 202))
-        page.route("**/jobs/j1/events", self.log)
-
-    def describe(self) -> dict[str, Any]:
-        return {"folder": "/captures/plate", "strikes": list(self.strikes.values()), "problems": [], "ready": True}
-
-    def report(self, **more: Any) -> dict[str, Any]:
-        report = {"seconds": 0.5, "peak_db": -6.0, "clipped": True, "onset_seconds": 0.004, "warnings": ["clipped"]}
-        return {**report, **more}
-
-    def hear(self, route: "Route", request: "Request") -> None:
-        key = request.url.split("?")[1]
-        self.asked.append((key, str(request.post_data_buffer)))
-        query = dict(part.split("=") for part in key.split("&"))
-        if key not in self.strikes:
-            file = f"{len(self.strikes) + 1:03d}.wav"
-            contact = [float(query[axis]) for axis in "xyz"]
-            self.strikes[key] = self.report(file=file, contact=contact, direction=None, row=0)
-        if self.broken:
-            route.abort()
-        else:
-            answer(route, self.strikes[key], 201)
-
-    def change(self, route: "Route", request: "Request") -> None:
-        self.asked.append((request.method, request.url.rsplit("/", 1)[1]))
-        if request.method == "DELETE":
-            self.strikes = {key: each for key, each in self.strikes.items() if not request.url.endswith(each["file"])}
-        answer(route, {})
-
-    def log(self, route: "Route") -> None:
-        events = [{"stage": "fit", "done": 3, "total": 9, "words": "loss 0.1"}, {"field": "/captures/plate/field"}]
-        body = "".join(f"id: {number}\ndata: {json.dumps(event)}\n\n" for number, event in enumerate(events))
-        route.fulfill(content_type="text/event-stream", body=body)
-
-
-def take_strike(page: "Page", place: tuple[float, float, float]) -> None:
-    page.mouse.click(*on_screen(page, place))
-    page.set_input_files("#sheet-capture input[type=file]", upload())
-    page.wait_for_selector("#sheet-capture dl")
-
-
-def until(page: "Page", true: Callable[[], bool]) -> None:
-    """Let the page go on until something is true; fail after ten seconds."""
-    for _ in range(200):
-        if true():
-            return
-        page.wait_for_timeout(50)
-    pytest.fail("the page did not do it in ten seconds")
-
-
-def test_a_capture_is_made_redone_and_reconstructed(visit: Open) -> None:
-    servers: list[CaptureServer] = []
-    page = visit(live=LIVE_CAPTURE, before=lambda page: servers.append(CaptureServer(page)))
-    (server,) = servers
-    assert page.is_disabled("text=● Record")
-    assert page.is_disabled("text=Reconstruct the field")
-    take_strike(page, (0.04, 0.04, 0.01))
-    text = page.inner_text("#sheet-capture dl")
-    for words in ("-6.0 dB", "the loudest samples are cut off", "at 4.00 ms", "500 ms"):
-        assert words in text
-    assert server.asked == [], "nothing is written before it is kept"
-    page.click("text=Save recording")
-    page.wait_for_selector("text=1 impact")
-    query = dict(part.split("=") for part in server.asked[0][0].split("&"))
-    assert [float(query[axis]) for axis in "xyz"] == pytest.approx([0.04, 0.04, 0.01], abs=SPACING)
-    assert [float(query[f"n{axis}"]) for axis in "xyz"] == pytest.approx([0, 0, -1]), "blows go into the surface"
-    take_strike(page, (-0.04, 0.0, 0.01))
-    page.click("text=Save recording")
-    page.wait_for_selector("text=2 impacts")
-    page.click("[aria-label='Record 001.wav again']")
-    page.set_input_files("#sheet-capture input[type=file]", upload())
-    page.click("button:text-is('Replace')")
-    until(page, lambda: server.asked[-1] == ("PUT", "001.wav"))
-    page.click("text=Reconstruct the field")
-    page.wait_for_selector("text=avmsf studio /captures/plate/field")
-    page.on("dialog", lambda dialog: dialog.accept())
-    page.click("[aria-label='Remove 002.wav']")
-    page.wait_for_selector("text=1 impact")
-    assert server.asked[-1] == ("DELETE", "002.wav")
-
-
-def test_a_recording_outlives_a_broken_connection_and_a_reload(visit: Open) -> None:
-    servers: list[CaptureServer] = []
-    page = visit(live=LIVE_CAPTURE, before=lambda page: servers.append(CaptureServer(page)))
-    (server,) = servers
-    server.broken = True
-    take_strike(page, (0.04, 0.04, 0.01))
-    page.click("text=Save recording")
-    page.wait_for_selector("text=The recording is not lost")
-    assert page.locator("text=waits for the server").count() == 1
-    page.reload()
-    page.wait_for_selector("text=waits for the server")
-    server.broken = False
-    page.click("text=Send again")
-    page.wait_for_selector("text=1 impact")
-    until(page, lambda: page.locator("text=waits for the server").count() == 0)
-    assert len(set(server.asked)) == 1, "sent again as it was"
-    assert len(server.asked) >= 2
-    assert len(server.strikes) == 1
-
-
 def test_a_strike_is_changed_only_as_this_page_knows_it(visit: Open) -> None:
     asked: list[tuple[str, str, str | None]] = []
 
@@ -357,22 +242,6 @@ def test_a_page_without_a_server_offers_nothing_that_needs_one(plain: "Page") ->
     assert page.locator("#tabs button").all_inner_texts() == ["Strike", "Modes"]
 
 
-@pytest.mark.parametrize("live", [None, LIVE])
-def test_only_a_studios_page_is_told_of_one_that_was_stopped(visit: Open, live: Any) -> None:
-    page = visit(live=live)
-    load = """import(new URL("page/bundle.js", location.href))
-        .then(({ loadBundle }) => loadBundle()).catch((error) => error.message)"""
-    for hinder, said in (
-        (lambda route: route.abort(), "manifest.json cannot be loaded: check that the server runs"),
-        (lambda route: route.fulfill(status=404), "manifest.json cannot be read (404)"),
-    ):
-        page.route("**/manifest.json", hinder)
-        told = page.evaluate(load)
-        assert told.startswith(said)
-        assert ("a restarted studio" in told) == (live is not None)
-        page.unroute("**/manifest.json")
-
-
 def block_webgl(page: "Page") -> None:
     page.add_init_script(
         """const get = HTMLCanvasElement.prototype.getContext;
@@ -402,23 +271,6 @@ def test_what_the_browser_lacks_is_said_and_the_rest_works(visit: Open, before: 
     assert page.evaluate("avmsf.studio.last.force") == 1
     page.click("#tab-modes")
     assert page.locator("tbody tr").count() == 6
-
-
-def test_what_goes_wrong_with_a_recording_is_told(visit: Open) -> None:
-    def before(page: "Page") -> None:
-        page.route("**/locate", lambda route: route.abort())
-        page.add_init_script(
-            "navigator.mediaDevices.getUserMedia = () => Promise.reject(new DOMException('no', 'NotAllowedError'));"
-        )
-
-    page = visit(live=LIVE, before=before)
-    page.click("#tab-find")
-    page.set_input_files("#sheet-find input[type=file]", upload("song.mp3", b"ID3 and so on, no wav"))
-    page.wait_for_selector("text=song.mp3: expected a WAV file")
-    page.set_input_files("#sheet-find input[type=file]", upload())
-    page.wait_for_selector("text=The server does not answer")
-    page.click("text=● Record")
-    page.wait_for_selector("text=blocks the microphone")
 
 
 def test_a_field_without_geometry_is_told_and_offers_no_blow(visit: Open) -> None:

@@ -73,6 +73,9 @@ class Strikes:
     def __init__(self, page: "Page") -> None:
         self.strikes: list[dict[str, Any]] = []
         self.asked: list[tuple[str, str, str | None]] = []
+        self.sent: list[tuple[str, str]] = []
+        self.broken = False
+        """Whether the line is cut after an impact was written."""
         page.route("**/capture", lambda route: answer(route, self.describe()))
         page.route("**/capture/check", lambda route: answer(route, self.report()))
         page.route("**/capture/strikes?**", self.add)
@@ -86,11 +89,19 @@ class Strikes:
         return {**report, **more}
 
     def add(self, route: "Route", request: "Request") -> None:
-        query = dict(part.split("=") for part in request.url.split("?")[1].split("&"))
+        words = request.url.split("?")[1]
+        query = dict(part.split("=") for part in words.split("&"))
+        if (words, str(request.post_data_buffer)) in self.sent:
+            answer(route, self.strikes[-1], 201)
+            return
+        self.sent.append((words, str(request.post_data_buffer)))
         contact = [float(query[axis]) for axis in "xyz"]
         file = f"{len(self.strikes) + 1:03d}.wav"
         self.strikes.append(self.report(file=file, contact=contact, direction=None, row=0, digest="d1"))
-        answer(route, self.strikes[-1], 201)
+        if self.broken:
+            route.abort()
+        else:
+            answer(route, self.strikes[-1], 201)
 
     def change(self, route: "Route", request: "Request") -> None:
         file, match = request.url.rsplit("/", 1)[1], request.headers.get("if-match")
@@ -137,6 +148,37 @@ def strike_once(page: "Page") -> None:
     take(page, HERE)
     page.click("text=Save recording")
     page.wait_for_selector("text=1 impact")
+
+
+def test_a_recording_outlives_a_broken_connection_and_a_reload(capturing: Any) -> None:
+    page, server = capturing()
+    server.broken = True
+    take(page, HERE)
+    page.click("text=Save recording")
+    page.wait_for_selector("text=The recording is not lost")
+    assert page.locator("text=waits for the server").count() == 1
+    server.broken = False
+    page.reload()
+    page.wait_for_selector("text=1 impact")
+    page.wait_for_function("!document.body.textContent.includes('waits for the server')")
+    assert len(server.strikes) == 1, "sent again as it was"
+    assert page.evaluate(STORED) == []
+
+
+def test_a_capture_is_reconstructed(capturing: Any) -> None:
+    page, _ = capturing()
+    events = ('{"stage": "fit", "done": 3, "total": 9}', '{"field": "/captures/plate/field"}')
+    body = "".join(f"id: {number}\ndata: {event}\n\n" for number, event in enumerate(events))
+    page.route("**/reconstruct", lambda route: answer(route, {"job": "j1"}, 202))
+    page.route("**/jobs/j1/events", lambda route: route.fulfill(content_type="text/event-stream", body=body))
+    assert page.is_disabled("text=● Record")
+    assert page.is_disabled("text=Reconstruct the field")
+    strike_once(page)
+    take(page, THERE)
+    page.click("text=Save recording")
+    page.wait_for_selector("text=2 impacts")
+    page.click("text=Reconstruct the field")
+    page.wait_for_selector("text=avmsf studio /captures/plate/field")
 
 
 def test_a_recording_that_was_not_kept_waits_when_the_next_is_made(capturing: Any) -> None:

@@ -15,10 +15,7 @@ import torch
 from avmsf.editing.guided import GuidedEditProgress
 from avmsf.export.sampled_field import SampledField
 from avmsf.field.store import load
-from avmsf.studio.responses import RequestError
-from avmsf.studio.session import Session
-from avmsf.studio.worker import Voice
-from factories.raising import raises
+from avmsf.studio.worker import EventWriter
 from opened_plate import open_plate, plate_field
 from page_plate import lay_out, plate_table
 from plate_page import LIVE, Open, Serve, answer, upload, words_on
@@ -126,7 +123,7 @@ class EditServer:
     def _lead(self, route: "Route") -> None:
         with tempfile.TemporaryFile("w+") as told:
             for step in self.led:
-                Voice(told).steering(step)
+                EventWriter(told).guided_edit(step)
             told.seek(0)
             steps = told.read().splitlines()
         if self.beside is None:
@@ -369,12 +366,6 @@ def test_a_lead_under_way_is_followed_by_a_page_opened_later(edits: Any, live: d
     assert pitch_of_page(page) == pytest.approx(500.0, abs=3)
 
 
-def test_another_kind_of_job_is_not_taken_for_a_lead(edits: Any) -> None:
-    page, _ = edits(job="j9", jobKind="reconstruct", abilities=["edit", "like", "reconstruct"])
-    assert page.locator("#sheet-edit button:visible", has_text="Stop").count() == 0
-    assert not slider(page, "Pitch").locator("input").is_disabled()
-
-
 def test_an_answer_that_is_cut_is_no_success(edits: Any) -> None:
     page, server = edits()
 
@@ -458,30 +449,6 @@ def test_strikes_compared_one_after_another_do_not_pile_up(visit: Open) -> None:
     assert page.evaluate("[heard.playing.length, ...heard.rows]") == [1, 500]
 
 
-def test_the_models_blow_is_drawn_from_its_own_beginning_beside_both_spectra(visit: Open) -> None:
-    page = visit(strikes=True)
-    page.evaluate(
-        """() => {
-             const { engine, spectra } = avmsf.studio;
-             const [strike, struck] = [engine.strike.bind(engine), spectra.struck.bind(spectra)];
-             window.told = [];
-             engine.strike = (row, options) => { told.push(["heard", row, options]); return strike(row, options); };
-             spectra.struck = (row, force, mallet) => {
-               told.push(["drawn", row, { force, ...mallet }]);
-               return struck(row, force, mallet);
-             };
-           }"""
-    )
-    page.evaluate("avmsf.studio.strike(100)")
-    page.click("#sheet-strike >> text=100.wav")
-    page.wait_for_function("told.length === 5")
-    (_, *as_recorded), _, recording, model, drawn = page.evaluate("told")
-    assert recording == drawn == ["drawn", *as_recorded], "as a blow of force 1, no harder, no softer"
-    assert model == ["heard", *as_recorded]
-    # The spectra of both stay to be compared.
-    assert page.evaluate("avmsf.studio.spectra.compared !== null")
-
-
 def test_a_recording_is_heard(visit: Open) -> None:
     page = visit(strikes=True)
     page.click("#sheet-strike li:has-text('100.wav') >> text=Recording")
@@ -493,43 +460,6 @@ def test_a_recording_is_heard(visit: Open) -> None:
            }"""
     )
     assert page.evaluate("avmsf.studio.last === undefined"), "without a blow of the model"
-
-
-def test_the_heading_says_which_field_is_heard(browser: "Browser", tmp_path: Path) -> None:
-    with edited_plate(browser, tmp_path) as (page, server):
-        before = page.inner_text("h1")
-        move(page, "Pitch")
-        page.wait_for_function("avmsf.studio.last !== undefined")
-        page.wait_for_timeout(3000)
-        picture = "document.getElementById('decay').toDataURL()"
-        drawn = page.evaluate(picture)
-        page.fill("#sheet-edit input[aria-label='Name of the new field']", "higher")
-        page.click("text=Save as")
-        page.wait_for_selector("text=Saved:")
-        assert page.inner_text("h1") == "higher"
-        assert page.title().startswith("higher")
-        assert page.evaluate(picture) == drawn, "what is heard is the same as before"
-        other = page.context.new_page()
-        visit_edits(other, server)
-        assert other.inner_text("h1") == "higher"
-        page.click("#sheet-edit >> text=Undo")
-        page.wait_for_function(f"document.querySelector('h1').textContent === {json.dumps(before)}")
-        assert before != "higher"
-
-
-def test_remarks_speak_of_the_pages_own_controls(browser: "Browser", tmp_path: Path) -> None:
-    with edited_plate(browser, tmp_path) as (page, server):
-        page.get_by_label("New material").select_option("glass")
-        said = page.locator("#words, #sheet-edit [aria-live]", has_text='"Present material"')
-        said.first.wait_for()
-        assert '"from"' not in page.inner_text("body")
-        page.get_by_label("Present material").select_option("wood")
-        page.get_by_label("New material").select_option("")
-        move(page, "Size")
-        page.wait_for_function("avmsf.studio.live.sliders.size > 1")
-        # What it is of counts for another size too.
-        assert server.manifest()["live"]["sliders"]["material"] == {"from": "wood", "to": None}
-        assert said.count() == 0
 
 
 def test_what_an_object_is_of_changes_nothing_by_itself(edits: Any) -> None:
@@ -580,37 +510,3 @@ def test_a_lead_that_another_tab_forestalled_is_told_to_be_kept_beside(edits: An
     assert shown(page, "Size") == ["× 2.00"]
     assert "Guided edit finished" not in words_on(page)
     assert "Undo" not in words_on(page)
-
-
-def test_a_lead_that_is_no_longer_heard_is_not_said_to_be(edits: Any) -> None:
-    page, server = edits()
-    server.led = led_by((0.92, 1.01), (0.31, 1.249))
-    server.then = lambda: server.change(size=2.0)
-    page.set_input_files("#sheet-edit input[type=file]", upload())
-    page.wait_for_selector("text=Started")
-    server.let_go()
-    page.wait_for_selector("text=Another tab changed this field after your change")
-    page.wait_for_selector("#sheet-edit button:text-is('Undo'):enabled")
-    assert "Guided edit finished" not in words_on(page)
-
-
-def test_an_undo_that_another_tab_forestalls_shows_what_there_is(edits: Any) -> None:
-    page, server = edits()
-    move(page, "Pitch")
-    page.wait_for_function("avmsf.studio.revision === 2")
-    server.change(size=2.0)
-    page.click("#sheet-edit >> text=Undo")
-    page.wait_for_selector("text=Another tab has changed this field. The page shows its current state: repeat")
-    assert shown(page, "Size", "Pitch") == ["× 2.00", "× 1.00"]
-    assert (server.revision, [what for what, _ in server.asked]) == (3, ["edit", "undo"])
-
-
-def test_words_on_another_tabs_change_hold_no_numbers_of_revisions(edits: Any) -> None:
-    page, server = edits()
-    server.change(size=2.0)
-    move(page, "Pitch")
-    page.wait_for_selector("text=Nothing was overwritten: show that change")
-    assert "revision" not in words_on(page)
-    with raises(RequestError, name="base", value=1) as refused:
-        Session(Path(), lambda revision: None).expect_current(1)
-    assert "revision" not in str(refused.value)

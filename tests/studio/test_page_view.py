@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from page_plate import LARGER, SIDES, plate_table
-from plate_page import Open, on_screen, words_on
+from plate_page import Open, on_screen
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -63,24 +63,6 @@ def test_a_ray_meets_the_nearest_triangle_of_all(plain: "Page") -> None:
     ours, theirs = np.array(found, dtype=float).T
     assert np.isfinite(ours).sum() > 100
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-5)
-
-
-def test_a_click_on_two_hundred_thousand_triangles_is_quick(plain: "Page") -> None:
-    """A hundred rays in half a second; each took as long as ten of these, when every triangle was tried."""
-    milliseconds = in_module(
-        plain,
-        "triangletree",
-        f"""({{ TriangleTree }}, _, three) => {{
-          const tree = new TriangleTree(({BUMPY})(three, 448, 220));
-          const begun = performance.now();
-          for (let n = 0; n < 100; n++) {{
-            const direction = new three.Vector3(0.1 * Math.sin(n), 0.1 * Math.cos(n), -1).normalize();
-            if (tree.distance([0, 0, 5], direction.toArray()) === Infinity) throw new Error("beside");
-          }}
-          return performance.now() - begun;
-        }}""",
-    )
-    assert milliseconds < 500
 
 
 def test_the_nearest_contacts_are_found(plain: "Page") -> None:
@@ -312,19 +294,6 @@ def test_keys_strike_hardest_with_shift_and_once_when_held(plain: "Page") -> Non
     assert page.evaluate("avmsf.studio.last.force") == 1
 
 
-def test_a_long_touch_selects_nothing_and_words_are_told_once(plain: "Page") -> None:
-    page = plain
-    assert page.evaluate("getComputedStyle(document.getElementById('view')).userSelect") == "none"
-    page.evaluate(
-        "import(new URL('page/dom.js', document.baseURI)).then(({ say }) => { say('one'); say('two', { bad: true }); })"
-    )
-    page.wait_for_selector("text=two")
-    live = "[aria-live], [role=status], [role=alert], [role=log]"
-    assert page.locator(f":is({live}) :is({live})").count() == 0
-    assert page.locator(f":is({live}) >> text=two").count() == 1
-    page.evaluate("document.getElementById('words').replaceChildren()")
-
-
 INKED = """(name) => {
   const canvas = document.getElementById(name);
   const ink = (token) => {
@@ -406,80 +375,3 @@ def test_what_is_heard_is_drawn_and_nothing_where_nobody_listened(visit: Open) -
     gaps = np.diff(drawn).max()
     # 700 ms of the 2.3 s that the chart shows.
     assert gaps > 0.6 * 0.7 / 2.3 * len(heard)
-
-
-def test_a_sound_that_is_turned_down_to_fit_is_told(visit: Open) -> None:
-    page = visit()
-    page.mouse.click(*on_screen(page, CORNER))
-    page.wait_for_timeout(100)
-    assert page.is_hidden("#limited")
-    page.evaluate("avmsf.strike(0, { force: 60 })")
-    page.wait_for_selector("#limited", state="visible")
-    page.wait_for_selector("#limited", state="hidden")
-
-
-def test_a_sound_that_the_browser_holds_back_is_told_until_it_plays(visit: Open) -> None:
-    page = visit()
-    page.evaluate(
-        """() => {
-             const { context } = avmsf.studio.engine;
-             Object.defineProperty(context, "state", { value: "interrupted", configurable: true });
-             avmsf.strike(0);
-           }"""
-    )
-    page.wait_for_selector("text=The browser blocks the sound")
-    page.evaluate(
-        """() => {
-             const { context } = avmsf.studio.engine;
-             Object.defineProperty(context, "state", { value: "running", configurable: true });
-             context.dispatchEvent(new Event("statechange"));
-           }"""
-    )
-    page.wait_for_function("!document.getElementById('words').textContent.includes('blocks the sound')")
-
-
-def test_a_field_without_contacts_is_not_told_to_be_struck(visit: Open) -> None:
-    def empty(page: "Page") -> None:
-        def bend(route: Any) -> None:
-            manifest = route.fetch().json()
-            for name in ("points", "normals", "sine"):
-                manifest["tensors"][name]["shape"][0] = 0
-            route.fulfill(json={**manifest, "points": 0})
-
-        page.route("**/manifest.json", bend)
-
-    page = visit(before=empty)
-    said = words_on(page, ".bad")
-    assert "This field has no geometry" in said
-    assert "strike" not in said
-
-
-def test_a_recording_is_drawn_from_its_beginning_beside_the_model_of_its_own_contact(visit: Open) -> None:
-    page = visit(strikes=True)
-    recording = "#sheet-strike li:has-text('100.wav') >> text=Recording"
-    page.evaluate("avmsf.strike(325)")
-    page.wait_for_timeout(1500)
-    page.click(recording)
-    page.wait_for_timeout(700)
-    assert page.inner_text("#blow-facts") == "100.wav: recording"
-    heard = np.flatnonzero(np.isfinite(columns(page, "decay", "second")))
-    # The chart's axis is 2.3 s long; before, the recording was drawn 1.5 s into the blow elsewhere.
-    assert heard.min() < column_of(page, 0.5 / 2.3)
-
-    def lines() -> np.ndarray:
-        """Return how far down the model's lines began at the blow, however far they have fallen; 1 for none."""
-        page.wait_for_timeout(200)
-        both = np.fmin(columns(page, "spectrum", "first"), columns(page, "spectrum", "faint"))
-        about = [both[column_of(page, share_of(400.0 * order)) + np.arange(-1, 2)] for order in range(1, 7)]
-        return np.nan_to_num(np.array(about), nan=1.0).min(axis=1)
-
-    page.evaluate("avmsf.studio.spectra.listen(avmsf.studio.modes, null)")
-    page.evaluate("avmsf.strike(325)")
-    elsewhere = lines()
-    page.click(recording)
-    beside = lines()
-    page.evaluate("avmsf.strike(100)")
-    # Two of the chart's 124 pixels: how a line's end is colored depends on the time since the blow.
-    np.testing.assert_allclose(beside, lines(), atol=2.1 / 124, rtol=0)
-    # In the middle of the plate most modes have a node.
-    assert (elsewhere - beside > 0.3).sum() >= 2

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from avmsf.errors import CaptureError, LocationError, StudioError
-from avmsf.studio.capture import read_upload
+from avmsf.errors import LocationError, StudioError
 from avmsf.studio.locate import Finder
 from avmsf.studio.opening import open_target
 from avmsf.studio.responses import echo
@@ -220,14 +219,6 @@ def test_the_body_of_an_edit_is_bounded(plate: Served) -> None:
 def test_samples_beyond_float32_are_refused(plate: Served) -> None:
     for samples in (np.full(4000, 1e308), np.array([1e308, -1e308] * 2000)):
         refused(plate.ask("POST", "locate", wav(samples, subtype="DOUBLE")), 422)
-
-
-def test_a_damaged_header_prints_no_traceback(capfd: pytest.CaptureFixture[str]) -> None:
-    # An AIFF file, cut off, at which libsndfile asks for the place before its beginning.
-    common = b"COMM\0\0\0\x18\0\xff\0\0\0\1\0 @\x0b\0\0\0\0\0\0\0\0FL32"
-    with pytest.raises(CaptureError):
-        read_upload(b"FORM\0\0\0\\AIFCFVER\0\0\0\4\xa2\x80Q@" + common)
-    assert capfd.readouterr().err == ""
 
 
 def test_an_error_ahead_of_time_is_reported_and_the_next_revision_prepared(

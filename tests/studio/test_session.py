@@ -1,7 +1,6 @@
 """The open field: revisions, what edits make of it, and that nobody's work is overwritten in silence."""
 
 import math
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,10 +8,9 @@ from typing import Any
 import pytest
 import torch
 
-from avmsf._utils.files import way_out
 from avmsf.editing.material import change_material
 from avmsf.editing.modal_edit import adjust_modes
-from avmsf.errors import EditError, FieldFileError, SimulationError, StudioError
+from avmsf.errors import EditError, FieldFileError, SimulationError
 from avmsf.export.sampled_field import SampledField
 from avmsf.fem.material import CERAMIC, WOOD
 from avmsf.field.scaled_gains import length_of
@@ -192,26 +190,26 @@ def test_a_field_that_cannot_be_written_leaves_no_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "",
-        " ",
-        "../up",
-        "a/b",
-        "a\\b",
-        "/etc/x",
-        ".hidden",
-        "nul",
-        "COM1.txt",
-        "x" * 200,
-        "a\0b",
-        "a\nb",
-        "=1+1",
-        "~",
-        "x.",
-    ],
-)
+NAMES = [
+    "",
+    " ",
+    "../up",
+    "a/b",
+    "a\\b",
+    "/etc/x",
+    ".hidden",
+    "nul",
+    "COM1.txt",
+    "x" * 200,
+    "a\0b",
+    "a\nb",
+    "=1+1",
+    "~",
+    "x.",
+]
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_names_that_lead_elsewhere_are_refused(name: str) -> None:
     with raises(RequestError, name="name", value=name) as refused:
         file_name(name)
@@ -224,21 +222,6 @@ def test_a_name_is_as_long_as_files_names_may_be(tmp_path: Path) -> None:
     with raises(RequestError, name="name", value=201) as refused:
         session.save(2, "音" * 67)
     assert refused.value.status == 400
-
-
-@pytest.mark.parametrize("number", [13, 28, 30])
-def test_a_file_that_cannot_be_made_says_what_helps(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
-) -> None:
-    session, _ = opened(tmp_path)
-
-    def refuse(*arguments: object) -> int:
-        raise OSError(number, os.strerror(number))
-
-    monkeypatch.setattr("avmsf.studio.session.os.open", refuse)
-    with raises(StudioError, file="bowl.safetensors", value=os.strerror(number)) as caught:
-        session.save(1, "bowl")
-    assert str(caught.value).endswith(way_out(OSError(number, "")))
 
 
 def test_a_field_that_is_not_heard_is_kept_under_a_free_name(tmp_path: Path) -> None:
