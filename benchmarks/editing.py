@@ -10,12 +10,17 @@ from pathlib import Path
 from statistics import mean
 
 from avmsf.editing.reference import Reference
-from avmsf.evaluation.editing import EditScore, judge, write_scores
-from avmsf.evaluation.editing_methods import towards_reference
+from avmsf.evaluation.editing import (
+    SIMULATED_TRANSITIONS,
+    EditScore,
+    EditTask,
+    Transition,
+    judge,
+    towards_reference,
+    write_scores,
+)
 from avmsf.evaluation.editing_objects import SHAPES, STRANGERS, KnownObject, SolvedShape, drawn_size, simulated_objects
-from avmsf.evaluation.editing_tasks import SIMULATED_TRANSITIONS, EditTask, Transition
-from avmsf.evaluation.mode_embedding import MaterialSpace, UmapSettings
-from avmsf.evaluation.mode_features import Pitches, PitchesAndRings
+from avmsf.evaluation.mode_embedding import MaterialSpace, Pitches, PitchesAndRings, UmapSettings
 from avmsf.fem.material import MATERIALS
 from benchmarks.report import Options, Report, Table, log
 from benchmarks.step import peak_gigabytes

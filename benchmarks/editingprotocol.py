@@ -21,8 +21,20 @@ from avmsf.editing.reference import Reference
 from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import AvmsfError, EvaluationError
 from avmsf.evaluation.clap import Clap
-from avmsf.evaluation.editing import EditScore, judge, write_scores
-from avmsf.evaluation.editing_methods import GENERATED, EditMethod, Recast, towards_reference, towards_words
+from avmsf.evaluation.editing import (
+    GENERATED,
+    RECORDED_TRANSITIONS,
+    SEVEN_TRANSITIONS,
+    EditMethod,
+    EditScore,
+    EditTask,
+    Recast,
+    judge,
+    prompted_tasks,
+    towards_reference,
+    towards_words,
+    write_scores,
+)
 from avmsf.evaluation.editing_objects import (
     PUBLISHED,
     REALIMPACT_26,
@@ -32,9 +44,8 @@ from avmsf.evaluation.editing_objects import (
     PaperFields,
     recorded_objects,
 )
-from avmsf.evaluation.editing_tasks import RECORDED_TRANSITIONS, SEVEN_TRANSITIONS, EditTask, prompted_tasks
-from avmsf.evaluation.object_features import ObjectLooks
-from avmsf.evaluation.published import EDITING_UMAP
+from avmsf.evaluation.objects import ObjectLooks
+from avmsf.evaluation.protocols import EDITING_UMAP
 from avmsf.pipeline.config import DINO, PRESETS
 from avmsf.pipeline.features import choose_encoder
 from benchmarks.editing import labelled_objects, referred_task, spaces_of, strange_shapes, stranger

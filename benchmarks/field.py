@@ -12,9 +12,9 @@ from torch import Tensor
 
 from avmsf.capture import Impacts
 from avmsf.evaluation.metrics import PAPER
-from avmsf.evaluation.renderer import Renderer
 from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor, sine_floor
 from avmsf.evaluation.splits import Scores, evaluate, score, split
+from avmsf.evaluation.task import Renderer
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.candidate_bodies import nominal_bodies
 from avmsf.field.config import FitConfig

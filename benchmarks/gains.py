@@ -14,7 +14,7 @@ import torch
 
 from avmsf.capture import Impacts
 from avmsf.errors import CaptureWarning
-from avmsf.evaluation.ground_truth import truth_at, truth_from_first_sample
+from avmsf.evaluation.modal_metrics import truth_at, truth_from_first_sample
 from avmsf.evaluation.simple_methods import MeanWaveform
 from avmsf.evaluation.splits import evaluate, score, split
 from avmsf.features.feature_field import FeatureField

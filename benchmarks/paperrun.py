@@ -11,7 +11,7 @@ from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
 from avmsf.datasets import CaptureCollection
-from avmsf.evaluation.object_features import ObjectLooks
+from avmsf.evaluation.objects import ObjectLooks
 from avmsf.evaluation.simple_methods import MeanWaveform
 from avmsf.evaluation.splits import evaluate, split
 from avmsf.features.feature_field import FeatureField

@@ -28,8 +28,7 @@ from avmsf.baselines.sonicgauss.small import SmallConfig, SmallSonicGauss, Small
 from avmsf.baselines.sonicgauss.small_renderer import SmallRenderer, fit_small
 from avmsf.baselines.sonicgauss.tuning import TrainingConfig, train
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.methods import method_named
-from avmsf.evaluation.sonicgauss_method import SmallSonicGaussMethod
+from avmsf.evaluation.methods import SmallSonicGaussMethod, method_named
 from avmsf.simulate.sim20 import SIM20
 from factories.raising import raises
 from factories.sonicgauss_cases import SECONDS, cloud, impacts

@@ -21,8 +21,7 @@ from avmsf.baselines.sonicgauss.point_transformer import (
 )
 from avmsf.baselines.sonicgauss.published import PublishedSizes, PublishedSonicGauss
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.methods import method_named, report_of
-from avmsf.evaluation.sonicgauss_method import SonicGaussMethod
+from avmsf.evaluation.methods import SonicGaussMethod, method_named, report_of
 from avmsf.evaluation.task import Task
 from factories.raising import raises
 from factories.sonicgauss_cases import cloud, impacts

@@ -10,9 +10,9 @@ from avmsf.cli.evaluate import run
 from avmsf.cli.options.evaluate import deciding, parse
 from avmsf.errors import AvmsfError, EvaluationError, FitError
 from avmsf.evaluation.field_methods import FieldMethod
-from avmsf.evaluation.object_bodies import ObjectBodies
-from avmsf.evaluation.plan import Evaluation
+from avmsf.evaluation.objects import ObjectBodies
 from avmsf.evaluation.results import ResultsFolder
+from avmsf.evaluation.runner import Evaluation
 from avmsf.evaluation.task import Task
 from avmsf.modal.extraction.finders import ShortTime
 from avmsf.simulate.sim20 import ABLATED

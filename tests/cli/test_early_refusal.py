@@ -11,8 +11,8 @@ import pytest
 from avmsf.cli.options.paths import ExistingField, InputError
 from avmsf.errors import SimulationError
 from avmsf.evaluation.methods import METHODS
-from avmsf.evaluation.names import METHOD_NAMES, PROTOCOL_NAMES
 from avmsf.evaluation.protocols import PROTOCOLS
+from avmsf.evaluation.registry import METHOD_NAMES, PROTOCOL_NAMES
 from avmsf.fem.material import material_named
 from avmsf.gaussians.ply_header import NEEDED
 from avmsf.pipeline.config import CACHE, CACHED_FIELD

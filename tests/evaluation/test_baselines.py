@@ -13,9 +13,9 @@ import torch
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, FitError
 from avmsf.evaluation.metrics import relative_stft_error
-from avmsf.evaluation.renderer import Renderer, expect_renderer
 from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor, sine_floor
 from avmsf.evaluation.splits import Scores, evaluate, score, split
+from avmsf.evaluation.task import Renderer, expect_renderer
 from avmsf.gaussians.points import farthest_points
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_gains

@@ -7,8 +7,7 @@ import torch
 
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.interpolation import SplineGains
-from avmsf.evaluation.simple_methods import MeanGains
+from avmsf.evaluation.simple_methods import MeanGains, SplineGains
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual

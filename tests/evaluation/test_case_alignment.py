@@ -10,14 +10,13 @@ from torch import Tensor
 from avmsf.capture.impacts import Impacts
 from avmsf.datasets import CaptureCollection
 from avmsf.evaluation import align_split, evaluate
-from avmsf.evaluation.case_run import CaseRun
 from avmsf.evaluation.cases import Case
 from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.methods import method_named
-from avmsf.evaluation.plan import Evaluation
 from avmsf.evaluation.protocols import PROTOCOLS
+from avmsf.evaluation.runner import CaseRun, Evaluation
 from avmsf.evaluation.simple_methods import NearestRecording
-from avmsf.evaluation.sound_metrics import Judging
+from avmsf.evaluation.splits import Judging
 from avmsf.evaluation.task import Task
 from factories.delayed_plate import ALIGNED, delays, distance, strikes, without_delays
 from factories.plate_set import NoBodies, PlateLooks

@@ -21,8 +21,23 @@ from avmsf.editing.reference import Reference
 from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import AvmsfWarning, EditError, EvaluationError
 from avmsf.evaluation.clap import Clap
-from avmsf.evaluation.editing import judge, spectral_distance, write_scores
-from avmsf.evaluation.editing_methods import Generation, Recast, Untouched, towards_reference, towards_words
+from avmsf.evaluation.editing import (
+    PROMPTS,
+    RECORDED_TRANSITIONS,
+    SEVEN_TRANSITIONS,
+    SIMULATED_TRANSITIONS,
+    EditTask,
+    Generation,
+    Recast,
+    Transition,
+    Untouched,
+    judge,
+    prompted_tasks,
+    spectral_distance,
+    towards_reference,
+    towards_words,
+    write_scores,
+)
 from avmsf.evaluation.editing_objects import (
     PUBLISHED,
     REALIMPACT_26,
@@ -34,17 +49,7 @@ from avmsf.evaluation.editing_objects import (
     recorded_objects,
     simulated_objects,
 )
-from avmsf.evaluation.editing_tasks import (
-    PROMPTS,
-    RECORDED_TRANSITIONS,
-    SEVEN_TRANSITIONS,
-    SIMULATED_TRANSITIONS,
-    EditTask,
-    Transition,
-    prompted_tasks,
-)
-from avmsf.evaluation.mode_embedding import MaterialSpace
-from avmsf.evaluation.mode_features import PitchesAndRings
+from avmsf.evaluation.mode_embedding import MaterialSpace, PitchesAndRings
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import GLASS, MATERIALS, STEEL, WOOD

@@ -16,22 +16,16 @@ import torch
 from avmsf.capture import read_capture
 from avmsf.datasets import CaptureCollection
 from avmsf.errors import AvmsfError, EvaluationError, FitError
-from avmsf.evaluation.ground_truth import truth_at
 from avmsf.evaluation.methods import method_named
-from avmsf.evaluation.modal_metrics import ModalRenderer, judge_modes
-from avmsf.evaluation.object_bodies import ObjectBodies
-from avmsf.evaluation.object_features import ObjectLooks
-from avmsf.evaluation.other_objects import draw_stranger
-from avmsf.evaluation.parallel import RunProgress, Workers, run_objects
-from avmsf.evaluation.plan import Evaluation
+from avmsf.evaluation.modal_metrics import ModalRenderer, judge_modes, truth_at
+from avmsf.evaluation.objects import ObjectBodies, ObjectLooks, draw_stranger
 from avmsf.evaluation.protocols import PROTOCOLS
-from avmsf.evaluation.renderer import Renderer
 from avmsf.evaluation.report import write_summary
 from avmsf.evaluation.results import ENCODER, ResultsFolder
+from avmsf.evaluation.runner import Evaluation, RunProgress, Workers, run_objects
 from avmsf.evaluation.simple_methods import NearestRecording
-from avmsf.evaluation.sound_metrics import Judging, spread
-from avmsf.evaluation.splits import evaluate, split
-from avmsf.evaluation.task import Method, Task
+from avmsf.evaluation.splits import Judging, evaluate, split, spread
+from avmsf.evaluation.task import Method, Renderer, Task
 from avmsf.simulate.ground_truth import read_truth
 from factories.plate_set import NoBodies, PlateLooks, fill_plates
 from factories.raising import raises
@@ -244,7 +238,7 @@ def test_results_of_different_evaluations_are_not_mixed(
     changed = replace(Counting([]), name="knn3")
     with raises(EvaluationError, file=results.path, name="knn3", value=held["methods"]["knn3"]):
         run_objects(planned(plates, changed), ("a",), results)
-    monkeypatch.setattr("avmsf.evaluation.plan.source_digest", lambda module: "of other code")
+    monkeypatch.setattr("avmsf.evaluation.runner.source_digest", lambda module: "of other code")
     with raises(EvaluationError, file=results.path, name="source", value=held["source"]):
         run_objects(planned(plates, "knn3"), ("a",), results)
     assert (tmp_path / "results" / "objects" / "a.json").read_bytes() == before
@@ -340,7 +334,7 @@ def test_cdpam_is_taken_of_a_few_contacts(plates: Path, tmp_path: Path, monkeypa
             assert sample_rate == 8000.0
             return (predicted - truth).abs().sum(1).double()
 
-    monkeypatch.setattr("avmsf.evaluation.sound_metrics._cdpam", Ear)
+    monkeypatch.setattr("avmsf.evaluation.splits._cdpam", Ear)
     evaluation = replace(planned(plates, "nearest"), judging=Judging(level="raw", cdpam_contacts=3))
     run_objects(evaluation, ("a",), ResultsFolder(tmp_path))
     (record,) = ResultsFolder(tmp_path).records()

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from avmsf.capture.impacts import Impacts
-from avmsf.evaluation.ground_truth import common_delay, truth_from_first_sample
-from avmsf.evaluation.modal_metrics import judge_modes
+from avmsf.evaluation.modal_metrics import common_delay, judge_modes, truth_from_first_sample
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.modes import ModalBank
 from avmsf.simulate.ground_truth import Truth

@@ -12,11 +12,11 @@ from avmsf.cli.evaluate import run
 from avmsf.cli.options.evaluate import parse
 from avmsf.errors import AvmsfError, EvaluationError
 from avmsf.evaluation.cases import Choosing, Growing
-from avmsf.evaluation.learning_curve import curves, draw_learning_curve
-from avmsf.evaluation.object_bodies import ObjectBodies
-from avmsf.evaluation.plan import Evaluation
+from avmsf.evaluation.objects import ObjectBodies
 from avmsf.evaluation.protocols import protocol_named
 from avmsf.evaluation.results import CaseRecord, ObjectRecord, Outcome
+from avmsf.evaluation.runner import Evaluation
+from avmsf.evaluation.summary import curves, draw_learning_curve
 from factories.plate_capture import fill_plate
 from factories.raising import raises
 

@@ -16,10 +16,9 @@ from avmsf.capture import Impacts, read_capture
 from avmsf.cli import main
 from avmsf.errors import LocationError
 from avmsf.evaluation import localization, report
-from avmsf.evaluation.field_methods import FieldMethod
-from avmsf.evaluation.grid_field import GridField
+from avmsf.evaluation.field_methods import FieldMethod, GridField
 from avmsf.evaluation.localization import MAX_VERTICES, located, random_distance
-from avmsf.evaluation.object_features import ObjectLooks
+from avmsf.evaluation.objects import ObjectLooks
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.simple_methods import NearestRecording, WhiteNoise
 from avmsf.evaluation.task import Task
@@ -141,7 +140,7 @@ def test_heat_maps_have_the_true_contacts_and_the_papers_methods_their_own_dista
 
     monkeypatch.setattr(ObjectLooks, "__call__", lambda looks, *given, **named: PlateLooks()(*given, **named))
     monkeypatch.setattr(FieldMethod, "fit", quick)
-    monkeypatch.setattr("avmsf.evaluation.case_run.located", watched)
+    monkeypatch.setattr("avmsf.evaluation.runner.located", watched)
     monkeypatch.setattr(report, "draw_contact", draw)
     words = ["evaluate", "localize", str(data), "--objects", "a", "--methods", "field-auto,paper-grid,paper,nearest"]
     words += ["--lift.encoder", "descriptors", "--output", str(results), "--figures"]

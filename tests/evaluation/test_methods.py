@@ -14,14 +14,10 @@ import torch
 from avmsf.baselines.diffsound.material_fit import DiffSoundConfig
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, FitError, SceneError
-from avmsf.evaluation.diffsound_method import DiffSoundMethod
-from avmsf.evaluation.field_methods import FieldMethod, UninformedField
-from avmsf.evaluation.grid_field import PAPER_GRID, Grid, GridField
-from avmsf.evaluation.methods import METHODS, RecordedMethod, method_named, report_of
-from avmsf.evaluation.random_modes import random_modes
-from avmsf.evaluation.renderer import Renderer
+from avmsf.evaluation.field_methods import PAPER_GRID, FieldMethod, Grid, GridField, UninformedField, random_modes
+from avmsf.evaluation.methods import METHODS, DiffSoundMethod, RecordedMethod, method_named, report_of
 from avmsf.evaluation.splits import split
-from avmsf.evaluation.task import Method, Task
+from avmsf.evaluation.task import Method, Renderer, Task
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.body_family import BodyFamily
 from avmsf.fem.candidate_bodies import NominalBodies, NominalBody

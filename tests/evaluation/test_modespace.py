@@ -10,8 +10,14 @@ import pytest
 import torch
 
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.mode_embedding import MaterialSpace, UmapSettings
-from avmsf.evaluation.mode_features import ModeFeatures, Pitches, PitchesAndRings, features_of
+from avmsf.evaluation.mode_embedding import (
+    MaterialSpace,
+    ModeFeatures,
+    Pitches,
+    PitchesAndRings,
+    UmapSettings,
+    features_of,
+)
 from avmsf.modal.modes import ModalBank
 from factories.raising import raises
 

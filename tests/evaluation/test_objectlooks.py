@@ -11,7 +11,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.datasets.dataset import DatasetReport, Look, ObjectFacts
 from avmsf.errors import SceneError
-from avmsf.evaluation.object_features import ObjectLooks
+from avmsf.evaluation.objects import ObjectLooks
 from avmsf.features.feature_field import FeatureField
 from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.ply import read_splats

@@ -10,13 +10,12 @@ import torch
 from avmsf.cli.evaluate import looks_of, settled_lifts
 from avmsf.datasets import CaptureCollection
 from avmsf.errors import EvaluationError, SceneError
-from avmsf.evaluation.field_methods import NETWORK, FieldMethod
-from avmsf.evaluation.grid_field import GridField
+from avmsf.evaluation.field_methods import NETWORK, FieldMethod, GridField
 from avmsf.evaluation.methods import METHODS
-from avmsf.evaluation.plan import Evaluation
 from avmsf.evaluation.protocols import PROTOCOLS
 from avmsf.evaluation.results import ResultsFolder
-from avmsf.evaluation.sound_metrics import Judging
+from avmsf.evaluation.runner import Evaluation
+from avmsf.evaluation.splits import Judging
 from avmsf.evaluation.task import Task
 from avmsf.features.descriptors import ImageDescriptors
 from avmsf.features.encoder import Encoder

@@ -16,16 +16,15 @@ from PIL import Image
 from test_evaluation_run import planned
 
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.listening import Heard, draw_spectrogram, keep_sound, listening_gain
-from avmsf.evaluation.markdown import markdown
 from avmsf.evaluation.methods import METHODS
-from avmsf.evaluation.parallel import run_objects
-from avmsf.evaluation.published import PUBLISHED, published_ratios
+from avmsf.evaluation.page import Heard, draw_spectrogram, keep_sound, listening_gain
+from avmsf.evaluation.protocols import PUBLISHED, published_ratios
+from avmsf.evaluation.registry import TITLES
 from avmsf.evaluation.report import write_page, write_summary
-from avmsf.evaluation.report_tables import WARNING, Grid, Section, figure, sections
+from avmsf.evaluation.report_tables import WARNING, Grid, Section, figure, markdown, sections
 from avmsf.evaluation.results import CaseRecord, ObjectRecord, Outcome, ResultsFolder, natural
+from avmsf.evaluation.runner import run_objects
 from avmsf.evaluation.summary import Mean, missing_of, object_figures, summarize
-from avmsf.evaluation.titles import TITLES
 from factories.plate_set import fill_plates
 from factories.raising import raises
 
@@ -66,9 +65,9 @@ def test_means_are_over_contacts_then_over_objects() -> None:
     assert summary["failures"] == [{"object": "10", "case": "farthest", "method": "paper", "failure": "no modes"}]
 
 
-def best_of(records: tuple[ObjectRecord, ...], title: str, **settings: frozenset[str]) -> tuple[list[str], Section]:
-    """Return the methods that a table marks as best, and its section."""
-    (part,) = [each for each in sections(records, IDENTITY, subsets=settings) if each.title == title]
+def best_of(records: tuple[ObjectRecord, ...]) -> tuple[list[str], Section]:
+    """Return the methods that the main table marks as best, and its section."""
+    (part,) = [each for each in sections(records, IDENTITY) if each.title == "All methods"]
     assert part.grid is not None
     return [part.grid.rows[row][0] for row, _ in sorted(part.grid.best)], part
 
@@ -76,17 +75,16 @@ def best_of(records: tuple[ObjectRecord, ...], title: str, **settings: frozenset
 def test_the_best_is_marked_among_methods_that_have_all_objects() -> None:
     easy = record("1", {"knn3": (2.0, 2.0), "nearest": (3.0, 3.0), "paper": (1.0, 1.0)})
     hard = record("2", {"knn3": (9.0, 9.0), "nearest": (8.0, 8.0), "paper": "no modes"})
-    for title, parts in (("All methods", {}), ("Objects: part", {"part": frozenset("12")})):
-        best, part = best_of((easy, hard, record("3", {"knn3": (1.0, 1.0), "nearest": (1.5, 1.5)})), title, **parts)
-        # Of three objects 4 and 4.17, of two 5.5 and 5.5: of equal ones the first.
-        assert best == ["knn3"]
-        assert "paper" in part.remarks[0]
-    whole = len(best_of((easy, hard), "All methods")[1].remarks)
-    best, part = best_of((easy,), "All methods")
+    best, part = best_of((easy, hard, record("3", {"knn3": (1.0, 1.0), "nearest": (1.5, 1.5)})))
+    # Of three objects 4 and 4.17.
+    assert best == ["knn3"]
+    assert "paper" in part.remarks[0]
+    whole = len(best_of((easy, hard))[1].remarks)
+    best, part = best_of((easy,))
     assert best == ["paper"]
     assert len(part.remarks) == whole - 1
     # Where every method lacks an object there is no mean to compare.
-    best, _ = best_of((easy, record("2", {"nearest": (8.0, 8.0)}), record("3", {"knn3": (1.0, 1.0)})), "All methods")
+    best, _ = best_of((easy, record("2", {"nearest": (8.0, 8.0)}), record("3", {"knn3": (1.0, 1.0)})))
     assert best == []
 
 
@@ -146,15 +144,15 @@ def test_the_mean_of_one_has_no_standard_error() -> None:
 
 
 def test_tables_have_the_papers_rows_for_its_datasets_alone() -> None:
-    words = markdown(sections(THREE, IDENTITY, subsets={}))
+    words = markdown(sections(THREE, IDENTITY))
     assert "| paper: AV-MSF | 0.0130 |" in words
     assert "| knn3 | **4.00 ± 1.2** | 3 |" in words
     assert "| 10 | farthest | paper | no modes |" in words
     assert WARNING in words
     assert "| paper: AV-MSF | 972 | 0.0438 |" in words
     for folder in ("sim-20", "ObjectFolder Real of mine", "ObjectFolder Real (captures)"):
-        assert "paper: AV-MSF" not in markdown(sections(THREE, {**IDENTITY, "dataset": folder}, subsets={}))
-    other = markdown(sections(THREE, {**IDENTITY, "dataset": "sim-20"}, subsets={}))
+        assert "paper: AV-MSF" not in markdown(sections(THREE, {**IDENTITY, "dataset": folder}))
+    other = markdown(sections(THREE, {**IDENTITY, "dataset": "sim-20"}))
     # The ratios that its tables allow stand beside ours everywhere.
     assert "| paper, ObjectFolder Real: paper | 0.929 |" in other
     assert WARNING in other
@@ -162,11 +160,11 @@ def test_tables_have_the_papers_rows_for_its_datasets_alone() -> None:
 
 def test_every_method_has_a_title_and_tables_give_it() -> None:
     assert set(METHODS) <= set(TITLES)
-    assert f"paper: {TITLES['paper']}" in markdown(sections(THREE, IDENTITY, subsets={}))
+    assert f"paper: {TITLES['paper']}" in markdown(sections(THREE, IDENTITY))
     # Also those that read a file or a folder.
     method = "sonicgauss:/some/folder"
     records = (record("1", {"knn3": (1.0, 1.0), method: (1.0, 1.0)}),)
-    words = markdown(sections(records, {**IDENTITY, "methods": {"knn3": "", method: ""}}, subsets={}))
+    words = markdown(sections(records, {**IDENTITY, "methods": {"knn3": "", method: ""}}))
     assert TITLES["sonicgauss"] in words
 
 
@@ -259,7 +257,7 @@ def evaluated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     results = ResultsFolder(place / "results")
     run_objects(planned(plates, "knn3", "nearest", "paper"), ("a", "b <i>"), results)
     write_summary(results, subsets={"round": frozenset("a")})
-    write_page(results, subsets={"round": frozenset("a")})
+    write_page(results)
     return place / "results"
 
 
@@ -291,14 +289,14 @@ def test_the_page_stands_on_its_own_and_can_be_read_by_all(evaluated: Path) -> N
 
 def test_the_page_can_be_made_again_and_is_the_same(evaluated: Path) -> None:
     before = (evaluated / "report.html").read_bytes()
-    write_page(ResultsFolder(evaluated), subsets={"round": frozenset("a")})
+    write_page(ResultsFolder(evaluated))
     assert (evaluated / "report.html").read_bytes() == before
 
 
 def test_the_page_stays_small(evaluated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = (evaluated / "report.html").read_text()
     monkeypatch.setattr("avmsf.evaluation.page.LARGEST", len(whole) // 3)
-    write_page(ResultsFolder(evaluated), subsets={})
+    write_page(ResultsFolder(evaluated))
     smaller = (evaluated / "report.html").read_text()
     assert len(smaller) < len(whole) / 2
     assert 0 < smaller.count("<audio") < whole.count("<audio")
@@ -310,4 +308,3 @@ def test_times_and_failures_are_told(evaluated: Path) -> None:
     assert times["a"]["methods"]["knn3"]["render"] > 0
     words = (evaluated / "report.md").read_text()
     assert "| a | farthest | paper | a: nothing shows its look |" in words
-    assert "## Objects: round" in words

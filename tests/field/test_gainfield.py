@@ -12,7 +12,7 @@ from safetensors.torch import load as from_bytes
 from safetensors.torch import save as to_bytes
 
 from avmsf.errors import FieldFileError
-from avmsf.evaluation.renderer import Renderer
+from avmsf.evaluation.task import Renderer
 from avmsf.field.attention import AttentionGains
 from avmsf.field.gain_field import GainField, Gains
 from avmsf.field.gains.model import MixtureGains

@@ -7,13 +7,12 @@ import torch
 
 from avmsf.datasets import CaptureCollection
 from avmsf.errors import SceneError
-from avmsf.evaluation.object_features import ObjectLooks
-from avmsf.evaluation.plan import Evaluation
+from avmsf.evaluation.objects import ObjectLooks
 from avmsf.evaluation.protocols import PROTOCOLS
 from avmsf.evaluation.results import ResultsFolder
-from avmsf.evaluation.run import run_object
+from avmsf.evaluation.runner import Evaluation, run_object
 from avmsf.evaluation.simple_methods import NearestRecording
-from avmsf.evaluation.sound_metrics import Judging
+from avmsf.evaluation.splits import Judging
 from avmsf.evaluation.task import Task
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import write_splats

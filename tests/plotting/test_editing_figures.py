@@ -11,11 +11,8 @@ from test_editing import QUICK, Speaker, flat_space, struck
 
 from avmsf.editing.config import DistillationConfig
 from avmsf.evaluation.clap import Clap
-from avmsf.evaluation.editing import EditScore, judge, write_scores
-from avmsf.evaluation.editing_methods import towards_words
-from avmsf.evaluation.editing_tasks import EditTask
-from avmsf.evaluation.mode_embedding import MaterialSpace
-from avmsf.evaluation.mode_features import Pitches
+from avmsf.evaluation.editing import EditScore, EditTask, judge, towards_words, write_scores
+from avmsf.evaluation.mode_embedding import MaterialSpace, Pitches
 from factories.made_clap import save_clap
 
 # The benchmarks are no part of the package.

@@ -21,19 +21,15 @@ from avmsf.datasets.dataset import Dataset
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.cases import Growing, Predefined
 from avmsf.evaluation.field_methods import configured
-from avmsf.evaluation.learning_curve import curves, draw_learning_curve
 from avmsf.evaluation.methods import RecordedMethod, method_named
-from avmsf.evaluation.object_bodies import ObjectBodies
-from avmsf.evaluation.object_features import ObjectLooks
-from avmsf.evaluation.parallel import RunProgress, Workers, run_objects
-from avmsf.evaluation.plan import Evaluation
-from avmsf.evaluation.protocols import LEARNING_CURVE, PREDEFINED, EvaluationProtocol, protocol_named
-from avmsf.evaluation.published import PUBLISHED
+from avmsf.evaluation.objects import SUBSETS, ObjectBodies, ObjectLooks, choose_objects, members
+from avmsf.evaluation.protocols import LEARNING_CURVE, PREDEFINED, PUBLISHED, EvaluationProtocol, protocol_named
 from avmsf.evaluation.report import PAGE, SUMMARY, TABLES, write_figures, write_page, write_summary
 from avmsf.evaluation.report_tables import Section
 from avmsf.evaluation.results import IDENTITY, ResultsFolder, write_json
-from avmsf.evaluation.sound_metrics import Judging
-from avmsf.evaluation.subsets import SUBSETS, choose_objects, members
+from avmsf.evaluation.runner import Evaluation, RunProgress, Workers, run_objects
+from avmsf.evaluation.splits import Judging
+from avmsf.evaluation.summary import curves, draw_learning_curve
 from avmsf.evaluation.task import Look, Looking, Method
 from avmsf.modal.extraction.finders import finder_named
 from avmsf.pipeline.config import AUTO, PRESETS, LiftConfig, SceneConfig, TimeZero, ViewsConfig
@@ -72,7 +68,7 @@ def run(options: Options) -> int:
     try:
         run_shown(evaluation, objects, results, workers, after_each=write)
         summary = write()
-        parts = write_page(results, subsets=groups)
+        parts = write_page(results)
         figures = write_figures(results) if options.figures else []
     except KeyboardInterrupt:
         if (folder / IDENTITY).exists():

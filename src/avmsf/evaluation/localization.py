@@ -16,8 +16,8 @@ from avmsf.baselines.diffsound.locator import DiffSoundLocator
 from avmsf.baselines.diffsound.renderer import DiffSound
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, LocationError
-from avmsf.evaluation.renderer import Renderer
 from avmsf.evaluation.simple_methods import NearestRecording
+from avmsf.evaluation.task import Renderer
 from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.points import farthest_points
 from avmsf.localization.contact_map import ContactMap

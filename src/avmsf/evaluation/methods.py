@@ -6,23 +6,200 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from avmsf.baselines.diffsound.renderer import DiffSound
-from avmsf.baselines.sonicgauss.small import COMMAND
-from avmsf.baselines.sonicgauss.tuning import TunedRenderer
-from avmsf.errors import EvaluationError
-from avmsf.evaluation.diffsound_method import DiffSoundMethod
-from avmsf.evaluation.field_methods import NETWORK, FieldMethod, UninformedField
-from avmsf.evaluation.grid_field import PAPER_GRID, QUICK_GRID, GridField
-from avmsf.evaluation.interpolation import SplineGains
-from avmsf.evaluation.names import PUBLISHED, RECORDED, SMALL, expect_method
-from avmsf.evaluation.recorded import Recorded
-from avmsf.evaluation.renderer import Renderer
-from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, RandomImpact, WhiteNoise
-from avmsf.evaluation.sonicgauss_method import SmallSonicGaussMethod, SonicGaussMethod
-from avmsf.evaluation.task import Look, Method, Task
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf._utils.device import usable_device
+from avmsf.baselines.diffsound.material_fit import DiffSoundConfig
+from avmsf.baselines.diffsound.renderer import DiffSound, fit_diffsound
+from avmsf.baselines.sonicgauss.published import PublishedSizes, PublishedSonicGauss, folder_digest
+from avmsf.baselines.sonicgauss.published_renderer import EPOCHS, PublishedRenderer, fit_published
+from avmsf.baselines.sonicgauss.small import COMMAND, SmallWeights
+from avmsf.baselines.sonicgauss.small_renderer import TUNING, SmallRenderer, fit_small
+from avmsf.baselines.sonicgauss.tuning import TrainingConfig, TunedRenderer
+from avmsf.capture.audio import read_recording
+from avmsf.errors import CaptureError, EvaluationError
+from avmsf.evaluation.field_methods import NETWORK, PAPER_GRID, QUICK_GRID, FieldMethod, GridField, UninformedField
+from avmsf.evaluation.registry import PUBLISHED, RECORDED, SMALL, expect_method
+from avmsf.evaluation.simple_methods import (
+    MeanGains,
+    MeanWaveform,
+    NearestRecording,
+    RandomImpact,
+    SplineGains,
+    WhiteNoise,
+)
+from avmsf.evaluation.task import Look, Method, Renderer, Task
+from avmsf.fem.material import MATERIALS
 from avmsf.field.config import GainModel
 from avmsf.field.sound_field import SoundField
 from avmsf.pipeline.config import PRESETS, PipelineConfig
+
+
+@dataclass(frozen=True)
+class DiffSoundMethod:
+    """A simulation whose material is fitted to the training recordings, from the dataset's material where it is known.
+
+    A material that is not in the table, such as metal, counts as not known.
+    """
+
+    name: str
+    """What tables call it."""
+    weighted: bool = False
+    """Whether each mode has a weight of its own, fitted to the training recordings."""
+    config: DiffSoundConfig = field(default_factory=DiffSoundConfig)
+
+    def fit(self, task: Task) -> DiffSound:
+        """Fit the material. Raises AvmsfError where the object has no body, or its recordings no modes."""
+        known = task.material if task.material in MATERIALS else None
+        config = self.config if known is None else replace(self.config, material=known)
+        return fit_diffsound(task.train, task.family(), task.modes(), config, weighted=self.weighted)
+
+
+@dataclass(frozen=True)
+class SonicGaussMethod:
+    """The published architecture and weights, fine-tuned to each object, on CUDA where there is a GPU."""
+
+    folder: Path
+    """Holds the published files."""
+    sizes: PublishedSizes = field(default_factory=PublishedSizes)
+    epochs: int = EPOCHS
+
+    @property
+    def name(self) -> str:
+        """`sonicgauss:` and the folder."""
+        return f"{PUBLISHED}{self.folder}"
+
+    def __repr__(self) -> str:
+        # Results of other weights are not mixed.
+        return f"SonicGaussMethod(weights {folder_digest(self.folder)}, {self.sizes}, {self.epochs})"
+
+    def fit(self, task: Task) -> PublishedRenderer:
+        """Fine-tune. Raises AvmsfError for weights of another model, and for an object without Gaussians."""
+        model = PublishedSonicGauss.load(self.folder, self.sizes)
+        device = usable_device(task.device, raising=EvaluationError)
+        return fit_published(model.to(device), task.gaussians(), task.train, epochs=self.epochs, seed=task.seed)
+
+
+@dataclass(frozen=True)
+class SmallSonicGaussMethod:
+    """The small generator, trained from scratch on simulated objects, fine-tuned to each object."""
+
+    file: Path
+    """Weights that `python -m benchmarks baselines --parts sonicgauss-training` made."""
+    config: TrainingConfig = TUNING
+
+    @property
+    def name(self) -> str:
+        """`sonicgauss-small:` and the file."""
+        return f"{SMALL}{self.file}"
+
+    def __repr__(self) -> str:
+        digest = hashlib.sha256(self.file.read_bytes()).hexdigest()[:16]
+        return f"SmallSonicGaussMethod(weights {digest}, {self.config})"
+
+    def fit(self, task: Task) -> SmallRenderer:
+        """Fine-tune. Raises AvmsfError for a file of something else, and for an object without Gaussians."""
+        return fit_small(SmallWeights.read(self.file), task.gaussians(), task.train, self.config, seed=task.seed)
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """Wav files, one a recording of the object, that are looked up by the contact of that recording.
+
+    FOLDER/RECORDING.wav for the recording called RECORDING or RECORDING.wav, whose name may hold folders. Of several
+    recordings at one contact the first with a file is used for all. Files are read on demand, so that only those of the
+    evaluated contacts are needed.
+    """
+
+    folder: Path
+    """Holds the object's files."""
+    contacts: Float[Tensor, "contacts 3"]
+    """Contacts of the object's recordings, meters."""
+    names: tuple[str, ...]
+    """The recordings' names, row for row."""
+    sample_rate: float
+    """Samples per second that the files must have, Hz."""
+    samples: int
+    """Samples that each file must have."""
+
+    def __post_init__(self) -> None:
+        if len(self.contacts) != len(self.names):
+            raise EvaluationError.expected(
+                f"one for each of {len(self.contacts)} contacts", len(self.names), name="names"
+            )
+        if not self.folder.is_dir():
+            example = self.path(self.names[0]).name if self.names else "RECORDING.wav"
+            raise EvaluationError.expected(
+                f"a folder with the object's sounds, such as {example}",
+                file=self.folder,
+                advice="render them there, or omit the object",
+            )
+
+    def path(self, name: str) -> Path:
+        """Return where the sound that stands for a recording is expected."""
+        return self.folder / (name if name.lower().endswith(".wav") else f"{name}.wav")
+
+    def render(
+        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Float[Tensor, "contacts samples"]:
+        """Return the files' sounds, as they are.
+
+        Raises EvaluationError for a contact without a recording, for a missing file, and for one that is no sound, has
+        several different channels or another rate or length.
+        """
+        sounds = [self._read(self._find(contact)) for contact in contacts]
+        return torch.stack(sounds) if sounds else torch.zeros(0, self.samples)
+
+    def _find(self, contact: Float[Tensor, "3"]) -> Path:
+        # Contacts that went through float32 are still the same places; a micrometer is far below any two's distance.
+        rows = torch.nonzero((self.contacts.double() - contact.double()).norm(dim=1) < 1e-6).flatten().tolist()
+        if not rows:
+            place = ", ".join(f"{value:g}" for value in contact.tolist())
+            raise EvaluationError(
+                f"{self.folder}: expected a contact of a recording, got ({place}) m; sounds from files are available "
+                "at recorded contacts only",
+                file=self.folder,
+                name="contacts",
+                value=contact.tolist(),
+            )
+        paths = [self.path(self.names[row]) for row in rows]
+        present = [path for path in paths if path.is_file()]
+        if not present:
+            raise EvaluationError.expected(
+                f"a mono wav of {self.samples} samples at {self.sample_rate:g} Hz",
+                got="no such file",
+                file=paths[0],
+                name=self.names[rows[0]],
+                advice="render it",
+            )
+        return present[0]
+
+    def _read(self, path: Path) -> Float[Tensor, " samples"]:
+        try:
+            recording = read_recording(path)
+        except CaptureError as error:
+            raise EvaluationError(str(error), **{**error.attributes, "file": path}) from error
+        if recording.sample_rate != self.sample_rate or recording.frames != self.samples:
+            raise EvaluationError(
+                f"{path}: expected {self.samples} samples at {self.sample_rate:g} Hz, as the recordings have, got "
+                f"{recording.frames} at {recording.sample_rate:g} Hz; render it again, from the onset on",
+                file=path,
+                name="samples",
+                value=(recording.frames, recording.sample_rate),
+            )
+        first = recording.channels[0]
+        if any(not np.array_equal(channel, first) for channel in recording.channels[1:]):
+            raise EvaluationError(
+                f"{path}: expected one channel, got {len(recording.channels)} different ones; save it as mono",
+                file=path,
+                name="channels",
+                value=len(recording.channels),
+            )
+        return torch.from_numpy(first.copy()).float()
+
 
 NEIGHBORS = 3
 """Number of nearest recordings that are averaged (the paper's KNN), or all where there are fewer."""

@@ -8,11 +8,9 @@ from torch import Tensor
 
 from avmsf._utils.files import write_whole
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.listening import Heard
 from avmsf.evaluation.localization import read_map
-from avmsf.evaluation.markdown import markdown
-from avmsf.evaluation.page import heard_contacts, page
-from avmsf.evaluation.report_tables import Section, sections
+from avmsf.evaluation.page import Heard, heard_contacts, page
+from avmsf.evaluation.report_tables import Section, markdown, sections
 from avmsf.evaluation.results import ObjectRecord, ResultsFolder, write_json
 from avmsf.evaluation.summary import missing_of, summarize, times_of
 from avmsf.plotting.contacts import draw_contact
@@ -42,14 +40,14 @@ def write_summary(
     summary = summarize(records, identity, subsets=subsets, missing=missing)
     write_json(results.path / SUMMARY, summary)
     write_json(results.path / TIMES, times_of(records))
-    _write_text(results.path / TABLES, markdown(sections(records, identity, subsets=subsets, missing=missing)))
+    _write_text(results.path / TABLES, markdown(sections(records, identity, missing=missing)))
     return summary
 
 
-def write_page(results: ResultsFolder, *, subsets: Mapping[str, frozenset[str]]) -> list[Section]:
+def write_page(results: ResultsFolder) -> list[Section]:
     """Write `report.html`, and return its parts. Raises EvaluationError where a stored sound is missing."""
     records = results.records()
-    parts = sections(records, results.identity(), subsets=subsets)
+    parts = sections(records, results.identity())
     _write_text(results.path / PAGE, page(parts, records, results.path))
     return parts
 

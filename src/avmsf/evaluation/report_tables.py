@@ -1,4 +1,4 @@
-"""The content of a report, as titles, paragraphs and tables, for Markdown and HTML."""
+"""The content of a report, as titles, paragraphs and tables; and as Markdown."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from avmsf._utils.wording import counted
-from avmsf.evaluation.protocols import BASELINE, PROTOCOLS
-from avmsf.evaluation.published import COMPUTATION, published, published_ratios
+from avmsf.evaluation.protocols import BASELINE, COMPUTATION, PROTOCOLS, published, published_ratios
+from avmsf.evaluation.registry import TITLES, kind_of
 from avmsf.evaluation.results import ObjectRecord
 from avmsf.evaluation.summary import (
     RISING,
     Mean,
     Table,
-    differences,
     failures_of,
     figures_of,
     labels_of,
@@ -21,7 +20,6 @@ from avmsf.evaluation.summary import (
     ratios,
     times_of,
 )
-from avmsf.evaluation.titles import TITLES, kind_of
 
 HEADINGS = {
     "l1": "L1",
@@ -69,7 +67,6 @@ def sections(
     records: Sequence[ObjectRecord],
     identity: Mapping[str, Any],
     *,
-    subsets: Mapping[str, frozenset[str]],
     missing: Mapping[str, Sequence[str]] | None = None,
 ) -> list[Section]:
     """Return all parts of the report on these results, and which are missing: methods by object."""
@@ -84,14 +81,8 @@ def sections(
         parts.append(_main_table(main, shown, protocol, dataset, labels))
         if any(BASELINE in methods for methods in main.values()):
             parts.append(_ratio_table(main, shown, protocol, dataset))
-            parts.append(_difference_table(main, shown))
-        for name, members in subsets.items():
-            chosen = {each: main[each] for each in main if each in members}
-            if chosen and len(chosen) < len(main):
-                parts.append(_subset_table(name, chosen, shown))
         if len(labels) > 1:
             parts += [_case_table(metric, tables, protocol, dataset) for metric in shown]
-        parts += _mode_table(main, shown) + _object_tables(main, shown)
     parts.append(_times(records, order, protocol, dataset))
     parts.append(_failures(records))
     return parts
@@ -205,30 +196,6 @@ def _ratio_table(main: Table, shown: Sequence[str], protocol: str, dataset: str)
     )
 
 
-def _difference_table(main: Table, shown: Sequence[str]) -> Section:
-    found = differences(main)
-    shown = [metric for metric in shown if any(metric in figures for figures in found.values())]
-    rows = tuple(
-        (method, *(_mean(found[method].get(metric), signed=True) for metric in shown))
-        for method in found
-        if method != BASELINE
-    )
-    return Section(
-        f"Paired difference to {BASELINE}",
-        ("Method minus baseline, paired by object; below two standard errors a difference is not significant.",),
-        Grid(("method", *_headings(shown)), rows),
-    )
-
-
-def _subset_table(name: str, chosen: Table, shown: Sequence[str]) -> Section:
-    found = means(chosen)
-    rows = tuple((method, *(_mean(found[method].get(metric)) for metric in shown)) for method in found)
-    words = f"{len(chosen)} objects: {', '.join(chosen)}."
-    return Section(
-        f"Objects: {name}", (words,), Grid(("method", *_headings(shown)), rows, _best(chosen, shown)), _of_fewer(chosen)
-    )
-
-
 def _case_table(metric: str, tables: Mapping[str, Table], protocol: str, dataset: str) -> Section:
     found = {label: means(table) for label, table in tables.items()}
     methods = list(dict.fromkeys(method for each in found.values() for method in each))
@@ -239,41 +206,6 @@ def _case_table(metric: str, tables: Mapping[str, Table], protocol: str, dataset
         if any(own.get(label) is not None for label in tables):
             rows.append((f"paper: {title}", *(figure(own.get(label)) for label in tables)))
     return Section(f"{HEADINGS.get(metric, metric)} by case", (), Grid(("method", *tables), tuple(rows)))
-
-
-def _mode_table(main: Table, shown: Sequence[str]) -> list[Section]:
-    others = [metric for metric in _found(main) if metric not in shown]
-    if not others:
-        return []
-    found = means(main)
-    rows = tuple(
-        (method, *(_mean(figures.get(metric)) for metric in others))
-        for method, figures in found.items()
-        if any(metric in figures for metric in others)
-    )
-    words = (
-        "Of methods that have modes: the fraction of the true energy whose modes were found, the errors of their "
-        "frequency (relative) and damping (natural logarithm), false modes, and their energy relative to the true one."
-    )
-    return [Section("Modes compared with the ground truth", (words,), Grid(("method", *_headings(others)), rows))]
-
-
-def _object_tables(main: Table, shown: Sequence[str]) -> list[Section]:
-    methods = list(dict.fromkeys(method for figures in main.values() for method in figures))
-    return [
-        Section(
-            f"{HEADINGS.get(metric, metric)} by object",
-            (),
-            Grid(
-                ("object", *methods),
-                tuple(
-                    (identifier, *(figure(figures.get(method, {}).get(metric)) for method in methods))
-                    for identifier, figures in main.items()
-                ),
-            ),
-        )
-        for metric in shown
-    ]
 
 
 def _times(records: Sequence[ObjectRecord], order: Sequence[str], protocol: str, dataset: str) -> Section:
@@ -339,13 +271,11 @@ def _headings(metrics: Sequence[str]) -> tuple[str, ...]:
     return tuple(HEADINGS.get(metric, metric.replace("_", " ")) for metric in metrics)
 
 
-def _mean(mean: Mean | None, *, signed: bool = False) -> str:
+def _mean(mean: Mean | None) -> str:
     if mean is None:
         return _DASH
-    words = figure(mean.mean)
-    if signed and mean.mean > 0:
-        words = f"+{words}"
-    return words if mean.standard_error is None else f"{words} ± {figure(mean.standard_error, 2)}"
+    text = figure(mean.mean)
+    return text if mean.standard_error is None else f"{text} ± {figure(mean.standard_error, 2)}"
 
 
 def _count(figures: Mapping[str, Mean]) -> str:
@@ -376,5 +306,37 @@ def _of_fewer(table: Table) -> tuple[str, ...]:
         return ()
     return (
         f"Not of all {len(table)} objects: {', '.join(fewer)}. Their means are of other objects than those of the "
-        "other rows, and not marked as best; ratios and paired differences are of the same objects.",
+        "other rows, and not marked as best; ratios are of the same objects.",
     )
+
+
+def markdown(parts: Sequence[Section]) -> str:
+    """Return the parts as one text: the first one's title above all, each table in pipes."""
+    lines: list[str] = []
+    for place, part in enumerate(parts):
+        lines += [f"{'#' if place == 0 else '##'} {_escaped(part.title)}", ""]
+        for words in part.words:
+            lines += [_escaped(words), ""]
+        if part.grid is not None:
+            lines += [*_table(part.grid), ""]
+        for words in part.remarks:
+            lines += [_escaped(words), ""]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _table(grid: Grid) -> list[str]:
+    figures = len(grid.columns) - 1
+    lines = [_row(grid.columns), f"|---|{'---:|' * figures}"]
+    for number, row in enumerate(grid.rows):
+        words = map(_escaped, row)
+        cells = [f"**{cell}**" if (number, place) in grid.best else cell for place, cell in enumerate(words)]
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines
+
+
+def _row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(_escaped(cell) for cell in cells)} |"
+
+
+def _escaped(words: str) -> str:
+    return words.replace("\\", "\\\\").replace("|", "\\|").replace("*", "\\*").replace("<", "&lt;")

@@ -1,26 +1,109 @@
-"""Baselines of a field, and what its modes alone reach.
+"""Baselines made of the training recordings, and what an object's modes alone reach.
 
-Each baseline is a `Renderer` made only from the training impacts; nearest is by Euclidean distance, and of equally near
-contacts the first. What modes alone reach is computed from the test sounds, with the best gains and without noise. A
-field with noise can have less error in a spectrum.
+Each baseline is a `Renderer`; nearest is by Euclidean distance, and of equally near contacts the first. What modes
+alone reach is computed from the test sounds, with the best gains and without noise. A field with noise can have less
+error in a spectrum.
 """
 
 import zlib
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Complex, Float, Float64
+from scipy.interpolate import RBFInterpolator
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from avmsf.capture.impacts import Impacts
+from avmsf.capture.impacts import Impacts, places_of
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.modal_baselines import ModalBaseline
 from avmsf.field.gains.family import Sites, nearest_sites
+from avmsf.field.gains.positional import Axes
+from avmsf.field.recipes import orientation_signs
 from avmsf.gaussians.points import nearest_points
+from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_gains, fit_sine_gains
 from avmsf.modal.modes import ModalBank
+from avmsf.modal.residual_noise import shape_noise
 from avmsf.modal.synthesis import synthesize
+
+
+@dataclass(frozen=True, eq=False)
+class ModalBaseline(ABC):
+    """Modes of the training impacts, with gains that are made of the training contacts' own."""
+
+    train: Impacts
+    extraction: Extraction
+    """Modes of the training impacts, and their gains in each of them, row for row."""
+    noise: bool = field(default=False, kw_only=True)
+    """Whether the extraction's residual is heard beside the modes, as it is in a field: one draw for all contacts."""
+    seed: int = field(default=0, kw_only=True)
+    """Start of the noise's chance."""
+
+    def __post_init__(self) -> None:
+        if len(self.extraction.gains) != len(self.train):
+            raise EvaluationError(
+                f"expected gains of {len(self.train)} training impacts, got those of {len(self.extraction.gains)}; "
+                "extract the modes from these impacts",
+                name="extraction",
+                value=len(self.extraction.gains),
+            )
+
+    @property
+    def sample_rate(self) -> float:
+        """Samples per second, Hz."""
+        return self.train.sample_rate
+
+    @property
+    def bank(self) -> ModalBank:
+        """The modes, the same at all contacts."""
+        return self.extraction.bank
+
+    @cached_property
+    def amplitudes(self) -> Float[Tensor, "contacts two_modes"]:
+        """The training contacts' gains in phase, then in quadrature, as if all blows came from the same side.
+
+        Of two blows from opposite sides of a thin wall the gains are opposite too, and their mean would be silence.
+        """
+        both = torch.cat([self.extraction.gains, self.extraction.quadrature], dim=1)
+        return both * orientation_signs(self.train.contacts, self.train.directions).to(both)[:, None]
+
+    @abstractmethod
+    def amplitudes_at(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts two_modes"]:
+        """Return the gains in phase, then in quadrature, that the contacts are given."""
+
+    def complex_gains(
+        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Complex[Tensor, "contacts modes"]:
+        """Return amplitudes A at the contacts: their sounds are the real part of the sum of A exp((-d + 2 pi i f) t).
+
+        `directions` make no difference.
+        """
+        gains, quadrature = self.amplitudes_at(contacts).chunk(2, dim=1)
+        return torch.complex(quadrature, -gains)
+
+    def render(
+        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Float[Tensor, "contacts samples"]:
+        """Return the modes' sound at each contact, and the noise beside it where there is any."""
+        gains, quadrature = self.amplitudes_at(contacts).chunk(2, dim=1)
+        samples = self.train.sounds.shape[1]
+        sounds = synthesize(
+            gains,
+            self.bank.frequency,
+            self.bank.damping,
+            samples=samples,
+            sample_rate=self.train.sample_rate,
+            quadrature=quadrature,
+        )
+        if not self.noise:
+            return sounds
+        generator = torch.Generator().manual_seed(self.seed)
+        magnitude = self.extraction.residual.magnitude
+        return sounds + shape_noise(magnitude, contacts=1, samples=samples, generator=generator)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,3 +262,46 @@ def _expect_neighbors(train: Impacts, count: int) -> None:
         raise EvaluationError(
             f"expected a count of 1 to {len(train)} nearest training impacts, got {count}", name="count", value=count
         )
+
+
+@dataclass(frozen=True, eq=False)
+class SplineGains(ModalBaseline):
+    """The modes with gains in phase and in quadrature that are thin-plate splines through the training contacts.
+
+    Contacts in one place count once, with their mean gains. With fewer places than twice what determines a linear
+    function the spline is linear in the distance, with a constant: the thin plate would run away beyond the contacts.
+    """
+
+    def amplitudes_at(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts two_modes"]:
+        """Return the splines' gains in phase, then in quadrature."""
+        places, means = self._places
+        along, asked = self._axes.along(places), self._axes.along(contacts.double())
+        if len(places) == 1 or not along.shape[1]:
+            return means.mean(0, keepdim=True).expand(len(contacts), -1).to(self.amplitudes)
+        kernel, degree = ("thin_plate_spline", 1) if self._bends else ("linear", 0)
+        spline = RBFInterpolator(along.numpy(), means.numpy(), kernel=kernel, degree=degree)
+        return torch.from_numpy(np.asarray(spline(asked.numpy()))).to(self.amplitudes)
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """What the spline is, as plain values: its kernel, directions and distinct places."""
+        directions = self._axes.along(self._places[0]).shape[1]
+        kernel = "thin plate" if self._bends else "distance"
+        return {"kernel": kernel, "directions": directions, "sites": len(self._places[0])}
+
+    @cached_property
+    def _places(self) -> tuple[Float64[Tensor, "places 3"], Float64[Tensor, "places two_modes"]]:
+        """Distinct places, and the mean gains there."""
+        owner = places_of(self.train.contacts.double())
+        members = (owner[None, :] == torch.arange(int(owner.max()) + 1)[:, None]).double()
+        mean = members / members.sum(1, keepdim=True)
+        return mean @ self.train.contacts.double(), mean @ self.amplitudes.double()
+
+    @cached_property
+    def _axes(self) -> Axes:
+        return Axes(self._places[0])
+
+    @property
+    def _bends(self) -> bool:
+        places = self._places[0]
+        return len(places) >= 2 * (self._axes.along(places).shape[1] + 1)

@@ -12,7 +12,7 @@ from avmsf.cli.options.common import Flag, Printing, parse_options, spelled
 from avmsf.cli.options.paths import CacheFolder, Existing, OutputFolder
 from avmsf.datasets.detect import detect_dataset
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.names import expect_method, expect_protocol, expect_suited
+from avmsf.evaluation.registry import expect_method, expect_protocol, expect_suited
 from avmsf.gaussians.config import SplatConfig
 from avmsf.modal.config import ExtractionMethod
 from avmsf.pipeline.config import BodyConfig, Geometry, LiftConfig, TimeZero

@@ -1,0 +1,248 @@
+"""What methods read of the objects of a dataset, made once an object and cached; and groups of objects."""
+
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.signal import resample_poly
+from torch import Tensor
+
+from avmsf._utils.locks import NO_LIMIT
+from avmsf.baselines.diffsound.material_fit import MODES as DIFFSOUND_MODES
+from avmsf.capture.impacts import Impacts
+from avmsf.datasets import CaptureCollection
+from avmsf.datasets.dataset import Dataset
+from avmsf.datasets.numbering import ABLATION, NON_SYMMETRIC
+from avmsf.errors import AvmsfError, EvaluationError, SceneError
+from avmsf.evaluation.modal_metrics import simulated
+from avmsf.evaluation.protocols import EvaluationProtocol
+from avmsf.evaluation.task import Look
+from avmsf.features.feature_field import FeatureField
+from avmsf.features.store import load_features
+from avmsf.fem.body_family import BodyFamily, body_family
+from avmsf.field.gains.elastic import CandidateBodies
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.ply import read_splats
+from avmsf.mesh.surface import Surface
+from avmsf.pipeline.bodies import candidate_bodies, roughened
+from avmsf.pipeline.config import AUTO, DESCRIPTORS, PRESETS, BodyConfig, Geometry, LiftConfig, SceneConfig, ViewsConfig
+from avmsf.pipeline.scene import FEATURES, SceneStages
+from avmsf.pipeline.stages import StageFolder
+from avmsf.reconstruction import ObjectShape
+from avmsf.simulate import sim20
+
+NAMES: Mapping[Look, str] = {
+    "unaligned": "unaligned.safetensors",
+    "paper": "paper.safetensors",
+    "paper-positions": "paper.safetensors",
+    "paper-unaligned": "paper-unaligned.safetensors",
+}
+"""What the files of features are called, where they are not those of the fields without ablation."""
+
+
+@dataclass(frozen=True)
+class ObjectLooks:
+    """Makes the features of a dataset's objects, each in a folder of its own beneath `cache`."""
+
+    dataset: Dataset
+    cache: Path
+    config: SceneConfig = field(default_factory=SceneConfig)
+    paper: LiftConfig = PRESETS["paper"].scene.lift
+    """How features are made in the paper's form."""
+    device: str | None = None
+    """Device of Gaussians and DINOv2; None for a GPU where there is one."""
+    meshes: bool = True
+    """Whether `surface` is an object's mesh where the dataset has one; else it is as `positions`."""
+    seed: int = 0
+    """Seed of the points on a mesh."""
+
+    def __call__(self, identifier: str, look: Look, views: int | None = None) -> FeatureField:
+        """Return what `look` means for an object, from at most `views` views, or from all for None.
+
+        `positions` are those of the same points that looks are lifted onto, so that the two differ in nothing else; of
+        an object that nothing shows, they are its surface's, or fill the box of its contacts. `surface` is as in
+        `avmsf fit`, and needs no views of an object with a mesh. Raises SceneError for the looks of an object that
+        nothing shows, and DatasetError for an unknown one.
+        """
+        surface = self.dataset.capture(identifier).surface if look == "surface" and self.meshes else None
+        if surface is not None:
+            return FeatureField.from_mesh(surface, seed=self.seed)
+        bare = look == "surface" or look.endswith("positions")
+        if bare and self.dataset.look(identifier) is None:
+            return self._bare(identifier)
+        lift = self.paper if look.startswith("paper") else self.config.lift
+        if look == "surface" and lift.encoder == AUTO:
+            # Positions do not depend on the encoder.
+            lift = replace(lift, encoder=DESCRIPTORS)
+        lift = replace(lift, symmetry=not look.endswith("unaligned"))
+        stages = self._stages(identifier, replace(self.config, lift=lift), views, name=NAMES.get(look, FEATURES))
+        with stages.stages.lock("avmsf evaluate", wait=NO_LIMIT):
+            features = load_features(stages.features.path)
+        return FeatureField.from_points(features.points) if bare else features
+
+    def cloud(self, identifier: str, views: int | None = None) -> GaussianCloud:
+        """Return an object's Gaussians: those in its folder, or fitted to its views, or to pictures of its mesh.
+
+        Raises SceneError where nothing shows the object.
+        """
+        # Other methods may look at the mesh alone; those that ask for Gaussians have the best that shows the object.
+        config = replace(self.config, views=replace(self.config.views, source=ViewsConfig().source))
+        stages = self._stages(identifier, config, views)
+        with stages.stages.lock("avmsf evaluate", wait=NO_LIMIT):
+            return read_splats(stages.cloud.path)
+
+    def _stages(self, identifier: str, config: SceneConfig, views: int | None, name: str = FEATURES) -> SceneStages:
+        """Return the stages from what shows an object. Raises SceneError where nothing does."""
+        seen = self.dataset.look(identifier)
+        if seen is None:
+            raise SceneError(f"{identifier}: expected a mesh or photographs in the dataset, got none", name=identifier)
+        config = replace(config, views=replace(config.views, count=views or 0))
+        place = self.cache / identifier / ("all views" if views is None else f"{views} views")
+        return SceneStages(
+            seen.folder, StageFolder(place), config, settings=seen.settings, name=name, device=self.device
+        )
+
+    def _bare(self, identifier: str) -> FeatureField:
+        capture = self.dataset.capture(identifier)
+        if capture.surface is None:
+            return FeatureField.from_contacts(capture.impacts.contacts)
+        return FeatureField.from_points(capture.surface.vertices)
+
+
+NOISE = 0.02
+"""Displacement of a noisy mesh's vertices over the object's size."""
+
+
+@dataclass(frozen=True)
+class ObjectBodies:
+    """Computes the bodies of a dataset's objects, each in a folder of its own beneath `cache`."""
+
+    dataset: Dataset
+    cache: Path
+    geometry: Geometry = "mesh"
+    config: BodyConfig = field(default_factory=BodyConfig)
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    """How Gaussians are made, where the geometry asks for them."""
+    seed: int = 0
+    """Start of the chance in the noise."""
+    device: str | None = None
+    """Device of Gaussians; None for a GPU where there is one."""
+
+    def __call__(self, identifier: str) -> CandidateBodies:
+        """Return an object's bodies. Raises SceneError where its shape is unknown, SimulationError for an unfit one."""
+        return candidate_bodies(self._surface(identifier), self.config, cache=self.cache / identifier / "bodies")
+
+    def family(self, identifier: str) -> BodyFamily:
+        """Return an object's bodies for DiffSound. Raises SceneError and SimulationError likewise."""
+        return body_family(self._surface(identifier), count=DIFFSOUND_MODES)
+
+    def _surface(self, identifier: str) -> Surface | ObjectShape:
+        if self.geometry == "gaussians":
+            return self._shape(identifier)
+        surface = self.dataset.capture(identifier).surface
+        if surface is None or not len(surface.faces):
+            raise SceneError.expected("a mesh in the dataset", name=identifier, advice="take geometry from Gaussians")
+        return surface if self.geometry == "mesh" else roughened(surface, NOISE, seed=self.seed)
+
+    def _shape(self, identifier: str) -> ObjectShape:
+        seen = self.dataset.look(identifier)
+        if seen is None:
+            raise SceneError(f"{identifier}: expected a mesh or photographs in the dataset, got none", name=identifier)
+        scene = replace(self.scene, views=replace(self.scene.views, source=ViewsConfig().source))
+        stages = SceneStages(
+            seen.folder,
+            StageFolder(self.cache / identifier / "all views"),
+            scene,
+            settings=seen.settings,
+            device=self.device,
+        )
+        with stages.stages.lock("avmsf evaluate", wait=NO_LIMIT):
+            return stages.shape()
+
+
+def draw_stranger(dataset: Dataset, identifier: str, train: Impacts, *, seed: int) -> Float[Tensor, " samples"]:
+    """Return a recording of another object of the dataset, at the rate and of the length of `train`.
+
+    The draw depends on the seed and the object alone. Objects that cannot be read are passed over. Shorter recordings
+    end in silence, longer ones are cut. Raises EvaluationError where there is no other object.
+    """
+    others = [other for other in dataset.objects() if other != identifier]
+    generator = torch.Generator().manual_seed(zlib.crc32(identifier.encode(), seed))
+    for place in torch.randperm(len(others), generator=generator).tolist():
+        try:
+            impacts = dataset.capture(others[place]).impacts
+        except AvmsfError:
+            continue
+        row = int(torch.randint(len(impacts), (), generator=generator))
+        sound = _at_rate(impacts.sounds[row], impacts.sample_rate, train.sample_rate)
+        samples = train.sounds.shape[1]
+        return torch.nn.functional.pad(sound, (0, max(0, samples - len(sound))))[:samples].to(train.sounds.dtype)
+    raise EvaluationError.expected(
+        f"another readable object in {dataset.name}", name=identifier, advice="download more of the dataset"
+    )
+
+
+def _at_rate(sound: Float[Tensor, " samples"], found: float, wanted: float) -> Float[Tensor, " resampled"]:
+    if found == wanted:
+        return sound
+    ratio = Fraction(wanted).limit_denominator(1000) / Fraction(found).limit_denominator(1000)
+    ratio = ratio.limit_denominator(1000)
+    resampled = resample_poly(sound.double().numpy(), ratio.numerator, ratio.denominator)
+    return torch.from_numpy(resampled.astype(np.float32))
+
+
+ABLATED, NOT_SYMMETRIC = "ablation", "non-symmetric"
+"""The groups' names."""
+SUBSETS: Mapping[str, str] = {
+    ABLATED: "those of the paper's ablations or the simulated ones in their place",
+    NOT_SYMMETRIC: "those without rotational symmetry",
+}
+"""What the objects of each group have in common."""
+_NUMBERS: Mapping[str, Sequence[str]] = {ABLATED: ABLATION, NOT_SYMMETRIC: NON_SYMMETRIC}
+
+_SIMULATED: Mapping[str, Sequence[str]] = {ABLATED: sim20.ABLATED, NOT_SYMMETRIC: sim20.NON_SYMMETRIC}
+
+
+def members(dataset: Dataset) -> dict[str, frozenset[str]]:
+    """Return the groups that a dataset has objects of, by name.
+
+    The numbers of ObjectFolder Real are RealImpact's too, before the first underscore of an object's name. Of captures
+    only those are known that were simulated.
+    """
+    if isinstance(dataset, CaptureCollection):
+        found = {name: simulated(dataset, names) for name, names in _SIMULATED.items()}
+    else:
+        objects = dataset.objects()
+        found = {
+            name: frozenset(each for each in objects if each.partition("_")[0] in numbers)
+            for name, numbers in _NUMBERS.items()
+        }
+    return {name: each for name, each in found.items() if each}
+
+
+def choose_objects(dataset: Dataset, protocol: EvaluationProtocol, asked: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the objects that take part: those asked for, else the protocol's group, else all.
+
+    Raises DatasetError for unknown ones, and EvaluationError where the protocol is about a group that the dataset does
+    not have.
+    """
+    if asked:
+        return tuple(dict.fromkeys(dataset.facts(identifier).identifier for identifier in asked))
+    if protocol.subset is not None:
+        group = members(dataset).get(protocol.subset, frozenset())
+        if group:
+            return tuple(each for each in dataset.objects() if each in group)
+        if protocol.required:
+            raise EvaluationError.expected(
+                f"objects of the group {protocol.subset}",
+                protocol.subset,
+                got="none",
+                name="subset",
+                advice="name objects with --objects",
+            )
+    return dataset.objects()

@@ -1,0 +1,135 @@
+"""The names and titles of methods and protocols; importing this loads nothing that computes."""
+
+import difflib
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+
+from avmsf.errors import EvaluationError
+
+PROTOCOL_NAMES = (
+    "farthest",
+    "leave-one-out",
+    "closest",
+    "predefined",
+    "shots",
+    "learning-curve",
+    "views",
+    "ablation",
+    "non-symmetric",
+    "localize",
+    "grid",
+)
+METHOD_NAMES = (
+    "white-noise",
+    "random-impact",
+    "nearest",
+    "knn3",
+    "knn3-directions",
+    "knn-gains",
+    "spline-gains",
+    "diffsound",
+    "diffsound-weighted",
+    "field",
+    "field-auto",
+    "field-elastic",
+    "field-smooth",
+    "field-thin-plate",
+    "field-positions",
+    "field-unaligned",
+    "field-no-initialization",
+    "field-no-residual",
+    "field-warmup",
+    "paper",
+    "paper-positions",
+    "paper-no-initialization",
+    "paper-unaligned",
+    "paper-no-residual",
+    "paper-per-contact",
+    "field-grid",
+    "paper-grid",
+)
+"""All methods but those that take a path, in the order of tables."""
+PUBLISHED, SMALL, RECORDED = "sonicgauss:", "sonicgauss-small:", "recorded:"
+"""How the names of methods that take a path begin."""
+_SEVERAL_SETS = ("shots", "learning-curve")
+"""Protocols that test a recording after training on several sets of others."""
+
+
+def expect_protocol(name: str) -> None:
+    """Raise `EvaluationError`, which lists the known ones, for the name of no protocol."""
+    if name not in PROTOCOL_NAMES:
+        raise EvaluationError(
+            f"expected a protocol of {', '.join(PROTOCOL_NAMES)}, got {name!r}{_guess(name, PROTOCOL_NAMES)}",
+            name="protocol",
+            value=name,
+        )
+
+
+def expect_method(name: str) -> None:
+    """Raise `EvaluationError`, which lists the known ones, for the name of no method."""
+    if name not in METHOD_NAMES and name.partition(":")[0] + ":" not in (PUBLISHED, SMALL, RECORDED):
+        raise EvaluationError(
+            f"expected a method of {', '.join(METHOD_NAMES)}, {PUBLISHED}FOLDER, {SMALL}FILE and {RECORDED}FOLDER, got "
+            f"{name!r}{_guess(name, METHOD_NAMES)}",
+            name="method",
+            value=name,
+        )
+
+
+def expect_suited(method: str, protocol: str) -> None:
+    """Raise `EvaluationError` for a method whose sounds cannot be those of the protocol's training recordings."""
+    if method.startswith(RECORDED) and protocol in _SEVERAL_SETS:
+        raise EvaluationError(
+            f"{method}: expected a protocol that tests each recording once, got {protocol}, which trains on several "
+            "sets of recordings, and the folder holds the sounds of one; choose farthest, closest, predefined or "
+            "leave-one-out",
+            name="method",
+            value=method,
+        )
+
+
+def _guess(name: str, known: Sequence[str]) -> str:
+    near = difflib.get_close_matches(name, known, n=1)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+TITLES: Mapping[str, str] = MappingProxyType(
+    {
+        "white-noise": "Gaussian noise at the level of the training recordings",
+        "random-impact": "a recording of another object",
+        "nearest": "the nearest training recording",
+        "knn3": "mean waveform of the three nearest recordings (the paper's KNN)",
+        "knn3-directions": "mean waveform of the three nearest recordings, by position and impact direction",
+        "knn-gains": "modal gains averaged over the three nearest recordings",
+        "spline-gains": "modal gains by thin-plate splines",
+        "diffsound": "reimplementation of DiffSound, as in the paper",
+        "diffsound-weighted": "DiffSound with a fitted weight for each mode",
+        "sonicgauss": "SonicGauss with its published weights, trained on ObjectFolder Real, fine-tuned",
+        "recorded": "sounds of another system, from files",
+        "sonicgauss-small": "SonicGauss's objective at a small size, trained from scratch on simulated objects",
+        "field": "attention network, quick settings, visual features",
+        "field-auto": "Gaussian process over kernel families (the default of this package)",
+        "field-elastic": "Gaussian process on elastic mode shapes only",
+        "field-smooth": "Gaussian process on distances only",
+        "field-thin-plate": "Gaussian process of thin-plate splines only",
+        "field-positions": "attention network, quick settings, positions only",
+        "field-unaligned": "attention network, quick settings, without symmetry pooling",
+        "field-no-initialization": "attention network, quick settings, without extracted modes",
+        "field-no-residual": "attention network, quick settings, without residual noise",
+        "field-warmup": "attention network, quick settings, warm-up only",
+        "field-grid": "attention network, settings chosen from a small grid",
+        "paper": "the paper's method with the preset `paper`, shared damping",
+        "paper-per-contact": "the paper's method with damping per contact",
+        "paper-positions": "the paper's method without visual features",
+        "paper-no-initialization": "the paper's method without extracted modes",
+        "paper-unaligned": "the paper's method without symmetry pooling",
+        "paper-no-residual": "the paper's method without residual noise",
+        "paper-grid": "the paper's method with settings chosen from its lists",
+    }
+)
+"""By the names of `avmsf.evaluation.methods.METHODS`."""
+
+
+def kind_of(method: str) -> str:
+    """Return a method's name without the file or folder that it reads."""
+    return method.partition(":")[0]

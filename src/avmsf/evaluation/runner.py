@@ -1,0 +1,592 @@
+"""Running an evaluation: all methods in all cases of an object, each result stored at once; in parallel on ray."""
+
+import hashlib
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Protocol, runtime_checkable
+
+import numba
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf._utils.caching import Given, Result, once, source_digest
+from avmsf.capture.impacts import Impacts
+from avmsf.datasets.dataset import Dataset, ObjectFacts
+from avmsf.errors import AvmsfError, EvaluationError
+from avmsf.evaluation.cases import Case, Places
+from avmsf.evaluation.field_methods import configured
+from avmsf.evaluation.localization import located, write_map
+from avmsf.evaluation.methods import report_of
+from avmsf.evaluation.modal_metrics import truth_at, truth_from_first_sample, truth_of
+from avmsf.evaluation.objects import draw_stranger
+from avmsf.evaluation.page import keep_sound, listening_gain
+from avmsf.evaluation.protocols import EvaluationProtocol
+from avmsf.evaluation.results import ENCODER, CaseRecord, ObjectRecord, Outcome, ResultsFolder, failure_of
+from avmsf.evaluation.splits import Judgement, Judging, align_split, spread
+from avmsf.evaluation.task import FromFiles, Look, Looking, Method, Renderer, Task, expect_renderer
+from avmsf.features.feature_field import FeatureField
+from avmsf.fem.body_family import BodyFamily
+from avmsf.field.gains.elastic import CandidateBodies
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.modal.extraction.extract import Extraction, extract_once
+from avmsf.modal.extraction.finders import HighResolution, ModeFinder
+from avmsf.simulate.ground_truth import Truth
+
+
+@runtime_checkable
+class FeatureMaker(Protocol):
+    """Computes an object's features."""
+
+    def __call__(self, identifier: str, look: Look, views: int | None = None) -> FeatureField:
+        """Return an object's features, from at most `views` views. Raises SceneError without visual input."""
+        ...
+
+
+@runtime_checkable
+class BodyMaker(Protocol):
+    """Computes an object's FE models."""
+
+    def __call__(self, identifier: str) -> CandidateBodies:
+        """Return an object's bodies. Raises AvmsfError where its shape is unknown or unfit."""
+        ...
+
+    def family(self, identifier: str) -> BodyFamily:
+        """Return its bodies of any material and thickness, for simulations. Raises AvmsfError likewise."""
+        ...
+
+
+@runtime_checkable
+class CloudMaker(Protocol):
+    """Makes an object's Gaussians."""
+
+    def __call__(self, identifier: str, views: int | None = None) -> GaussianCloud:
+        """Return an object's Gaussians, from at most `views` views. Raises SceneError without visual input."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Data set, protocol, methods and settings of an evaluation."""
+
+    dataset: Dataset
+    title: str
+    """Name of the dataset in reports; one folder of results has one."""
+    protocol: EvaluationProtocol
+    methods: tuple[Method, ...]
+    features: FeatureMaker
+    bodies: BodyMaker
+    seed: int = 0
+    """Random seed of the methods."""
+    judging: Judging = field(default_factory=Judging)
+    finder: ModeFinder = field(default_factory=HighResolution)
+    """Extraction of modes, once per case."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of the features, as plain values."""
+    clouds: CloudMaker | None = None
+    """None where no method reads Gaussians."""
+    device: str | None = None
+    """Device that methods train on, with the same result up to rounding; None for a GPU where there is one."""
+    encoder: str | None = None
+    """Encoder that `auto` in the settings stands for; None where the settings name it, or no method reads features."""
+    time_zero: str | None = None
+    """Start of the dataset's sounds, `onset` or `peak`, on which all methods are scored; None for the dataset's own."""
+    own_starts: Dataset | None = None
+    """The same dataset with its own starts, for fields that are not of the paper's configuration; None where all
+    methods are fitted to the sounds that they are scored on."""
+
+    options: Mapping[str, str] = field(default_factory=dict)
+    """What a command line spelled of all this, by option, for messages."""
+
+    def begin(self, results: ResultsFolder) -> None:
+        """Take a folder for this evaluation's results.
+
+        Raises EvaluationError where the folder holds other ones, and where a metric's package is not installed.
+        """
+        if not self.protocol.locating:
+            self.judging.prepare()
+        identity = {
+            "version": version("avmsf"),
+            "source": source_digest("avmsf.cli.evaluate"),
+            "protocol": self.protocol.name,
+            "choosing": repr(self.protocol.choosing),
+            "dataset": self.title,
+            "seed": self.seed,
+            "time_zero": self.time_zero,
+            "metrics": _plain(self.judging),
+            "modes": _plain(self.finder),
+            "settings": dict(self.settings),
+        }
+        results.begin(identity, {method.name: self._described(method) for method in self.methods}, self.options)
+
+    def _described(self, method: Method) -> str:
+        """Return what tells a method apart from another of its name. Methods that read no features share any folder."""
+        read = self.encoder is not None and isinstance(method, Looking) and method.look != "surface"
+        return f"{method!r}{ENCODER}{self.encoder}" if read else repr(method)
+
+
+def _plain(settings: Any) -> Any:
+    """Return settings as plain values, those of a dataclass by their names, with the name of its class as `kind`."""
+    if not is_dataclass(settings):
+        return settings
+    values = {each.name: _plain(getattr(settings, each.name)) for each in fields(settings)}
+    return {"kind": type(settings).__name__, **values}
+
+
+LISTENED = 3
+"""Test contacts of an experiment whose sounds are kept to be listened to."""
+_RECORDED = "recorded"
+"""What the recordings' own files are called beside the methods'."""
+
+
+class _Recordings:
+    """A case's recordings from one kind of start, aligned when first asked for, and their modes, kept in a file."""
+
+    def __init__(self, impacts: Impacts, case: Case, finder: ModeFinder, path: Path) -> None:
+        self.train, self.test = impacts.take(case.train), impacts.take(case.test)
+        self._finder, self._path = finder, path
+        self._found: Extraction | None = None
+
+    def modes(self) -> Extraction:
+        if self._found is None:
+            self._found = extract_once(self.train, self._finder, self._path)
+        return self._found
+
+    def align(self) -> None:
+        """Give all recordings the starts that the training ones have in common."""
+        self.train, self.test = align_split(self.train, self.test, modes=self.modes)
+
+
+class CaseRun:
+    """Runs methods in one case, with modes that are found once and kept in a file."""
+
+    def __init__(
+        self,
+        evaluation: Evaluation,
+        identifier: str,
+        case: Case,
+        impacts: Impacts,
+        truth: Truth | None,
+        *,
+        folder: Path,
+        place: str,
+        look: Callable[[Look], FeatureField],
+        bodies: Callable[[], CandidateBodies],
+        family: Callable[[], BodyFamily],
+        material: str | None,
+        stranger: Callable[[], Float[Tensor, " samples"]],
+        vertices: Float[Tensor, "vertices 3"] | None,
+        listened: bool,
+        own_starts: Impacts | None = None,
+    ) -> None:
+        """Prepare a case of an object; `place` is its own path beneath the results' folder.
+
+        All methods are scored on `impacts`. Where these start at their peaks, `own_starts` are the same recordings with
+        the dataset's own starts, for fields that are not of the paper's configuration: from its peak a recording's
+        modes have phases of its own, which hide the signs of the gains.
+        """
+        self.evaluation, self.identifier, self.case, self.impacts = evaluation, identifier, case, impacts
+        modes, finder = folder / "modes", evaluation.finder
+        self.scored = self.own = _Recordings(impacts, case, finder, modes / f"{place}.safetensors")
+        if own_starts is not None:
+            self.own = _Recordings(own_starts, case, finder, modes / f"{place} own starts.safetensors")
+        self.truth = None if truth is None else truth_at(truth, self.scored.test.names)
+        self.folder, self.place, self.look, self.stranger = folder, place, look, stranger
+        self.bodies, self.family, self.material, self.vertices = bodies, family, material, vertices
+        self.listened = spread(len(case.test), LISTENED) if listened else []
+        self.shared = 0.0
+
+    def outcome(self, method: Method) -> Outcome:
+        """Return what a method comes to; whatever it raises, but for an interruption, is its failure."""
+        begun, shared = time.perf_counter(), self.shared
+        settings = configured(method)
+        recordings = self.scored if settings is None or settings.published else self.own
+        try:
+            for each in (self.scored, recordings):
+                with self._sharing():
+                    each.align()
+            renderer = expect_renderer(method.fit(self._task(recordings)))
+            fit_seconds = time.perf_counter() - begun - (self.shared - shared)
+            begun = time.perf_counter()
+            with torch.no_grad():
+                sounds = renderer.render(recordings.test.contacts, directions=recordings.test.directions)
+            render_seconds = time.perf_counter() - begun
+            judgement, maps = self._judgement(method, recordings, renderer, sounds)
+        except Exception as error:  # A fault in one method must not cost the others their hours.
+            return Outcome(self.case.key, method.name, failure=failure_of(error))
+        return Outcome(
+            self.case.key,
+            method.name,
+            judgement.values,
+            judgement.figures,
+            round(fit_seconds, 4),
+            round(render_seconds, 4),
+            self._keep_sounds(method.name, sounds),
+            report_of(renderer),
+            maps,
+        )
+
+    def described(self, known: CaseRecord) -> CaseRecord:
+        """Return the case's record with the recordings' files, and with what modes and features have taken so far."""
+        sounds = known.sounds or self._keep_sounds(_RECORDED, self.scored.test.sounds)
+        seconds, self.shared = known.shared_seconds + self.shared, 0.0
+        return replace(known, sounds=sounds, shared_seconds=round(seconds, 4))
+
+    def _judgement(
+        self, method: Method, recordings: _Recordings, renderer: Renderer, sounds: Float[Tensor, "contacts samples"]
+    ) -> tuple[Judgement, dict[str, str]]:
+        """Return the metrics, and the files of contacts' maps by the names of their recordings."""
+        if not self.evaluation.protocol.locating:
+            loudest = float(self.impacts.sounds.abs().max())
+            return self.evaluation.judging.judge(renderer, sounds, self.scored.test, self.truth, loudest=loudest), {}
+        points, settings = self._shared(self.look)("surface").points, configured(method)
+        published = settings is not None and settings.published
+        found = located(
+            renderer,
+            recordings.train,
+            recordings.test,
+            points,
+            vertices=self.vertices,
+            published=published,
+            map_rows=self.listened,
+        )
+        maps = {}
+        for row, each in found.maps.items():
+            file = f"maps/{self.place}/{row:03d} {_file_word(method.name)}.safetensors"
+            write_map(self.folder / file, each, truth=recordings.test.contacts[row])
+            maps[recordings.test.names[row]] = file
+        return Judgement(dict(found.errors), {}), maps
+
+    def _task(self, recordings: _Recordings) -> Task:
+        return Task(
+            name=self.identifier,
+            train=recordings.train,
+            contacts=self.impacts.contacts,
+            names=self.impacts.names,
+            seed=self.evaluation.seed,
+            modes=self._shared(recordings.modes),
+            features=self._shared(self.look),
+            bodies=self._shared(self.bodies),
+            stranger=self._shared(self.stranger),
+            family=self._shared(self.family),
+            material=self.material,
+            gaussians=self._gaussians,
+            device=self.evaluation.device,
+        )
+
+    def _shared(self, make: Callable[Given, Result]) -> Callable[Given, Result]:
+        def made(*given: Given.args, **named: Given.kwargs) -> Result:
+            with self._sharing():
+                return make(*given, **named)
+
+        return made
+
+    def _gaussians(self) -> GaussianCloud:
+        if self.evaluation.clouds is None:
+            raise EvaluationError.expected(
+                "Gaussians, views or a mesh", name=self.identifier, advice="give one, or omit the method"
+            )
+        with self._sharing():
+            return self.evaluation.clouds(self.identifier, self.case.views)
+
+    @contextmanager
+    def _sharing(self) -> Iterator[None]:
+        """Count the time to no method: whichever asks first would seem the slowest."""
+        begun = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.shared += time.perf_counter() - begun
+
+    def _keep_sounds(self, name: str, sounds: Float[Tensor, "contacts samples"]) -> dict[str, str]:
+        """Write the sounds to listen to, and return their files by the names of their recordings."""
+        kept = {}
+        word = _file_word(name)
+        for row in self.listened:
+            file = f"sounds/{self.place}/{row:03d} {word}.flac"
+            test = self.scored.test
+            keep_sound(
+                self.folder / file, sounds[row], sample_rate=test.sample_rate, gain=listening_gain(test.sounds[row])
+            )
+            kept[test.names[row]] = file
+        return kept
+
+
+def _file_word(method: str) -> str:
+    """Return a method's name for files: methods that read a folder have its path in their name."""
+    return "".join(mark if mark.isalnum() or mark in "-_" else "-" for mark in method)
+
+
+def run_object(
+    evaluation: Evaluation, identifier: str, results: ResultsFolder, log: Callable[[str], None] | None = None
+) -> None:
+    """Evaluate all methods on one object, except those with stored results; each result is stored at once.
+
+    On one thread. Failures of an object or a method are stored as their results. `log` is called with a message for
+    each method that begins. Raises EvaluationError where stored results are of other recordings.
+    """
+    with one_thread():
+        record = results.read(identifier) or ObjectRecord(identifier)
+        try:
+            capture = evaluation.dataset.capture(identifier)
+            impacts, surface = capture.impacts, capture.surface
+            own = None if evaluation.own_starts is None else evaluation.own_starts.capture(identifier).impacts
+            # From its peak, a recording's modes have phases of its own, which the truth of all does not have.
+            truth = None if evaluation.time_zero == "peak" else truth_of(evaluation.dataset, identifier)
+            digest = digest_of(impacts, truth)
+            if truth is not None:
+                truth = truth_from_first_sample(truth_at(truth, impacts.names), impacts)
+            facts, cases = evaluation.dataset.facts(identifier), evaluation.protocol.choosing.cases(impacts)
+        except (AvmsfError, OSError, ValueError) as error:  # A damaged object must not cost the others their hours.
+            results.write(replace(record, failure=failure_of(error)))
+            return
+        record = _described(_of_same_recordings(record, digest, evaluation, results), impacts, facts, cases)
+        results.write(record)
+        # Each made once for all cases; so is the error of what cannot be made.
+        features = once(evaluation.features)
+        bodies = once(partial(evaluation.bodies, identifier))
+        family = once(partial(evaluation.bodies.family, identifier))
+        stranger = once(partial(draw_stranger, evaluation.dataset, identifier, impacts, seed=evaluation.seed))
+        firsts = {case.label: case.key for case in reversed(cases)}
+        for number, case in enumerate(cases, 1):
+            record = _run_case(
+                CaseRun(
+                    evaluation,
+                    identifier,
+                    case,
+                    impacts,
+                    truth,
+                    folder=results.path,
+                    place=f"{identifier}/{number:02d}",
+                    look=partial(features, identifier, views=case.views),
+                    bodies=bodies,
+                    family=family,
+                    material=facts.material,
+                    stranger=stranger,
+                    vertices=None if surface is None or not len(surface.faces) else surface.vertices,
+                    listened=firsts[case.label] == case.key,
+                    own_starts=own,
+                ),
+                record,
+                results,
+                log,
+            )
+
+
+def _of_same_recordings(
+    record: ObjectRecord, digest: str, evaluation: Evaluation, results: ResultsFolder
+) -> ObjectRecord:
+    """Return an object's record, empty where it has no values; raise EvaluationError for other recordings' values."""
+    if record.digest != digest and all(each.failure is not None for each in record.outcomes):
+        record = ObjectRecord(record.identifier)
+    if record.digest not in ("", digest):
+        raise EvaluationError(
+            f"{results.path}: expected results of the recordings of {record.identifier} in {evaluation.title}, got "
+            "those of others; choose another --output",
+            file=results.path,
+            name=record.identifier,
+            value=record.digest,
+        )
+    return replace(record, digest=digest)
+
+
+def _described(record: ObjectRecord, impacts: Impacts, facts: ObjectFacts, cases: Sequence[Case]) -> ObjectRecord:
+    """Return an object's record with what is known of it now, and with its cases."""
+    known = {case.key: case for case in record.cases}
+    return replace(
+        record,
+        name=facts.name,
+        material=facts.material,
+        inferred=facts.inferred,
+        contacts=len(Places.of(impacts).rows),
+        sample_rate=impacts.sample_rate,
+        duration=impacts.duration,
+        cases=tuple(known.get(case.key) or _named(case, impacts) for case in cases),
+        failure=None,
+    )
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch and numba compute on one thread: sums in one order, and workers that do not stall each other."""
+    threads, kernels = torch.get_num_threads(), numba.get_num_threads()
+    torch.set_num_threads(1)
+    numba.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        numba.set_num_threads(kernels)
+
+
+def digest_of(impacts: Impacts, truth: Truth | None) -> str:
+    """Return a digest of all that figures depend on of an object's recordings and truth."""
+    digest = hashlib.sha256(impacts.digest().encode())
+    for tensor in () if truth is None else (truth.frequency, truth.damping, truth.gains, truth.quadrature):
+        digest.update(tensor.contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _run_case(
+    run: CaseRun, record: ObjectRecord, results: ResultsFolder, log: Callable[[str], None] | None
+) -> ObjectRecord:
+    """Run the methods that have no figures in a case, and return the object's record with them."""
+    key = run.case.key
+    for method in run.evaluation.methods:
+        digest = method.digest(run.identifier) if isinstance(method, FromFiles) else ""
+        if record.done(key, method.name, digest):
+            continue
+        if log is not None:
+            log(f"{key}, {method.name}")
+        outcome = replace(run.outcome(method), digest=digest)
+        cases = tuple(run.described(case) if case.key == key else case for case in record.cases)
+        record = replace(record, cases=cases).adding(outcome)
+        results.write(record)
+    return record
+
+
+def _named(case: Case, impacts: Impacts) -> CaseRecord:
+    train, test = (tuple(impacts.names[row] for row in rows) for rows in (case.train, case.test))
+    return CaseRecord(case.key, case.label, train, test)
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Processes that compute."""
+
+    count: int = 1
+    """Number of parallel objects on this computer; with 1 and no address, ray is not needed."""
+    address: str | None = None
+    """A ray cluster's address, or `auto`; its computers must see data and results under the same paths."""
+
+    def __post_init__(self) -> None:
+        if self.count < 1:
+            raise EvaluationError(f"expected 1 worker or more, got {self.count}", name="workers", value=self.count)
+
+
+@dataclass(frozen=True)
+class RunProgress:
+    """Progress of an evaluation."""
+
+    words: str
+    """The stage that has begun or ended."""
+    done: int
+    """Number of finished objects."""
+    total: int
+
+
+def run_objects(
+    evaluation: Evaluation,
+    identifiers: Sequence[str],
+    results: ResultsFolder,
+    *,
+    workers: Workers | None = None,
+    progress: Callable[[RunProgress], None] | None = None,
+) -> None:
+    """Evaluate the objects, and keep each figure as it comes; what has figures already is not computed again.
+
+    Each object is computed on one thread, so that figures do not depend on the number of workers. Raises as
+    `Evaluation.begin` and `run_object`, and EvaluationError where ray is needed and not installed.
+    """
+    who = workers or Workers()
+    heard = progress or (lambda event: None)
+    if who.address is None and who.count == 1:
+        evaluation.begin(results)
+        for done, identifier in enumerate(identifiers):
+
+            def log(words: str, identifier: str = identifier, done: int = done) -> None:
+                heard(RunProgress(f"{identifier}: {words}", done, len(identifiers)))
+
+            run_object(evaluation, identifier, results, log)
+            heard(RunProgress(f"{identifier}: done", done + 1, len(identifiers)))
+        return
+    ray = _ray()
+    evaluation.begin(results)
+    with _cluster(ray, who):
+        _run_remotely(ray, evaluation, identifiers, results, heard)
+
+
+def _run_remotely(
+    ray: ModuleType,
+    evaluation: Evaluation,
+    identifiers: Sequence[str],
+    results: ResultsFolder,
+    heard: Callable[[RunProgress], None],
+) -> None:
+    # max_retries: a worker that was killed for memory would be killed again.
+    remote = ray.remote(num_cpus=1, max_retries=0)(_run_alone)
+    shared = ray.put((evaluation, results))
+    pending: dict[Any, str] = {remote.remote(shared, identifier): identifier for identifier in identifiers}
+    heard(RunProgress(f"{len(pending)} objects on ray", 0, len(identifiers)))
+    try:
+        while pending:
+            # A time limit lets Ctrl-C through.
+            ready, _ = ray.wait(list(pending), num_returns=1, timeout=1.0)
+            for reference in ready:
+                identifier = pending.pop(reference)
+                try:
+                    ray.get(reference)
+                except ray.exceptions.RayError as error:
+                    cause = getattr(error, "cause", None)
+                    if isinstance(cause, Exception) and not isinstance(cause, ray.exceptions.RayError):
+                        raise cause from None
+                    raise EvaluationError.expected(
+                        "a worker process that finishes",
+                        got=f"one that ended early ({str(error).splitlines()[0]})",
+                        name=identifier,
+                        advice="run the command again, with fewer --workers if memory ran out",
+                    ) from error
+                heard(RunProgress(f"{identifier}: done", len(identifiers) - len(pending), len(identifiers)))
+    finally:
+        for reference in pending:
+            ray.cancel(reference, force=True)
+
+
+def _run_alone(shared: tuple[Evaluation, ResultsFolder], identifier: str) -> None:
+    evaluation, results = shared
+    run_object(evaluation, identifier, results)
+
+
+@contextmanager
+def _cluster(ray: ModuleType, workers: Workers) -> Iterator[None]:
+    settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
+    if workers.address is None:
+        settings |= {"num_cpus": workers.count, "include_dashboard": False, "address": "local"}
+    else:
+        settings["address"] = workers.address
+    try:
+        ray.init(**settings)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        wanted, advice = "a cluster to connect to", "check that it runs and has this address"
+        if workers.address is None:
+            wanted, advice = "ray to start on this computer", "use --workers 1, which needs no ray"
+        reason = " ".join(str(error).split())
+        raise EvaluationError.expected(wanted, workers.address, got=reason, name="ray", advice=advice) from error
+    try:
+        yield
+    finally:
+        ray.shutdown()
+
+
+def _ray() -> ModuleType:
+    # One computer needs no authentication, and no usage is reported.
+    for name, value in {
+        "RAY_AUTH_MODE": "disabled",
+        "RAY_USAGE_STATS_ENABLED": "0",
+        "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    }.items():
+        os.environ.setdefault(name, value)
+    try:
+        import ray
+    except ImportError as error:
+        raise EvaluationError.expected(
+            "an installed package", name="ray", advice="pip install 'avmsf[scale]', or omit --workers and --ray"
+        ) from error
+    return ray
