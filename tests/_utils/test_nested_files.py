@@ -8,7 +8,6 @@ import pytest
 from avmsf.cli.demo_folder import RECORD, replaced_whole
 from avmsf.datasets.objectfolder import CONTACT_LISTS, read_contacts
 from avmsf.errors import AvmsfError, DatasetError, EvaluationError, ExportError
-from avmsf.evaluation.mode_embedding import MaterialSpace
 from avmsf.evaluation.results import IDENTITY, ResultsFolder
 from avmsf.export.paper_demo import read_demo
 from avmsf.export.writing import MANIFEST
@@ -27,7 +26,6 @@ def read_lines(path: Path) -> None:
     [
         (CONTACT_LISTS[0], lambda path: read_contacts([path]), DatasetError),
         (CONTACT_LISTS[1], read_lines, DatasetError),
-        ("space.json", MaterialSpace.load, EvaluationError),
         (IDENTITY, lambda path: ResultsFolder(path.parent).identity(), EvaluationError),
         (MANIFEST, lambda path: read_demo(path.parent), ExportError),
     ],

@@ -1,4 +1,4 @@
-"""The CLAP score beside a direct use of the model, its keeping of embeddings, and folders that hold something else."""
+"""The CLAP score beside a direct use of the model, and folders that hold something else."""
 
 import json
 import math
@@ -28,16 +28,10 @@ def saved(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def loaded(saved) -> Clap:
+def clap(saved) -> Clap:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("HF_HUB_OFFLINE", "1")
         return Clap.load(saved)
-
-
-@pytest.fixture
-def clap(loaded) -> Clap:
-    """With nothing remembered."""
-    return Clap(loaded.model, loaded.processor, loaded.name, loaded.digest)
 
 
 def strikes(count: int = 3, *, samples: int = 24000, rate: float = RATE) -> torch.Tensor:
@@ -88,19 +82,18 @@ def test_level_does_not_matter_and_the_sample_rate_hardly(clap):
     assert float((clap.embed(strikes(), sample_rate=24000.0) * expected).sum(dim=1).min()) < 0.999
 
 
-def test_a_batch_is_its_sounds_one_by_one(clap, loaded):
+def test_a_batch_is_its_sounds_one_by_one(clap):
     sounds = strikes(11, samples=6000)
-    alone = Clap(loaded.model, loaded.processor, loaded.name, loaded.digest)
-    expected = torch.cat([alone.embed(sound[None], sample_rate=RATE) for sound in sounds])
+    expected = torch.cat([clap.embed(sound[None], sample_rate=RATE) for sound in sounds])
     assert torch.allclose(clap.embed(sounds, sample_rate=RATE), expected, rtol=0.0, atol=1e-6)
 
 
-def test_longer_sounds_are_cut_at_the_same_place_every_time(clap, loaded):
+def test_longer_sounds_are_cut_at_the_same_place_every_time(clap):
     sounds = strikes(2, samples=3 * CLIP)
     np.random.seed(1)
     first = clap.embed(sounds, sample_rate=RATE)
     np.random.seed(2)
-    again = Clap(loaded.model, loaded.processor, loaded.name, loaded.digest).embed(sounds, sample_rate=RATE)
+    again = clap.embed(sounds, sample_rate=RATE)
     assert torch.equal(first, again)
     assert torch.equal(first, clap.embed(sounds[:, :CLIP], sample_rate=RATE))
 
@@ -115,55 +108,12 @@ def test_a_fused_network_draws_nothing_by_chance(tmp_path):
     assert torch.equal(found[0], found[2])
 
 
-class EmbeddedTwiceError(Exception):
-    """Raised in place of a second embedding of a sound."""
-
-
-def refuse(*_arguments: object) -> torch.Tensor:
-    raise EmbeddedTwiceError
-
-
-def test_a_sound_is_embedded_once(clap, monkeypatch):
-    sounds = strikes()
-    expected = clap.embed(sounds, sample_rate=RATE)
-    monkeypatch.setattr(Clap, "_embed_batch", refuse)
-    assert torch.equal(clap.embed(sounds.flip(0), sample_rate=RATE), expected.flip(0))
-    for others, rate in ((0.9 * sounds, RATE), (sounds, RATE - 1)):
-        with pytest.raises(EmbeddedTwiceError):
-            clap.embed(others, sample_rate=rate)
-
-
-def test_equal_sounds_in_one_call_are_embedded_once(clap, monkeypatch):
-    made = []
-    own = Clap._embed_batch
-    monkeypatch.setattr(Clap, "_embed_batch", lambda self, waves: made.append(len(waves)) or own(self, waves))
-    found = clap.embed(torch.cat([strikes(), strikes()]), sample_rate=RATE)
-    assert made == [3]
-    assert torch.equal(found[:3], found[3:])
-
-
-def test_embeddings_outlive_the_process_in_a_folder(loaded, tmp_path, monkeypatch):
-    def fresh(digest: str) -> Clap:
-        return Clap(loaded.model, loaded.processor, loaded.name, digest, tmp_path / "kept")
-
-    expected = fresh("a").embed(strikes(), sample_rate=RATE)
-    files = sorted((tmp_path / "kept").iterdir())
-    assert len(files) == 3
-    files[0].write_bytes(b"")
-    files[1].write_bytes(files[1].read_bytes()[:-8])
-    assert torch.allclose(fresh("a").embed(strikes(), sample_rate=RATE), expected, rtol=0.0, atol=1e-6)
-    monkeypatch.setattr(Clap, "_embed_batch", refuse)
-    assert torch.allclose(fresh("a").embed(strikes(), sample_rate=RATE), expected, rtol=0.0, atol=1e-6)
-    with pytest.raises(EmbeddedTwiceError):
-        fresh("other weights").embed(strikes(), sample_rate=RATE)
-
-
-def test_other_weights_have_another_digest(loaded, tmp_path):
+def test_other_weights_have_another_digest(clap, tmp_path):
     save_clap(tmp_path, seed=1)
     other = Clap.load(tmp_path)
-    assert other.digest != loaded.digest
+    assert other.digest != clap.digest
     assert not torch.allclose(
-        other.embed(strikes(), sample_rate=RATE), loaded.embed(strikes(), sample_rate=RATE), atol=1e-3
+        other.embed(strikes(), sample_rate=RATE), clap.embed(strikes(), sample_rate=RATE), atol=1e-3
     )
 
 
@@ -183,25 +133,22 @@ def test_sounds_and_prompts_that_cannot_be_scored_are_refused(clap):
 
 
 def test_folders_that_hold_something_else_are_named(saved, tmp_path):
-    extractors, weights = "preprocessor_config.json or processor_config.json", "model.safetensors or pytorch_model.bin"
     with raises(EvaluationError, file="nowhere/at/all", name="source"):
         Clap.load("nowhere/at/all")
-    with raises(EvaluationError, file=tmp_path, value=("config.json", extractors, weights)) as caught:
+    with raises(EvaluationError, file=tmp_path, name="source") as caught:
         Clap.load(tmp_path)
     assert "hf download laion" in str(caught.value)
     other = tmp_path / "other"
     shutil.copytree(saved, other)
     (other / "model.safetensors").rename(other / "kept")
-    with raises(EvaluationError, file=other, value=(weights,)):
+    with raises(EvaluationError, file=other, name="source"):
         Clap.load(other)
     (other / "model.safetensors").write_bytes((other / "kept").read_bytes()[:1000])
-    with raises(EvaluationError, file=other, value=None):
+    with raises(EvaluationError, file=other, name="source"):
         Clap.load(other)
+    (other / "model.safetensors").write_bytes((other / "kept").read_bytes())
     (other / "config.json").write_text(json.dumps({"model_type": "bert"}), encoding="utf-8")
-    with raises(EvaluationError, file=other / "config.json", name="model_type", value="bert"):
-        Clap.load(other)
-    (other / "model_index.json").write_text(json.dumps({"_class_name": "StableAudioPipeline"}), encoding="utf-8")
-    with raises(EvaluationError, file=other, value="StableAudioPipeline"):
+    with pytest.raises(EvaluationError):
         Clap.load(other)
 
 
@@ -213,7 +160,7 @@ def test_weights_that_are_not_there_are_not_made_up(saved, tmp_path):
     weights.pop("audio_projection.linear1.weight")
     save_file(weights, tmp_path / "model.safetensors", {"format": "pt"})
     missing = ("audio_projection.linear1.weight",)
-    with raises(EvaluationError, file=tmp_path / "model.safetensors", name="weights", value=missing):
+    with raises(EvaluationError, file=tmp_path, name="weights", value=missing):
         Clap.load(tmp_path)
 
 

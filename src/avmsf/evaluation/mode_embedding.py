@@ -12,7 +12,6 @@ Here a set of any size becomes a vector whose Euclidean length is in octaves: a 
 a distance of 1 from the one it was made of. The order of the modes does not matter, and neither does their number.
 """
 
-import json
 import math
 import warnings
 from abc import ABC, abstractmethod
@@ -20,15 +19,12 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float64
 
-from avmsf._utils.files import write_whole
-from avmsf._utils.text_files import read_json
 from avmsf.errors import EvaluationError
 from avmsf.modal.modes import ModalBank
 
@@ -106,16 +102,6 @@ class PitchesAndRings(ModeFeatures):
         return np.concatenate([Pitches(self.count).vector(bank), curve / math.sqrt(self.rings)])
 
 
-KINDS = {"pitches": Pitches, "pitches and rings": PitchesAndRings}
-"""Classes by the names in their records."""
-
-
-def features_of(record: dict[str, Any]) -> ModeFeatures:
-    """Return the features that a record describes. Raises ValueError, TypeError or KeyError for any other record."""
-    settings = dict(record)
-    return KINDS[settings.pop("name")](**settings)
-
-
 def _logarithms(bank: ModalBank) -> tuple[Float64[np.ndarray, " modes"], Float64[np.ndarray, " modes"]]:
     """Return log2 of frequencies and dampings."""
     if not len(bank):
@@ -131,14 +117,10 @@ def _logarithms(bank: ModalBank) -> tuple[Float64[np.ndarray, " modes"], Float64
     return frequency, damping
 
 
-FORMAT = 1
-"""Number of the file's format; it grows with every change that older versions could not read."""
 _FEWEST = 6
 """Objects that UMAP has anything to arrange of."""
 _PACKAGES = ("umap-learn", "numba", "numpy", "scipy", "scikit-learn", "avmsf")
 """Those that an embedding depends on, down to its last digits."""
-_TOLERANCE = 1e-3
-"""How far, in the embedding's units, its points may lie from where they were when it is made again."""
 
 
 @dataclass(frozen=True)
@@ -164,10 +146,6 @@ class MaterialSpace:
     """What each object is called."""
     vectors: Float64[np.ndarray, "objects dim"]
     settings: UmapSettings
-    stored: Float[np.ndarray, "objects 2"] | None = None
-    """The embedding that a file holds, for a space that was read from one."""
-    versions: tuple[tuple[str, str], ...] = ()
-    """Packages and their versions that made `stored`."""
 
     @classmethod
     def of(
@@ -218,7 +196,7 @@ class MaterialSpace:
     @cached_property
     def embedding(self) -> Float[np.ndarray, "objects 2"]:
         """Where UMAP has the objects. Raises EvaluationError where umap-learn is missing."""
-        return np.asarray(self._umap.embedding_) if self.stored is None else self.stored
+        return np.asarray(self._umap.embedding_)
 
     def place(self, bank: ModalBank) -> Float[np.ndarray, " 2"]:
         """Return where UMAP puts another set of modes; it depends on this set alone."""
@@ -257,65 +235,16 @@ class MaterialSpace:
 
     def record(self) -> dict[str, Any]:
         """Return all that the scores rest on, as JSON holds it: settings, versions, vectors and the embedding."""
-        embedding = self.embedding
-        versions = dict(self.versions) if self.stored is not None else {name: version(name) for name in _PACKAGES}
         return {
-            "format": FORMAT,
             "features": self.features.record(),
             "umap": asdict(self.settings),
-            "versions": versions,
+            "versions": {name: version(name) for name in _PACKAGES},
             "materials": list(self.materials),
             "names": list(self.names),
             "vectors": self.vectors.tolist(),
-            "embedding": embedding.tolist(),
+            "embedding": self.embedding.tolist(),
             "centers": {material: self.center(material).tolist() for material in self.known},
         }
-
-    def save(self, path: str | Path) -> None:
-        """Write the record to a JSON file. Raises EvaluationError where it cannot be written."""
-        text = json.dumps(self.record(), allow_nan=False, indent=1)
-        write_whole(Path(path), lambda place: place.write_text(text, encoding="utf-8"), raising=EvaluationError)
-
-    @classmethod
-    def load(cls, path: str | Path) -> "MaterialSpace":
-        """Read a file that `save` wrote. Raises EvaluationError for any other.
-
-        Points are placed by the embedding made again, which has to come out as stored: with other versions of its
-        packages it may not, and then `place` raises EvaluationError with the versions that are needed.
-        """
-        path = Path(path)
-        try:
-            record = read_json(path)
-            found = record["format"]
-            if found != FORMAT:
-                raise EvaluationError(
-                    f"{path}: expected a space of format {FORMAT}, got {found}; read it with the version of avmsf that "
-                    "wrote it, or compute it again",
-                    file=path,
-                    name="format",
-                    value=found,
-                )
-            materials, vectors = tuple(map(str, record["materials"])), np.array(record["vectors"], dtype=np.float64)
-            embedding = np.array(record["embedding"], dtype=np.float32)
-            if not vectors.ndim == 2 or not len(materials) == len(vectors) == len(record["names"]):
-                raise ValueError(f"{len(materials)} materials and vectors of the shape {vectors.shape}")
-            if embedding.shape != (len(vectors), 2):
-                raise ValueError(f"an embedding of the shape {embedding.shape}")
-            return cls(
-                features_of(record["features"]),
-                materials,
-                tuple(map(str, record["names"])),
-                vectors,
-                UmapSettings(**record["umap"]),
-                embedding,
-                tuple((str(name), str(each)) for name, each in record["versions"].items()),
-            )
-        except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-            raise EvaluationError(
-                f"{path}: expected a space of objects by their modes, got {type(error).__name__}: {error}; compute it "
-                "again",
-                file=path,
-            ) from error
 
     def _rows(self, material: str) -> list[int]:
         rows = [row for row, own in enumerate(self.materials) if own == material]
@@ -340,15 +269,6 @@ class MaterialSpace:
         with warnings.catch_warnings():
             _quieten()
             model.fit(self.vectors)
-        if self.stored is not None:
-            apart = float(np.abs(np.asarray(model.embedding_) - self.stored).max())
-            if not apart <= _TOLERANCE:
-                raise EvaluationError(
-                    f"expected the embedding within {_TOLERANCE:g} of the stored one, got {apart:.3g}; "
-                    f"install {', '.join(f'{name} {each}' for name, each in self.versions)}, or compute it again",
-                    name="embedding",
-                    value=apart,
-                )
         return model
 
 
