@@ -26,7 +26,7 @@ from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
-from avmsf.plotting.edit_spectra import HeardModes
+from avmsf.plotting.edits import ModeLevels
 from factories.made_audio import save_audio
 from factories.made_fields import FIELDS, mixture, places
 from factories.raising import raises
@@ -190,7 +190,7 @@ def test_info_names_the_new_material(field: Path, capsys: Streams) -> None:
 
 def test_the_table_has_the_modes_of_most_energy(field: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(edit, "_LISTED", 1)
-    faintest = f"{float(FREQUENCY[HeardModes.of(ceramic()).size.argmin()]):g}"
+    faintest = f"{float(FREQUENCY[ModeLevels.of(ceramic()).size.argmin()]):g}"
     edited(field, "--mode-decay", faintest, "1e4")
     out = capsys.readouterr().out
     assert re.search(rf"│ +{faintest}\b", out)

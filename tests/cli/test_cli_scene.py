@@ -4,13 +4,11 @@ import json
 import re
 import shutil
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
 
-from avmsf.cli import info_clouds as infoclouds
 from avmsf.cli import main
 from avmsf.cli.info import describe
 from avmsf.cli.scene_bar import SceneBar
@@ -21,7 +19,6 @@ from avmsf.gaussians.ply import read_splats
 from avmsf.mesh import Surface
 from avmsf.mesh.surface import write_surface
 from avmsf.photographs.folder import write_views
-from avmsf.plotting.clouds import save_turntable
 from factories.plate_capture import PLATE, TINY, fill_plate
 from factories.small_scene import SMALL_SPLAT, THICKNESS, slab_views, write_surface_file
 
@@ -193,17 +190,14 @@ def test_features_serve_the_fit_of_another_command(kept: Path, capture: Path, tm
     assert torch.equal(load(output).gain_field.points, load(kept / "field.safetensors").gain_field.points)
 
 
-def test_clouds_and_features_are_drawn(
-    kept: Path, tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(infoclouds, "save_turntable", partial(save_turntable, frames=3))
+def test_clouds_and_features_are_drawn(kept: Path, tmp_path: Path, capsys: Streams) -> None:
     assert main(["info", str(kept / "cloud.ply"), "--plots", str(tmp_path / "a")]) == 0
-    words = ["info", str(kept / "features.safetensors"), "--cloud", str(kept / "cloud.ply"), "--regions", "8"]
+    words = ["info", str(kept / "features.safetensors"), "--cloud", str(kept / "cloud.ply")]
     assert main([*words, "--plots", str(tmp_path / "b")]) == 0
     out, _ = capsys.readouterr()
     assert "features: descriptors" in out
-    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["cloud.png", "turntable.gif"]
-    assert sorted(path.name for path in (tmp_path / "b").iterdir()) == ["features.png", "turntable.gif"]
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["cloud.png"]
+    assert [path.name for path in (tmp_path / "b").iterdir()] == ["features.png"]
 
 
 def test_two_photographs_are_too_few(capture: Path, tmp_path: Path, capsys: Streams) -> None:

@@ -21,7 +21,7 @@ from avmsf.field.store import save
 from avmsf.localization.locator import Locator
 from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
-from avmsf.plotting.sides import ALL_SIDES, view_from
+from avmsf.plotting.clouds import ALL_SIDES, view_from
 from avmsf.plotting.style import FIRST, SECOND
 from factories.made_fields import BANK, positional
 from factories.raising import raises

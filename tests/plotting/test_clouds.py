@@ -1,17 +1,11 @@
 """Pictures of clouds show what they are given, where it is."""
 
-import itertools
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from avmsf.errors import EvaluationError
-from avmsf.features.feature_field import FeatureField
-from avmsf.plotting.clouds import component_colors, draw_cloud, draw_features, label_colors, save_turntable
-from avmsf.plotting.sides import ALL_SIDES, AROUND, view_from
+from avmsf.plotting.clouds import ALL_SIDES, AROUND, component_colors, draw_cloud, view_from
 from avmsf.symmetry.symmetries import MirrorSymmetry, RotationalSymmetry, Symmetries
 from factories.raising import raises
 
@@ -27,23 +21,16 @@ FOUND = Symmetries(
 
 
 def test_a_sheet_has_a_row_for_each_set_of_colors_and_a_column_for_each_side():
-    field = FeatureField(POINTS, torch.randn(300, 8, generator=GENERATOR), "test")
-    figure = draw_features(
-        field,
-        title="a box",
-        colors=torch.rand(300, 3),
-        clusters=5,
-        symmetries=FOUND,
-        sides=((0.0, 25.0), (90.0, 25.0)),
-    )
+    rows = {"color": torch.rand(300, 3), "features": component_colors(torch.randn(300, 8, generator=GENERATOR))}
+    figure = draw_cloud(POINTS, rows, title="a box", symmetries=FOUND, sides=((0.0, 25.0), (90.0, 25.0)))
     titles = [axes.get_title() for axes in figure.axes]
     assert titles == [
         f"{name}\nazimuth {azimuth}°, elevation 25°"
-        for name in ("color", "features", "5 clusters", "symmetries")
+        for name in ("color", "features", "symmetries")
         for azimuth in (0, 90)
     ]
     assert all(len(axes.collections[0].get_offsets()) == 300 for axes in figure.axes)
-    assert [len(axes.lines) for axes in figure.axes] == [0] * 6 + [2, 2]
+    assert [len(axes.lines) for axes in figure.axes] == [0] * 4 + [2, 2]
 
 
 def test_an_axis_and_a_plane_are_drawn_where_they_are():
@@ -103,28 +90,8 @@ def test_colors_follow_the_principal_components():
     assert bool((component_colors(torch.ones(9, 4)) == 0.5).all())
 
 
-def test_labels_have_colors_of_their_own():
-    colors = label_colors(torch.arange(64))
-    assert len(torch.unique((255 * colors).round(), dim=0)) == 64
-
-
-def test_a_turntable_turns(tmp_path: Path):
-    path = tmp_path / "deep" / "turn.gif"
-    save_turntable(POINTS, torch.rand(300, 3, generator=GENERATOR), path, symmetries=FOUND, frames=4)
-    with Image.open(path) as picture:
-        assert picture.n_frames == 4
-        stills = []
-        for frame in range(4):
-            picture.seek(frame)
-            stills.append(np.asarray(picture.convert("RGB"), dtype=float))
-    assert all(np.abs(one - other).mean() > 1.0 for one, other in itertools.pairwise(stills))
-    assert [each.name for each in path.parent.iterdir()] == ["turn.gif"]
-
-
-def test_what_cannot_be_drawn_is_refused(tmp_path: Path):
+def test_what_cannot_be_drawn_is_refused():
     with raises(EvaluationError, value=(len(POINTS), 0, len(AROUND))):
         draw_cloud(POINTS, {}, title="")
-    with raises(EvaluationError, file="turn.png", name="frames"):
-        save_turntable(POINTS, POINTS, tmp_path / "turn.png")
     with raises(EvaluationError, name="up", value=[0.0, 0.0, 0.0]):
         draw_cloud(POINTS, {"color": POINTS}, title="", up=(0.0, 0.0, 0.0))

@@ -32,7 +32,8 @@ from avmsf.pipeline.config import CACHE, DESCRIPTORS, LiftConfig, PipelineConfig
 from avmsf.pipeline.reconstruct import reconstruct
 from avmsf.pipeline.record import modes_words
 from avmsf.pipeline.scene import CLOUD
-from avmsf.plotting.pictures import draw_modes, draw_scores, draw_spectrograms, save_picture
+from avmsf.plotting.pictures import draw_modes, draw_scores, save_picture
+from avmsf.plotting.spectrograms import draw_spectrograms
 from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER
 
 TRAIN = 12

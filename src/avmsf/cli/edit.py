@@ -25,9 +25,9 @@ from avmsf.editing.modal_edit import EDITS, adjust_modes, remarks, silenced
 from avmsf.errors import EditError
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
-from avmsf.plotting.edit_spectra import HeardModes, draw_edit, draw_sound_change
-from avmsf.plotting.edits import draw_clap_curves
+from avmsf.plotting.edits import ModeLevels, draw_clap_curves, draw_edit
 from avmsf.plotting.pictures import save_picture
+from avmsf.plotting.spectrograms import draw_sound_change
 
 _LISTED = 20
 """Modes in the table, those of most energy."""
@@ -89,7 +89,7 @@ def run(options: Options) -> int:
         for ending in ("checkpoint", "preview.wav", "clap.json"):
             beside(options.output, ending).unlink(missing_ok=True)
     edits = new.origin.report[EDITS][len(old.origin.report.get(EDITS, [])) :]
-    before, after = HeardModes.of(old), HeardModes.of(new)
+    before, after = ModeLevels.of(old), ModeLevels.of(new)
     screen = console(errors=options.json)
     screen.print(_table(before, after))
     for words in remarks(edits, new):
@@ -179,7 +179,7 @@ def _show(
     name = old.origin.capture or "field"
     sounds = torch.cat([field.render(place[None]) for field, place in (before, after)])
     modes = draw_edit(
-        HeardModes.of(old), HeardModes.of(new), sample_rate=old.sample_rate, title=f"modes of {name}, edited"
+        ModeLevels.of(old), ModeLevels.of(new), sample_rate=old.sample_rate, title=f"modes of {name}, edited"
     )
     pictures = {
         MODES: modes,
@@ -201,7 +201,7 @@ def _show_scores(path: Path, edit: dict[str, Any]) -> None:
     say(f"wrote {path}")
 
 
-def _rows(before: HeardModes, after: HeardModes) -> list[dict[str, Any]]:
+def _rows(before: ModeLevels, after: ModeLevels) -> list[dict[str, Any]]:
     """Return what became of each mode, in the field's order."""
     change = 20.0 * torch.log10(after.size / before.size)
     columns = (before.frequency, after.frequency, before.t60, after.t60, change)
@@ -212,12 +212,12 @@ def _rows(before: HeardModes, after: HeardModes) -> list[dict[str, Any]]:
     ]
 
 
-def _longest(modes: HeardModes) -> float:
+def _longest(modes: ModeLevels) -> float:
     """Return the longest T60 of the modes that sound, s; zero without one."""
     return float(torch.where(modes.size > 0, modes.t60, 0.0).max())
 
 
-def _level(modes: HeardModes) -> float:
+def _level(modes: ModeLevels) -> float:
     """Return the level of all modes together, dB; -inf without one that sounds."""
     return float(20.0 * torch.log10(modes.size.norm()))
 
@@ -228,7 +228,7 @@ def _change(row: dict[str, Any]) -> str:
     return decimals(row["level_change_db"], 1) if math.isfinite(row["level_change_db"]) else "back"
 
 
-def _table(before: HeardModes, after: HeardModes) -> Table:
+def _table(before: ModeLevels, after: ModeLevels) -> Table:
     energy = torch.maximum(*(modes.size.square() * modes.t60 for modes in (before, after)))
     listed = torch.argsort(energy, descending=True)[:_LISTED].sort().values.tolist()
     rows = _rows(before, after)

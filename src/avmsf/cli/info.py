@@ -116,7 +116,8 @@ def draw_field(
 ) -> None:
     """Write the figures of a field, with some of the recordings `recorded` next to its sounds."""
     # Drawing imports matplotlib, which text does without.
-    from avmsf.plotting.pictures import draw_gains, draw_modes, draw_spectrograms, save_picture
+    from avmsf.plotting.pictures import draw_gains, draw_modes, save_picture
+    from avmsf.plotting.spectrograms import draw_spectrograms
     from avmsf.plotting.surfaces import draw_surface
     from avmsf.plotting.uncertainty import draw_band, draw_doubt
 

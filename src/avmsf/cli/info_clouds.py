@@ -20,7 +20,7 @@ from avmsf.features.store import load_features, read_report
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.initialize import ZEROTH
 from avmsf.gaussians.ply import read_splats
-from avmsf.plotting.clouds import component_colors, draw_cloud, draw_features, save_turntable
+from avmsf.plotting.clouds import component_colors, draw_cloud
 from avmsf.plotting.pictures import save_picture
 from avmsf.symmetry.symmetries import Symmetries
 
@@ -57,22 +57,15 @@ def _draw_cloud(cloud: GaussianCloud, options: Options, folder: Path) -> None:
     colors = plain_colors(cloud)
     title = f"{options.file.name}: {counted(len(cloud), 'Gaussian')}"
     _write(draw_cloud(cloud.centers, {"color": colors}, title=title, up=_UP[options.up]), folder / "cloud.png")
-    _turn(cloud.centers, colors, options.up, folder)
 
 
 def _draw_features(features: FeatureField, report: dict[str, Any], options: Options, folder: Path) -> None:
     symmetries = Symmetries.from_dict(report["symmetries"]) if "symmetries" in report else None
-    shown = without_positions(features)
-    figure = draw_features(
-        shown,
-        title=f"{options.file.name}: {features.encoder} on {len(features.points)} points",
-        colors=None if options.cloud is None else _colors_of(options.cloud, features),
-        clusters=min(options.regions, len(features.points)),
-        symmetries=symmetries,
-        up=_UP[options.up],
-    )
+    rows = {} if options.cloud is None else {"color": _colors_of(options.cloud, features)}
+    rows["features"] = component_colors(without_positions(features).features)
+    title = f"{options.file.name}: {features.encoder} on {len(features.points)} points"
+    figure = draw_cloud(features.points, rows, title=title, symmetries=symmetries, up=_UP[options.up])
     _write(figure, folder / "features.png")
-    _turn(features.points, component_colors(shown.features), options.up, folder, symmetries=symmetries)
 
 
 def _colors_of(path: Path, features: FeatureField) -> Float[Tensor, "points 3"]:
@@ -88,19 +81,6 @@ def _colors_of(path: Path, features: FeatureField) -> Float[Tensor, "points 3"]:
             value=len(cloud),
         )
     return plain_colors(cloud.take(torch.from_numpy(rows)))
-
-
-def _turn(
-    points: Float[Tensor, "points 3"],
-    colors: Float[Tensor, "points 3"],
-    up: str,
-    folder: Path,
-    *,
-    symmetries: Symmetries | None = None,
-) -> None:
-    path = folder / "turntable.gif"
-    save_turntable(points, colors, path, symmetries=symmetries, up=_UP[up])
-    say(f"wrote {path}")
 
 
 def _write(picture: Figure, path: Path) -> None:

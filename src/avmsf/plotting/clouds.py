@@ -1,30 +1,87 @@
-"""Pictures of a cloud from all sides: its colors, features, clusters and symmetries, as a sheet or a turntable."""
+"""Pictures of a cloud from all sides: its colors, features and symmetries."""
 
-import io
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import hsv_to_rgb
 from matplotlib.figure import Figure
-from PIL import Image
 from torch import Tensor
 
-from avmsf._utils.files import write_whole
 from avmsf.errors import EvaluationError
-from avmsf.features.feature_field import FeatureField
-from avmsf.gaussians.points import cluster
-from avmsf.plotting.sides import ABOVE, AROUND, UP, Side, name_axes, side_words, view_from
 from avmsf.plotting.style import FIRST, SECOND, styled
 from avmsf.symmetry.symmetries import Symmetries
 
+Side: TypeAlias = tuple[float, float]
+"""Azimuth about the direction to the sky, and elevation above the horizon, of an eye far away; degrees."""
+UP = (0.0, 0.0, 1.0)
+ABOVE = 25.0
+"""Elevation of an eye that looks into what is open above and still sees the sides, degrees."""
+AROUND: tuple[Side, ...] = tuple((azimuth, ABOVE) for azimuth in (30.0, 120.0, 210.0, 300.0))
+"""Four sides from a little above."""
+ALL_SIDES: tuple[Side, ...] = (
+    (-60.0, 25.0),
+    (60.0, 25.0),
+    (180.0, 25.0),
+    (-60.0, 75.0),
+    (-60.0, -25.0),
+    (-60.0, -75.0),
+)
+"""Three sides, into what is open above, and two from below: nothing on a convex object is out of sight in all."""
+_ARROW = 28.0
+"""Length of the arrows along the axes, points."""
+
+
+def side_words(side: Side) -> str:
+    """Return a side's azimuth and elevation as text."""
+    azimuth, elevation = side
+    return f"azimuth {azimuth:g}°, elevation {elevation:g}°"
+
+
+def view_from(side: Side, up: Sequence[float] = UP) -> Float[np.ndarray, "3 3"]:
+    """Return rows right, up and towards the eye of a side; azimuth 0 looks from the axis after the one that is up.
+
+    That is from x where z is up, from z where y is. Raises EvaluationError where `up` is no direction.
+    """
+    azimuth, elevation = side
+    sky = np.asarray(up, dtype=float)
+    if sky.shape != (3,) or not np.isfinite(sky).all() or np.linalg.norm(sky) == 0.0:
+        raise EvaluationError(f"expected an up direction of three numbers, got {list(up)}", name="up", value=list(up))
+    sky = sky / np.linalg.norm(sky)
+    first = np.roll(np.eye(3)[np.argmax(np.abs(sky))], 1)
+    first = first - (first @ sky) * sky
+    first /= np.linalg.norm(first)
+    angle, height = math.radians(azimuth), math.radians(elevation)
+    level = math.cos(angle) * first + math.sin(angle) * np.cross(sky, first)
+    eye = math.cos(height) * level + math.sin(height) * sky
+    right = np.cross(sky, level)
+    return np.stack([right, np.cross(eye, right), eye])
+
+
+def name_axes(axes: Axes, view: Float[np.ndarray, "3 3"]) -> None:
+    """Draw the directions of x, y and z in the lower left corner; rows of `view` as of `view_from`."""
+    for axis, name in enumerate("xyz"):
+        across, along = _ARROW * view[:2, axis]
+        # What points at the eye or away from it has no direction here.
+        if np.hypot(across, along) > 0.4 * _ARROW:
+            axes.annotate(
+                name,
+                (0.06, 0.06),
+                (across, along),
+                xycoords="axes fraction",
+                textcoords="offset points",
+                arrowprops={"arrowstyle": "<-", "color": FIRST},
+                color=FIRST,
+                ha="center",
+                va="center",
+            )
+
+
 _GRAY = 0.62
-_INCHES, _TURNTABLE_INCHES = 3.0, 4.0
+_INCHES = 3.0
 _MARGIN = 1.12
 _WIDTH = 1.9
 """Width of a dot over the picture's, times the root of how many there are."""
@@ -61,35 +118,13 @@ def draw_cloud(
     for (name, shown), line in zip(rows.items(), grid, strict=True):
         for side, axes in zip(sides, line, strict=True):
             view = view_from(side, up)
-            _scatter(axes, points, shown, view, inches=_INCHES)
+            _scatter(axes, points, shown, view)
             if symmetries is not None and name == "symmetries":
                 _draw_symmetries(axes, points, symmetries, view)
             name_axes(axes, view)
             axes.set_title(f"{name}\n{side_words(side)}")
     figure.suptitle(title)
     return figure
-
-
-def draw_features(
-    features: FeatureField,
-    *,
-    title: str,
-    colors: Float[Tensor, "points 3"] | None = None,
-    clusters: int | None = None,
-    symmetries: Symmetries | None = None,
-    sides: Sequence[Side] = AROUND,
-    up: Sequence[float] = UP,
-) -> Figure:
-    """Draw what is known of an object's points, as `draw_cloud` does.
-
-    Rows: the points in their own colors if given, their features' first three principal components as red, green and
-    blue, `clusters` k-means groups if asked for, and the symmetries if given.
-    """
-    rows = {} if colors is None else {"color": colors}
-    rows["features"] = component_colors(features.features)
-    if clusters is not None:
-        rows[f"{clusters} clusters"] = label_colors(cluster(features.points, clusters).labels)
-    return draw_cloud(features.points, rows, title=title, symmetries=symmetries, sides=sides, up=up)
 
 
 def component_colors(features: Float[Tensor, "points dim"]) -> Float[Tensor, "points 3"]:
@@ -109,47 +144,6 @@ def component_colors(features: Float[Tensor, "points dim"]) -> Float[Tensor, "po
     return colors
 
 
-def label_colors(labels: Int[Tensor, " points"]) -> Float[Tensor, "points 3"]:
-    """Return a color for each label; labels that follow one another get hues far apart."""
-    number = labels.numpy()
-    hue = (number * 0.618034) % 1.0
-    saturation = 0.55 + 0.4 * ((number * 0.37) % 1.0)
-    value = 0.6 + 0.4 * ((number * 0.73) % 1.0)
-    return torch.from_numpy(hsv_to_rgb(np.stack([hue, saturation, value], axis=1))).float()
-
-
-@styled
-def save_turntable(
-    points: Float[Tensor, "points 3"],
-    colors: Float[Tensor, "points 3"],
-    path: Path,
-    *,
-    symmetries: Symmetries | None = None,
-    frames: int = 36,
-    up: Sequence[float] = UP,
-) -> None:
-    """Write an animated GIF of the cloud turning once in three seconds. Raises EvaluationError for another ending."""
-    if path.suffix.lower() != ".gif" or frames < 2:
-        raise EvaluationError.expected(
-            "a name that ends in .gif and 2 frames or more", frames, got=f"{frames} frames", file=path, name="frames"
-        )
-    pictures = []
-    for frame in range(frames):
-        figure = Figure(figsize=(_TURNTABLE_INCHES, _TURNTABLE_INCHES), dpi=100)
-        axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-        view = view_from((360.0 * frame / frames, ABOVE), up)
-        _scatter(axes, points, colors, view, inches=_TURNTABLE_INCHES)
-        if symmetries is not None:
-            _draw_symmetries(axes, points, symmetries, view)
-        still = io.BytesIO()
-        FigureCanvasAgg(figure).print_figure(still, format="png", dpi=100)
-        pictures.append(Image.open(still).convert("RGB"))
-    memory = io.BytesIO()
-    first, *others = pictures
-    first.save(memory, format="GIF", save_all=True, append_images=others, duration=round(3000 / frames), loop=0)
-    write_whole(path, lambda place: place.write_bytes(memory.getvalue()))
-
-
 def _middle(points: Float[Tensor, "points 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
     places = points.double().numpy()
     middle = (places.min(0) + places.max(0)) / 2
@@ -161,8 +155,6 @@ def _scatter(
     points: Float[Tensor, "points 3"],
     colors: Float[Tensor, "points 3"],
     view: Float[np.ndarray, "3 3"],
-    *,
-    inches: float,
 ) -> None:
     middle, radius = _middle(points)
     seen = (points.double().numpy() - middle) @ view.T
@@ -171,7 +163,7 @@ def _scatter(
     shade = 0.72 + 0.28 * (seen[:, 2:] / max(radius, 1e-30) + 1) / 2
     shown = np.clip(colors.numpy() * shade, 0.0, 1.0)
     # Dots so wide that near ones hide far ones: about twice as wide as they lie apart.
-    dot = 72 * inches * _WIDTH / math.sqrt(max(len(seen), _FEW))
+    dot = 72 * _INCHES * _WIDTH / math.sqrt(max(len(seen), _FEW))
     axes.scatter(seen[order, 0], seen[order, 1], c=shown[order], s=dot**2, linewidths=0, rasterized=True)
     reach = _MARGIN * radius if radius > 0.0 else 1.0
     axes.set_xlim(-reach, reach)

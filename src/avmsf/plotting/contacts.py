@@ -15,8 +15,7 @@ from torch import Tensor
 from avmsf._utils.files import write_whole
 from avmsf.errors import EvaluationError
 from avmsf.localization.contact_map import ContactMap
-from avmsf.plotting.clouds import draw_cloud
-from avmsf.plotting.sides import ALL_SIDES, Side
+from avmsf.plotting.clouds import ALL_SIDES, Side, draw_cloud
 from avmsf.plotting.style import FIRST, SECOND, SEQUENTIAL, styled
 
 _DECADES = 3.0

@@ -1,15 +1,112 @@
-"""Figures of edits: where their modes lie among labelled objects, and their CLAP score over the steps."""
+"""Figures of edits: modes before and after, where they lie among labelled objects, and CLAP scores over the steps."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from statistics import mean
 from typing import TypeAlias
 
 import numpy as np
-from jaxtyping import Float
+import torch
+from jaxtyping import Float, Float64
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import StrMethodFormatter
+from torch import Tensor
 
-from avmsf.plotting.style import series_color, styled
+from avmsf.field.sound_field import SoundField
+from avmsf.plotting.style import FIRST, SECOND, series_color, styled
+
+_RANGE_DB = 80.0
+"""What is shown below the loudest."""
+_POINTS = 256
+"""Points of the object that a mode's level is taken over, at most."""
+_BANDS = 3
+"""Bands an octave in which modes are counted."""
+
+
+@dataclass(frozen=True, eq=False)
+class ModeLevels:
+    """An object's modes by their mean level over its surface."""
+
+    frequency: Float64[Tensor, " modes"]
+    """Hz."""
+    t60: Float64[Tensor, " modes"]
+    """Time in which each falls by 60 dB, s."""
+    size: Float64[Tensor, " modes"]
+    """Root mean square amplitude over the surface; zero for modes that are silent."""
+
+    @classmethod
+    def of(cls, field: SoundField) -> "ModeLevels":
+        """Return those of a field."""
+        points = field.gain_field.points
+        known = field.known(points[:: max(1, -(-len(points) // _POINTS))])
+        size = torch.where(field.audible, known.power.mean(0).sqrt(), 0.0)
+        return cls(field.bank.frequency, np.log(1000.0) / field.bank.damping, size)
+
+    def level_db(self, reference: float) -> Float64[Tensor, " modes"]:
+        """Return levels over an amplitude, dB; -inf for silent modes."""
+        return 20.0 * torch.log10(self.size / max(reference, torch.finfo(torch.float64).tiny))
+
+
+@styled
+def draw_edit(before: ModeLevels, after: ModeLevels, *, sample_rate: float, title: str) -> Figure:
+    """Draw levels, ring times and the number of modes over frequency (logarithmic), before and after an edit.
+
+    Modes that are silent have no level; the band above half the sample rate (Hz), where all are, is shaded.
+    """
+    figure = Figure(figsize=(9, 8.4), layout="constrained")
+    levels, rings, counts = figure.subplots(3, 1, sharex=True, height_ratios=(3, 3, 2))
+    loudest = float(before.size.max())
+    drawn = [("before", before, FIRST), ("after", after, SECOND)]
+    tops = [each.level_db(loudest).max().item() for _, each, _ in drawn if bool((each.size > 0).any())]
+    top = max([0.0, *tops])
+    for name, modes, color in drawn:
+        heard = (modes.size > 0).numpy()
+        frequency, t60 = modes.frequency.numpy(), modes.t60.numpy()
+        level = np.maximum(modes.level_db(loudest).numpy()[heard], top - _RANGE_DB)
+        levels.vlines(frequency[heard], top - _RANGE_DB, level, colors=color, linewidths=1.2, alpha=0.7)
+        levels.plot(frequency[heard], level, "o", color=color, markersize=4, label=name)
+        rings.plot(frequency[heard], t60[heard], "o", color=color, markersize=4, alpha=0.8)
+        rings.plot(frequency[~heard], t60[~heard], "o", color=color, markersize=4, mfc="none")
+    for one, other in zip(_places(before), _places(after), strict=True):
+        rings.plot([one[0], other[0]], [one[1], other[1]], color="gray", linewidth=0.5, alpha=0.5, zorder=0)
+    _count(counts, drawn)
+    levels.set_ylim(top - _RANGE_DB, top + 6.0)
+    levels.set_ylabel("level (dB re strongest mode before)")
+    levels.legend()
+    rings.set_yscale("log")
+    rings.set_ylabel("decay time T60 (s)")
+    counts.set_ylabel("modes per third-octave band")
+    counts.set_xlabel("frequency (Hz); hollow: silent")
+    for axes in (levels, rings, counts):
+        axes.set_xscale("log")
+        axes.grid(which="both")
+        _shade(axes, 0.5 * sample_rate, max(float(each.frequency.max()) for _, each, _ in drawn))
+    for axis in (counts.xaxis, rings.yaxis):
+        axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    figure.suptitle(title)
+    return figure
+
+
+def _places(modes: ModeLevels) -> list[tuple[float, float]]:
+    return list(zip(modes.frequency.tolist(), modes.t60.tolist(), strict=True))
+
+
+def _count(axes: Axes, drawn: list[tuple[str, ModeLevels, str]]) -> None:
+    """Draw how many modes there are in each band, silent ones left out."""
+    octaves = [modes.frequency[modes.size > 0].log2().numpy() * _BANDS for _, modes, _ in drawn]
+    both = np.concatenate(octaves)
+    if not len(both):
+        return
+    edges = np.arange(np.floor(both.min()), np.ceil(both.max()) + 1.5)
+    for (_, _, color), places in zip(drawn, octaves, strict=True):
+        axes.stairs(np.histogram(places, edges)[0], 2.0 ** (edges / _BANDS), color=color, fill=True, alpha=0.35)
+
+
+def _shade(axes: Axes, start: float, highest: float) -> None:
+    if highest >= start:
+        axes.axvspan(start, 1.1 * highest, color="gray", alpha=0.2, linewidth=0)
+
 
 Move: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
 """Where an edited object's modes lie in an embedding before and after the edit."""

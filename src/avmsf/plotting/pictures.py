@@ -1,4 +1,4 @@
-"""Pictures of modes, gains, sounds and scores: functions from values to a matplotlib figure, and one that writes it."""
+"""Pictures of modes, gains and scores: functions from values to a matplotlib figure, and one that writes it."""
 
 import io
 import math
@@ -17,14 +17,10 @@ from torch import Tensor
 
 from avmsf._utils.files import write_whole
 from avmsf.errors import EvaluationError
-from avmsf.modal.config import scaled_fft_size
 from avmsf.modal.modes import ModalBank
-from avmsf.modal.spectra import magnitude_stft
-from avmsf.plotting.style import DIVERGING, FIRST, SECOND, SEQUENTIAL, styled
+from avmsf.plotting.style import DIVERGING, FIRST, SECOND, styled
 
 FORMATS = ("png", "pdf", "svg")
-_RANGE_DB = 80.0
-"""What spectrograms show below the loudest point of the truth."""
 
 
 def save_picture(figure: Figure, path: Path) -> None:
@@ -123,58 +119,6 @@ def draw_gains(
 
 
 @styled
-def draw_spectrograms(
-    truth: Float[Tensor, "contacts samples"],
-    predicted: Float[Tensor, "contacts samples"],
-    *,
-    sample_rate: float,
-    names: Sequence[str],
-    title: str,
-) -> Figure:
-    """Draw recorded and rendered sounds side by side, one row a contact, both on the recorded one's scale.
-
-    Shows the band and the time in which the recordings have energy.
-    """
-    fft_size = scaled_fft_size(1024, sample_rate=sample_rate)
-    hop = max(1, fft_size // 8)
-    figure = Figure(figsize=(10, 2.1 * len(truth) + 1.2), layout="constrained")
-    grid = figure.subplots(len(truth), 2, sharex=True, sharey=True, squeeze=False, gridspec_kw={"wspace": 0.06})
-    spectra = [magnitude_stft(sounds, fft_size=fft_size, hop=hop) for sounds in (truth, predicted)]
-    highest, latest = _heard_extent(spectra[0])
-    duration = truth.shape[1] / sample_rate
-    unit = 1000 if sample_rate > 4000 else 1
-    for row, name in enumerate(names):
-        reference = float(spectra[0][row].max().clamp_min(1e-30))
-        for column, (spectrum, what) in enumerate(zip(spectra, ("recorded", "rendered"), strict=True)):
-            level = 20 * torch.log10((spectrum[row] / reference).clamp_min(1e-10))
-            axes = grid[row, column]
-            image = axes.imshow(
-                level.numpy(),
-                origin="lower",
-                aspect="auto",
-                extent=(
-                    -hop / 2 / sample_rate,
-                    (level.shape[1] - 0.5) * hop / sample_rate,
-                    0.0,
-                    sample_rate / 2 / unit,
-                ),
-                cmap=SEQUENTIAL,
-                vmin=-_RANGE_DB,
-                vmax=0.0,
-                interpolation="nearest",
-            )
-            axes.set_title(f"{name}: {what}")
-            axes.set_ylim(0.0, highest * sample_rate / 2 / unit)
-            axes.set_xlim(0.0, max(latest * duration, 4 * hop / sample_rate))
-        grid[row, 0].set_ylabel("frequency (kHz)" if unit > 1 else "frequency (Hz)")
-    for axes in grid[-1]:
-        axes.set_xlabel("time (s)")
-    figure.colorbar(image, ax=grid, label="level (dB re maximum of the recording)", shrink=0.8)
-    figure.suptitle(title)
-    return figure
-
-
-@styled
 def draw_scores(means: Mapping[str, float], errors: Mapping[str, float], *, title: str) -> Figure:
     """Draw each method's mean error as a bar with its standard error, best on top, on a logarithmic axis."""
     order = sorted(means, key=lambda method: -means[method])
@@ -254,18 +198,3 @@ def _scatter_in_space(
         axis.set_major_locator(MaxNLocator(3))
         axis.set_tick_params(labelsize=7)
     return axes, drawn
-
-
-def _heard_extent(magnitude: Float[Tensor, "contacts bins frames"]) -> tuple[float, float]:
-    """Return up to which part of the band and of the time there is energy within 50 and 60 dB of the greatest, up to 1.
-
-    Energy by frequency is summed over time and the reverse, lest the click of the onset, which has all frequencies for
-    a moment, count as much as what rings.
-    """
-    power = magnitude.square().sum(0)
-    if not bool(power.any()):
-        return 1.0, 1.0
-    bins = torch.nonzero(power.sum(1) > 1e-5 * power.sum(1).max()).flatten()
-    frames = torch.nonzero(power.sum(0) > 1e-6 * power.sum(0).max()).flatten()
-    parts = (int(bins[-1]) / len(power), int(frames[-1]) / power.shape[1])
-    return min(1.0, 1.15 * parts[0] + 0.01), min(1.0, 1.1 * parts[1] + 0.01)

@@ -1,4 +1,4 @@
-"""Spectrograms with a logarithmic frequency axis, of many methods next to each other."""
+"""Spectrograms: of many methods with a logarithmic frequency axis, of two sounds with a linear one."""
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -9,6 +9,7 @@ from jaxtyping import Float, Float64
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator, StrMethodFormatter
 from torch import Tensor
 
@@ -45,6 +46,58 @@ def log_spectrogram(
         first = min(round(low), spectrum.shape[0] - 1)
         rows.append(spectrum[first : max(first + 1, round(high))].amax(0))
     return 20 * torch.log10(torch.stack(rows).clamp(min=1e-9))
+
+
+@styled
+def draw_spectrograms(
+    truth: Float[Tensor, "contacts samples"],
+    predicted: Float[Tensor, "contacts samples"],
+    *,
+    sample_rate: float,
+    names: Sequence[str],
+    title: str,
+) -> Figure:
+    """Draw recorded and rendered sounds side by side, one row a contact, both on the recorded one's scale.
+
+    Shows the band and the time in which the recordings have energy.
+    """
+    figure = Figure(figsize=(10, 2.1 * len(truth) + 1.2), layout="constrained")
+    grid = figure.subplots(len(truth), 2, sharex=True, sharey=True, squeeze=False, gridspec_kw={"wspace": 0.06})
+    fft_size, hop = _linear_sizes(sample_rate)
+    spectra = [magnitude_stft(sounds, fft_size=fft_size, hop=hop) for sounds in (truth, predicted)]
+    highest, latest = _energy_extent(spectra[0])
+    for row, name in enumerate(names):
+        reference = float(spectra[0][row].max())
+        for axes, spectrum, what in zip(grid[row], spectra, ("recorded", "rendered"), strict=True):
+            image = _draw_linear(axes, spectrum[row], reference, sample_rate)
+            axes.set_title(f"{name}: {what}")
+        grid[row, 0].set_ylabel("frequency (Hz)")
+    grid[0, 0].set_ylim(0.0, highest * sample_rate / 2)
+    grid[0, 0].set_xlim(0.0, max(latest * truth.shape[1] / sample_rate, 4 * hop / sample_rate))
+    for axes in grid[-1]:
+        axes.set_xlabel("time (s)")
+    figure.colorbar(image, ax=grid, label="level (dB re maximum of the recording)", shrink=0.8)
+    figure.suptitle(title)
+    return figure
+
+
+@styled
+def draw_sound_change(
+    before: Float[Tensor, " samples"], after: Float[Tensor, " samples"], *, sample_rate: float, title: str
+) -> Figure:
+    """Draw the spectrograms of two sounds side by side, each on the scale of its own loudest point."""
+    figure = Figure(figsize=(10, 4.2), layout="constrained")
+    grid = figure.subplots(1, 2, sharex=True, sharey=True)
+    fft_size, hop = _linear_sizes(sample_rate)
+    spectra = magnitude_stft(torch.stack([before, after]), fft_size=fft_size, hop=hop)
+    for axes, spectrum, what in zip(grid, spectra, ("before", "after"), strict=True):
+        image = _draw_linear(axes, spectrum, float(spectrum.max()), sample_rate)
+        axes.set_title(what)
+        axes.set_xlabel("time (s)")
+    grid[0].set_ylabel("frequency (Hz)")
+    figure.colorbar(image, ax=grid, label="level (dB re maximum of each)", shrink=0.8)
+    figure.suptitle(title)
+    return figure
 
 
 @styled
@@ -122,3 +175,39 @@ def _set_axes(axes: Axes, seconds: float, band: tuple[float, float]) -> None:
     axes.yaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+def _linear_sizes(sample_rate: float) -> tuple[int, int]:
+    """Return FFT size and hop of spectrograms with a linear frequency axis."""
+    fft_size = scaled_fft_size(1024, sample_rate=sample_rate)
+    return fft_size, max(1, fft_size // 8)
+
+
+def _draw_linear(axes: Axes, spectrum: Float[Tensor, "bins frames"], reference: float, sample_rate: float) -> AxesImage:
+    """Draw magnitudes as levels over a reference, with a linear frequency axis."""
+    step = _linear_sizes(sample_rate)[1] / sample_rate
+    return axes.imshow(
+        20 * torch.log10((spectrum / max(reference, 1e-30)).clamp_min(1e-10)).numpy(),
+        origin="lower",
+        aspect="auto",
+        extent=(-step / 2, (spectrum.shape[1] - 0.5) * step, 0.0, sample_rate / 2),
+        cmap=SEQUENTIAL,
+        vmin=-RANGE_DB,
+        vmax=0.0,
+        interpolation="nearest",
+    )
+
+
+def _energy_extent(magnitude: Float[Tensor, "contacts bins frames"]) -> tuple[float, float]:
+    """Return up to which part of the band and of the time there is energy within 50 and 60 dB of the greatest, up to 1.
+
+    Energy by frequency is summed over time and the reverse, lest the click of the onset, which has all frequencies for
+    a moment, count as much as what rings.
+    """
+    power = magnitude.square().sum(0)
+    if not bool(power.any()):
+        return 1.0, 1.0
+    bins = torch.nonzero(power.sum(1) > 1e-5 * power.sum(1).max()).flatten()
+    frames = torch.nonzero(power.sum(0) > 1e-6 * power.sum(0).max()).flatten()
+    parts = (int(bins[-1]) / len(power), int(frames[-1]) / power.shape[1])
+    return min(1.0, 1.15 * parts[0] + 0.01), min(1.0, 1.1 * parts[1] + 0.01)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from avmsf.errors import EvaluationError
 from avmsf.mesh.surface import Surface
-from avmsf.plotting.sides import ALL_SIDES, name_axes, view_from
+from avmsf.plotting.clouds import ALL_SIDES, name_axes, view_from
 from avmsf.plotting.style import FIRST, SERIES, styled
 
 _LIGHT = np.array([-0.4, 0.5, 0.77])

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from avmsf.field.uncertainty import SpectrumBand
-from avmsf.plotting.sides import ALL_SIDES, name_axes, view_from
+from avmsf.plotting.clouds import ALL_SIDES, name_axes, view_from
 from avmsf.plotting.style import FIRST, SECOND, SEQUENTIAL, styled
 
 _RANGE_DB = 100.0

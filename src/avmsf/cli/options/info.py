@@ -35,13 +35,11 @@ class Options(Printing):
     plots: PlotsFolder = None
     """Write figures to this folder. Field: modes.png, gains.png; uncertainty.png and spectrum.png if the gains have a
     posterior; surface.png, with cross-sections, if they have a body; spectrograms.png with --capture. Gaussians:
-    cloud.png and turntable.gif. Features: features.png and turntable.gif."""
+    cloud.png. Features: features.png."""
     cloud: Annotated[
         Path | None, tyro.conf.arg(metavar="CLOUD.ply"), Existing("Gaussians, as a .ply file", ("a mesh or Gaussians",))
     ] = None
     """Features: also draw the colors of the Gaussians that the features lie on."""
-    regions: int = 64
-    """Features: number of regions to draw."""
     up: Literal["x", "y", "z"] = "z"
     """Gaussians and features: axis that points up."""
 
