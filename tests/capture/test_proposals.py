@@ -23,17 +23,10 @@ def found(folder: Path) -> dict[str, object]:
     return {each.key: each.value for each in propose_settings(folder)}
 
 
-def folder_of(path: Path, sounds: list[np.ndarray], forces=None, contacts=None) -> Path:
+def folder_of(path: Path, sounds: list[np.ndarray]) -> Path:
     names = [f"{number:02}.wav" for number in range(len(sounds))]
-    places = range(len(sounds)) if contacts is None else contacts
-    rows = [f"{name},{0.1 * place},0,0" for name, place in zip(names, places, strict=True)]
-    header = "file,x,y,z"
-    if forces is not None:
-        rows, header = (
-            [f"{row},{force:.6g}" for row, force in zip(rows, forces, strict=True)],
-            f"{header},force_newtons",
-        )
-    return fill(path, rows=rows, header=header, replace=dict(zip(names, sounds, strict=True)))
+    rows = [f"{name},{0.1 * row},0,0" for row, name in enumerate(names)]
+    return fill(path, rows=rows, replace=dict(zip(names, sounds, strict=True)))
 
 
 def rumbling(
@@ -79,48 +72,6 @@ def test_the_bowl_s_rumble_is_found(shared: Path, tmp_path: Path) -> None:
         rows.append(f"{path.name},{number},0,0")
     (tmp_path / "impacts.csv").write_text("\n".join(["file,x,y,z", *rows, ""]))
     assert found(tmp_path) == {"highpass": 20.0}
-
-
-@pytest.mark.parametrize("name", ["aircraft_response", "ruler10", "tree43"])
-def test_impulse_responses_of_one_time_zero_need_no_alignment(shared: Path, name: str) -> None:
-    assert found(shared / name) == {"align": False}
-
-
-def test_recordings_trimmed_at_different_places_do(shared: Path, tmp_path: Path) -> None:
-    folder = shutil.copytree(shared / "aircraft_response", tmp_path / "trimmed")
-    generator = np.random.default_rng(0)
-    for path in sorted(folder.glob("impacts/*.wav")):
-        sound, rate = soundfile.read(path)
-        soundfile.write(path, sound[generator.integers(3) :], rate, subtype="FLOAT")
-    assert found(folder) == {}
-
-
-@pytest.mark.parametrize("repeated", [True, False])
-@pytest.mark.parametrize("related", [True, False])
-def test_forces_unrelated_to_the_loudness_are_not_divided_by(tmp_path: Path, related: bool, repeated: bool) -> None:
-    generator = np.random.default_rng(1)
-    count = 24
-    forces = 10 ** generator.uniform(-0.7, 0.7, count)
-    contacts = np.arange(count) // 4 if repeated else np.arange(count)
-    # Contacts differ by 3 dB; repeated impacts differ by their force, or else by 1 dB.
-    places = 10 ** (3 / 20 * generator.standard_normal(count))[contacts]
-    gains = places * (forces if related else 10 ** (1 / 20 * generator.standard_normal(count))) / 30
-    sounds = [gain * ring(0.3, before=0.05, seed=1, noise=1e-5) for gain in gains]
-    folder = folder_of(tmp_path, sounds, forces, contacts)
-    assert found(folder) == ({} if related else {"normalize": "none"})
-
-
-def test_few_recordings_do_not_show_that_forces_are_unrelated(tmp_path: Path) -> None:
-    sounds = [ring(0.3, before=0.05, seed=seed) for seed in range(5)]
-    assert found(folder_of(tmp_path, sounds, [1, 2, 4, 8, 16])) == {}
-
-
-def test_levels_that_scatter_do_not_show_it_either(tmp_path: Path) -> None:
-    # The level goes with a fifth of the force, and differs by 6 dB among the contacts: two standard errors from a half.
-    forces = 10 ** np.linspace(0, 0.6, 12)
-    scatter = 10 ** (6 / 20 * np.array([1, -1, -1, 1, 1, -1, -1, 1, 1, -1, -1, 1]))
-    sounds = [gain * ring(0.3, before=0.05, seed=1, noise=1e-5) for gain in forces**0.2 * scatter / 10]
-    assert found(folder_of(tmp_path, sounds, forces)) == {}
 
 
 def hammer(newtons: float, *, pushes: int = 1) -> np.ndarray:
@@ -171,11 +122,10 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     proposals = [
         Proposal("force_channel", 1, "Because\nof # it all. " * 30),
         Proposal("highpass", 20.0, "é"),
-        Proposal("normalize", "none", "so"),
-        Proposal("align", False, ""),
+        Proposal("unit", "mm", ""),
     ]
     path = write_settings(tmp_path, proposals)
-    expected = replace(CaptureSettings(), force_channel=1, highpass=20.0, normalize="none", align=False)
+    expected = replace(CaptureSettings(), force_channel=1, highpass=20.0, unit="mm")
     assert CaptureSettings.read(path) == expected
     assert path.read_text(encoding="utf-8") == settings_text(proposals)
 

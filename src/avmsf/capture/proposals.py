@@ -7,15 +7,14 @@ docs/decisions/reading-recordings.md has the measurements behind the limits.
 import json
 import os
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Complex128, Float64
-from scipy.special import stdtrit
+from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf._utils.files import unwritable
@@ -24,9 +23,8 @@ from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.measure import HIGHEST_NOISE_DB, decibels, noise_level
 from avmsf.capture.onset import SECONDS_BEFORE, find_onset, find_pulse
 from avmsf.capture.placement import judge_placement, surface_points
-from avmsf.capture.prepare import Prepared, prepare, remove_rumble
+from avmsf.capture.prepare import prepare, remove_rumble
 from avmsf.capture.settings import METRES, SETTINGS, CaptureSettings, settings_of
-from avmsf.capture.starts import shorten, start_with_impact
 from avmsf.capture.table import Row, Strike, read_rows, understand
 from avmsf.capture.together import NARROWEST, WIDEST, find_surface, fitting_units_of
 from avmsf.errors import CaptureError
@@ -43,19 +41,12 @@ MAX_RUMBLE_RISE = 10**0.6
 6 dB. The power of a few periods of noise scatters by 3."""
 MIN_NOISE_SHARE = 1e-6
 """Mean square of noise against the squared peak, -60 dB, below which it does not hide the decay over its T60."""
-AUDIO_RATE = 16_000.0
-"""Sample rate, Hz, from which on recordings are of sound: slower ones are of structures that vibrate below 20 Hz."""
+MIN_AUDIO_RATE_HZ = 16_000.0
+"""Sample rate from which on recordings are of sound: slower ones are of structures that vibrate below 20 Hz."""
 MAX_LOW_SHARE = 0.1
 """Share of the energy after the impacts, below the lowest candidate, above which it is no sound of the object."""
-SHORTEST_LEAD_SECONDS = 0.1
+MIN_LEAD_SECONDS = 0.1
 """Two periods of the lowest candidate: less than that before an impact does not show rumble."""
-MIN_COHERENCE = 0.9
-"""Coherence of phases from which recordings have one time zero: phases then scatter by .2 rad, and gains err by 2 %.
-Measured impulse responses have .94 to 1.00, and .53 to .92 with a delay of 0 or 1 sample each by chance."""
-SIGNIFICANCE = 1e-3
-"""Probability of forces that are related to the loudness to look as if they were not."""
-MIN_FREEDOM = 5
-"""Degrees of freedom of the regression of level on force; with fewer, repeated impacts do not suffice on their own."""
 
 
 @dataclass(frozen=True)
@@ -99,11 +90,8 @@ def propose_settings(
         proposals += choose_channels([channel_figures(recording) for _, recording in _recordings(folder, strikes)])
     found: dict[str, Any] = {each.key: each.value for each in proposals}
     settings = replace(settings, **found)
-    evidence = Evidence(settings)
-    for strike, recording in _recordings(folder, strikes):
-        evidence.add(strike, recording)
-    proposals += [each for each in evidence.proposals() if each.key not in chosen]
-    return tuple(proposals)
+    highpass = None if "highpass" in chosen else propose_highpass(_recordings(folder, strikes), settings)
+    return tuple(proposals if highpass is None else [*proposals, highpass])
 
 
 def write_settings(folder: str | Path, proposals: Sequence[Proposal]) -> Path:
@@ -181,144 +169,62 @@ def channel_figures(recording: Recording) -> Float64[np.ndarray, "2 channels"]:
     return np.array([(_push_share(row), _above_noise(row, recording.sample_rate)) for row in recording.channels]).T
 
 
-class Evidence:
-    """What the recordings of a folder show about `normalize`, `highpass` and `align`, added one after the other."""
+def propose_highpass(recordings: Iterable[tuple[Strike, Recording]], settings: CaptureSettings) -> Proposal | None:
+    """Propose the lowest candidate that removes most of the noise and nothing of the object's.
 
-    def __init__(self, settings: CaptureSettings) -> None:
-        self.settings = settings
-        self._rates: set[float] = set()
-        self._shortest = float("inf")
-        self._starts: list[Prepared] = []
-        self._struck: list[tuple[Strike, float, float]] = []
-        self._noise: list[Float64[np.ndarray, "kinds candidates"]] = []
-        self._low: list[float] = []
-        self._squares: Complex128[np.ndarray, " bins"] | float = 0.0
-        self._powers: Float64[np.ndarray, " bins"] | float = 0.0
-
-    def add(self, strike: Strike, recording: Recording) -> None:
-        """Add one recording; one that cannot be prepared is passed over."""
-        settings, rate = self.settings, recording.sample_rate
+    Or the lowest where most of what follows the impacts lies below it, as of a sensor that settles. Recordings that
+    cannot be prepared are passed over; those of different rates, which are refused as a capture, show nothing.
+    """
+    rates, durations, noise, low = set(), [], [], []
+    for strike, recording in recordings:
         try:
             prepared = prepare(recording, settings, newtons=strike.newtons)
         except CaptureError:
-            return
-        self._rates.add(rate)
-        if len(self._rates) > 1:
-            return  # Refused as a capture; spectra of different rates cannot be added up.
-        self._shortest = min(self._shortest, recording.duration)
-        self._starts.append(shorten(prepared, rate=rate, settings=replace(settings, seconds=SECONDS_BEFORE)))
-        if prepared.newtons is not None:
-            self._struck.append((strike, prepared.newtons, prepared.peak * prepared.newtons))
+            continue
+        rate, onset = recording.sample_rate, prepared.onset
+        rates.add(rate)
+        durations.append(recording.duration)
         response = recording.response(settings.response_channel, force_channel=settings.force_channel)
-        kept = round(settings.kept_seconds(rate) * rate)
-        onset = prepared.onset
         if prepared.pulse is None and recording.duration * CANDIDATES_HZ[0] >= 1.0:
             # Sway and drift as loud as the impact hide its onset.
             onset = find_onset(remove_rumble(response, CANDIDATES_HZ[0], recording), sample_rate=rate)
         lead = response[: max(0, onset - round(SECONDS_BEFORE * rate))]
-        later = response[onset : onset + kept]
-        if len(lead) >= SHORTEST_LEAD_SECONDS * rate:
-            self._noise.append(_low_powers(lead, later, rate) / float(np.abs(response).max()) ** 2)
+        later = response[onset : onset + round(settings.kept_seconds(rate) * rate)]
+        if len(lead) >= MIN_LEAD_SECONDS * rate:
+            noise.append(_low_powers(lead, later, rate) / float(np.abs(response).max()) ** 2)
         # Digital silence, as after a click at the start, has no rumble.
         power = float(np.square(later).mean())
-        self._low.append(_low_power(later, CANDIDATES_HZ[0], rate) / power if power else 0.0)
-        spectrum = np.fft.rfft(np.concatenate([prepared.before, prepared.sound])[:kept], kept)
-        spectrum /= np.linalg.norm(spectrum)
-        self._squares, self._powers = self._squares + spectrum**2, self._powers + np.abs(spectrum) ** 2
-
-    def proposals(self) -> list[Proposal]:
-        """Return what all recordings together show."""
-        if len(self._rates) != 1 or len(self._starts) < 2:
-            return []
-        highpass = self._highpass()
-        # What is below it decides onsets, levels and phases as well.
-        found = (self._normalize(), self._align()) if highpass is None else (highpass,)
-        return [each for each in found if each is not None]
-
-    def _normalize(self) -> Proposal | None:
-        """Propose "none" where dividing by the force makes levels differ more, significantly.
-
-        With b the slope of the level over the force, both in dB, the division leaves less variance where b > .5 and
-        more where b < .5. Levels are compared within repeated impacts where these suffice, else over all contacts,
-        whose own differences are then the noise of the regression.
-        """
-        if self.settings.normalize != "auto" or len(self._struck) != len(self._starts):
-            return None
-        force, level = np.array([(decibels(push), decibels(peak)) for _, push, peak in self._struck]).T
-        places = [(*(round(value, 6) for value in each.contact), each.direction) for each, _, _ in self._struck]
-        groups = np.unique([places.index(each) for each in places], return_inverse=True)[1]
-        freedom = len(groups) - int(groups.max()) - 2
-        if freedom < MIN_FREEDOM:
-            groups, freedom = np.zeros_like(groups), len(groups) - 2
-        sizes = np.bincount(groups)
-        force, level = (each - (np.bincount(groups, each) / sizes)[groups] for each in (force, level))
-        spread = float(force @ force)
-        if freedom < MIN_FREEDOM or spread <= 0.0:
-            return None
-        slope = float(force @ level) / spread
-        error = float(np.sqrt(np.square(level - slope * force).sum() / freedom / spread))
-        if slope - error * float(stdtrit(freedom, SIGNIFICANCE)) >= 0.5:
-            return None
-        return Proposal(
-            "normalize",
-            "none",
-            f"The levels do not follow the forces: 10 dB more force changed the level by {10 * slope:+.1f} dB "
-            f"(standard error {10 * error:.1f} dB), so dividing by them would make levels differ more.",
-        )
-
-    def _highpass(self) -> Proposal | None:
-        """Propose the lowest candidate that removes most of the noise and nothing of the object's.
-
-        Or the lowest where most of what follows the impacts lies below it, as of a sensor that settles.
-        """
-        if self.settings.highpass > 0.0:
-            return None
-        if min(self._rates) >= AUDIO_RATE and (share := float(np.median(self._low))) > MAX_LOW_SHARE:
-            return Proposal(
-                "highpass",
-                CANDIDATES_HZ[0],
-                f"{share:.0%} of the energy after the impacts lies below {CANDIDATES_HZ[0]:g} Hz: drift, sway or a "
-                "sensor that settles. Leave it out if the object itself vibrates there.",
-            )
-        if len(self._noise) < len(self._starts) / 2:
-            return None
-        before, below, later = np.mean(self._noise, axis=0)
-        if before[0] < MIN_NOISE_SHARE:
-            return None
-        chosen, left = None, before[0]
-        for cutoff, total, low, after in zip(CANDIDATES_HZ, before, below, later, strict=True):
-            rest = max(total - low, 1e-12 * total)
-            impossible = cutoff * self._shortest < 1.0 or after > MAX_RUMBLE_RISE * low
-            if impossible or left / rest < MIN_NOISE_RATIO:
-                continue
-            chosen, left = cutoff, rest
-        if chosen is None:
-            return None
+        low.append(_low_power(later, CANDIDATES_HZ[0], rate) / power if power else 0.0)
+    if len(rates) != 1 or len(durations) < 2 or settings.highpass > 0.0:
+        return None
+    if min(rates) >= MIN_AUDIO_RATE_HZ and (share := float(np.median(low))) > MAX_LOW_SHARE:
         return Proposal(
             "highpass",
-            chosen,
-            f"Before the impacts, an offset or rumble below {chosen:g} Hz is most of the noise: without it, noise is "
-            f"{10 * np.log10(before[0] / left):.0f} dB lower. The object does not vibrate there: the power below "
-            f"{chosen:g} Hz does not rise at the impact.",
+            CANDIDATES_HZ[0],
+            f"{share:.0%} of the energy after the impacts lies below {CANDIDATES_HZ[0]:g} Hz: drift, sway or a "
+            "sensor that settles. Leave it out if the object itself vibrates there.",
         )
-
-    def _align(self) -> Proposal | None:
-        """Propose false where all recordings start with the impact and their phases agree as they are."""
-        settings = self.settings
-        if not settings.align or settings.force_channel is not None:
-            return None
-        if not start_with_impact(self._starts, rate=min(self._rates)):
-            return None
-        coherence = float(np.abs(self._squares).sum() / np.sum(self._powers))
-        if coherence < MIN_COHERENCE:
-            return None
-        return Proposal(
-            "align",
-            False,
-            "All recordings are impulse responses with one time zero: they start with the impact, and their phases "
-            f"agree (coherence {coherence:.2f} of 1). They are not cut in any case; this also skips the estimation of "
-            "their delays.",
-        )
+    if len(noise) < len(durations) / 2:
+        return None
+    before, below, later = np.mean(noise, axis=0)
+    if before[0] < MIN_NOISE_SHARE:
+        return None
+    chosen, left = None, before[0]
+    for cutoff, total, under, after in zip(CANDIDATES_HZ, before, below, later, strict=True):
+        rest = max(total - under, 1e-12 * total)
+        impossible = cutoff * min(durations) < 1.0 or after > MAX_RUMBLE_RISE * under
+        if impossible or left / rest < MIN_NOISE_RATIO:
+            continue
+        chosen, left = cutoff, rest
+    if chosen is None:
+        return None
+    return Proposal(
+        "highpass",
+        chosen,
+        f"Before the impacts, an offset or rumble below {chosen:g} Hz is most of the noise: without it, noise is "
+        f"{10 * np.log10(before[0] / left):.0f} dB lower. The object does not vibrate there: the power below "
+        f"{chosen:g} Hz does not rise at the impact.",
+    )
 
 
 def contacts_of(rows: Sequence[Row], settings: CaptureSettings) -> Float64[Tensor, "contacts 3"]:
