@@ -3,17 +3,18 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from avmsf.errors import SceneError, SimulationError
-from avmsf.fem.candidate_bodies import WALL_TRIAL, WALLS, Shape
+from avmsf.errors import SimulationError
+from avmsf.fem.candidate_bodies import WALL_TRIAL, WALLS, Shape, walled_solid
 from avmsf.fem.isotropic import IsotropicModes, isotropic_modes
 from avmsf.fem.mesh_check import CheckedSurface, checked
-from avmsf.fem.mesh_filling import TRIANGLES, filled_solid, wall_solids
+from avmsf.fem.mesh_filling import filled_solid, wall_solids
 from avmsf.fem.solid import Solid
 from avmsf.fem.walls import Wall, wall_of
 from avmsf.mesh.surface import Surface
@@ -128,14 +129,7 @@ def _of_shape(shape: Shape, count: int, dofs: int, solid_dofs: int, log: Callabl
     between = shape.thickness_range
     if between is None:
         return _solid_body(checked(shape.as_seen(), log=log), count, solid_dofs, log)
-
-    def make(thickness: float) -> Solid:
-        try:
-            surface = shape.shell(thickness, faces=round(0.5 * TRIANGLES * dofs))
-        except SceneError as error:
-            raise SimulationError(str(error), **error.attributes) from error
-        return filled_solid(checked(surface, log=log), dofs, wall=thickness)
-
+    make = partial(walled_solid, shape, dofs=dofs, log=log)
     return _of_walls(make, np.geomspace(*between, _THICKNESSES).tolist(), count, log)
 
 

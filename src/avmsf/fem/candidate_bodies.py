@@ -368,11 +368,7 @@ class BodyMaker:
         if wall is None:
             return filled_solid(self._checked, dofs)
         if self._shape is not None:
-            try:
-                surface = self._shape.shell(wall, faces=round(0.5 * TRIANGLES * dofs))
-            except SceneError as error:
-                raise SimulationError(str(error), **error.attributes) from error
-            return filled_solid(checked(surface, log=self._log), dofs, wall=wall)
+            return walled_solid(self._shape, wall, dofs, log=self._log)
         with _REMESHING:
             if dofs not in self._walls:
                 self._walls[dofs] = wall_solids(self._checked, dofs)
@@ -406,6 +402,15 @@ class BodyMaker:
         content.update(vertices.tobytes())
         content.update(faces.tobytes())
         return content.hexdigest()
+
+
+def walled_solid(shape: Shape, thickness: float, dofs: int, *, log: Callable[[str], None]) -> Solid:
+    """Return the elements of a wall of a shape, meters thick. Raises SimulationError where it cannot be made."""
+    try:
+        surface = shape.shell(thickness, faces=round(0.5 * TRIANGLES * dofs))
+    except SceneError as error:
+        raise SimulationError(str(error), **error.attributes) from error
+    return filled_solid(checked(surface, log=log), dofs, wall=thickness)
 
 
 def _frequency_error(coarse: ElasticModes, fine: ElasticModes) -> float:

@@ -98,9 +98,7 @@ def _averaging(joined: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
 
 def _joined(skin: Skin) -> scipy.sparse.csr_array:
     """Return 1 for points that share an edge."""
-    count = len(skin.points)
-    ends = skin.faces[:, [[0, 1], [1, 2], [2, 0], [1, 0], [2, 1], [0, 2]]].reshape(-1, 2)
-    joined = scipy.sparse.csr_array((np.ones(len(ends)), ends.T), shape=(count, count))
+    joined = skin.adjacency
     joined.data[:] = 1.0
     return joined
 

@@ -80,7 +80,7 @@ def prisms(skin: Skin, thickness: Float64[np.ndarray, " points"], *, layers: int
 def _offsets(skin: Skin, thickness: Float64[np.ndarray, " points"]) -> Float64[np.ndarray, "points 3"] | None:
     """Return the way from each point through the wall, or None where some prisms stay folded."""
     directions, lengths = -skin.normals, thickness.copy()
-    ends = skin.faces[:, [[0, 1], [1, 2], [2, 0], [1, 0], [2, 1], [0, 2]]].reshape(-1, 2)
+    ends = skin.directed_edges
     tolerance = _SLOPE * np.linalg.norm(skin.points[ends[:, 0]] - skin.points[ends[:, 1]], axis=1)
     for _ in range(_STEPS):
         folded = _folded(skin, lengths[:, None] * directions)
@@ -115,8 +115,7 @@ def _tilted(skin: Skin, directions: np.ndarray, folded: np.ndarray) -> np.ndarra
     Where there is a direction that all triangles around a vertex see from outside, this finds one in the end.
     """
     tilted = directions.copy()
-    corners = skin.points[skin.faces[folded]]
-    inward = -unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    inward = -skin.face_normals[folded]
     np.add.at(tilted, skin.faces[folded], _TILT * inward[:, None])
     return unit(tilted)
 

@@ -223,6 +223,17 @@ class Skin:
         return sides, which, count[which]
 
     @property
+    def directed_edges(self) -> Int[np.ndarray, "sides 2"]:
+        """The sides of all triangles, each from both of its ends: rows of `points`."""
+        return self.faces[:, [[0, 1], [1, 2], [2, 0], [1, 0], [2, 1], [0, 2]]].reshape(-1, 2)
+
+    @property
+    def adjacency(self) -> scipy.sparse.csr_array:
+        """How many triangles' sides join each pair of points."""
+        ends = self.directed_edges
+        return scipy.sparse.csr_array((np.ones(len(ends)), ends.T), shape=(len(self.points),) * 2)
+
+    @property
     def normals(self) -> Float64[np.ndarray, "points 3"]:
         """Unit normals at the points: the mean of the triangles around each, weighted by their angles there."""
         corners = self.points[self.faces]

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float64, Int
@@ -124,8 +123,7 @@ class Wall:
         """Return the distance to the other side behind each point of a sheet, filled in from neighbors at rims."""
         reach, cosine, _ = _Behind(self.skin)(sheet.points, sheet.normals)
         known = (cosine < _OPPOSITE) & (reach < _THICKER * self.thickness)
-        ends = sheet.faces[:, [[0, 1], [1, 2], [2, 0], [1, 0], [2, 1], [0, 2]]].reshape(-1, 2)
-        joined = scipy.sparse.csr_array((np.ones(len(ends)), ends.T), shape=(len(sheet.points),) * 2)
+        joined = sheet.adjacency
         values = np.where(known, reach, 0.0)
         for _ in range(_ROUNDS):
             if known.all():
