@@ -138,11 +138,6 @@ def _empty_accessor() -> bytes:
     )
 
 
-def _large_face() -> bytes:
-    corners = " ".join(str(1 + number % 3) for number in range(2_000_000))
-    return f"v 0 0 0\nv 1 0 0\nv 0 1 0\nf {corners}\n".encode()
-
-
 def _wrong_index(index: int) -> Callable[[], bytes]:
     return lambda: (
         "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
@@ -187,7 +182,6 @@ BOMBS: dict[str, Bomb] = {
     "mask of 30016 x 30016": _picture("masks/0.png", 30_016),
     "glb with 20,000 nodes": _surface(".glb", _many_nodes),
     "glb accessor of 1e8 without data": _surface(".glb", _empty_accessor),
-    "obj face of 2,000,000 corners": _surface(".obj", _large_face),
     "ply face beyond its vertices": _surface(".ply", _wrong_index(99)),
     "ply face of a negative vertex": _surface(".ply", _wrong_index(-9)),
     "field metadata 100,000 levels deep": _field("nested", 0),

@@ -94,9 +94,6 @@ def test_a_part_moved_out_of_the_world_is_refused(tmp_path: Path) -> None:
     [
         ("nodes.glb", triangle(nodes=2000), "nodes", 2000),
         ("empty.glb", triangle(count=100_000_000), "values", 100_000_000),
-        ("face.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf " + b"1 2 3 " * 1000, "corners of a face", 3000),
-        ("materials.obj", b"".join(b"usemtl m%d\nf 1 2 3\n" % number for number in range(1001)), "materials", 1001),
-        ("folded.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf " + b"1 2 \\\n3 " * 1000, "corners of a face", 3000),
     ],
 )
 def test_counts_in_the_file_are_bounded_before_anything_is_built(
@@ -110,12 +107,6 @@ def test_counts_in_the_file_are_bounded_before_anything_is_built(
     monkeypatch.setattr(trimesh, "load_scene", build)
     with raises(CaptureError, file=name, name=counted, value=found):
         read_surface(tmp_path / name)
-
-
-def test_a_material_may_return_as_often_as_it_likes(tmp_path: Path) -> None:
-    lines = [f"g group {row}\nusemtl {'red' if row % 2 else 'blue'}\nf 1 2 3\n" for row in range(3000)]
-    (tmp_path / "surface.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "".join(lines))
-    assert len(load_mesh(tmp_path / "surface.obj").geometry) == 2
 
 
 def test_buffers_within_a_text_gltf_may_be_larger_than_other_json(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import trimesh
 
 from avmsf.errors import SceneError
 from avmsf.fem.candidate_bodies import BodyMaker, nominal_bodies
-from avmsf.mesh.boolean import difference
+from avmsf.mesh.level_set import difference
 from avmsf.mesh.surface import Surface
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig

@@ -4,6 +4,7 @@ Every reader of meshes goes through `load_mesh`, so that what it returns has ind
 """
 
 import io
+import json
 import logging
 import re
 import struct
@@ -18,7 +19,6 @@ from PIL import Image
 from avmsf._utils.files import is_lfs_pointer
 from avmsf._utils.text_files import parse_json, read_json
 from avmsf.errors import AvmsfError, CaptureError
-from avmsf.mesh.plain_mesh import expect_uncompressed, plain_mesh
 
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
 MAX_BYTES = 1 << 30
@@ -32,16 +32,18 @@ about 1 GB while they are read."""
 MAX_PARTS = 1_000
 """Parts of a mesh, each placed by a node or a material of its own. A struck object has a few; each takes a millisecond
 and more to place, texture and render."""
-MAX_CORNERS = 1_000
-"""Corners of one polygon. Modeling programs write caps of at most some hundreds; a polygon of more is cut into
-triangles without area."""
 MAX_COORDINATE = 1e9
 """Largest coordinate, in the file's unit: a kilometer in micrometers. Its cube is an ordinary number in float32."""
 MAX_TEXTURE_PIXELS = 3 * 8192**2
 """Pixels of all textures: three pictures of 8192 x 8192, the largest that graphics cards of all makes take. 0.6 GB."""
-_MAX_VALUES = 12 * MAX_FACES
-"""Entries of all accessors of a glb: four vectors (position, normal, color, texture) for each corner."""
 _COMMAS = re.compile(rb"^\s*(v|vertex)\s+-?[0-9]+,[0-9]", re.MULTILINE)
+_UNUSUAL = re.compile(rb"\A\xef\xbb\xbf|^[ \t]+[vf]|^[vf][^\n]*\t|^f[^\n]*[ /]-", re.MULTILINE)
+"""A byte-order mark, tabs or spaces where one space is usual, and negative indices."""
+_INTEGERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2"}
+_WIDTHS = {"VEC2": 2, "VEC3": 3, "VEC4": 4}
+_FLOAT32 = 5126
+"""Types of numbers in a glTF's accessors, and of what they form."""
+_COMPRESSED = {"KHR_draco_mesh_compression": "Draco", "EXT_meshopt_compression": "meshoptimizer"}
 # Of a missing texture trimesh logs a traceback, which goes to the terminal where nothing else takes it.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
@@ -53,15 +55,15 @@ def load_mesh(path: Path, *, raising: type[AvmsfError] = CaptureError) -> trimes
     than the bounds above, of another format, or damaged.
     """
     try:
-        _expect_small(path)
+        _check_size(path)
         with warnings.catch_warnings():
             # numpy's casts of damaged numbers; the results are checked below.
             warnings.simplefilter("ignore", RuntimeWarning)
-            plain = plain_mesh(path)
+            plain = _plain_mesh(path)
             source = path if plain is None else io.BytesIO(plain)
             resolver = trimesh.resolvers.FilePathResolver(str(path))
             scene = trimesh.load_scene(source, path.suffix.lower()[1:], resolver, process=False)
-            _expect_sound(scene)
+            _check_scene(scene)
     except AvmsfError as error:
         raise raising(f"{path}: {error}", file=path, row=error.row, name=error.name, value=error.value) from error
     except Exception as error:  # trimesh's readers raise whatever their format's parsing raises
@@ -85,7 +87,7 @@ def load_parts(path: Path) -> list[Any]:
     return list(scene.dump())
 
 
-def _expect_small(path: Path) -> None:
+def _check_size(path: Path) -> None:
     """Raise CaptureError where the file's own counts are beyond the bounds, before anything is built."""
     suffix = path.suffix.lower()
     if not path.is_file():
@@ -104,89 +106,33 @@ def _expect_small(path: Path) -> None:
         raise CaptureError(
             f"expected at most {most:,} bytes, got {size:,}; reduce the mesh{advice}", name="bytes", value=size
         )
-    if suffix == ".obj":
-        _expect_small_obj(path)
-    elif suffix in (".glb", ".gltf"):
-        _expect_small_gltf(read_json(path, max_bytes=MAX_GLTF_BYTES) if suffix == ".gltf" else _glb_record(path))
+    if suffix == ".gltf":
+        _check_gltf(read_json(path, max_bytes=MAX_GLTF_BYTES))
 
 
-def _expect_small_obj(path: Path) -> None:
-    faces = changes = corners = 0
-    materials: set[bytes] = set()
-    with open(path, "rb") as file:
-        for line in file:
-            # A line that ends in a backslash goes on in the next.
-            if line.startswith((b"f ", b"f\t")) or corners:
-                corners += len(line.split()) - 1
-                if not line.rstrip(b"\r\n").endswith(b"\\"):
-                    _expect_at_most(MAX_CORNERS, corners, "corners of a face")
-                    faces, corners = faces + max(corners - 2, 0), 0
-            elif line.startswith(b"usemtl"):
-                # Faces of one material become one part, however often the file goes back to it.
-                materials.add(line[6:].strip())
-                changes += 1
-                _expect_at_most(MAX_PARTS, len(materials), "materials")
-    _expect_at_most(MAX_FACES, faces, "triangles")
-    _expect_at_most(MAX_FACES, changes, "changes of the material")
-
-
-def _glb_record(path: Path) -> Any:
-    """Return the JSON at the beginning of a binary glTF."""
-    with open(path, "rb") as file:
-        magic, _, _, length, kind = struct.unpack("<4sII I4s", file.read(20))
-        if magic != b"glTF" or kind != b"JSON":
-            raise CaptureError(f"expected a binary glTF, got a file that begins with {magic!r}", value=magic)
-        return parse_json(file.read(min(length, MAX_BYTES)).decode("utf-8"))
-
-
-def _expect_small_gltf(record: Any) -> None:
-    def entries(values: Any, name: str) -> list[dict[str, Any]]:
-        found = values.get(name, []) if isinstance(values, dict) else []
-        return [each for each in found if isinstance(each, dict)] if isinstance(found, list) else []
-
-    expect_uncompressed(record)
-    primitives = [len(entries(mesh, "primitives")) for mesh in entries(record, "meshes")]
-    used = [node["mesh"] for node in entries(record, "nodes") if isinstance(node.get("mesh"), int)]
-    _expect_at_most(MAX_PARTS, len(entries(record, "nodes")), "nodes")
-    _expect_at_most(MAX_PARTS, sum(primitives), "primitives")
-    _expect_at_most(MAX_PARTS, sum(primitives[row] for row in used if 0 <= row < len(primitives)), "parts")
-    values = 0
-    for row, each in enumerate(entries(record, "accessors")):
-        count = each.get("count")
-        if not isinstance(count, int) or count < 0:
-            raise CaptureError(
-                f"expected a whole number as the count of accessor {row}, got {count!r}; export it again",
-                row=row,
-                name="count",
-                value=count,
-            )
-        values += count
-    _expect_at_most(_MAX_VALUES, values, "values")
-
-
-def _expect_at_most(most: int, found: int, what: str) -> None:
+def _check_at_most(most: int, found: int, what: str) -> None:
     if found > most:
         raise CaptureError(f"expected at most {most:,} {what}, got {found:,}; reduce the mesh", name=what, value=found)
 
 
-def _expect_sound(scene: trimesh.Scene) -> None:
+def _check_scene(scene: trimesh.Scene) -> None:
     """Raise CaptureError for too many faces, indices that do not exist, and coordinates not finite or too large."""
     names = [scene.graph[node][1] for node in scene.graph.nodes_geometry]
-    _expect_at_most(MAX_PARTS, len(names), "parts")
-    _expect_at_most(MAX_FACES, sum(len(getattr(scene.geometry[name], "faces", ())) for name in names), "triangles")
+    _check_at_most(MAX_PARTS, len(names), "parts")
+    _check_at_most(MAX_FACES, sum(len(getattr(scene.geometry[name], "faces", ())) for name in names), "triangles")
     for geometry in scene.geometry.values():
         vertices = np.asarray(getattr(geometry, "vertices", np.zeros((0, 3))), dtype=np.float64)
-        _expect_at_most(3 * MAX_FACES, len(vertices), "vertices")
+        _check_at_most(3 * MAX_FACES, len(vertices), "vertices")
         if vertices.shape[1:] != (3,):
             raise CaptureError(
                 f"expected vertices of three coordinates, got {vertices.shape[1]}; export it again",
                 name="vertices",
                 value=list(vertices.shape),
             )
-        expect_finite_vertices(vertices)
-        expect_corners(np.asarray(getattr(geometry, "faces", np.zeros((0, 3))), dtype=np.int64), len(vertices))
+        check_finite_vertices(vertices)
+        check_corners(np.asarray(getattr(geometry, "faces", np.zeros((0, 3))), dtype=np.int64), len(vertices))
     pixels = sum(image.width * image.height for geometry in scene.geometry.values() for image in _textures(geometry))
-    _expect_at_most(MAX_TEXTURE_PIXELS, pixels, "pixels in its textures")
+    _check_at_most(MAX_TEXTURE_PIXELS, pixels, "pixels in its textures")
     farthest = 0.0 if scene.bounds is None else float(np.abs(scene.bounds).max())
     if not farthest <= MAX_COORDINATE:
         raise CaptureError(
@@ -204,7 +150,7 @@ def _textures(geometry: Any) -> list[Image.Image]:
     return [each for each in named.values() if isinstance(each, Image.Image)]
 
 
-def expect_finite_vertices(vertices: np.ndarray) -> None:
+def check_finite_vertices(vertices: np.ndarray) -> None:
     """Raise CaptureError for vertices [points, 3] that are not finite, with the first of them."""
     unfit = ~np.isfinite(vertices).all(axis=1)
     if unfit.any():
@@ -218,7 +164,7 @@ def expect_finite_vertices(vertices: np.ndarray) -> None:
         )
 
 
-def expect_corners(faces: np.ndarray, vertices: int) -> None:
+def check_corners(faces: np.ndarray, vertices: int) -> None:
     """Raise CaptureError where corners of faces [faces, 3] are not indices of this number of vertices."""
     for corner in () if not faces.size else (int(faces.min()), int(faces.max())):
         if not 0 <= corner < vertices:
@@ -228,3 +174,87 @@ def expect_corners(faces: np.ndarray, vertices: int) -> None:
                 name="faces",
                 value=corner,
             )
+
+
+def _plain_mesh(path: Path) -> bytes | None:
+    """Return the rewritten content of an OBJ or GLB file; None where the file is plain already, or of another kind."""
+    suffix = path.suffix.lower()
+    if suffix == ".obj":
+        content = path.read_bytes()
+        return _plain_obj(content) if _UNUSUAL.search(content) else None
+    return _plain_glb(path.read_bytes()) if suffix == ".glb" else None
+
+
+def _plain_obj(content: bytes) -> bytes:
+    """Return an OBJ file with single spaces, without a byte-order mark, and with indices counted from the first."""
+    counts, lines = {b"v": 0, b"vt": 0, b"vn": 0}, []
+    content = content.removeprefix(b"\xef\xbb\xbf").replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
+    for line in content.splitlines():
+        words = line.partition(b"#")[0].split()
+        if words and words[0] in counts:
+            counts[words[0]] += 1
+        elif words and words[0] == b"f":
+            words[1:] = [_counted(word, tuple(counts.values())) if b"-" in word else word for word in words[1:]]
+        else:
+            words = [line]
+        lines.append(b" ".join(words))
+    return b"\n".join(lines)
+
+
+def _counted(corner: bytes, counts: tuple[int, ...]) -> bytes:
+    """Return one corner of a face, such as -3/-3, with indices from 1; negative ones count back from the last."""
+    found = []
+    for index, count in zip(corner.split(b"/"), counts, strict=False):
+        if index.startswith(b"-") and count + int(index) < 0:
+            raise CaptureError.expected(f"an index from -{count} to -1", int(index), name="f")
+        found.append(b"%d" % (count + 1 + int(index)) if index.startswith(b"-") else index)
+    return b"/".join(found)
+
+
+def _check_gltf(record: Any) -> None:
+    """Raise CaptureError for the JSON of a glTF that is compressed, or whose arrays or nodes are beyond the bounds."""
+    for name in record.get("extensionsRequired", ()):
+        if name in _COMPRESSED:
+            raise CaptureError(
+                f"expected a mesh without compression, got one compressed by {_COMPRESSED[name]}; export it without",
+                name="extensionsRequired",
+                value=name,
+            )
+    _check_at_most(MAX_PARTS, len(record.get("nodes", ())), "nodes")
+    # Four vectors (position, normal, color, texture) for each corner; an array without a buffer is zeros in memory.
+    _check_at_most(12 * MAX_FACES, sum(each["count"] for each in record.get("accessors", ())), "values")
+
+
+def _normalized(record: Any) -> list[dict[str, Any]]:
+    """Return the accessors of positions, normals and texture coordinates whose integers stand for -1 to 1."""
+    primitives = [each for mesh in record.get("meshes", ()) for each in mesh["primitives"]]
+    used = {row for each in primitives for name, row in each["attributes"].items() if not name.startswith("COLOR")}
+    chosen = (record["accessors"][row] for row in sorted(used))
+    return [each for each in chosen if each.get("normalized") and each["componentType"] in _INTEGERS]
+
+
+def _plain_glb(content: bytes) -> bytes | None:
+    """Return a binary glTF with normalized integers (KHR_mesh_quantization) as floats; None where it has none."""
+    start = 20 + struct.unpack_from("<I", content, 12)[0]
+    record = parse_json(content[20:start].decode("utf-8"))
+    body = content[start + 8 : start + 8 + struct.unpack_from("<I", content, start)[0]] if len(content) > start else b""
+    _check_gltf(record)
+    chosen = _normalized(record)
+    for each in chosen:
+        kind, width = np.dtype(_INTEGERS[each["componentType"]]), _WIDTHS[each["type"]]
+        view = record["bufferViews"][each["bufferView"]]
+        strides = view.get("byteStride", width * kind.itemsize), kind.itemsize
+        offset = view.get("byteOffset", 0) + each.get("byteOffset", 0)
+        values = np.ndarray((each["count"], width), kind, body, offset, strides) / np.iinfo(kind).max
+        floats = np.maximum(values, -1.0).astype("<f4").tobytes()
+        body += bytes(-len(body) % 4)
+        each.update(bufferView=len(record["bufferViews"]), byteOffset=0, componentType=_FLOAT32, normalized=False)
+        record["bufferViews"].append({"buffer": 0, "byteOffset": len(body), "byteLength": len(floats)})
+        body += floats
+    if not chosen:
+        return None
+    record["buffers"][0]["byteLength"] = len(body)
+    text = json.dumps(record).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(body), b"BIN\0") + body
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks

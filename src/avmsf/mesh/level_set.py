@@ -1,13 +1,14 @@
-"""From values on a grid to the closed surface of what they enclose, drawn and thinned by libraries."""
+"""Closed surfaces by libraries: of what values on a grid enclose, thinned, and of the difference of two."""
 
 import fast_simplification
+import manifold3d
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, SceneError
 from avmsf.mesh.surface import Surface
 
 _SPECK = 0.02
@@ -88,3 +89,25 @@ def _closed(triangles: Int[np.ndarray, "faces 3"]) -> bool:
     edges = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     once = np.unique(edges, axis=0)
     return len(once) == len(edges) and bool(np.array_equal(once, np.unique(edges[:, ::-1], axis=0)))
+
+
+def difference(surface: Surface, cut: Surface) -> Surface:
+    """Return the largest connected part of what `surface` encloses and `cut` does not, as a closed surface.
+
+    It has no triangles where nothing is left. Raises SceneError for surfaces that are not closed.
+    """
+    left = _manifold(surface) - _manifold(cut)
+    if left.status() != manifold3d.Error.NoError:
+        raise SceneError(
+            f"expected two closed surfaces, got {left.status().name}; make the shape on finer cells",
+            name="surface",
+            value=left.status().name,
+        )
+    mesh = max(left.decompose(), key=lambda part: float(part.volume()), default=left).to_mesh()
+    vertices, faces = np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts)
+    return Surface(torch.from_numpy(vertices).float(), torch.from_numpy(faces).long())
+
+
+def _manifold(surface: Surface) -> manifold3d.Manifold:
+    vertices, faces = surface.vertices.numpy().astype(np.float32), surface.faces.numpy().astype(np.uint32)
+    return manifold3d.Manifold(manifold3d.Mesh(vert_properties=vertices, tri_verts=faces))

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from avmsf.errors import CaptureError, Remark
-from avmsf.mesh.io import expect_corners, expect_finite_vertices, load_parts
+from avmsf.mesh.io import check_corners, check_finite_vertices, load_parts
 from avmsf.mesh.surface import Surface
 
 GRAY = 0.7
@@ -67,7 +67,7 @@ class TexturedMesh:
         texture. Raises CaptureError for coordinates that are not numbers, for faces that name vertices which are not
         there, and for a mesh without a face that has an area.
         """
-        _expect_mesh(vertices, faces)
+        _check_mesh(vertices, faces)
         used, rows = np.unique(vertices.numpy()[faces.numpy().ravel()], axis=0, return_inverse=True)
         welded = rows.reshape(-1, 3)
         textured = bool(textures)
@@ -227,13 +227,13 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.where(length > 0, length, 1.0)
 
 
-def _expect_mesh(vertices: Tensor, faces: Tensor) -> None:
+def _check_mesh(vertices: Tensor, faces: Tensor) -> None:
     if not len(faces):
         raise CaptureError(
             f"expected a mesh with triangles to render, got {len(vertices)} points without any", name="faces", value=0
         )
-    expect_finite_vertices(vertices.numpy())
-    expect_corners(faces.numpy(), len(vertices))
+    check_finite_vertices(vertices.numpy())
+    check_corners(faces.numpy(), len(vertices))
     corners = vertices.double()[faces]
     doubled = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     if not bool((doubled != 0).any()):

@@ -9,8 +9,7 @@ from jaxtyping import Bool, Float32, Int
 from scipy import ndimage
 
 from avmsf.errors import CaptureError, SceneError
-from avmsf.mesh.boolean import difference
-from avmsf.mesh.level_set import enclose
+from avmsf.mesh.level_set import difference, enclose
 from avmsf.mesh.surface import Surface
 from avmsf.reconstruction.distance import distance_from
 from avmsf.reconstruction.grid import Grid
