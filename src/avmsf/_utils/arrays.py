@@ -24,9 +24,9 @@ def as_vectors(values: ArrayLike, name: str, *, count: int | None = None) -> Flo
     found = as_floats(values, name)
     rows = "rows" if count is None else str(count)
     if found.ndim != 2 or found.shape[1] != 3 or (count is not None and len(found) != count):
-        single = f"; put a single one into a list, {name}=[[x, y, z]]" if found.shape == (3,) else ""
+        single = f"put a single one into a list, {name}=[[x, y, z]]" if found.shape == (3,) else ""
         shape = list(found.shape)
-        raise ArrayError(f"{name}: expected an array [{rows}, 3], got {shape}{single}", name=name, value=shape)
+        raise ArrayError.expected(f"an array [{rows}, 3]", shape, name=name, advice=single)
     return _finite(found, name)
 
 
@@ -51,8 +51,7 @@ def as_numbers(values: float | int | ArrayLike, name: str, *, count: int) -> Flo
     """Return `count` numbers, or one that holds for all, as a tensor of `count`. Raises as `as_vectors`."""
     found = as_floats(values, name)
     if found.ndim > 1 or (found.ndim == 1 and len(found) != count):
-        shape = list(found.shape)
-        raise ArrayError(f"{name}: expected one number or {count}, got shape {shape}", name=name, value=shape)
+        raise ArrayError.expected(f"one number or {count}", list(found.shape), name=name)
     return _finite(found.expand(count), name)
 
 
@@ -60,8 +59,7 @@ def as_rows(values: ArrayLike, name: str, *, count: int) -> Float[Tensor, "rows 
     """Return `count` rows of numbers. Raises as `as_vectors`."""
     found = as_floats(values, name)
     if found.ndim != 2 or len(found) != count:
-        shape = list(found.shape)
-        raise ArrayError(f"{name}: expected an array of {count} rows, got shape {shape}", name=name, value=shape)
+        raise ArrayError.expected(f"an array of {count} rows", list(found.shape), name=name)
     return _finite(found, name)
 
 
@@ -75,7 +73,7 @@ def as_floats(values: float | int | ArrayLike, name: str) -> Float[Tensor, "*sha
             "numbers in an array or nested lists of equal lengths", type(values).__name__, got=got, name=name
         ) from error
     if found.is_complex():
-        raise ArrayError(f"{name}: expected real numbers, got {found.dtype}", name=name, value=str(found.dtype))
+        raise ArrayError.expected("real numbers", str(found.dtype), name=name)
     kept = isinstance(values, Tensor) and found.is_floating_point()
     return found.detach().cpu() if kept else found.detach().cpu().double()
 
@@ -83,7 +81,7 @@ def as_floats(values: float | int | ArrayLike, name: str) -> Float[Tensor, "*sha
 def as_rate(value: float | int, name: str = "sample_rate") -> float:
     """Return a sample rate, Hz. Raises ArrayError for what is no number above 0."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not 0.0 < float(value) < math.inf:
-        raise ArrayError(f"{name}: expected a number above 0, in hertz, got {value!r}", name=name, value=value)
+        raise ArrayError.expected("a number above 0, in hertz", value, name=name)
     return float(value)
 
 
@@ -91,7 +89,7 @@ def _finite(found: Tensor, name: str) -> Tensor:
     wrong = torch.nonzero(~torch.isfinite(found))
     if len(wrong):
         row, value = int(wrong[0, 0]), float(found[tuple(wrong[0].tolist())])
-        raise ArrayError(f"{name}, row {row}: expected finite numbers, got {value}", name=name, row=row, value=value)
+        raise ArrayError.expected("finite numbers", value, name=name, row=row)
     return found
 
 

@@ -22,13 +22,9 @@ def read_header_text(path: Path, key: str, *, what: str, advice: str, raising: t
     except (OSError, ValueError) as error:
         raise unreadable(path, what=what, advice=advice, raising=raising) from error
     if key not in metadata:
-        raise raising(
-            f"{path}: expected {what} with the metadata entry {key!r}, got another safetensors file; name another, or "
-            f"{advice}",
-            file=path,
-            name=key,
-            value=sorted(metadata),
-        )
+        wanted, got = f"{what} with the metadata entry {key!r}", "another safetensors file"
+        advice = f"name another, or {advice}"
+        raise raising.expected(wanted, sorted(metadata), got=got, file=path, name=key, advice=advice)
     return metadata[key]
 
 

@@ -56,15 +56,12 @@ def read_checkpoint(
         other = sorted(name for name in identity.keys() | found.keys() if identity.get(name) != found.get(name))
     # torch.load raises whatever unpacking raises, with the advice to trust the file.
     except Exception as error:
-        raise raising(
-            f"{path}: expected a checkpoint of {what}, got another or a damaged file; delete it or name another",
-            file=path,
+        advice = "delete it or name another"
+        raise raising.expected(
+            f"a checkpoint of {what}", got="another or a damaged file", file=path, advice=advice
         ) from error
     if other:
-        raise raising(
-            f"{path}: expected a checkpoint of {what} with the same {' and '.join(other)}, got another; delete it to "
-            "start again, or repeat its arguments to continue it",
-            file=path,
-            value=other,
-        )
+        wanted = f"a checkpoint of {what} with the same {' and '.join(other)}"
+        advice = "delete it to start again, or repeat its arguments to continue it"
+        raise raising.expected(wanted, other, got="another", file=path, advice=advice)
     return dict(state)
