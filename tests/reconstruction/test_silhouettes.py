@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from avmsf.reconstruction.grid import Grid
-from avmsf.reconstruction.silhouettes import Outline, hull_distance
+from avmsf.reconstruction.visual_hull import Grid, Outline, hull_distance
 from factories.looked_at import ball, views_of
 
 RADIUS = 0.05

@@ -4,8 +4,7 @@ import trimesh
 
 from avmsf.mesh.level_set import enclose
 from avmsf.reconstruction.fairing import drawn_taut
-from avmsf.reconstruction.grid import Grid
-from avmsf.reconstruction.silhouettes import Outline, hull_distance
+from avmsf.reconstruction.visual_hull import Grid, Outline, hull_distance
 from factories.looked_at import ball, mesh_of, views_of
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from avmsf._utils.compiled import compiled, lane_count, run_lanes
-from avmsf.reconstruction.grid import Grid
+from avmsf.reconstruction.visual_hull import Grid
 
 _BINS = 32
 

@@ -14,9 +14,8 @@ import scipy.sparse.linalg
 from jaxtyping import Bool, Float32, Float64, Int
 from scipy import ndimage
 
-from avmsf.reconstruction.grid import Grid
 from avmsf.reconstruction.object_shape import closed_surface
-from avmsf.reconstruction.silhouettes import Outline
+from avmsf.reconstruction.visual_hull import Grid, Outline
 
 _ROUND = 0.015
 """Standard deviation of the Gaussian blur of the hull that measures how bent its surface is, over the diagonal."""

@@ -9,9 +9,8 @@ from jaxtyping import Bool, Float32
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import View
 from avmsf.photographs.mesh_views import MeshTracer
-from avmsf.reconstruction.grid import Grid
 from avmsf.reconstruction.object_shape import closed_surface
-from avmsf.reconstruction.silhouettes import Outline, hull_distance
+from avmsf.reconstruction.visual_hull import Grid, Outline, hull_distance
 
 DISSENT = 0.05
 """Part of the masks that may be wrong."""

@@ -12,7 +12,7 @@ from avmsf.errors import CaptureError, SceneError
 from avmsf.mesh.level_set import difference, enclose
 from avmsf.mesh.surface import Surface
 from avmsf.reconstruction.distance import distance_from
-from avmsf.reconstruction.grid import Grid
+from avmsf.reconstruction.visual_hull import Grid
 
 FACES = 6000
 """Triangles at most of a body's surface: tetrahedra of 12,000 to 40,000 degrees of freedom have no more outside."""
@@ -133,31 +133,22 @@ class ObjectShape:
         a thickness that is not positive or leaves nothing of the cavity.
         """
         if not 0 < thickness < np.inf:
-            raise SceneError(f"expected a thickness above 0 m, got {thickness:g} m", name="thickness", value=thickness)
+            raise SceneError.expected("a number of meters above 0", thickness, name="thickness")
         if not self.hollow.any():
-            raise SceneError(
-                "expected an object with a cavity, got one without; use solid() or as_seen()", name="cavity"
-            )
+            raise SceneError.expected("at least one", got="none", name="cavity", advice="use solid() or as_seen()")
         empty = self._emptied(thickness)
         if empty is None:
             deepest = float(self._depth[self.hollow > 0].max())
-            raise SceneError(
-                f"expected a wall thickness below {1000 * deepest:.3g} mm, the depth of the cavity, got "
-                f"{1000 * thickness:.3g} mm",
-                name="thickness",
-                value=thickness,
-            )
+            wanted = f"a wall thickness below {deepest:.3g} m, the depth of the cavity"
+            raise SceneError.expected(wanted, thickness, name="thickness")
         # Both sides are drawn by themselves, so a wall may be thinner than a cell.
         values = np.minimum(self._signed_depth - np.float32(thickness), -empty)
         grid = Grid(self.grid.lowest - self.grid.spacing, self.grid.spacing, tuple(each + 2 for each in values.shape))
         cavity = self._enclose(np.pad(values, 1, constant_values=-self.grid.spacing), grid, faces)
         left = difference(self.solid(faces=faces), cavity)
         if not len(left.faces):
-            raise SceneError(
-                f"expected a wall that can be represented, got {1000 * thickness:.3g} mm; choose a thicker one",
-                name="thickness",
-                value=thickness,
-            )
+            wanted = "a wall thickness in meters that can be represented"
+            raise SceneError.expected(wanted, thickness, name="thickness", advice="choose a thicker one")
         return left
 
     @cached_property
@@ -248,8 +239,4 @@ def closed_surface(values: Float32[np.ndarray, "x y z"], grid: Grid, faces: int 
     try:
         return enclose(values, 0.0, lowest=grid.lowest, spacing=grid.spacing, faces=faces)
     except CaptureError as error:
-        raise SceneError(
-            f"expected a shape with an inside, got none on a grid of {grid.shape}: {error}",
-            name=error.name,
-            value=error.value,
-        ) from error
+        raise SceneError(f"expected a shape with an inside: {error}", name=error.name, value=error.value) from error

@@ -13,13 +13,11 @@ from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.extent import masked_views, no_common_point, object_extent
 from avmsf.photographs.mesh_views import MeshTracer
-from avmsf.reconstruction.convex_hull import depth_in_convex_hull
 from avmsf.reconstruction.depth_fusion import SeenDepth, fused_depth
 from avmsf.reconstruction.fairing import drawn_taut
-from avmsf.reconstruction.grid import Grid
 from avmsf.reconstruction.mask_consistency import DISSENT, agreeing, edge_offset
 from avmsf.reconstruction.object_shape import ObjectShape, ShapeReport, closed_surface
-from avmsf.reconstruction.silhouettes import Outline, hull_distance
+from avmsf.reconstruction.visual_hull import Grid, Outline, depth_in_convex_hull, hull_distance
 
 DepthMap = Callable[[Camera], Float[Tensor, "height width"]]
 """What gives the depth of the first surface that each pixel of a camera sees, meters along the axis; 0 where none."""
@@ -65,7 +63,7 @@ def object_surface(views: Sequence[View], depth_map: DepthMap, *, cells: int = 1
     common, and where views do not bound the object: an image cuts it, or all are from one side.
     """
     if cells < 16:
-        raise SceneError(f"cells: expected 16 or more, got {cells}", name="cells", value=cells)
+        raise SceneError.expected("16 or more", cells, name="cells")
     masked = masked_views(views)
     outlines = [Outline.of(view) for view in masked]
     offset = edge_offset(masked, outlines)
@@ -119,11 +117,12 @@ def _rough(
         if not any(solid.take(end, axis=axis).any() for axis in range(3) for end in (0, -1)):
             return _box(solid, grid, len(views))
         reach *= 1.5
-    raise SceneError(
-        f"expected views from several sides, whose masks bound the object, got {len(views)} whose masks leave it open "
-        f"{reach / 1.5:.3g} m from its middle; add views of the complete object from other sides",
+    raise SceneError.expected(
+        "views from several sides, whose masks bound the object",
+        len(views),
+        got=f"{len(views)} whose masks leave it open {reach / 1.5:.3g} m from its middle",
         name="views",
-        value=len(views),
+        advice="add views of the complete object from other sides",
     )
 
 
@@ -218,11 +217,8 @@ def _closed(
     rows = np.rint((places - grid.lowest) / grid.spacing).astype(int)
     known = ndimage.maximum_filter(sights, 3)[tuple(rows.T)] >= 1
     if int(known.sum()) < 4:
-        raise SceneError(
-            "expected views with a surface in their masks, got none; check that depth and views are of one object",
-            name="views",
-            value=0,
-        )
+        advice = "check that depth and views are of one object"
+        raise SceneError.expected("a surface in their masks", 0, got="none", name="views", advice=advice)
     near = hull > -2 * grid.spacing
     bound = hull.copy()
     inside = depth_in_convex_hull(places[known], grid, np.argwhere(near))

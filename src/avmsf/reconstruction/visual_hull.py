@@ -1,4 +1,4 @@
-"""The visual hull as a signed distance: how far inside the outlines of all masks each place lies."""
+"""Signed distances on a grid of cells: how far inside the outlines of all masks, or a convex hull, each place lies."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,17 +6,60 @@ from typing import no_type_check
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32, Float64, Int
+from scipy.spatial import ConvexHull, QhullError
 
 from avmsf._utils.compiled import compiled, lane_count, run_lanes
+from avmsf.errors import SceneError
 from avmsf.photographs.cameras import View
-from avmsf.reconstruction.grid import Grid
 
-_FINER = 3
+_SUBPIXELS = 3
 """Times as many pixels across in which the distance to an outline is measured. It must be odd."""
 
-_FAR = np.float32(1e6)
+_OUTSIDE_M = np.float32(1e6)
 """Meters outside, of what is not known to be inside."""
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Cells of equal edges; values belong to the middles of cells."""
+
+    lowest: Float64[np.ndarray, " 3"]
+    """Middle of the first cell, object frame, meters."""
+    spacing: float
+    """Edge of a cell, meters."""
+    shape: tuple[int, int, int]
+    """Cells along x, y and z."""
+
+    @classmethod
+    def around(
+        cls, low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"], *, cells: int, finest: float, margin: int
+    ) -> "Grid":
+        """Return a grid of `cells` along the longest side of a box, and `margin` cells more on each side.
+
+        A box that fills less than half of its cube has finer cells, at most `finest` times as fine, as many as half
+        the cube would have: slender objects are thin.
+        """
+        extent = high - low
+        filled = float(np.prod(extent / extent.max()))
+        spacing = float(extent.max()) / cells * min(max((2.0 * filled) ** (1 / 3), 1 / finest), 1.0)
+        counts = np.ceil(extent / spacing).astype(int) + 2 * margin + 1
+        middle = (low + high) / 2
+        return cls(middle - spacing * (counts - 1) / 2, spacing, (int(counts[0]), int(counts[1]), int(counts[2])))
+
+    @property
+    def diagonal(self) -> float:
+        """Diagonal of the box of all cells, meters."""
+        return self.spacing * float(np.linalg.norm(self.shape))
+
+    def places(self, rows: Int[np.ndarray, "*cells 3"]) -> Float64[np.ndarray, "*cells 3"]:
+        """Return the middles of cells given by their indices, meters."""
+        return self.lowest + self.spacing * rows
+
+    def coarser(self, factor: int) -> "Grid":
+        """Return a grid that covers this one with cells `factor` times as wide; both have the same first middle."""
+        counts = [-(-(count - 1) // factor) + 1 for count in self.shape]
+        return Grid(self.lowest, self.spacing * factor, (counts[0], counts[1], counts[2]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,16 +89,16 @@ class Outline:
 def _inside(mask: np.ndarray) -> Float32[np.ndarray, "height width"]:
     """Return the signed distance of each pixel's middle from the outline, pixels."""
     height, width = mask.shape
-    fine = cv2.resize(mask, (width * _FINER, height * _FINER), interpolation=cv2.INTER_LINEAR) > 127
+    fine = cv2.resize(mask, (width * _SUBPIXELS, height * _SUBPIXELS), interpolation=cv2.INTER_LINEAR) > 127
     if fine.all() or not fine.any():
         return np.full(mask.shape, float(max(mask.shape)) * (1.0 if fine.all() else -1.0), dtype=np.float32)
     solid = fine.astype(np.uint8)
     within = cv2.distanceTransform(solid, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     beyond = cv2.distanceTransform(1 - solid, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     # Each counts to the middle of the first pixel of the other side, half a pixel beyond the outline.
-    signed = np.where(fine, within - 0.5, 0.5 - beyond) / _FINER
-    middle = _FINER // 2
-    return np.ascontiguousarray(signed[middle::_FINER, middle::_FINER], dtype=np.float32)
+    signed = np.where(fine, within - 0.5, 0.5 - beyond) / _SUBPIXELS
+    middle = _SUBPIXELS // 2
+    return np.ascontiguousarray(signed[middle::_SUBPIXELS, middle::_SUBPIXELS], dtype=np.float32)
 
 
 def hull_distance(
@@ -71,22 +114,12 @@ def hull_distance(
     least = np.full((len(rows), rank + 1), np.inf, dtype=np.float32)
     seen = np.zeros(len(rows), dtype=np.uint16)
     for each in outlines:
-        run_lanes(
-            _measure,
-            lane_count(),
-            each.projection,
-            each.inside,
-            each.focal,
-            grid.lowest,
-            grid.spacing,
-            rows,
-            least,
-            seen,
-        )
+        outline = each.projection, each.inside, each.focal
+        run_lanes(_measure, lane_count(), *outline, grid.lowest, grid.spacing, rows, least, seen)
     # Of what few views have in their image nothing is known, and the object is in most of them.
     known = np.isfinite(least[:, rank]) & (seen >= 0.5 * seen.max(initial=0))
-    distance = np.full(grid.shape, -_FAR, dtype=np.float32)
-    distance[tuple(rows.T)] = np.where(known, least[:, rank], -_FAR)
+    distance = np.full(grid.shape, -_OUTSIDE_M, dtype=np.float32)
+    distance[tuple(rows.T)] = np.where(known, least[:, rank], -_OUTSIDE_M)
     return distance
 
 
@@ -117,3 +150,37 @@ def _measure(lane, lanes, projection, inside, focal, lowest, spacing, rows, leas
         for place in range(kept):
             if value < least[cell, place]:
                 value, least[cell, place] = least[cell, place], value
+
+
+def depth_in_convex_hull(
+    points: Float64[np.ndarray, "points 3"], grid: Grid, rows: Int[np.ndarray, "cells 3"]
+) -> Float32[np.ndarray, " cells"]:
+    """Return how far inside the convex hull of points the middles of cells lie, meters, negative outside.
+
+    Raises SceneError for points in one plane.
+    """
+    try:
+        planes = ConvexHull(points).equations
+    except QhullError as error:
+        raise SceneError.expected(
+            "points that span a volume", len(points), got=f"{len(points)} in one plane", name="points"
+        ) from error
+    # Triangles of one flat face share their plane.
+    planes = np.unique(np.round(planes, 6), axis=0)
+    result = np.full(len(rows), np.inf, dtype=np.float32)
+    run_lanes(_depth_below_planes, lane_count(), planes, grid.lowest, grid.spacing, rows, result)
+    return result
+
+
+@compiled(error_model="numpy")
+@no_type_check
+def _depth_below_planes(lane, lanes, planes, lowest, spacing, rows, result):
+    count = rows.shape[0]
+    for cell in range(lane * count // lanes, (lane + 1) * count // lanes):
+        x = lowest[0] + spacing * rows[cell, 0]
+        y = lowest[1] + spacing * rows[cell, 1]
+        z = lowest[2] + spacing * rows[cell, 2]
+        least = np.inf
+        for plane in range(planes.shape[0]):
+            least = min(least, -(planes[plane, 0] * x + planes[plane, 1] * y + planes[plane, 2] * z + planes[plane, 3]))
+        result[cell] = least
