@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from avmsf.errors import SceneError
-from avmsf.features.feature_field import FeatureField
-from avmsf.features.pca import reduce, resize, with_positions
+from avmsf.features.feature_field import FeatureField, reduce, resize, with_positions
 from factories.raising import raises
 
 

@@ -19,7 +19,7 @@ MODELS: Final = tuple(
 """Names under which the hub has them; small, base and large give 384, 768 and 1024 features."""
 IMAGENET_MEAN: Final = (0.485, 0.456, 0.406)
 IMAGENET_DEVIATION: Final = (0.229, 0.224, 0.225)
-_CONFIG, _WEIGHTS, _PREPROCESSOR = "config.json", "model.safetensors", "preprocessor_config.json"
+_FILES = _CONFIG, _WEIGHTS, _PREPROCESSOR = "config.json", "model.safetensors", "preprocessor_config.json"
 
 
 class DinoEncoder:
@@ -63,7 +63,7 @@ class DinoEncoder:
         rounds the factors of the first layer to TF32. Raises SceneError where transformers is missing, where the model
         is neither here nor to be downloaded, and for a folder that holds another model or a part of one.
         """
-        folder, name = _find(source)
+        folder, name = _model_folder(source)
         model = _load_model(folder, torch.device(device))
         mean, deviation = _constants(folder / _PREPROCESSOR)
         return cls(model, name=name, longest=longest, mean=mean, deviation=deviation)
@@ -106,54 +106,46 @@ def _interpolation(length: int, patch: int) -> Float[Tensor, "cells patches"]:
     return (1 - (places[:, None] - torch.arange(count)).abs()).clamp(min=0.0)
 
 
-def _find(source: str | Path) -> tuple[Path, str]:
-    """Return the folder that holds a model, and the name of its features."""
-    folder = Path(source).expanduser()
+def _model_folder(source: str | Path) -> tuple[Path, str]:
+    """Return the folder that holds a model, downloaded where that is needed, and the name of its features."""
+    folder, name = Path(source).expanduser(), str(source)
     if folder.is_dir():
         return folder, f"DINOv2 from the folder {folder.resolve().name}"
-    name = str(source)
     if name not in MODELS:
-        raise SceneError(
-            f"{name}: expected a folder with {_CONFIG} and {_WEIGHTS}, or one of {', '.join(MODELS)}, got no such "
-            "folder; check the path",
-            file=folder,
+        raise SceneError.expected(
+            f"a folder with {_CONFIG} and {_WEIGHTS}, or one of {', '.join(MODELS)}",
+            name,
+            got="no such folder",
             name="encoder",
-            value=name,
+            file=folder,
+            advice="check the path",
         )
-    return _from_hub(name), name
-
-
-def _from_hub(name: str) -> Path:
-    """Return the folder of a model in the hub's cache, after downloading it where it is not there."""
     _transformers()
     from huggingface_hub import snapshot_download, try_to_load_from_cache
 
-    wanted = (_CONFIG, _PREPROCESSOR, _WEIGHTS)
-    cached = [try_to_load_from_cache(name, file) for file in wanted]
+    cached = [try_to_load_from_cache(name, file) for file in _FILES]
     if all(isinstance(path, str) for path in cached):
-        return Path(str(cached[0])).parent
+        return Path(str(cached[0])).parent, name
     try:
-        return Path(snapshot_download(name, allow_patterns=list(wanted), etag_timeout=HUB_SECONDS))
+        return Path(snapshot_download(name, allow_patterns=list(_FILES), etag_timeout=HUB_SECONDS)), name
     except Exception as error:  # the hub's client raises whatever the network beneath it does
-        raise SceneError(
-            f"{name}: expected its weights, got none: they could not be downloaded ({why_not(error)}); save {_CONFIG}, "
-            f"{_WEIGHTS} and {_PREPROCESSOR} from https://huggingface.co/{name}/tree/main in one FOLDER and use "
-            "--encoder FOLDER, or use --encoder descriptors, which needs no download",
+        raise SceneError.expected(
+            f"the weights of {name}",
+            name,
+            got=f"none: they could not be downloaded ({why_not(error)})",
             name="encoder",
-            value=name,
+            advice=f"save {', '.join(_FILES)} from https://huggingface.co/{name}/tree/main in one FOLDER and use "
+            "--encoder FOLDER, or use --encoder descriptors, which needs no download",
         ) from error
 
 
 def _load_model(folder: Path, device: torch.device) -> nn.Module:
     transformers = _transformers()
     lacking = [name for name in (_CONFIG, _WEIGHTS) if not (folder / name).is_file()]
+    advice = f"copy {', '.join(_FILES)} of one model such as {MODELS[0]} there"
     if lacking:
-        raise SceneError(
-            f"{folder}: expected a DINOv2 model, got no {' and no '.join(lacking)}; copy {_CONFIG}, {_WEIGHTS} and "
-            f"{_PREPROCESSOR} of a model such as {MODELS[0]} there",
-            file=folder,
-            name=lacking[0],
-        )
+        got = f"no {' and no '.join(lacking)}"
+        raise SceneError.expected("a DINOv2 model", got=got, file=folder, name=lacking[0], advice=advice)
     kind = read_settings(folder / _CONFIG, raising=SceneError).get("model_type")
     classes = {"dinov2": "Dinov2Model", "dinov2_with_registers": "Dinov2WithRegistersModel"}
     if kind not in classes:
@@ -165,20 +157,14 @@ def _load_model(folder: Path, device: torch.device) -> nn.Module:
             folder, local_files_only=True, use_safetensors=True, dtype=torch.float32, output_loading_info=True
         )
     except Exception as error:  # whatever is wrong with the file, transformers and safetensors have their own errors
-        raise SceneError(
-            f"{folder / _WEIGHTS}: expected the model's weights, got a file that cannot be loaded ({error}); copy the "
-            "model's files again",
-            file=folder / _WEIGHTS,
-        ) from error
+        got = f"a file that cannot be loaded ({error})"
+        raise SceneError.expected("the model's weights", got=got, file=folder / _WEIGHTS, advice=advice) from error
     # The mask token is for training alone. Any other weight would be left random.
     missing = sorted(name for name in report["missing_keys"] if not name.endswith("mask_token"))
     if missing:
-        raise SceneError(
-            f"{folder / _WEIGHTS}: expected all of the model's weights, {len(missing)} are missing, such as "
-            f"{missing[0]}; copy it and {_CONFIG} from the same model",
-            file=folder / _WEIGHTS,
-            name=missing[0],
-            value=len(missing),
+        got = f"{len(missing)} fewer, without {missing[0]}"
+        raise SceneError.expected(
+            "all of the model's weights", len(missing), got=got, file=folder / _WEIGHTS, name=missing[0], advice=advice
         )
     return model.to(device)
 
@@ -189,15 +175,12 @@ def _constants(path: Path) -> tuple[Sequence[float], Sequence[float]]:
         return IMAGENET_MEAN, IMAGENET_DEVIATION
     record = read_settings(path, raising=SceneError)
     found = record.get("image_mean", list(IMAGENET_MEAN)), record.get("image_std", list(IMAGENET_DEVIATION))
-    if not all(isinstance(each, list) and len(each) == 3 and all(map(_is_number, each)) for each in found):
+    numbers = [number for each in found if isinstance(each, list) and len(each) == 3 for number in each]
+    if len(numbers) != 6 or not all(isinstance(each, float | int) for each in numbers):
         raise SceneError.expected(
             "image_mean and image_std of three numbers", found, file=path, name="image_mean", advice="copy it again"
         )
     return found
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, float | int)
 
 
 def _transformers() -> Any:
@@ -205,9 +188,10 @@ def _transformers() -> Any:
         import transformers
         from transformers import Dinov2Model, Dinov2WithRegistersModel  # noqa: F401
     except (ImportError, RuntimeError) as error:  # RuntimeError: one of its own optional packages is broken
-        raise SceneError(
-            f"expected the package transformers for DINOv2, got an import error ({error}); pip install "
-            "'avmsf[vision]', or use --encoder descriptors",
+        raise SceneError.expected(
+            "the package transformers for DINOv2",
+            got=f"an import error ({error})",
             name="transformers",
+            advice="pip install 'avmsf[vision]', or use --encoder descriptors",
         ) from error
     return transformers

@@ -45,11 +45,10 @@ def unit_image(
     lowest, highest = (float(color.min()), float(color.max())) if color.numel() else (float("nan"),) * 2
     # Renderings overshoot a little; a factor of 255 is a mistake.
     if not -1.0 <= lowest <= highest <= 2.0:
-        raise SceneError(
-            f"expected an image of bytes or of numbers from 0 to 1, got {tuple(image.shape)} numbers from {lowest:g} "
-            f"to {highest:g}; divide by the largest value of a pixel",
-            name="image",
-            value=[lowest, highest],
+        got = f"{tuple(image.shape)} numbers from {lowest:g} to {highest:g}"
+        advice = "divide by the largest value of a pixel"
+        raise SceneError.expected(
+            "bytes, or numbers from 0 to 1", [lowest, highest], got=got, name="image", advice=advice
         )
     return color.clamp(0.0, 1.0)
 

@@ -1,4 +1,4 @@
-"""What is known of every point of an object's surface, for the gain field to read."""
+"""What is known of every point of an object's surface, as a gain field wants it: few numbers of about unit size."""
 
 import hashlib
 import math
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from avmsf._utils.arrays import Seed, generator_of
 from avmsf._utils.summary import short_repr
-from avmsf.errors import FitError
+from avmsf.errors import FitError, SceneError
 from avmsf.gaussians.points import cluster, lattice, nearest_points, sample_surface
 from avmsf.mesh.surface import Surface
 
@@ -110,14 +110,66 @@ class FeatureField:
         return Regions(groups.centers.float(), sums / sizes[:, None])
 
 
+def reduce(features: FeatureField, dim: int, *, whitening: float = 1.0) -> FeatureField:
+    """Return the features' first `dim` principal components, with the encoder's name followed by what was done.
+
+    `whitening` says how even they become: at 1 each has variance 1 over the points; at 0 they keep the proportions
+    that they have, the first having variance 1. A component's sign is that of its largest loading, so that the same
+    features give the same components anywhere. Fewer come out where the features vary in fewer directions. Raises
+    SceneError for features that are all equal.
+    """
+    if dim < 1:
+        raise SceneError.expected("at least 1", dim, name="dim")
+    if not 0.0 <= whitening <= 1.0:
+        raise SceneError.expected("0 to 1", whitening, name="whitening")
+    values = features.features.double()
+    values = values - values.mean(0)
+    variances, directions = torch.linalg.eigh(values.T @ values / len(values))
+    variances, directions = variances.flip(0), directions.flip(1)
+    # What is below the rounding of float32 features varies in no direction.
+    kept = min(dim, int((variances > 1e-10 * variances[0]).sum()))
+    if not float(variances[0]) > 0:
+        raise SceneError.expected(
+            "features that differ over the object",
+            len(values),
+            got=f"{len(values)} equal ones",
+            name=features.encoder,
+            advice="use another encoder, or only positions",
+        )
+    variances, directions = variances[:kept], directions[:, :kept]
+    largest = directions.gather(0, directions.abs().argmax(0, keepdim=True))
+    sizes = variances ** (whitening / 2) * variances[0] ** ((1 - whitening) / 2)
+    reduced = values @ (directions * largest.sign()) / sizes
+    return FeatureField(features.points, reduced.float(), f"{features.encoder}, {kept} components")
+
+
+def resize(features: FeatureField, size: float) -> FeatureField:
+    """Return the features times what makes their root mean square length over the points `size`.
+
+    Raises SceneError for features that are all zero.
+    """
+    length = float(features.features.double().square().sum(1).mean().sqrt())
+    if not length > 0:
+        raise SceneError.expected("features other than zero", 0.0, name=features.encoder, advice="use another encoder")
+    return FeatureField(features.points, features.features * (size / length), features.encoder)
+
+
+def with_positions(features: FeatureField) -> FeatureField:
+    """Return the features with the points' positions before them, as `FeatureField.from_points` has them.
+
+    Color alone does not distinguish a bowl's left from its right; a gain field may need to. Positions have a norm of 1
+    at most and a root mean square of about .5; `resize` gives features a comparable size.
+    """
+    positions = FeatureField.from_points(features.points).features
+    joined = torch.cat([positions, features.features.float()], dim=1)
+    return FeatureField(features.points, joined, f"{GEOMETRY} and {features.encoder}")
+
+
 def _half_diagonal(points: Float[Tensor, "points 3"]) -> float:
     return math.dist(points.amax(0).tolist(), points.amin(0).tolist()) / 2
 
 
 def _expect_extent(points: Float[Tensor, "points 3"]) -> None:
     if len(points) == 0 or not bool(torch.isfinite(points).all()) or _half_diagonal(points) == 0.0:
-        raise FitError(
-            f"expected points that span an object, got {len(points)} at one position or not finite",
-            name="points",
-            value=len(points),
-        )
+        got = f"{len(points)} at one position or not finite"
+        raise FitError.expected("points that span an object", len(points), got=got, name="points")

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from avmsf._utils.headers import MAX_HEADER_BYTES
+from avmsf._utils.headers import read_metadata
 
 KEY = "avmsf_features"
 """Entry of a file's metadata that holds the features' record."""
@@ -11,8 +11,6 @@ KEY = "avmsf_features"
 def holds_features(path: Path) -> bool:
     """Return whether the header of a file says that it holds features, and not for example a field."""
     try:
-        with path.open("rb") as file:
-            length = int.from_bytes(file.read(8), "little")
-            return f'"{KEY}"'.encode() in file.read(min(length, MAX_HEADER_BYTES))
-    except OSError:
+        return KEY in read_metadata(path)
+    except (OSError, ValueError):
         return False

@@ -80,12 +80,12 @@ def supported(lifted: Lifted, views: Sequence[View]) -> Lifted:
         held += ((depth > 0) & (places >= 0).all(1) & (places <= size).all(1)).to(held)
     kept = (lifted.seen >= (LEAST_SEEN * held).clamp_min(1.0)) & (2 * lifted.past <= lifted.seen)
     if not bool(kept.any()):
-        raise SceneError(
-            f"expected points visible in {100 * LEAST_SEEN:g} % of the views that show their position, got none of "
-            f"{len(points)} ({int((lifted.seen > 0).sum())} are visible in any); check that cameras and points are in "
-            "one frame and unit, and that the Gaussians were fitted to these views",
+        raise SceneError.expected(
+            f"points visible in {100 * LEAST_SEEN:g} % of the views that show their position",
+            0,
+            got=f"none of {len(points)} ({int((lifted.seen > 0).sum())} are visible in any)",
             name="points",
-            value=0,
+            advice="check that cameras and points are in one frame and unit, and that the Gaussians are of these views",
         )
     features = replace(lifted.features, points=points[kept], features=lifted.features.features[kept])
     return replace(
@@ -151,11 +151,8 @@ def lift_points(
     described at a time. Raises SceneError where there is nothing to lift or where no view sees any point.
     """
     if not len(points) or not len(views):
-        raise SceneError(
-            f"expected points and views to compute features from, got {len(points)} and {len(views)}",
-            name="views" if len(points) else "points",
-            value=0,
-        )
+        name = "views" if len(points) else "points"
+        raise SceneError.expected("at least one", 0, name=name)
     tally = _Tally(len(points))
     for done, view in enumerate(views, start=1):
         behind = points.new_zeros(len(points)) if reach is None else reach(view.camera)
@@ -181,12 +178,8 @@ class _Tally:
         if not self.sums.shape[1]:
             self.sums = torch.zeros(found.shape)
         if found.shape != self.sums.shape:
-            raise SceneError(
-                f"{view}: expected {self.sums.shape[1]} features as in the other views, got {found.shape[1]}; use an "
-                "encoder of one dimension",
-                name=view,
-                value=found.shape[1],
-            )
+            wanted = f"{self.sums.shape[1]} features as in the other views"
+            raise SceneError.expected(wanted, found.shape[1], name=view, advice="use an encoder of one dimension")
         self.seen += weights > 0
         self.weights += weights
         self.sums += weights[:, None] * found
@@ -196,11 +189,9 @@ class _Tally:
         """Return the means, with those of seen neighbors where there is none."""
         known = self.seen > 0
         if not bool(known.any()):
-            raise SceneError(
-                f"expected points visible in the views, got none of {len(points)}; check that points and cameras are "
-                "in one frame and in meters, and that the masks are not empty",
-                name="points",
-                value=0,
+            advice = "check that points and cameras are in one frame and in meters, and that the masks are not empty"
+            raise SceneError.expected(
+                "points visible in the views", 0, got=f"none of {len(points)}", name="points", advice=advice
             )
         means = self.sums[known] / self.weights[known][:, None]
         features = torch.zeros_like(self.sums)
@@ -226,12 +217,9 @@ def _describe(view: View, encoder: Encoder, *, inpainted: bool) -> Float[Tensor,
     color = view.color if coverage is None or not inpainted else continue_outside(view.color, coverage)
     found = encoder.describe(color)
     if found.ndim != 3 or not found.numel() or not bool(torch.isfinite(found).all()):
-        raise SceneError(
-            f"{view.name}: expected finite features [dim, rows, columns] from the encoder {encoder.name!r}, got "
-            f"{list(found.shape)}" + (" with numbers that are not finite" if found.numel() else ""),
-            name=encoder.name,
-            value=list(found.shape),
-        )
+        got = f"{list(found.shape)}" + (" with numbers that are not finite" if found.numel() else "")
+        wanted = f"finite features [dim, rows, columns] of {view.name}"
+        raise SceneError.expected(wanted, list(found.shape), got=got, name=encoder.name)
     return found.float()
 
 

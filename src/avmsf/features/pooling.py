@@ -33,7 +33,7 @@ def refine(
     iterations: int = ITERATIONS,
     angles: int = ANGLES,
     reach: float = REACH,
-    log: Callable[[str], None] | None = None,
+    log: Callable[[str], None] = lambda _: None,
 ) -> FeatureField:
     """Return the same points with features that agree between symmetric places.
 
@@ -48,8 +48,8 @@ def refine(
     """
     if iterations < 1 or angles < 1:
         name, value = ("iterations", iterations) if iterations < 1 else ("angles", angles)
-        raise SceneError(f"{name}: expected at least 1, got {value}", name=name, value=value)
-    orbits = _orbits(features.points, symmetries, angles=angles, reach=reach, log=log or _silent)
+        raise SceneError.expected("at least 1", value, name=name)
+    orbits = _orbits(features.points, symmetries, angles=angles, reach=reach, log=log)
     pools = [_pool(rows, found) for rows, found in orbits]
     values = features.features.detach().cpu().numpy()
     for _ in range(iterations):
@@ -66,11 +66,11 @@ def orbit_spread(features: FeatureField, symmetries: Symmetries, *, angles: int 
     Points in whose orbit nothing else was seen do not count. Raises SceneError without symmetries.
     """
     if not symmetries:
-        raise SceneError("expected symmetries, got none", name="symmetries", value=0)
+        raise SceneError.expected("at least one", 0, name="symmetries")
     values = features.features.detach().cpu().double()
     total = float(values.var(dim=0, correction=0).sum())
     within, counted = 0.0, 0
-    for rows, found in _orbits(features.points, symmetries, angles=angles, log=_silent):
+    for rows, found in _orbits(features.points, symmetries, angles=angles):
         members = found.sum(dim=0)
         shared = members > 1
         mean = torch.from_numpy(_pool(rows, found).astype(np.float64) @ values.numpy())
@@ -97,7 +97,7 @@ def _orbits(
     symmetries: Symmetries,
     *,
     angles: int,
-    log: Callable[[str], None],
+    log: Callable[[str], None] = lambda _: None,
     reach: float = REACH,
 ) -> list[Counterparts]:
     """Return the counterparts under every rotation, and then under every mirror plane."""
@@ -128,7 +128,3 @@ def _counterparts(
         rows.append(row.long())
         found.append(distance <= reach[row])
     return torch.stack(rows), torch.stack(found)
-
-
-def _silent(_: str) -> None:
-    return None

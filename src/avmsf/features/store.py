@@ -21,6 +21,7 @@ from avmsf.features.header import KEY
 
 FORMAT = 1
 """Number of this format; it grows with every change that older versions could not read."""
+_ADVICE = "compute the features again"
 
 
 def save_features(features: FeatureField, path: str | Path, *, report: dict[str, Any] | None = None) -> None:
@@ -41,16 +42,15 @@ def save_features(features: FeatureField, path: str | Path, *, report: dict[str,
         "sizes": {"points": features.features.shape[0], "dim": features.features.shape[1]},
         "report": report or {},
     }
-    _expect_values(tensors, path)
+    _check_finite(tensors, path)
     try:
-        words = json.dumps(record, allow_nan=False)
+        text = json.dumps(record, allow_nan=False)
     except (TypeError, ValueError) as error:
-        raise SceneError(
-            f"{path}: expected a report of finite numbers, text, lists and dicts ({error}); remove other values",
-            file=path,
-            name="report",
+        got = f"other values ({error})"
+        raise SceneError.expected(
+            "a report of finite numbers, text, lists and dicts", got=got, file=path, name="report"
         ) from error
-    content = to_bytes(tensors, {KEY: words})
+    content = to_bytes(tensors, {KEY: text})
     write_whole(path, lambda place: place.write_bytes(content), raising=SceneError)
 
 
@@ -61,34 +61,32 @@ def load_features(path: str | Path) -> FeatureField:
     are not those of its header.
     """
     path = Path(path)
-    words, tensors = _read(path)
-    record = _understand(words, path)
+    text, tensors = _read(path)
+    record = _parse_record(text, path)
     sizes = record["sizes"]
     expected = {"points": (sizes["points"], 3), "features": (sizes["points"], sizes["dim"])}
     found = {name: tuple(tensor.shape) for name, tensor in tensors.items() if tensor.dtype == torch.float32}
     if found != expected or tensors.keys() != expected.keys():
         shapes = {name: list(tensor.shape) for name, tensor in tensors.items()}
-        raise SceneError.expected(
-            f"the float32 tensors {expected}", shapes, file=path, name="tensors", advice="compute the features again"
-        )
-    _expect_values(tensors, path)
+        raise SceneError.expected(f"the float32 tensors {expected}", shapes, file=path, name="tensors", advice=_ADVICE)
+    _check_finite(tensors, path)
     return FeatureField(tensors["points"], tensors["features"], record["encoder"])
 
 
 def read_report(path: str | Path) -> dict[str, Any]:
     """Return the report that features were saved with. Raises SceneError as `load_features`."""
     path = Path(path)
-    return _understand(_read(path)[0], path)["report"]
+    return _parse_record(_read(path)[0], path)["report"]
 
 
 def _read(path: Path) -> tuple[str, dict[str, Tensor]]:
-    return read_tensors(path, KEY, what="a file of features", advice="compute the features again", raising=SceneError)
+    return read_tensors(path, KEY, what="a file of features", advice=_ADVICE, raising=SceneError)
 
 
-def _understand(words: str, path: Path) -> dict[str, Any]:
+def _parse_record(text: str, path: Path) -> dict[str, Any]:
     """Return the header's record after checking every entry of it."""
     try:
-        record = parse_json(words)
+        record = parse_json(text)
         found, writer = record["format"], record["version"]
         if found == FORMAT:
             counts = [record["sizes"][name] for name in ("points", "dim")]
@@ -96,28 +94,25 @@ def _understand(words: str, path: Path) -> dict[str, Any]:
             if not kinds or any(type(count) is not int or count < 1 for count in counts):
                 raise ValueError(f"sizes {record['sizes']}, encoder {record['encoder']!r}")
     except (ValueError, TypeError, KeyError) as error:
-        raise SceneError(
-            f"{path}: expected the header of a file of features, got a damaged one ({type(error).__name__}: {error}); "
-            "compute the features again",
-            file=path,
-            name="header",
+        got = f"a damaged one ({type(error).__name__}: {error})"
+        raise SceneError.expected(
+            "the header of a file of features", got=got, file=path, name="header", advice=_ADVICE
         ) from error
     if found != FORMAT:
-        raise SceneError(
-            f"{path}: expected features of format {FORMAT}, got format {found}, written by avmsf {writer} (this is "
-            f"avmsf {version('avmsf')}); install avmsf {writer} or newer, or compute the features again",
+        raise SceneError.expected(
+            f"features of format {FORMAT}",
+            found,
+            got=f"format {found}, written by avmsf {writer} (this is avmsf {version('avmsf')})",
             file=path,
             name="format",
-            value=found,
+            advice=f"install avmsf {writer} or newer, or {_ADVICE}",
         )
     return record
 
 
-def _expect_values(tensors: dict[str, Tensor], path: Path) -> None:
+def _check_finite(tensors: dict[str, Tensor], path: Path) -> None:
     for name, tensor in tensors.items():
         if not tensor.numel() or not bool(torch.isfinite(tensor).all()):
-            raise SceneError(
-                f"{path}: expected finite numbers as {name}, got others or none; compute the features again",
-                file=path,
-                name=name,
+            raise SceneError.expected(
+                f"finite numbers as {name}", got="others or none", file=path, name=name, advice=_ADVICE
             )

@@ -11,9 +11,8 @@ from avmsf.errors import SceneError
 from avmsf.features.descriptors import ImageDescriptors
 from avmsf.features.dino import DinoEncoder
 from avmsf.features.encoder import Encoder
-from avmsf.features.feature_field import FeatureField
+from avmsf.features.feature_field import FeatureField, reduce, resize, with_positions
 from avmsf.features.lift import Lifted, LiftProgress, by_presence, by_visibility, lift, lift_points, supported
-from avmsf.features.pca import reduce, resize, with_positions
 from avmsf.features.pooling import orbit_spread, refine
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.points import sample_surface
