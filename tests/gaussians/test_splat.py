@@ -15,7 +15,7 @@ from avmsf.gaussians.fit import SplatProgress, splat
 from avmsf.gaussians.initialize import StartPoints, photographed_colors, starting_cloud
 from avmsf.gaussians.rasterizer.cpu import NumbaRasterizer
 from avmsf.gaussians.ssim import psnr
-from avmsf.gaussians.targets import choose_backdrop, prepare_photographs
+from avmsf.gaussians.targets import choose_background, prepare_photographs
 from avmsf.photographs.cameras import View
 from factories.ball_views import MIDDLE, RADIUS, ball_color, ball_view, ball_views
 from factories.raising import raises, warns
@@ -135,7 +135,7 @@ def test_before_random_colors_the_object_alone_is_fitted() -> None:
         assert view.mask is not None
         image = torch.where(view.mask[..., None] > 127, view.image, noise)
         views.append(View(view.name, image, view.camera, view.mask))
-    assert choose_backdrop(views, QUICK).color is None
+    assert choose_background(views, QUICK) is None
     # Without the loss on the mask, the colors alone must say what is the object.
     cloud = splat(views, replace(QUICK, steps=120, mask_weight=0.0))
     assert _mean_psnr(cloud, ball_views(16)) > 24.0
@@ -146,41 +146,41 @@ def test_before_random_colors_the_object_alone_is_fitted() -> None:
         assert float(alpha[mask].mean()) > 0.95
 
 
-def test_the_backdrop_is_the_plain_color_around_the_object() -> None:
-    found = choose_backdrop(ball_views(4, background=0.6), SplatConfig()).color
+def test_the_background_is_the_plain_color_around_the_object() -> None:
+    found = choose_background(ball_views(4, background=0.6), SplatConfig())
     assert found is not None
     # 0.6 is 153 of 255.
     torch.testing.assert_close(found, torch.full((3,), 0.6), rtol=0, atol=1e-6)
-    unmasked = choose_backdrop(ball_views(4, background=0.6, masked=False), SplatConfig()).color
+    unmasked = choose_background(ball_views(4, background=0.6, masked=False), SplatConfig())
     assert unmasked is not None
     torch.testing.assert_close(unmasked, found)
-    given = choose_backdrop(ball_views(4), SplatConfig(background=(0.1, 0.2, 0.3))).color
+    given = choose_background(ball_views(4), SplatConfig(background=(0.1, 0.2, 0.3)))
     assert given is not None
     assert given.tolist() == pytest.approx([0.1, 0.2, 0.3])
     with raises(SceneError, name="background", value="random"):
-        choose_backdrop(ball_views(4, masked=False), SplatConfig(background="random"))
+        choose_background(ball_views(4, masked=False), SplatConfig(background="random"))
 
 
 def test_views_that_cannot_be_compared_are_passed_over() -> None:
     views = ball_views(6)
     empty = replace(views[0], mask=torch.zeros(64, 64, dtype=torch.uint8))
-    backdrop = choose_backdrop(views, replace(QUICK, background="random"))
+    background = choose_background(views, replace(QUICK, background="random"))
     bare = replace(views[1], mask=None)
     with warns(CaptureWarning, name="masks", value=["01.png"]):
-        kept = prepare_photographs([empty, bare, *views[2:]], backdrop, halvings=1)
+        kept = prepare_photographs([empty, bare, *views[2:]], background, halvings=1)
     assert [each.name for each in kept] == ["02.png", "03.png", "04.png", "05.png"]
     with raises(SceneError, name="views", value=2):
-        prepare_photographs(views[:2], choose_backdrop(views, QUICK), halvings=0)
+        prepare_photographs(views[:2], choose_background(views, QUICK), halvings=0)
 
 
 def test_halved_photographs_are_means_that_the_halved_camera_sees() -> None:
     view = ball_view(ball_views(3, size=65)[1].camera)
-    photograph = prepare_photographs([view] * 3, choose_backdrop([view], QUICK), halvings=2)[0]
+    photograph = prepare_photographs([view] * 3, choose_background([view], QUICK), halvings=2)[0]
     assert [(camera.width, camera.height) for camera in photograph.cameras] == [(65, 65), (32, 32), (16, 16)]
     mean = photograph.images[0].double().mean()
     assert all(float(image.double().mean() - mean) == pytest.approx(0.0, abs=1.0) for image in photograph.images)
     even = ball_view(ball_views(2)[1].camera)
-    small = prepare_photographs([even] * 3, choose_backdrop([even], QUICK), halvings=1)[0].images[1]
+    small = prepare_photographs([even] * 3, choose_background([even], QUICK), halvings=1)[0].images[1]
     blocks = even.image.reshape(32, 2, 32, 2, 3).double().mean((1, 3))
     # Rounded to a level.
     assert float((small - blocks).abs().max()) <= 0.5

@@ -1,31 +1,41 @@
 """From views to Gaussians: 3D Gaussian Splatting (Kerbl et al. 2023), in steps that a processor can afford."""
 
+import hashlib
 import importlib.util
+import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
+from avmsf._utils.device import steps_between_losses
 from avmsf._utils.state import read_checkpoint, write_checkpoint
 from avmsf.errors import AvmsfWarning, SceneError
-from avmsf.gaussians.checkpoint import fingerprint
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.config import SplatConfig
-from avmsf.gaussians.fit_run import SplatRun
+from avmsf.gaussians.densify import Density
 from avmsf.gaussians.initialize import StartPoints, photographed_colors, starting_cloud
 from avmsf.gaussians.prune import keep_object
-from avmsf.gaussians.rasterizer.protocol import Rasterizer, choose_rasterizer
-from avmsf.gaussians.ssim import psnr
-from avmsf.gaussians.targets import choose_backdrop, prepare_photographs
+from avmsf.gaussians.rasterizer.protocol import Rasterizer, Rendering, choose_rasterizer
+from avmsf.gaussians.ssim import psnr, ssim
+from avmsf.gaussians.targets import Photograph, choose_background, prepare_photographs
 from avmsf.gaussians.visual_hull import visual_hull
 from avmsf.photographs.cameras import View
 
-_TELL_EVERY = 10
+_MIN_PROGRESS_STEPS = 10
 """Least number of steps between reports of progress."""
 _CHECKPOINT_SECONDS = 30.0
+_CHECKPOINT_VERSION = 1
+_GROUPS = ("centers", "rotations", "log_scales", "logit_opacities", "colors", "shades")
+"""Parameters with a rate of their own; colors are the harmonics of degree 0, shades those above."""
+_BETAS, _EPSILON = (0.9, 0.999), 1e-15
+"""Adam's, as in 3DGS."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +85,8 @@ def splat(
     device = _device(device, rasterizer)
     rasterizer = choose_rasterizer(device) if rasterizer is None else rasterizer
     began = time.monotonic()
-    backdrop = choose_backdrop(views, config)
-    photographs = prepare_photographs(views, backdrop, halvings=config.halvings)
+    background = choose_background(views, config)
+    photographs = prepare_photographs(views, background, halvings=config.halvings)
     cloud = starting_cloud(
         _hull_points(views, config) if start is None else start,
         degree=config.degree,
@@ -84,57 +94,61 @@ def splat(
         opacity=config.start_opacity,
         flatness=config.start_flatness,
     )
-    run = SplatRun(cloud.to(device), photographs, backdrop, config, rasterizer=rasterizer)
-    keeper = _Keeper(None if checkpoint is None else Path(checkpoint), fingerprint(views, cloud, config))
-    keeper.resume(run)
+    run = _Run(cloud.to(device), photographs, background, config, rasterizer=rasterizer)
+    saved = None if checkpoint is None else _Checkpoint(Path(checkpoint), _fingerprint(views, cloud, config))
+    if saved is not None:
+        saved.resume(run)
     try:
         while run.step < config.steps:
-            loss, rendering, target = run.advance()
-            last, every = run.step == config.steps, max(_TELL_EVERY, run.losses_every)
+            loss, rendering, target = run.train_step()
+            last, every = run.step == config.steps, max(_MIN_PROGRESS_STEPS, run.losses_every)
             if progress is not None and (last or run.step % every == 0):
                 likeness = psnr(rendering.color, target.image)
                 elapsed = time.monotonic() - began
                 progress(SplatProgress(run.step, config.steps, float(loss), likeness, elapsed, run.cloud))
-            keeper.look(run)
+            if saved is not None and (last or time.monotonic() - saved.at > _CHECKPOINT_SECONDS):
+                saved.save(run)
     except KeyboardInterrupt:
         # During a step's changes, only the state saved before it is consistent.
-        if run.whole:
-            keeper.save(run)
+        if saved is not None and run.whole:
+            saved.save(run)
         raise
-    keeper.save(run)
     return keep_object(run.cloud, views, rasterizer=rasterizer).to("cpu")
 
 
-class _Keeper:
-    """Saves a run's state at intervals."""
+class _Checkpoint:
+    """Where a run's state is saved, and what it belongs to."""
 
-    def __init__(self, path: Path | None, fingerprint: str) -> None:
-        self.path, self.saved_at = path, time.monotonic()
+    def __init__(self, path: Path, fingerprint: str) -> None:
+        self.path, self.at = path, time.monotonic()
         self.identity = {"view, initial point or setting": fingerprint}
 
-    def resume(self, run: SplatRun) -> None:
-        state = (
-            None
-            if self.path is None
-            else read_checkpoint(self.path, self.identity, what="fit of Gaussians", raising=SceneError)
-        )
+    def resume(self, run: "_Run") -> None:
+        state = read_checkpoint(self.path, self.identity, what="fit of Gaussians", raising=SceneError)
         if state is not None:
             run.resume(state["run"])
 
-    def look(self, run: SplatRun) -> None:
-        if time.monotonic() - self.saved_at > _CHECKPOINT_SECONDS:
-            self.save(run)
-
-    def save(self, run: SplatRun) -> None:
-        if self.path is None:
-            return
+    def save(self, run: "_Run") -> None:
         try:
             write_checkpoint(self.path, {"run": run.state()}, self.identity, raising=SceneError)
         except SceneError as error:
             # A full disk costs the checkpoint, not the run.
             message = f"the fit of the Gaussians continues without a new checkpoint: {error}"
             warnings.warn(AvmsfWarning(message, file=error.file, value=error.value), stacklevel=3)
-        self.saved_at = time.monotonic()
+        self.at = time.monotonic()
+
+
+def _fingerprint(views: Sequence[View], cloud: GaussianCloud, config: SplatConfig) -> str:
+    """Return a digest of a fit's views, start and settings."""
+    digest = hashlib.sha256(repr((_CHECKPOINT_VERSION, asdict(config))).encode())
+    for view in views:
+        camera = view.camera
+        digest.update(repr((view.name, camera.focal, camera.principal, camera.width, camera.height)).encode())
+        for each in (camera.world_to_camera, view.image, view.mask):
+            digest.update(b"none" if each is None else each.contiguous().numpy().tobytes())
+    for each in (cloud.centers, cloud.rotations, cloud.log_scales, cloud.logit_opacities, cloud.harmonics):
+        digest.update(each.contiguous().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def _hull_points(views: Sequence[View], config: SplatConfig) -> StartPoints:
@@ -148,3 +162,223 @@ def _device(device: torch.device | str | None, rasterizer: Rasterizer | None) ->
         return torch.device(device)
     usable = torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
     return torch.device("cuda" if usable and rasterizer is None else "cpu")
+
+
+@dataclass(frozen=True, eq=False)
+class _Target:
+    """What one rendering is compared with."""
+
+    image: Float[Tensor, "height width 3"]
+    coverage: Float[Tensor, "height width"] | None
+    background: Float[Tensor, " 3"]
+
+
+class _Run:
+    """One run: parameters, optimizer, schedules and what one step does."""
+
+    def __init__(
+        self,
+        cloud: GaussianCloud,
+        photographs: Sequence[Photograph],
+        background: Float[Tensor, " 3"] | None,
+        config: SplatConfig,
+        *,
+        rasterizer: Rasterizer,
+    ) -> None:
+        device = cloud.centers.device
+        self.photographs = [each.to(device) for each in photographs]
+        self.background = None if background is None else background.to(device)
+        self.config, self.rasterizer, self.losses_every = config, rasterizer, steps_between_losses(device)
+        spread = cloud.centers.amax(0) - cloud.centers.amin(0)
+        self.half_diagonal = 0.5 * float(spread.norm())
+        self.parameters = {name: value.clone() for name, value in _named(cloud).items()}
+        self.moments = {
+            name: (torch.zeros_like(value), torch.zeros_like(value)) for name, value in self.parameters.items()
+        }
+        self.generator = torch.Generator().manual_seed(config.seed)
+        self.queue: list[int] = []
+        self.density = Density.none(cloud)
+        self.step = 0
+        self.whole = True
+
+    @property
+    def cloud(self) -> GaussianCloud:
+        """The Gaussians as they are now; they change with the next step."""
+        return self._cloud(self.parameters, self.config.degree)
+
+    def train_step(self) -> tuple[Float[Tensor, ""], Rendering, _Target]:
+        """Take one step; return the loss before it, and what was compared.
+
+        Raises `SceneError` where the loss is no finite number, on a graphics card some steps later.
+        """
+        photograph, level = self.photographs[self._next_view()], self._level()
+        target = self._target(photograph, level)
+        leaves = {name: value.detach().requires_grad_() for name, value in self.parameters.items()}
+        cloud = self._cloud(leaves, self._degree())
+        rendering = self.rasterizer(cloud, photograph.cameras[level], background=target.background)
+        growing = self.step < self.config.densify_until * self.config.steps
+        if growing:
+            rendering.screen.retain_grad()
+        loss = self.loss(rendering, target)
+        if self.config.flat_weight > 0:
+            # The smallest axis lies across the surface, as soon as the photographs know a surface.
+            thickness = cloud.log_scales.amin(1).exp().mean()
+            loss = loss + self.config.flat_weight / self.half_diagonal * thickness
+        loss.backward()  # type: ignore[no-untyped-call]
+        # Before densification too, to which there would seem to be no Gaussians.
+        done = self.step + 1
+        if done == self.config.steps or not done % self.losses_every or not done % self.config.densify_every:
+            self._expect_finite(float(loss.detach()))
+        self.whole = False
+        if growing:
+            self.density.note(rendering, photograph.cameras[level])
+        self._adam_step({name: leaf.grad for name, leaf in leaves.items()})
+        self.step += 1
+        self._densify_and_prune()
+        self.whole = True
+        return loss.detach(), rendering, target
+
+    def _expect_finite(self, loss: float) -> None:
+        if not math.isfinite(loss):
+            advice = "lower center_rate, scale_rate and opacity_rate"
+            raise SceneError.expected("a finite number", loss, row=self.step, name="loss", advice=advice)
+
+    def loss(self, rendering: Rendering, target: _Target) -> Float[Tensor, ""]:
+        """Return the mixture of absolute difference, 1 - SSIM and the mask's error (3DGS, eq. 7, and the mask's)."""
+        part = self.config.dissimilarity_weight
+        loss = (1.0 - part) * (rendering.color - target.image).abs().mean()
+        if part > 0:
+            loss = loss + part * (1.0 - ssim(rendering.color, target.image))
+        if target.coverage is not None and self.config.mask_weight > 0:
+            loss = loss + self.config.mask_weight * (rendering.alpha - target.coverage).abs().mean()
+        return loss
+
+    def state(self) -> dict[str, Any]:
+        """Return all that decides how the run goes on after its last whole step."""
+        return {
+            "parameters": self.parameters,
+            "moments": {name: list(pair) for name, pair in self.moments.items()},
+            "generator": self.generator.get_state(),
+            "queue": self.queue,
+            "density": self.density.state(),
+            "step": self.step,
+        }
+
+    def resume(self, state: dict[str, Any]) -> None:
+        """Go on from a `state`."""
+        device = self.parameters["centers"].device
+        self.parameters = {name: value.to(device) for name, value in state["parameters"].items()}
+        self.moments = {name: (one.to(device), two.to(device)) for name, (one, two) in state["moments"].items()}
+        self.generator.set_state(state["generator"])
+        self.queue, self.step = list(state["queue"]), state["step"]
+        self.density = Density(**{name: value.to(device) for name, value in state["density"].items()})
+
+    def _cloud(self, values: dict[str, Tensor], degree: int) -> GaussianCloud:
+        above = (degree + 1) ** 2 - 1
+        harmonics = torch.cat([values["colors"], values["shades"][:, :above]], dim=1) if above else values["colors"]
+        return GaussianCloud(
+            values["centers"], values["rotations"], values["log_scales"], values["logit_opacities"], harmonics
+        )
+
+    def _next_view(self) -> int:
+        """Draw the next view, each once before any comes again."""
+        if not self.queue:
+            self.queue = torch.randperm(len(self.photographs), generator=self.generator).tolist()
+        return self.queue.pop()
+
+    def _fraction(self) -> float:
+        return self.step / self.config.steps
+
+    def _level(self) -> int:
+        """Return how often the images are halved now."""
+        if self._fraction() >= self.config.coarse_until:
+            return 0
+        spans = math.ceil(self.config.halvings * (1.0 - self._fraction() / self.config.coarse_until))
+        return min(self.config.halvings, spans)
+
+    def _degree(self) -> int:
+        every = self.config.degree_every
+        return self.config.degree if every <= 0 else min(self.config.degree, int(self._fraction() / every))
+
+    def _target(self, photograph: Photograph, level: int) -> _Target:
+        mask = photograph.masks[level]
+        image = photograph.images[level].float() / 255
+        coverage = None if mask is None else mask.float() / 255
+        if self.background is not None:
+            return _Target(image, coverage, self.background)
+        assert coverage is not None
+        background = torch.rand(3, generator=self.generator).to(image, non_blocking=True)
+        return _Target(torch.lerp(background.expand_as(image), image, coverage[..., None]), coverage, background)
+
+    def _rates(self) -> dict[str, float]:
+        config, part = self.config, self._fraction()
+        fall = config.final_rate**part
+        return {
+            "centers": config.center_rate * self.half_diagonal * config.final_center_rate**part,
+            "rotations": config.rotation_rate * fall,
+            "log_scales": config.scale_rate * fall,
+            "logit_opacities": config.opacity_rate * fall,
+            "colors": config.color_rate * fall,
+            "shades": config.shade_rate * fall,
+        }
+
+    def _adam_step(self, gradients: dict[str, Tensor | None]) -> None:
+        """Take Adam's step (Kingma & Ba 2015); what has no gradient, shades before their degree's time, stays."""
+        (by_mean, by_square), count, rates = _BETAS, self.step + 1, self._rates()
+        known = {name: gradient for name, gradient in gradients.items() if gradient is not None}
+        slopes = list(known.values())
+        means, squares = ([self.moments[name][place] for name in known] for place in range(2))
+        torch._foreach_lerp_(means, slopes, 1.0 - by_mean)
+        torch._foreach_mul_(squares, by_square)
+        torch._foreach_addcmul_(squares, slopes, slopes, 1.0 - by_square)
+        spreads = torch._foreach_mul(squares, 1.0 / (1.0 - by_square**count))
+        torch._foreach_sqrt_(spreads)
+        torch._foreach_add_(spreads, _EPSILON)
+        steps = [-rates[name] / (1.0 - by_mean**count) for name in known]
+        torch._foreach_addcdiv_([self.parameters[name] for name in known], means, spreads, steps)
+
+    def _densify_and_prune(self) -> None:
+        """Add and remove Gaussians where that is due."""
+        config, step = self.config, self.step
+        first, last = config.densify_from * config.steps, config.densify_until * config.steps
+        if first <= step <= last and step % config.densify_every == 0:
+            rows, fresh = self.density.grown(self.cloud, config, self.half_diagonal, generator=self.generator)
+            self._rebuild(rows, fresh)
+            if config.reset_every and step % config.reset_every == 0 and step < last:
+                self._reset_opacities()
+        elif step > last and step % config.densify_every == 0:
+            faint = self.cloud.opacities < config.least_opacity
+            if bool(faint.any()):
+                self._rebuild(torch.nonzero(~faint)[:, 0], None)
+
+    def _rebuild(self, rows: Tensor, fresh: GaussianCloud | None) -> None:
+        """Keep the given rows, then add new Gaussians, about which the optimizer knows nothing yet."""
+        added = {} if fresh is None else _named(fresh)
+        for name in _GROUPS:
+            more = added.get(name, self.parameters[name][:0])
+            self.parameters[name] = torch.cat([self.parameters[name][rows], more])
+            first, second = self.moments[name]
+            blank = torch.zeros_like(more)
+            self.moments[name] = (torch.cat([first[rows], blank]), torch.cat([second[rows], blank]))
+        count = len(self.parameters["centers"])
+        if count < 4:
+            advice = "check cameras and that the initial points are on the object, or lower least_opacity"
+            raise SceneError.expected("at least 4", count, row=self.step, name="gaussians", advice=advice)
+        self.density = Density.none(self.cloud)
+
+    def _reset_opacities(self) -> None:
+        highest = 2.0 * self.config.least_opacity
+        self.parameters["logit_opacities"].clamp_(max=math.log(highest / (1.0 - highest)))
+        for moment in self.moments["logit_opacities"]:
+            moment.zero_()
+
+
+def _named(cloud: GaussianCloud) -> dict[str, Tensor]:
+    return {
+        "centers": cloud.centers,
+        "rotations": cloud.rotations,
+        "log_scales": cloud.log_scales,
+        "logit_opacities": cloud.logit_opacities,
+        "colors": cloud.harmonics[:, :1],
+        "shades": cloud.harmonics[:, 1:],
+    }

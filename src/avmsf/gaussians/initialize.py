@@ -31,11 +31,9 @@ class StartPoints:
 
     def __post_init__(self) -> None:
         if len(self.points) < 4 or not all(bool(torch.isfinite(each).all()) for each in (self.points, self.colors)):
-            raise SceneError(
-                f"expected 4 or more finite initial points on the object, got {len(self.points)}; give others, or "
-                "masks for a visual hull",
-                name="points",
-                value=len(self.points),
+            advice = "give others, or masks for a visual hull"
+            raise SceneError.expected(
+                "4 or more finite ones on the object", len(self.points), name="points", advice=advice
             )
 
 
@@ -52,9 +50,7 @@ def starting_cloud(
     nearest = cKDTree(places).query(places, k=4)[0][:, 1:].mean(1)
     least = 1e-3 * float(np.linalg.norm(np.ptp(places, axis=0)))
     if not least > 0.0:
-        raise SceneError(
-            f"expected initial points on the object, got {count} at one position", name="points", value=count
-        )
+        raise SceneError.expected("points on the object", count, got=f"{count} at one position", name="points")
     scales = torch.from_numpy(np.log(np.maximum(scale * nearest, least))).float()[:, None].repeat(1, 3)
     harmonics = torch.zeros(count, (degree + 1) ** 2, 3)
     harmonics[:, 0] = (start.colors - 0.5) / ZEROTH

@@ -70,23 +70,14 @@ def read_splats(path: str | Path) -> GaussianCloud:
         wrong = np.flatnonzero(~(np.abs(table[name]) <= np.finfo(np.float32).max))
         if len(wrong):
             row, value = int(wrong[0]), float(table[name][wrong[0]])
-            raise SceneError(
-                f"{path}, vertex {row}: expected a finite float32 number as {name}, got {value} ({len(wrong)} vertices "
-                "of this kind); export the Gaussians again without these",
-                file=path,
-                row=row,
-                name=name,
-                value=value,
+            raise SceneError.expected(
+                f"a finite float32 number as {name} of each vertex", value, file=path, row=row, name=name
             )
     columns = [_columns(table, names) for names in (MIDDLE, ROTATION, SCALES, OPACITY, ZEROTH)]
     if not bool((columns[1] != 0).any(1).all()):
         row = int((columns[1] == 0).all(1).nonzero()[0])
-        raise SceneError(
-            f"{path}, vertex {row}: expected a quaternion as rotation, got 0, 0, 0, 0; export it again",
-            file=path,
-            row=row,
-            name=ROTATION[0],
-            value=[0.0] * 4,
+        raise SceneError.expected(
+            "a quaternion as the rotation of each vertex", [0.0] * 4, file=path, row=row, name=ROTATION[0]
         )
     rest = _columns(table, others)
     harmonics = torch.cat([columns[4][:, None], rest.reshape(len(rest), 3, count // 3).mT], dim=1).contiguous()

@@ -1,6 +1,6 @@
 """The header of a `.ply` of Gaussians, and whether the file is long enough for it. Loads no numpy or torch."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from avmsf.errors import SceneError
@@ -62,9 +62,7 @@ def parse_header(path: Path, content: bytes) -> Header:
     line_end = content.find(b"\n", end, end + len(b"end_header") + 3)
     if not content.startswith(b"ply") or end < 0 or line_end < 0:
         found = "a header without an end" if content.startswith(b"ply") else f"a file that begins with {content[:12]!r}"
-        raise SceneError.expected(
-            "a .ply of Gaussians as 3DGS writes it", content[:12], got=str(found), file=path, name="header"
-        )
+        raise SceneError.expected("a .ply of Gaussians", content[:12], got=found, file=path, name="header")
     order, elements = None, list[Element]()
     for row, line in enumerate(content[:end].decode("latin-1").splitlines()[1:], start=2):
         match line.split():
@@ -73,9 +71,9 @@ def parse_header(path: Path, content: bytes) -> Header:
             case ["element", name, count] if count.isdecimal() and len(count) <= _MAX_DIGITS:
                 elements.append(Element(name, int(count), ()))
             case ["property", "list", _, _, name] if elements:
-                elements[-1] = _with(elements[-1], name, "list")
+                elements[-1] = replace(elements[-1], properties=(*elements[-1].properties, (name, "list")))
             case ["property", word, name] if elements and word in _TYPES:
-                elements[-1] = _with(elements[-1], name, _TYPES[word])
+                elements[-1] = replace(elements[-1], properties=(*elements[-1].properties, (name, _TYPES[word])))
             case ["comment", *_] | ["obj_info", *_] | []:
                 pass
             case _:
@@ -89,64 +87,36 @@ def parse_header(path: Path, content: bytes) -> Header:
     return Header(order, tuple(elements), line_end + 1)
 
 
-def _with(element: Element, name: str, kind: str) -> Element:
-    return Element(element.name, element.count, (*element.properties, (name, kind)))
-
-
 def expect_gaussians(path: Path, header: Header) -> Element:
     """Return the element that holds the Gaussians. Raises SceneError, which describes the file, for other files."""
     named = {element.name: element for element in header.elements}
-    names = [name for element in header.elements for name, _ in element.properties]
-    if any(name.startswith("packed_") for name in names):
-        raise SceneError(
-            f"{path}: expected uncompressed Gaussians as 3DGS writes them, got compressed ones ({', '.join(named)}); "
-            "export them uncompressed",
-            file=path,
-            name="compression",
-            value=list(named),
-        )
-    vertices = named.get("vertex")
+    vertices, faces = named.get("vertex"), named.get("face")
     found = [] if vertices is None else [name for name, _ in vertices.properties]
     missing = [name for name in NEEDED if name not in found]
-    if vertices is not None and not missing:
-        degrees = {3 * (degree + 1) ** 2 - 3: degree for degree in range(4)}
+    packed = any(name.startswith("packed_") for element in header.elements for name, _ in element.properties)
+    if vertices is not None and not missing and not packed:
         rest = sorted(name for name in found if name.startswith("f_rest_"))
-        if len(rest) not in degrees or rest != sorted(f"f_rest_{place}" for place in range(len(rest))):
+        if len(rest) not in (0, 9, 24, 45) or rest != sorted(f"f_rest_{place}" for place in range(len(rest))):
             raise SceneError.expected(
                 "0, 9, 24 or 45 coefficients f_rest_* (degrees 0 to 3)", len(rest), file=path, name="f_rest"
             )
         if not vertices.count:
-            raise SceneError(
-                f"{path}: expected Gaussians, got none; fit them to the views again", file=path, name="vertex", value=0
-            )
+            raise SceneError.expected("Gaussians", 0, file=path, name="vertex", advice="fit them to the views again")
         return vertices
-    if "opacity" in found or "f_dc_0" in found:
-        raise SceneError(
-            f"{path}: expected the properties that 3DGS writes, got Gaussians without {', '.join(missing)}",
-            file=path,
-            name=missing[0],
-            value=missing,
-        )
-    if "face" in named and named["face"].count:
-        raise SceneError(
-            f"{path}: expected Gaussians, got a mesh of {named['face'].count} faces; use it as the capture's surface",
-            file=path,
-            name="face",
-            value=named["face"].count,
-        )
-    if vertices is not None and {"x", "y", "z"} <= set(found):
-        raise SceneError(
-            f"{path}: expected Gaussians, got a point cloud of {vertices.count} points; use it as the capture's "
-            "surface, or as initial points",
-            file=path,
-            name="vertex",
-            value=vertices.count,
-        )
-    raise SceneError(
-        f"{path}: expected the Gaussians that 3DGS writes, got a .ply of {', '.join(named) or 'nothing'}",
-        file=path,
-        name="elements",
-        value=list(named),
+    value: object
+    got, name, value, advice = f"a .ply of {', '.join(named) or 'nothing'}", "elements", list(named), ""
+    if packed:
+        got, name, advice = f"compressed ones ({', '.join(named)})", "compression", "export them uncompressed"
+    elif "opacity" in found or "f_dc_0" in found:
+        got, name, value = f"Gaussians without {', '.join(missing)}", missing[0], missing
+    elif faces is not None and faces.count:
+        got, name, value = f"a mesh of {faces.count} faces", "face", faces.count
+        advice = "use it as the capture's surface"
+    elif vertices is not None and {"x", "y", "z"} <= set(found):
+        got, name, value = f"a point cloud of {vertices.count} points", "vertex", vertices.count
+        advice = "use it as the capture's surface, or as initial points"
+    raise SceneError.expected(
+        "uncompressed Gaussians as 3DGS writes them", value, got=got, file=path, name=name, advice=advice
     )
 
 
@@ -157,10 +127,12 @@ def vertices_start(path: Path, header: Header, vertices: Element, *, size: int) 
     """
     before = header.elements[: header.elements.index(vertices)]
     if any(kind == "list" for element in (*before, vertices) for _, kind in element.properties):
-        raise SceneError(
-            f"{path}: expected single numbers before and in the vertices, got lists; export it with 3DGS",
+        raise SceneError.expected(
+            "single numbers before and in the vertices",
+            got="lists",
             file=path,
             name="list",
+            advice="export it with 3DGS",
         )
     if header.order == "ascii":
         return header.length
@@ -177,9 +149,7 @@ def _bytes_of(element: Element) -> int:
 
 def unreadable(path: Path, error: OSError) -> SceneError:
     """Return the error for a file that the system does not read."""
-    return SceneError(
-        f"{path}: expected a .ply of Gaussians, got a file that cannot be read ({error.strerror or error})", file=path
-    )
+    return SceneError.expected("a .ply of Gaussians that can be read", got=str(error.strerror or error), file=path)
 
 
 def truncated(path: Path, found: int, expected: int) -> SceneError:

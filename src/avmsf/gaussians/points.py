@@ -99,12 +99,7 @@ def cluster(points: Float[Tensor, "points 3"], count: int, *, iterations: int = 
     places = points.detach().double().cpu()
     distinct = len(torch.unique(places, dim=0)) if len(places) else 0
     if not 1 <= count <= distinct:
-        raise FitError(
-            f"expected 1 to {distinct} clusters, the number of different positions, got {count}; reduce it or give "
-            "more points",
-            name="count",
-            value=count,
-        )
+        raise FitError.expected(f"1 to {distinct} clusters, as many as different positions", count, name="count")
     centers = places[farthest_points(places, count)]
     labels = nearest_points(centers, places)[:, 0]
     for _ in range(iterations):
@@ -128,11 +123,8 @@ def sample_surface(
 
     mesh = trimesh.Trimesh(vertices.double().cpu().numpy(), faces.cpu().numpy(), process=False)
     if not (math.isfinite(mesh.area) and mesh.area > 0.0):
-        raise CaptureError(
-            f"expected a surface with an area, got {mesh.area:g} m² of {len(vertices)} vertices, {len(faces)} faces",
-            name="surface",
-            value=float(mesh.area),
-        )
+        got = f"{mesh.area:g} m² of {len(vertices)} vertices, {len(faces)} faces"
+        raise CaptureError.expected("triangles with an area", float(mesh.area), got=got, name="surface")
     seed = int(torch.randint(2**31 - 1, (1,), generator=generator))
     places, rows = trimesh.sample.sample_surface(mesh, count, seed=seed)
     # Of a triangle without area trimesh knows no normal; it is never drawn from.
@@ -154,9 +146,7 @@ def lattice(contacts: Float[Tensor, "contacts 3"], count: int) -> Float[Tensor, 
     wide = [side > 1e-3 * longest for side in extent]
     corners = 2 ** sum(wide)
     if count < corners:
-        raise EvaluationError(
-            f"expected at least {corners} points, the corners of the box, got {count}", name="count", value=count
-        )
+        raise EvaluationError.expected(f"at least {corners}, the corners of the box", count, name="count")
     numbers = [1, 1, 1]
     for spacing in (longest / steps for steps in range(1, count + 1)):
         finer = [1 + max(1, round(side / spacing)) if on else 1 for side, on in zip(extent, wide, strict=True)]

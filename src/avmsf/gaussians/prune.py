@@ -114,9 +114,5 @@ def _close(points: Float[Tensor, "points 3"]) -> Bool[Tensor, " points"]:
 
 def _expect_some(rows: Tensor, cloud: GaussianCloud) -> None:
     if not len(rows):
-        raise SceneError(
-            f"expected Gaussians on the object, got none of {len(cloud)}; check that masks, cameras and Gaussians "
-            "belong together and that not all are almost transparent",
-            name="gaussians",
-            value=0,
-        )
+        advice = "check that masks, cameras and Gaussians belong together and that not all are almost transparent"
+        raise SceneError.expected("some on the object", 0, got=f"none of {len(cloud)}", name="gaussians", advice=advice)

@@ -46,57 +46,47 @@ class Photograph:
         return replace(self, images=tuple(image.to(device) for image in self.images), masks=masks)
 
 
-@dataclass(frozen=True, eq=False)
-class Backdrop:
-    """What is behind the object in renderings."""
-
-    color: Float[Tensor, " 3"] | None
-    """Red, green and blue, 0 to 1; None puts another color behind every time, and the same into the photographs."""
-
-
-def choose_backdrop(views: Sequence[View], config: SplatConfig) -> Backdrop:
+def choose_background(views: Sequence[View], config: SplatConfig) -> Float[Tensor, " 3"] | None:
     """Return the color that the config names, or the one found around the masks, or at the edges of the images.
 
-    Raises `SceneError` for random colors without any mask.
+    Red, green and blue, 0 to 1; None puts another color behind every time, and the same into the photographs. Raises
+    `SceneError` for random colors without any mask.
     """
     masked = any(view.mask is not None for view in views)
     if not isinstance(config.background, str):
-        return Backdrop(torch.tensor(config.background))
+        return torch.tensor(config.background)
     if config.background == "random":
         if not masked:
-            raise SceneError(
-                "expected views with masks for a random background, got none; give masks or the background's color",
-                name="background",
-                value="random",
+            raise SceneError.expected(
+                "a color, or views with masks for random ones", "random", got="random without masks", name="background"
             )
-        return Backdrop(None)
+        return None
     pixels = np.concatenate([_outside(view) for view in views])
     if not len(pixels):
-        return Backdrop(torch.zeros(3))
+        return torch.zeros(3)
     color = np.median(pixels, axis=0)
     plain = float((np.abs(pixels - color).max(1) <= _PLAIN_STEP).mean()) >= _PLAIN_PART
     # Without a mask there is no other way than to fit the whole photograph.
-    return Backdrop(torch.from_numpy(color / 255.0).float() if plain or not masked else None)
+    return torch.from_numpy(color / 255.0).float() if plain or not masked else None
 
 
-def prepare_photographs(views: Sequence[View], backdrop: Backdrop, *, halvings: int) -> list[Photograph]:
+def prepare_photographs(
+    views: Sequence[View], background: Float[Tensor, " 3"] | None, *, halvings: int
+) -> list[Photograph]:
     """Return the views that can be compared: all, or before random colors those with a mask.
 
     A mask without the object says nothing that is worth believing: its view is left out. `visual_hull` warns of it.
     """
     kept = [view for view in views if view.mask is None or bool((view.mask > 127).any())]
-    if backdrop.color is None:
+    if background is None:
         unknown = [view.name for view in kept if view.mask is None]
         if unknown:
             message = f"views without a mask are not used, since the background is not plain: {', '.join(unknown)}"
             warnings.warn(CaptureWarning(message, name="masks", value=unknown), stacklevel=3)
         kept = [view for view in kept if view.mask is not None]
     if len(kept) < 3:
-        raise SceneError(
-            f"expected 3 or more views, got {len(kept)} of {len(views)} that can be used; give more",
-            name="views",
-            value=len(kept),
-        )
+        got = f"{len(kept)} of {len(views)} that can be used"
+        raise SceneError.expected("3 or more", len(kept), got=got, name="views", advice="give more")
     return [Photograph.of(view, halvings=halvings) for view in kept]
 
 

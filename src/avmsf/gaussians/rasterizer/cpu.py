@@ -41,12 +41,9 @@ def _expect_plain(cloud: GaussianCloud, background: Float[Tensor, " 3"]) -> None
     tensors = {each.name: getattr(cloud, each.name) for each in fields(cloud)}
     for name, tensor in {**tensors, "background": background}.items():
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
-            raise SceneError(
-                f"{name}: expected float32 numbers on the CPU, got {str(tensor.dtype).removeprefix('torch.')} on "
-                f"{tensor.device}; convert it, or use the rasterizer of `choose_rasterizer` for that device",
-                name=name,
-                value=[str(tensor.dtype).removeprefix("torch."), str(tensor.device)],
-            )
+            found = [str(tensor.dtype).removeprefix("torch."), str(tensor.device)]
+            advice = "convert it, or use the rasterizer of `choose_rasterizer` for that device"
+            raise SceneError.expected("float32 numbers on the CPU", found, name=name, advice=advice)
 
 
 def _fault(cloud: GaussianCloud, row: int) -> SceneError:
@@ -54,16 +51,7 @@ def _fault(cloud: GaussianCloud, row: int) -> SceneError:
     for each in fields(cloud):
         values = getattr(cloud, each.name)[row].detach()
         if not bool(torch.isfinite(values).all()):
-            return SceneError(
-                f"{each.name}, row {row}: expected finite numbers, got {values.tolist()}; remove the Gaussian with "
-                "`GaussianCloud.take`, or lower the learning rate if training made it",
-                row=row,
-                name=each.name,
-                value=values.tolist(),
-            )
-    return SceneError(
-        f"rotations, row {row}: expected a quaternion, got one of length 0; write 1, 0, 0, 0 for no rotation",
-        row=row,
-        name="rotations",
-        value=cloud.rotations[row].tolist(),
-    )
+            advice = "remove it with `GaussianCloud.take`, or lower the learning rate if training made it"
+            return SceneError.expected("finite numbers", values.tolist(), row=row, name=each.name, advice=advice)
+    value, advice = cloud.rotations[row].tolist(), "write 1, 0, 0, 0 for no rotation"
+    return SceneError.expected("a quaternion of a length above 0", value, row=row, name="rotations", advice=advice)

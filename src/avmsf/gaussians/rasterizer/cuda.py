@@ -22,11 +22,9 @@ class GsplatRasterizer:
         try:
             self._gsplat: Any = importlib.import_module("gsplat")
         except ImportError as error:
-            raise SceneError(
-                f"expected the package gsplat to render on the GPU, got an import error ({error}); pip install "
-                "'avmsf[gpu]', or render on the CPU",
-                name="gsplat",
-            ) from error
+            advice = "pip install 'avmsf[gpu]', or render on the CPU"
+            got = f"an import error ({error})"
+            raise SceneError.expected("the package gsplat", got=got, name="gsplat", advice=advice) from error
 
     def __call__(self, cloud: GaussianCloud, camera: Camera, *, background: Float[Tensor, " 3"]) -> Rendering:
         """Return what `camera` sees before a `background` color.
@@ -36,12 +34,8 @@ class GsplatRasterizer:
         centers = cloud.centers
         for name, tensor in (("cloud", centers), ("background", background)):
             if not _lies_on_card(tensor):
-                raise SceneError(
-                    f"{name}: expected a CUDA device, got {tensor.device}; move it, or use the rasterizer of "
-                    "`choose_rasterizer` for that device",
-                    name=name,
-                    value=str(tensor.device),
-                )
+                advice = "move it, or use the rasterizer of `choose_rasterizer` for that device"
+                raise SceneError.expected("a CUDA device", str(tensor.device), name=name, advice=advice)
         painted, covered, found = self._gsplat.rasterization(
             means=centers,
             quats=cloud.rotations,

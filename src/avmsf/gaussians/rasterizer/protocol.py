@@ -56,11 +56,9 @@ def choose_rasterizer(device: torch.device | str) -> Rasterizer:
     if kind != "cuda":
         raise SceneError.expected("cpu or cuda", str(device), name="device", advice="move the Gaussians to one")
     if not torch.cuda.is_available():
-        raise SceneError(
-            "device: expected a CUDA device that PyTorch can use, got none; choose cpu, or install the PyTorch build "
-            "for your GPU",
-            name="device",
-            value=str(device),
+        advice = "choose cpu, or install the PyTorch build for your GPU"
+        raise SceneError.expected(
+            "a CUDA device that PyTorch can use", str(device), got="none", name="device", advice=advice
         )
     from avmsf.gaussians.rasterizer.cuda import GsplatRasterizer
 
