@@ -227,6 +227,8 @@ def test_a_written_object_is_an_ordinary_capture_with_views_and_truth(simulation
     capture, impacts = read_capture(folder), simulation.capture.impacts
     assert torch.equal(capture.impacts.sounds, impacts.sounds)
     assert capture.settings == simulation.capture.settings
+    assert capture.settings.align
+    assert "align" not in (folder / "capture.toml").read_text()
     assert torch.equal(capture.impacts.contacts, impacts.contacts)
     for name in ("directions", "forces"):
         assert torch.equal(getattr(capture.impacts, name), getattr(impacts, name))

@@ -54,10 +54,6 @@ class Suggestions:
     """Expected error of the whole field after each of the contacts and those before it."""
     points: Float64[Tensor, "points 3"]
     """Points spread evenly over the surface, meters."""
-    map_before: Float64[Tensor, " points"]
-    """Expected error at these with the present recordings."""
-    map_after: Float64[Tensor, " points"]
-    """Expected error at these after all the contacts."""
     unreachable: int = 0
     """How many of `points` were no candidates because a hammer cannot reach them from outside."""
 
@@ -117,17 +113,15 @@ def _suggest(
     kept = _weighed(pool, allowed, max(MAX_CANDIDATES, count))
     sites = gains.sites(pool[kept], None if directions is None else directions[kept])
     error = _ExpectedError(field, gains, points, sites)
-    before = error.map()
+    before = float(error.map().square().mean().sqrt())
     rows, after = _chosen(error, sites, allowed[kept], count, same)
     return Suggestions(
         sites.points[rows],
         sites.directions[rows] if gains.directional else None,
         kept[rows],
-        float(before.square().mean().sqrt()),
+        before,
         tuple(after),
         points,
-        before,
-        error.map(),
         unreachable,
     )
 

@@ -22,9 +22,6 @@ from avmsf.simulate.imperfections import smooth_field, stream, support_places, s
 from avmsf.simulate.recipe import AXES, ObjectRecipe
 from avmsf.simulate.shapes import make_shape, textured, vary_thickness
 
-Log = Callable[[str], None]
-
-
 _LARGEST = 10.0
 """Meters along its longest side beyond which a mesh is likelier to count millimeters."""
 
@@ -45,7 +42,7 @@ class Body:
         return self.mesh.surface
 
 
-def make_body(recipe: ObjectRecipe, *, cache: Path | None, log: Log) -> Body:
+def make_body(recipe: ObjectRecipe, *, cache: Path | None, log: Callable[[str], None]) -> Body:
     """Make a recipe's body, its elastic modes read from the folder `cache` where they were computed before.
 
     A file that is damaged is made again. Raises SimulationError for an unknown shape and a mesh that cannot be made
