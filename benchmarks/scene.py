@@ -9,7 +9,6 @@ from pathlib import Path
 import torch
 
 from avmsf.capture import Capture, read_capture, write_capture
-from avmsf.capture.settings import CaptureSettings
 from avmsf.evaluation.splits import evaluate, split
 from avmsf.features.pooling import orbit_spread, refine
 from avmsf.field.config import FitConfig
@@ -18,8 +17,9 @@ from avmsf.gaussians.config import SplatConfig
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.folder import write_views
 from avmsf.pipeline.config import LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
-from avmsf.pipeline.reconstruct import reconstruct
+from avmsf.pipeline.fit import fit_in_stages
 from avmsf.pipeline.scene import ProgressListener
+from avmsf.pipeline.stages import StageFolder
 from benchmarks.dino import measure_dino
 from benchmarks.look import SHAPES, finish, lift_pictures, pictures, shape, slab, speckled
 from benchmarks.material import STRUCK
@@ -85,15 +85,7 @@ def _pipeline(options: Options) -> Report:
             config = PipelineConfig(scene=quick, fit=FitConfig(warmup_steps=20, steps=2, damping="shared"))
         begun = time.perf_counter()
         capture = read_capture(folder)
-        made = reconstruct(
-            folder,
-            capture,
-            capture.impacts,
-            config,
-            cache=Path(place) / "cache",
-            settings=CaptureSettings(),
-            listener=ProgressListener(log),
-        )
+        made = fit_in_stages(capture, config, StageFolder(Path(place) / "cache"), listener=ProgressListener(log))
         taken = time.perf_counter() - begun
         error = evaluate(load(made.field), test).mean()["relative_stft"]
     rows: list[list[str | float]] = [[each.stage, each.seconds] for each in made.stages]

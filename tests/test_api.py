@@ -18,13 +18,15 @@ import avmsf
 from avmsf._utils.arrays import as_directions
 from avmsf.capture import Impacts
 from avmsf.cli import main
-from avmsf.editing import change_material
+from avmsf.editing import adjust_modes, change_material
 from avmsf.errors import (
     ArrayError,
     AvmsfError,
     CaptureError,
     CaptureWarning,
+    EditError,
     EvaluationError,
+    ExportError,
     FitError,
     PositionError,
     PositionWarning,
@@ -38,7 +40,10 @@ from factories.plate_capture import fill_plate
 from factories.plate_field import RATE, plate_impacts
 from factories.raising import raises, warns
 
-NAMES = {"Capture", "SoundField", "Surface", "evaluate", "extract_modes", "load", "locate", "read", "split", "suggest"}
+NAMES = {
+    *("Capture", "SoundField", "Surface"),
+    *("edit", "evaluate", "extract_modes", "fit", "load", "locate", "read", "split", "suggest", "write"),
+}
 CONTACT = [0.05, 0.06, 0.0]
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), (1.0, 1.0), (2.5, 2.0), 5, 4)
 
@@ -50,7 +55,7 @@ def capture() -> avmsf.Capture:
 
 @cache
 def field() -> SoundField:
-    return SoundField.fit(capture(), config=PipelineConfig(modes=8), progress=False)
+    return avmsf.fit(capture(), config=PipelineConfig(modes=8), progress=False)
 
 
 def test_the_top_has_the_names_that_users_start_from_and_its_packages():
@@ -103,7 +108,7 @@ def test_a_split_that_leaves_nothing_to_train_or_to_test_is_refused(size):
 def test_fit_makes_the_field_that_the_command_makes(tmp_path):
     folder, output = fill_plate(tmp_path / "plate", surface=False), tmp_path / "field.safetensors"
     assert main(["fit", str(folder), "--output", str(output), "--modes", "6", "--steps", "5"]) == 0
-    made = SoundField.fit(avmsf.read(folder), config=PipelineConfig(modes=6, fit=FitConfig(steps=5)), progress=False)
+    made = avmsf.fit(avmsf.read(folder), config=PipelineConfig(modes=6, fit=FitConfig(steps=5)), progress=False)
     one, other = made.render([CONTACT]), avmsf.load(output).render([CONTACT])
     # Modes of two runs differ in their last digits.
     assert float((one - other).abs().max()) < 1e-4 * float(one.abs().max())
@@ -111,16 +116,16 @@ def test_fit_makes_the_field_that_the_command_makes(tmp_path):
 
 
 def test_fit_says_what_it_does_unless_that_is_turned_off(capfd):
-    SoundField.fit(capture(), config=PipelineConfig(modes=2, fit=FitConfig(steps=0)), progress=False)
+    avmsf.fit(capture(), config=PipelineConfig(modes=2, fit=FitConfig(steps=0)), progress=False)
     assert capfd.readouterr() == ("", "")
-    SoundField.fit(capture(), config=PipelineConfig(modes=2, fit=FitConfig(steps=0)))
+    avmsf.fit(capture(), config=PipelineConfig(modes=2, fit=FitConfig(steps=0)))
     out, err = capfd.readouterr()
     assert out == ""
     assert "modes" in err
 
 
 def test_a_seed_takes_the_place_of_the_configurations():
-    made = SoundField.fit(capture(), seed=7, config=PipelineConfig(modes=2, fit=FitConfig(steps=0)), progress=False)
+    made = avmsf.fit(capture(), seed=7, config=PipelineConfig(modes=2, fit=FitConfig(steps=0)), progress=False)
     assert made.origin.config.seed == 7
     assert made.origin.report["pipeline"]["gain_model"] == "auto"
 
@@ -187,7 +192,7 @@ def test_suggestions_are_chosen_among_candidates():
 
 def test_the_attention_network_has_no_posterior():
     quick = PipelineConfig(gain_model="network", modes=2, fit=FitConfig(steps=0, warmup_steps=1, clusters=4))
-    network = SoundField.fit(capture(), config=quick, progress=False)
+    network = avmsf.fit(capture(), config=quick, progress=False)
     with pytest.raises(FitError):
         network.posterior([CONTACT])
 
@@ -214,7 +219,7 @@ def test_long_work_says_what_it_does_in_a_pipe_too(monkeypatch, capsys, progress
     monkeypatch.setattr("avmsf._utils.progress.REPEAT_SECONDS", 1e-3)
     avmsf.locate(field(), capture().impacts.sounds[3], points=field().gain_field.points, progress=progress)
     assert ("locating" in capsys.readouterr().err) == progress
-    SoundField.fit(capture(), config=PipelineConfig(modes=2, fit=FitConfig(steps=2)), progress=progress)
+    avmsf.fit(capture(), config=PipelineConfig(modes=2, fit=FitConfig(steps=2)), progress=progress)
     assert (" ... 0 s" in capsys.readouterr().err) == progress
 
 
@@ -231,7 +236,7 @@ def test_evaluation_aligns_recordings_as_the_fit_did(tmp_path):
         after=torch.stack([row[start + 2000 : start + 2032] for row, start in rows]),
     )
     train, test = avmsf.split(avmsf.Capture("plate", whole))
-    made = SoundField.fit(train, config=PipelineConfig(modes=8), progress=False)
+    made = avmsf.fit(train, config=PipelineConfig(modes=8), progress=False)
     assert made.alignment is not None
     made.save(tmp_path / "field.safetensors")
     read = avmsf.load(tmp_path / "field.safetensors")
@@ -318,7 +323,7 @@ def test_arguments_of_another_type_are_refused_by_name(tmp_path):
 import avmsf
 field = avmsf.load({str(tmp_path / "a.safetensors")!r})
 for call in (
-    lambda: avmsf.SoundField.fit("bowl"),
+    lambda: avmsf.fit(3),
     lambda: avmsf.evaluate(field, "bowl"),
     lambda: avmsf.suggest(field, 2.5),
     lambda: avmsf.locate(field, [0.0, 1.0] * 2000, sample_rate="48k"),
@@ -329,7 +334,7 @@ for call in (
         print(error.name, error.value)
 """
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert said.splitlines() == ["capture str", "test str", "count 2.5", "sample_rate 48k"]
+    assert said.splitlines() == ["capture int", "test str", "count 2.5", "sample_rate 48k"]
 
 
 def test_contacts_in_another_unit_are_refused_before_anything_is_computed():
@@ -337,7 +342,7 @@ def test_contacts_in_another_unit_are_refused_before_anything_is_computed():
     plate = avmsf.Surface.of([[0, 0, 0], [0.2, 0, 0], [0.2, 0.15, 0], [0, 0.15, 0]], [[0, 1, 2], [0, 2, 3]])
     far = avmsf.Capture("plate", replace(given, contacts=1000.0 * given.contacts), plate)
     with raises(CaptureError, name="contacts"):
-        SoundField.fit(far, progress=False)
+        avmsf.fit(far, progress=False)
 
 
 def test_contacts_between_the_vertices_of_a_coarse_mesh_are_on_the_object():
@@ -347,7 +352,7 @@ def test_contacts_between_the_vertices_of_a_coarse_mesh_are_on_the_object():
     box = trimesh.creation.box(bounds=np.stack([low, high]))
     with warnings.catch_warnings():
         warnings.simplefilter("error", CaptureWarning)
-        fitted = SoundField.fit(
+        fitted = avmsf.fit(
             replace(capture(), surface=avmsf.Surface.of(box.vertices, box.faces)),
             gain_model="thin-plate",
             config=PipelineConfig(modes=4),
@@ -370,8 +375,8 @@ field = avmsf.load({str(tmp_path / "a.safetensors")!r})
 capture = avmsf.Capture("plate", avmsf.capture.Impacts.of([[0, 0, 0]], [[0.0, 1.0]], 8000.0))
 for call in (
     lambda: avmsf.extract_modes("bowl"),
-    lambda: avmsf.SoundField.fit(capture, seed="x"),
-    lambda: avmsf.SoundField.fit(capture, gain_model="bad"),
+    lambda: avmsf.fit(capture, seed="x"),
+    lambda: avmsf.fit(capture, gain_model="bad"),
     lambda: field.render([{CONTACT}], samples=-1),
     lambda: field.render([{CONTACT}], samples=2.5),
     lambda: avmsf.editing.change_material(field, "ceramic", "paper"),
@@ -427,3 +432,23 @@ def test_configurations_print_what_differs_from_the_defaults():
     config = PipelineConfig(gain_model="smooth", fit=FitConfig(seed=3))
     assert repr(config) == "PipelineConfig(gain_model='smooth', fit=FitConfig(seed=3))"
     assert len(repr(PRESETS["paper"])) < 500
+
+
+def test_an_edit_is_the_material_first_and_then_the_modes():
+    edited = avmsf.edit(field(), material="wood", old_material="ceramic", pitch=1.2)
+    expected = adjust_modes(change_material(field(), "ceramic", "wood"), pitch=1.2)
+    assert torch.equal(edited.bank.frequency, expected.bank.frequency)
+    assert torch.equal(edited.render([CONTACT]), expected.render([CONTACT]))
+    with pytest.raises(EditError):
+        avmsf.edit(field())
+
+
+def test_a_field_is_written_in_the_format_of_its_ending(tmp_path):
+    avmsf.write(field(), tmp_path / "plate.html")
+    assert "<html" in (tmp_path / "plate.html").read_text()
+    avmsf.write(field(), str(tmp_path / "plate.glb"), contacts=5)
+    assert (tmp_path / "plate.glb").read_bytes().startswith(b"glTF")
+    avmsf.write(field(), tmp_path / "samples", to="wavs", contacts=3)
+    assert len(list((tmp_path / "samples").rglob("*.wav"))) == 3
+    with raises(ExportError, name="to", value=".xyz"):
+        avmsf.write(field(), tmp_path / "plate.xyz")

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from avmsf.capture import Capture, CaptureSettings
 
-__version__ = "0.1.0"
+__version__ = "0.9.0"
 
 # Imported when first used: torch takes seconds. The stub `__init__.pyi` lists the names, also for editors.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -22,14 +22,17 @@ from . import simulate as simulate
 from . import studio as studio
 from . import symmetry as symmetry
 from .capture import Capture as Capture
+from .editing.material import edit as edit
 from .evaluation.splits import evaluate as evaluate
 from .evaluation.splits import split as split
+from .export.write import write as write
 from .field.sound_field import SoundField as SoundField
 from .field.store import load as load
 from .field.suggest import suggest as suggest
 from .localization.locate import locate as locate
 from .mesh import Surface as Surface
 from .modal.extraction.extract import extract_modes as extract_modes
+from .pipeline.fit import fit as fit
 
 __version__: str
 

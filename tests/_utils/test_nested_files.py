@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from avmsf.cli.demo_folder import RECORD, replaced_whole
 from avmsf.datasets.objectfolder import CONTACT_LISTS, read_contacts
 from avmsf.errors import AvmsfError, DatasetError, EvaluationError, ExportError
 from avmsf.evaluation.results import IDENTITY, ResultsFolder
@@ -50,9 +49,3 @@ def test_a_stage_whose_record_is_nested_runs_again(tmp_path: Path) -> None:
         (record,) = tmp_path.glob("*.json")
         record.write_text(NESTED)
     assert len(made) == 2
-
-
-def test_a_demo_whose_record_is_nested_is_not_replaced(tmp_path: Path) -> None:
-    (tmp_path / RECORD).write_text(NESTED)
-    with pytest.raises(AvmsfError), replaced_whole(tmp_path):
-        pass

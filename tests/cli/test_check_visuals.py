@@ -70,7 +70,7 @@ def test_masks_that_some_photographs_lack_are_a_problem(tmp_path: Path) -> None:
 
 
 def test_images_of_a_cache_are_no_photographs(tmp_path: Path) -> None:
-    """`avmsf surface FOLDER/images`, of the wrong folder, leaves its cache there."""
+    """`avmsf fit FOLDER/images`, of the wrong folder, leaves its cache there."""
     write_transforms(tmp_path, frames(ring(4)))
     write_image(tmp_path / "images" / ".avmsf" / "motion" / "view_000.png")
     assert pictures_in(tmp_path / "images", deep=True) == [tmp_path / "images" / f"{name}.png" for name in "abcd"]
@@ -132,11 +132,10 @@ def test_the_report_has_them_and_leads_to_the_command_that_uses_them(
     out, err = capsys.readouterr()
     (line,) = [line for line in out.splitlines() if line.startswith("the object is shown by: ")]
     assert ("4 photographs" in line) == pictured
-    following = f"avmsf reconstruct {folder} -o field.safetensors" if pictured else f"avmsf modes {folder}"
+    following = f"avmsf fit {folder} -o field.safetensors" if pictured else f"avmsf modes {folder}"
     assert err.splitlines()[-1] == f"next: {following}"
     assert main(["modes", str(folder)]) == 0
-    following = "reconstruct" if pictured else "fit"
-    assert capsys.readouterr().err.splitlines()[-1].startswith(f"next: avmsf {following} ")
+    assert capsys.readouterr().err.splitlines()[-1].startswith("next: avmsf fit ")
     # The mask without a photograph is one; nor has noise a plain background, from which masks are found.
     assert out.splitlines()[-1] == ("readable, with 2 warnings" if pictured else "no problem found")
     assert main(["check", str(folder), "--json"]) == 0
@@ -185,7 +184,7 @@ def test_what_is_wrong_with_cameras_is_named_by_check_as_by_reconstruct(
     assert lines[-1] == ("readable, with 1 warning" if words else "no problem found")
     if words:
         (line,) = [line for line in lines if words in line]
-        assert main(["reconstruct", str(folder), "--lift.encoder", "descriptors"]) == 2
+        assert main(["fit", str(folder), "--gain-model", "visual", "--lift.encoder", "descriptors"]) == 2
         assert not (folder / ".avmsf" / "cloud.ply").exists()
         # The views that are compared are others, and so is the number of the cameras.
         assert line.partition(words)[2] in capsys.readouterr().err
@@ -230,7 +229,7 @@ def test_check_opens_gaussians_and_tells_another_frame_which_reconstruct_refuses
     if words:
         (line,) = [line for line in lines if words in line]
         assert "feet" not in line
-        assert main(["reconstruct", str(folder), "--lift.encoder", "descriptors"]) == 2
+        assert main(["fit", str(folder), "--gain-model", "visual", "--lift.encoder", "descriptors"]) == 2
         assert words in capsys.readouterr().err
         assert not (folder / ".avmsf" / "features.safetensors").exists()
 
@@ -278,25 +277,11 @@ def test_a_file_that_looks_like_an_input_and_is_not_used_is_named_and_ends_a_fit
     (sentence,) = found(folder).unused
     assert sentence.startswith(name.removesuffix("0001.jpg"))
     assert advice in sentence
-    for verb in ("fit", "reconstruct"):
-        assert main([verb, str(folder), "-o", str(tmp_path / "field.safetensors"), "--json"]) == 2
-        assert json.loads(capsys.readouterr().out)["error"]["value"] == [sentence]
+    assert main(["fit", str(folder), "-o", str(tmp_path / "field.safetensors"), "--json"]) == 2
+    assert json.loads(capsys.readouterr().out)["error"]["value"] == [sentence]
     assert not (tmp_path / "field.safetensors").exists()
 
 
 def test_every_file_of_a_capture_with_photographs_or_a_mesh_is_used(tmp_path: Path) -> None:
     write_transforms(fill_plate(tmp_path), frames(ring(4)))
     assert found(tmp_path).unused == ()
-
-
-def test_a_field_of_positions_has_to_be_asked_for_where_photographs_show_the_object(
-    tmp_path: Path, capsys: Streams
-) -> None:
-    folder = fill_plate(tmp_path / "plate")
-    for path in folder.glob("surface.*"):
-        path.unlink()
-    write_transforms(folder, frames(ring(4)))
-    words = ["fit", str(folder), "-o", str(tmp_path / "f.safetensors"), "--gain-model", "smooth", "--steps", "1"]
-    assert main([*words, "--json"]) == 2
-    assert json.loads(capsys.readouterr().out)["error"]["name"] == "shape"
-    assert main([*words, "--without-shape"]) == 0

@@ -488,7 +488,7 @@ def test_points_alone_are_noted(captured: bool, field_file: Path, tmp_path: Path
     words = ["export", str(field_file), "--to", "gltf", "--output", str(tmp_path / "a.glb")]
     assert main([*words, *(["--capture", str(folder)] if captured else [])]) == 0
     (note,) = [line for line in capsys.readouterr().err.splitlines() if "points are shown" in line]
-    assert (f"avmsf surface {folder}" in note) == captured
+    assert (f"avmsf fit {folder} --until surface" in note) == captured
 
 
 def test_an_edited_field_is_not_paired_with_recordings(field_file: Path, tmp_path: Path, capsys: Streams) -> None:

@@ -11,10 +11,9 @@ import torch
 
 from avmsf.cli import main
 from avmsf.cli.info import describe
-from avmsf.cli.scene_bar import SceneBar
+from avmsf.cli.progress import ProgressBar
 from avmsf.features.store import load_features, read_report
 from avmsf.field.store import load
-from avmsf.gaussians.fit import SplatProgress
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh import Surface
 from avmsf.mesh.surface import write_surface
@@ -26,7 +25,7 @@ Streams = pytest.CaptureFixture[str]
 LIFT = ("--lift.encoder", "descriptors", "--lift.points", "600")
 RENDERED = ("--views.rendered", "48", "--views.count", "18")
 MODES = ("--modes", "12")
-FIT = tuple(f"--fit.{word[2:]}" if word.startswith("--") else word for word in TINY[: -len(MODES)])
+FIT = TINY[: -len(MODES)]
 SMALL = (*SMALL_SPLAT, *LIFT, *FIT, *MODES, "--gain-model", "network")
 
 
@@ -49,7 +48,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def kept(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The capture's cache after a first reconstruction."""
     cache = tmp_path_factory.mktemp("cache") / "kept"
-    assert main(["reconstruct", str(capture), "--cache", str(cache), *SMALL]) == 0
+    assert main(["fit", str(capture), "--cache", str(cache), *SMALL]) == 0
     return cache
 
 
@@ -89,11 +88,11 @@ def test_the_same_command_makes_nothing_anew_and_another_setting_only_what_follo
 ) -> None:
     cache = tmp_path / "cache"
     shutil.copytree(kept, cache)
-    words = ["reconstruct", str(capture), "--cache", str(cache), *SMALL, "--json"]
+    words = ["fit", str(capture), "--cache", str(cache), *SMALL, "--json"]
     assert main(words) == 0
     kept_all = dict.fromkeys(("views", "cloud", "features", "modes", "fit"), False)
     assert made_now(capsys) == kept_all
-    assert main([*words, "--fit.seed", "5"]) == 0
+    assert main([*words, "--learning-rate", "2e-3"]) == 0
     found, messages = capsys.readouterr()
     assert {each["stage"]: each["fresh"] for each in json.loads(found)["stages"]} == kept_all | {"fit": True}
     cached = [(str(row), "5", name, " (cached)") for row, name in enumerate(("views", "cloud", "features", "modes"), 1)]
@@ -112,9 +111,7 @@ def test_a_changed_picture_makes_everything_anew(capture: Path, kept: Path, tmp_
     first, second = pictures[0].read_bytes(), pictures[1].read_bytes()
     pictures[0].write_bytes(second)
     pictures[1].write_bytes(first)
-    assert (
-        main(["features", str(changed), "--cache", str(cache), *SMALL_SPLAT, "--encoder", "descriptors", "--json"]) == 0
-    )
+    assert main(["fit", str(changed), "--until", "features", "--cache", str(cache), *SMALL_SPLAT, *LIFT, "--json"]) == 0
     capsys.readouterr()
     assert (cache / "views" / "images" / pictures[0].name).read_bytes() != (
         kept / "views" / "images" / pictures[0].name
@@ -126,20 +123,20 @@ def test_an_interrupted_splatting_goes_on_to_the_same_gaussians(
     capture: Path, kept: Path, tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cache = tmp_path / "cache"
-    show = SceneBar.splatting
+    show = ProgressBar.step
     seen: list[int] = []
 
-    def interrupt(self: SceneBar, progress: SplatProgress) -> None:
-        seen.append(progress.step)
+    def interrupt(self: ProgressBar, stage: str, done: int, total: int, message: str) -> None:
+        seen.append(done)
         if len(seen) == 3:
             raise KeyboardInterrupt
-        show(self, progress)
+        show(self, stage, done, total, message)
 
-    monkeypatch.setattr(SceneBar, "splatting", interrupt)
-    words = ["splat", str(capture), "--cache", str(cache), "--output", str(tmp_path / "cloud.ply")]
-    words += [word.replace("--splat.", "--") for word in SMALL_SPLAT]
+    monkeypatch.setattr(ProgressBar, "step", interrupt)
+    words = ["fit", str(capture), "--until", "gaussians", "--cache", str(cache), *SMALL_SPLAT]
+    words += ["--output", str(tmp_path / "cloud.ply")]
     assert main(words) == 130
-    assert "avmsf splat: interrupted" in capsys.readouterr().err
+    assert "avmsf fit: interrupted" in capsys.readouterr().err
     assert not (tmp_path / "cloud.ply").exists()
     del seen[:]
     seen += [0, 0, 0]
@@ -155,7 +152,7 @@ def test_a_mesh_is_the_object_itself(tmp_path: Path, capsys: Streams) -> None:
     folder.mkdir()
     write_surface_file(folder)
     output = tmp_path / "features.safetensors"
-    words = ["features", str(folder), "--encoder", "descriptors", "--points", "700", *RENDERED]
+    words = ["fit", str(folder), "--until", "features", *LIFT[:2], "--lift.points", "700", *RENDERED]
     assert main([*words, "--output", str(output)]) == 0
     capsys.readouterr()
     features, report = load_features(output), read_report(output)
@@ -174,7 +171,7 @@ def test_gaussians_made_elsewhere_are_looked_at_from_all_sides(kept: Path, tmp_p
     folder = tmp_path / "slab"
     folder.mkdir()
     shutil.copy(kept / "cloud.ply", folder / "splats.ply")
-    assert main(["features", str(folder), "--encoder", "descriptors", *RENDERED]) == 0
+    assert main(["fit", str(folder), "--until", "features", *LIFT[:2], *RENDERED]) == 0
     out, _ = capsys.readouterr()
     assert "features: descriptors" in out
     features = load_features(folder / ".avmsf" / "features.safetensors")
@@ -205,7 +202,7 @@ def test_two_photographs_are_too_few(capture: Path, tmp_path: Path, capsys: Stre
     shutil.copytree(capture / "images", folder / "images")
     for extra in sorted((folder / "images").iterdir())[2:]:
         extra.unlink()
-    assert main(["features", str(folder), "--encoder", "descriptors"]) == 2
+    assert main(["fit", str(folder), "--until", "features", *LIFT[:2]]) == 2
     assert "expected 3 photographs or more, got 2" in capsys.readouterr().err
 
 
@@ -216,18 +213,16 @@ def test_a_surface_of_points_is_the_object_without_any_look(tmp_path: Path, caps
         Surface(torch.cat([places, torch.zeros(500, 1)], dim=1), torch.zeros(0, 3, dtype=torch.int64)),
         folder / "surface.ply",
     )
-    assert main(["reconstruct", str(folder), *FIT, *MODES]) == 0
+    assert main(["fit", str(folder), *FIT, *MODES]) == 0
     assert counts(capsys.readouterr().err) == [("1", "2", "modes", ""), ("2", "2", "field", "")]
     assert len(load(folder / ".avmsf" / "field.safetensors").gain_field.points) == 500
 
 
-def test_a_folder_without_any_look_is_refused_by_lift_and_fitted_in_a_box_by_reconstruct(
-    tmp_path: Path, capsys: Streams
-) -> None:
+def test_a_folder_that_shows_nothing_has_no_features_and_is_fitted_in_a_box(tmp_path: Path, capsys: Streams) -> None:
     folder = fill_plate(tmp_path / "plate", surface=False)
-    assert main(["features", str(folder), "--encoder", "descriptors"]) == 2
+    assert main(["fit", str(folder), "--until", "features", *LIFT[:2]]) == 2
     assert "expected photographs" in capsys.readouterr().err
-    assert main(["reconstruct", str(folder), *FIT, *MODES]) == 0
+    assert main(["fit", str(folder), *FIT, *MODES]) == 0
     assert "bounding box" in capsys.readouterr().err
 
 
@@ -240,6 +235,6 @@ def test_contacts_on_another_scale_than_the_photographs_are_refused_with_the_sca
     rows = [line.split(",") for line in table[1:]]
     scaled = [",".join([row[0], *(f"{10 * float(value):.9g}" for value in row[1:4]), *row[4:]]) for row in rows]
     (folder / "impacts.csv").write_text("\n".join([table[0], *scaled, ""]))
-    assert main(["reconstruct", str(folder), "--cache", str(kept), *SMALL]) == 2
+    assert main(["fit", str(folder), "--cache", str(kept), *SMALL]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
     assert "multiplied by 0.1" in error

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from avmsf.capture import Impacts, read_capture
 from avmsf.cli import demo
-from avmsf.cli.overall_bar import OverallBar
 from avmsf.evaluation.simple_methods import MeanWaveform
 from avmsf.evaluation.splits import split
 from avmsf.features.feature_field import FeatureField
@@ -20,8 +19,9 @@ from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.store import save
 from avmsf.gaussians.points import farthest_points
 from avmsf.modal.extraction.extract import extract_modes
-from avmsf.pipeline.reconstruct import Reconstruction
-from avmsf.pipeline.scene import CLOUD
+from avmsf.pipeline.fit import StagedFit
+from avmsf.pipeline.scene import CLOUD, ProgressListener
+from avmsf.pipeline.stages import StageFolder
 from factories.delayed_plate import ALIGNED, delays, distance, strikes, without_delays
 
 COUNT = 16
@@ -44,18 +44,17 @@ def test_the_demos_page_and_sounds_do_not_depend_on_delays(tmp_path: Path, monke
     )
     shown: list[Impacts] = []
 
-    def reconstruct(*arguments: object, cache: Path, **named: object) -> Reconstruction:
-        cache.mkdir()
-        (cache / CLOUD).touch()
-        save(field, cache / "field.safetensors")
-        return Reconstruction(cache / "field.safetensors", (), {}, modes)
+    def fit_in_stages(capture: object, config: object, stages: StageFolder, **named: object) -> StagedFit:
+        stages.folder.mkdir()
+        stages.path(CLOUD).touch()
+        save(field, stages.path("field.safetensors"))
+        return StagedFit(stages.path("field.safetensors"), (), {}, modes)
 
     monkeypatch.setattr(demo, "read_capture", lambda folder: replace(read_capture(folder), impacts=delayed))
-    monkeypatch.setattr(demo, "reconstruct", reconstruct)
+    monkeypatch.setattr(demo, "fit_in_stages", fit_in_stages)
     monkeypatch.setattr(demo, "write_webpage", lambda *arguments, strikes, **named: shown.append(strikes))
     monkeypatch.setattr(demo, "save_picture", lambda picture, path: None)
-    with OverallBar(demo.STAGES) as bar:
-        demo._go_all_the_way(tmp_path, bar)
+    demo._go_all_the_way(tmp_path, ProgressListener())
     exact_train, exact_test = (without_delays(each, modes, delays(COUNT)) for each in (train, test))
     assert distance(shown[0].sounds, exact_test.sounds) < ALIGNED
     heard = exact_test.take(farthest_points(test.contacts, 2).tolist())

@@ -13,8 +13,7 @@ from rich.file_proxy import FileProxy
 from avmsf.cli import check, heartbeat, main
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.printing import say
-from avmsf.cli.progress import FitBar
-from avmsf.field.fit import Progress
+from avmsf.cli.progress import ProgressBar
 
 Streams = pytest.CaptureFixture[str]
 
@@ -64,8 +63,8 @@ def test_steps_of_a_fit_are_seen_in_a_pipe(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(sys, "stderr", stream)
 
     def work() -> None:
-        with FitBar() as bar:
-            bar.show(Progress("fit", 7, 90, 0.5, 0))
+        with ProgressBar() as bar:
+            bar.step("fit", 7, 90, "spectral loss 0.500")
             wait_for(lambda: "step 7 of 90" in stream.getvalue())
 
     run_check(work, monkeypatch)

@@ -6,7 +6,7 @@ import pytest
 
 from avmsf.cli import RENAMED, main
 from avmsf.cli.options.edit import parse as parse_edit
-from avmsf.cli.options.features import parse as parse_features
+from avmsf.cli.options.fit import parse as parse_fit
 from avmsf.cli.options.simulate import parse as parse_simulate
 from avmsf.errors import AvmsfError
 from factories.raising import raises
@@ -22,8 +22,8 @@ def test_an_option_may_have_another_name_than_its_attribute() -> None:
 @pytest.mark.parametrize(
     ("parse", "words", "option", "value"),
     [
-        (parse_features, "mug", "--feature-size", 0.0),
-        (parse_features, "mug", "--splat.wrong-masks", 2.0),
+        (parse_fit, "mug", "--lift.feature-size", 0.0),
+        (parse_fit, "mug", "--splat.wrong-masks", 2.0),
         (parse_edit, "field -o new", "--free-modes", 0),
         (parse_edit, "field -o new", "--contacts-per-step", 0),
         (parse_simulate, "", "--elastic-modes", 0),

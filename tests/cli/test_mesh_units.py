@@ -11,15 +11,12 @@ from factories.plate_capture import fill_plate
 from factories.small_scene import write_surface_file
 
 Streams = pytest.CaptureFixture[str]
-VERBS = {
-    "check": [],
-    "modes": [],
-    "fit": ["OUT.safetensors"],
-    "splat": ["OUT.ply"],
-    "surface": ["OUT.ply"],
-    "features": ["OUT.safetensors"],
-    "reconstruct": ["OUT.safetensors"],
-}
+COMMANDS = (
+    "check FOLDER",
+    "modes FOLDER",
+    "fit FOLDER -o OUT.safetensors",
+    *(f"fit FOLDER --until {stage}" for stage in ("gaussians", "features", "surface")),
+)
 
 
 def capture_in(folder: Path, unit: str) -> Path:
@@ -34,13 +31,12 @@ def capture_in(folder: Path, unit: str) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("verb", VERBS)
-def test_every_verb_names_the_unit_and_writes_nothing(verb: str, tmp_path: Path, capsys: Streams) -> None:
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_names_the_unit_and_writes_nothing(command: str, tmp_path: Path, capsys: Streams) -> None:
     folder = capture_in(tmp_path / "plate", "mm")
     before = sorted(folder.rglob("*"))
-    output = [word.replace("OUT", str(tmp_path / "out")) for word in VERBS[verb]]
-    words = [verb, str(folder), *(["--output", *output] if output else [])]
-    assert main(words) == 2
+    words = command.replace("FOLDER", str(folder)).replace("OUT", str(tmp_path / "out"))
+    assert main(words.split()) == 2
     said = capsys.readouterr()
     assert 'surface_unit = "mm"' in said.out + said.err
     assert sorted(folder.rglob("*")) == before

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from avmsf.cli import main
-from avmsf.cli.fit import summary, warn_of_quality
+from avmsf.cli.fit import summary
 from avmsf.cli.heartbeat import verbosity
 from avmsf.cli.options import suggest
 from avmsf.cli.scores import body_warnings, order_words, outlier_words, quality_words
@@ -43,11 +43,11 @@ def test_without_a_contact_no_command_is_named() -> None:
 
 
 @pytest.mark.parametrize(("error", "words"), [(0.3, ""), (0.69, "hardly better than"), (0.9, "worse than")])
-def test_a_field_that_is_no_better_than_averaging_says_so(
-    error: float, words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    warn_of_quality(field_with({"quality": {**FOUND, "error": error, "standard_error": 0.05}}))
-    assert words in capsys.readouterr().err
+def test_a_field_that_is_no_better_than_averaging_says_so(error: float, words: str) -> None:
+    quality = field_with({"quality": {**FOUND, "error": error, "standard_error": 0.05}}).quality
+    assert quality is not None
+    assert words in str(quality)
+    assert (quality.level > 0) == bool(words)
 
 
 def test_an_edited_or_unjudged_field_gets_no_words() -> None:

@@ -12,7 +12,7 @@ import trimesh
 from avmsf.cli import main
 from avmsf.cli.info import gains_at
 from avmsf.cli.options.checks import OutputError
-from avmsf.cli.options.surface import parse
+from avmsf.cli.options.fit import parse
 from avmsf.errors import EvaluationError
 from avmsf.field.store import save
 from avmsf.mesh import Surface, read_surface
@@ -24,7 +24,7 @@ from factories.raising import raises
 from factories.small_scene import SMALL_SPLAT, THICKNESS, slab, slab_views, write_surface_file
 
 Streams = pytest.CaptureFixture[str]
-FIT = tuple(f"--fit.{word[2:]}" if word.startswith("--") else word for word in TINY[:-2])
+FIT = TINY[:-2]
 
 
 @pytest.mark.parametrize("kind", ["ply", "obj", "glb"])
@@ -34,7 +34,7 @@ def test_a_mesh_is_written_as_it_is_in_meters(kind: str, tmp_path: Path) -> None
     write_surface_file(folder)
     (folder / "capture.toml").write_text('surface_unit = "mm"')
     for option, name in (("--output", "a"), ("-o", "b")):
-        assert main(["surface", str(folder), option, str(tmp_path / f"{name}.{kind}")]) == 0
+        assert main(["fit", str(folder), "--until", "surface", option, str(tmp_path / f"{name}.{kind}")]) == 0
     for name in "ab":
         written, given = read_surface(tmp_path / f"{name}.{kind}"), slab()
         assert torch.allclose(written.vertices, given.vertices / 1000, atol=1e-8)
@@ -44,7 +44,7 @@ def test_a_mesh_is_written_as_it_is_in_meters(kind: str, tmp_path: Path) -> None
 def test_pictures_become_a_closed_surface_that_is_kept(tmp_path: Path) -> None:
     folder, output = tmp_path / "slab", tmp_path / "slab.ply"
     write_views(slab_views(), folder)
-    assert main(["surface", str(folder), "--output", str(output), *SMALL_SPLAT]) == 0
+    assert main(["fit", str(folder), "--until", "surface", "--output", str(output), *SMALL_SPLAT]) == 0
     assert output.read_bytes() == (folder / ".avmsf" / "surface.ply").read_bytes()
     mesh = trimesh.load(output)
     assert mesh.is_watertight
@@ -52,11 +52,10 @@ def test_pictures_become_a_closed_surface_that_is_kept(tmp_path: Path) -> None:
     assert mesh.extents.tolist() == pytest.approx([PLATE.length, PLATE.width, THICKNESS], abs=0.02)
 
 
-def test_a_reconstruction_leaves_its_surface_and_says_where(tmp_path: Path, capsys: Streams) -> None:
+def test_a_fit_leaves_its_surface_and_says_where(tmp_path: Path, capsys: Streams) -> None:
     folder = fill_plate(tmp_path / "plate", surface=False)
     write_surface_file(folder)
-    words = ["--views.rendered", "48", "--views.count", "6", "--lift.encoder", "descriptors", "--lift.points", "300"]
-    assert main(["reconstruct", str(folder), "--gain-model", "smooth", *words, *FIT, "--modes", "12", "--json"]) == 0
+    assert main(["fit", str(folder), "--gain-model", "smooth", *FIT, "--modes", "12", "--json"]) == 0
     out, err = capsys.readouterr()
     values = json.loads(out)
     assert values["surface"] == str(folder / ".avmsf" / "surface.ply")
@@ -67,8 +66,8 @@ def test_a_reconstruction_leaves_its_surface_and_says_where(tmp_path: Path, caps
 
 def test_what_cannot_be_written_is_refused_first(tmp_path: Path, capsys: Streams) -> None:
     with raises(OutputError, name="suffix", value=".stl"):
-        parse([str(tmp_path), "-o", str(tmp_path / "surface.stl")]).check_inputs()
-    assert main(["surface", str(tmp_path), "--output", str(tmp_path / "surface.obj")]) == 2
+        parse([str(tmp_path), "--until", "surface", "-o", str(tmp_path / "surface.stl")]).check_inputs()
+    assert main(["fit", str(tmp_path), "--until", "surface", "--output", str(tmp_path / "surface.obj")]) == 2
     assert "surface.obj" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
@@ -99,7 +98,7 @@ def test_the_picture_is_written_beside_the_surface_and_with_a_field(tmp_path: Pa
     folder = tmp_path / "slab"
     folder.mkdir()
     write_surface_file(folder)
-    assert main(["surface", str(folder), "--plots", str(tmp_path)]) == 0
+    assert main(["fit", str(folder), "--until", "surface", "--plots", str(tmp_path)]) == 0
     assert (tmp_path / "surface.png").read_bytes().startswith(b"\x89PNG")
     contacts = bar_contacts(6)
     for name, made in (("with", elastic_field), ("without", positional_field)):

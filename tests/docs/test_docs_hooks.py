@@ -22,10 +22,6 @@ def test_every_option_has_a_description_on_its_line(pages: dict[str, str]) -> No
     assert all(line.removeprefix(":   ").strip() for line in described)
 
 
-def test_the_page_of_dataset_has_the_options_of_its_part(pages: dict[str, str]) -> None:
-    assert "`--contact-data FOLDER`" in pages["cli/dataset.md"]
-
-
 def _hooks() -> ModuleType:
     pytest.importorskip("latex2mathml")
     pytest.importorskip("mkdocs")

@@ -17,22 +17,21 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 DOCS = REPOSITORY / "docs"
 PAGES = (*sorted((DOCS / "tutorials").glob("*.md")), REPOSITORY / "README.md", DOCS / "getting-started.md")
 """Tutorials first: what they have run in the same folder is not repeated for README and getting started."""
-PHOTOGRAPHS = "**With photographs**"
-"""Where README turns from a capture with a mesh to one with photographs."""
+PHOTOGRAPHS, PYTHON = "**With photographs**", "## Python"
+"""Where README turns from a capture with a mesh to one with photographs, and to Python."""
 FEW_STEPS = ("--splat.steps", "60", "--splat.start-points", "800")
 FEW_VIEWS = ("--views.rendered", "48", "--views.count", "18")
 SMALL = {
     "fit bowl.ply": ("--modes", "8", "--body.dofs", "2000", "--body.wall", "0.003"),
-    "fit": ("--gain-model", "smooth", "--modes", "8", "--steps", "4"),
-    "reconstruct": (*FEW_STEPS, *FEW_VIEWS, "--lift.encoder", "descriptors", "--gain-model", "smooth", "--modes", "8"),
-    "splat": tuple(word.replace("splat.", "") for word in FEW_STEPS),
-    "features": (*FEW_STEPS, "--encoder", "descriptors"),
-    "surface": FEW_STEPS,
+    "fit": (
+        *(*FEW_STEPS, *FEW_VIEWS, "--lift.encoder", "descriptors"),
+        *("--gain-model", "smooth", "--modes", "8", "--steps", "4"),
+    ),
     "evaluate": ("--modes", "8"),
     "evaluate learning-curve": ("--methods", "knn3", "--counts", "3", "--starts", "1", "--modes", "8"),
 }
 """For each verb, settings that take seconds; the pages' own take minutes."""
-LONG = ("avmsf simulate", "avmsf reconstruct scan")
+LONG = ("avmsf simulate", "avmsf fit scan")
 """Commands that take minutes with any setting: what they make is there already, or is not used on the page."""
 
 
@@ -59,13 +58,23 @@ def photographed(workshop: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return folder
 
 
+@pytest.fixture(scope="module")
+def bare(workshop: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the same without anything that shows the object."""
+    folder = tmp_path_factory.mktemp("bare") / "workshop"
+    shutil.copytree(workshop, folder)
+    (folder / "bowl" / "surface.ply").unlink()
+    return folder
+
+
 def parts(page: Path) -> dict[str, str]:
     """Return the page's text by the folder in which it is to run."""
     text = page.read_text()
     if page.stem == "README":
-        mesh, mark, photographs = text.partition(PHOTOGRAPHS)
-        # README's Python, in the second part, would fit bodies of many thicknesses, for minutes, if it had a mesh.
-        return {"workshop": mesh, "photographed": mark + photographs}
+        mesh, _, rest = text.partition(PHOTOGRAPHS)
+        photographs, _, python = rest.partition(PYTHON)
+        # README's Python would fit bodies of many thicknesses, for minutes, if anything showed the shape.
+        return {"workshop": mesh, "photographed": photographs, "bare": python}
     return {"photographed" if page.stem == "photographs" else "workshop": text}
 
 

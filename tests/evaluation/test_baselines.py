@@ -239,7 +239,7 @@ def test_what_is_no_renderer_is_refused(made):
 
 
 def fit_to_recordings(train):
-    """Raise what `SoundField.fit` raises for recordings without a capture."""
+    """Raise what `avmsf.fit` raises for recordings without a capture."""
     raise FitError("no capture", name="capture", value=type(train).__name__)
 
 

@@ -117,8 +117,8 @@ def test_the_sentence_names_both_errors_and_what_to_do():
     assert "0.32" in better
     assert "0.72" in better
     assert "0.81" in worse
-    assert "avmsf reconstruct" in worse
-    assert "avmsf reconstruct" not in better
+    assert "photographs" in worse
+    assert "photographs" not in better
 
 
 def test_an_edited_field_has_no_quality():

@@ -240,7 +240,7 @@ def test_a_newer_format_is_refused_by_name(tmp_path):
     ("report", "command"),
     [
         ({}, "avmsf fit FOLDER --output"),
-        ({"pipeline": {"scene": {"views": {}}}}, "avmsf reconstruct FOLDER --output"),
+        ({"pipeline": {"scene": {"views": {}}}}, "avmsf fit FOLDER --output"),
         ({"guess": "…", "material": {"name": "glass"}}, "avmsf fit FOLDER --material glass --output"),
     ],
 )

@@ -6,15 +6,12 @@ from pathlib import Path
 
 import pytest
 
+import avmsf
 from avmsf.capture import Capture, CaptureSettings
-from avmsf.cli.options.features import parse as parse_features
 from avmsf.cli.options.fit import parse as parse_fit
 from avmsf.cli.options.modes import parse as parse_modes
-from avmsf.cli.options.reconstruct import parse as parse_reconstruct
-from avmsf.cli.options.splat import parse as parse_splat
 from avmsf.errors import FitError
 from avmsf.field.config import FitConfig
-from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
 from avmsf.gaussians.config import SplatConfig
 from avmsf.modal.extraction.finders import ShortTime
@@ -29,7 +26,7 @@ PUBLISHED = ("warmup_gains", "warmup_weights", "spectral_norm", "residual_start"
 
 def test_the_default_preset_is_the_default() -> None:
     assert PRESETS["default"] == PipelineConfig()
-    assert parse_reconstruct(["mug"]).pipeline == PRESETS["default"]
+    assert parse_fit(["mug"]).pipeline == PRESETS["default"]
 
 
 def test_the_paper_preset_deviates_nowhere_that_there_is_a_switch_for() -> None:
@@ -53,28 +50,23 @@ def test_the_paper_preset_deviates_nowhere_that_there_is_a_switch_for() -> None:
 
 
 def test_commands_start_from_the_preset_and_change_what_is_said() -> None:
-    assert parse_reconstruct(["mug", "--preset", "paper"]).pipeline == PRESETS["paper"]
-    words = ["mug", "--lift.encoder", "descriptors", "--preset", "paper", "--fit.steps", "7"]
-    mixed = parse_reconstruct(words).pipeline
+    assert parse_fit(["mug", "--preset", "paper"]).pipeline == PRESETS["paper"]
+    words = ["mug", "--lift.encoder", "descriptors", "--preset", "paper", "--steps", "7"]
+    mixed = parse_fit(words).pipeline
     assert (mixed.fit.steps, mixed.fit.clusters) == (7, 256)
     assert (mixed.scene.lift.encoder, mixed.scene.lift.onto) == ("descriptors", "gaussians")
-    fitted = parse_fit(["mug", "--output", "mug.safetensors", "--preset", "paper"])
-    assert (fitted.config, fitted.extraction, fitted.gain_model) == (PRESETS["paper"].fit, "short-time", "network")
 
 
-def test_features_and_modes_start_from_the_preset_too() -> None:
+def test_modes_start_from_the_preset_too() -> None:
     paper = PRESETS["paper"]
-    assert parse_features(["mug", "--preset", "paper"]).config == paper.scene.lift
-    assert parse_features(["mug", "--preset", "paper", "--components", "3"]).config == replace(
-        paper.scene.lift, components=3
-    )
     modes = parse_modes(["mug", "--preset", "paper", "--modes", "5"]).pipeline
     assert (modes.extraction, modes.time_zero, modes.modes) == (paper.extraction, paper.time_zero, 5)
-    assert parse_features(["mug"]).config == PRESETS["default"].scene.lift
     assert parse_modes(["mug"]).pipeline == PRESETS["default"]
-    # `splat` needs no preset.
-    splat = parse_splat(["mug"])
-    assert (splat.views, splat.config) == (paper.scene.views, paper.scene.splat)
+
+
+def test_a_seed_is_that_of_all_stages() -> None:
+    made = parse_fit(["mug", "--seed", "4"]).pipeline
+    assert {made.fit.seed, made.scene.views.seed, made.scene.splat.seed, made.scene.lift.seed} == {4}
 
 
 def test_no_setting_of_a_preset_is_left_out_by_the_commands(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -82,9 +74,7 @@ def test_no_setting_of_a_preset_is_left_out_by_the_commands(monkeypatch: pytest.
     other = PipelineConfig("smooth", BodyConfig(wall=0.5), scene, FitConfig(steps=6), "short-time", 5, "peak", "cpu")
     assert all(getattr(other, each.name) != getattr(PipelineConfig(), each.name) for each in fields(other))
     monkeypatch.setattr("avmsf.cli.options.common.PRESETS", {"default": PipelineConfig(), "paper": other})
-    assert parse_reconstruct(["mug", "--preset", "paper"]).pipeline == other
-    fitted = parse_fit(["mug", "--output", "mug.safetensors", "--preset", "paper"])
-    assert (fitted.pipeline, fitted.preset) == (replace(other, scene=SceneConfig()), "paper")
+    assert parse_fit(["mug", "--preset", "paper"]).pipeline == other
 
 
 def test_the_start_of_sounds_is_the_presets_before_the_captures_own() -> None:
@@ -100,19 +90,19 @@ def test_the_table_of_the_docs_selects_the_preset_but_for_what_the_paper_leaves_
     page = (Path(__file__).parents[2] / "docs" / "paper-map.md").read_text(encoding="utf-8")
     table = page.partition("## The paper's form of each stage")[2].partition("\n\n`evaluate`")[0]
     words = [word for options in re.findall(r"`(--[^`]*)`", table.partition("|---|")[2]) for word in options.split()]
-    found, paper = parse_reconstruct(["mug", *words]).pipeline, PRESETS["paper"]
+    found, paper = parse_fit(["mug", *words]).pipeline, PRESETS["paper"]
     silent = {name: getattr(paper.fit, name) for name in ("width", "hidden", "layers", "warmup_rate")}
     assert replace(found, fit=replace(found.fit, **silent)) == paper
 
 
 def test_a_preset_that_there_is_not_is_refused() -> None:
     with pytest.raises(SystemExit):
-        parse_reconstruct(["mug", "--preset", "quick"])
+        parse_fit(["mug", "--preset", "quick"])
 
 
 def test_a_capture_with_another_start_of_sounds_than_the_presets_is_refused() -> None:
     with raises(FitError, name="time_zero", value="onset"):
-        SoundField.fit(Capture("plate", plate_impacts()), config=PRESETS["paper"], progress=False)
+        avmsf.fit(Capture("plate", plate_impacts()), config=PRESETS["paper"], progress=False)
 
 
 def test_settings_in_earlier_files_have_the_names_of_today() -> None:

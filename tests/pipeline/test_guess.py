@@ -9,7 +9,7 @@ import pytest
 import torch
 import trimesh
 
-from avmsf.capture import CaptureSettings
+import avmsf
 from avmsf.cli import main
 from avmsf.editing.material import infer_material
 from avmsf.errors import FitError, SimulationError
@@ -22,8 +22,8 @@ from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
 from avmsf.field.suggest import suggest
 from avmsf.mesh.surface import Surface, write_surface
-from avmsf.pipeline.config import BodyConfig
-from avmsf.pipeline.guess import guess_field, known_surface
+from avmsf.pipeline.config import BodyConfig, PipelineConfig
+from avmsf.pipeline.guess import expect_no_recordings, guess_field
 from factories.raising import raises
 
 LENGTH, WIDTH, HEIGHT = 0.3, 0.02, 0.012
@@ -163,29 +163,35 @@ def test_what_cannot_vibrate_or_is_in_another_unit_is_refused():
 
 def test_recordings_are_not_passed_over(tmp_path: Path):
     write_surface(box(LENGTH, WIDTH, HEIGHT), tmp_path / "surface.ply")
-    settings = CaptureSettings()
     for rows in ("", "file,x,y,z\n"):
         (tmp_path / "impacts.csv").write_text(rows)
-        assert len(known_surface(tmp_path, settings).faces)
+        expect_no_recordings(tmp_path)
     (tmp_path / "impacts.csv").write_text("file,x,y,z\n1.wav,0,0,0\n")
     with raises(FitError, file=tmp_path / "impacts.csv", name="--material"):
-        known_surface(tmp_path, settings)
-    assert len(known_surface(tmp_path / "surface.ply", settings).faces)
-    (tmp_path / "surface.ply").unlink()
-    (tmp_path / "impacts.csv").unlink()
-    with raises(FitError, file=tmp_path, name="surface"):
-        known_surface(tmp_path, settings)
+        avmsf.fit(tmp_path, material="steel", progress=False)
 
 
-@pytest.mark.parametrize("verb", ["fit", "reconstruct"])
-def test_a_mesh_and_a_material_give_a_field_from_the_command_line(verb: str, tmp_path: Path, capsys):
+def test_a_mesh_or_its_file_and_a_material_give_a_field(tmp_path: Path):
+    write_surface(box(LENGTH, WIDTH, HEIGHT), tmp_path / "bar.ply")
+    config = PipelineConfig(modes=12, body=QUICK)
+    made = [
+        avmsf.fit(each, material="steel", config=config, progress=False)
+        for each in (str(tmp_path / "bar.ply"), box(LENGTH, WIDTH, HEIGHT))
+    ]
+    assert made[0].origin.capture == "bar"
+    for each in made:
+        torch.testing.assert_close(each.bank.frequency, bar().bank.frequency, rtol=1e-4, atol=0)
+    assert [path.name for path in tmp_path.iterdir()] == ["bar.ply"]
+
+
+def test_a_mesh_and_a_material_give_a_field_from_the_command_line(tmp_path: Path, capsys):
     write_surface(box(LENGTH, WIDTH, HEIGHT), tmp_path / "surface.ply")
     output = tmp_path / "field.safetensors"
     words = ["--material", "steel", "--modes", "12", "--body.dofs", "6000", "--output", str(output)]
-    assert main([verb, str(tmp_path), *words]) == 0
+    assert main(["fit", str(tmp_path), *words]) == 0
     assert "No recordings" in capsys.readouterr().out
     field = load(output)
     torch.testing.assert_close(field.bank.frequency, bar().bank.frequency, rtol=5e-3, atol=0)
     capsys.readouterr()
-    assert main([verb, str(tmp_path), *words, "--train-count", "3"]) == 2
+    assert main(["fit", str(tmp_path), *words, "--train-count", "3"]) == 2
     assert "--train-count" in capsys.readouterr().err

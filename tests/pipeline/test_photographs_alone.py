@@ -14,7 +14,7 @@ from avmsf.mesh import read_surface
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.photographs.folder import write_views
 from avmsf.pipeline.config import CACHE
-from avmsf.pipeline.reconstruct import SURFACE
+from avmsf.pipeline.fit import SURFACE
 from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER
 from factories.plate_capture import TINY, fill_plate
 from factories.small_scene import SMALL_SPLAT, slab_views
@@ -23,7 +23,7 @@ Streams = pytest.CaptureFixture[str]
 SMALL = (
     *SMALL_SPLAT,
     *("--lift.encoder", "descriptors", "--lift.points", "600", "--modes", "12"),
-    *(f"--fit.{word[2:]}" if word.startswith("--") else word for word in TINY[:-2]),
+    *TINY[:-2],
 )
 
 
@@ -40,13 +40,13 @@ def slab(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_photographs_alone_give_elastic_mode_shapes(slab: Path, capsys: Streams) -> None:
     bodies = ("--body.wall", "0", "--body.shapes", "12", "--body.dofs", "3000", "--body.supports", "free")
-    assert main(["reconstruct", str(slab), *SMALL, *bodies, "--json"]) == 0
+    assert main(["fit", str(slab), *SMALL, *bodies, "--json"]) == 0
     made = json.loads(capsys.readouterr().out)
     report = made["report"]
     assert Elastic.kind not in report["unavailable"]
     assert report["bodies"][0]["body"].startswith("solid body")
     assert report["bodies"][0]["weight"] > 0
-    assert main(["reconstruct", str(slab), *SMALL, *bodies, "--json"]) == 0
+    assert main(["fit", str(slab), *SMALL, *bodies, "--json"]) == 0
     again = json.loads(capsys.readouterr().out)
     assert [each["stage"] for each in again["stages"]] == ["views", "cloud", "features", "surface", "modes", "fit"]
     assert not any(each["fresh"] for each in again["stages"])
@@ -56,8 +56,8 @@ def test_photographs_alone_give_elastic_mode_shapes(slab: Path, capsys: Streams)
 def test_the_thickness_of_a_wall_reaches_the_report_and_the_summary(tmp_path: Path, capsys: Streams) -> None:
     folder = tmp_path / "mug"
     shutil.copytree(EXAMPLE_FOLDER, folder)
-    words = ["--splat.steps", "200", "--lift.encoder", "descriptors", "--fit.steps", "2", "--train-count", "12"]
-    assert main(["reconstruct", str(folder), *words, "--body.shapes", "40", "--body.supports", "free", "--json"]) == 0
+    words = ["--splat.steps", "200", "--lift.encoder", "descriptors", "--steps", "2", "--train-count", "12"]
+    assert main(["fit", str(folder), *words, "--body.shapes", "40", "--body.supports", "free", "--json"]) == 0
     made = json.loads(capsys.readouterr().out)
     found = made["report"]["thickness"]
     assert found["low"] < found["median"] < found["high"]

@@ -8,12 +8,11 @@ from pathlib import Path
 import pytest
 import trimesh
 
-from avmsf.capture import CaptureSettings, read_capture
+from avmsf.capture import read_capture
 from avmsf.cli import main
 from avmsf.errors import FolderInUseError
 from avmsf.pipeline.config import CACHE, PipelineConfig
-from avmsf.pipeline.reconstruct import reconstruct
-from avmsf.pipeline.scene import ProgressListener
+from avmsf.pipeline.fit import fit_in_stages
 from avmsf.pipeline.stages import StageFolder
 from factories.plate_capture import fill_plate
 
@@ -26,7 +25,7 @@ def held(folder: Path) -> Iterator[None]:
     begun, done = threading.Event(), threading.Event()
 
     def hold() -> None:
-        with StageFolder(folder).lock("avmsf reconstruct mug"):
+        with StageFolder(folder).lock("avmsf fit mug"):
             begun.set()
             done.wait()
 
@@ -40,18 +39,18 @@ def held(folder: Path) -> Iterator[None]:
         thread.join()
 
 
-@pytest.mark.parametrize("verb", ["splat", "features"])
-def test_a_command_is_refused_while_another_one_makes_stages(verb: str, tmp_path: Path, capsys: Streams) -> None:
+@pytest.mark.parametrize("stage", ["gaussians", "features"])
+def test_a_command_is_refused_while_another_one_makes_stages(stage: str, tmp_path: Path, capsys: Streams) -> None:
     trimesh.creation.icosphere(subdivisions=1, radius=0.05).export(tmp_path / "surface.ply")
     with held(tmp_path / CACHE):
-        assert main([verb, str(tmp_path)]) == 2
-    assert "avmsf reconstruct mug" in capsys.readouterr().err
+        assert main(["fit", str(tmp_path), "--until", stage]) == 2
+    assert "avmsf fit mug" in capsys.readouterr().err
     assert not (tmp_path / CACHE / "views").exists()
 
 
 def test_a_folder_that_shows_nothing_is_left_as_it_is(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").touch()
-    assert main(["splat", str(tmp_path)]) == 2
+    assert main(["fit", str(tmp_path), "--until", "gaussians"]) == 2
     assert [each.name for each in tmp_path.iterdir()] == ["notes.txt"]
 
 
@@ -60,17 +59,9 @@ def test_only_the_cache_that_is_written_is_locked(tmp_path: Path) -> None:
         assert (tmp_path / "other" / "cache").is_dir()
 
 
-def test_reconstruct_is_refused_before_it_reads_what_another_one_writes(tmp_path: Path) -> None:
+def test_a_fit_is_refused_before_it_reads_what_another_one_writes(tmp_path: Path) -> None:
     capture = read_capture(fill_plate(tmp_path / "plate"))
     with held(tmp_path / "cache"), pytest.raises(FolderInUseError) as refused:
-        reconstruct(
-            tmp_path / "plate",
-            capture,
-            capture.impacts,
-            PipelineConfig("smooth", modes=4),
-            cache=tmp_path / "cache",
-            settings=CaptureSettings(),
-            listener=ProgressListener(),
-        )
-    assert refused.value.holder["command"] == "avmsf reconstruct mug"
+        fit_in_stages(capture, PipelineConfig("smooth", modes=4), StageFolder(tmp_path / "cache"))
+    assert refused.value.holder["command"] == "avmsf fit mug"
     assert sorted(each.name for each in (tmp_path / "cache").iterdir()) == ["stages.lock"]

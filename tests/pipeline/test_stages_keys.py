@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 import torch
 
-from avmsf.capture import CaptureSettings, read_capture
+import avmsf.pipeline.fit as module
+from avmsf.capture import read_capture
 from avmsf.editing import guided
 from avmsf.errors import CaptureError, SimulationError
 from avmsf.fem import candidate_bodies as nominal
@@ -21,11 +22,9 @@ from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import fingerprint, gain_case
 from avmsf.field.store import load
 from avmsf.mesh.surface import Surface
-from avmsf.pipeline import reconstruct as module
 from avmsf.pipeline import stages
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig, PipelineConfig
-from avmsf.pipeline.scene import ProgressListener
 from avmsf.pipeline.stages import StageFolder
 from avmsf.simulate import recipe
 from factories.plate_capture import fill_plate
@@ -113,23 +112,17 @@ def test_a_field_does_not_depend_on_free_memory_and_is_made_again_once_there_are
 
     def run() -> bool:
         """Return whether the field was made now."""
-        made = module.reconstruct(
-            tmp_path / "plate",
+        made = module.fit_in_stages(
             capture,
-            capture.impacts,
             PipelineConfig(
                 body=BodyConfig(wall=0.004, shapes=8, dofs=1000),
                 fit=FitConfig(steps=2, fft_sizes=(1024, 256)),
                 modes=6,
             ),
-            cache=tmp_path / "cache",
-            settings=CaptureSettings(),
-            listener=ProgressListener(),
+            StageFolder(tmp_path / "cache"),
         )
         return {each.stage: each.fresh for each in made.stages}["fit"]
 
-    # The plate has a surface, of which features are made by pictures: not what is tested.
-    monkeypatch.setattr(module, "SceneStages", NoScene)
     failures[:] = [SimulationError("3.1 GB are free")]
     assert run()
     failures[:] = [SimulationError("2.9 GB are free")]
@@ -142,13 +135,3 @@ def test_a_field_does_not_depend_on_free_memory_and_is_made_again_once_there_are
     assert asked == []
     recipe = json.loads((tmp_path / "cache" / "field.safetensors.stage.json").read_text())["recipe"]
     assert "GB" not in json.dumps(recipe)
-
-
-class NoScene:
-    """Stages of a folder that shows nothing."""
-
-    def __init__(self, *arguments: object, **named: object) -> None:
-        self.source = None
-
-    def __bool__(self) -> bool:
-        return False

@@ -408,5 +408,5 @@ def test_a_change_that_another_process_does_not_let_through_changes_nothing(
     assert refused.value.status == 503
     assert not (tmp_path / "impacts.csv").exists()
     # Stages that are made meanwhile do not keep impacts out.
-    with write_lock(tmp_path / CACHE, "stages", command="avmsf reconstruct"):
+    with write_lock(tmp_path / CACHE, "stages", command="avmsf fit"):
         assert CaptureEditor(tmp_path).add(blow(0), contact(0.1))["file"] == "001.wav"

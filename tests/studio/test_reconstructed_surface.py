@@ -12,7 +12,7 @@ from avmsf.field.store import save
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
 from avmsf.pipeline.config import CACHE
-from avmsf.pipeline.reconstruct import FIELD, SURFACE
+from avmsf.pipeline.fit import FIELD, SURFACE
 from avmsf.pipeline.scene import CLOUD
 from avmsf.studio.opening import find_reconstructed, open_target
 from opened_plate import plate_field

@@ -387,8 +387,8 @@ def test_a_worker_copies_its_field_before_another_process_may_replace_it(
     locked: list[bool] = []
     given: list[tuple[object, ...]] = []
 
-    def stand_in(*arguments: object, **named: object) -> object:
-        given.append((*arguments[3:], named["settings"].time_zero))
+    def stand_in(*arguments: Any, **named: object) -> object:
+        given.append((arguments[1], arguments[0].settings.time_zero))
         field.write_text("made")
         return SimpleNamespace(field=field, stages=[])
 
@@ -396,7 +396,7 @@ def test_a_worker_copies_its_field_before_another_process_may_replace_it(
         locked.append(FileLock(folder / CACHE / "stages.lock", is_singleton=True, fallback_to_soft=False).is_locked)
         copy_whole(source, path)
 
-    monkeypatch.setattr(worker, "reconstruct", stand_in)
+    monkeypatch.setattr(worker, "fit_in_stages", stand_in)
     monkeypatch.setattr(worker, "copy_whole", copy)
     task = {"folder": str(folder), "preset": "paper", "modes": 6, "output": str(tmp_path / "files" / "reconstructed")}
     with open(tmp_path / "said", "w") as said:

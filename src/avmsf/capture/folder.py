@@ -32,6 +32,8 @@ class Capture:
     surface: Surface | None = None
     settings: CaptureSettings = field(default_factory=CaptureSettings)
     """Settings with which its folder was read."""
+    folder: Path | None = None
+    """Folder that it was read from, which may hold photographs, a video or Gaussians."""
 
     def __repr__(self) -> str:
         surface = "no surface" if self.surface is None else repr(self.surface)
@@ -84,7 +86,7 @@ def _read_capture(folder: Path, settings: CaptureSettings) -> Capture:
     )
     for remark in remarks + warned + _summary(reports, folder):
         warnings.warn(remark, stacklevel=3)
-    return Capture(settings.name or folder.resolve().name, impacts, surface, settings)
+    return Capture(settings.name or folder.resolve().name, impacts, surface, settings, folder)
 
 
 def read_strike(folder: Path, strike: Strike, *, settings: CaptureSettings) -> tuple[Prepared, RecordingReport]:

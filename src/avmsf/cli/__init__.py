@@ -25,11 +25,7 @@ from avmsf.errors import AvmsfError, AvmsfWarning
 VERBS = {
     "check": "Check the recordings of a capture: levels, noise, clipping, onsets, second impacts and alignment.",
     "modes": "List the modes of an object: frequencies, dampings and levels, from all recordings of a capture.",
-    "splat": "Fit 3D Gaussians to photographs, a video or a mesh, as a .ply file that any 3DGS viewer opens.",
-    "features": "Compute visual features on an object's surface, equal at points that are symmetric to each other.",
-    "surface": "Write an object's surface as a mesh: the folder's own, or one reconstructed from its views.",
     "fit": "Fit a sound field to a capture and write it to one file.",
-    "reconstruct": "Make a field from a capture folder with photographs or a mesh: Gaussians, features, modes, gains.",
     "render": "Write the sounds of impacts anywhere on the object as wav files.",
     "info": "Describe a field, Gaussians or features, and draw them with --plots.",
     "locate": "Find where on the object the impact of a recording was, with a heat map and the uncertainty.",
@@ -39,13 +35,17 @@ VERBS = {
     "simulate": "Simulate objects, their recordings and images, as capture folders with ground truth.",
     "export": "Write a field for other tools: web page, glTF, Faust, samplers, modal analysis.",
     "studio": "Open a web page that plays an object, locates impacts, edits fields and records captures.",
-    "dataset": "List the objects of a published dataset: what can be read, and what is missing.",
     "demo": "Run a complete example: from photographs and recordings of a mug to its sound field, sounds and images.",
 }
 """Each verb's module in this package and in `options`, and the first sentence of its help, in the order of the work."""
 RENAMED = {
     "play": "studio",
-    "lift": "features",
+    "dataset": "check",
+    "lift": "fit --until features",
+    "features": "fit --until features",
+    "splat": "fit --until gaussians",
+    "surface": "fit --until surface",
+    "reconstruct": "fit",
     "view-cloud": "info",
     "show": "info",
     "efficiency": "evaluate learning-curve",

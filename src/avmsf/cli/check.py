@@ -1,4 +1,4 @@
-"""`avmsf check`: what each recording of a capture is worth, and what is wrong."""
+"""`avmsf check`: what each recording of a capture is worth, what a dataset holds, and what is wrong."""
 
 import warnings
 from collections.abc import Sequence
@@ -17,6 +17,7 @@ from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.check import Options
 from avmsf.cli.printing import console, decimals, next_command, print_json, say, table
 from avmsf.cli.visuals import misplaced, visual_inputs
+from avmsf.datasets import DatasetReport, ObjectReport, open_dataset
 from avmsf.errors import CaptureError, CaptureWarning, ExtractionError
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.extraction.finders import HighResolution
@@ -29,7 +30,9 @@ MAX_PRINTED = 1000
 
 
 def run(options: Options) -> int:
-    """Print the report; return 2 where the capture cannot be read."""
+    """Print the report; return 2 where the capture, or every object of a dataset, cannot be read."""
+    if options.is_dataset:
+        return _check_dataset(options)
     settings = None if options.settings is None else CaptureSettings.read(options.settings)
     screen = console(errors=options.json)
     doing(f"reading {options.capture}")
@@ -84,7 +87,7 @@ def run(options: Options) -> int:
         wrong += bool(aligned.not_aligned) + bool(aligned.inverted) + len(aligned.faults())
     screen.print("no problem found" if not wrong else f"readable, with {counted(wrong, 'warning')}", soft_wrap=True)
     if visual is not None and visual.reconstructs:
-        next_command("avmsf reconstruct", options.capture, "-o field.safetensors")
+        next_command("avmsf fit", options.capture, "-o field.safetensors")
     else:
         next_command("avmsf modes", options.capture)
     return 0
@@ -146,3 +149,52 @@ def _table(report: CaptureReport, title: str, aligned: AlignmentReport | None) -
         for row in report.recordings[:MAX_PRINTED]
     ]
     return table(title, [*columns, "delay smp"] if delays else columns, rows, words=2)
+
+
+def _check_dataset(options: Options) -> int:
+    """Print which objects of a dataset can be read, and what is missing; return 2 where none can be."""
+    report = open_dataset(options.capture, contacts=options.contact_data).check()
+    screen = console(errors=options.json)
+    screen.print(_objects(report, f"{report.dataset} in {options.capture}"))
+    for line in _lines(report):
+        screen.print(line, soft_wrap=True)
+    if options.json:
+        print_json(asdict(report))
+    readable = sum(_readable(each) for each in report.objects)
+    if not readable:
+        say(f"avmsf check: {options.capture}: expected a readable object, found none; fix the listed problems")
+        return UNREADABLE
+    recordings = sum(each.recordings for each in report.objects)
+    screen.print(
+        f"{readable} of {counted(len(report.objects), 'object')} can be read, with {counted(recordings, 'recording')}",
+        soft_wrap=True,
+    )
+    next_command("avmsf evaluate farthest", options.capture)
+    return 0
+
+
+def _readable(report: ObjectReport) -> bool:
+    return report.recordings >= 2
+
+
+def _lines(report: DatasetReport) -> list[str]:
+    """Return what is not in the table, a line each: missing parts, then problems, then remarks."""
+    problems = [f"{each.facts.identifier}: {problem}" for each in report.objects for problem in each.problems]
+    return [*(f"missing: {part}" for part in report.missing), *problems, *(f"note: {each}" for each in report.remarks)]
+
+
+def _objects(report: DatasetReport, title: str) -> object:
+    rows = []
+    for each in report.objects:
+        facts = each.facts
+        inferred = " (inferred)" * facts.inferred
+        rows.append(
+            (
+                facts.identifier,
+                "unreadable" if not _readable(each) else "incomplete" if each.problems else "good",
+                "–" if facts.name == facts.identifier else facts.name + inferred,
+                "–" if facts.material is None else facts.material + inferred,
+                str(each.recordings),
+            )
+        )
+    return table(title, ("object", "state", "name", "material", "recordings"), rows, words=4)

@@ -4,19 +4,21 @@ import json
 import shlex
 import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from avmsf.capture import CaptureSettings, Impacts, check, read_capture
-from avmsf.cli.demo_folder import RECORD, record, replaced_whole
+from avmsf._utils.files import way_out
+from avmsf.capture import Impacts, check, read_capture
 from avmsf.cli.mode_table import amplitudes, levels
+from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.demo import Options
-from avmsf.cli.overall_bar import REFINEMENT, OverallBar
 from avmsf.cli.printing import console, figure, json_text, print_json, print_text, say
+from avmsf.cli.progress import ProgressBar
 from avmsf.cli.scores import compare, parts_words, score_markdown, score_table, score_values
 from avmsf.cli.writing import Level, write_sound, write_text
 from avmsf.evaluation.simple_methods import MeanWaveform
@@ -29,9 +31,10 @@ from avmsf.field.store import load
 from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.points import farthest_points
 from avmsf.pipeline.config import CACHE, DESCRIPTORS, LiftConfig, PipelineConfig, SceneConfig
-from avmsf.pipeline.reconstruct import reconstruct
+from avmsf.pipeline.fit import fit_in_stages
 from avmsf.pipeline.record import modes_words
-from avmsf.pipeline.scene import CLOUD
+from avmsf.pipeline.scene import CLOUD, ProgressListener
+from avmsf.pipeline.stages import StageFolder
 from avmsf.plotting.pictures import draw_modes, draw_scores, save_picture
 from avmsf.plotting.spectrograms import draw_spectrograms
 from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER
@@ -45,27 +48,16 @@ CONFIG = PipelineConfig(
     # A mug's dampings hardly change with position, so the trials that would find this are left out.
     fit=FitConfig(damping="shared"),
 )
-STAGES = {
-    "check": 1.0,
-    "splat": 16.0,
-    "lift": 6.0,
-    "shape": 8.0,
-    "modes": 2.0,
-    "bodies": 58.0,
-    "fit": 30.0,
-    REFINEMENT: 19.0,
-    "page": 3.0,
-}
-"""The stages, and the seconds of CPU time that each takes once loops are compiled: how far the bar is by then."""
-FIELD, GAUSSIANS, SHAPE, PAGE, SCORES = "mug.safetensors", "mug.ply", "mug-surface.ply", "mug.html", "scores.md"
+FIELD, GAUSSIANS, SHAPE, PAGE = "mug.safetensors", "mug.ply", "mug-surface.ply", "mug.html"
+SCORES, RECORD = "scores.md", "demo.json"
 _HEARD = 2
 """Contacts whose sounds and spectrograms are written."""
 
 
 def run(options: Options) -> int:
     """Fill the folder, then print a summary."""
-    with replaced_whole(options.folder) as begun, OverallBar(STAGES) as bar:
-        scores, strikes, report = _go_all_the_way(begun, bar)
+    with _filled_whole(options.folder) as begun, ProgressBar() as bar:
+        scores, strikes, report = _go_all_the_way(begun, bar.listener)
     screen = console(errors=options.json)
     screen.print(score_table(_title(*strikes), scores))
     words = closing_words(options.folder, scores, *strikes, report)
@@ -77,28 +69,38 @@ def run(options: Options) -> int:
     return 0
 
 
+@contextmanager
+def _filled_whole(folder: Path) -> Iterator[Path]:
+    """Give a folder to fill inside of an empty `folder`, which gets its content at the end, or nothing."""
+    begun, known = folder / ".unfinished", folder.exists()
+    try:
+        begun.mkdir(parents=True)
+        yield begun
+        for each in begun.iterdir():
+            each.rename(folder / each.name)
+    except OSError as error:
+        path, reason = error.filename or folder, error.strerror or str(error)
+        raise OutputError.expected("a writable path", reason, file=path, advice=way_out(error)) from error
+    finally:
+        shutil.rmtree(begun, ignore_errors=True)
+        if not known:
+            with suppress(OSError):
+                folder.rmdir()
+
+
 def _go_all_the_way(
-    folder: Path, bar: OverallBar
+    folder: Path, listener: ProgressListener
 ) -> tuple[dict[str, Scores], tuple[Impacts, Impacts], Mapping[str, Any]]:
     """Fill `folder`; return the scores, the impacts fitted to and scored on, and the field's report."""
     shutil.copytree(EXAMPLE_FOLDER, folder / "capture")
     report = check(folder / "capture")
     wrong = sum(bool(each.problems) for each in report.recordings)
-    bar.log(f"check: {len(report.recordings)} recordings, {wrong} with problems")
+    listener.log(f"check: {len(report.recordings)} recordings, {wrong} with problems")
     capture = replace(read_capture(folder / "capture"), name="mug")
     train, test = split(capture.impacts, TRAIN)
-    made = reconstruct(
-        folder / "capture",
-        capture,
-        train,
-        CONFIG,
-        cache=folder / CACHE,
-        settings=CaptureSettings.read(folder / "capture" / "capture.toml"),
-        listener=bar.listener,
-        fitting=bar.fitting,
-    )
+    made = fit_in_stages(capture, CONFIG, StageFolder(folder / CACHE), train=train, listener=listener)
     train, test = made.modes.aligned(train), made.modes.aligned(test)
-    bar.log("page: a web page, sounds, figures and scores")
+    listener.log("page: a web page, sounds, figures and scores")
     shutil.move(made.field, folder / FIELD)
     shutil.move(folder / CACHE / CLOUD, folder / GAUSSIANS)
     field = load(folder / FIELD)
@@ -139,7 +141,7 @@ def _go_all_the_way(
         "stages": {each.stage: each.seconds for each in made.stages},
         "scores": score_values(scores),
     }
-    write_text(folder / RECORD, json_text(record(folder) | facts) + "\n")
+    write_text(folder / RECORD, json_text(facts) + "\n")
     return scores, (train, test), field.origin.report
 
 
@@ -211,7 +213,7 @@ Open {folder / PAGE} in a browser and click the mug to strike it.
 Next, try:
   {command} render {place}/{FIELD} --position {x:.3f} {y:.3f} {z:.3f} -o impact.wav   # an impact anywhere, in meters
   {command} locate {place}/{FIELD} {place}/capture/{test.names[0]}   # the contact of a recording
-  {command} reconstruct YOUR_FOLDER --output yours.safetensors   # your own object"""
+  {command} fit YOUR_FOLDER --output yours.safetensors   # your own object"""
 
 
 def _command() -> str:

@@ -12,10 +12,10 @@ from rich.console import Console
 from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf._utils.wording import counted
 from avmsf.cli import INTERRUPTED
-from avmsf.cli.object_bar import ObjectBar
 from avmsf.cli.options.common import spelled
 from avmsf.cli.options.evaluate import Options, deciding, words_of
 from avmsf.cli.printing import console, decimals, next_command, next_step, print_json, say, table
+from avmsf.cli.progress import ProgressBar
 from avmsf.datasets import CaptureCollection, open_dataset
 from avmsf.datasets.dataset import Dataset
 from avmsf.errors import EvaluationError
@@ -225,12 +225,12 @@ def run_shown(
     after_each: Callable[[], object] = lambda: None,
 ) -> None:
     """Run an evaluation under a progress bar, and call `after_each` after each object."""
-    with ObjectBar() as bar:
+    with ProgressBar() as bar:
 
         def show(progress: RunProgress) -> None:
             if progress.done > bar.done:
                 after_each()
-            bar.show(progress.words, done=progress.done, total=progress.total)
+            bar.objects(progress.words, progress.done, progress.total)
 
         run_objects(evaluation, objects, results, workers=workers, progress=show)
 

@@ -36,7 +36,7 @@ from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh.surface import Surface
 from avmsf.pipeline.config import CACHE
-from avmsf.pipeline.reconstruct import SURFACE
+from avmsf.pipeline.fit import SURFACE
 
 _DEAD_DB = 40.0
 """Energy of a contact below the loudest one's, dB, from which on it is no key of a sample set by default."""
@@ -198,7 +198,7 @@ def _captured(options: Options) -> tuple[Path | None, float]:
 
 
 def _reconstructed(options: Options) -> Path | None:
-    """Return the surface, in meters, that `reconstruct` left in a cache or `demo` next to the field; print if none."""
+    """Return the surface, in meters, that `fit` left in a cache or `demo` next to the field; print if none."""
     field, capture = options.field, options.capture
     if capture is None:
         say("note: only the field's points are shown; --object or --capture adds the surface")
@@ -207,8 +207,8 @@ def _reconstructed(options: Options) -> Path | None:
     made = next((each for each in [field.with_name(f"{field.stem}-{SURFACE}"), *caches] if each.is_file()), None)
     if made is None:
         say(
-            f"note: {capture} has no surface: only the field's points are shown; make one by avmsf surface {capture}, "
-            "or give --object"
+            f"note: {capture} has no surface: only the field's points are shown; make one by avmsf fit {capture} "
+            "--until surface, or give --object"
         )
     return made
 

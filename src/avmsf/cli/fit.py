@@ -1,22 +1,28 @@
-"""`avmsf fit`: a capture folder in, a field file out."""
+"""`avmsf fit`: a capture folder in, a field file out, or what a stage before it makes."""
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import torch
+import trimesh
 from rich.console import Console
 
 from avmsf._utils.device import TRAINABLE, usable_device
+from avmsf._utils.files import copy_whole, write_whole
 from avmsf._utils.wording import counted
-from avmsf.capture import CaptureSettings, Impacts, read_capture
+from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
+from avmsf.capture.table import TABLE, in_folder, read_rows, understand
+from avmsf.capture.together import expect_one_unit, find_surface
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
 from avmsf.cli.heartbeat import doing
-from avmsf.cli.options.checks import read_settings
+from avmsf.cli.options.checks import OutputError, read_settings
 from avmsf.cli.options.fit import Options
-from avmsf.cli.printing import console, next_command, next_step, print_json, say
-from avmsf.cli.progress import FitBar
+from avmsf.cli.printing import console, figure, next_command, next_step, print_json, print_result, say, table
+from avmsf.cli.progress import ProgressBar
 from avmsf.cli.scores import (
     body_warnings,
     compare,
@@ -32,10 +38,16 @@ from avmsf.errors import FitError
 from avmsf.evaluation.splits import Scores, split
 from avmsf.features.store import load_features, read_report
 from avmsf.field.sound_field import SoundField
-from avmsf.field.store import save
-from avmsf.pipeline.fitting import discard_unfinished, fit_capture, unfinished
-from avmsf.pipeline.guess import guess_field, known_surface
-from avmsf.pipeline.record import capture_settings_of, modes_words, with_record
+from avmsf.field.store import load
+from avmsf.gaussians.ply import read_splats
+from avmsf.mesh.surface import Surface, SurfaceKind, read_surface, write_surface
+from avmsf.pipeline.fit import fit_in_stages, guess_in_stages, keep_surface, object_shape
+from avmsf.pipeline.record import capture_settings_of, modes_words
+from avmsf.pipeline.scene import SceneStages
+from avmsf.pipeline.stages import Kept, StageFolder
+from avmsf.plotting.pictures import save_picture
+from avmsf.plotting.surfaces import draw_surface
+from avmsf.symmetry.symmetries import Symmetries
 
 _SHOWN = 8
 """Names of recordings in a line, at most."""
@@ -44,63 +56,94 @@ _SHOWN = 8
 def run(options: Options) -> int:
     """Fit, write, and print a summary; return 130 where Ctrl-C stopped it."""
     usable_device(options.device, raising=FitError, kinds=TRAINABLE)
-    known = read_settings(options.capture, options.settings)
-    if options.material is not None:
-        return _run_guess(options, options.material, known)
-    capture = read_capture(options.capture, capture_settings_of(options.pipeline, known))
-    if options.without_shape:
-        capture = replace(capture, surface=None)
-    elif options.features is None:
-        expect_shape(options.capture, capture, views=False, verb="fit")
-    train, test = part_contacts(
-        capture.impacts, fraction=options.train_fraction, count=options.train_count, start=options.start
-    )
-    features, made = None, {}
-    if options.features is not None:
-        features, made = load_features(options.features), read_report(options.features)
+    settings = capture_settings_of(options.pipeline, read_settings(options.capture, options.settings))
     try:
-        with FitBar() as bar:
-            fitted, modes = fit_capture(
-                capture,
-                options.pipeline,
-                train=train,
-                features=features,
-                features_report=made,
-                output=options.output,
-                log=say,
-                progress=bar.show,
-            )
+        if options.until is not None:
+            _make_stage(options, settings)
+        elif options.material is not None:
+            _guess(options, options.material, settings)
+        else:
+            _fit(options, settings)
     except KeyboardInterrupt:
-        if not unfinished(options.output, "modes").exists():
-            raise
-        checkpoint = unfinished(options.output, "checkpoint")
-        where = f"from {checkpoint}, or delete it" if checkpoint.exists() else "from the start of training"
-        say(f"avmsf fit: interrupted; repeat the command to continue {where}")
+        say("avmsf fit: interrupted; repeat the command to continue")
         return INTERRUPTED
-    screen = console(errors=options.json)
-    for sentence in (*order_words(fitted), *describe_alignment(modes, train)):
+    return 0
+
+
+def _fit(options: Options, settings: CaptureSettings) -> None:
+    capture = read_capture(options.capture, settings)
+    if options.without_shape:
+        capture = replace(capture, surface=None, folder=None)
+    elif options.features is None:
+        expect_shape(options.capture, capture)
+    train, test = _parts(capture, options)
+    features, described = None, None
+    if options.features is not None:
+        features, described = load_features(options.features), read_report(options.features)
+    stages = StageFolder(options.kept)
+    with ProgressBar() as bar, stages.lock("avmsf fit"):
+        made = fit_in_stages(
+            capture,
+            options.pipeline,
+            stages,
+            train=train,
+            features=features,
+            features_report=described,
+            listener=bar.listener,
+        )
+        fitted = load(made.field)
+        if options.output is not None:
+            copy_whole(made.field, options.output)
+    screen, path = console(errors=options.json), options.output or made.field
+    for sentence in (*order_words(fitted), *describe_alignment(made.modes, train)):
         screen.print(sentence, soft_wrap=True)
-    save(fitted, options.output)
-    discard_unfinished(options.output)
     doing("comparing the field with the recordings that it was not fitted to")
-    scores = {} if test is None else compare(fitted, train, test, modes)
+    scores = {} if test is None else compare(fitted, train, test, made.modes)
     if test is not None:
         shown = ", ".join(test.names[:_SHOWN]) + f" and {len(test) - _SHOWN} more" * (len(test) > _SHOWN)
         say(f"not trained on: {shown}")
-    print_fitted(screen, fitted, train, test, scores, options.output)
-    screen.print(f"wrote {options.output}", soft_wrap=True)
-    next_after_fit(options.output, trial=test is not None)
-    warn_of_quality(fitted)
+    if made.report:
+        screen.print(features_words(made.report), soft_wrap=True)
+    rows = [[each.stage, figure(each.seconds), "computed" if each.fresh else "cached"] for each in made.stages]
+    screen.print(table("stages", ["stage", "seconds", "source"], rows))
+    print_fitted(screen, fitted, train, test, scores, path)
+    if made.surface is not None:
+        screen.print(f"the object's surface is {made.surface}", soft_wrap=True)
+    screen.print(f"wrote {path}", soft_wrap=True)
+    if test is not None:
+        next_step("the same command without --train-fraction and --train-count, to fit to all recordings")
+    else:
+        next_command("avmsf render", path, "--position X Y Z -o impact.wav")
+    if fitted.quality is not None and fitted.quality.level > 0:
+        # Last, so that it is read: the field is not better than averaging recordings.
+        say(str(fitted.quality))
     if options.json:
         print_json(
             {
-                **fitted_values(fitted, train, test, scores, options.output),
+                "field": str(path),
+                "capture": fitted.origin.capture,
+                "modes": int(fitted.is_mode.sum()),
+                "supporting_poles": int((~fitted.is_mode).sum()),
+                "trained_on": list(train.names),
+                "tested_on": [] if test is None else list(test.names),
+                "report": fitted.origin.report,
+                "body": None if fitted.body is None else fitted.body.record(),
+                "scores": score_values(scores),
+                "quality": None if fitted.quality is None else fitted.quality.level,
+                "surface": None if made.surface is None else str(made.surface),
                 "preset": options.preset,
                 "config": asdict(options.config),
+                "features_report": made.report,
+                "stages": [asdict(each) for each in made.stages],
                 "sample_rate": fitted.sample_rate,
             }
         )
-    return 0
+
+
+def _parts(capture: Capture, options: Options) -> tuple[Impacts, Impacts | None]:
+    """Return the recordings to fit to and those to score on, None where all are fitted to."""
+    size = options.train_count if options.train_fraction is None else options.train_fraction
+    return (capture.impacts, None) if size is None else split(capture.impacts, size, start=options.start)
 
 
 def print_fitted(
@@ -119,79 +162,128 @@ def print_fitted(
         screen.print(words, soft_wrap=True)
 
 
-def fitted_values(
-    fitted: SoundField, train: Impacts, test: Impacts | None, scores: Mapping[str, Scores], path: Path
-) -> dict[str, Any]:
-    """Return what `--json` prints of a field in the file `path`, whichever command fitted it."""
-    return {
-        "field": str(path),
-        "capture": fitted.origin.capture,
-        "modes": int(fitted.is_mode.sum()),
-        "supporting_poles": int((~fitted.is_mode).sum()),
-        "trained_on": list(train.names),
-        "tested_on": [] if test is None else list(test.names),
-        "report": fitted.origin.report,
-        "body": None if fitted.body is None else fitted.body.record(),
-        "scores": score_values(scores),
-        "quality": None if fitted.quality is None else fitted.quality.level,
-    }
-
-
-def _run_guess(options: Options, material: str, settings: CaptureSettings) -> int:
-    """Compute a field without recordings, write it and print a summary."""
-    guessed = guess_field(
-        known_surface(options.capture, settings),
-        material,
-        body=options.body,
-        modes=options.modes,
-        config=options.config,
-        settings=settings,
-        name=settings.name or options.capture.resolve().stem,
-        cache=unfinished(options.output, "bodies"),
-        log=say,
-    )
-    guessed = with_record(guessed, options.pipeline, {})
-    save(guessed, options.output)
-    show_guess(guessed, options.output, json=options.json)
-    return 0
-
-
-def next_after_fit(output: Path, *, trial: bool) -> None:
-    """Print what is useful after a fit: after a `trial` on a part of the recordings, a fit to all of them."""
-    if trial:
-        next_step("the same command without --train-fraction and --train-count, to fit to all recordings")
-    else:
-        next_command("avmsf render", output, "--position X Y Z -o impact.wav")
-
-
-def warn_of_quality(fitted: SoundField) -> None:
-    """Print last that a field is not better than averaging recordings, and what to do."""
-    if fitted.quality is not None and fitted.quality.level > 0:
-        say(str(fitted.quality))
-
-
-def show_guess(guessed: SoundField, output: Path, *, json: bool) -> None:
-    """Print a summary of a field without recordings in the file `output`."""
-    screen = console(errors=json)
-    for words in quality_words(guessed, output):
+def _guess(options: Options, material: str, settings: CaptureSettings) -> None:
+    """Compute a field without recordings, and print a summary."""
+    stages = StageFolder(options.kept)
+    with ProgressBar() as bar, stages.lock("avmsf fit"):
+        made = guess_in_stages(
+            options.capture, material, options.pipeline, stages, settings=settings, listener=bar.listener
+        )
+        guessed, path = load(made), options.output or made
+        if options.output is not None:
+            copy_whole(made, options.output)
+    screen = console(errors=options.json)
+    for words in quality_words(guessed, path):
         screen.print(words, soft_wrap=True)
-    screen.print(f"wrote {output}", soft_wrap=True)
-    next_command("avmsf render", output, "--position X Y Z -o impact.wav")
-    if json:
-        report = guessed.origin.report
-        values = {"field": str(output), "capture": guessed.origin.capture, "modes": len(guessed.bank)}
-        print_json(values | {"sample_rate": guessed.sample_rate, "trained_on": [], "report": report})
+    screen.print(f"wrote {path}", soft_wrap=True)
+    next_command("avmsf render", path, "--position X Y Z -o impact.wav")
+    if options.json:
+        values = {"field": str(path), "capture": guessed.origin.capture, "modes": len(guessed.bank)}
+        values |= {"sample_rate": guessed.sample_rate, "trained_on": [], "report": guessed.origin.report}
+        print_json(values)
 
 
-def part_contacts(
-    impacts: Impacts, *, fraction: float | None, count: int | None, start: int
-) -> tuple[Impacts, Impacts | None]:
-    """Return the recordings to fit to and those to score on, None where all are fitted to."""
-    if fraction is not None:
-        return split(impacts, fraction, start=start)
-    if count is not None:
-        return split(impacts, count, start=start)
-    return impacts, None
+def _make_stage(options: Options, settings: CaptureSettings) -> None:
+    """Make Gaussians, features or a surface of the folder's views, and print what they are."""
+    expect_one_unit(options.capture, settings)
+    stages = StageFolder(options.kept)
+    with ProgressBar() as bar:
+        scene = SceneStages(
+            options.capture,
+            stages,
+            options.pipeline.scene,
+            settings=settings,
+            listener=bar.listener,
+            device=options.device,
+        )
+        scene.expect_any()
+        with stages.lock("avmsf fit"):
+            match options.until:
+                case "gaussians":
+                    made, key, values = scene.cloud, "cloud", {"gaussians": len(read_splats(scene.cloud.path))}
+                    words = counted(values["gaussians"], "Gaussian")
+                case "features":
+                    made, key, values = scene.features, "features", read_report(scene.features.path)
+                    words = features_words(values)
+                case _:
+                    made = keep_surface(stages, *object_shape(find_surface(options.capture, settings), scene))
+                    surface = read_surface(made.path)
+                    key, values, words = "surface", {"triangles": len(surface.faces)}, surface_words(surface)
+                    if options.plots is not None:
+                        _draw(surface, options.capture, settings, options.plots / "surface.png")
+            if options.output is not None:
+                _write_stage(made.path, options.output)
+    lines = [words, *(stage_line(name, each) for name, each in {**scene.made(), key: made}.items())]
+    if options.plots is not None:
+        lines.append(f"wrote {options.plots / 'surface.png'}")
+    if options.output is not None:
+        lines.append(f"wrote {options.output}")
+    path = options.output or made.path
+    print_result("\n".join(lines), {key: str(path), **values}, json=options.json)
+    match options.until:
+        case "gaussians":
+            next_command("avmsf info", path, "--plots plots")
+        case "features":
+            model = "--preset paper" if options.preset == "paper" else "--gain-model visual"
+            words = f"--features {shlex.quote(str(path))} {model} -o field.safetensors"
+            next_command("avmsf fit", options.capture, words)
+        case _:
+            next_command("avmsf fit", options.capture, "-o field.safetensors")
+
+
+def _write_stage(made: Path, output: Path) -> None:
+    """Copy what a stage made; a surface is written in the format of the output."""
+    suffix = output.suffix.lower()
+    if suffix == ".obj" or suffix == ".glb":
+        kind: SurfaceKind = "obj" if suffix == ".obj" else "glb"
+        surface = read_surface(made)
+        write_whole(output, lambda place: write_surface(surface, place, kind=kind), raising=OutputError)
+    else:
+        copy_whole(made, output)
+
+
+def _draw(surface: Surface, folder: Path, settings: CaptureSettings, picture: Path) -> None:
+    """Draw a surface with the contacts of the folder's table. Raises CaptureError for a bad table."""
+    contacts = None
+    if (folder / TABLE).is_file():
+        with in_folder(folder):
+            rows = [understand(row, settings).contact for row in read_rows(folder)[0]]
+        contacts = torch.tensor(rows, dtype=torch.float64)
+    save_picture(draw_surface(surface, title=f"{folder.resolve().name}: surface", contacts=contacts), picture)
+
+
+def surface_words(surface: Surface) -> str:
+    """Return a message on a surface's size, and on whether it is closed."""
+    mesh = trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=True)
+    extent = " x ".join(f"{1000 * side:.3g}" for side in mesh.extents)
+    words = f"{counted(len(surface.faces), 'triangle')}, {extent} mm, area {1e4 * mesh.area:.3g} cm2"
+    closed = f"closed, volume {1e6 * mesh.volume:.3g} cm3" if mesh.is_watertight else "not closed"
+    return f"{words}, {closed}"
+
+
+def stage_line(name: str, kept: Kept) -> str:
+    """Return a message on a stage's time and output."""
+    return f"{name:9} {kept.seconds:7.1f} s{'' if kept.fresh else ' (cached)'}  {kept.path}"
+
+
+def features_words(report: Mapping[str, Any]) -> str:
+    """Return a message on the features, their consistency over the views, and their symmetries."""
+    lines = [
+        f"features: {report['encoder']}, on {report['points']} points, {report['unseen']} of them in no view; "
+        f"consistency of the views {100 * report['agreement']:.0f} % of the features' variance"
+    ]
+    if report.get("dropped"):
+        lines.append(
+            f"removed: {counted(report['dropped'], 'Gaussian')} inside the object or behind its surface in the views"
+        )
+    if "symmetries" in report:
+        lines.append(Symmetries.from_dict(report["symmetries"]).summary())
+    if "orbit_spread" in report:
+        before, after = report["orbit_spread"]
+        lines.append(
+            f"deviation over symmetric points, relative to all: {before:.3f} before pooling, {after:.3f} after"
+        )
+    return "\n".join(lines)
 
 
 def summary(fitted: SoundField, contacts: int) -> str:

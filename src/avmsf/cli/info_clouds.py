@@ -11,9 +11,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf._utils.wording import counted
+from avmsf.cli.fit import features_words
 from avmsf.cli.options.info import Options
 from avmsf.cli.printing import console, say
-from avmsf.cli.scenes import features_words
 from avmsf.errors import SceneError
 from avmsf.features.feature_field import GEOMETRY, FeatureField
 from avmsf.features.store import load_features, read_report

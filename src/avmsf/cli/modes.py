@@ -9,7 +9,6 @@ from avmsf.cli.mode_table import amplitudes, levels, listed, mode_rows, mode_tab
 from avmsf.cli.options.checks import read_settings
 from avmsf.cli.options.modes import Options
 from avmsf.cli.printing import console, next_command, print_json, say
-from avmsf.cli.visuals import visual_inputs
 from avmsf.modal.extraction.extract import extract_modes
 from avmsf.modal.extraction.quality import measure_quality
 from avmsf.pipeline.record import capture_settings_of, finder_of
@@ -61,7 +60,5 @@ def run(options: Options) -> int:
                 "supporting_poles": [asdict(row) | asdict(how) for row, how in supporting],
             }
         )
-    visual = visual_inputs(options.capture, capture.settings)
-    verb = "reconstruct" if visual is not None and visual.reconstructs else "fit"
-    next_command(f"avmsf {verb}", options.capture, "-o field.safetensors")
+    next_command("avmsf fit", options.capture, "-o field.safetensors")
     return 0

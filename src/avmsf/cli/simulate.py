@@ -4,9 +4,9 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 from avmsf.cli import INTERRUPTED
-from avmsf.cli.object_bar import ObjectBar
 from avmsf.cli.options.simulate import Options
 from avmsf.cli.printing import console, next_command, print_json, print_result, say, table
+from avmsf.cli.progress import ProgressBar
 from avmsf.fem.material import MATERIALS
 from avmsf.simulate.recipe import ObjectRecipe
 from avmsf.simulate.shapes import KINDS
@@ -24,10 +24,10 @@ def run(options: Options) -> int:
     assert options.output is not None
     recipes, folder = _chosen(options, options.output)
     try:
-        with ObjectBar() as bar:
+        with ProgressBar() as bar:
 
             def show(progress: SetProgress) -> None:
-                bar.show(f"{progress.name}: {progress.stage}", done=progress.done, total=progress.total)
+                bar.objects(f"{progress.name}: {progress.stage}", progress.done, progress.total)
 
             simulate_set(recipes, folder, cache=options.cache, progress=show)
     except KeyboardInterrupt:

@@ -17,7 +17,6 @@ from avmsf.cli.writing import write_text
 from avmsf.field.store import load
 from avmsf.field.suggest import Suggestions, suggest
 from avmsf.field.uncertainty import relative_gain_std, unedited_mixture
-from avmsf.pipeline.record import recorded
 from avmsf.plotting.pictures import save_picture
 from avmsf.plotting.uncertainty import draw_doubt
 
@@ -64,9 +63,7 @@ def run(options: Options) -> int:
         save_picture(picture, paths[PICTURE])
         for path in paths.values():
             say(f"wrote {path}")
-    # `fit` would make a field of a shape from photographs without that shape.
-    verb = "fit" if recorded(field).get("scene") is None else "reconstruct"
-    next_command(f"avmsf {verb} CAPTURE -o {shlex.quote(str(options.field))}")
+    next_command(f"avmsf fit CAPTURE -o {shlex.quote(str(options.field))}")
     if options.json:
         print_json(
             {

@@ -45,7 +45,7 @@ class VisualInputs:
 
     @property
     def reconstructs(self) -> bool:
-        """Whether `avmsf reconstruct` finds more of the object here than `avmsf fit`, which reads a mesh alone."""
+        """Whether the object's shape is reconstructed, since there is no mesh."""
         return self.mesh is None and bool(self.photographs or self.video or self.gaussians)
 
     @property
@@ -97,35 +97,20 @@ def visual_inputs(folder: Path, settings: CaptureSettings | None) -> VisualInput
     )
 
 
-def expect_shape(folder: Path, capture: Capture, *, views: bool, verb: str) -> None:
-    """Raise `SceneError` where the folder was meant to show the object and a field would know positions alone.
+def expect_shape(folder: Path, capture: Capture) -> None:
+    """Raise where a folder was meant to show the object and a field would know the contacts' positions alone.
 
-    `views` says whether photographs, a video and Gaussians are used.
+    FitError for a surface in another frame than the contacts, SceneError for files that nothing reads.
     """
     advice = "; or fit a field of the positions alone by --without-shape"
-    surface, visual = capture.surface, visual_inputs(folder, capture.settings)
-    if surface is not None and not len(surface.faces) and not views:
-        raise SceneError(
-            f"{folder}: expected a mesh, got {len(surface.vertices)} points without triangles; make a mesh of "
-            f"them{advice}",
-            file=folder,
-            name="faces",
-        )
-    if surface is not None:
+    if capture.surface is not None:
         try:
-            expect_placed(capture.impacts.contacts, surface_points(surface), names=capture.impacts.names)
+            expect_placed(capture.impacts.contacts, surface_points(capture.surface), names=capture.impacts.names)
         except FitError as error:
             raise FitError(f"{error}{advice}", **error.attributes) from error
-    if surface is not None or visual is None or (views and visual.reconstructs):
         return
-    if visual.reconstructs:
-        raise SceneError(
-            f"{folder}: expected a mesh for avmsf {verb}, got none; avmsf reconstruct uses what "
-            f"shows the object here ({visual.sentence.partition(': ')[2]}){advice}",
-            file=folder,
-            name="shape",
-        )
-    if visual.unused:
+    visual = visual_inputs(folder, capture.settings)
+    if visual is not None and not visual.reconstructs and visual.unused:
         raise SceneError(
             f"{folder}: expected the object's shape, got none; {'; '.join(visual.unused[:3])}{advice}",
             file=folder,
@@ -135,7 +120,7 @@ def expect_shape(folder: Path, capture: Capture, *, views: bool, verb: str) -> N
 
 
 def misplaced(folder: Path, settings: CaptureSettings | None, visual: VisualInputs) -> list[AvmsfWarning | AvmsfError]:
-    """Return what `avmsf reconstruct` would warn of or raise of cameras, masks, Gaussians and contacts together.
+    """Return what `avmsf fit` would warn of or raise of cameras, masks, Gaussians and contacts together.
 
     It opens some of the photographs, at a low resolution.
     """

@@ -90,8 +90,7 @@ def refuse_unknown(identifier: str, known: Collection[str], dataset: str) -> NoR
         near = sorted(known, key=lambda name: abs((number_of(name) or 0) - number))[:4]
     meant = f"did you mean {' or '.join(near)}?" if near else f"such as {', '.join(in_order(known)[:8])};"
     raise DatasetError(
-        f"{dataset}: expected one of its {len(known)} objects, got {identifier!r}; {meant} "
-        "`avmsf dataset check` lists all",
+        f"{dataset}: expected one of its {len(known)} objects, got {identifier!r}; {meant} `avmsf check` lists all",
         name="object",
         value=identifier,
     )

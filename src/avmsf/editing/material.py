@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from avmsf._utils.wording import counted
-from avmsf.editing.modal_edit import EDITS, edited, muted
+from avmsf.editing.modal_edit import EDITS, Slider, adjust_modes, edited, muted
 from avmsf.errors import EditError
 from avmsf.fem.material import MATERIALS, Material, material_named
 from avmsf.field.probable_body import ProbableBody
@@ -263,3 +263,38 @@ def _before_adjustments(
         pitch, decay = (torch.tensor(entry[name], dtype=torch.float64) for name in ("pitch", "decay"))
         bank = ModalBank(bank.frequency / pitch, bank.damping * decay)
     return bank, None
+
+
+def edit(
+    field: SoundField,
+    *,
+    material: Material | str | None = None,
+    old_material: Material | str | None = None,
+    size: float = 1.0,
+    law: GainLaw = DISPLACEMENT,
+    pitch: Slider = 1.0,
+    decay: Slider = 1.0,
+    brightness_db: float = 0.0,
+    gains_db: Slider = 0.0,
+) -> SoundField:
+    """Return the field of another material, size, pitch, decay or brightness; the shape stays.
+
+    `material` and `size` (new lengths over old ones) follow the laws of linear modal analysis, see `change_material`;
+    the material before, `old_material`, is the one nearest to the modes' dampings where it is not given. Then
+    frequencies are multiplied by `pitch`, decay times by `decay`, and levels changed by `gains_db` and, per octave,
+    `brightness_db`, see `adjust_modes`. Optimization towards recordings or a text is `avmsf.editing.edit_towards`.
+
+    Raises EditError where nothing is to change, and as these two; SimulationError for an unknown material.
+    """
+    adjusted = {"pitch": pitch, "decay": decay, "brightness_db": brightness_db, "gains_db": gains_db}
+    neutral = {"pitch": 1.0, "decay": 1.0, "brightness_db": 0.0, "gains_db": 0.0}
+    modes = [name for name, value in adjusted.items() if not isinstance(value, float | int) or value != neutral[name]]
+    if material is None and size == 1.0 and not modes:
+        raise EditError("expected an edit, got none: give material, size, pitch, decay, brightness_db or gains_db")
+    if material is not None or size != 1.0:
+        new = material_named(material) if isinstance(material, str) else material
+        old = infer_material(field, option="old_material", new=new).material if old_material is None else old_material
+        field = change_material(field, old, old if new is None else new, size=size, law=law)
+    if modes:
+        field = adjust_modes(field, pitch=pitch, decay=decay, brightness_db=brightness_db, gains_db=gains_db)
+    return field

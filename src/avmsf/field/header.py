@@ -70,7 +70,6 @@ def value_of(error: Exception) -> Any:
 def _remake(record: Mapping[str, Any], path: Path) -> str:
     """Return the command that makes the field of an older file again."""
     report = record["origin"]["report"]
-    verb = "reconstruct" if (report.get("pipeline") or {}).get("scene") else "fit"
     material = f" --material {report['material']['name']}" if "guess" in report else ""
     capture = record["origin"]["capture"]
-    return f"fit it again: avmsf {verb} FOLDER{material} --output {path}, where FOLDER is that of {capture!r}"
+    return f"fit it again: avmsf fit FOLDER{material} --output {path}, where FOLDER is that of {capture!r}"

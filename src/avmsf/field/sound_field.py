@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Complex, Float, Float64
@@ -12,7 +12,6 @@ from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_count, as_directions, as_numbers, as_vectors
 from avmsf._utils.summary import short_repr
-from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import PositionWarning
@@ -26,11 +25,6 @@ from avmsf.modal.extraction.alignment import Alignment
 from avmsf.modal.modes import ForcePulse, ModalBank
 from avmsf.modal.residual_noise import Residual, low_fluctuation_noise, shape_noise
 from avmsf.modal.synthesis import synthesize_phased
-
-if TYPE_CHECKING:
-    from avmsf.features.feature_field import FeatureField
-    from avmsf.field.config import GainModel
-    from avmsf.pipeline.config import PipelineConfig
 
 SUPPORTING = "supporting_poles"
 """What a report calls the rows of the bank's poles that are no modes of the object."""
@@ -102,7 +96,7 @@ class FieldQuality:
             f"Warning: by leave-one-out, the field is {found} {simple}: relative STFT "
             f"errors of {self.error:.2f} and {self._simple_error:.2f} ({self.positions} positions). Look for mistakes "
             "by avmsf check: recordings given to other contacts, a mesh in another frame or of another object. Record "
-            "more positions; without a mesh, add one, or make the shape from photographs by avmsf reconstruct."
+            "more positions; without a mesh, add one, or photographs, a video or Gaussians."
         )
 
     @property
@@ -209,35 +203,6 @@ class SoundField:
         mask = torch.ones(len(self.bank), dtype=torch.bool)
         mask[self.origin.report.get(SUPPORTING, [])] = False
         return mask
-
-    @classmethod
-    def fit(
-        cls,
-        capture: Capture,
-        gain_model: "GainModel | None" = None,
-        *,
-        features: "FeatureField | None" = None,
-        config: "PipelineConfig | None" = None,
-        seed: int | None = None,
-        device: str | None = None,
-        progress: bool = True,
-    ) -> "SoundField":
-        """Fit a field to the recordings of a capture, as `avmsf fit` does.
-
-        The recordings are aligned and their modes found, the object's elastic modes are computed where the capture has
-        a mesh, and the gain model is fitted and compared with the recordings by leave-one-out (`quality`). It takes
-        seconds to minutes. `gain_model`, `seed` and `device` take the place of those of `config`: by default "auto",
-        the Gaussian process over all kernel families, seed 0, and a CUDA GPU where there is one. `features` describe
-        the object's points for the gain models "visual" and "network"; without them these are positions on the mesh.
-        With `progress`, the standard error says what is done.
-
-        Raises AvmsfError for a capture that no field can be fitted to.
-        """
-        from avmsf.pipeline.fitting import fit_with_progress
-
-        return fit_with_progress(
-            capture, gain_model, features=features, config=config, seed=seed, device=device, progress=progress
-        )
 
     def save(self, path: str | Path) -> None:
         """Write the field to one safetensors file. Raises FieldFileError where it cannot be written."""

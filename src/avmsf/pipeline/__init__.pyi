@@ -2,5 +2,4 @@ from .bodies import candidate_bodies as candidate_bodies
 from .config import PRESETS as PRESETS
 from .config import BodyConfig as BodyConfig
 from .config import PipelineConfig as PipelineConfig
-from .fitting import fit_capture as fit_capture
 from .guess import guess_field as guess_field

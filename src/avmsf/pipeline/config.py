@@ -5,7 +5,7 @@ Importing this imports nothing that computes.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from typing import Literal, get_args
 
 from avmsf._utils.text import changes_repr
@@ -137,6 +137,11 @@ class SceneConfig:
     """How Gaussians are fitted to views."""
     lift: LiftConfig = field(default_factory=LiftConfig)
     """How features are made of views and Gaussians."""
+
+    def with_seed(self, seed: int) -> "SceneConfig":
+        """Return the settings with one seed for all stages."""
+        parts = {each.name: replace(getattr(self, each.name), seed=seed) for each in fields(self)}
+        return replace(self, **parts)
 
 
 @dataclass(frozen=True)

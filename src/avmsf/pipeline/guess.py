@@ -8,10 +8,9 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from avmsf.capture.filenames import SURFACE_FILES
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.table import TABLE, read_cells
-from avmsf.capture.together import NARROWEST, WIDEST, find_surface
+from avmsf.capture.together import NARROWEST, WIDEST
 from avmsf.errors import FitError, SimulationError
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.candidate_bodies import NominalBody, Shape, nominal_bodies
@@ -22,7 +21,7 @@ from avmsf.fem.radiation import radiated_pressure
 from avmsf.field.config import FitConfig
 from avmsf.field.scaled_gains import BodyGains
 from avmsf.field.sound_field import Origin, SoundField
-from avmsf.mesh.surface import Surface, read_surface
+from avmsf.mesh.surface import Surface
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.pipeline.bodies import wall_error
@@ -109,22 +108,6 @@ def expect_no_recordings(folder: Path) -> None:
             file=table,
             name="--material",
         )
-
-
-def known_surface(place: Path, settings: CaptureSettings) -> Surface:
-    """Return the surface of a mesh file, or of a folder without recordings. Raises FitError where there is none."""
-    if not place.is_dir():
-        return read_surface(place, meters=settings.surface_meters)
-    expect_no_recordings(place)
-    surface = find_surface(place, settings)
-    if surface is None:
-        raise FitError(
-            f"{place}: expected a mesh ({', '.join(SURFACE_FILES)}), got none; name the mesh's file, or use avmsf "
-            "reconstruct for photographs",
-            file=place,
-            name="surface",
-        )
-    return surface
 
 
 def _expect_meters(surface: Surface) -> None:

@@ -38,7 +38,7 @@ VIEWS, CLOUD, FEATURES = "views", "cloud.ply", "features.safetensors"
 """What the stages call their outputs."""
 
 
-def _say_nothing(words: str) -> None:
+def _ignore(*values: object) -> None:
     pass
 
 
@@ -46,12 +46,21 @@ def _say_nothing(words: str) -> None:
 class ProgressListener:
     """Callbacks that receive the progress of the stages."""
 
-    log: Callable[[str], None] = _say_nothing
+    log: Callable[[str], None] = _ignore
     """Receives a sentence as each stage begins."""
-    splatting: Callable[[SplatProgress], None] | None = None
-    lifting: Callable[[LiftProgress], None] | None = None
-    counting: Callable[[str], None] = _say_nothing
-    """Hears the number and name of each stage of a reconstruction, see `StageFolder.count`."""
+    step: Callable[[str, int, int, str], None] = _ignore
+    """Receives a stage's name, its steps done and in all, and a message on the last one."""
+    counting: Callable[[str], None] = _ignore
+    """Receives the number and name of each stage, see `StageFolder.count`."""
+
+    def splatting(self, progress: SplatProgress) -> None:
+        """Pass on how far Gaussians are fitted."""
+        message = f"loss {progress.loss:.3g}, {progress.psnr:.1f} dB, {progress.gaussians} Gaussians"
+        self.step("splat", progress.step, progress.steps, message)
+
+    def lifting(self, progress: LiftProgress) -> None:
+        """Pass on how many views are described."""
+        self.step("features", progress.done, progress.total, progress.view)
 
 
 class SceneStages:

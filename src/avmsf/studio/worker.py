@@ -28,12 +28,9 @@ from avmsf.editing.guided import Guide, GuidedEditProgress, edit_towards
 from avmsf.editing.reference import Reference
 from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import AvmsfError, CaptureWarning
-from avmsf.features.lift import LiftProgress
-from avmsf.field.fit import Progress
 from avmsf.field.store import load, save
-from avmsf.gaussians.fit import SplatProgress
 from avmsf.pipeline.config import CACHE, PRESETS, SceneConfig
-from avmsf.pipeline.reconstruct import reconstruct
+from avmsf.pipeline.fit import fit_in_stages
 from avmsf.pipeline.record import capture_settings_of
 from avmsf.pipeline.scene import ProgressListener, SceneStages
 from avmsf.pipeline.stages import StageFolder
@@ -66,20 +63,12 @@ class EventWriter:
 
     @property
     def listener(self) -> ProgressListener:
-        """The listener of a reconstruction."""
-        return ProgressListener(self.log, self._splatting, self._lifting)
+        """What the stages of a fit report to."""
+        return ProgressListener(self.log, self._stage_step)
 
-    def _splatting(self, progress: SplatProgress) -> None:
-        if progress.step % _RARELY == 0 or progress.step == progress.steps:
-            self.step("splat", progress.step, progress.steps, f"{progress.psnr:.1f} dB, {progress.gaussians} Gaussians")
-
-    def _lifting(self, progress: LiftProgress) -> None:
-        self.step("features", progress.done, progress.total, progress.view)
-
-    def fitting(self, progress: Progress) -> None:
-        """Send the progress of a fit."""
-        if progress.step % _RARELY == 0 or progress.step == progress.steps:
-            self.step("fit", progress.step, progress.steps, f"{progress.stage}, loss {progress.loss:.3g}")
+    def _stage_step(self, stage: str, done: int, total: int, words: str) -> None:
+        if done % _RARELY == 0 or done == total or stage == "features":
+            self.step(stage, done, total, words)
 
     def guided_edit(self, progress: GuidedEditProgress) -> None:
         """Send the progress of an edit's optimization."""
@@ -98,18 +87,9 @@ def make_field(task: Values, events: EventWriter) -> Values:
     config = replace(PRESETS[task["preset"]], modes=int(task["modes"]))
     settings = capture_settings_of(config, settings_of(folder))
     events.log("capture: reading the recordings")
-    capture = read_capture(folder, settings)
-    with StageFolder(folder / CACHE).lock(COMMAND):
-        made = reconstruct(
-            folder,
-            capture,
-            capture.impacts,
-            config,
-            cache=folder / CACHE,
-            settings=settings,
-            listener=events.listener,
-            fitting=events.fitting,
-        )
+    capture, stages = read_capture(folder, settings), StageFolder(folder / CACHE)
+    with stages.lock(COMMAND):
+        made = fit_in_stages(capture, config, stages, listener=events.listener)
         copy_whole(made.field, Path(task["output"]))
     return {
         "field": str(made.field),

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import tyro
 
+from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.common import Printing, parse_options
 from avmsf.cli.options.paths import NewFolder
 
@@ -21,7 +22,18 @@ class Options(Printing):
     """
 
     folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="FOLDER"), NewFolder()]] = Path("demo")
-    """Folder for all results; an earlier demo in it is replaced."""
+    """Folder for all results, new or empty."""
+
+    def check_inputs(self) -> None:
+        """Raise the package's errors for a folder that cannot be written or holds files."""
+        super().check_inputs()
+        if self.folder.is_dir() and any(self.folder.iterdir()):
+            raise OutputError.expected(
+                "a new or empty folder",
+                "one with files",
+                file=self.folder,
+                advice="choose another folder, or remove the earlier demo",
+            )
 
 
 def parse(words: Sequence[str]) -> Options:

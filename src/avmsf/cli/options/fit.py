@@ -1,29 +1,50 @@
 """Options of `avmsf fit`."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Literal
 
 import tyro
 
-from avmsf.cli.options.checks import expect_capture, expect_device, expect_modes
+from avmsf.capture.filenames import expect_views
+from avmsf.cli.options.checks import OutputError, expect_device, expect_modes, expect_rows, read_settings
 from avmsf.cli.options.common import Flag, Printing, parse_options, preset_of, preset_values
-from avmsf.cli.options.paths import NEW_TENSORS, Existing, SettingsFile
+from avmsf.cli.options.paths import CacheFolder, Existing, NewFile, PlotsFolder, SettingsFile
 from avmsf.errors import EvaluationError, FitError
 from avmsf.fem.material import material_named
 from avmsf.field.config import FitConfig, GainModel
+from avmsf.gaussians.config import SplatConfig
 from avmsf.modal.config import ExtractionMethod
-from avmsf.pipeline.config import BodyConfig, PipelineConfig, Preset, SceneConfig, TimeZero
+from avmsf.pipeline.config import (
+    CACHE,
+    BodyConfig,
+    LiftConfig,
+    PipelineConfig,
+    Preset,
+    SceneConfig,
+    TimeZero,
+    ViewsConfig,
+)
+
+Stage = Literal["gaussians", "features", "surface"]
+_SUFFIXES: dict[Stage | None, tuple[str, ...]] = {
+    None: (".safetensors",),
+    "gaussians": (".ply",),
+    "features": (".safetensors",),
+    "surface": (".ply", ".obj", ".glb"),
+}
+"""Endings of the output, by the stage that is the last."""
 
 
 @dataclass(frozen=True)
 class Options(Printing):
     """Fit a sound field to a capture and write it to one file.
 
-    Without recordings, a mesh and --material give an approximate field. Repeat an interrupted command to continue it:
-    its state is saved next to the output, and the result is the same.
+    CAPTURE holds impacts.csv, the recordings that it names, and what shows the object: a mesh, photographs, a video or
+    Gaussians. A mesh is used before photographs. Without recordings, --material gives an approximate field. The output
+    of each stage is cached, only what changed is computed again, and repeating an interrupted command continues it.
     """
 
     capture: tyro.conf.Positional[
@@ -33,13 +54,21 @@ class Options(Printing):
             Existing("a capture folder, or a mesh with --material", ("a folder", "a mesh or Gaussians")),
         ]
     ]
-    """Folder with impacts.csv and the recordings that it names; with --material, a folder with a mesh, or a mesh."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FIELD.safetensors"), NEW_TENSORS]
-    """File to write the field to."""
+    """Capture folder; with --material also a folder without recordings, or a mesh."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FIELD.safetensors")] = None
+    """File to write the field to, by default only the cache; with --until what that stage makes: gaussians .ply,
+    features .safetensors, surface .ply, .obj or .glb."""
+    until: Stage | None = None
+    """Stop after a stage, which needs no recordings: 3D Gaussians fitted to the views, image features of the object's
+    points, or the object's surface, a folder's own mesh or one reconstructed from its views, in meters."""
+    cache: CacheFolder = None
+    """Cache the output of each stage here, by default in CAPTURE/.avmsf."""
     settings: SettingsFile = None
     """Use this capture.toml instead of the folder's own."""
+    plots: PlotsFolder = None
+    """With --until surface: draw the surface and two cross-sections to surface.png in this folder."""
     material: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Compute an approximate field of an object without recordings from its mesh and its material: ceramic, glass,
+    """Compute an approximate field of an object without recordings from its shape and its material: ceramic, glass,
     wood, plastic, iron, polycarbonate or steel."""
     train_fraction: float | None = None
     """Fit to all recordings at this fraction of the contacts, spread as far apart as possible, and compute the error
@@ -51,15 +80,16 @@ class Options(Printing):
     features: Annotated[
         Path | None,
         tyro.conf.arg(metavar="FEATURES.safetensors"),
-        Existing("features, as avmsf features writes them", ("features",)),
+        Existing("features, as avmsf fit --until features writes them", ("features",)),
     ] = None
-    """Features written by `avmsf features`, in the frame of the contacts; by default positions on the surface."""
+    """Features written by --until features, in the frame of the contacts; by default those of the folder's views
+    where the gain model reads features."""
     without_shape: Flag = False
     """Fit to the positions of the contacts alone, whatever shows the object's shape."""
     gain_model: GainModel = "auto"
     """How gains vary over the object. auto: a Gaussian process over all kernel families, weighted by evidence; the
-    elastic family needs a mesh. network: the paper's attention network on the features. The others: a Gaussian process
-    over one family, for study; symmetry needs a mesh, visual needs --features."""
+    elastic family needs a shape. network: the paper's attention network on image features. The others: a Gaussian
+    process over one family, for study; symmetry needs a shape, visual image features."""
     body: BodyConfig = field(default_factory=BodyConfig)
     """Finite-element models."""
     extraction: ExtractionMethod = "high-resolution"
@@ -69,70 +99,88 @@ class Options(Printing):
     time_zero: TimeZero | None = None
     """Start of the sounds: onset, or peak (paper); by default that of capture.toml."""
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda")] = None
-    """Device for training end to end, its spectral loss and the network; by default the GPU if there is one. Mode
-    extraction, clustering, finite elements and the Gaussian process run on the CPU."""
+    """Device for Gaussians (with gsplat), DINOv2, training end to end and the network; by default the GPU if there is
+    one. Mode extraction, finite elements and the Gaussian process run on the CPU."""
+    views: ViewsConfig = field(default_factory=ViewsConfig)
+    """How views are made."""
+    splat: SplatConfig = field(default_factory=SplatConfig)
+    """How Gaussians are fitted."""
+    lift: LiftConfig = field(default_factory=LiftConfig)
+    """How features are made."""
     preset: Preset = "default"
     """Defaults of all settings. default: takes seconds to minutes. paper: everything as published, the middle of each
-    published list; takes hours. `--preset paper --help` shows its values. Features are those of --features; `avmsf
-    reconstruct` computes the preset's."""
+    published list; takes hours. `--preset paper --help` shows its values."""
     config: Annotated[tyro.conf.OmitArgPrefixes[FitConfig], tyro.conf.arg(name="fit")] = field(
         default_factory=FitConfig
     )
-    """How the field is fitted."""
+    """How the field is fitted; --seed is the seed of all stages."""
 
     @property
     def pipeline(self) -> PipelineConfig:
-        """All settings as one; those of views and features are in the features' file."""
-        scene, start = SceneConfig(), self.time_zero
+        """All settings as one."""
+        scene, start = SceneConfig(self.views, self.splat, self.lift), self.time_zero
+        if self.config.seed:
+            scene = scene.with_seed(self.config.seed)
         return PipelineConfig(
             self.gain_model, self.body, scene, self.config, self.extraction, self.modes, start, self.device
         )
 
+    @property
+    def kept(self) -> Path:
+        """The folder that caches the stages' outputs."""
+        if self.cache is not None:
+            return self.cache
+        return self.capture / CACHE if self.capture.is_dir() else self.capture.parent / CACHE / self.capture.stem
+
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
+        if self.output is not None:
+            NewFile(_SUFFIXES[self.until]).check(self.output)
+        if self.plots is not None and self.until != "surface":
+            raise OutputError.expected("--until surface with it", self.until, name="--plots")
         expect_device(self.device, raising=FitError)
         expect_modes(self.modes)
-        expect_split(self.train_fraction, self.train_count)
-        if self.material is None:
-            expect_capture(self.capture, self.settings)
-        else:
+        self._check_split()
+        settings = read_settings(self.capture, self.settings)
+        if self.material is not None:
             material_named(self.material, option="--material")
-            refuse_with_material(self)
+            self._check_material()
+        if self.until is not None or (self.material is not None and self.capture.is_dir()):
+            expect_views(self.capture, settings)
+        elif self.material is None:
+            expect_rows(self.capture, settings)
+
+    def _check_split(self) -> None:
+        if self.train_count is not None and self.train_fraction is not None:
+            raise FitError("expected --train-count or --train-fraction, got both; leave one out", name="--train-count")
+        if self.train_fraction is not None and not 0.0 < self.train_fraction < 1.0:
+            raise EvaluationError.expected(
+                "a fraction of training contacts between 0 and 1, such as 0.75",
+                self.train_fraction,
+                name="--train-fraction",
+            )
+
+    def _check_material(self) -> None:
+        """Raise FitError for options that need recordings, given with --material."""
+        names = ("train_fraction", "train_count", "features", "until", "time_zero")
+        given = [name for name in names if getattr(self, name) is not None]
+        if self.gain_model not in ("auto", "elastic"):
+            given.append("gain_model")
+        if self.body.supports == "try":
+            given.append("body.supports")
+        if given:
+            option = f"--{given[0].replace('_', '-')}"
+            raise FitError(
+                f"{option}: expected recordings, got --material, which computes a field without them; leave one out",
+                name=option,
+                value="--material",
+            )
 
 
 def parse(words: Sequence[str]) -> Options:
     """Return the options that the words spell, with the preset's settings as defaults."""
     values = preset_values(preset_of(words), fit="config")
-    # Views and features are made beforehand.
-    del values["scene"]
+    scene = values.pop("scene")
+    values |= {each.name: getattr(scene, each.name) for each in fields(scene)}
     return parse_options(partial(Options, **values), "fit", words)
-
-
-def expect_split(fraction: float | None, count: int | None) -> None:
-    """Raise `FitError` for both a fraction and a count, `EvaluationError` for a fraction that is no part."""
-    if count is not None and fraction is not None:
-        raise FitError("expected --train-count or --train-fraction, got both; leave one out", name="--train-count")
-    if fraction is not None and not 0.0 < fraction < 1.0:
-        raise EvaluationError.expected(
-            "a fraction of training contacts between 0 and 1, such as 0.75", fraction, name="--train-fraction"
-        )
-
-
-def refuse_with_material(options: Any) -> None:
-    """Raise FitError for options of `fit` or `reconstruct` that need recordings, given with --material."""
-    names = ("train_fraction", "train_count", "features")
-    given = [name for name in names if getattr(options, name, None) is not None]
-    if options.gain_model not in ("auto", "elastic"):
-        given.append("gain_model")
-    if options.body.supports == "try":
-        given.append("body.supports")
-    if options.time_zero is not None:
-        given.append("time_zero")
-    if given:
-        option = f"--{given[0].replace('_', '-')}"
-        raise FitError(
-            f"{option}: expected recordings, got --material, which computes a field without them; leave one out",
-            name=option,
-            value="--material",
-        )

@@ -26,8 +26,7 @@ class Options(Printing):
             Existing("a field, Gaussians or features", ("a sound field", "features", "a mesh or Gaussians")),
         ]
     ]
-    """A field (.safetensors, of `avmsf fit`), Gaussians (.ply, of `avmsf splat`) or features (.safetensors, of
-    `avmsf features`)."""
+    """A field (.safetensors), Gaussians (.ply) or features (.safetensors), as `avmsf fit` writes them."""
     capture: OtherCapture = None
     """Field: compare it with a capture's recordings that it was not fitted to, or with all if there are none."""
     settings: SettingsFile = None

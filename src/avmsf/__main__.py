@@ -1,0 +1,7 @@
+"""The command `avmsf`, as `python -m avmsf`."""
+
+import sys
+
+from avmsf.cli import main
+
+sys.exit(main())

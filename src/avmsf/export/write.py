@@ -1,0 +1,60 @@
+"""A field in any format of other tools, by the ending of a file's name or the format's."""
+
+from pathlib import Path
+from typing import Any, get_args
+
+from avmsf.errors import ExportError
+from avmsf.export.faust import write_faust
+from avmsf.export.formats import FAUST_SUFFIXES, GLTF_SUFFIXES, PAGE_SUFFIXES, POINTS, UNIVERSAL_SUFFIXES, Format
+from avmsf.export.gltf import write_gltf
+from avmsf.export.paper_demo import write_demo
+from avmsf.export.sampled_field import SampledField
+from avmsf.export.samples import write_grid
+from avmsf.export.uff import write_universal
+from avmsf.export.web import write_webpage
+from avmsf.export.writing import Written
+from avmsf.field.positions import points_on_object
+from avmsf.field.sound_field import SoundField
+
+_SUFFIXES: dict[str, Format] = {
+    **dict.fromkeys(PAGE_SUFFIXES, "web"),
+    **dict.fromkeys(GLTF_SUFFIXES, "gltf"),
+    **dict.fromkeys(FAUST_SUFFIXES, "faust"),
+    **dict.fromkeys(UNIVERSAL_SUFFIXES, "uff"),
+}
+_WRITERS = {
+    "gltf": write_gltf,
+    "faust": write_faust,
+    "avmsf-demo": write_demo,
+    "wavs": write_grid,
+    "uff": write_universal,
+}
+
+
+def write(
+    field: SoundField, output: str | Path, *, to: Format | None = None, contacts: int | None = None, **options: Any
+) -> Written:
+    """Write a field for other tools, and return what was written and what the format could not hold.
+
+    `to` is the format, by default that of the ending: .html a web page, .glb glTF, .dsp and .lib Faust, .uff modal
+    analysis. Folders take "web", "wavs" (a sample set) or "avmsf-demo" (the layout of the paper's demo). At most
+    `contacts` points, spread over the object, are written, by default as many as the format's tools read easily.
+    `options` are those of the format's writer in `avmsf.export`, such as `strikes=` of `write_webpage`, or `force=True`
+    to replace files. Raises ExportError for an unknown ending, and as the writer.
+    """
+    output = Path(output)
+    kind = _SUFFIXES.get(output.suffix.lower()) if to is None else to
+    if kind is None or kind not in get_args(Format):
+        raise ExportError.expected(
+            f"a name that ends in {', '.join(_SUFFIXES)}, or to= one of {', '.join(get_args(Format))}",
+            output.suffix if to is None else to,
+            file=output,
+            name="to",
+        )
+    limit = POINTS[kind] if contacts is None else contacts
+    if kind == "web":
+        return write_webpage(field, output, limit=limit, **options)
+    sampled = SampledField.of(field, points_on_object(field.gain_field), limit=limit)
+    writer: Any = _WRITERS[kind]
+    written: Written = writer(sampled, output, **options)
+    return written

@@ -1,0 +1,576 @@
+"""From a capture to a field in one call: its shape, from a mesh or from views, its modes, and its gains."""
+
+import hashlib
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import Progress as Bar
+
+from avmsf._utils.caching import once
+from avmsf._utils.files import write_whole
+from avmsf._utils.progress import is_live, repeated
+from avmsf._utils.wording import counted
+from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
+from avmsf.capture.placement import surface_points
+from avmsf.capture.settings import settings_of
+from avmsf.capture.together import find_surface
+from avmsf.errors import AvmsfError, FitError, SceneError
+from avmsf.features.feature_field import FeatureField
+from avmsf.features.store import load_features, read_report
+from avmsf.fem.material import Material, material_named
+from avmsf.field.config import AUTO, NETWORK, GainModel
+from avmsf.field.fit import Progress
+from avmsf.field.fit import fit as fit_field
+from avmsf.field.gains.elastic import CandidateBodies, Elastic
+from avmsf.field.gains.estimator import estimator_for
+from avmsf.field.gains.positional import Visual
+from avmsf.field.sound_field import SoundField
+from avmsf.field.store import load, save
+from avmsf.gaussians.ply import read_splats
+from avmsf.mesh import Surface
+from avmsf.mesh.closest_point import ClosestPoints
+from avmsf.mesh.surface import read_surface, write_surface
+from avmsf.modal.extraction.extract import Extraction, extract_once
+from avmsf.photographs import read_views
+from avmsf.photographs.nerf_json import stated_moves
+from avmsf.pipeline.bodies import candidate_bodies
+from avmsf.pipeline.config import CACHE, CACHED_FIELD, PipelineConfig
+from avmsf.pipeline.frame_check import expect_contacts_in_views, expect_on_object, judge_outlines
+from avmsf.pipeline.guess import expect_no_recordings, guess_field
+from avmsf.pipeline.record import capture_settings_of, finder_of, modes_words, supporting_poles, with_record
+from avmsf.pipeline.scene import ProgressListener, SceneStages
+from avmsf.pipeline.stages import Kept, StageFolder
+from avmsf.reconstruction import ObjectShape
+from avmsf.symmetry.find import find_symmetries
+from avmsf.symmetry.symmetries import Symmetries
+
+SURFACE = "surface.ply"
+"""What the stage of the object's surface calls its output, in meters."""
+MODES, FIELD = "modes.safetensors", CACHED_FIELD
+"""What the last stages call their outputs."""
+OFF_MESH = 0.02
+"""Distance of a Gaussian from a mesh, over its size, up to which it is of its surface: three pixels of a photograph in
+which the object is 150 pixels wide."""
+BODIES = "bodies"
+"""Folder of elastic modes in the cache, kept by content."""
+_FEW = 8
+"""Recordings below which little is known of the gains between contacts."""
+
+
+@dataclass(frozen=True)
+class StageTime:
+    """What one stage took."""
+
+    stage: str
+    seconds: float
+    """Of the run that made it, which may have been an earlier one."""
+    fresh: bool
+    """Whether it ran now."""
+
+
+@dataclass(frozen=True, eq=False)
+class StagedFit:
+    """A field that was made stage by stage."""
+
+    field: Path
+    """The field's file in the cache."""
+    stages: tuple[StageTime, ...]
+    report: Mapping[str, Any]
+    """What the features' file says of itself; empty where no features were made."""
+    modes: Extraction
+    """The modes that the field started from."""
+    surface: Path | None = None
+    """The object's surface in the cache; None where its shape is unknown or the gain model needs none."""
+
+
+def fit(
+    capture: Capture | Surface | str | Path,
+    gain_model: GainModel | None = None,
+    *,
+    material: Material | str | None = None,
+    features: FeatureField | None = None,
+    config: PipelineConfig | None = None,
+    cache: str | Path | None = None,
+    seed: int | None = None,
+    device: str | None = None,
+    progress: bool = True,
+) -> SoundField:
+    """Fit a sound field to the recordings of a capture, as `avmsf fit` does.
+
+    `capture` is a folder, or what `avmsf.read` made of it. The recordings are aligned and their modes found. The
+    object's shape is its mesh, otherwise what photographs, a video or Gaussians in the folder show. Its elastic modes
+    are computed, and the gain model is fitted and compared with the recordings by leave-one-out (`SoundField.quality`).
+    It takes seconds to minutes with a mesh, minutes with photographs. Without any shape the field knows the contacts'
+    positions alone.
+
+    Without recordings, a `material` gives an approximate field, see `guess_field`: `capture` is then a mesh (a file or
+    a Surface), or a folder with a mesh or with photographs whose cameras are in meters.
+
+    `gain_model`, `seed` (of all stages) and `device` take the place of those of `config`: by default "auto", the
+    Gaussian process over all kernel families, seed 0, and a CUDA GPU where there is one. The gain models "visual" and
+    "network" read image features of the object's points: `features`, or those of what the folder shows, otherwise
+    positions. `cache` is a folder that keeps what each stage makes, so that only what changed is computed again; by
+    default `.avmsf` in the capture's folder where its views are used, and none otherwise. With `progress`, the standard
+    error says what is done.
+
+    Raises AvmsfError for a capture that no field can be fitted to.
+    """
+    config = _configured(PipelineConfig() if config is None else config, gain_model, seed, device)
+    source = Path(capture) if isinstance(capture, str) else capture
+    with _shown(progress) as listener:
+        if material is not None:
+            if isinstance(source, Capture):
+                raise FitError.expected("a mesh or a folder with material=", "Capture", name="capture")
+            settings = settings_of(source) if isinstance(source, Path) else CaptureSettings()
+            views = isinstance(source, Path) and source.is_dir() and not _is_mesh(find_surface(source, settings))
+            with _stage_folder(cache, source if views and isinstance(source, Path) else None) as stages:
+                return load(guess_in_stages(source, material, config, stages, settings=settings, listener=listener))
+        if isinstance(source, Path):
+            source = read_capture(source, capture_settings_of(config, settings_of(source)))
+        if not isinstance(source, Capture):
+            raise FitError(
+                f"capture: expected a Capture or a folder, got {type(source).__name__}; read a folder by "
+                "avmsf.read(folder)",
+                name="capture",
+                value=type(source).__name__,
+            )
+        views = _scene(source, config, features, StageFolder(Path()), listener) is not None
+        with _stage_folder(cache, source.folder if views else None) as stages:
+            return load(fit_in_stages(source, config, stages, features=features, listener=listener).field)
+
+
+def fit_in_stages(
+    capture: Capture,
+    config: PipelineConfig,
+    stages: StageFolder,
+    *,
+    train: Impacts | None = None,
+    features: FeatureField | None = None,
+    features_report: Mapping[str, Any] | None = None,
+    listener: ProgressListener | None = None,
+) -> StagedFit:
+    """Make views, Gaussians, features, modes and a field of a capture, or what of these has to be made anew.
+
+    `train` are the recordings to fit to, by default all; the contacts of all give the object's position. `features`
+    describe the object's points, and `features_report` how they were made. An interrupted stage goes on from where it
+    was. Raises as the stages do: CaptureError, ExtractionError, FitError, SceneError, SimulationError, FieldFileError,
+    and FolderInUseError where another process makes stages in the folder; who reads the field's file afterwards holds
+    `stages.lock` around both.
+    """
+    listener = ProgressListener() if listener is None else listener
+    train = capture.impacts if train is None else train
+    _expect_start(capture, config)
+    with stages.lock("avmsf fit"):
+        if len(train) < _FEW:
+            listener.log(f"expected {_FEW} recordings or more to predict gains between contacts well, got {len(train)}")
+        # Before the modes: what is wrong with the object's shape shows in less time than they take.
+        shape = _shape(capture, config, features, features_report or {}, stages, listener)
+        return _fit_shape(capture, train, shape, config, stages, listener)
+
+
+def _fit_shape(
+    capture: Capture,
+    train: Impacts,
+    shape: "_Shape",
+    config: PipelineConfig,
+    stages: StageFolder,
+    listener: ProgressListener,
+) -> StagedFit:
+    method = finder_of(config)
+    heard = {"impacts": train.digest(), "method": repr(method)}
+    listener.log(f"modes: {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
+    found = stages.keep(MODES, heard, lambda path: extract_once(train, method, path, needed=True))
+    modes, cache = extract_once(train, method, found.path), stages.folder / BODIES
+
+    def bodies() -> CandidateBodies:
+        listener.log("bodies: finite-element models of the object")
+        return candidate_bodies(shape.surface(), config.body, impacts=train, cache=cache, log=listener.log)
+
+    def make(path: Path) -> None:
+        gains = estimator_for(
+            config.gain_model,
+            bodies,
+            symmetries=shape.symmetries,
+            features=shape.features,
+            log=listener.log if shape.known else None,
+        )
+        supporting = supporting_poles(modes, train)
+        listener.log(f"fit: a field of {modes_words(len(modes.bank), len(supporting))}")
+        fitted = fit_field(
+            train,
+            shape.features if config.gain_model == Visual.kind else shape.points,
+            modes,
+            config.fit,
+            gains=gains,
+            capture=capture.name,
+            settings=capture.settings,
+            checkpoint=stages.checkpoint(FIELD),
+            progress=lambda progress: _show_step(progress, listener),
+            device=config.device,
+            supporting=supporting,
+        )
+        save(with_record(fitted, config, shape.report), path)
+
+    def is_final(path: Path) -> bool:
+        """Whether a kept field has the elastic family, or there is still none, as for want of memory."""
+        if config.gain_model == NETWORK or Elastic.kind not in load(path).origin.report.get("unavailable", {}):
+            return True
+        try:
+            bodies()
+        except AvmsfError:
+            return True
+        return False
+
+    recipe = {**heard, "features": shape.digest, "fit": asdict(config.fit), "modes": found.digest}
+    recipe |= {"gain_model": config.gain_model, "name": capture.name}
+    recipe |= {"body": asdict(config.body), "settings": asdict(capture.settings), "surface": shape.surface_digest}
+    kept = stages.keep(FIELD, recipe, make, usable=is_final)
+    made = {**shape.made, "modes": found, "fit": kept}
+    times = tuple(StageTime(name, each.seconds, each.fresh) for name, each in made.items())
+    return StagedFit(kept.path, times, shape.report, modes, made["surface"].path if "surface" in made else None)
+
+
+def guess_in_stages(
+    source: Path | Surface,
+    material: Material | str,
+    config: PipelineConfig,
+    stages: StageFolder,
+    *,
+    settings: CaptureSettings,
+    listener: ProgressListener,
+) -> Path:
+    """Return the file of a field that is guessed for an object without recordings, made anew where something changed.
+
+    `source` is a mesh, or a folder: the object's shape is then its mesh, or what its photographs show where their
+    cameras are known in meters. Raises as the stages and `guess_field` do, FitError for a folder with recordings, and
+    SceneError where the size is not known.
+    """
+    material = material_named(material) if isinstance(material, str) else material
+    with stages.lock("avmsf fit"):
+        name, scene = settings.name or "", None
+        if isinstance(source, Surface):
+            mesh: Surface | None = source
+        elif source.is_dir():
+            expect_no_recordings(source)
+            name = name or source.resolve().name
+            mesh = find_surface(source, settings)
+            if not _is_mesh(mesh):
+                scene = SceneStages(
+                    source, stages, config.scene, settings=settings, listener=listener, device=config.device
+                )
+                scene.expect_any()
+        else:
+            name, mesh = name or source.resolve().stem, read_surface(source, meters=settings.surface_meters)
+        if scene is not None and scene.source is not None and scene.source.kind in ("photographs", "video"):
+            raise SceneError(
+                f"{scene.folder}: expected a mesh, or photographs with cameras in meters (transforms.json, COLMAP), "
+                f"got {scene.source.kind} without the object's size",
+                file=scene.folder,
+                value=scene.source.kind,
+            )
+        stages.count((*(() if scene is None else scene.outputs[:-1]), FIELD), listener.counting)
+        shape, digest = object_shape(mesh, scene)
+
+        def make(path: Path) -> None:
+            guessed = guess_field(
+                shape(),
+                material,
+                body=config.body,
+                modes=config.modes,
+                config=config.fit,
+                settings=settings,
+                name=name,
+                cache=stages.folder / BODIES,
+                log=listener.log,
+            )
+            save(with_record(guessed, config, {}), path)
+
+        recipe = {"guess": asdict(material), "surface": digest, "modes": config.modes, "body": asdict(config.body)}
+        recipe |= {"fit": asdict(config.fit), "settings": asdict(settings), "name": name}
+        return stages.keep(FIELD, recipe, make).path
+
+
+def _configured(
+    config: PipelineConfig, gain_model: GainModel | None, seed: int | None, device: str | None
+) -> PipelineConfig:
+    if gain_model is not None:
+        config = replace(config, gain_model=gain_model)
+    if seed is not None:
+        config = replace(config, fit=replace(config.fit, seed=seed), scene=config.scene.with_seed(seed))
+    return config if device is None else replace(config, device=device)
+
+
+@contextmanager
+def _stage_folder(cache: str | Path | None, folder: Path | None) -> Iterator[StageFolder]:
+    """Yield the stages of a cache, by default of a capture's folder; without either they are kept for this call."""
+    if cache is not None or folder is not None:
+        yield StageFolder(Path(cache) if cache is not None else Path(folder or ".") / CACHE)
+        return
+    with tempfile.TemporaryDirectory(prefix="avmsf-", ignore_cleanup_errors=True) as place:
+        yield StageFolder(Path(place))
+
+
+@contextmanager
+def _shown(progress: bool) -> Iterator[ProgressListener]:
+    """Yield a listener that shows progress on the standard error, or shows nothing."""
+    if not progress:
+        yield ProgressListener()
+        return
+    console, doing = Console(stderr=True), ["fitting"]
+    live = is_live(console)
+    with (
+        Bar(console=console, transient=True, disable=not live) as bar,
+        nullcontext() if live else repeated(lambda: doing[0]),
+    ):
+        task = bar.add_task("fitting", total=None)
+
+        def log(message: str) -> None:
+            doing[0] = message
+            console.print(message, markup=False, highlight=False, soft_wrap=True)
+
+        def step(stage: str, done: int, total: int, message: str) -> None:
+            doing[0] = f"{stage}: step {done} of {total}, {message}"
+            bar.update(task, description=stage, completed=done, total=total)
+
+        yield ProgressListener(log, step)
+
+
+def _show_step(progress: Progress, listener: ProgressListener) -> None:
+    """Pass a step of a fit on: its warm-up and its end-to-end training are two stages."""
+    if progress.step <= progress.warmup:
+        loss = f"squared gain error {progress.loss:.3g}"
+        listener.step(f"{progress.stage}, warm-up", progress.step, progress.warmup, loss)
+    else:
+        done, total = progress.step - progress.warmup, progress.steps - progress.warmup
+        listener.step(f"{progress.stage}, end to end", done, total, f"spectral loss {progress.loss:.3g}")
+
+
+def _expect_start(capture: Capture, config: PipelineConfig) -> None:
+    """Raise FitError where the sounds of a folder were read with another start than the configuration has."""
+    found = capture.settings.time_zero
+    if config.time_zero not in (None, found):
+        raise FitError.expected(
+            f"sounds that start at the {config.time_zero}",
+            found,
+            name="time_zero",
+            advice="read the capture with CaptureSettings of this time_zero, or set time_zero=None",
+        )
+
+
+def _is_mesh(surface: Surface | None) -> bool:
+    return surface is not None and len(surface.faces) > 0
+
+
+def _no_shape(config: PipelineConfig) -> str:
+    """Return the note on a capture without a shape, which says also what its gain model has to do without."""
+    lacks = " and no elastic mode shapes" if config.gain_model == AUTO else ""
+    return (
+        f"nothing shows the object's shape: points that fill the bounding box of its contacts are used{lacks}. Add a "
+        "mesh (surface.obj), photographs, a video or Gaussians"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Shape:
+    """What a field may read of an object's points, and its surface."""
+
+    points: FeatureField
+    """The object's points with their positions as features, or with those that were given."""
+    features: FeatureField
+    """What the network reads: image features, or positions where there are none."""
+    symmetries: Callable[[], Symmetries | None]
+    """Finds the symmetries of the object's shape."""
+    surface: Callable[[], Surface | ObjectShape]
+    """Makes the object's mesh, or the shape that its views show. Raises SceneError without either."""
+    surface_digest: str
+    """Of what the surface is made of."""
+    made: Mapping[str, Kept]
+    """The stages that made it."""
+    report: Mapping[str, Any]
+    """How the features were made."""
+    known: bool = True
+    """Whether anything shows the shape."""
+
+    @property
+    def digest(self) -> str:
+        """Of the points and the features."""
+        digest = hashlib.sha256()
+        for each in (self.points, self.features):
+            digest.update(each.encoder.encode())
+            for tensor in (each.points, each.features):
+                digest.update(tensor.contiguous().numpy().tobytes())
+        return digest.hexdigest()
+
+
+def _scene(
+    capture: Capture,
+    config: PipelineConfig,
+    features: FeatureField | None,
+    stages: StageFolder,
+    listener: ProgressListener,
+) -> SceneStages | None:
+    """Return the stages of the views that a fit needs: for a shape without a mesh, and for features.
+
+    None where the folder shows nothing but points.
+    """
+    needed = not _is_mesh(capture.surface) or config.gain_model in (NETWORK, Visual.kind)
+    if not needed or capture.folder is None or features is not None:
+        return None
+    scene = SceneStages(
+        capture.folder, stages, config.scene, settings=capture.settings, listener=listener, device=config.device
+    )
+    points = capture.surface is not None and not _is_mesh(capture.surface)
+    return None if not scene or (points and scene.source is not None and scene.source.kind == "mesh") else scene
+
+
+def _shape(
+    capture: Capture,
+    config: PipelineConfig,
+    features: FeatureField | None,
+    report: Mapping[str, Any],
+    stages: StageFolder,
+    listener: ProgressListener,
+) -> _Shape:
+    scene = _scene(capture, config, features, stages, listener)
+    outputs = () if scene is None else scene.outputs
+    # The network needs no surface.
+    shaped = config.gain_model != NETWORK and (scene is not None or _is_mesh(capture.surface))
+    stages.count((*outputs, *((SURFACE,) if shaped else ()), MODES, FIELD), listener.counting)
+    if scene is not None:
+        return _shape_of_views(capture, config, scene, listener)
+    points = _points_of(capture, config, features, listener.log)
+    surface, digest = object_shape(capture.surface, None)
+    made = _surface_stage(stages, surface, digest, listener) if shaped else {}
+    known = capture.surface is not None or features is not None
+    return _Shape(points, points, lambda: _symmetries(capture, config), surface, digest, made, report, known)
+
+
+def _points_of(
+    capture: Capture, config: PipelineConfig, features: FeatureField | None, log: Callable[[str], None]
+) -> FeatureField:
+    """Return the object's points: the described ones, else of its surface, else those that fill the contacts' box."""
+    if features is not None:
+        expect_on_object(capture.impacts.contacts, features.points, names=capture.impacts.names)
+        return features
+    if config.gain_model == NETWORK:
+        log("no visual features were given: the network reads positions alone")
+    if capture.surface is None:
+        log(_no_shape(config))
+        return FeatureField.from_contacts(capture.impacts.contacts)
+    expect_on_object(capture.impacts.contacts, surface_points(capture.surface), names=capture.impacts.names)
+    return FeatureField.from_mesh(capture.surface, seed=config.fit.seed)
+
+
+def _symmetries(capture: Capture, config: PipelineConfig) -> Symmetries | None:
+    if capture.surface is None:
+        return None
+    generator = torch.Generator().manual_seed(config.fit.seed)
+    points = FeatureField.from_mesh(capture.surface, seed=generator).points
+    return find_symmetries(points, seed=generator)
+
+
+def _shape_of_views(capture: Capture, config: PipelineConfig, scene: SceneStages, listener: ProgressListener) -> _Shape:
+    impacts, settings = capture.impacts, capture.settings
+    stated = stated_moves(scene.folder, meters=settings.views_meters)
+    if scene.source is not None and scene.source.kind == "cameras":
+        # Before Gaussians, which take minutes.
+        views = read_views(scene.views.path)
+        warning = None if capture.surface is None else judge_outlines(capture.surface, views, settings)
+        if warning is not None:
+            warnings.warn(warning, stacklevel=2)
+        expect_contacts_in_views(impacts.contacts, views, settings, stated=stated)
+    if scene.splats is not None:
+        points = read_splats(scene.cloud.path).centers
+        expect_on_object(impacts.contacts, points, names=impacts.names, what="Gaussians", stated=stated)
+    features = load_features(scene.features.path)
+    surface, digest = object_shape(capture.surface, scene)
+    made = scene.made()
+    if config.gain_model != NETWORK:
+        made |= _surface_stage(scene.stages, surface, digest, listener)
+    seen = capture.surface
+    if seen is None and "surface" in made:
+        # Gaussians lie up to a wall's thickness below the surface, where a wall's other side may be nearer.
+        seen = read_surface(made["surface"].path)
+    # The paper's network reads the Gaussians' own centers.
+    centers = config.gain_model == NETWORK and config.scene.lift.onto == "gaussians"
+    if seen is not None and "cloud" in made and not centers:
+        features = moved_onto(features, seen)
+    # Structure from motion knows nothing of the frame that the contacts are in.
+    found_frame = scene.source is not None and scene.source.kind in ("photographs", "video")
+    if scene.splats is None:
+        expect_on_object(impacts.contacts, features.points, names=impacts.names, stated=stated, strict=found_frame)
+    report = read_report(scene.features.path)
+
+    def symmetries() -> Symmetries | None:
+        found = report.get("symmetries")
+        return None if found is None else Symmetries.from_dict(found)
+
+    return _Shape(FeatureField.from_points(features.points), features, symmetries, surface, digest, made, report)
+
+
+def _surface_stage(
+    stages: StageFolder, surface: Callable[[], Surface | ObjectShape], digest: str, listener: ProgressListener
+) -> dict[str, Kept]:
+    """Return the stage of the object's surface; none where its shape is unknown."""
+    try:
+        return {"surface": keep_surface(stages, surface, digest)}
+    except SceneError as error:
+        listener.log(f"no surface is written: {error}")
+        return {}
+
+
+def moved_onto(features: FeatureField, surface: Surface) -> FeatureField:
+    """Return features of Gaussians at the places of a mesh nearest to them, without those farther than `OFF_MESH`.
+
+    As they are where most are farther, for the two are in different frames then, and where there are no triangles.
+    """
+    triangles = surface.vertices.double().numpy()[surface.faces.numpy()]
+    sides = triangles[:, 1:] - triangles[:, :1]
+    triangles = triangles[np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) > 0]
+    if not len(triangles):
+        return features
+    found = ClosestPoints(triangles)(features.points.double().numpy())
+    size = float((surface.vertices.amax(0) - surface.vertices.amin(0)).norm())
+    near = found.distances <= OFF_MESH * size
+    if 2 * near.sum() < len(near):
+        return features
+    places = (triangles[found.rows] * found.weights[:, :, None]).sum(axis=1)[near]
+    rows = torch.from_numpy(near)
+    return replace(features, points=torch.from_numpy(places).to(features.points), features=features.features[rows])
+
+
+def object_shape(found: Surface | None, scene: SceneStages | None) -> tuple[Callable[[], Surface | ObjectShape], str]:
+    """Return what makes the object's shape, and the digest of what it is made of: its mesh before its views.
+
+    `found` is the surface that the folder holds. What is returned raises SceneError where the shape is unknown.
+    """
+    if found is not None and len(found.faces):
+        digest = hashlib.sha256(found.vertices.contiguous().numpy().tobytes())
+        digest.update(found.faces.contiguous().numpy().tobytes())
+        return lambda: found, digest.hexdigest()
+    if scene is None:
+
+        def unknown() -> ObjectShape:
+            raise SceneError("surface: expected a mesh or views of the object in the folder, got none", name="surface")
+
+        return unknown, ""
+    return once(scene.shape), f"{scene.cloud.digest} {scene.views.digest}"
+
+
+def keep_surface(stages: StageFolder, make: Callable[[], Surface | ObjectShape], digest: str) -> Kept:
+    """Return the file of the object's surface, made where what is kept is of something else. Raises as `make`."""
+
+    def write(path: Path) -> None:
+        shape = make()
+        surface = shape if isinstance(shape, Surface) else shape.as_seen()
+        write_whole(path, lambda place: write_surface(surface, place), raising=SceneError)
+
+    return stages.keep(SURFACE, {"of": digest}, write)
