@@ -11,11 +11,11 @@ import pytest
 import soundfile
 import torch
 
-from avmsf.cli import edit, main, steering
-from avmsf.cli.edit import run
-from avmsf.cli.edit_material import old_material
+from avmsf.cli import edit, main
+from avmsf.cli.edit import old_material, run
 from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.edit import parse
+from avmsf.cli.progress import ProgressBar
 from avmsf.editing.material import RATIO_ONLY, change_material, rayleigh_damping
 from avmsf.editing.material_statistics import MaterialStatistics
 from avmsf.editing.modal_edit import EDITS, adjust_modes
@@ -237,14 +237,14 @@ def test_towards_a_recording_and_an_interrupted_edit_goes_on(
     told = json.loads(capsys.readouterr().out)
     assert told["edits"][0]["reference"] == "like.wav"
     assert float((whole.bank.frequency / FREQUENCY).median()) == pytest.approx(1.3, rel=0.1)
-    shown = steering.SteerBar.show
+    shown = ProgressBar.step
 
-    def impatient(bar: steering.SteerBar, progress: steering.GuidedEditProgress) -> None:
-        shown(bar, progress)
-        if progress.step == 2:
+    def impatient(bar: ProgressBar, stage: str, done: int, total: int, message: str) -> None:
+        shown(bar, stage, done, total, message)
+        if done == 2:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(steering.SteerBar, "show", impatient)
+    monkeypatch.setattr(ProgressBar, "step", impatient)
     command = [str(field), "--output", str(field.with_name("part.safetensors")), *words]
     assert run(parse(command)) == 130
     assert f"from {field.with_name('part.safetensors.checkpoint')}" in capsys.readouterr().err
@@ -256,7 +256,7 @@ def test_towards_a_recording_and_an_interrupted_edit_goes_on(
     edited(field, "--pitch", "2", name="part")
     assert state.read_bytes() == kept
     steps = []
-    monkeypatch.setattr(steering.SteerBar, "show", lambda bar, progress: steps.append(progress.step))
+    monkeypatch.setattr(ProgressBar, "step", lambda bar, stage, done, *rest: steps.append(done))
     expect_same(edited(field, *words, name="part"), whole)
     assert steps == [3, 4]
     assert not list(field.parent.glob("*.preview.wav")) + list(field.parent.glob("*.checkpoint"))
@@ -366,7 +366,7 @@ def test_options_that_would_do_nothing_are_refused(field: Path, monkeypatch: pyt
 def test_settings_of_a_model_that_cannot_be_meant_are_refused_before_it_is_loaded(
     field: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(steering.StableAudio, "load", lambda *_, **__: pytest.fail("a model was loaded"))
+    monkeypatch.setattr(edit.StableAudio, "load", lambda *_, **__: pytest.fail("a model was loaded"))
     for option, text, name, value in (
         ("--guidance", "-5", "guidance", -5.0),
         ("--denoising", "0", "denoising", 0),
@@ -386,7 +386,7 @@ def test_towards_words(field: Path, monkeypatch: pytest.MonkeyPatch, capsys: Str
         loaded.append((source, settings))
         return model
 
-    monkeypatch.setattr(steering.StableAudio, "load", load_model)
+    monkeypatch.setattr(edit.StableAudio, "load", load_model)
     words = ["--prompt", "a bell", "--negative", "wood", "--model", "here", "--steps", "40", "--contacts-per-step", "2"]
     alone = field.with_name("generated.wav")
     new = edited(field, *words, "--model-seconds", "1", "--generated", str(alone), "--parameters", "published")
@@ -418,16 +418,16 @@ def test_towards_words_by_a_saved_model_and_an_interrupted_edit_goes_on(
     assert (told["edit"], told["prompt"], told["model"]) == ("guided", "a wooden bowl is hit", "tiny-audio")
     whole = load(field.with_name("whole.safetensors"))
     assert bool((whole.bank.frequency != FREQUENCY).all())
-    shown = steering.SteerBar.show
+    shown = ProgressBar.step
     steps = []
 
-    def impatient(bar: steering.SteerBar, progress: steering.GuidedEditProgress) -> None:
-        shown(bar, progress)
-        steps.append(progress.step)
+    def impatient(bar: ProgressBar, stage: str, done: int, total: int, message: str) -> None:
+        shown(bar, stage, done, total, message)
+        steps.append(done)
         if steps == [1]:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(steering.SteerBar, "show", impatient)
+    monkeypatch.setattr(ProgressBar, "step", impatient)
     assert edit_to("part") == 130
     assert "part.safetensors.checkpoint" in capsys.readouterr().err
     assert edit_to("part") == 0

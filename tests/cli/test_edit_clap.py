@@ -7,9 +7,10 @@ import pytest
 from matplotlib.figure import Figure
 from test_cli_edit import PLACES, RATE, Echo, ceramic
 
-from avmsf.cli import edit, main, steering
+from avmsf.cli import edit, main
 from avmsf.cli.edit import run
 from avmsf.cli.options.edit import parse
+from avmsf.cli.progress import ProgressBar
 from avmsf.editing.modal_edit import EDITS, adjust_modes
 from avmsf.errors import AvmsfError
 from avmsf.evaluation.clap import Clap
@@ -28,7 +29,7 @@ def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     save_clap(tmp_path / "clap")
     save(ceramic(), tmp_path / "plate.safetensors")
     model = Echo(adjust_modes(ceramic(), pitch=1.02).render(PLACES[:1])[0])
-    monkeypatch.setattr(steering.StableAudio, "load", lambda *_, **__: model)
+    monkeypatch.setattr(edit.StableAudio, "load", lambda *_, **__: model)
     return [str(tmp_path / "plate.safetensors"), *QUICK, "--clap", str(tmp_path / "clap")]
 
 
@@ -63,16 +64,16 @@ def test_an_interrupted_edit_has_the_whole_curve(
         return found
 
     assert run(parse([*words, "--output", str(tmp_path / "whole.safetensors")])) == 0
-    shown = steering.SteerBar.show
+    shown = ProgressBar.step
 
-    def impatient(bar: steering.SteerBar, progress: steering.GuidedEditProgress) -> None:
-        shown(bar, progress)
-        if progress.step == 3:
+    def impatient(bar: ProgressBar, stage: str, done: int, total: int, message: str) -> None:
+        shown(bar, stage, done, total, message)
+        if done == 3:
             raise KeyboardInterrupt
 
     part = [*words, "--output", str(tmp_path / "part.safetensors")]
     with monkeypatch.context() as patched:
-        patched.setattr(steering.SteerBar, "show", impatient)
+        patched.setattr(ProgressBar, "step", impatient)
         assert run(parse(part)) == 130
     kept = tmp_path / "part.safetensors.clap.json"
     save_clap(tmp_path / "other", seed=1)

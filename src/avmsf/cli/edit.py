@@ -1,7 +1,8 @@
 """`avmsf edit`: a field in, the field of another material, size, pitch or sound out."""
 
+import json
 import math
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,25 +11,48 @@ from jaxtyping import Float
 from rich.table import Table
 from torch import Tensor
 
+from avmsf._utils.files import write_whole
+from avmsf._utils.text_files import read_json
 from avmsf._utils.wording import counted
 from avmsf.capture.settings import METRES
 from avmsf.cli import INTERRUPTED
-from avmsf.cli.clap_curve import CLAP
 from avmsf.cli.contacts import contacts_at, refuse_far
-from avmsf.cli.edit_material import MaterialChange
 from avmsf.cli.options.common import Unit
-from avmsf.cli.options.edit import AFTER, BEFORE, CURVE, MODES, SPECTROGRAMS, ModeOptions, Options
+from avmsf.cli.options.edit import (
+    AFTER,
+    BEFORE,
+    CURVE,
+    MODES,
+    SPECTROGRAMS,
+    GuideOptions,
+    MaterialOptions,
+    ModeOptions,
+    Options,
+)
 from avmsf.cli.printing import console, decimals, figure, next_command, print_json, say, table
-from avmsf.cli.steering import Steering, beside
+from avmsf.cli.progress import ProgressBar
 from avmsf.cli.writing import Level, write_sound
+from avmsf.editing.distillation import DecoderDistillation
+from avmsf.editing.guided import PARAMETERISATIONS, Guide, GuidedEditProgress, edit_towards
+from avmsf.editing.material import LAWS, change_material, infer_material
+from avmsf.editing.material_statistics import MaterialStatistics
 from avmsf.editing.modal_edit import EDITS, adjust_modes, remarks, silenced
+from avmsf.editing.reference import Reference
+from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import EditError
+from avmsf.evaluation.clap import Clap
+from avmsf.fem.material import Material, material_named
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
 from avmsf.plotting.edits import ModeLevels, draw_clap_curves, draw_edit
 from avmsf.plotting.pictures import save_picture
 from avmsf.plotting.spectrograms import draw_sound_change
 
+CLAP = "clap"
+"""The key of the scores in the last edit of a field's report."""
+_PREVIEW = Level("peak", -1.0)
+_GENERATED_SECONDS = 3.0
+"""Duration of a sound that is generated from a prompt only."""
 _LISTED = 20
 """Modes in the table, those of most energy."""
 _CANDIDATES = 64
@@ -40,23 +64,19 @@ _LOUD_NOISE_DB = 6.0
 """Decrease of the modes' level, dB, from which on the noise, whose level stays, may be too loud: half the amplitude."""
 
 
-@dataclass(frozen=True)
-class Sliders(ModeOptions):
-    """Every mode by hand."""
-
-    def apply(self, field: SoundField, *, named: Float[Tensor, " modes"]) -> SoundField:
-        """Return the adjusted field; modes are called by the frequencies `named`, Hz."""
-        levels = torch.zeros(len(named), dtype=torch.float64)
-        pitch, decay = torch.full_like(levels, self.pitch), torch.full_like(levels, self.decay)
-        for frequency, level in self.mode_db:
-            levels[_called(frequency, named, "--mode-db")] += level
-        for option, values, given in (
-            ("--mode-pitch", pitch, self.mode_pitch),
-            ("--mode-decay", decay, self.mode_decay),
-        ):
-            for frequency, factor in given:
-                values[_called(frequency, named, option)] *= factor
-        return adjust_modes(field, pitch=pitch, decay=decay, brightness_db=self.brightness, gains_db=levels)
+def _adjusted(options: ModeOptions, field: SoundField, *, named: Float[Tensor, " modes"]) -> SoundField:
+    """Return the field with each mode adjusted by hand; modes are called by the frequencies `named`, Hz."""
+    levels = torch.zeros(len(named), dtype=torch.float64)
+    pitch, decay = torch.full_like(levels, options.pitch), torch.full_like(levels, options.decay)
+    for frequency, level in options.mode_db:
+        levels[_called(frequency, named, "--mode-db")] += level
+    for option, values, given in (
+        ("--mode-pitch", pitch, options.mode_pitch),
+        ("--mode-decay", decay, options.mode_decay),
+    ):
+        for frequency, factor in given:
+            values[_called(frequency, named, option)] *= factor
+    return adjust_modes(field, pitch=pitch, decay=decay, brightness_db=options.brightness, gains_db=levels)
 
 
 def _called(frequency: float, named: Float[Tensor, " modes"], option: str) -> int:
@@ -74,20 +94,19 @@ def _called(frequency: float, named: Float[Tensor, " modes"], option: str) -> in
 
 def run(options: Options) -> int:
     """Edit, write, and print the result; return 130 where Ctrl-C stopped it."""
-    asked = _Edit.of(options)
     old = load(options.field)
     contact = _contact(old, options.position, unit=options.unit)
     try:
-        new = _edited(options, asked, old)
+        new = _edited(options, old)
     except KeyboardInterrupt:
-        kept = beside(options.output, "checkpoint")
+        kept = _beside(options.output, "checkpoint")
         where = f"from {kept}, or delete it" if kept.exists() else "from the start"
         say(f"avmsf edit: interrupted; run the same command again to continue {where}")
         return INTERRUPTED
     save(new, options.output)
-    if asked.steering.asked:
+    if options.steering.asked:
         for ending in ("checkpoint", "preview.wav", "clap.json"):
-            beside(options.output, ending).unlink(missing_ok=True)
+            _beside(options.output, ending).unlink(missing_ok=True)
     edits = new.origin.report[EDITS][len(old.origin.report.get(EDITS, [])) :]
     before, after = ModeLevels.of(old), ModeLevels.of(new)
     screen = console(errors=options.json)
@@ -130,33 +149,146 @@ def run(options: Options) -> int:
     return 0
 
 
-@dataclass(frozen=True)
-class _Edit:
-    """What is asked for, in the order in which it is done."""
-
-    change: MaterialChange
-    sliders: Sliders
-    steering: Steering
-
-    @classmethod
-    def of(cls, options: Options) -> "_Edit":
-        """Return what options ask for."""
-        parts = (options.change, options.sliders, options.steering)
-        kinds = (MaterialChange, Sliders, Steering)
-        return cls(*(kind(**vars(part)) for kind, part in zip(kinds, parts, strict=True)))
-
-
-def _edited(options: Options, asked: _Edit, field: SoundField) -> SoundField:
-    named = field.bank.frequency
-    needed = asked.change.asked or asked.steering.like_material is not None
-    old = asked.change.infer_material(field) if needed else None
-    if asked.change.asked and old is not None:
-        field, old = asked.change.apply(field, old=old), asked.change.target(old)
-    if asked.sliders.asked:
-        field = asked.sliders.apply(field, named=named)
-    if asked.steering.asked:
-        field = asked.steering.apply(field, output=options.output, old=old)
+def _edited(options: Options, field: SoundField) -> SoundField:
+    """Return the edited field: material and size first, then modes, then the guided edit."""
+    named, change, guide = field.bank.frequency, options.change, options.steering
+    old: Material | None = None
+    if change.asked or guide.like_material is not None:
+        new = None if change.material is None else material_named(change.material)
+        old = old_material(field, new=new) if change.old is None else material_named(change.old)
+    if change.asked and old is not None:
+        target = _target(change, old)
+        field, old = change_material(field, old, target, size=change.size, law=LAWS[change.law]), target
+    if options.sliders.asked:
+        field = _adjusted(options.sliders, field, named=named)
+    if guide.asked:
+        field = _guided(guide, field, output=options.output, old=old)
     return field
+
+
+def _target(change: MaterialOptions, old: Material) -> Material:
+    """Return the new material of an object of `old`."""
+    new = old if change.material is None else material_named(change.material)
+    if change.constants:
+        new = replace(new, name=f"{new.name} with {', '.join(change.constants)} changed", **change.constants)
+    return new
+
+
+def old_material(field: SoundField, *, new: Material | None = None) -> Material:
+    """Return a field's material, and print its source. Raises `EditError` where no material fits."""
+    known = infer_material(field, option="--from", new=new)
+    say(known.words)
+    return known.material
+
+
+def _guided(options: GuideOptions, field: SoundField, *, output: Path, old: Material | None) -> SoundField:
+    """Return the field edited towards a prompt, recordings, or the sound of a material.
+
+    State and preview are written next to `output`, its later file, so that the same command continues to the same
+    result. `old` is the field's material, needed only for `like_material`.
+    """
+    preview, checkpoint = _beside(output, "preview.wav"), _beside(output, "checkpoint")
+    curve: ClapCurve | None = None
+    if options.clap is not None and options.prompt is not None:
+        clap, kept = Clap.load(options.clap), _beside(output, "clap.json")
+        curve = ClapCurve(clap, options.prompt, field, kept, resumed=checkpoint.exists())
+    # After CLAP: a wrong name of its network is refused before the large model is loaded.
+    guide = _guide(options, field, old)
+    with ProgressBar() as bar:
+
+        def progress(reached: GuidedEditProgress) -> None:
+            if curve is not None:
+                curve.add(reached)
+            message = f"loss {figure(reached.loss)}, pitch x {figure(reached.pitch, 4)}"
+            if reached.preview is not None:
+                factor = _PREVIEW.factor(reached.preview[None])
+                write_sound(preview, factor * reached.preview, sample_rate=field.sample_rate, coding="float32")
+                message += f"; preview in {preview}"
+            bar.step("edit", reached.step, reached.steps, message)
+
+        edited = edit_towards(
+            field, guide, config=options.config, parameters=PARAMETERISATIONS[options.parameters], progress=progress,
+            checkpoint=checkpoint,
+        )  # fmt: skip
+    if curve is None:
+        return edited
+    *others, last = edited.origin.report[EDITS]
+    report = {**edited.origin.report, EDITS: [*others, {**last, CLAP: curve.record()}]}
+    return replace(edited, origin=replace(edited.origin, report=report))
+
+
+def _guide(options: GuideOptions, field: SoundField, old: Material | None) -> Guide:
+    if options.like_material is not None:
+        assert old is not None
+        common = MaterialStatistics.transform(field, old, material_named(options.like_material))
+        return common.reference(samples=field.samples, sample_rate=field.sample_rate, seed=options.config.seed)
+    if options.prompt is None:
+        return Reference.read(options.like, sample_rate=field.sample_rate)
+    say(f"loading {options.model}")
+    model = StableAudio.load(options.model, seconds=options.model_seconds, device=options.device)
+    if options.generated is not None:
+        seconds = _GENERATED_SECONDS if options.model_seconds is None else options.model_seconds
+        made = model.generate(options.prompt, seconds=seconds, seed=options.config.seed, negative=options.negative)
+        write_sound(options.generated, made, sample_rate=model.sample_rate, coding="float32")
+    return DecoderDistillation(
+        model,
+        options.prompt,
+        sample_rate=field.sample_rate,
+        negative=options.negative,
+        config=options.distillation,
+    )
+
+
+def _beside(output: Path, ending: str) -> Path:
+    """Return the path of a part of an unfinished edit: next to its later file."""
+    return output.with_name(f"{output.name}.{ending}")
+
+
+class ClapCurve:
+    """The CLAP score of a field's sound at one contact over the steps of an edit; step 0 is the unedited field."""
+
+    def __init__(self, clap: Clap, prompt: str, field: SoundField, kept: Path, *, resumed: bool) -> None:
+        """Start a curve, or with `resumed` continue that of the file `kept`.
+
+        Raises EditError for a file that is damaged or has scores of another network.
+        """
+        self.clap, self.prompt, self.field, self.kept = clap, prompt, field, kept
+        self.scores = _read_scores(kept, clap) if resumed and kept.is_file() else {}
+
+    def add(self, progress: GuidedEditProgress) -> None:
+        """Score a preview, and the unedited field before the first one. Silent sounds have no score."""
+        if progress.preview is None or progress.place is None:
+            return
+        if not self.scores:
+            self._score(0, self.field.render(progress.place[None])[0])
+        self._score(progress.step, progress.preview)
+        text = json.dumps({"digest": self.clap.digest, "scores": list(self.scores.items())})
+        write_whole(self.kept, lambda path: path.write_text(text, encoding="utf-8"), raising=EditError)
+
+    def record(self) -> dict[str, Any]:
+        """Return the steps and scores as plain values."""
+        return {"model": self.clap.name, "steps": [*self.scores], "scores": [*self.scores.values()]}
+
+    def _score(self, step: int, sound: Float[Tensor, " samples"]) -> None:
+        if bool(sound.any()):
+            self.scores[step] = float(self.clap.score(sound[None], [self.prompt], sample_rate=self.field.sample_rate))
+
+
+def _read_scores(path: Path, clap: Clap) -> dict[int, float]:
+    try:
+        read = read_json(path)
+        scores = {int(step): float(score) for step, score in read["scores"]}
+        digest = read["digest"]
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise EditError(f"{path}: expected CLAP scores, got {error}; delete the file to continue", file=path) from error
+    if digest != clap.digest:
+        raise EditError(
+            f"{path}: expected scores of {clap.name}, got those of another network; give that network",
+            file=path,
+            name="digest",
+            value=digest,
+        )
+    return scores
 
 
 def _contact(field: SoundField, at: tuple[float, float, float] | None, *, unit: Unit = "m") -> Float[Tensor, " 3"]:
