@@ -17,7 +17,7 @@ from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.capture.audio import read_recording
 from avmsf.capture.folder import read_strike
 from avmsf.capture.prepare import margin_length, prepare
-from avmsf.capture.table import read_rows, understand
+from avmsf.capture.table import parse_row, read_rows
 from avmsf.errors import CaptureWarning
 from avmsf.evaluation.splits import evaluate, split
 from avmsf.features.feature_field import FeatureField
@@ -74,7 +74,7 @@ def by_threshold(folder: Path) -> Impacts:
     """Read a capture with each sound from its own onset on, final, whatever the others say."""
     settings = CaptureSettings()
     rows, _ = read_rows(folder)
-    strikes = [understand(row, settings) for row in rows]
+    strikes = [parse_row(row, settings) for row in rows]
     prepared = [read_strike(folder, strike, settings=settings)[0] for strike in strikes]
     rate = read_recording(folder / strikes[0].file).sample_rate
     length = min(round(settings.kept_seconds(rate) * rate), *(len(each.sound) for each in prepared))

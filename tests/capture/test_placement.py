@@ -9,8 +9,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from avmsf.capture import CaptureSettings
-from avmsf.capture.placement import FACTORS, Mistake, contacted_part, judge_placement, surface_points
-from avmsf.capture.table import read_rows, understand
+from avmsf.capture.placement import FACTORS, Mistake, check_placement, contacted_part, surface_points
+from avmsf.capture.table import parse_row, read_rows
 from avmsf.errors import CaptureError
 from avmsf.mesh import Surface, read_surface
 from factories.raising import raises
@@ -35,7 +35,7 @@ CONTACTS = object_points(20, seed=1)
 
 
 def test_contacts_on_the_surface_pass() -> None:
-    placement = judge_placement(CONTACTS, CLOUD)
+    placement = check_placement(CONTACTS, CLOUD)
     assert placement.on_surface
     assert placement.describe() == ""
     assert placement.mistake is None
@@ -45,7 +45,7 @@ def test_contacts_on_the_surface_pass() -> None:
 
 def test_distances_are_meters_to_the_nearest_point() -> None:
     cloud = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 2]])
-    placement = judge_placement(torch.tensor([[1.0, 0.3, 0.4], [0, 2, 0.25]]), cloud)
+    placement = check_placement(torch.tensor([[1.0, 0.3, 0.4], [0, 2, 0.25]]), cloud)
     assert placement.distances.tolist() == pytest.approx([0.5, 0.25])
     assert placement.diagonal == pytest.approx(3)
 
@@ -55,7 +55,7 @@ def test_distances_are_meters_to_the_nearest_point() -> None:
     [(1e-3, "is their unit mm?"), (1e-2, "is their unit cm?"), (0.0254, "is their unit inches?"), (0.3048, "feet?")],
 )
 def test_contacts_in_another_unit_are_told(size: float, name: str) -> None:
-    placement = judge_placement(CONTACTS / size, CLOUD)
+    placement = check_placement(CONTACTS / size, CLOUD)
     assert placement.mistake is not None
     assert placement.mistake.factor == pytest.approx(size)
     assert placement.mistake.unit_only
@@ -67,7 +67,7 @@ def test_contacts_in_another_unit_are_told(size: float, name: str) -> None:
 # Contacts on a surface three times too large look like contacts on a part of it.
 @pytest.mark.parametrize("factor", [factor for factor in FACTORS if factor < 1 or factor > 9])
 def test_every_ratio_of_units_is_found_whichever_of_the_two_it_befell(factor: float) -> None:
-    placement = judge_placement(CONTACTS, CLOUD * factor)
+    placement = check_placement(CONTACTS, CLOUD * factor)
     assert placement.mistake is not None
     assert placement.mistake.factor == pytest.approx(factor)
     assert placement.mistake.unit_only
@@ -75,7 +75,7 @@ def test_every_ratio_of_units_is_found_whichever_of_the_two_it_befell(factor: fl
 
 def test_a_surface_in_millimeters_is_told_even_if_all_contacts_lie_near_one_of_its_corners() -> None:
     cloud = 1000 * (CLOUD - CLOUD[0])
-    placement = judge_placement(CONTACTS - CLOUD[0], cloud)
+    placement = check_placement(CONTACTS - CLOUD[0], cloud)
     assert not placement.off
     assert not placement.on_surface
     assert "multiplied by 1000" in placement.describe()
@@ -84,7 +84,7 @@ def test_a_surface_in_millimeters_is_told_even_if_all_contacts_lie_near_one_of_i
 
 def test_y_up_for_z_up_is_told_either_way() -> None:
     for axes, written in ((Y_UP, "(x, -z, y)"), (Y_UP.T, "(x, z, -y)")):
-        placement = judge_placement(CONTACTS @ axes, CLOUD)
+        placement = check_placement(CONTACTS @ axes, CLOUD)
         assert placement.mistake is not None
         assert torch.equal(placement.mistake.axes, axes)
         assert written in placement.describe()
@@ -99,7 +99,7 @@ def test_other_names_of_the_axes_are_undone() -> None:
         for code in (1 << number % 3, 7 ^ 1 << number % 3):
             signs = torch.tensor([1.0 - 2 * (code >> axis & 1) for axis in range(3)], dtype=torch.float64)
             axes = torch.diag(signs) @ torch.eye(3, dtype=torch.float64)[list(order)]
-            placement = judge_placement(CONTACTS @ axes, CLOUD)
+            placement = check_placement(CONTACTS @ axes, CLOUD)
             if placement.mistake is None:
                 missed += [] if placement.on_surface else [(order, code)]
             else:
@@ -110,7 +110,7 @@ def test_other_names_of_the_axes_are_undone() -> None:
 
 def test_another_origin_is_found_to_the_spacing_of_the_points() -> None:
     shift = torch.tensor([0.7, -0.2, 0.4], dtype=torch.float64)
-    placement = judge_placement(CONTACTS - shift, CLOUD)
+    placement = check_placement(CONTACTS - shift, CLOUD)
     assert placement.mistake is not None
     assert torch.equal(placement.mistake.axes, torch.eye(3, dtype=torch.float64))
     assert placement.mistake.factor == 1
@@ -120,7 +120,7 @@ def test_another_origin_is_found_to_the_spacing_of_the_points() -> None:
 
 def test_unit_axes_and_origin_together() -> None:
     shift = torch.tensor([0.5, 0.1, -0.3], dtype=torch.float64)
-    placement = judge_placement(1000 * (CONTACTS - shift) @ Y_UP, CLOUD)
+    placement = check_placement(1000 * (CONTACTS - shift) @ Y_UP, CLOUD)
     assert placement.mistake is not None
     assert placement.mistake.factor == pytest.approx(1e-3)
     assert torch.equal(placement.mistake.axes, Y_UP)
@@ -142,7 +142,7 @@ def test_the_similarity_that_befell_a_mesh_is_named_and_no_row(
     signs: tuple[float, ...], scale: float, shift: float, misplaced: bool
 ) -> None:
     moved = scale * CLOUD * torch.tensor(signs) + shift * torch.tensor([0.43, 0, 0], dtype=torch.float64)
-    placement = judge_placement(CONTACTS, moved)
+    placement = check_placement(CONTACTS, moved)
     assert placement.mistake is not None
     assert placement.mistake.factor == pytest.approx(scale, rel=0.02)
     assert placement.mistake.axes.diag().tolist() == list(signs)
@@ -155,13 +155,13 @@ def test_the_similarity_that_befell_a_mesh_is_named_and_no_row(
 def test_contacts_that_are_measured_coarsely_are_no_mistake_of_all() -> None:
     noise = torch.randn(20, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     for part in (0.005, 0.01, 0.02):
-        assert judge_placement(CONTACTS + part * 0.43 * noise, CLOUD).mistake is None
+        assert check_placement(CONTACTS + part * 0.43 * noise, CLOUD).mistake is None
 
 
 def test_one_wrong_row_is_no_mistake_of_all() -> None:
     contacts = CONTACTS.clone()
     contacts[7] = contacts[7] + torch.tensor([0.0, 1.0, 0.0])
-    placement = judge_placement(contacts, CLOUD)
+    placement = check_placement(contacts, CLOUD)
     assert placement.mistake is None
     assert placement.off == (7,)
     assert placement.off == (7,)
@@ -177,7 +177,7 @@ def test_contacts_of_another_object_are_not_explained() -> None:
     explained = 0
     for _ in range(10):
         contacts = 0.3 * torch.randn(12, 3, dtype=torch.float64, generator=generator)
-        placement = judge_placement(contacts, CLOUD)
+        placement = check_placement(contacts, CLOUD)
         assert not placement.on_surface
         explained += placement.mistake is not None
         assert (placement.mistake is None) == ("in different frames" in placement.describe())
@@ -187,7 +187,7 @@ def test_contacts_of_another_object_are_not_explained() -> None:
 
 def test_sparse_points_widen_the_tolerance() -> None:
     corners = torch.tensor(trimesh.creation.box((0.2, 0.2, 0.2)).vertices)
-    assert judge_placement(torch.tensor([[0.1, 0.02, 0.0], [0.0, 0.1, 0.0]]), corners).on_surface
+    assert check_placement(torch.tensor([[0.1, 0.02, 0.0], [0.0, 0.1, 0.0]]), corners).on_surface
 
 
 def test_a_surface_is_covered_by_points_always_the_same() -> None:
@@ -197,27 +197,27 @@ def test_a_surface_is_covered_by_points_always_the_same() -> None:
     assert torch.equal(points, surface_points(surface))
     assert bool(((points.abs().amax(dim=1) - 0.1).abs() < 1e-7).all())
     # 20,000 points on .24 m^2 lie 3.5 mm apart.
-    assert judge_placement(torch.tensor([[0.1, 0.013, -0.052], [0.03, -0.1, 0.02]]), points).distances.max() < 0.01
+    assert check_placement(torch.tensor([[0.1, 0.013, -0.052], [0.03, -0.1, 0.02]]), points).distances.max() < 0.01
 
 
 def test_nothing_to_judge_is_refused() -> None:
     with raises(CaptureError, name="contacts", value=0):
-        judge_placement(torch.zeros(0, 3), CLOUD)
+        check_placement(torch.zeros(0, 3), CLOUD)
     with raises(CaptureError, name="contacts", value=2):
-        judge_placement(torch.full((2, 3), torch.nan), CLOUD)
+        check_placement(torch.full((2, 3), torch.nan), CLOUD)
     with raises(CaptureError, name="points", value=0.0):
-        judge_placement(CONTACTS, torch.ones(5, 3))
+        check_placement(CONTACTS, torch.ones(5, 3))
 
 
 def test_the_aircrafts_contacts_lie_on_it_and_its_mistakes_are_named(shared: Path) -> None:
-    strikes = [understand(row, CaptureSettings()) for row in read_rows(shared / "aircraft")[0]]
+    strikes = [parse_row(row, CaptureSettings()) for row in read_rows(shared / "aircraft")[0]]
     contacts = torch.tensor([strike.contact for strike in strikes], dtype=torch.float64)
     points = surface_points(read_surface(shared / "aircraft/surface.obj"))
-    placement = judge_placement(contacts, points)
+    placement = check_placement(contacts, points)
     assert placement.on_surface
     assert float(placement.distances.max()) < 0.01
-    assert "is their unit mm?" in judge_placement(1000 * contacts, points).describe()
-    assert "(x, -z, y)" in judge_placement(contacts @ Y_UP, points).describe()
+    assert "is their unit mm?" in check_placement(1000 * contacts, points).describe()
+    assert "(x, -z, y)" in check_placement(contacts @ Y_UP, points).describe()
 
 
 def test_first_impacts_near_the_middle_of_a_plate_are_no_other_unit() -> None:
@@ -228,11 +228,11 @@ def test_first_impacts_near_the_middle_of_a_plate_are_no_other_unit() -> None:
         )
     )
     first = torch.tensor([[0.02, 0.0, 0.0], [-0.02, 0.01, 0.0]])
-    assert not judge_placement(first, plate).other_unit
+    assert not check_placement(first, plate).other_unit
     patch = 0.1 * (torch.rand(8, 3, generator=torch.Generator().manual_seed(0)) - 0.5) * torch.tensor([1.0, 1.0, 0.0])
-    assert not judge_placement(patch, plate).other_unit
-    assert judge_placement(0.01 * patch, plate).other_unit
-    assert judge_placement(1000 * patch, plate).other_unit
+    assert not check_placement(patch, plate).other_unit
+    assert check_placement(0.01 * patch, plate).other_unit
+    assert check_placement(1000 * patch, plate).other_unit
 
 
 def test_of_a_scan_with_its_table_the_part_that_the_contacts_lie_on_is_kept() -> None:
@@ -256,11 +256,11 @@ def test_what_a_file_states_goes_before_what_is_fitted_and_an_arbitrary_frame_is
     moved = 2.9 * CLOUD @ turn.T + shift
     stated = Mistake(2.9, turn, shift, stated="transforms.json (applied_scale = 2.9)")
     for contacts in (CONTACTS, CONTACTS + 0.004 * torch.randn(CONTACTS.shape, dtype=torch.float64)):
-        placement = judge_placement(contacts, moved, stated=[stated])
+        placement = check_placement(contacts, moved, stated=[stated])
         assert placement.misplaced
         assert "once moved as transforms.json (applied_scale = 2.9)" in placement.describe()
-    placement = judge_placement(CONTACTS, moved)
+    placement = check_placement(CONTACTS, moved)
     assert placement.misplaced
     assert "different frames" in placement.describe(what="Gaussians")
     # What is stated of contacts that lie where they should is not believed.
-    assert judge_placement(CONTACTS, CLOUD, stated=[stated]).on_surface
+    assert check_placement(CONTACTS, CLOUD, stated=[stated]).on_surface

@@ -1,7 +1,8 @@
 """Everything that is wrong with a capture folder, found without stopping at the first thing."""
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from avmsf.capture.folder import read_strike
 from avmsf.capture.measure import RecordingReport
 from avmsf.capture.prepare import Prepared, margin_length
 from avmsf.capture.settings import CaptureSettings, settings_of
-from avmsf.capture.starts import stay_uncut
+from avmsf.capture.starts import are_uncut
 from avmsf.capture.table import (
     FARTHEST,
     TABLE,
@@ -21,12 +22,12 @@ from avmsf.capture.table import (
     fitting_units,
     is_missing,
     missing_recording_of,
+    parse_row,
     read_rows,
     refuse_repeated_files,
-    understand,
 )
-from avmsf.capture.together import common_length, common_rate, find_surface, judge_contacts, judge_levels, judge_surface
-from avmsf.errors import CaptureError, CaptureWarning
+from avmsf.capture.together import check_contacts, check_levels, check_surface, common_length, common_rate, find_surface
+from avmsf.errors import CaptureError
 
 MAX_SUGGESTIONS = 3
 """Missing files for which a similar name is sought: each search compares up to a thousand names."""
@@ -91,16 +92,30 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
             f"(unit = {settings.unit!r}): {fitting_units(largest)}"
         )
         reports = [replace(each, problems=(words,)) if each.line in far else each for each in reports]
-    refused = _check_contacts(folder, strikes, rows, settings=settings, problems=problems)
+    refused: list[str] = []
+    problems += map(str, check_contacts(strikes, settings) if strikes else ())
+    with _collected(refused):
+        refuse_repeated_files(strikes)
+    with _collected(refused):
+        surface = find_surface(folder, settings)
+        if surface is not None and strikes:
+            problems += map(str, check_surface(strikes, surface, settings=settings))
     if len(missing) > MAX_SUGGESTIONS:
         lack = f"{TABLE}: expected a file for each row, got none for {len(missing)} of {len(rows)}"
         refused.append(f"{lack}; {advice_for_missing(folder, missing, files)}")
     comparable = len(sounds) > 1 and len({each.rate for each in sounds}) == 1
-    uncut = comparable and stay_uncut([each.start for each in sounds], rate=sounds[0].rate, settings=settings)
+    uncut = comparable and are_uncut([each.start for each in sounds], rate=sounds[0].rate, settings=settings)
     if uncut:
         reports = [each if each.onset_seconds is None else replace(each, onset_seconds=0.0) for each in reports]
         sounds = [replace(each, samples=each.samples + each.start.onset) for each in sounds]
-    refused += _check_sounds(sounds, settings=settings, problems=problems)
+    if sounds:
+        names = [each.file for each in sounds]
+        with _collected(refused):
+            rate = common_rate([each.rate for each in sounds], names)
+            lengths = [each.samples for each in sounds]
+            problems += map(str, common_length(lengths, names, rate=rate, settings=settings)[1])
+        with _collected(refused):
+            problems += map(str, check_levels([each.peak for each in sounds], names))
     first = {each.digest: each.file for each in reversed(sounds)}
     problems += [
         f"{each.file}: the same sound as {first[each.digest]}, to the last bit: copy the right file, or remove its row"
@@ -121,6 +136,15 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
             "that the contacts are in this order, too"
         )
     return CaptureReport(readable, tuple(reports), tuple(refused + problems), tuple(remarks))
+
+
+@contextmanager
+def _collected(refused: list[str]) -> Iterator[None]:
+    """Add a CaptureError's message to what makes the folder unreadable, and go on."""
+    try:
+        yield
+    except CaptureError as error:
+        refused.append(str(error))
 
 
 def _wav_files(folder: Path) -> list[str]:
@@ -145,7 +169,7 @@ def _check_row(
     """
     strike = None
     try:
-        strike = understand(row, settings)
+        strike = parse_row(row, settings)
         if is_missing(folder / strike.file):
             missing.append(strike.file)
             if len(missing) > MAX_SUGGESTIONS:
@@ -158,48 +182,3 @@ def _check_row(
         file = strike.file if strike is not None else row.cells["file"]
         return strike, None, RecordingReport(file=file, line=row.line, readable=False, problems=(str(error),))
     return strike, prepared, report
-
-
-def _check_sounds(sounds: list[_Sound], *, settings: CaptureSettings, problems: list[str]) -> list[str]:
-    """Add to `problems` what looks wrong about all sounds together, and return what makes the folder unreadable."""
-    if not sounds:
-        return []
-    names, samples, rates, peaks = zip(
-        *((each.file, each.samples, each.rate, each.peak) for each in sounds), strict=True
-    )
-    refused = []
-    judges: tuple[Callable[[], list[CaptureWarning]], ...] = (
-        lambda: common_length(samples, names, rate=common_rate(rates, names), settings=settings)[1],
-        lambda: judge_levels(peaks, names),
-    )
-    for judge in judges:
-        try:
-            problems += [str(each) for each in judge()]
-        except CaptureError as error:
-            refused.append(str(error))
-    return refused
-
-
-def _check_contacts(
-    folder: Path, strikes: list[Strike], rows: list[Row], *, settings: CaptureSettings, problems: list[str]
-) -> list[str]:
-    """Add to `problems` what looks wrong about the contacts, and return what makes the folder unreadable."""
-    if strikes:
-        problems += [str(each) for each in judge_contacts(strikes, settings)]
-
-    def judge_shape() -> None:
-        surface = find_surface(folder, settings)
-        if surface is not None and strikes:
-            problems.extend(str(each) for each in judge_surface(strikes, surface, settings=settings))
-
-    refused = []
-    judges: tuple[Callable[[], None], ...] = (
-        lambda: refuse_repeated_files(strikes),
-        judge_shape,
-    )
-    for judge in judges:
-        try:
-            judge()
-        except CaptureError as error:
-            refused.append(str(error))
-    return refused

@@ -18,7 +18,7 @@ from avmsf.capture.prepare import Prepared, prepare
 from avmsf.capture.settings import SETTINGS, CaptureSettings, settings_of
 from avmsf.capture.starts import build_impacts, shorten
 from avmsf.capture.table import DIRECTION, FORCE, REQUIRED, TABLE, Strike, in_folder, read_strikes
-from avmsf.capture.together import common_rate, find_surface, judge_contacts, judge_levels, judge_surface
+from avmsf.capture.together import check_contacts, check_levels, check_surface, common_rate, find_surface
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.mesh.surface import Surface, write_surface
 
@@ -61,10 +61,10 @@ def read_capture(folder: str | Path, settings: CaptureSettings | None = None) ->
 
 def _read_capture(folder: Path, settings: CaptureSettings) -> Capture:
     strikes, remarks = read_strikes(folder, settings)
-    remarks += judge_contacts(strikes, settings)
+    remarks += check_contacts(strikes, settings)
     surface = find_surface(folder, settings)
     if surface is not None:
-        remarks += judge_surface(strikes, surface, settings=settings)
+        remarks += check_surface(strikes, surface, settings=settings)
         surface, _ = contacted_part(surface, torch.tensor([strike.contact for strike in strikes]))
     recordings, reports, peaks = [], [], []
     for strike in strikes:
@@ -73,7 +73,7 @@ def _read_capture(folder: Path, settings: CaptureSettings) -> Capture:
         peaks.append(prepared.peak)
         reports.append(report)
     names = [strike.file for strike in strikes]
-    remarks += judge_levels(peaks, names)
+    remarks += check_levels(peaks, names)
     rate = common_rate([report.sample_rate or 0.0 for report in reports], names)
     directions = [strike.direction for strike in strikes]
     impacts, warned = build_impacts(

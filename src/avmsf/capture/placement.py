@@ -184,7 +184,7 @@ class Placement:
         )
 
 
-def judge_placement(
+def check_placement(
     contacts: Float[Tensor, "contacts 3"], points: Float[Tensor, "points 3"], *, stated: Sequence[Mistake] = ()
 ) -> Placement:
     """Measure how far contacts lie from a surface given by its points, and seek the similarity that explains them best.
@@ -229,7 +229,7 @@ def expect_placed(
     `Placement.misplaced` says so: rough surfaces, glue, single wrong rows and small shifts pass. `names` are for the
     message.
     """
-    placement = judge_placement(contacts, points)
+    placement = check_placement(contacts, points)
     if not placement.misplaced:
         return
     if placement.mistake is None:

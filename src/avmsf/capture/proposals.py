@@ -22,10 +22,10 @@ from avmsf._utils.text_files import read_toml
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.measure import HIGHEST_NOISE_DB, decibels, noise_level
 from avmsf.capture.onset import SECONDS_BEFORE, find_onset, find_pulse
-from avmsf.capture.placement import judge_placement, surface_points
+from avmsf.capture.placement import check_placement, surface_points
 from avmsf.capture.prepare import prepare, remove_rumble
 from avmsf.capture.settings import METRES, SETTINGS, CaptureSettings, settings_of
-from avmsf.capture.table import Row, Strike, read_rows, understand
+from avmsf.capture.table import Row, Strike, parse_row, read_rows
 from avmsf.capture.together import NARROWEST, WIDEST, find_surface, fitting_units_of
 from avmsf.errors import CaptureError
 
@@ -252,7 +252,7 @@ def _units(folder: Path, rows: Sequence[Row], settings: CaptureSettings, factor:
         unit = None if factor is None else unit_named(factor * settings.meters)
         reason = "The contacts then lie on the object in the photographs; in the present unit most are outside of it."
         return [] if unit is None else [Proposal("unit", unit, reason)]
-    placement = judge_placement(contacts, surface_points(surface))
+    placement = check_placement(contacts, surface_points(surface))
     if not placement.other_unit and NARROWEST <= placement.diagonal <= WIDEST:
         return []
     units: dict[str, Any] = fitting_units_of(placement, settings)
@@ -267,7 +267,7 @@ def _units(folder: Path, rows: Sequence[Row], settings: CaptureSettings, factor:
 def _strikes(rows: Sequence[Row], settings: CaptureSettings) -> Iterator[Strike]:
     for row in rows:
         try:
-            yield understand(row, settings)
+            yield parse_row(row, settings)
         except CaptureError:
             continue
 

@@ -53,7 +53,7 @@ def start_with_impact(recordings: Sequence[Prepared], *, rate: float) -> bool:
     return bool(mean[:first].max() >= START_LEVEL * mean.max())
 
 
-def stay_uncut(recordings: Sequence[Prepared], *, rate: float, settings: CaptureSettings) -> bool:
+def are_uncut(recordings: Sequence[Prepared], *, rate: float, settings: CaptureSettings) -> bool:
     """Return whether the recordings of a capture are taken from their files' first sample on, though `align` is set.
 
     A force channel, `align = false` and `time_zero = "peak"` say where the sounds start.
@@ -66,9 +66,9 @@ def stay_uncut(recordings: Sequence[Prepared], *, rate: float, settings: Capture
     )
 
 
-def settle_starts(recordings: Sequence[Prepared], *, rate: float, settings: CaptureSettings) -> list[Prepared]:
-    """Return the recordings uncut where all of them start with the impact (`stay_uncut`), else as they are."""
-    if not stay_uncut(recordings, rate=rate, settings=settings):
+def align_starts(recordings: Sequence[Prepared], *, rate: float, settings: CaptureSettings) -> list[Prepared]:
+    """Return the recordings uncut where all of them start with the impact (`are_uncut`), else as they are."""
+    if not are_uncut(recordings, rate=rate, settings=settings):
         return list(recordings)
     return [
         replace(each, sound=np.concatenate([each.before, each.sound]), before=each.before[:0], onset=0)
@@ -97,7 +97,7 @@ def build_impacts(
     Without `align`, or from the peaks on, nothing will be moved later, so that `before` and `after` are None. `rate` is
     the files' in Hz. Raises `CaptureError` as `common_length`.
     """
-    settled = settle_starts(recordings, rate=rate, settings=settings)
+    settled = align_starts(recordings, rate=rate, settings=settings)
     length, remarks = common_length([len(each.sound) for each in settled], names, rate=rate, settings=settings)
     before = after = None
     if settings.align and not settings.from_peaks:

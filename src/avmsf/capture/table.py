@@ -111,7 +111,7 @@ def read_rows(folder: Path) -> tuple[list[Row], list[CaptureWarning]]:
     if not lines:
         raise CaptureError(f"{path}: expected a table, got an empty file; {HOW_TO_WRITE}", file=path, value="")
     header = [name.lower() for name in lines[0][1]]
-    remarks = _judge_header(header, path)
+    remarks = _check_header(header, path)
     rows = []
     for line, cells in lines[1:]:
         if len(cells) != len(header):
@@ -139,7 +139,7 @@ def _as_on_disk(folder: Path, file: str) -> str:
     return file
 
 
-def understand(row: Row, settings: CaptureSettings) -> Strike:
+def parse_row(row: Row, settings: CaptureSettings) -> Strike:
     """Turn one row into a contact in meters, a unit direction and a force; `CaptureError` names the row and value."""
     where = row.location
     written = [_number(row, name) for name in ("x", "y", "z")]
@@ -185,11 +185,11 @@ def in_folder(folder: Path) -> Iterator[None]:
 def read_strikes(folder: Path, settings: CaptureSettings) -> tuple[list[Strike], list[CaptureWarning]]:
     """Return the parsed rows of the folder's `impacts.csv`, and warnings of columns that are not used.
 
-    Raises `CaptureError` as `read_rows` and `understand`, for two rows of one file, and where several are missing.
+    Raises `CaptureError` as `read_rows` and `parse_row`, for two rows of one file, and where several are missing.
     """
     with in_folder(folder):
         rows, remarks = read_rows(folder)
-        strikes = [understand(row, settings) for row in rows]
+        strikes = [parse_row(row, settings) for row in rows]
         refuse_repeated_files(strikes)
         _refuse_missing(folder, strikes)
     return strikes, remarks
@@ -269,7 +269,7 @@ def fitting_units(written: float) -> str:
     return f"write the unit in capture.toml: {choices}"
 
 
-def _judge_header(header: Sequence[str], path: Path) -> list[CaptureWarning]:
+def _check_header(header: Sequence[str], path: Path) -> list[CaptureWarning]:
     missing = [name for name in REQUIRED if name not in header]
     if missing:
         numbers = "vertex numbers have to become positions: " if any("vert" in name for name in header) else ""

@@ -11,10 +11,10 @@ import torch
 
 from avmsf._utils.wording import counted
 from avmsf.capture.filenames import find_surface_file
-from avmsf.capture.placement import Placement, contacted_part, judge_placement, surface_points
+from avmsf.capture.placement import Placement, check_placement, contacted_part, surface_points
 from avmsf.capture.prepare import shortest_allowed
 from avmsf.capture.settings import METRES, CaptureSettings
-from avmsf.capture.table import TABLE, Strike, fitting_units, read_rows, understand
+from avmsf.capture.table import TABLE, Strike, fitting_units, parse_row, read_rows
 from avmsf.errors import CaptureError, CaptureWarning, Location
 from avmsf.mesh.surface import Surface, read_surface
 
@@ -54,7 +54,7 @@ def common_rate(rates: Sequence[float], names: Sequence[str]) -> float:
     return rates[0]
 
 
-def judge_levels(peaks: Sequence[float], names: Sequence[str]) -> list[CaptureWarning]:
+def check_levels(peaks: Sequence[float], names: Sequence[str]) -> list[CaptureWarning]:
     """Return a warning where a prepared sound is far louder or fainter than the others, or all peaks are one.
 
     Raises `CaptureError` where the loudest is more than `MAX_RANGE_DB` above the faintest.
@@ -129,7 +129,7 @@ def common_length(
     return min(asked, shortest), remarks
 
 
-def judge_contacts(strikes: Sequence[Strike], settings: CaptureSettings) -> list[CaptureWarning]:
+def check_contacts(strikes: Sequence[Strike], settings: CaptureSettings) -> list[CaptureWarning]:
     """Return warnings of repeated contacts, and of contacts that together look like another unit's."""
     remarks = []
     places = defaultdict(list)
@@ -155,7 +155,7 @@ def judge_contacts(strikes: Sequence[Strike], settings: CaptureSettings) -> list
     return remarks
 
 
-def judge_surface(strikes: Sequence[Strike], surface: Surface, *, settings: CaptureSettings) -> list[CaptureWarning]:
+def check_surface(strikes: Sequence[Strike], surface: Surface, *, settings: CaptureSettings) -> list[CaptureWarning]:
     """Return a warning of contacts off the surface.
 
     `CaptureError` where surface and contacts are in different units, and where a contact lies farther off than the
@@ -163,7 +163,7 @@ def judge_surface(strikes: Sequence[Strike], surface: Surface, *, settings: Capt
     """
     contacts = torch.tensor([strike.contact for strike in strikes], dtype=torch.float64)
     surface, areas = contacted_part(surface, contacts)
-    placement = judge_placement(contacts, surface_points(surface))
+    placement = check_placement(contacts, surface_points(surface))
     if areas:
         sizes = " and ".join(f"{1e4 * area:.3g} cm2" for area in areas[1:3])
         message = f"the contacts lie on a part of {1e4 * areas[0]:.3g} cm2; larger ones ({sizes}) are left out"
@@ -198,10 +198,10 @@ def expect_one_unit(folder: Path, settings: CaptureSettings) -> None:
     with suppress(CaptureError):
         for row in read_rows(folder)[0]:
             with suppress(CaptureError):
-                strikes.append(understand(row, settings))
+                strikes.append(parse_row(row, settings))
     surface = find_surface(folder, settings) if strikes else None
     if surface is not None:
-        judge_surface(strikes, surface, settings=settings)
+        check_surface(strikes, surface, settings=settings)
 
 
 def fitting_units_of(placement: Placement, settings: CaptureSettings) -> dict[str, str]:

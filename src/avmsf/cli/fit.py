@@ -14,7 +14,7 @@ from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf._utils.files import copy_whole, write_whole
 from avmsf._utils.wording import counted
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
-from avmsf.capture.table import TABLE, in_folder, read_rows, understand
+from avmsf.capture.table import TABLE, in_folder, parse_row, read_rows
 from avmsf.capture.together import expect_one_unit, find_surface
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
@@ -247,7 +247,7 @@ def _draw(surface: Surface, folder: Path, settings: CaptureSettings, picture: Pa
     contacts = None
     if (folder / TABLE).is_file():
         with in_folder(folder):
-            rows = [understand(row, settings).contact for row in read_rows(folder)[0]]
+            rows = [parse_row(row, settings).contact for row in read_rows(folder)[0]]
         contacts = torch.tensor(rows, dtype=torch.float64)
     save_picture(draw_surface(surface, title=f"{folder.resolve().name}: surface", contacts=contacts), picture)
 

@@ -14,7 +14,7 @@ from avmsf.capture.audio import Recording
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.measure import measure, shared_problems
-from avmsf.capture.placement import judge_placement, surface_points
+from avmsf.capture.placement import check_placement, surface_points
 from avmsf.capture.prepare import Prepared, prepare
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.starts import build_impacts, shorten
@@ -151,7 +151,7 @@ def _repeated(impacts: Impacts) -> list[str]:
 def _misplaced(impacts: Impacts, surface: Surface | None, *, origin: str) -> list[str]:
     if surface is None:
         return []
-    placement = judge_placement(impacts.contacts, surface_points(surface))
+    placement = check_placement(impacts.contacts, surface_points(surface))
     found = placement.describe(impacts.names)
     if placement.other_unit:
         raise DatasetError(

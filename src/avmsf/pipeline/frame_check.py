@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy import ndimage
 from torch import Tensor
 
-from avmsf.capture.placement import FACTORS, WRONG_ROWS, Mistake, judge_placement
+from avmsf.capture.placement import FACTORS, WRONG_ROWS, Mistake, check_placement
 from avmsf.capture.proposals import unit_named
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError, CaptureWarning
@@ -139,7 +139,7 @@ def expect_contacts_in_views(
     if inside and not (stated and hull):
         return
     factor = max((each for each in FACTORS if _share_inside(each * contacts, chosen) >= 1 - WRONG_ROWS), default=1.0)
-    placement = None if hull is None else judge_placement(contacts, _surface_of(hull), stated=stated)
+    placement = None if hull is None else check_placement(contacts, _surface_of(hull), stated=stated)
     if placement is not None and placement.mistake is not None and placement.mistake.stated:
         raise CaptureError(
             f"expected contacts on the object in the photographs: {placement.mistake}",
@@ -174,7 +174,7 @@ def expect_on_object(
     Raises `CaptureError` for contacts in another frame, for one farther off than the object is large, and, if `strict`,
     for any off it. The `value` of both is the largest distance, meters.
     """
-    placement = judge_placement(contacts, points, stated=stated)
+    placement = check_placement(contacts, points, stated=stated)
     words, distance = placement.describe(names, what=what), float(placement.distances.max())
     apart = placement.misplaced or placement.other_unit or distance > placement.diagonal
     if words and (apart or (strict and placement.off)):

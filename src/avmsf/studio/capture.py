@@ -38,9 +38,9 @@ from avmsf.capture.table import (
     TABLE,
     Row,
     Strike,
+    parse_row,
     read_cells,
     read_rows,
-    understand,
 )
 from avmsf.errors import AvmsfError, CaptureError, FolderInUseError, RecordingLengthError
 from avmsf.pipeline.config import CACHE
@@ -219,7 +219,7 @@ class CaptureEditor:
         found = []
         for row in ImpactTable(self.folder).rows:
             try:
-                impact = understand(row, settings)
+                impact = parse_row(row, settings)
                 present = self._readable(impact.file).is_file()
             except AvmsfError:
                 continue
@@ -309,7 +309,7 @@ class CaptureEditor:
     def _described(self, index: int, row: Row, settings: CaptureSettings) -> dict[str, Any]:
         values: dict[str, Any] = {"row": index, "file": file_of(row), "contact": None, "direction": None}
         try:
-            impact = understand(row, settings)
+            impact = parse_row(row, settings)
             values |= {"file": impact.file, "contact": impact.contact, "direction": impact.direction}
             path = self._readable(impact.file)
             report, digest = _measured(path, _state(path), impact, settings)
@@ -377,7 +377,7 @@ class CaptureEditor:
         for row in ImpactTable(self.folder).rows:
             if file_of(row) != replaced:
                 try:
-                    with soundfile.SoundFile(self._readable(understand(row, settings).file)) as other:
+                    with soundfile.SoundFile(self._readable(parse_row(row, settings).file)) as other:
                         rates.append(float(other.samplerate))
                 except (AvmsfError, soundfile.LibsndfileError, OSError):
                     continue
