@@ -6,7 +6,7 @@ import os
 import pytest
 import torch
 
-from avmsf._utils.memory import lacks_memory
+from avmsf.errors import lacks_memory
 
 
 def test_a_tensor_that_cannot_be_allocated_lacks_memory() -> None:

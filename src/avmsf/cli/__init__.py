@@ -17,10 +17,9 @@ from types import FrameType
 from typing import TextIO
 
 import avmsf
-from avmsf._utils.memory import NO_MEMORY, lacks_memory
-from avmsf._utils.text import printable
+from avmsf._utils.wording import printable
 from avmsf.cli.heartbeat import beating, meanwhile, verbosity
-from avmsf.errors import AvmsfError, AvmsfWarning
+from avmsf.errors import NO_MEMORY, AvmsfError, AvmsfWarning, lacks_memory
 
 VERBS = {
     "check": "Check the recordings of a capture: levels, noise, clipping, onsets, second impacts and alignment.",

@@ -11,8 +11,7 @@ import torch
 from starlette.responses import JSONResponse
 
 from avmsf._utils.files import way_out
-from avmsf._utils.memory import lacks_memory
-from avmsf.errors import AvmsfError, StudioError
+from avmsf.errors import AvmsfError, StudioError, lacks_memory
 
 UNUSABLE = 422
 """Status of what was understood and cannot be used, as a recording of silence."""

@@ -13,8 +13,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, HTMLResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from avmsf._utils.memory import lacks_memory
-from avmsf.errors import AvmsfError
+from avmsf.errors import AvmsfError, lacks_memory
 from avmsf.export.web import MEDIA_TYPES
 from avmsf.studio.capture import Contact
 from avmsf.studio.guard import contained, nothing_here, policy_of, read_words

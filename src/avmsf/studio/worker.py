@@ -19,7 +19,6 @@ from typing import Any, TextIO
 
 from avmsf._utils.children import end_with_parent
 from avmsf._utils.files import copy_whole
-from avmsf._utils.memory import NO_MEMORY, lacks_memory
 from avmsf.capture import read_capture
 from avmsf.capture.settings import settings_of
 from avmsf.editing.config import GuidedEditConfig
@@ -27,7 +26,7 @@ from avmsf.editing.distillation import DecoderDistillation
 from avmsf.editing.guided import Guide, GuidedEditProgress, edit_towards
 from avmsf.editing.reference import Reference
 from avmsf.editing.stable_audio import StableAudio
-from avmsf.errors import AvmsfError, CaptureWarning
+from avmsf.errors import NO_MEMORY, AvmsfError, CaptureWarning, lacks_memory
 from avmsf.field.store import load, save
 from avmsf.pipeline.config import CACHE, PRESETS, SceneConfig
 from avmsf.pipeline.fit import fit_in_stages
