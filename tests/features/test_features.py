@@ -1,7 +1,6 @@
 """What is known of an object's points: who is nearest, what a region is described by, and how large the object is."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -47,19 +46,6 @@ def test_a_region_is_described_by_the_mean_of_its_points_features(dtype):
         torch.testing.assert_close(regions.centers[group], points[labels == group].mean(0), rtol=0, atol=1e-6)
 
 
-def test_one_region_a_point_is_the_points_themselves():
-    field = FeatureField.from_points(box(9))
-    regions = field.clusters(9)
-    rows = field.nearest(regions.centers)
-    assert sorted(rows.tolist()) == list(range(9))
-    assert torch.equal(regions.descriptors, field.features[rows])
-
-
-def test_more_regions_than_positions_are_refused():
-    with raises(FitError, name="count", value=10):
-        FeatureField.from_points(box(9)).clusters(10)
-
-
 def test_position_features_know_neither_the_objects_place_nor_its_size():
     points = box().double()
     there = FeatureField.from_points(points)
@@ -71,11 +57,6 @@ def test_position_features_know_neither_the_objects_place_nor_its_size():
     half_diagonal = float((there.features.amax(0) - there.features.amin(0)).norm()) / 2
     assert half_diagonal == pytest.approx(1, abs=1e-6)
     assert elsewhere.half_diagonal == pytest.approx(7 * there.half_diagonal, rel=1e-6)
-
-
-def test_half_the_diagonal_of_a_box():
-    corners = torch.tensor([[1.0, 1.0, 1.0], [3.0, 4.0, 7.0]])
-    assert FeatureField.from_points(corners).half_diagonal == pytest.approx(math.sqrt(4 + 9 + 36) / 2, rel=1e-7)
 
 
 def test_normals_follow_the_positions():
@@ -114,24 +95,16 @@ def test_points_that_stand_for_contacts_fill_their_box_and_stay_in_their_plane(f
     assert float(distance.max()) < 0.02
 
 
-def test_points_in_one_place_span_nothing():
-    alike = torch.ones(5, 3)
-    with raises(FitError, name="points", value=5):
-        FeatureField.from_points(alike)
-    with raises(FitError, name="points", value=5):
-        FeatureField.from_contacts(alike)
-    with raises(FitError, name="points", value=0):
-        FeatureField.from_points(alike[:0])
-
-
-def test_points_that_are_not_finite_are_refused():
-    points = box(5)
-    points[2, 1] = float("nan")
-    with raises(FitError, name="points", value=5):
-        FeatureField.from_points(points)
-
-
-def test_a_field_is_a_value():
-    field = FeatureField.from_points(box())
-    assert field.encoder == "geometry"
-    assert replace(field, encoder="other").encoder == "other"
+@pytest.mark.parametrize(
+    ("points", "make", "name", "value"),
+    [
+        (torch.ones(5, 3), FeatureField.from_points, "points", 5),
+        (torch.ones(5, 3), FeatureField.from_contacts, "points", 5),
+        (torch.ones(0, 3), FeatureField.from_points, "points", 0),
+        (box(5).index_fill(0, torch.tensor([2]), math.nan), FeatureField.from_points, "points", 5),
+        (box(9), lambda points: FeatureField.from_points(points).clusters(10), "count", 10),
+    ],
+)
+def test_points_that_span_nothing_are_refused(points, make, name, value):
+    with raises(FitError, name=name, value=value):
+        make(points)

@@ -60,23 +60,15 @@ def test_a_few_wrong_masks_among_many_carve_nothing_away() -> None:
     _expect_ball(hull)
 
 
-def test_masks_without_the_object_are_refused() -> None:
-    empty = [_with_mask(view, torch.zeros(64, 64, dtype=torch.uint8)) for view in ball_views(5)]
-    with raises(SceneError, name="masks", value=[view.name for view in empty]):
-        visual_hull(empty, points=500)
-
-
-def test_too_few_masks_are_refused() -> None:
-    with raises(SceneError, name="views", value=0):
-        visual_hull(ball_views(5, masked=False), points=500)
-    with raises(SceneError, name="views", value=2):
-        visual_hull(ball_views(2), points=500)
-
-
-def test_masks_of_other_cameras_are_refused() -> None:
-    views = ball_views(8)
-    spot = torch.zeros(64, 64, dtype=torch.uint8)
-    spot[2:5, 2:5] = 255
+def test_views_that_leave_nothing_are_refused() -> None:
+    views, empty, spot = ball_views(8), torch.zeros(64, 64, dtype=torch.uint8), torch.zeros(64, 64, dtype=torch.uint8)
     # Each view has the object in a corner of its image that no other view shows.
-    with raises(SceneError, name="masks", value=8):
-        visual_hull([_with_mask(view, spot) for view in views], points=500)
+    spot[2:5, 2:5] = 255
+    for wrong, name, value in (
+        ([_with_mask(view, empty) for view in views], "masks", [view.name for view in views]),
+        (ball_views(5, masked=False), "views", 0),
+        (ball_views(2), "views", 2),
+        ([_with_mask(view, spot) for view in views], "masks", 8),
+    ):
+        with raises(SceneError, name=name, value=value):
+            visual_hull(wrong, points=500)

@@ -92,15 +92,6 @@ def test_clusters_are_a_minimum_of_lloyds():
     assert torch.equal(groups.labels, torch.cdist(points, groups.centers).argmin(dim=1))
 
 
-def test_clusters_find_what_is_apart():
-    corners = torch.tensor(list(itertools.product([0.0, 1.0], repeat=3)), dtype=torch.float64)
-    points = (corners[:, None] + 0.1 * (cloud(30) - 0.5)).reshape(-1, 3)
-    groups = cluster(points, 8)
-    for block in groups.labels.reshape(8, 30):
-        assert len(block.unique()) == 1
-    assert len(groups.labels.unique()) == 8
-
-
 def test_clusters_come_in_the_points_dtype_and_leave_none_empty():
     points = cloud(20).float().repeat(5, 1)
     groups = cluster(points, 20)
@@ -134,17 +125,6 @@ def test_samples_lie_on_the_surface_evenly_with_its_normals():
     areas = torch.tensor([8.0, 4.0, 2.0], dtype=torch.float64) / 14.0
     # Four standard errors of a share of 6000.
     assert bool(((shares - areas).abs() < 4 * (areas * (1 - areas) / 6000).sqrt()).all())
-
-
-def test_the_generator_decides_the_samples():
-    box = trimesh.creation.box()
-    vertices, faces = torch.tensor(np.asarray(box.vertices)), torch.tensor(np.asarray(box.faces))
-
-    def draw(seed: int) -> torch.Tensor:
-        return sample_surface(vertices, faces, 10, generator=torch.Generator().manual_seed(seed)).points
-
-    assert torch.equal(draw(3), draw(3))
-    assert not torch.equal(draw(3), draw(4))
 
 
 def test_triangles_without_area_are_passed_over_and_alone_refused():

@@ -180,19 +180,6 @@ def test_a_rigid_motion_of_all_changes_nothing() -> None:
     torch.testing.assert_close(here.depth[~undecided], there.depth[~undecided], atol=1e-5, rtol=0)
 
 
-def test_twice_as_far_and_twice_as_large_looks_the_same() -> None:
-    cloud = cloud_of(degree=3)
-    grown = GaussianCloud(
-        2 * cloud.centers, cloud.rotations, cloud.log_scales + math.log(2), cloud.logit_opacities, cloud.harmonics
-    )
-    # No center lies near the near plane, which does not grow.
-    near, far = camera_of(distance=1.0), camera_of(distance=2.0)
-    _, undecided = render_everywhere(cloud, near, background=BACKGROUND)
-    here, there = image_of(cloud, near), image_of(grown, far)
-    torch.testing.assert_close(here.color[~undecided], there.color[~undecided], atol=1e-5, rtol=0)
-    torch.testing.assert_close(2 * here.depth[~undecided], there.depth[~undecided], atol=1e-5, rtol=0)
-
-
 def test_the_order_of_the_gaussians_is_of_no_effect() -> None:
     cloud, camera = cloud_of(), camera_of()
     order = torch.randperm(len(cloud), generator=torch.Generator().manual_seed(3))

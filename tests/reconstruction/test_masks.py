@@ -23,6 +23,7 @@ def _grown(view: View, pixels: int) -> View:
     return replace(view, mask=torch.from_numpy(change(view.mask.numpy(), kernel)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pixels", [-2, 2])
 def test_masks_that_are_all_too_large_or_too_small_leave_the_size_as_it_is(pixels: int) -> None:
     mesh = ball(RADIUS)
@@ -34,6 +35,7 @@ def test_masks_that_are_all_too_large_or_too_small_leave_the_size_as_it_is(pixel
     assert shape.report.mask_offset == pytest.approx(pixels, abs=0.4)
 
 
+@pytest.mark.slow
 def test_a_mask_that_is_wrong_about_a_small_part_is_left_out() -> None:
     # Mirrored masks differ in the arm alone, which is a hundredth of the volume.
     arm = trimesh.creation.box((0.03, 0.012, 0.012))
