@@ -1,4 +1,4 @@
-"""How well the symmetries of known shapes and scanned objects are found: clean, noisy, and with a part missing."""
+"""How well the symmetries of known shapes and scanned objects are found: clean, noisy, and thinned."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -21,7 +21,7 @@ PARTS = ("made", "scanned")
 POINTS = 8000
 POSES = 2
 _FIRST_SEED = 200
-"""The settings were chosen on poses, cuts and noise of other seeds."""
+"""The settings were chosen on poses and noise of other seeds."""
 _NEAR_DEGREES, _NEAR_GAP = 5.0, 0.05
 """How far a found axis or plane may lie from a true one, degrees and diagonals, to count as it."""
 
@@ -72,16 +72,6 @@ def _noisy(points: Points, random: np.random.Generator) -> Points:
     return points + 0.01 * diagonal * random.normal(size=points.shape)
 
 
-def _cut(points: Points, random: np.random.Generator) -> Points:
-    along = points @ _direction(random)
-    return points[along < np.quantile(along, 0.7)]
-
-
-def _holed(points: Points, random: np.random.Generator) -> Points:
-    distance = np.linalg.norm(points - points[random.integers(len(points))], axis=1)
-    return points[distance > np.quantile(distance, 0.3)]
-
-
 def _thinned(points: Points, random: np.random.Generator) -> Points:
     """Drop 30 % of the points, at one end of the object next to none and at the other most."""
     along = points @ _direction(random)
@@ -93,8 +83,6 @@ CONDITIONS = {
     "clean": _clean,
     "1 % noise": _noisy,
     "thinned": _thinned,
-    "cut off": _cut,
-    "hole": _holed,
 }
 
 
@@ -367,8 +355,7 @@ def _report(scores: dict[tuple[str, str], list[Score]], shapes: dict[str, Shape]
             "cell. An axis counts as found if the order is right, to within 5 degrees and 5 % of the diagonal. A "
             "continuous axis stands for the planes that contain it and for the half turns across it.",
             "noise: 1 % of the diagonal, normal, on every coordinate. thinned: 30 % dropped, next to none at one end "
-            "and most at the other. cut off: the 30 % farthest along a direction. hole: the 30 % nearest to a point. "
-            "Where a cut takes the mug's handle, what is left turns about its axis, and counts as wrong all the same.",
+            "and most at the other.",
         ),
         (
             Table("symmetries: right/found of the true ones, over all poses", ("shape", "true", *CONDITIONS), rows),

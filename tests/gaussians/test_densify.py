@@ -25,10 +25,10 @@ def _cloud(scales: list[float], opacities: list[float]) -> GaussianCloud:
     )
 
 
-def _grown(cloud: GaussianCloud, pull: list[float], config: SplatConfig) -> tuple[torch.Tensor, GaussianCloud]:
+def _grown(cloud: GaussianCloud, gradient: list[float], config: SplatConfig) -> tuple[torch.Tensor, GaussianCloud]:
     # Seen twice each: the mean counts.
-    density = Density(2 * torch.tensor(pull), torch.full((len(cloud),), 2.0))
-    return density.grown(cloud, config, HALF_DIAGONAL, generator=torch.Generator().manual_seed(3))
+    density = Density(2 * torch.tensor(gradient), torch.full((len(cloud),), 2.0))
+    return density.densify(cloud, config, HALF_DIAGONAL, generator=torch.Generator().manual_seed(3))
 
 
 def test_small_ones_are_copied_large_ones_split_and_faint_ones_go() -> None:

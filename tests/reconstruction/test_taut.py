@@ -3,7 +3,7 @@ import pytest
 import trimesh
 
 from avmsf.mesh.level_set import enclose
-from avmsf.reconstruction.fairing import drawn_taut
+from avmsf.reconstruction.fairing import fair_hull
 from avmsf.reconstruction.visual_hull import Grid, Outline, hull_distance
 from factories.looked_at import ball, mesh_of, views_of
 
@@ -12,10 +12,11 @@ def _hull(mesh: trimesh.Trimesh, *, taut: bool) -> trimesh.Trimesh:
     outlines = [Outline.of(view) for view in views_of(mesh, azimuths=24)]
     grid = Grid.around(mesh.bounds[0] - 0.03, mesh.bounds[1] + 0.03, cells=96, finest=1.0, margin=2)
     hull = hull_distance(outlines, grid, rank=0)
-    values = drawn_taut(hull, outlines, grid, float(np.linalg.norm(mesh.extents)))[0] if taut else hull
+    values = fair_hull(hull, outlines, grid, float(np.linalg.norm(mesh.extents)))[0] if taut else hull
     return mesh_of(enclose(values, 0.0, lowest=grid.lowest, spacing=grid.spacing))
 
 
+@pytest.mark.slow
 def test_the_pyramid_above_a_flat_top_is_removed() -> None:
     block = trimesh.creation.cylinder(radius=0.05, height=0.04, sections=96)
     above = _hull(block, taut=False).bounds[1, 2] - 0.02

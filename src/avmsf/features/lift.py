@@ -14,7 +14,7 @@ from avmsf.features.feature_field import FeatureField
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.points import nearest_points
 from avmsf.gaussians.rasterizer.protocol import Rasterizer, choose_rasterizer
-from avmsf.gaussians.visibility import DepthMap, Sight, depth_of_cloud, depth_reach, look
+from avmsf.gaussians.visibility import DepthMap, Visibility, depth_of_cloud, depth_reach, depth_test
 from avmsf.photographs.cameras import Camera, View
 
 _REACH = 1.0
@@ -30,7 +30,7 @@ Fitted Gaussians also fill walls and the space behind them. On a simulated mug w
 10,332 lie more than 2 mm off the true surface. Of the 8080 that `supported` leaves, 18 % do; of those within 1 mm it
 leaves out 1.7 %. A part of .1 costs three times as many of these.
 """
-Weighting = Callable[[Sight], Float[Tensor, " points"]]
+Weighting = Callable[[Visibility], Float[Tensor, " points"]]
 """How much one view's word counts for each point, given what it sees of them; zero where it sees nothing."""
 
 
@@ -93,15 +93,16 @@ def supported(lifted: Lifted, views: Sequence[View]) -> Lifted:
     )
 
 
-def by_presence(sight: Sight) -> Float[Tensor, " points"]:
+def by_presence(visibility: Visibility) -> Float[Tensor, " points"]:
     """Weigh all views that see a point alike: the paper's plain mean."""
-    return sight.seen.double()
+    return visibility.seen.double()
 
 
-def by_visibility(sight: Sight) -> Float[Tensor, " points"]:
+def by_visibility(visibility: Visibility) -> Float[Tensor, " points"]:
     """Weigh a view by how surely it sees a point, and by the pixels that it spends on a piece of surface there."""
-    nearness = torch.where(sight.share > 0, sight.camera.focal[0] * sight.camera.focal[1] / sight.depth**2, 0.0)
-    return sight.share * nearness
+    focal = visibility.camera.focal
+    nearness = torch.where(visibility.share > 0, focal[0] * focal[1] / visibility.depth**2, 0.0)
+    return visibility.share * nearness
 
 
 def lift(
@@ -156,10 +157,10 @@ def lift_points(
     tally = _Tally(len(points))
     for done, view in enumerate(views, start=1):
         behind = points.new_zeros(len(points)) if reach is None else reach(view.camera)
-        sight = look(points.detach(), view, depth_map(view.camera), reach=behind)
-        found = _sample(_describe(view, encoder, inpainted=inpainted), sight)
-        tally.add(found, torch.where(sight.seen, weighting(sight), 0.0).float(), view.name)
-        tally.past += sight.seen & (sight.past > 0.5)
+        visibility = depth_test(points.detach(), view, depth_map(view.camera), reach=behind)
+        found = _sample(_describe(view, encoder, inpainted=inpainted), visibility)
+        tally.add(found, torch.where(visibility.seen, weighting(visibility), 0.0).float(), view.name)
+        tally.past += visibility.seen & (visibility.past > 0.5)
         if progress is not None:
             progress(LiftProgress(view.name, done, len(views)))
     return tally.result(points, encoder.name)
@@ -223,11 +224,11 @@ def _describe(view: View, encoder: Encoder, *, inpainted: bool) -> Float[Tensor,
     return found.float()
 
 
-def _sample(features: Float[Tensor, "dim rows columns"], sight: Sight) -> Float[Tensor, "points dim"]:
+def _sample(features: Float[Tensor, "dim rows columns"], visibility: Visibility) -> Float[Tensor, "points dim"]:
     """Return the map's values at the places that are seen, bilinear between the cells' centers."""
-    size = sight.places.new_tensor([sight.camera.width, sight.camera.height])
+    size = visibility.places.new_tensor([visibility.camera.width, visibility.camera.height])
     # Without aligned corners, -1 and 1 are the image's edges, as in the pixels' own convention.
-    grid = (2 * sight.places / size - 1).float().to(features.device)
+    grid = (2 * visibility.places / size - 1).float().to(features.device)
     return functional.grid_sample(
         features[None], grid[None, None], mode="bilinear", padding_mode="border", align_corners=False
     )[0, :, 0].T.cpu()

@@ -1,7 +1,7 @@
 """Where Gaussians are too few or for nothing: adaptive density control (3DGS, section 5.2).
 
-A Gaussian that the photographs pull about in the image stands for too much: a small one is copied, a large one is split
-into two smaller ones drawn from its own density. One that is almost transparent, or as large as the object, goes.
+A Gaussian whose position gradient in the image is large stands for too much: a small one is copied, a large one is
+split into two smaller ones drawn from its own density. One that is almost transparent, or as large as the object, goes.
 """
 
 import math
@@ -25,51 +25,51 @@ _OVERSIZE = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Density:
-    """How strongly the photographs pulled at each Gaussian since the number last changed."""
+    """The accumulated position gradient of each Gaussian since the number last changed."""
 
-    pull: Float[Tensor, " points"]
-    """Sum over views of the slope's length by the place in the image, in half images (gsplat's normalization)."""
+    gradient: Float[Tensor, " points"]
+    """Sum over views of the length of the loss's gradient by the center in the image, in half images, as in gsplat."""
     views: Float[Tensor, " points"]
     """Views that saw the Gaussian."""
 
     @classmethod
-    def none(cls, cloud: GaussianCloud) -> "Density":
+    def zeros(cls, cloud: GaussianCloud) -> "Density":
         """Return what is known of Gaussians at first."""
         return cls(torch.zeros_like(cloud.logit_opacities), torch.zeros_like(cloud.logit_opacities))
 
     def state(self) -> dict[str, Any]:
         """Return the tensors by name."""
-        return {"pull": self.pull, "views": self.views}
+        return {"gradient": self.gradient, "views": self.views}
 
-    def note(self, rendering: Rendering, camera: Camera) -> None:
-        """Add one view's pull, after the backward pass."""
+    def add_view(self, rendering: Rendering, camera: Camera) -> None:
+        """Add one view's gradient, after the backward pass."""
         slope = rendering.screen.grad
         if slope is None:
             return
-        self.pull.add_(torch.hypot(slope[:, 0] * (camera.width / 2), slope[:, 1] * (camera.height / 2)))
+        self.gradient.add_(torch.hypot(slope[:, 0] * (camera.width / 2), slope[:, 1] * (camera.height / 2)))
         self.views.add_((rendering.radii > 0).float())
 
-    def grown(
+    def densify(
         self, cloud: GaussianCloud, config: SplatConfig, half_diagonal: float, *, generator: torch.Generator
     ) -> tuple[Tensor, GaussianCloud]:
         """Return the rows that stay, and the Gaussians that are new: copies, and the two halves of each split one.
 
-        Of more candidates than the config has room for, those with the strongest pull are taken.
+        Of more candidates than the config has room for, those with the largest gradient are taken.
         """
         largest = cloud.log_scales.amax(1).exp()
         kept = (cloud.opacities >= config.least_opacity) & (largest <= _OVERSIZE * half_diagonal)
-        strength = torch.where(kept, self.pull / self.views.clamp(min=1.0), 0.0)
+        strength = torch.where(kept, self.gradient / self.views.clamp(min=1.0), 0.0)
         room = max(0, config.gaussians - int(kept.sum()))
         wanted = min(room, int((strength > config.growth).sum()))
         chosen = torch.zeros_like(kept)
         chosen[torch.sort(strength, descending=True, stable=True).indices[:wanted]] = True
         small = largest <= config.large * half_diagonal
         copied, split = cloud.take(chosen & small), cloud.take(chosen & ~small)
-        halves = _halves(split, generator=generator)
+        halves = _split(split, generator=generator)
         return torch.nonzero(kept & ~(chosen & ~small))[:, 0], copied.join(halves)
 
 
-def _halves(cloud: GaussianCloud, *, generator: torch.Generator) -> GaussianCloud:
+def _split(cloud: GaussianCloud, *, generator: torch.Generator) -> GaussianCloud:
     twice = cloud.take(torch.arange(len(cloud), device=cloud.centers.device).repeat(2))
     offsets = torch.randn(len(twice), 3, generator=generator).to(twice.centers) * twice.log_scales.exp()
     centers = twice.centers + (rotation_matrices(twice.rotations) @ offsets[..., None])[..., 0]

@@ -31,7 +31,7 @@ from avmsf.photographs.cameras import View
 _MIN_PROGRESS_STEPS = 10
 """Least number of steps between reports of progress."""
 _CHECKPOINT_SECONDS = 30.0
-_CHECKPOINT_VERSION = 1
+_CHECKPOINT_VERSION = 2
 _GROUPS = ("centers", "rotations", "log_scales", "logit_opacities", "colors", "shades")
 """Parameters with a rate of their own; colors are the harmonics of degree 0, shades those above."""
 _BETAS, _EPSILON = (0.9, 0.999), 1e-15
@@ -152,7 +152,7 @@ def _fingerprint(views: Sequence[View], cloud: GaussianCloud, config: SplatConfi
 
 
 def _hull_points(views: Sequence[View], config: SplatConfig) -> StartPoints:
-    hull = visual_hull(views, points=config.start_points, dissent=config.wrong_masks)
+    hull = visual_hull(views, points=config.start_points, wrong_fraction=config.wrong_masks)
     colors = photographed_colors(hull.points, views, spacing=hull.spacing)
     return StartPoints(hull.points, colors, hull.normals)
 
@@ -197,7 +197,7 @@ class _Run:
         }
         self.generator = torch.Generator().manual_seed(config.seed)
         self.queue: list[int] = []
-        self.density = Density.none(cloud)
+        self.density = Density.zeros(cloud)
         self.step = 0
         self.whole = True
 
@@ -231,7 +231,7 @@ class _Run:
             self._expect_finite(float(loss.detach()))
         self.whole = False
         if growing:
-            self.density.note(rendering, photograph.cameras[level])
+            self.density.add_view(rendering, photograph.cameras[level])
         self._adam_step({name: leaf.grad for name, leaf in leaves.items()})
         self.step += 1
         self._densify_and_prune()
@@ -342,7 +342,7 @@ class _Run:
         config, step = self.config, self.step
         first, last = config.densify_from * config.steps, config.densify_until * config.steps
         if first <= step <= last and step % config.densify_every == 0:
-            rows, fresh = self.density.grown(self.cloud, config, self.half_diagonal, generator=self.generator)
+            rows, fresh = self.density.densify(self.cloud, config, self.half_diagonal, generator=self.generator)
             self._rebuild(rows, fresh)
             if config.reset_every and step % config.reset_every == 0 and step < last:
                 self._reset_opacities()
@@ -364,7 +364,7 @@ class _Run:
         if count < 4:
             advice = "check cameras and that the initial points are on the object, or lower least_opacity"
             raise SceneError.expected("at least 4", count, row=self.step, name="gaussians", advice=advice)
-        self.density = Density.none(self.cloud)
+        self.density = Density.zeros(self.cloud)
 
     def _reset_opacities(self) -> None:
         highest = 2.0 * self.config.least_opacity

@@ -31,19 +31,20 @@ def keep_object(
     *,
     rasterizer: Rasterizer | None = None,
     least_opacity: float = 0.1,
-    dissent: float = 0.1,
+    wrong_fraction: float = 0.1,
     least_weight: float = 0.5,
 ) -> GaussianCloud:
     """Return the Gaussians that lie on the object.
 
-    Those go whose opacity is less than `least_opacity`; whose center is outside of the masks in more than `dissent` of
-    the views that have it in their image; whose scale is that of the object; whose neighbors are far away; and, with a
-    `rasterizer`, those that in no view color as much as `least_weight` pixels in sum, because others hide them.
+    Those go whose opacity is less than `least_opacity`; whose center is outside of the masks in more than
+    `wrong_fraction` of the views that have it in their image; whose scale is that of the object; whose neighbors are
+    far away; and, with a `rasterizer`, those that in no view color as much as `least_weight` pixels in sum, because
+    others hide them.
     Raises `SceneError` where nothing remains.
     """
     cloud = cloud.detach()
     rows = torch.nonzero(cloud.opacities >= least_opacity)[:, 0]
-    rows = rows[masks_agree(cloud.centers[rows], views, dissent=dissent)]
+    rows = rows[masks_agree(cloud.centers[rows], views, wrong_fraction=wrong_fraction)]
     _expect_some(rows, cloud)
     rows = rows[_sized(cloud.take(rows))]
     if rasterizer is not None:
@@ -55,9 +56,9 @@ def keep_object(
 
 
 def masks_agree(
-    points: Float[Tensor, "points 3"], views: Sequence[View], *, dissent: float = 0.1
+    points: Float[Tensor, "points 3"], views: Sequence[View], *, wrong_fraction: float = 0.1
 ) -> Bool[Tensor, " points"]:
-    """Return which points at most `dissent` of the views that have them in their image see outside of their mask.
+    """Return which points at most `wrong_fraction` of the views with them in their image see outside of their mask.
 
     Views without a mask, or with an empty one, do not vote; a point that no view sees is not on the object, where some
     view could have.
@@ -78,7 +79,7 @@ def masks_agree(
         against[inside] += (~mask[pixels[:, 1], pixels[:, 0]]).float()
     if not voters:
         return torch.ones(len(points), dtype=torch.bool, device=device)
-    return ((seen > 0) & (against <= dissent * seen)).to(device)
+    return ((seen > 0) & (against <= wrong_fraction * seen)).to(device)
 
 
 def blended_weight(cloud: GaussianCloud, views: Sequence[View], *, rasterizer: Rasterizer) -> Float[Tensor, " points"]:

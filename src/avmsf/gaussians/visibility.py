@@ -1,7 +1,7 @@
 """Which points of an object a camera sees: what lies no deeper than the surface that the camera sees there.
 
-The four pixels around a point's place each say whether their depth reaches the point, within a tolerance, and the
-point's share of sight is their mean, weighted as bilinear interpolation would. Depths themselves are not interpolated:
+The four pixels around a point's place each say whether their depth reaches the point, within a tolerance, and its
+share is their mean, weighted as bilinear interpolation would. Depths themselves are not interpolated:
 between an object and what lies behind it a mean depth is nobody's.
 """
 
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.densify import rotation_matrices
 from avmsf.gaussians.rasterizer.protocol import Rasterizer
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh
@@ -28,7 +29,7 @@ DepthMap = Callable[[Camera], Float[Tensor, "height width"]]
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class Visibility:
     """What one camera sees of many points."""
 
     places: Float[Tensor, "points 2"]
@@ -47,13 +48,13 @@ class Sight:
         return self.share > 0.5
 
 
-def look(
+def depth_test(
     points: Float[Tensor, "points 3"],
     view: View,
     depth: Float[Tensor, "height width"],
     *,
     reach: Float[Tensor, " points"],
-) -> Sight:
+) -> Visibility:
     """Return what a view's camera sees of the points, given the depth that it sees at each pixel.
 
     `reach`, meters, is how far behind the seen surface a point may lie and still be on it. Two pixels' width at the
@@ -64,17 +65,17 @@ def look(
     # Behind the camera there are no places, and NaN is not at least 0.
     inside = (places >= 0).all(1) & (places <= places.new_tensor([camera.width, camera.height])).all(1)
     places = torch.where(inside[:, None], places, 0.5)
-    slack = reach.cpu().double() + 2 * deep / min(camera.focal)
+    tolerance = reach.cpu().double() + 2 * deep / min(camera.focal)
     surface, coverage = depth.detach().double().cpu(), view.coverage
     share, past = torch.zeros_like(deep), torch.zeros_like(deep)
     for rows, columns, weight in _corners(places, camera):
         there = surface[rows, columns]
-        shows = (there > 0) & (there >= deep - slack)
+        shows = (there > 0) & (there >= deep - tolerance)
         if coverage is not None:
             shows &= coverage[rows, columns] >= _COVERED
         share += weight * shows
-        past += weight * (shows & (there > deep + slack))
-    return Sight(places, deep, torch.where(inside, share, 0.0), torch.where(inside, past, 0.0), camera)
+        past += weight * (shows & (there > deep + tolerance))
+    return Visibility(places, deep, torch.where(inside, share, 0.0), torch.where(inside, past, 0.0), camera)
 
 
 def depth_of_cloud(cloud: GaussianCloud, rasterizer: Rasterizer) -> DepthMap:
@@ -110,16 +111,8 @@ def depth_of_surface(surface: Surface) -> DepthMap:
 def depth_reach(cloud: GaussianCloud, camera: Camera) -> Float[Tensor, " points"]:
     """Return each Gaussian's standard deviation along a camera's optical axis, meters."""
     axis = camera.world_to_camera[2, :3].to(cloud.centers)
-    w, x, y, z = torch.nn.functional.normalize(cloud.rotations, dim=1).unbind(1)
     # The axis in each Gaussian's own frame: the rotation matrix's columns times it.
-    own = torch.stack(
-        [
-            (1 - 2 * (y * y + z * z)) * axis[0] + 2 * (x * y + w * z) * axis[1] + 2 * (x * z - w * y) * axis[2],
-            2 * (x * y - w * z) * axis[0] + (1 - 2 * (x * x + z * z)) * axis[1] + 2 * (y * z + w * x) * axis[2],
-            2 * (x * z + w * y) * axis[0] + 2 * (y * z - w * x) * axis[1] + (1 - 2 * (x * x + y * y)) * axis[2],
-        ],
-        dim=1,
-    )
+    own = (rotation_matrices(cloud.rotations) * axis[:, None]).sum(1)
     return (own * cloud.log_scales.exp()).norm(dim=1)
 
 

@@ -34,14 +34,14 @@ class Hull:
     """Edge of a voxel, meters."""
 
 
-def visual_hull(views: Sequence[View], *, points: int, dissent: float = 0.05) -> Hull:
+def visual_hull(views: Sequence[View], *, points: int, wrong_fraction: float = 0.05) -> Hull:
     """Carve the object out of its masks, finely enough for about `points` voxels at the surface.
 
     A view has a say where it sees: what lies beyond its image's edge it leaves to the others. A voxel goes when more
-    than `dissent` of the views that see it say so, so that a few wrong masks among many views carve nothing away, and
-    when fewer than half as many views see it as see the middle of the object. Views without a mask are passed over, and
-    those whose mask is empty, with a `CaptureWarning`. Raises `SceneError` where fewer than 3 masks remain, or masks
-    that have nothing in common.
+    than `wrong_fraction` of the views that see it say so, so that a few wrong masks among many views carve nothing
+    away, and when fewer than half as many views see it as see the middle of the object. Views without a mask are passed
+    over, and those whose mask is empty, with a `CaptureWarning`. Raises `SceneError` where fewer than 3 masks remain,
+    or masks that have nothing in common.
     """
     masked = masked_views(views)
     middle, reach = object_extent(masked)
@@ -49,7 +49,7 @@ def visual_hull(views: Sequence[View], *, points: int, dissent: float = 0.05) ->
     shape = (_ROUGH,) * 3
     # The rough box is a guess: where the object touches its edge, it grows.
     for _ in range(4):
-        solid = _carve(masked, lowest, spacing, shape, dissent)
+        solid = _carve(masked, lowest, spacing, shape, wrong_fraction)
         if not solid.any() or not _touches_edge(solid):
             break
         reach *= 1.5
@@ -62,7 +62,7 @@ def visual_hull(views: Sequence[View], *, points: int, dissent: float = 0.05) ->
         spacing = max(finer, float(extent.max()) / _FINEST)
         shape = (*(np.ceil(extent / spacing).astype(int) + 4).tolist(),)
         lowest = lowest - 2 * spacing
-        solid = _carve(masked, lowest, spacing, shape, dissent)
+        solid = _carve(masked, lowest, spacing, shape, wrong_fraction)
         _expect_something(solid, masked)
     rows = np.argwhere(_surface(solid))
     normals = _normals(solid, rows)
@@ -71,7 +71,7 @@ def visual_hull(views: Sequence[View], *, points: int, dissent: float = 0.05) ->
 
 
 def _carve(
-    views: Sequence[View], lowest: np.ndarray, spacing: float, shape: tuple[int, ...], dissent: float
+    views: Sequence[View], lowest: np.ndarray, spacing: float, shape: tuple[int, ...], wrong_fraction: float
 ) -> np.ndarray:
     """Return which voxels of a grid the views leave."""
     seen, against = np.zeros(shape, dtype=np.uint16), np.zeros(shape, dtype=np.uint16)
@@ -86,7 +86,7 @@ def _carve(
             mask = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5) <= grown
         projection = view.camera.intrinsics.numpy() @ pose[:3]
         run_lanes(_vote, lane_count(), projection, mask, lowest + 0.5 * spacing, spacing, seen, against)
-    agreed = against <= dissent * seen
+    agreed = against <= wrong_fraction * seen
     looks = seen[agreed & (seen > 0)]
     enough = 0.5 * float(np.quantile(looks, 0.9)) if len(looks) else 1.0
     return agreed & (seen >= max(1.0, enough))

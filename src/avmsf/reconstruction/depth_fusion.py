@@ -41,8 +41,8 @@ def fused_depth(
     for each in views:
         run_lanes(_count, lane_count(), each.projection, each.depth, grid.lowest, grid.spacing, rows, band, counts)
     total = np.cumsum(counts, axis=1, dtype=np.float32)
-    sights = total[:, -1]
-    wanted = quantile * sights
+    view_counts = total[:, -1]
+    wanted = quantile * view_counts
     first = np.minimum((total < wanted[:, None]).sum(axis=1), _BINS - 1)
     at = np.arange(len(rows))
     before = np.where(first > 0, total[at, np.maximum(first - 1, 0)], 0.0)
@@ -50,8 +50,8 @@ def fused_depth(
     value = ((first + np.clip(within, 0.0, 1.0)) / _BINS * 2.0 - 1.0) * band
     values = np.full(grid.shape, -band, dtype=np.float32)
     seen = np.zeros(grid.shape, dtype=np.float32)
-    values[tuple(rows.T)] = np.where(sights >= least, value, -band)
-    seen[tuple(rows.T)] = sights
+    values[tuple(rows.T)] = np.where(view_counts >= least, value, -band)
+    seen[tuple(rows.T)] = view_counts
     return values, seen
 
 

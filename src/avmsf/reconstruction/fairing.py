@@ -23,7 +23,7 @@ _TOUCHING = 0.75
 """Distance from an outline, pixels, within which a place is on it."""
 _EVEN = 0.03
 """Difference of the blurred hull up to which two places are equally bent: a plane has .5, a right-angled edge .25."""
-_ALIKE = 0.5
+_MIN_VOTE_RATIO = 0.5
 """Part of the most outlines that pass a place on a line of sight, from which on another place is touched as well. On a
 bracket with a hole, 15 to 23 of 72 pass the places of the hole's edge and 3 to 9 the pyramid's around it."""
 _COUNTS = 2
@@ -35,7 +35,7 @@ _ROUNDS = 300
 """Iterations of the conjugate gradient method at most."""
 
 
-def drawn_taut(
+def fair_hull(
     hull: Float32[np.ndarray, "x y z"], outlines: Sequence[Outline], grid: Grid, diagonal: float
 ) -> tuple[Float32[np.ndarray, "x y z"], Float32[np.ndarray, "x y z"]]:
     """Return how far inside the smaller hull each cell lies, and how far from the nearest touched place, meters."""
@@ -71,7 +71,7 @@ def _touched(
     for _ in range(_COUNTS):
         chosen = np.zeros(len(places))
         for each, (rows, pixels) in zip(outlines, passing, strict=True):
-            often = votes[rows] >= _ALIKE * _largest(votes[rows], pixels, each.inside.shape)
+            often = votes[rows] >= _MIN_VOTE_RATIO * _largest(votes[rows], pixels, each.inside.shape)
             few, where = rows[often], pixels[:, often]
             chosen[few[bent[few] <= _EVEN - _largest(-bent[few], where, each.inside.shape)]] += 1
         votes = chosen

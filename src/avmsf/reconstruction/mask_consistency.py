@@ -12,7 +12,7 @@ from avmsf.photographs.mesh_views import MeshTracer
 from avmsf.reconstruction.object_shape import closed_surface
 from avmsf.reconstruction.visual_hull import Grid, Outline, hull_distance
 
-DISSENT = 0.05
+WRONG_FRACTION = 0.05
 """Part of the masks that may be wrong."""
 _CUT = 0.002
 """Part of the consensus that a right mask leaves out in most views (median over 20 objects with 72 views: 0)."""
@@ -56,14 +56,14 @@ def edge_offset(views: Sequence[View], outlines: Sequence[Outline]) -> float:
     return float((weight * pixels).sum() / weight.sum())
 
 
-def agreeing(views: Sequence[View], outlines: Sequence[Outline], grid: Grid) -> Bool[np.ndarray, " views"]:
+def consistent_masks(views: Sequence[View], outlines: Sequence[Outline], grid: Grid) -> Bool[np.ndarray, " views"]:
     """Return which masks agree with the consensus of all, on a grid around the object.
 
     The consensus is what all but 5 % of the masks keep. A right mask may leave out a part of it that few other views
     could see, but shows nothing beyond it; one that does both is wrong, and one that leaves out much.
     At least half of the masks agree, for a wrong one leaves out more than the median.
     """
-    values = hull_distance(outlines, grid, rank=round(DISSENT * len(outlines)))
+    values = hull_distance(outlines, grid, rank=round(WRONG_FRACTION * len(outlines)))
     solid = values > 0
     if not solid.any():
         return np.ones(len(outlines), dtype=bool)

@@ -14,17 +14,17 @@ from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.extent import masked_views, no_common_point, object_extent
 from avmsf.photographs.mesh_views import MeshTracer
 from avmsf.reconstruction.depth_fusion import SeenDepth, fused_depth
-from avmsf.reconstruction.fairing import drawn_taut
-from avmsf.reconstruction.mask_consistency import DISSENT, agreeing, edge_offset
+from avmsf.reconstruction.fairing import fair_hull
+from avmsf.reconstruction.mask_consistency import WRONG_FRACTION, consistent_masks, edge_offset
 from avmsf.reconstruction.object_shape import ObjectShape, ShapeReport, closed_surface
 from avmsf.reconstruction.visual_hull import Grid, Outline, depth_in_convex_hull, hull_distance
 
 DepthMap = Callable[[Camera], Float[Tensor, "height width"]]
 """What gives the depth of the first surface that each pixel of a camera sees, meters along the axis; 0 where none."""
 
-_ROUGH = 48
+_COARSE_CELLS = 48
 """Cells along an edge of the first grids, which find where the object is and which masks are wrong."""
-_FINER = 4.0
+_MAX_REFINEMENT = 4.0
 """Times as many cells along the longest side of a slender object, at most."""
 _MARGIN = 4
 """Cells of free room around the hull."""
@@ -32,18 +32,18 @@ _BAND = 0.015
 """How far behind a view's depth places are still seen, over the diagonal: depth of Gaussians scatters so much."""
 _QUANTILE = 0.35
 """Of the distances before the surface: two thirds of the views must see a place free."""
-_SLACK = 0.005
+_DEPTH_TOLERANCE = 0.005
 """How far depth must lie behind the hull to be believed, over the diagonal: its mean over views is so exact."""
-_LEAST = 0.04
+_MIN_VIEW_FRACTION = 0.04
 """Part of the views that must see a place for its depth to count, but three views at least."""
-_CLOSED = 4000
+_CLOSING_FACES = 4000
 """Triangles of the surface whose convex hull closes what no view sees."""
 _NARROW = 2
 """Half the width of hollows that are none, cells."""
-_UNTOUCHED = 0.025
+_MIN_TOUCH_DISTANCE = 0.025
 """Distance from the nearest touch of an outline, over the diagonal, from which on a place is inside a face of which
 outlines tell the edge alone. Touches on round parts are three pixels apart."""
-_ALIKE = 0.7
+_MIN_AREA_RATIO = 0.7
 """Area of such a face over that of the largest, from which on both are openings or neither: the ends of a tube."""
 _LARGE_FACE = 0.02
 """Part of the surface that a face must be for a supposed opening."""
@@ -68,25 +68,25 @@ def object_surface(views: Sequence[View], depth_map: DepthMap, *, cells: int = 1
     outlines = [Outline.of(view) for view in masked]
     offset = edge_offset(masked, outlines)
     outlines = [outline.moved_in(offset) for outline in outlines]
-    rough = Grid.around(*_rough(masked, outlines), cells=_ROUGH, finest=_FINER, margin=2)
-    right = agreeing(masked, outlines, rough)
+    rough = Grid.around(*_rough(masked, outlines), cells=_COARSE_CELLS, finest=_MAX_REFINEMENT, margin=2)
+    right = consistent_masks(masked, outlines, rough)
     kept = [view for view, each in zip(masked, right, strict=True) if each]
     outlines = [outline for outline, each in zip(outlines, right, strict=True) if each]
     low, high = _box(hull_distance(outlines, rough, rank=0) > -rough.spacing, rough, len(kept))
-    grid = Grid.around(low, high, cells=cells, finest=_FINER, margin=_MARGIN)
+    grid = Grid.around(low, high, cells=cells, finest=_MAX_REFINEMENT, margin=_MARGIN)
     hull = _hull(outlines, grid)
     low, high = _box(hull > 0, grid, len(kept))
     diagonal = float(np.linalg.norm(high - low))
-    hull, untouched = drawn_taut(hull, outlines, grid, diagonal)
+    hull, untouched = fair_hull(hull, outlines, grid, diagonal)
     depths = [_Depth(view, depth_map(view.camera).detach().cpu().float().numpy()) for view in kept]
     bias = _bias(hull, grid, depths, diagonal)
-    free, sights = _free(hull, grid, depths, bias, diagonal)
-    seen = np.minimum(hull, _SLACK * diagonal - free)
-    seen, bound, unseen, direction = _closed(hull, seen, sights, grid)
+    free, view_counts = _free(hull, grid, depths, bias, diagonal)
+    seen = np.minimum(hull, _DEPTH_TOLERANCE * diagonal - free)
+    seen, bound, unseen, direction = _closed(hull, seen, view_counts, grid)
     hollow = _hollows(bound, seen, grid, diagonal)
     supposed = not hollow.any()
     if supposed:
-        hollow = _supposed(seen, untouched > _UNTOUCHED * diagonal)
+        hollow = _unobserved_cavities(seen, untouched > _MIN_TOUCH_DISTANCE * diagonal)
     outer = seen
     if not supposed:
         outer = np.where(_covered(hollow > 0, (bound > 0) & (seen <= 0)), np.maximum(seen, bound), seen)
@@ -112,8 +112,8 @@ def _rough(
     """Return the lowest and highest corner of a box around what all but a few masks keep, meters."""
     middle, reach = object_extent(views)
     for _ in range(5):
-        grid = Grid(middle - reach, 2 * reach / (_ROUGH - 1), (_ROUGH,) * 3)
-        solid = hull_distance(outlines, grid, rank=round(DISSENT * len(outlines))) > -grid.spacing
+        grid = Grid(middle - reach, 2 * reach / (_COARSE_CELLS - 1), (_COARSE_CELLS,) * 3)
+        solid = hull_distance(outlines, grid, rank=round(WRONG_FRACTION * len(outlines))) > -grid.spacing
         if not any(solid.take(end, axis=axis).any() for axis in range(3) for end in (0, -1)):
             return _box(solid, grid, len(views))
         reach *= 1.5
@@ -178,13 +178,13 @@ def _free(
         SeenDepth(each.projection, np.where(each.depth > 0, each.depth - np.float32(bias), np.float32(0.0)))
         for each in depths
     ]
-    least = max(3.0, _LEAST * len(depths))
+    least = max(3.0, _MIN_VIEW_FRACTION * len(depths))
     band = _BAND * diagonal
-    free, sights = fused_depth(known, grid, hull > -2 * grid.spacing, band=band, quantile=_QUANTILE, least=least)
-    return ndimage.gaussian_filter(free, 1.0), sights
+    free, view_counts = fused_depth(known, grid, hull > -2 * grid.spacing, band=band, quantile=_QUANTILE, least=least)
+    return ndimage.gaussian_filter(free, 1.0), view_counts
 
 
-def _supposed(seen: Float32[np.ndarray, "x y z"], untouched: Bool[np.ndarray, "x y z"]) -> np.ndarray:
+def _unobserved_cavities(seen: Float32[np.ndarray, "x y z"], untouched: Bool[np.ndarray, "x y z"]) -> np.ndarray:
     """Return cavities, numbered, right below the largest faces that no outline touches, as deep as a cell.
 
     Outlines do not say whether such a face is there, or only its edge.
@@ -195,7 +195,7 @@ def _supposed(seen: Float32[np.ndarray, "x y z"], untouched: Bool[np.ndarray, "x
     label, count = ndimage.label(skin, np.ones((3, 3, 3)))
     sizes = np.bincount(label.ravel(), minlength=count + 1)[1:]
     total = int(shallow.sum())
-    large = [row + 1 for row in range(count) if sizes[row] >= max(_ALIKE * sizes.max(), _LARGE_FACE * total)]
+    large = [row + 1 for row in range(count) if sizes[row] >= max(_MIN_AREA_RATIO * sizes.max(), _LARGE_FACE * total)]
     numbers = np.zeros(count + 1, dtype=np.int32)
     numbers[large] = np.arange(1, len(large) + 1)
     return numbers[label]
@@ -204,7 +204,7 @@ def _supposed(seen: Float32[np.ndarray, "x y z"], untouched: Bool[np.ndarray, "x
 def _closed(
     hull: Float32[np.ndarray, "x y z"],
     seen: Float32[np.ndarray, "x y z"],
-    sights: Float32[np.ndarray, "x y z"],
+    view_counts: Float32[np.ndarray, "x y z"],
     grid: Grid,
 ) -> tuple[Float32[np.ndarray, "x y z"], Float32[np.ndarray, "x y z"], float, tuple[float, float, float] | None]:
     """Cut what no view sees by the convex hull of what views see.
@@ -212,10 +212,10 @@ def _closed(
     Return the cut solid, the hull cut likewise, which lids cavities, the part of the surface that no view saw, and the
     direction in which it lies.
     """
-    surface = closed_surface(seen, grid, _CLOSED)
+    surface = closed_surface(seen, grid, _CLOSING_FACES)
     places = surface.vertices.double().numpy()
     rows = np.rint((places - grid.lowest) / grid.spacing).astype(int)
-    known = ndimage.maximum_filter(sights, 3)[tuple(rows.T)] >= 1
+    known = ndimage.maximum_filter(view_counts, 3)[tuple(rows.T)] >= 1
     if int(known.sum()) < 4:
         advice = "check that depth and views are of one object"
         raise SceneError.expected("a surface in their masks", 0, got="none", name="views", advice=advice)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.ndimage import distance_transform_edt
+from scipy.spatial.transform import Rotation
 
 from avmsf.gaussians.neighborhoods import Neighborhoods, describe_neighborhoods
 from avmsf.symmetry.alignment import Motion, draw_by_area
@@ -130,7 +131,7 @@ def turns_of_pairs(surface: Neighborhoods, pairs: Pairs, *, coarse: CoarseCloud,
     axis, place, angle = np.concatenate(directions), np.concatenate(places), np.concatenate(angles)
     near = np.linalg.norm(place - surface.points.mean(0), axis=1) < 1.0
     axis, place, angle = axis[near], place[near], angle[near]
-    linear = _turn_matrices(axis, angle)
+    linear = Rotation.from_rotvec(angle[:, None] * axis).as_matrix()
     scores = coarse.score(linear, place - np.einsum("mij,mj->mi", linear, place))
     order = np.argsort(-scores)[: 60 * most]
     return distinct([Motion(axis[row], place[row], float(angle[row])) for row in order], most=most)
@@ -162,13 +163,3 @@ def matching_pairs(surface: Neighborhoods, *, generator: np.random.Generator) ->
     second = partners.ravel()
     fine = np.isfinite(unlike[first, second])
     return rows[first[fine]], rows[second[fine]]
-
-
-def _turn_matrices(
-    axis: Float[np.ndarray, "motions 3"], angle: Float[np.ndarray, " motions"]
-) -> Float[np.ndarray, "motions 3 3"]:
-    cosine, sine = np.cos(angle)[:, None, None], np.sin(angle)[:, None, None]
-    cross = np.zeros((len(axis), 3, 3))
-    cross[:, [2, 0, 1], [1, 2, 0]] = axis
-    cross -= cross.transpose(0, 2, 1)
-    return cosine * np.eye(3) + sine * cross + (1 - cosine) * axis[:, :, None] * axis[:, None, :]
