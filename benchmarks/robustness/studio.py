@@ -159,8 +159,7 @@ class Fuzzer:
         query = "&".join(
             f"{key}={value}" for key, value in zip(("x", "y", "z", "nx", "ny", "nz", "newtons"), values, strict=True)
         )
-        key = {"idempotency-key": f"key-{self.random.integers(10**9):010d}"}
-        return Request("POST", f"capture/strikes?{query}", self._recording(), key)
+        return Request("POST", f"capture/strikes?{query}", self._recording())
 
     def _recording(self) -> bytes:
         """Return a sound file, whole, of hostile samples, or damaged."""

@@ -213,17 +213,6 @@ def test_a_mesh_too_fine_for_viewers_is_reduced_and_keeps_its_colors(tmp_path, m
         read_look(tmp_path / "ball.ply", table())
 
 
-def test_another_ending_and_anothers_file_are_refused(tmp_path):
-    with raises(ExportError, file="thing.obj", name="suffix", value=".obj"):
-        write_gltf(table(), tmp_path / "thing.obj")
-    (tmp_path / "theirs.glb").write_bytes(b"glTF of someone else")
-    with raises(ExportError, file="theirs.glb", name="--overwrite"):
-        write_gltf(table(), tmp_path / "theirs.glb")
-    assert (tmp_path / "theirs.glb").read_bytes() == b"glTF of someone else"
-    write_gltf(table(), tmp_path / "theirs.glb", force=True)
-    assert [path.name for path in tmp_path.iterdir()] == ["theirs.glb"]
-
-
 def test_a_field_without_modes_is_refused(tmp_path):
     field = table()
     empty = type(field)(
@@ -232,3 +221,5 @@ def test_a_field_without_modes_is_refused(tmp_path):
     )  # fmt: skip
     with raises(ExportError, file="thing.glb", name="modes", value=0):
         write_gltf(empty, tmp_path / "thing.glb")
+    with raises(ExportError, file="thing.obj", name="suffix", value=".obj"):
+        write_gltf(field, tmp_path / "thing.obj")

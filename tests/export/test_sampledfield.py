@@ -128,20 +128,18 @@ def test_two_points_have_normals_away_from_their_middle():
     assert normals.tolist() == [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]
 
 
-@pytest.mark.parametrize("points", [torch.zeros(0, 3), torch.tensor([[0.0, 0.0, torch.nan]])])
-def test_points_that_are_none_are_refused(points):
-    with raises(ExportError, name="points", value=len(points)):
-        SampledField.of(sounding("positional"), points)
-
-
-def test_normals_of_other_points_are_refused():
-    with raises(ExportError, name="normals", value=4):
-        SampledField.of(sounding("positional"), places(5, seed=9), torch.ones(4, 3))
-
-
-def test_a_limit_of_none_is_refused():
-    with raises(ExportError, name="limit", value=0):
-        SampledField.of(sounding("positional"), limit=0)
+@pytest.mark.parametrize(
+    ("given", "name", "value"),
+    [
+        ({"points": torch.zeros(0, 3)}, "points", 0),
+        ({"points": torch.tensor([[0.0, 0.0, torch.nan]])}, "points", 1),
+        ({"points": places(5, seed=9), "normals": torch.ones(4, 3)}, "normals", 4),
+        ({"limit": 0}, "limit", 0),
+    ],
+)
+def test_what_cannot_be_sampled_is_refused(given, name, value):
+    with raises(ExportError, name=name, value=value):
+        SampledField.of(sounding("positional"), **given)
 
 
 def test_supporting_poles_are_counted_among_the_modes_that_sound(tmp_path):

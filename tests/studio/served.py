@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from avmsf.studio.guard import LARGEST_UPLOAD, Guard, new_token
+from avmsf.studio.guard import MAX_UPLOAD_BYTES, Guard, new_token
 from avmsf.studio.opening import Opened
 from avmsf.studio.routes import make_app
 from avmsf.studio.server import PageServer, _listening
@@ -68,7 +68,7 @@ class Served:
 
 @contextmanager
 def served(
-    opened: Opened, folder: Path, *, config: StudioConfig | None = None, largest: int = LARGEST_UPLOAD
+    opened: Opened, folder: Path, *, config: StudioConfig | None = None, largest: int = MAX_UPLOAD_BYTES
 ) -> Iterator[Served]:
     folder.mkdir(exist_ok=True)
     studio = Studio(opened, folder, config)

@@ -158,7 +158,7 @@ def test_an_edit_is_heard_undone_and_saved(plate: Served) -> None:
 def test_a_blow_on_an_edited_object_is_located_in_the_pages_frame(plate: Served) -> None:
     points = torch.from_numpy(tensor(plate, plate.manifest(), "points").copy())
     plate.ask("POST", "edit", {"base": 1, "material": {"from": "ceramic"}, "size": 0.8})
-    edited = plate.studio.session.current.expect_field()
+    edited = plate.studio.session.current.require_field()
     sound = edited.render(0.8 * points[[33]].double())[0]
     [found] = plate.ask("POST", "locate", wav(np.concatenate([np.zeros(200), sound.numpy()]))).words["impacts"]
     assert found["row"] == 33
@@ -180,7 +180,7 @@ def test_words_need_their_model(plate: Served, monkeypatch: pytest.MonkeyPatch) 
     assert answer.status == 422
     assert "pip install 'avmsf[text]'" in answer.words["error"]
     monkeypatch.setattr(edit, "find_spec", lambda name: None)
-    assert edit.words_model("folder") is None
+    assert edit.text_model("folder") is None
 
 
 def test_a_descent_is_asked_for_alone(plate: Served) -> None:
@@ -360,7 +360,7 @@ def test_the_field_that_a_job_made_is_opened_whatever_has_replaced_it_since(
         monkeypatch.setattr(jobs, "start", lambda kind, task, take: start(kind, task, take, worker))
         last = running.events(running.ask("POST", "reconstruct", {}).words["job"])[-1]
         assert last["field"] == str(tmp_path / "replaced")
-        assert torch.equal(running.studio.session.current.expect_field().bank.frequency, made.bank.frequency)
+        assert torch.equal(running.studio.session.current.require_field().bank.frequency, made.bank.frequency)
 
 
 def test_a_reconstruction_has_the_settings_that_the_studio_was_started_with(
@@ -461,7 +461,7 @@ def test_what_can_be_opened_and_what_not(tmp_path: Path, monkeypatch: pytest.Mon
     trimesh.creation.box((0.2, 0.1, 0.1)).export(mesh)
     with raises(StudioError, file=tmp_path / "bowl", name="capture", value="surface.stl"):
         open_target(mesh)
-    monkeypatch.setattr("avmsf.studio.opening.LARGEST_MESH", 10)
+    monkeypatch.setattr("avmsf.studio.opening.MAX_MESH_BYTES", 10)
     with raises(StudioError, file=mesh, value=mesh.stat().st_size):
         open_target(mesh)
 

@@ -248,7 +248,7 @@ class _Optimization:
         probes = self.points[farthest_points(self.points, min(len(self.points), _MAX_PROBES))]
         self.probes = self._at(probes)
         self.loudness = self._check_audible()
-        self.loudest_place = probes[int(self.loudness.argmax())]
+        self.loudest_point = probes[int(self.loudness.argmax())]
         self.sizes = [scaled_fft_size(size, sample_rate=field.sample_rate) for size in config.fft_sizes]
         self.settings = {**guide.describe(), "parameters": parameters.name, **asdict(config)}
         self.step, self.failed = 0, 0
@@ -279,7 +279,7 @@ class _Optimization:
                     edit, every = self.variables.edit(), self.config.preview_every
                     due = every > 0 and (self.step % every == 0 or self.step == self.config.steps)
                     preview = self._preview() if due else None
-                    factors, place = (edit.pitch_factor, edit.decay_factor), self.loudest_place if due else None
+                    factors, place = (edit.pitch_factor, edit.decay_factor), self.loudest_point if due else None
                     progress(GuidedEditProgress(self.step, self.config.steps, loss, *factors, preview, place))
                 if time.monotonic() - self.saved_at > _CHECKPOINT_SECONDS:
                     self._save()
@@ -334,7 +334,7 @@ class _Optimization:
 
     def _preview(self) -> Float[Tensor, " samples"]:
         """Return the edited field's sound, noise and all, where the unedited one is loudest."""
-        return self._normalized_edit().of(self.field).render(self.loudest_place[None])[0]
+        return self._normalized_edit().of(self.field).render(self.loudest_point[None])[0]
 
     def _normalized_edit(self) -> ModalEdit:
         """Return the edit as it stands, as loud at the probes as the field was."""

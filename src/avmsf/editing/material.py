@@ -70,7 +70,7 @@ def change_material(
     and `SimulationError` for a name of no material.
     """
     old, new = (material_named(each) if isinstance(each, str) else each for each in (old, new))
-    _expect(old, new, size)
+    _check(old, new, size)
     before, mute = field.bank, muted(field)
     omega = torch.hypot(2.0 * math.pi * before.frequency, before.damping)
     moved = omega * (math.sqrt(new.young / old.young) * math.sqrt(old.density / new.density) / size)
@@ -140,7 +140,7 @@ def _remarks(old: Material, new: Material, bank: ModalBank, dead: Bool[Tensor, "
     return remarks
 
 
-def _expect(old: Material, new: Material, size: float) -> None:
+def _check(old: Material, new: Material, size: float) -> None:
     if not 0.0 < size < math.inf:
         raise EditError.expected("the ratio of new to old lengths, above 0, such as 1.5", size, name="size")
     for name, material, other in (("new", new, old), ("old", old, new)):

@@ -23,7 +23,7 @@ _POINTS = 64
 """Contacts at which a field's brightness is computed."""
 _MODES = 40
 """Modes of a synthetic sound."""
-_HEARD = 1e-3
+_MIN_RELATIVE_GAIN = 1e-3
 """Gain relative to the object's largest below which a mode does not count for its brightness."""
 _SCATTER = 0.5
 """Standard deviation of a mode's gain about the slope, logarithm: contacts and shapes differ."""
@@ -78,9 +78,9 @@ class MaterialStatistics:
         columns = np.abs(terms).max(axis=0)
         law, _ = nnls(root * terms / columns, root[:, 0])
         # Inaudible gains would dominate a slope of logarithms.
-        heard = [each > _HEARD * each.max() for each in sizes]
-        octaves = [torch.log2(bank.frequency[kept]) for bank, kept in zip(banks, heard, strict=True)]
-        levels = [20 * torch.log10(each[kept]) for each, kept in zip(sizes, heard, strict=True)]
+        audible = [each > _MIN_RELATIVE_GAIN * each.max() for each in sizes]
+        octaves = [torch.log2(bank.frequency[kept]) for bank, kept in zip(banks, audible, strict=True)]
+        levels = [20 * torch.log10(each[kept]) for each, kept in zip(sizes, audible, strict=True)]
         # Each object has its own level: the slope is that within objects.
         apart = torch.cat([each - each.mean() for each in octaves])
         loud = torch.cat([each - each.mean() for each in levels])
@@ -118,16 +118,16 @@ class MaterialStatistics:
             frequency = torch.exp(torch.lerp(log[below], log[below + 1], place - below))
             turns = torch.rand(_MODES, generator=generator)
             scatter = torch.randn(_MODES, generator=generator)
-            heard = frequency < 0.5 * sample_rate
-            if not bool(heard.any()):
+            audible = frequency < 0.5 * sample_rate
+            if not bool(audible.any()):
                 lowest, wanted = float(self.frequency[0]), f"some below half the sample rate of {sample_rate:g} Hz"
                 raise EditError.expected(wanted, lowest, got=f"{lowest:.4g} Hz and above", name="frequency")
             octave = torch.log2(frequency / frequency[0])
             size = torch.exp(_SCATTER * scatter) * 10 ** (self.brightness * octave / 20)
             damping = 0.5 * (self.alpha + self.beta * (2 * math.pi * frequency).square()).clamp_min(1e-3)
-            signed = torch.where(turns < 0.5, -size, size).float()[heard]
+            signed = torch.where(turns < 0.5, -size, size).float()[audible]
             made.append(
-                synthesize(signed[None], frequency[heard], damping[heard], samples=samples, sample_rate=sample_rate)
+                synthesize(signed[None], frequency[audible], damping[audible], samples=samples, sample_rate=sample_rate)
             )
         return torch.cat(made)
 

@@ -111,9 +111,9 @@ def adjust_modes(
     """
     factors = {name: _values(field, value, name) for name, value in (("pitch", pitch), ("decay", decay))}
     for name, values in factors.items():
-        _expect(torch.isfinite(values) & (values > 0), name, values, "factors above 0, such as 0.5 for half the value")
+        _check(torch.isfinite(values) & (values > 0), name, values, "factors above 0, such as 0.5 for half the value")
     levels = _values(field, gains_db, "gains_db")
-    _expect(levels < math.inf, "gains_db", levels, "decibels, or -inf for silence")
+    _check(levels < math.inf, "gains_db", levels, "decibels, or -inf for silence")
     if not math.isfinite(brightness_db):
         raise EditError.expected("decibels an octave, such as 3", brightness_db, name="brightness_db")
     bank = ModalBank(field.bank.frequency * factors["pitch"], field.bank.damping / factors["decay"])
@@ -156,7 +156,7 @@ def _values(field: SoundField, value: Slider, name: str) -> Float64[Tensor, " mo
     return values.expand(modes)
 
 
-def _expect(fine: Bool[Tensor, " modes"], name: str, values: Float64[Tensor, " modes"], wanted: str) -> None:
+def _check(fine: Bool[Tensor, " modes"], name: str, values: Float64[Tensor, " modes"], wanted: str) -> None:
     if not bool(fine.all()):
         row = int(torch.nonzero(~fine)[0])
         value = float(values[row])

@@ -158,9 +158,9 @@ class StableAudio:
             times = pipeline.encode_duration(0.0, seconds, device, False, 1)
             parts = [torch.cat([each, *times], dim=1) for each in words.split(1)]
         # Without negative words the denoiser is told nothing, the times of the cross-attention included.
-        without, told = parts if negative is not None else (torch.zeros_like(parts[0]), parts[0])
+        without, conditional = parts if negative is not None else (torch.zeros_like(parts[0]), parts[0])
         both = torch.cat(times, dim=2)
-        return Conditioning(torch.cat([without, told]), torch.cat([both, both]))
+        return Conditioning(torch.cat([without, conditional]), torch.cat([both, both]))
 
     def denoised(
         self,

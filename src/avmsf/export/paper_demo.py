@@ -310,13 +310,13 @@ def discs(field: SampledField) -> GaussianCloud:
     width = torch.from_numpy(np.maximum(apart, 1e-6)).float() * 0.6
     scales = torch.stack([width, width, 0.1 * width], dim=1)
     # The rotation of the third axis onto the normal, as a quaternion.
-    turned = torch.cat([1.0 + field.normals[:, 2:], -field.normals[:, 1:2], field.normals[:, :1]], dim=1)
-    turned = torch.cat([turned, torch.zeros(len(field), 1)], dim=1)
+    rotated = torch.cat([1.0 + field.normals[:, 2:], -field.normals[:, 1:2], field.normals[:, :1]], dim=1)
+    rotated = torch.cat([rotated, torch.zeros(len(field), 1)], dim=1)
     below = field.normals[:, 2] < -1 + 1e-6
-    turned[below] = torch.tensor([0.0, 1.0, 0.0, 0.0])
+    rotated[below] = torch.tensor([0.0, 1.0, 0.0, 0.0])
     return GaussianCloud(
         field.points.float(),
-        torch.nn.functional.normalize(turned, dim=1),
+        torch.nn.functional.normalize(rotated, dim=1),
         scales.log(),
         torch.full((len(field),), 3.0),
         torch.full((len(field), 1, 3), (_GRAY - 0.5) / ZEROTH),

@@ -81,7 +81,7 @@ class SampledField:
         points, and for points that are not finite.
         """
         places = points_on_object(sound_field.gain_field) if points is None else points
-        _expect_places(places, normals, limit)
+        _check_points(places, normals, limit)
         if limit is not None and len(places) > limit:
             rows = spread_rows(places, limit)
             places = places[rows]
@@ -211,7 +211,7 @@ def spread_rows(points: Float[Tensor, "points 3"], count: int) -> Int[Tensor, " 
     return drawn[farthest_points(points[drawn], count)]
 
 
-def _expect_places(
+def _check_points(
     places: Float[Tensor, "points 3"], normals: Float[Tensor, "normals 3"] | None, limit: int | None
 ) -> None:
     finite = bool(torch.isfinite(places).all()) and (normals is None or bool(torch.isfinite(normals).all()))
@@ -273,12 +273,12 @@ def outward_normals(points: Float[Tensor, "points 3"]) -> Float32[Tensor, "point
 
 
 def _propagated(tree: object, normals: Float[np.ndarray, "points 3"], start: int) -> Float[np.ndarray, "points 3"]:
-    turned = normals.copy()
+    rotated = normals.copy()
     order, parents = breadth_first_order(tree, start, directed=False)
     for row in order[1:]:
-        if turned[row] @ turned[parents[row]] < 0:
-            turned[row] *= -1.0
-    return turned
+        if rotated[row] @ rotated[parents[row]] < 0:
+            rotated[row] *= -1.0
+    return rotated
 
 
 def _away(places: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:

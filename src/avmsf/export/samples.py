@@ -79,7 +79,7 @@ def write_grid(field: SampledField, folder: str | Path, grid: Grid | None = None
     contacts than MIDI has notes, and settings that are not positive.
     """
     grid = Grid() if grid is None else grid
-    _expect(grid)
+    _check(grid)
     rate = round(field.sample_rate)
     if rate != field.sample_rate or rate < 1:
         raise ExportError.expected(
@@ -138,7 +138,7 @@ def _soft_to_loud(
     return tuple(layers[number] for number in order), [sounds[number] for number in order]
 
 
-def _expect(grid: Grid) -> None:
+def _check(grid: Grid) -> None:
     most = HIGHEST_NOTE + 1 - LOWEST_NOTE
     seconds = 1.0 if grid.seconds is None else grid.seconds
     checks = [

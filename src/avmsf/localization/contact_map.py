@@ -94,12 +94,12 @@ class EquivalentPoint:
         Images farther than `tolerance` from `other` do not count, nor do symmetries that leave `first` about where it
         is.
         """
-        nearest, found, turned = tolerance, None, None
+        nearest, found, rotated = tolerance, None, None
         for symmetry, angle, image in _images(first, symmetries):
             distance = float((image - other.double()).norm())
             if distance < nearest and float((image - first.double()).norm()) > distance:
-                nearest, found, turned = distance, symmetry, angle
-        return cls(other, probability, found, turned)
+                nearest, found, rotated = distance, symmetry, angle
+        return cls(other, probability, found, rotated)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,19 +165,19 @@ class ContactMap:
     @property
     def most_probable(self) -> int:
         """Index of the most probable point."""
-        self._expect_located("most_probable")
+        self._check_located("most_probable")
         return int(torch.argmax(self.probability))
 
     @property
     def position(self) -> Float32[Tensor, " 3"]:
         """The most probable position, object frame, meters."""
-        self._expect_located("position")
+        self._check_located("position")
         return self.points[self.most_probable]
 
     def region(self, level: float = LEVEL) -> Bool[Tensor, " points"]:
         """Return the smallest set of points that contains the contact with a probability of `level` or more."""
-        self._expect_located("region")
-        _expect_probability(level)
+        self._check_located("region")
+        _check_probability(level)
         order = torch.argsort(self.probability, descending=True, stable=True)
         before = torch.cumsum(self.probability[order], 0) - self.probability[order]
         inside = torch.zeros(len(self.points), dtype=torch.bool)
@@ -194,7 +194,7 @@ class ContactMap:
 
     def credible_radius(self, level: float = LEVEL) -> float:
         """Return the distance from `position` within which the contact lies with a probability of `level`, meters."""
-        _expect_probability(level)
+        _check_probability(level)
         order = torch.argsort(self._distances, stable=True)
         reached = torch.cumsum(self.probability[order], 0) >= level * self.probability.sum()
         return float(self._distances[order][int(reached.double().argmax())])
@@ -302,7 +302,7 @@ class ContactMap:
             ],
         }
 
-    def _expect_located(self, name: str) -> None:
+    def _check_located(self, name: str) -> None:
         if self.refusal is not None:
             raise LocationError(self.refusal, name=name, value=self.mismatch_ratio)
 
@@ -343,6 +343,6 @@ def _images(
             yield rotation, angle, rotation.turn(row, angle)[0]
 
 
-def _expect_probability(level: float) -> None:
+def _check_probability(level: float) -> None:
     if not 0.0 < level < 1.0:
         raise LocationError.expected("a probability between 0 and 1, such as 0.9", level, name="level")

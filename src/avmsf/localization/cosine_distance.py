@@ -50,8 +50,10 @@ def cosine_distance(
     recorded = recorded / recorded.norm()
     turns = 2.0 * math.pi * frequency
     delays = delays_of(recorded.abs().square(), frequency, step=STEP)
-    turned = (recorded * torch.polar(torch.ones((), dtype=torch.float64), -delays[:, None] * turns)).to(torch.complex64)
-    parts = torch.view_as_real(turned).flatten(1).T.contiguous()
+    rotated = (recorded * torch.polar(torch.ones((), dtype=torch.float64), -delays[:, None] * turns)).to(
+        torch.complex64
+    )
+    parts = torch.view_as_real(rotated).flatten(1).T.contiguous()
     found = [
         (torch.view_as_real(part).flatten(1) @ parts).abs().amax(1) / part.norm(dim=1).clamp_min(1e-30)
         for part in torch.split(gains, _BATCH)

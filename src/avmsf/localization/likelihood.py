@@ -59,7 +59,7 @@ class PredictedGains:
     """Squares of the gains' magnitudes."""
     variance: Float32[Tensor, "points modes"]
     """v(x): the field's posterior variance of the gains."""
-    usual: Float32[Tensor, " modes"]
+    mean_power: Float32[Tensor, " modes"]
     """Mean of the gains' squares over the surface, nowhere zero."""
     frequency: Float64[Tensor, " modes"]
     """Hz."""
@@ -167,23 +167,23 @@ class _Strengths:
     sound: Float32[Tensor, ""]
     power: Float32[Tensor, " points"]
     variance: Float32[Tensor, " points"]
-    usual: Float32[Tensor, ""]
+    mean_power: Float32[Tensor, ""]
 
     @classmethod
     def of(
         cls, predicted: PredictedGains, values: Complex128[Tensor, " modes"], noise: Float32[Tensor, " modes"]
     ) -> "_Strengths":
         surplus = (values.abs().square().float() - noise).clamp_min(0.0)
-        level = (surplus.sum() / predicted.usual.sum()).clamp_min(1e-12)
-        weights = 1.0 / (noise + level * predicted.usual)
+        level = (surplus.sum() / predicted.mean_power.sum()).clamp_min(1e-12)
+        weights = 1.0 / (noise + level * predicted.mean_power)
         return cls(
-            weights @ surplus, predicted.power @ weights, predicted.variance @ weights, weights @ predicted.usual
+            weights @ surplus, predicted.power @ weights, predicted.variance @ weights, weights @ predicted.mean_power
         )
 
     def forces(self, rows: Int64[Tensor, " rows"], relative_error: float) -> Float32[Tensor, " rows"]:
         """Return the squares of the forces at which impacts, with their errors, have the sound's energy."""
         part = 0.5 * relative_error**2
-        own = (1.0 + part) * self.power[rows] + self.variance[rows] + part * self.usual
+        own = (1.0 + part) * self.power[rows] + self.variance[rows] + part * self.mean_power
         return (self.sound / own.clamp_min(_TINY)).clamp(1e-24, 1e24)
 
 
@@ -210,9 +210,9 @@ class _Trial:
         force: Force | None,
     ) -> "_Trial":
         """Return the trial of amplitudes of which the greatest has magnitude one."""
-        usual, unknown = predicted.usual, predicted.variance.mean(0)
-        level = (values.abs().square().float() - noise).clamp_min(0.0).sum() / (usual + unknown).sum()
-        error = level.clamp_min(1e-12) * (unknown + RELATIVE_ERRORS[1] ** 2 * usual)
+        mean_power, unknown = predicted.mean_power, predicted.variance.mean(0)
+        level = (values.abs().square().float() - noise).clamp_min(0.0).sum() / (mean_power + unknown).sum()
+        error = level.clamp_min(1e-12) * (unknown + RELATIVE_ERRORS[1] ** 2 * mean_power)
         weights = 1.0 / (noise + error)
         noise_fraction = float((weights * noise).mean())
         return cls(predicted, values, noise, weights, _Strengths.of(predicted, values, noise), force, noise_fraction)
@@ -225,8 +225,8 @@ class _Trial:
         surface. Its level has no scale, p(level) = 1 / level, as the force has none.
         """
         levels = torch.arange(-_LEVEL_LIMIT, _LEVEL_LIMIT, _LEVEL_STEP, dtype=torch.float64).exp()[:, None]
-        noise, usual = self.noise.double(), (self.predicted.usual + self.predicted.variance.mean(0)).double()
-        variance = torch.cat([levels * noise, noise + levels * usual / usual.mean()])
+        noise, mean_power = self.noise.double(), (self.predicted.mean_power + self.predicted.variance.mean(0)).double()
+        variance = torch.cat([levels * noise, noise + levels * mean_power / mean_power.mean()])
         logs = -(variance.log() + self.values.abs().square() / variance).sum(1)
         # The likelihood of a point is a sum over the relative errors, and leaves out a factor of the force's integral.
         constant = math.log(len(RELATIVE_ERRORS) + len(MORE_RELATIVE_ERRORS)) - 0.5 * math.log(math.pi)
@@ -236,12 +236,12 @@ class _Trial:
         """Return the rows, ascending, of the points whose gains match the amplitudes best, whatever the force."""
         if len(self.predicted.gains) <= count:
             return torch.arange(len(self.predicted.gains))
-        _, turned = self._turned(_COARSE)
-        match = (torch.view_as_real(self.predicted.gains).flatten(1) @ self._weighted(turned)).abs().amax(1)
+        _, rotated = self._rotated(_COARSE)
+        match = (torch.view_as_real(self.predicted.gains).flatten(1) @ self._weighted(rotated)).abs().amax(1)
         size = (self.predicted.power @ self.weights).clamp_min(_TINY).sqrt()
         return torch.sort(torch.topk(match / size, count).indices).values
 
-    def _turned(self, step: float) -> tuple[Float64[Tensor, " shifts"], Complex64[Tensor, "shifts modes"]]:
+    def _rotated(self, step: float) -> tuple[Float64[Tensor, " shifts"], Complex64[Tensor, "shifts modes"]]:
         """Return the shifts of `delays_of` for the amplitudes, and these turned back by each."""
         frequency = self.predicted.frequency
         energy = self.weights.double() * self.values.abs().square()
@@ -249,27 +249,27 @@ class _Trial:
         back = torch.polar(torch.ones((), dtype=torch.float64), -2.0 * math.pi * shifts[:, None] * frequency)
         return shifts, (self.values * back).to(torch.complex64)
 
-    def _weighted(self, turned: Complex64[Tensor, "shifts modes"]) -> Float32[Tensor, "two_modes shifts"]:
-        return torch.view_as_real(turned * self.weights).flatten(1).T.contiguous()
+    def _weighted(self, rotated: Complex64[Tensor, "shifts modes"]) -> Float32[Tensor, "two_modes shifts"]:
+        return torch.view_as_real(rotated * self.weights).flatten(1).T.contiguous()
 
     def evaluate(
         self, rows: Int64[Tensor, " rows"], relative_errors: tuple[float, ...]
     ) -> tuple[Float32[Tensor, " rows"], Float32[Tensor, " rows"], Float64[Tensor, " rows"]]:
         """Return the log likelihood, summed over relative errors, and the force and shift of the likeliest one."""
-        steps, turned = self._turned(_FINE)
+        steps, rotated = self._rotated(_FINE)
         prior = -0.5 * (steps / SHIFT_DEVIATION).square()
-        weighted, energy = self._weighted(turned), turned[0].abs().square()
+        weighted, energy = self._weighted(rotated), rotated[0].abs().square()
         evidence, forces, shifts = [], [], []
         for part in torch.split(rows, _BATCH):
             gains, power = self.predicted.gains[part], self.predicted.power[part]
             match = torch.view_as_real(gains).flatten(1) @ weighted
             gained = match.square() / (power @ self.weights).clamp_min(_TINY)[:, None]
             chosen = torch.argmax(gained + prior.float(), dim=1)
-            both = torch.view_as_real(gains) * torch.view_as_real(turned[chosen])
+            both = torch.view_as_real(gains) * torch.view_as_real(rotated[chosen])
             cross, variance = both[..., 0] + both[..., 1], self.predicted.variance[part]
             tried = []
             for relative_error in relative_errors:
-                error = torch.add(variance, power + self.predicted.usual, alpha=0.5 * relative_error**2)
+                error = torch.add(variance, power + self.predicted.mean_power, alpha=0.5 * relative_error**2)
                 tried.append(
                     self._marginalize_force(cross, energy, power, error, self.strengths.forces(part, relative_error))
                 )

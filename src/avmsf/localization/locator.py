@@ -31,7 +31,7 @@ from avmsf.modal.modes import ModalBank
 
 _UNIT = 1e-3
 """How far a direction's length may be from one."""
-_KEPT_LENGTHS = 8
+_MAX_CACHED_LENGTHS = 8
 """Lengths of sounds whose equations are kept."""
 _LIKELY = -3.0
 """Tempered log likelihood, relative to the largest, from which on a position is likely: 5 % of its probability."""
@@ -86,7 +86,7 @@ class Locator:
         positions = as_floats(field.gain_field.points if points is None else points, "points")
         ways = None if directions is None else as_floats(directions, "directions")
         parts = None if areas is None else as_floats(areas, "areas")
-        _expect_points(positions, ways, parts)
+        _check_points(positions, ways, parts)
         gains, variance, dampings = predict(field, positions, ways, factor=calibration_factor(field))
         return cls(
             field,
@@ -129,7 +129,7 @@ class Locator:
         # The energy without loud noise is uncertain, but no less than what modes explain, detuned or not.
         amplitudes = replace(amplitudes, energy=max(amplitudes.energy, amplitudes.fitted, float(detuned.max())))
         values, noise = length.separate(amplitudes)
-        _expect_more_than_noise(values, noise)
+        _check_above_noise(values, noise)
         scaled = length.scaled(known)
         found = evaluate_likelihood(length.predicted, values, noise, force=scaled)
         # The force does not say whether the impact was on this object.
@@ -176,7 +176,7 @@ class Locator:
             # The entry that is used moves to the end, so that one that a stream uses again and again is never dropped.
             found = self.lengths.pop(key, None)
             if found is None:
-                while len(self.lengths) >= _KEPT_LENGTHS:
+                while len(self.lengths) >= _MAX_CACHED_LENGTHS:
                     del self.lengths[next(iter(self.lengths))]
                 found = _Length.of(self, samples, highest)
             self.lengths[key] = found
@@ -244,11 +244,11 @@ class _Length:
     def explained(self, amplitudes: Amplitudes, found: LikelihoodResult, row: int) -> float:
         """Return the fraction of the sound's energy that an impact at a point explains."""
         extractor = self.extractor
-        turned = torch.polar(
+        rotated = torch.polar(
             found.force[row].expand(len(extractor.bank)).abs(),
             2.0 * torch.pi * float(found.shift[row]) * extractor.bank.frequency,
         )
-        own = extractor.mixing @ self.predicted.gains[row].to(torch.complex128) * turned * found.force[row].sign()
+        own = extractor.mixing @ self.predicted.gains[row].to(torch.complex128) * rotated * found.force[row].sign()
         both = torch.cat([own.real, own.imag])
         return amplitudes.part(float(2.0 * both @ amplitudes.products - both @ extractor.gram @ both))
 
@@ -275,9 +275,9 @@ def _decorrelated(
         gains[:, correlated] = gains[:, correlated] @ inner.conj().to(torch.complex64)
         variance[:, correlated] = variance[:, correlated] @ inner.abs().square().float()
     power = gains.abs().square()
-    usual = power.mean(0)
-    usual = usual.clamp_min(1e-8 * float(usual.max()))
-    return PredictedGains(gains, power, variance, usual, shares.T @ extractor.bank.frequency)
+    mean_power = power.mean(0)
+    mean_power = mean_power.clamp_min(1e-8 * float(mean_power.max()))
+    return PredictedGains(gains, power, variance, mean_power, shares.T @ extractor.bank.frequency)
 
 
 def _force_notes(
@@ -298,7 +298,7 @@ def _force_notes(
     return (f"expected a force of about {fitting:.2g} by the sound's level, got {given:.3g}; {meaning}",)
 
 
-def _expect_more_than_noise(values: Complex128[Tensor, " modes"], noise: Float64[Tensor, " modes"]) -> None:
+def _check_above_noise(values: Complex128[Tensor, " modes"], noise: Float64[Tensor, " modes"]) -> None:
     """Raise LocationError where the amplitudes are no larger than by noise alone."""
     surplus = values.abs().square() / noise
     modes = len(values)
@@ -313,7 +313,7 @@ def _expect_more_than_noise(values: Complex128[Tensor, " modes"], noise: Float64
         )
 
 
-def _expect_points(
+def _check_points(
     points: Float[Tensor, "..."],
     directions: Float[Tensor, "..."] | None,
     areas: Float[Tensor, "..."] | None,

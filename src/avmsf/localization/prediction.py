@@ -57,7 +57,7 @@ def predict(
     Gains are amplitudes of sines, and of cosines as imaginary part. The deviations are multiplied by `factor`; the
     variance is zero without it and without a posterior.
     """
-    turned = torch.polar(torch.ones_like(sound_field.phase), sound_field.phase).to(torch.complex64)
+    rotated = torch.polar(torch.ones_like(sound_field.phase), sound_field.phase).to(torch.complex64)
     gains, variances, dampings = [], [], []
     for rows in torch.split(torch.arange(len(points)), _BATCH):
         place = points[rows], None if directions is None else directions[rows]
@@ -69,7 +69,7 @@ def predict(
         else:
             variances.append((factor * deviation).square().sum(2).float())
         ahead = torch.zeros_like(known.mean) if known.quadrature is None else known.quadrature
-        gains.append(torch.complex(known.mean.float(), ahead.float()) * turned)
+        gains.append(torch.complex(known.mean.float(), ahead.float()) * rotated)
         if known.damping is not None:
             dampings.append(known.damping.float())
     return torch.cat(gains), torch.cat(variances), torch.cat(dampings) if dampings else None

@@ -156,7 +156,7 @@ class StreamingLocalizer:
         bank = ModalBank(field.bank.frequency[audible], field.bank.damping[audible])
         self._modes = Ringing.of(bank, strength, sample_rate=rate, hop=self.hop, window=self.window)
         memory = self.hop * (_MEMORY_HOPS + 2 * _SKIPPED_HOPS) + round(_ONSET_SEARCH_SECONDS * rate)
-        self._kept_samples = (self.later or self.window) + memory
+        self._history_samples = (self.later or self.window) + memory
         self.state = self._silence()
         locator.prepare(*(each for each in (self.window, self.later) if each is not None))
 
@@ -191,8 +191,8 @@ class StreamingLocalizer:
     def _process_hop(self, state: StreamState) -> tuple[StreamState, LocatedImpact | None]:
         """Process one hop, and return the estimate that it completes."""
         new, predicted = state.waiting[: self.hop], self._modes.render(state.ringing, self.hop)
-        recent = torch.cat([state.recent, new])[-self._kept_samples :]
-        residual = torch.cat([state.residual, new - predicted])[-self._kept_samples :]
+        recent = torch.cat([state.recent, new])[-self._history_samples :]
+        residual = torch.cat([state.residual, new - predicted])[-self._history_samples :]
         state = replace(
             state,
             clock=state.clock + self.hop,

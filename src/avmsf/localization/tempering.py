@@ -64,13 +64,13 @@ def calibrate_tempering(field: SoundField) -> float:
     smoothing = smoothing_matrix(places, contacts=distinct_contacts(fitted))
     # A locator leaves the others out, too.
     kept = torch.nonzero(field.audible & (scale_of(field) != 0.0)).flatten()
-    turned = torch.polar(torch.ones_like(field.phase), field.phase)[kept]
+    rotated = torch.polar(torch.ones_like(field.phase), field.phase)[kept]
     score = -0.5 * (_FACTORS.log() / _LOG_PRIOR_STD).square()
     for contact, truth in zip(contacts.tolist(), truths.tolist(), strict=True):
-        left = gains.without(_same_place(gains, contact))
+        left = gains.without(_at_same_point(gains, contact))
         if left.place_count < 2:
             continue
-        measured = gains.values[contact][kept] * turned
+        measured = gains.values[contact][kept] * rotated
         if not bool(measured.any()):
             continue
         loudest = float(measured.abs().max())
@@ -96,7 +96,7 @@ def _holdout_contacts(gains: MixtureGains) -> Int64[Tensor, " contacts"]:
     return farthest_points(gains.contacts, _MAX_HOLDOUT)
 
 
-def _same_place(gains: MixtureGains, contact: int) -> Tensor:
+def _at_same_point(gains: MixtureGains, contact: int) -> Tensor:
     """Return which contacts are where one is."""
     size = (gains.points.amax(0) - gains.points.amin(0)).double().norm()
     return (gains.contacts - gains.contacts[contact]).norm(dim=1) <= _SAME * size
@@ -114,9 +114,9 @@ def _predicted(
     predicted, variance, _ = predict(field, places, factor=factor)
     gains = predicted[:, kept]
     power = gains.abs().square()
-    usual = power.mean(0)
-    usual = usual.clamp_min(max(1e-8 * float(usual.max()), torch.finfo(torch.float32).tiny))
-    return PredictedGains(gains, power, (variance + about)[:, kept], usual, field.bank.frequency[kept].double())
+    mean_power = power.mean(0)
+    mean_power = mean_power.clamp_min(max(1e-8 * float(mean_power.max()), torch.finfo(torch.float32).tiny))
+    return PredictedGains(gains, power, (variance + about)[:, kept], mean_power, field.bank.frequency[kept].double())
 
 
 def _explained_energy(predicted: Tensor, measured: Tensor, weights: Float64[Tensor, " modes"]) -> float:

@@ -381,15 +381,12 @@ class CaptureEditor:
                         rates.append(float(other.samplerate))
                 except (AvmsfError, soundfile.LibsndfileError, OSError):
                     continue
-        usual = max(set(rates), key=rates.count) if rates else recording.sample_rate
-        if recording.sample_rate != usual:
-            raise CaptureError(
-                f"{recording.name}: expected {usual:g} Hz, as in the {counted(len(rates), 'recording')} before, got "
-                f"{recording.sample_rate:g} Hz; record at that rate, or convert it",
-                file=recording.name,
-                name="sample_rate",
-                value=recording.sample_rate,
-            )
+        common_rate = max(set(rates), key=rates.count) if rates else recording.sample_rate
+        if recording.sample_rate != common_rate:
+            wanted = f"{common_rate:g} Hz, as in the {counted(len(rates), 'recording')} before"
+            advice = "record at that rate, or convert it"
+            rate, name = recording.sample_rate, recording.name
+            raise CaptureError.expected(wanted, rate, file=name, name="sample_rate", advice=advice)
         return report
 
     def _next_name(self, table: ImpactTable) -> str:

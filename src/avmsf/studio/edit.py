@@ -235,7 +235,7 @@ def is_guided(words: Mapping[str, Any]) -> bool:
     return words.get("prompt") is not None
 
 
-def words_model(given: str | None) -> str | None:
+def text_model(given: str | None) -> str | None:
     """Return the model for text edits: the given one, or that in the hub's cache; None if there is none."""
     if any(find_spec(name) is None for name in ("diffusers", "torchsde", "transformers")):
         return None

@@ -34,7 +34,7 @@ from avmsf.studio.session import Revision
 
 _CLICKED = 8_000
 """Points of an object without a field."""
-_KEPT = 4
+_CACHED_REVISIONS = 4
 """Number of revisions whose files are kept: a page may still be reading the previous ones."""
 
 
@@ -186,7 +186,7 @@ class Showcase:
 
     def _forget(self) -> None:
         """Remove the files of revisions that no page reads any more."""
-        while len(self._shown) > _KEPT:
+        while len(self._shown) > _CACHED_REVISIONS:
             _, old = self._shown.popitem(last=False)
             if old.folder != self.object_folder:
                 shutil.rmtree(old.folder, ignore_errors=True)
@@ -234,13 +234,13 @@ def resample(sampled: SampledField, before: SoundField, after: SoundField) -> Sa
     old, new = scale_of(before), scale_of(after)
     if bool((after.audible & (~before.audible | ((old == 0) & (new != 0)))).any()):
         return None
-    heard = torch.nonzero(after.audible).flatten()
-    columns = (torch.cumsum(before.audible.long(), 0) - 1)[heard]
-    factor = torch.where(old[heard] == 0, 0.0, new[heard] / old[heard])
-    change = after.bank.damping[heard] / before.bank.damping[heard]
+    audible = torch.nonzero(after.audible).flatten()
+    columns = (torch.cumsum(before.audible.long(), 0) - 1)[audible]
+    factor = torch.where(old[audible] == 0, 0.0, new[audible] / old[audible])
+    change = after.bank.damping[audible] / before.bank.damping[audible]
     return replace(
         sampled,
-        frequency=after.bank.frequency[heard],
+        frequency=after.bank.frequency[audible],
         damping=sampled.damping[..., columns] * change,
         sine=(sampled.sine[:, columns] * factor).float(),
         cosine=(sampled.cosine[:, columns] * factor).float(),

@@ -31,9 +31,9 @@ def policy_of(page: str) -> str:
 
 NOTHING_HERE = "there is nothing at this address"
 """By this the page knows that its studio has moved: `server.js` has the same text."""
-LARGEST_UPLOAD = 64 << 20
+MAX_UPLOAD_BYTES = 64 << 20
 """Bytes of one request: a minute of stereo sound at 96 kHz, 32 bits."""
-LARGEST_WORDS = 1 << 20
+MAX_JSON_BYTES = 1 << 20
 """Maximum size of a JSON request, bytes."""
 LOOPBACK = ("127.0.0.1", "localhost")
 """Names under which a browser may know this machine."""
@@ -55,7 +55,7 @@ def new_token() -> str:
 class Guard:
     """ASGI middleware that passes allowed requests on, without the token in their paths."""
 
-    def __init__(self, app: ASGIApp, *, token: str, port: int, largest: int = LARGEST_UPLOAD) -> None:
+    def __init__(self, app: ASGIApp, *, token: str, port: int, largest: int = MAX_UPLOAD_BYTES) -> None:
         self.app, self.token, self.largest = app, token, largest
         self.hosts = frozenset(f"{name}:{port}" for name in LOOPBACK)
 
@@ -146,7 +146,7 @@ def contained(folder: Path, name: str) -> Path:
     return path
 
 
-async def read_words(request: Request, *, largest: int = LARGEST_WORDS) -> dict[str, object]:
+async def read_json_object(request: Request, *, largest: int = MAX_JSON_BYTES) -> dict[str, object]:
     """Return the JSON object of a request. Raises RequestError for other content, and for more than `largest` bytes."""
     body = bytearray()
     async for part in request.stream():

@@ -33,7 +33,7 @@ _LINE = 1 << 22
 """Bytes of one line, at most."""
 _GRACE = 3.0
 """Seconds that a process has to end once its standard input is closed."""
-_LAST_WORDS = 4000
+_MAX_STDERR_CHARACTERS = 4000
 """Characters of the process's standard error that are kept."""
 
 
@@ -61,10 +61,10 @@ class Job:
             last = _STOPPED
         except Exception as error:  # whatever it is, the next job must be able to start
             traceback.print_exception(error)
-            words = " ".join(f"{type(error).__name__}: {error}".split())[:_LAST_WORDS]
+            words = " ".join(f"{type(error).__name__}: {error}".split())[:_MAX_STDERR_CHARACTERS]
             last = {"error": f"{self.kind} failed ({words}); see the server's terminal, and start it again"}
         finally:
-            await self._tell(last, last=True)
+            await self._publish(last, last=True)
 
     async def cancel(self) -> bool:
         """Stop the process and wait for its end; completed stages are kept for the next run.
@@ -102,7 +102,7 @@ class Job:
         assert process.stdin is not None
         assert process.stdout is not None
         assert process.stderr is not None
-        said = asyncio.create_task(_last_words(process.stderr))
+        said = asyncio.create_task(_tail_of(process.stderr))
         result: Event | None = None
         try:
             # A process that ended without reading its task may have said why.
@@ -116,13 +116,13 @@ class Job:
                 if "result" in event or "error" in event:
                     result = event
                 else:
-                    await self._tell(event)
+                    await self._publish(event)
             await process.wait()
         finally:
             # The process ends with what it has started when its standard input closes.
             process.stdin.close()
             try:
-                await asyncio.wait_for(_last_words(process.stdout), _GRACE)
+                await asyncio.wait_for(_tail_of(process.stdout), _GRACE)
             except TimeoutError:
                 with contextlib.suppress(ProcessLookupError):
                     process.kill()
@@ -141,7 +141,7 @@ class Job:
         self._finishing = True
         return await self.finish(result["result"])
 
-    async def _tell(self, event: Event, *, last: bool = False) -> None:
+    async def _publish(self, event: Event, *, last: bool = False) -> None:
         async with self._changed_events:
             self.events.append(event)
             self.ended = last
@@ -167,7 +167,7 @@ class Jobs:
             return None
         return "it was stopped" if last.events[-1] == _STOPPED else last.events[-1].get("error")
 
-    def expect_none(self) -> None:
+    def check_idle(self) -> None:
         """Raise RequestError (409) while a job runs."""
         current = self.current
         if current is not None:
@@ -176,7 +176,7 @@ class Jobs:
 
     def start(self, kind: str, task: Event, finish: Finish, command: Sequence[str] = WORKER) -> Job:
         """Start a job. Raises RequestError (409) while another one runs."""
-        self.expect_none()
+        self.check_idle()
         job = Job(kind, task, finish, command)
         self._jobs[job.identifier] = job
         self._running = asyncio.create_task(job.run())
@@ -205,10 +205,10 @@ def _understand(line: bytes) -> Event | None:
     return event if isinstance(event, dict) else None
 
 
-async def _last_words(stream: asyncio.StreamReader) -> str:
+async def _tail_of(stream: asyncio.StreamReader) -> str:
     kept = ""
     while part := await stream.read(1 << 16):
-        kept = (kept + part.decode(errors="replace"))[-_LAST_WORDS:]
+        kept = (kept + part.decode(errors="replace"))[-_MAX_STDERR_CHARACTERS:]
     return kept
 
 

@@ -124,7 +124,7 @@ class Searches:
     def finder_of(self, revision: Revision) -> Finder:
         """Return the locator of a revision; its tables are computed at the first use."""
         if self._finder is None or self._finder[0] != revision.number:
-            field = revision.expect_field()
+            field = revision.require_field()
             points = self.showcase.current.sampled.points.double() * length_of(field.gain_field)
             settings = None if self.editor is None else self.editor.settings
             cached_symmetries = self._symmetries[revision.opening]

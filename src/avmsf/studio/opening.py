@@ -19,7 +19,7 @@ from avmsf.pipeline.sources import find_source, find_splats
 
 MESHES = (".obj", ".ply", ".glb", ".stl")
 """Suffixes of the meshes that a capture may have as its surface."""
-LARGEST_MESH = 512 << 20
+MAX_MESH_BYTES = 512 << 20
 """Bytes; what a browser shows has far fewer."""
 _MATERIALS = re.compile(r"^\s*mtllib\s+(.+?)\s*$", re.MULTILINE)
 _TEXTURES = re.compile(r"^\s*map_\w+\s+(?:.*\s)?(\S+)\s*$", re.MULTILINE)
@@ -111,8 +111,8 @@ def _open_folder(folder: Path, object: Path | None) -> Opened:
 
 def _open_mesh(mesh: Path, object: Path | None, capture: Path | None) -> Opened:
     size = mesh.stat().st_size
-    if size > LARGEST_MESH:
-        wanted, advice = f"a mesh of at most {LARGEST_MESH >> 20} MiB", "reduce it to a hundred thousand triangles"
+    if size > MAX_MESH_BYTES:
+        wanted, advice = f"a mesh of at most {MAX_MESH_BYTES >> 20} MiB", "reduce it to a hundred thousand triangles"
         raise StudioError.expected(wanted, size, got=f"{size >> 20}", file=mesh, advice=advice)
     if capture is None and (mesh.stem == "surface" or mesh.name in SPLATS):
         return _open_folder(mesh.resolve().parent, object)

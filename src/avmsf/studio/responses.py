@@ -21,7 +21,7 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 NUMERIC_ERRORS = (ValueError, ArithmeticError, torch.linalg.LinAlgError)  # type: ignore[attr-defined]
 """Errors of edits and searches for valid numbers that give no result."""
 FORESEEN_ERRORS = (OSError, MemoryError, RecursionError)
-"""Errors that `refusal_of` has a response for."""
+"""Errors that `error_response` has a response for."""
 _MAX_ECHO = 100
 """Characters of a request that an answer repeats."""
 _repr = reprlib.Repr()
@@ -62,7 +62,7 @@ def response_to(error: AvmsfError) -> Answer:
     return Answer({"error": " ".join(str(error).split()), **more}, status)
 
 
-def refusal_of(error: Exception) -> RequestError:
+def error_response(error: Exception) -> RequestError:
     """Return the answer to a request that failed by one of `FORESEEN_ERRORS`, or where there is not enough memory.
 
     The page sends a recording again after a status of 500 or more, and not after a lower one.

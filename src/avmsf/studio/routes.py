@@ -16,8 +16,8 @@ from starlette.routing import Route
 from avmsf.errors import AvmsfError, lacks_memory
 from avmsf.export.web import MEDIA_TYPES
 from avmsf.studio.capture import Contact
-from avmsf.studio.guard import contained, nothing_here, policy_of, read_words
-from avmsf.studio.responses import FORESEEN_ERRORS, Answer, refusal_of, response_to
+from avmsf.studio.guard import contained, nothing_here, policy_of, read_json_object
+from avmsf.studio.responses import FORESEEN_ERRORS, Answer, error_response, response_to
 from avmsf.studio.studio import Studio, unknown_base
 
 PAGE = Path(__file__).parent / "page"
@@ -57,8 +57,8 @@ def make_app(studio: Studio) -> Starlette:
         Route("/undo", calls.undo, methods=["POST"]),
         Route("/save", calls.save, methods=["POST"]),
         Route("/capture/check", calls.check, methods=["POST"]),
-        Route("/capture/strikes", calls.add_strike, methods=["POST"]),
-        Route("/capture/strikes/{path:path}", calls.change_strike, methods=["GET", "PUT", "DELETE"]),
+        Route("/capture/strikes", calls.add_impact, methods=["POST"]),
+        Route("/capture/strikes/{path:path}", calls.change_impact, methods=["GET", "PUT", "DELETE"]),
         Route("/reconstruct", calls.reconstruct, methods=["POST"]),
         Route("/object", calls.make_object, methods=["POST"]),
         _get("/jobs/{job}/events", calls.send_job_events),
@@ -68,7 +68,7 @@ def make_app(studio: Studio) -> Starlette:
         routes=routes,
         lifespan=lifespan,
         exception_handlers={
-            AvmsfError: _answer_refused,
+            AvmsfError: _answer_error,
             HTTPException: _answer_unknown,
             ClientDisconnect: _answer_nobody,
             **dict.fromkeys(FORESEEN_ERRORS, _answer_foreseen),
@@ -114,7 +114,7 @@ class Calls:
 
     async def edit(self, request: Request) -> Response:
         """Change the field."""
-        done = await self.studio.edit(await read_words(request))
+        done = await self.studio.edit(await read_json_object(request))
         return Answer(done, 202 if "job" in done else 200)
 
     async def lead(self, request: Request) -> Response:
@@ -126,23 +126,23 @@ class Calls:
 
     async def undo(self, request: Request) -> Response:
         """Take a change back."""
-        return Answer(await self.studio.undo(await read_words(request)))
+        return Answer(await self.studio.undo(await read_json_object(request)))
 
     async def save(self, request: Request) -> Response:
         """Write the field to a file."""
-        return Answer(await self.studio.save(await read_words(request)), 201)
+        return Answer(await self.studio.save(await read_json_object(request)), 201)
 
     async def check(self, request: Request) -> Response:
         """Check a recording without saving it."""
         content = await request.body()
         return Answer(await self.studio.with_editor(lambda editor: editor.check(content)))
 
-    async def add_strike(self, request: Request) -> Response:
+    async def add_impact(self, request: Request) -> Response:
         """Add an impact to the capture."""
         contact, content = Contact.read(request.query_params), await request.body()
         return Answer(await self.studio.with_editor(lambda editor: editor.add(content, contact)), 201)
 
-    async def change_strike(self, request: Request) -> Response:
+    async def change_impact(self, request: Request) -> Response:
         """Send, redo or take out one of the capture's recordings."""
         name = request.path_params["path"]
         match = _expected(request)
@@ -208,7 +208,7 @@ def _file(folder: Path, request: Request, *, only: Sequence[str] = ()) -> Respon
     return FileResponse(path, media_type=kind)
 
 
-async def _answer_refused(request: Request, error: Exception) -> Response:
+async def _answer_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, AvmsfError)
     return response_to(error)
 
@@ -223,12 +223,12 @@ async def _answer_nobody(request: Request, error: Exception) -> Response:
 
 
 async def _answer_foreseen(request: Request, error: Exception) -> Response:
-    return response_to(refusal_of(error))
+    return response_to(error_response(error))
 
 
 async def _answer_broken(request: Request, error: Exception) -> Response:
     if lacks_memory(error):
-        return response_to(refusal_of(error))
+        return response_to(error_response(error))
     # The server's own word on it is hidden with all that it says of ordinary requests.
     traceback.print_exception(error)
     words = f"the server failed ({type(error).__name__}); see its terminal, and reload the page for the current state"

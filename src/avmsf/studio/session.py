@@ -47,7 +47,7 @@ class Revision:
     name: str | None = None
     """What it, or what it was made of, was saved as last; None for as it was opened."""
 
-    def expect_field(self) -> SoundField:
+    def require_field(self) -> SoundField:
         """Return the field that is played. Raises RequestError (409) without a field."""
         if self.field is None:
             advice = "record impacts and reconstruct it first"
@@ -84,8 +84,8 @@ class Session:
     def edit(self, base: int, sliders: Sliders) -> Revision:
         """Set the sliders. Raises RequestError (409) if `base` is not the current revision, and the errors of edits."""
         with self._lock:
-            self.expect_current(base)
-            self._current.expect_field()
+            self.check_current(base)
+            self._current.require_field()
             ground = self._current.ground
             assert ground is not None
             field, remarks = sliders.apply(ground)
@@ -94,14 +94,14 @@ class Session:
     def lead(self, base: int, field: SoundField, remarks: tuple[str, ...]) -> Revision:
         """Take in what a descent has made of revision `base`; sliders are relative to it from then on."""
         with self._lock:
-            self.expect_current(base)
+            self.check_current(base)
             led = replace(self._current, ground=field, sliders=REST, field=field, remarks=remarks)
             return self._remember(led)
 
     def undo(self, base: int) -> Revision:
         """Undo the last revision, under a new number. Raises RequestError (409) as `edit`, and if there is no other."""
         with self._lock:
-            self.expect_current(base)
+            self.check_current(base)
             if not self._past:
                 raise bad_request("undo", "a change", got="none since the field was opened", status=409)
             undone = self._advance(self._past[-1])
@@ -114,8 +114,8 @@ class Session:
         Raises RequestError if a file of this name exists (409), or the name is invalid (400).
         """
         with self._lock:
-            self.expect_current(base)
-            field = self._current.expect_field()
+            self.check_current(base)
+            field = self._current.require_field()
             path = self.home / file_name(name)
             _write_new(field, path)
             saved = replace(self._current, ground=field, sliders=REST, name=path.name.removesuffix(SUFFIX))
@@ -138,7 +138,7 @@ class Session:
         wanted = f"fewer than {_MOST_ALIKE} files called {stem}"
         raise StudioError.expected(wanted, got="more", file=self.home, name=stem, advice="move them away")
 
-    def expect_current(self, base: int) -> None:
+    def check_current(self, base: int) -> None:
         """Raise RequestError (409), with the current revision, if `base` is another one."""
         if base != self._current.number:
             raise bad_request(

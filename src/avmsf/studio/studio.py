@@ -13,12 +13,12 @@ from avmsf.editing.modal_edit import EDITS, remarks
 from avmsf.field.store import load, save
 from avmsf.pipeline.config import Preset
 from avmsf.studio.capture import CaptureEditor, read_upload
-from avmsf.studio.edit import MATERIAL_NAMES, GuidedEditTarget, Sliders, is_guided, words_model
+from avmsf.studio.edit import MATERIAL_NAMES, GuidedEditTarget, Sliders, is_guided, text_model
 from avmsf.studio.files import Showcase
 from avmsf.studio.jobs import Event, Job, Jobs, Result, Threads
 from avmsf.studio.locate import Searches
 from avmsf.studio.opening import Opened, find_object, shows_more
-from avmsf.studio.responses import NUMERIC_ERRORS, RequestError, bad_request, refusal_of
+from avmsf.studio.responses import NUMERIC_ERRORS, RequestError, bad_request, error_response
 from avmsf.studio.session import Revision, Session
 
 MODES = 128
@@ -55,7 +55,7 @@ class Studio:
         self.showcase = Showcase(opened, folder, self.editor)
         self.session = Session(opened.home, self.showcase.show)
         self.jobs = Jobs()
-        self.model = words_model(self.config.model)
+        self.model = text_model(self.config.model)
         self.threads = Threads()
         self.searches = Searches(self.session, self.showcase, self.editor, self.threads)
         self.session.open(None if opened.field is None else load(opened.field))
@@ -86,20 +86,20 @@ class Studio:
         recording = await self.threads.read(read_upload, content)
         revision = self.session.current
         finder = self.searches.finder_of(revision)
-        blows = await self._compute(finder.locate, recording)
-        return {"revision": revision.number, "impacts": blows}
+        impacts = await self._compute(finder.locate, recording)
+        return {"revision": revision.number, "impacts": impacts}
 
     async def edit(self, words: dict[str, Any]) -> dict[str, Any]:
         """Set the sliders, or start to optimize the field towards a recording or a text. Raises the errors of edits."""
         base = base_of(words)
         if is_guided(words):
             return await self._lead(base, GuidedEditTarget.read(words, model=self.model))
-        sliders = Sliders.read(words, modes=len(self.session.current.expect_field().bank))
+        sliders = Sliders.read(words, modes=len(self.session.current.require_field().bank))
         return self._changed(await self._compute(self.session.edit, base, sliders))
 
     async def lead(self, base: int, content: bytes) -> dict[str, Any]:
         """Start to optimize the field towards a recording. Raises CaptureError for one that cannot be used."""
-        self.session.expect_current(base)
+        self.session.check_current(base)
         await self.threads.read(read_upload, content)
         return await self._lead(base, GuidedEditTarget(like=content))
 
@@ -158,9 +158,9 @@ class Studio:
         return self.jobs.start(_MAKING, task, self._take_object)
 
     async def _lead(self, base: int, wish: GuidedEditTarget) -> dict[str, Any]:
-        self.session.expect_current(base)
-        field = self.session.current.expect_field()
-        self.jobs.expect_none()
+        self.session.check_current(base)
+        field = self.session.current.require_field()
+        self.jobs.check_idle()
         place = Path(tempfile.mkdtemp(prefix="lead-", dir=self.folder))
         try:
             task = wish.task(place, steps=self.config.steps, model=self.model)
@@ -177,7 +177,7 @@ class Studio:
         except NUMERIC_ERRORS as error:
             # A check of the values that would name the cause is missing.
             traceback.print_exception(error)
-            raise refusal_of(error) from error
+            raise error_response(error) from error
 
     async def _take_field(self, result: Event) -> Event:
         revision = await self.threads.compute(lambda: self.session.open(load(result["output"])))
