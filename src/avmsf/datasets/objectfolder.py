@@ -275,10 +275,8 @@ def find_contacts(folder: Path, given: Path | None = None) -> tuple[Path, ...]:
             return found
     if given is not None:
         got = "a folder without them" if given.is_dir() else "no file or folder"
-        raise DatasetError(
-            f"{given}: expected {' and '.join(CONTACT_LISTS)}, or one of these lists, got {got}",
-            file=given,
-            name="contacts",
+        raise DatasetError.expected(
+            f"{' and '.join(CONTACT_LISTS)}, or one of these lists", got=got, file=given, name="contacts"
         )
     return ()
 

@@ -11,7 +11,7 @@ import sys
 import time
 import uuid
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,15 +25,16 @@ from avmsf._utils.wording import counted
 from avmsf.capture.filenames import PICTURE_SUFFIXES, pictures_in
 from avmsf.errors import CaptureError, Remark
 from avmsf.photographs.images import Picture, PictureSizeError, read_mask, read_picture
+from avmsf.photographs.shots import listed, mask_names
 
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 WORKER = Path(__file__).with_name("sfm_worker.py")
-FEWEST = 3
+MIN_IMAGES = 3
 """Fewest images with which cameras can be estimated."""
-ALL_PAIRS = 150
+MAX_ALL_PAIRS = 150
 """Images up to which every pair is matched; of more, each with the next ones in the order of their names."""
-POLL = 0.2
-"""Seconds between two checks of the worker."""
+POLL_SECONDS = 0.2
+"""Time between two checks of the worker."""
 
 
 @dataclass(frozen=True)
@@ -95,21 +96,25 @@ def estimate_cameras(
     more than `timeout` seconds or crashes, or less than the part `least` of the images gets a camera.
     """
     images, output = Path(images), Path(output)
-    _expect_job(images, output, camera_model=camera_model, timeout=timeout)
+    _check_job(images, output, camera_model=camera_model, timeout=timeout)
     begun = output / f".sfm.{uuid.uuid4().hex[:8]}"
     try:
         begun.mkdir(parents=True)
         names, lost = _stage_images(images, begun, shared_camera=shared_camera)
-        _write_job(
-            begun,
-            names,
-            seed=0 if seed is None else seed,
-            camera_model=camera_model,
-            shared_camera=shared_camera,
-            features=features,
-            longest=longest,
-            threads=-1 if threads is None else threads,
-        )
+        job = {
+            "folder": str(begun.resolve()),
+            "names": list(names),
+            "true_names": names,
+            "masks": (begun / "masks").is_dir(),
+            "exhaustive": len(names) <= MAX_ALL_PAIRS,
+            "seed": 0 if seed is None else seed,
+            "camera_model": camera_model,
+            "shared_camera": shared_camera,
+            "features": features,
+            "longest": longest,
+            "threads": -1 if threads is None else threads,
+        }
+        (begun / "job.json").write_text(json.dumps(job), encoding="utf-8")
         _run_worker(begun, timeout=timeout, progress=progress)
         models = json.loads((begun / "result.json").read_text(encoding="utf-8"))
         models.sort(key=lambda model: -len(model["names"]))
@@ -131,7 +136,7 @@ def estimate_cameras(
     return EstimatedCameras(output / "sparse" / "0", registered, missing, models[0]["points"], models[0]["error"])
 
 
-def _expect_job(images: Path, output: Path, *, camera_model: str, timeout: float) -> None:
+def _check_job(images: Path, output: Path, *, camera_model: str, timeout: float) -> None:
     if importlib.util.find_spec("pycolmap") is None:
         raise CaptureError(
             "expected the package pycolmap for photographs without cameras, got none: pip install 'avmsf[sfm]'",
@@ -144,9 +149,8 @@ def _expect_job(images: Path, output: Path, *, camera_model: str, timeout: float
     if not images.is_dir():
         raise CaptureError(f"{images}: expected a folder of photographs, got none", file=images)
     if (output / "sparse" / "0").exists():
-        raise CaptureError(
-            f"{output / 'sparse' / '0'}: expected no cameras, got existing ones; remove it to estimate them again",
-            file=output / "sparse" / "0",
+        raise CaptureError.expected(
+            "no cameras", got="existing ones", file=output / "sparse" / "0", advice="remove it to estimate them again"
         )
 
 
@@ -170,10 +174,10 @@ def _stage_images(images: Path, begun: Path, *, shared_camera: bool) -> tuple[di
         staged = _stage_image(path, picture, name, begun)
         names[staged], sizes[name] = name, picture.size
         _stage_mask(images, picture, name, begun / "masks" / f"{staged}.png")
-    if len(names) < FEWEST:
+    if len(names) < MIN_IMAGES:
         raise CaptureError(
-            f"{images}: expected at least {FEWEST} photographs ({', '.join(PICTURE_SUFFIXES)}), got {len(names)}"
-            + (f" and {len(lost)} that cannot be read: {_some(lost)}" if lost else ""),
+            f"{images}: expected at least {MIN_IMAGES} photographs ({', '.join(PICTURE_SUFFIXES)}), got {len(names)}"
+            + (f" and {len(lost)} that cannot be read: {listed(lost, most=8)}" if lost else ""),
             file=images,
             name="photographs",
             value=len(names),
@@ -183,7 +187,7 @@ def _stage_images(images: Path, begun: Path, *, shared_camera: bool) -> tuple[di
         odd = [name for name, size in sizes.items() if size != kinds[-1]]
         raise CaptureError(
             f"{images}: expected photographs of one size, got most of {kinds[-1][0]} x {kinds[-1][1]} pixels, but not "
-            f"{_some(odd)}; give photographs of one camera in one orientation, or set shared_camera=False",
+            f"{listed(odd, most=8)}; give photographs of one camera in one orientation, or set shared_camera=False",
             file=images,
             name="shared_camera",
             value=odd,
@@ -209,32 +213,14 @@ def _stage_image(path: Path, picture: Picture, name: str, begun: Path) -> str:
 
 def _stage_mask(images: Path, picture: Picture, name: str, staged: Path) -> None:
     """Write the image's mask, where it has one, as COLMAP reads it."""
-    mask = picture.mask
-    folder = images.parent / "masks"
-    places = [folder / Path(name).with_suffix(".png"), folder / f"{name}.png"]
-    for place in places if mask is None else ():
-        if place.is_file():
-            mask = read_mask(place)
-            break
+    path = next((place for place in mask_names(name, images.parent) if place.is_file()), None)
+    mask = picture.mask if picture.mask is not None or path is None else read_mask(path)
     if mask is None:
         return
     if mask.shape[::-1] != picture.size:
         mask = cv2.resize(mask, picture.size, interpolation=cv2.INTER_NEAREST)
     staged.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(staged), np.where(mask >= 128, 255, 0).astype(np.uint8))
-
-
-def _write_job(folder: Path, names: Mapping[str, str], **settings: Any) -> None:
-    """Write what the worker has to do with the images staged in `folder`: their true names by their own, settings."""
-    job = {
-        "folder": str(folder.resolve()),
-        "names": list(names),
-        "true_names": names,
-        "masks": (folder / "masks").is_dir(),
-        "exhaustive": len(names) <= ALL_PAIRS,
-        **settings,
-    }
-    (folder / "job.json").write_text(json.dumps(job), encoding="utf-8")
 
 
 def _run_worker(begun: Path, *, timeout: float, progress: Callable[[MotionProgress], None] | None) -> None:
@@ -264,7 +250,7 @@ def _run_worker(begun: Path, *, timeout: float, progress: Callable[[MotionProgre
                 if progress is not None:
                     progress(_progress(log, seconds))
                 with contextlib.suppress(subprocess.TimeoutExpired):
-                    worker.wait(POLL)
+                    worker.wait(POLL_SECONDS)
         finally:
             end_child(worker)
     if worker.returncode != 0 or not (begun / "result.json").is_file():
@@ -295,13 +281,13 @@ def _last_lines(log: Path, count: int = 6) -> str:
 
 def _refuse_few(models: Sequence[dict[str, Any]], everything: Sequence[str], *, least: float, images: Path) -> None:
     registered = models[0]["names"] if models else []
-    if len(registered) >= max(FEWEST, least * len(everything)):
+    if len(registered) >= max(MIN_IMAGES, least * len(everything)):
         return
     lacking = [name for name in everything if name not in registered]
     apart = f" in {len(models)} groups that could not be joined" if len(models) > 1 else ""
     raise CaptureError(
-        f"{images}: expected cameras of most photographs, got {len(registered)} of {len(everything)}{apart}, none for "
-        f"{_some(lacking)}; take sharp photographs 10 to 15 degrees apart, with a patterned, fixed ground in view",
+        f"{images}: expected cameras of most photographs, got {len(registered)} of {len(everything)}{apart}, none "
+        f"for {listed(lacking)}; take sharp photographs 10 to 15 degrees apart, with a patterned, fixed ground in view",
         file=images,
         name="cameras",
         value=lacking,
@@ -311,14 +297,14 @@ def _refuse_few(models: Sequence[dict[str, Any]], everything: Sequence[str], *, 
 def _remarks(models: Sequence[dict[str, Any]], lost: Sequence[str], missing: Sequence[str]) -> list[Remark]:
     remarks = []
     if lost:
-        message = f"{counted(len(lost), 'image')} not used, as they cannot be read: {_some(lost)}"
+        message = f"{counted(len(lost), 'image')} not used, as they cannot be read: {listed(lost, most=8)}"
         remarks.append(Remark(message, name="unreadable images", value=lost))
     # Groups overlap: an image may belong to several that could not be joined.
     kept = set(models[0]["names"])
     others = [[name for name in model["names"] if name not in kept] for model in models[1:]]
     others = [names for names in others if names]
     if others:
-        groups = "; ".join(_some(names) for names in others)
+        groups = "; ".join(listed(names, most=8) for names in others)
         message = (
             f"the photographs form {len(models)} groups that could not be joined; only the largest, of {len(kept)} "
             f"images, is used, without {groups}"
@@ -327,10 +313,6 @@ def _remarks(models: Sequence[dict[str, Any]], lost: Sequence[str], missing: Seq
     apart = {name for names in others for name in names}
     unseen = [name for name in missing if name not in apart and name not in lost]
     if unseen:
-        message = f"no camera was found for {counted(len(unseen), 'image')}: {_some(unseen)}"
+        message = f"no camera was found for {counted(len(unseen), 'image')}: {listed(unseen, most=8)}"
         remarks.append(Remark(message, name="cameras", value=unseen))
     return remarks
-
-
-def _some(names: Sequence[str], most: int = 8) -> str:
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

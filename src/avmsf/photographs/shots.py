@@ -61,11 +61,8 @@ def without_camera(shots: Sequence[Shot], folder: Path) -> list[str]:
 def refuse_many(count: int, where: Path) -> None:
     """Raise CaptureError for more than `MAX_SHOTS` photographs."""
     if count > MAX_SHOTS:
-        raise CaptureError(
-            f"{where}: expected at most {MAX_SHOTS:,} photographs, got {count:,}; select some hundreds",
-            file=where,
-            name="photographs",
-            value=count,
+        raise CaptureError.expected(
+            f"at most {MAX_SHOTS:,} photographs", count, file=where, name="photographs", advice="select some hundreds"
         )
 
 

@@ -18,7 +18,7 @@ from avmsf.photographs.cameras import View
 from avmsf.photographs.colmap import find_model
 from avmsf.photographs.folder import write_views
 from avmsf.photographs.mesh_views import orbit_cameras, render_views
-from avmsf.photographs.sfm import FEWEST, estimate_cameras
+from avmsf.photographs.sfm import MIN_IMAGES, estimate_cameras
 from avmsf.photographs.video import pick_frames
 from avmsf.pipeline.config import ViewsConfig
 from avmsf.pipeline.stages import Kept, StageFolder, digest_files
@@ -66,10 +66,10 @@ def find_source(folder: Path, settings: CaptureSettings, *, prefer: Literal["bes
     if surface is not None and shaped:
         beside = (*pictures_in(surface.parent, deep=False), *sorted(surface.parent.glob("*.mtl")))
         return Source("mesh", (surface, *beside), surface, folder)
-    if len(images) >= FEWEST or (images and photographs != folder):
-        if len(images) < FEWEST:
+    if len(images) >= MIN_IMAGES or (images and photographs != folder):
+        if len(images) < MIN_IMAGES:
             raise SceneError.expected(
-                f"{FEWEST} photographs or more", len(images), file=photographs, advice="take more"
+                f"{MIN_IMAGES} photographs or more", len(images), file=photographs, advice="take more"
             )
         return Source("photographs", (*images, *masks), photographs, folder)
     videos = sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES)
