@@ -3,10 +3,9 @@
 import time
 from pathlib import Path
 
-from avmsf.baselines.sonicgauss.objects import training_objects, training_recipes
-from avmsf.baselines.sonicgauss.pretraining import PretrainingConfig, pretrain
+from avmsf.baselines.sonicgauss.pretraining import PretrainingConfig, pretrain, training_objects, training_recipes
 from avmsf.baselines.sonicgauss.small import SmallConfig
-from avmsf.baselines.sonicgauss.tuning import TrainingConfig
+from avmsf.baselines.sonicgauss.training import TrainingConfig
 from benchmarks.report import Report, Table, log
 
 OBJECTS = 40

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from avmsf.baselines.diffsound import material_fit
-from avmsf.baselines.diffsound.locator import DiffSoundLocator
 from avmsf.baselines.diffsound.losses import ClipSpectra, divergence
 from avmsf.baselines.diffsound.material_fit import (
     DampingCurve,
@@ -19,7 +18,7 @@ from avmsf.baselines.diffsound.material_fit import (
     fit_material,
     predicted_sound,
 )
-from avmsf.baselines.diffsound.renderer import DiffSound, leveled
+from avmsf.baselines.diffsound.renderer import DiffSound, DiffSoundLocator, leveled
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, LocationError, SimulationError
 from avmsf.fem.body_family import BodyFamily, body_family

@@ -10,8 +10,6 @@ import torch
 
 from avmsf.baselines.sonicgauss import patches
 from avmsf.baselines.sonicgauss.conditioning import ContactEncoding, Fusion, degree_one, first_nine, normalized
-from avmsf.baselines.sonicgauss.flow import draw_times, flow_loss, integrate
-from avmsf.baselines.sonicgauss.objects import TrainingObject, training_recipes
 from avmsf.baselines.sonicgauss.patches import (
     CHANNELS,
     FFT,
@@ -23,10 +21,10 @@ from avmsf.baselines.sonicgauss.patches import (
     sounds_of,
     spectra,
 )
-from avmsf.baselines.sonicgauss.pretraining import PretrainingConfig, pretrain
+from avmsf.baselines.sonicgauss.pretraining import PretrainingConfig, TrainingObject, pretrain, training_recipes
 from avmsf.baselines.sonicgauss.small import SmallConfig, SmallSonicGauss, SmallWeights
 from avmsf.baselines.sonicgauss.small_renderer import SmallRenderer, fit_small
-from avmsf.baselines.sonicgauss.tuning import TrainingConfig, train
+from avmsf.baselines.sonicgauss.training import TrainingConfig, draw_times, flow_loss, integrate, train
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.methods import SmallSonicGaussMethod, method_named
 from avmsf.simulate.sim20 import SIM20

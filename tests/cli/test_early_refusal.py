@@ -12,7 +12,7 @@ from avmsf.cli.options.paths import ExistingField, InputError
 from avmsf.errors import SimulationError
 from avmsf.evaluation.methods import METHODS
 from avmsf.evaluation.protocols import PROTOCOLS
-from avmsf.evaluation.registry import METHOD_NAMES, PROTOCOL_NAMES
+from avmsf.evaluation.registry import METHOD_TITLES, PROTOCOL_NAMES
 from avmsf.fem.material import material_named
 from avmsf.gaussians.ply_header import NEEDED
 from avmsf.pipeline.config import CACHE, CACHED_FIELD
@@ -116,7 +116,7 @@ def test_no_refusal_loads_torch(place: Path) -> None:
 
 
 def test_names_are_those_of_the_methods_and_protocols() -> None:
-    assert tuple(METHODS) == METHOD_NAMES
+    assert tuple(METHODS) == tuple(METHOD_TITLES)
     assert tuple(PROTOCOLS) == PROTOCOL_NAMES
 
 

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from avmsf._utils.files import write_whole
 from avmsf._utils.state import read_tensors
-from avmsf.baselines.diffsound.locator import DiffSoundLocator
-from avmsf.baselines.diffsound.renderer import DiffSound
+from avmsf.baselines.diffsound.renderer import DiffSound, DiffSoundLocator
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, LocationError
 from avmsf.evaluation.simple_methods import NearestRecording

@@ -14,11 +14,17 @@ from torch import Tensor
 from avmsf._utils.device import usable_device
 from avmsf.baselines.diffsound.material_fit import DiffSoundConfig
 from avmsf.baselines.diffsound.renderer import DiffSound, fit_diffsound
-from avmsf.baselines.sonicgauss.published import PublishedSizes, PublishedSonicGauss, folder_digest
-from avmsf.baselines.sonicgauss.published_renderer import EPOCHS, PublishedRenderer, fit_published
+from avmsf.baselines.sonicgauss.published import (
+    EPOCHS,
+    PublishedRenderer,
+    PublishedSizes,
+    PublishedSonicGauss,
+    fit_published,
+    folder_digest,
+)
 from avmsf.baselines.sonicgauss.small import COMMAND, SmallWeights
 from avmsf.baselines.sonicgauss.small_renderer import TUNING, SmallRenderer, fit_small
-from avmsf.baselines.sonicgauss.tuning import TrainingConfig, TunedRenderer
+from avmsf.baselines.sonicgauss.training import TrainingConfig, TunedRenderer
 from avmsf.capture.audio import read_recording
 from avmsf.errors import CaptureError, EvaluationError
 from avmsf.evaluation.field_methods import NETWORK, PAPER_GRID, QUICK_GRID, FieldMethod, GridField, UninformedField
@@ -251,42 +257,17 @@ def _count(task: Task) -> int:
     return min(NEIGHBORS, len(task.train))
 
 
-def _white_noise(task: Task) -> WhiteNoise:
-    return WhiteNoise(task.train, seed=task.seed)
-
-
-def _random_impact(task: Task) -> RandomImpact:
-    return RandomImpact(task.stranger(), task.train.sample_rate)
-
-
-def _nearest(task: Task) -> NearestRecording:
-    return NearestRecording(task.train)
-
-
-def _mean_waveform(task: Task) -> MeanWaveform:
-    return MeanWaveform(task.train, count=_count(task))
-
-
-def _directed_mean_waveform(task: Task) -> MeanWaveform:
-    return MeanWaveform(task.train, count=_count(task), by_direction=True)
-
-
-def _mean_gains(task: Task) -> MeanGains:
-    return MeanGains(task.train, task.modes(), count=_count(task), noise=True, seed=task.seed)
-
-
-def _spline_gains(task: Task) -> SplineGains:
-    return SplineGains(task.train, task.modes(), noise=True, seed=task.seed)
-
-
 BASELINES = (
-    Baseline("white-noise", _white_noise),
-    Baseline("random-impact", _random_impact),
-    Baseline("nearest", _nearest),
-    Baseline("knn3", _mean_waveform),
-    Baseline("knn3-directions", _directed_mean_waveform),
-    Baseline("knn-gains", _mean_gains),
-    Baseline("spline-gains", _spline_gains),
+    Baseline("white-noise", lambda task: WhiteNoise(task.train, seed=task.seed)),
+    Baseline("random-impact", lambda task: RandomImpact(task.stranger(), task.train.sample_rate)),
+    Baseline("nearest", lambda task: NearestRecording(task.train)),
+    Baseline("knn3", lambda task: MeanWaveform(task.train, count=_count(task))),
+    Baseline("knn3-directions", lambda task: MeanWaveform(task.train, count=_count(task), by_direction=True)),
+    Baseline(
+        "knn-gains",
+        lambda task: MeanGains(task.train, task.modes(), count=_count(task), noise=True, seed=task.seed),
+    ),
+    Baseline("spline-gains", lambda task: SplineGains(task.train, task.modes(), noise=True, seed=task.seed)),
 )
 """The paper's baselines that need nothing but data, then the strong ones that it leaves out. Those that share modes
 have noise beside them, as the field has: without it all is silent between modes, and L1-log is lost."""

@@ -19,38 +19,45 @@ PROTOCOL_NAMES = (
     "localize",
     "grid",
 )
-METHOD_NAMES = (
-    "white-noise",
-    "random-impact",
-    "nearest",
-    "knn3",
-    "knn3-directions",
-    "knn-gains",
-    "spline-gains",
-    "diffsound",
-    "diffsound-weighted",
-    "field",
-    "field-auto",
-    "field-elastic",
-    "field-smooth",
-    "field-thin-plate",
-    "field-positions",
-    "field-unaligned",
-    "field-no-initialization",
-    "field-no-residual",
-    "field-warmup",
-    "paper",
-    "paper-positions",
-    "paper-no-initialization",
-    "paper-unaligned",
-    "paper-no-residual",
-    "paper-per-contact",
-    "field-grid",
-    "paper-grid",
+METHOD_TITLES: Mapping[str, str] = MappingProxyType(
+    {
+        "white-noise": "Gaussian noise at the level of the training recordings",
+        "random-impact": "a recording of another object",
+        "nearest": "the nearest training recording",
+        "knn3": "mean waveform of the three nearest recordings (the paper's KNN)",
+        "knn3-directions": "mean waveform of the three nearest recordings, by position and impact direction",
+        "knn-gains": "modal gains averaged over the three nearest recordings",
+        "spline-gains": "modal gains by thin-plate splines",
+        "diffsound": "reimplementation of DiffSound, as in the paper",
+        "diffsound-weighted": "DiffSound with a fitted weight for each mode",
+        "field": "attention network, quick settings, visual features",
+        "field-auto": "Gaussian process over kernel families (the default of this package)",
+        "field-elastic": "Gaussian process on elastic mode shapes only",
+        "field-smooth": "Gaussian process on distances only",
+        "field-thin-plate": "Gaussian process of thin-plate splines only",
+        "field-positions": "attention network, quick settings, positions only",
+        "field-unaligned": "attention network, quick settings, without symmetry pooling",
+        "field-no-initialization": "attention network, quick settings, without extracted modes",
+        "field-no-residual": "attention network, quick settings, without residual noise",
+        "field-warmup": "attention network, quick settings, warm-up only",
+        "paper": "the paper's method with the preset `paper`, shared damping",
+        "paper-positions": "the paper's method without visual features",
+        "paper-no-initialization": "the paper's method without extracted modes",
+        "paper-unaligned": "the paper's method without symmetry pooling",
+        "paper-no-residual": "the paper's method without residual noise",
+        "paper-per-contact": "the paper's method with damping per contact",
+        "field-grid": "attention network, settings chosen from a small grid",
+        "paper-grid": "the paper's method with settings chosen from its lists",
+    }
 )
-"""All methods but those that take a path, in the order of tables."""
+"""Titles of all methods but those that take a path, by their names, in the order of tables."""
 PUBLISHED, SMALL, RECORDED = "sonicgauss:", "sonicgauss-small:", "recorded:"
 """How the names of methods that take a path begin."""
+_PATH_TITLES = {
+    "sonicgauss": "SonicGauss with its published weights, trained on ObjectFolder Real, fine-tuned",
+    "recorded": "sounds of another system, from files",
+    "sonicgauss-small": "SonicGauss's objective at a small size, trained from scratch on simulated objects",
+}
 _SEVERAL_SETS = ("shots", "learning-curve")
 """Protocols that test a recording after training on several sets of others."""
 
@@ -67,10 +74,10 @@ def expect_protocol(name: str) -> None:
 
 def expect_method(name: str) -> None:
     """Raise `EvaluationError`, which lists the known ones, for the name of no method."""
-    if name not in METHOD_NAMES and name.partition(":")[0] + ":" not in (PUBLISHED, SMALL, RECORDED):
+    if name not in METHOD_TITLES and name.partition(":")[0] + ":" not in (PUBLISHED, SMALL, RECORDED):
         raise EvaluationError(
-            f"expected a method of {', '.join(METHOD_NAMES)}, {PUBLISHED}FOLDER, {SMALL}FILE and {RECORDED}FOLDER, got "
-            f"{name!r}{_guess(name, METHOD_NAMES)}",
+            f"expected a method of {', '.join(METHOD_TITLES)}, {PUBLISHED}FOLDER, {SMALL}FILE and {RECORDED}FOLDER, "
+            f"got {name!r}{_guess(name, tuple(METHOD_TITLES))}",
             name="method",
             value=name,
         )
@@ -93,43 +100,12 @@ def _guess(name: str, known: Sequence[str]) -> str:
     return f"; did you mean {near[0]}?" if near else ""
 
 
-TITLES: Mapping[str, str] = MappingProxyType(
-    {
-        "white-noise": "Gaussian noise at the level of the training recordings",
-        "random-impact": "a recording of another object",
-        "nearest": "the nearest training recording",
-        "knn3": "mean waveform of the three nearest recordings (the paper's KNN)",
-        "knn3-directions": "mean waveform of the three nearest recordings, by position and impact direction",
-        "knn-gains": "modal gains averaged over the three nearest recordings",
-        "spline-gains": "modal gains by thin-plate splines",
-        "diffsound": "reimplementation of DiffSound, as in the paper",
-        "diffsound-weighted": "DiffSound with a fitted weight for each mode",
-        "sonicgauss": "SonicGauss with its published weights, trained on ObjectFolder Real, fine-tuned",
-        "recorded": "sounds of another system, from files",
-        "sonicgauss-small": "SonicGauss's objective at a small size, trained from scratch on simulated objects",
-        "field": "attention network, quick settings, visual features",
-        "field-auto": "Gaussian process over kernel families (the default of this package)",
-        "field-elastic": "Gaussian process on elastic mode shapes only",
-        "field-smooth": "Gaussian process on distances only",
-        "field-thin-plate": "Gaussian process of thin-plate splines only",
-        "field-positions": "attention network, quick settings, positions only",
-        "field-unaligned": "attention network, quick settings, without symmetry pooling",
-        "field-no-initialization": "attention network, quick settings, without extracted modes",
-        "field-no-residual": "attention network, quick settings, without residual noise",
-        "field-warmup": "attention network, quick settings, warm-up only",
-        "field-grid": "attention network, settings chosen from a small grid",
-        "paper": "the paper's method with the preset `paper`, shared damping",
-        "paper-per-contact": "the paper's method with damping per contact",
-        "paper-positions": "the paper's method without visual features",
-        "paper-no-initialization": "the paper's method without extracted modes",
-        "paper-unaligned": "the paper's method without symmetry pooling",
-        "paper-no-residual": "the paper's method without residual noise",
-        "paper-grid": "the paper's method with settings chosen from its lists",
-    }
-)
-"""By the names of `avmsf.evaluation.methods.METHODS`."""
-
-
 def kind_of(method: str) -> str:
     """Return a method's name without the file or folder that it reads."""
     return method.partition(":")[0]
+
+
+def title_of(method: str) -> str | None:
+    """Return what reports call a method of this name, with or without its path; None for an unknown one."""
+    kind = kind_of(method)
+    return METHOD_TITLES.get(kind, _PATH_TITLES.get(kind))

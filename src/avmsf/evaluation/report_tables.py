@@ -7,7 +7,7 @@ from typing import Any
 
 from avmsf._utils.wording import counted
 from avmsf.evaluation.protocols import BASELINE, COMPUTATION, PROTOCOLS, published, published_ratios
-from avmsf.evaluation.registry import TITLES, kind_of
+from avmsf.evaluation.registry import kind_of, title_of
 from avmsf.evaluation.results import ObjectRecord
 from avmsf.evaluation.summary import (
     RISING,
@@ -168,7 +168,7 @@ def _main_table(main: Table, shown: Sequence[str], protocol: str, dataset: str, 
         else f"The paper has no values of this experiment on {dataset}."
     )
     grid = Grid(("method", *_headings(shown), "objects"), tuple(rows), best)
-    titles = "; ".join(f"{method}: {TITLES[kind_of(method)]}" for method in found if kind_of(method) in TITLES)
+    titles = "; ".join(f"{method}: {title}" for method in found if (title := title_of(method)) is not None)
     remarks = (*_of_fewer(main), remark, *([f"{titles}."] if titles else []))
     return Section("All methods" + (f": {labels[0]}" if len(labels) > 1 else ""), (), grid, remarks)
 

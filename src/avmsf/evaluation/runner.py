@@ -42,15 +42,6 @@ from avmsf.simulate.ground_truth import Truth
 
 
 @runtime_checkable
-class FeatureMaker(Protocol):
-    """Computes an object's features."""
-
-    def __call__(self, identifier: str, look: Look, views: int | None = None) -> FeatureField:
-        """Return an object's features, from at most `views` views. Raises SceneError without visual input."""
-        ...
-
-
-@runtime_checkable
 class BodyMaker(Protocol):
     """Computes an object's FE models."""
 
@@ -63,15 +54,6 @@ class BodyMaker(Protocol):
         ...
 
 
-@runtime_checkable
-class CloudMaker(Protocol):
-    """Makes an object's Gaussians."""
-
-    def __call__(self, identifier: str, views: int | None = None) -> GaussianCloud:
-        """Return an object's Gaussians, from at most `views` views. Raises SceneError without visual input."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class Evaluation:
     """Data set, protocol, methods and settings of an evaluation."""
@@ -81,7 +63,8 @@ class Evaluation:
     """Name of the dataset in reports; one folder of results has one."""
     protocol: EvaluationProtocol
     methods: tuple[Method, ...]
-    features: FeatureMaker
+    features: Callable[..., FeatureField]
+    """Of an object's identifier, a `Look` and the maximum of `views`, as `ObjectLooks`."""
     bodies: BodyMaker
     seed: int = 0
     """Random seed of the methods."""
@@ -90,8 +73,8 @@ class Evaluation:
     """Extraction of modes, once per case."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the features, as plain values."""
-    clouds: CloudMaker | None = None
-    """None where no method reads Gaussians."""
+    clouds: Callable[[str, int | None], GaussianCloud] | None = None
+    """Of an object's identifier and the maximum of views; None where no method reads Gaussians."""
     device: str | None = None
     """Device that methods train on, with the same result up to rounding; None for a GPU where there is one."""
     encoder: str | None = None

@@ -8,8 +8,7 @@ with mass-normalized shapes phi_i, damped frequencies f_i and dampings d_i of th
 an impulse sets each mode in motion with. One level, or with `weighted` a non-negative weight w_i for each mode, makes
 the magnitudes of spectra those of the training recordings, by least squares. Jin et al. (DiffSound, SIGGRAPH 2024)
 publish neither gains by position nor a level; Li et al. compare with "position-specific impact sounds" simulated "from
-the object's vibration modes" and add their learned residual noise, as here.
-"""
+the object's vibration modes" and add their learned residual noise, as here."""
 
 import math
 from dataclasses import dataclass, field
@@ -23,7 +22,6 @@ from jaxtyping import Complex, Float, Float64
 from torch import Tensor
 
 from avmsf.baselines.diffsound.material_fit import (
-    MODES,
     DampingCurve,
     DiffSoundConfig,
     MaterialFit,
@@ -32,17 +30,18 @@ from avmsf.baselines.diffsound.material_fit import (
     fit_material,
 )
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import EvaluationError
+from avmsf.errors import EvaluationError, LocationError
 from avmsf.fem.body_family import BodyFamily
 from avmsf.fem.elastic_modes import ElasticModes
+from avmsf.localization.cosine_distance import cosine_distance
 from avmsf.modal.config import scaled_fft_size
 from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual, low_fluctuation_noise
 from avmsf.modal.spectra import magnitude_stft
 from avmsf.modal.synthesis import synthesize
 
-__all__ = ["MODES", "DiffSound", "DiffSoundConfig", "fit_diffsound"]
 _FFT_SIZE = 2048
 """Samples at 44.1 and 48 kHz of the spectra that levels are fitted to."""
 
@@ -200,3 +199,46 @@ def _weights(
     root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
     target = np.linalg.lstsq(root.T, (products / scale).numpy(), rcond=None)[0]
     return torch.from_numpy(scipy.optimize.nnls(root, target)[0]) / scale
+
+
+@dataclass(frozen=True, eq=False)
+class DiffSoundLocator:
+    """Simulated gains at candidate points."""
+
+    renderer: DiffSound
+    points: Float64[Tensor, "points 3"]
+    """Object frame, meters."""
+    gains: Float64[Tensor, "points modes"]
+
+    @classmethod
+    def of(
+        cls,
+        renderer: DiffSound,
+        points: Float[Tensor, "points 3"],
+        *,
+        directions: Float[Tensor, "points 3"] | None = None,
+    ) -> "DiffSoundLocator":
+        """Return the locator over points, struck along `directions` (unit vectors) or straight into the surface."""
+        places = points.detach().cpu().double()
+        gains = renderer.gains(places, directions=directions)
+        return cls(renderer, places, gains)
+
+    def distance(self, sound: Float[Tensor, " samples"]) -> Float64[Tensor, " points"]:
+        """Return the cosine distance of each point's gains from a sound's, 0 to 1 (see `cosine_distance`).
+
+        The sound starts about at its onset and has the renderer's sample rate. Raises LocationError where it is silent
+        or not finite.
+        """
+        heard = sound.detach().cpu()[: self.renderer.samples].double()
+        if not bool(torch.isfinite(heard).all()) or not bool(heard.any()):
+            raise LocationError(
+                "sound: expected finite samples that are not all 0, got others; record the impact again", name="sound"
+            )
+        sine, cosine = fit_gains(heard[None], self.renderer.bank, sample_rate=self.renderer.sample_rate)
+        return cosine_distance(
+            self.gains.to(torch.complex64), torch.complex(sine[0], cosine[0]), self.renderer.bank.frequency
+        )
+
+    def place(self, sound: Float[Tensor, " samples"]) -> Float64[Tensor, " 3"]:
+        """Return the point of the least distance, meters."""
+        return self.points[int(self.distance(sound).argmin())]

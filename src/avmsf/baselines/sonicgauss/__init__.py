@@ -1,9 +1,8 @@
 """SonicGauss: impact sounds from Gaussians and a contact by flow matching, in its published size and a small one.
 
 - `conditioning`: 23 channels of Gaussians, the encoding of a contact, and their fusion; shared by both sizes.
-- `flow`: the objective of rectified flow and its Euler integration; shared by both sizes.
-- `tuning`: fine-tuning to one object's recordings; shared by both sizes.
+- `training`: the objective of rectified flow, its Euler integration, and training by it; shared by both sizes.
 - `published`, `point_transformer`: the published architecture, which reads a user's copy of the published weights.
 - `small`, `patches`: a small generator of log spectrograms, and its latents.
-- `objects`, `pretraining`: the small generator's training from scratch on simulated objects.
+- `pretraining`: the small generator's training from scratch on simulated objects.
 """

@@ -25,7 +25,7 @@ from avmsf.baselines.sonicgauss.conditioning import (
 )
 from avmsf.baselines.sonicgauss.patches import CHANNELS as LATENTS
 from avmsf.baselines.sonicgauss.patches import PATCHES, VALUES, PatchCodec
-from avmsf.baselines.sonicgauss.tensors import expect_tensors
+from avmsf.baselines.sonicgauss.training import expect_tensors
 from avmsf.errors import EvaluationError
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.points import farthest_points

@@ -7,11 +7,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from avmsf.baselines.sonicgauss.flow import integrate
 from avmsf.baselines.sonicgauss.patches import CHANNELS, PATCHES, PatchCodec, log_magnitudes, sounds_of, spectra
 from avmsf.baselines.sonicgauss.pretraining import clip_loss
 from avmsf.baselines.sonicgauss.small import SmallSonicGauss, SmallWeights, object_tokens, visible
-from avmsf.baselines.sonicgauss.tuning import TrainingConfig, TunedRenderer, expect_sound, train
+from avmsf.baselines.sonicgauss.training import TrainingConfig, TunedRenderer, expect_sound, integrate, train
 from avmsf.capture.impacts import Impacts
 from avmsf.gaussians.cloud import GaussianCloud
 

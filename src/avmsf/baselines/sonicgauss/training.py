@@ -1,8 +1,13 @@
-"""Training a generator by rectified flow, from scratch or on one object: AdamW, a warm-up, then a linear decay."""
+"""Rectified flow (Liu et al. 2023; Esser et al. 2024), and training a generator by it, from scratch or on one object.
+
+At time s from 0 to 1 there is z_s = (1 - s) z + s e of data z and Gaussian noise e, whose velocity is e - z. Training
+is by AdamW with a warm-up, then a linear decay.
+"""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -10,9 +15,65 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from avmsf.baselines.sonicgauss.conditioning import Normalized
-from avmsf.baselines.sonicgauss.flow import STEPS
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
+
+STEPS = 50
+"""Euler steps from noise to data, as published."""
+DROPPED = 0.1
+"""Part of the training conditions that are zeroed, as published."""
+
+Velocity = Callable[[Float[Tensor, "batch tokens channels"], Float[Tensor, " batch"]], Tensor]
+"""Velocity [batch tokens channels] at latents and times."""
+
+
+def draw_times(count: int, *, generator: torch.Generator) -> Float[Tensor, " batch"]:
+    """Return times between 0 and 1 whose logits are standard normal."""
+    return torch.sigmoid(torch.randn(count, generator=generator))
+
+
+def flow_loss(
+    velocity: Velocity, data: Float[Tensor, "batch tokens channels"], *, generator: torch.Generator
+) -> Float[Tensor, ""]:
+    """Return the mean squared error of the velocity at one random time for each row of the data."""
+    noise = torch.randn(data.shape, generator=generator).to(data)
+    times = draw_times(len(data), generator=generator).to(data)
+    weight = times[:, None, None]
+    return torch.nn.functional.mse_loss(velocity((1 - weight) * data + weight * noise, times), noise - data)
+
+
+@torch.no_grad()
+def integrate(
+    velocity: Velocity, noise: Float[Tensor, "batch tokens channels"], *, steps: int = STEPS
+) -> Float[Tensor, "batch tokens channels"]:
+    """Return the data that noise flows to, by Euler steps at the times 1, 1 - 1/steps, ..., 1/steps."""
+    latents = noise
+    for step in range(steps, 0, -1):
+        times = latents.new_full((len(latents),), step / steps)
+        latents = latents - velocity(latents, times) / steps
+    return latents
+
+
+def expect_tensors(path: Path, tensors: Mapping[str, Tensor], shapes: Mapping[str, Sequence[int]]) -> None:
+    """Raise EvaluationError, which names the first tensor that is missing or has another shape."""
+    missing = [name for name in shapes if name not in tensors]
+    if missing:
+        raise EvaluationError(
+            f"{path}: expected {len(shapes)} tensors, {len(missing)} are missing such as {missing[0]}; copy the file "
+            "again",
+            file=path,
+            name=missing[0],
+        )
+    for name, shape in shapes.items():
+        if tuple(tensors[name].shape) != tuple(shape):
+            raise EvaluationError(
+                f"{path}: expected the tensor {name} of the shape {list(shape)}, got {list(tensors[name].shape)}; copy "
+                "the file of this model",
+                file=path,
+                name=name,
+                value=list(tensors[name].shape),
+            )
+
 
 Loss = Callable[[Int[Tensor, " batch"], torch.Generator], Float[Tensor, ""]]
 """Loss of the clips of these rows."""
