@@ -19,7 +19,14 @@ from avmsf.evaluation.editing import (
     towards_reference,
     write_scores,
 )
-from avmsf.evaluation.editing_objects import SHAPES, STRANGERS, KnownObject, SolvedShape, drawn_size, simulated_objects
+from avmsf.evaluation.editing_objects import (
+    OTHER_SHAPES,
+    SHAPES,
+    KnownObject,
+    SolvedShape,
+    drawn_size,
+    simulated_objects,
+)
 from avmsf.evaluation.mode_embedding import MaterialSpace, Pitches, PitchesAndRings, UmapSettings
 from avmsf.fem.material import MATERIALS
 from benchmarks.report import Options, Report, Table, log
@@ -39,7 +46,7 @@ NAMES = {
 """What keys call the methods."""
 CONVENTIONS = (
     f"edit: simulated objects, four shapes in seven materials, make the clusters ({', '.join(SHAPES)}; each in a size "
-    f"of its own, .7 to 1.4 times); {' and '.join(STRANGERS)}, which are in no cluster, are edited towards 16 "
+    f"of its own, .7 to 1.4 times); {' and '.join(OTHER_SHAPES)}, which are in no cluster, are edited towards 16 "
     "recordings of the other of the two in the new material. Modes are the finite elements' own, Poisson's ratio .27 "
     "throughout; those within 60 dB of the loudest are compared.",
     "umap: distance to the center of the target's cluster in a UMAP of the sets of frequencies, as in the paper. "
@@ -104,7 +111,7 @@ def labelled_objects(kinds: Sequence[str] = SHAPES) -> tuple[KnownObject, ...]:
 
 def strange_shapes() -> tuple[SolvedShape, ...]:
     """Return the two shapes that are edited and referred to."""
-    return tuple(SolvedShape.of(kind, seed=12) for kind in STRANGERS)
+    return tuple(SolvedShape.of(kind, seed=12) for kind in OTHER_SHAPES)
 
 
 def spaces_of(labelled: Sequence[KnownObject], *, seed: int = 0) -> dict[str, MaterialSpace]:

@@ -36,10 +36,10 @@ from avmsf.evaluation.editing import (
     write_scores,
 )
 from avmsf.evaluation.editing_objects import (
+    OTHER_SHAPES,
     PUBLISHED,
     REALIMPACT_26,
     SHAPES,
-    STRANGERS,
     KnownObject,
     PaperFields,
     recorded_objects,
@@ -190,7 +190,9 @@ def simulated_cast(*, words: bool, seed: int = 0) -> Cast:
     else:
         pairs = tuple(zip(shapes, shapes[::-1], strict=True))
         tasks = tuple(referred_task(own, other, each, seed=seed) for each in SEVEN_TRANSITIONS for own, other in pairs)
-    what = f"simulated objects: {', '.join(SHAPES)} in seven materials make the clusters, {' and '.join(STRANGERS)}, "
+    what = (
+        f"simulated objects: {', '.join(SHAPES)} in seven materials make the clusters, {' and '.join(OTHER_SHAPES)}, "
+    )
     what += "which are in no cluster, are edited (as python -m benchmarks tasks --parts edit has them)"
     return Cast("simulated", labelled, tasks, what, known=True)
 

@@ -14,9 +14,9 @@ from avmsf.evaluation.cases import Case
 from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.methods import method_named
 from avmsf.evaluation.protocols import PROTOCOLS
-from avmsf.evaluation.runner import CaseRun, Evaluation
+from avmsf.evaluation.runner import CaseRun, Evaluation, ObjectData
 from avmsf.evaluation.simple_methods import NearestRecording
-from avmsf.evaluation.splits import Judging
+from avmsf.evaluation.splits import MetricSettings
 from avmsf.evaluation.task import Task
 from factories.delayed_plate import ALIGNED, delays, distance, strikes, without_delays
 from factories.plate_set import NoBodies, PlateLooks
@@ -27,33 +27,28 @@ METHODS = ("nearest", "knn3", "knn-gains")
 
 def run_of(impacts: Impacts, folder: Path, own_starts: Impacts | None = None) -> CaseRun:
     methods = tuple(map(method_named, METHODS))
-    judging = Judging(level="raw", cdpam=False)
+    metric_settings = MetricSettings(level="raw", cdpam=False)
     looks, bodies = PlateLooks(), NoBodies()
     protocol, dataset = PROTOCOLS["farthest"], CaptureCollection(folder)
-    return CaseRun(
-        Evaluation(dataset, "plates", protocol, methods, looks, bodies, judging=judging),
+    data = ObjectData(
         "a",
-        Case("all", tuple(range(TRAIN)), tuple(range(TRAIN, COUNT))),
         impacts,
-        None,
-        folder=folder,
-        place="a/01",
-        look=partial(looks, "a"),
+        features=looks,
         bodies=partial(bodies, "a"),
         family=partial(bodies.family, "a"),
-        material=None,
-        vertices=None,
         stranger=lambda: torch.zeros(impacts.sounds.shape[1]),
-        listened=False,
         own_starts=own_starts,
     )
+    evaluation = Evaluation(dataset, "plates", protocol, methods, looks, bodies, metric_settings=metric_settings)
+    case = Case("all", tuple(range(TRAIN)), tuple(range(TRAIN, COUNT)))
+    return CaseRun(evaluation, data, case, folder=folder, number=1, listened=False)
 
 
 def test_errors_of_baselines_do_not_depend_on_delays(tmp_path: Path) -> None:
     starts = delays(COUNT)
     run = run_of(strikes(COUNT, starts=starts), tmp_path / "delayed")
     found = [run.outcome(method) for method in run.evaluation.methods]
-    same = without_delays(run.impacts, run.scored.modes(), starts)
+    same = without_delays(run.data.impacts, run.scored.modes(), starts)
     other = run_of(same, tmp_path / "exact")
     expected = [other.outcome(method) for method in run.evaluation.methods]
     assert distance(run.scored.train.sounds, other.scored.train.sounds) < ALIGNED

@@ -44,8 +44,8 @@ from avmsf.evaluation.editing_objects import (
     KnownObject,
     PaperFields,
     SolvedShape,
+    audible_modes,
     drawn_size,
-    heard_modes,
     recorded_objects,
     simulated_objects,
 )
@@ -90,13 +90,19 @@ def reference_to(known: KnownObject) -> Reference:
     return Reference.of(known.impacts.sounds, sample_rate=RATE, name=known.name)
 
 
+def embedded(space: MaterialSpace, points: np.ndarray) -> MaterialSpace:
+    """Return the space with an embedding that is made up: UMAP would have to be compiled."""
+    vars(space)["embedding"] = points
+    return space
+
+
 def flat_space(features=None) -> MaterialSpace:
-    """A space of plates in three materials whose embedding is made up: nothing has to be compiled."""
+    """A space of plates in three materials with all points of its embedding at zero."""
     objects = [struck(material, size) for material in ("ceramic", "wood", "glass") for size in (0.8, 1.0, 1.3)]
     space = MaterialSpace.of(
         [each.bank for each in objects], [each.material for each in objects], features=features or PitchesAndRings()
     )
-    return replace(space, stored=np.zeros((9, 2), dtype=np.float32))
+    return embedded(space, np.zeros((9, 2), dtype=np.float32))
 
 
 @pytest.fixture
@@ -159,13 +165,13 @@ def test_only_modes_that_are_heard_count():
     bank = ModalBank(torch.tensor([100.0, 200.0, 300.0, 9000.0], dtype=torch.float64), torch.full((4,), 5.0).double())
     # Energies of 0, -60.2 and -59.2 dB, and the loudest of all beyond half the sample rate.
     amplitudes = torch.tensor([[1.0, 0.98e-3, 1.1e-3, 50.0]])
-    assert heard_modes(bank, amplitudes, sample_rate=RATE).frequency.tolist() == [100.0, 300.0]
-    assert heard_modes(bank, amplitudes).frequency.tolist() == [100.0, 9000.0]
+    assert audible_modes(bank, amplitudes, sample_rate=RATE).frequency.tolist() == [100.0, 300.0]
+    assert audible_modes(bank, amplitudes).frequency.tolist() == [100.0, 9000.0]
     # A quarter of the damping is four times the energy.
     slow = replace(bank, damping=torch.tensor([5.0, 1.25, 5.0, 5.0], dtype=torch.float64))
-    assert heard_modes(slow, amplitudes, sample_rate=RATE).frequency.tolist() == [100.0, 200.0, 300.0]
+    assert audible_modes(slow, amplitudes, sample_rate=RATE).frequency.tolist() == [100.0, 200.0, 300.0]
     with raises(EvaluationError, name="bank", value=4):
-        heard_modes(bank, amplitudes, sample_rate=100.0)
+        audible_modes(bank, amplitudes, sample_rate=100.0)
 
 
 def test_the_26_objects_follow_the_rule_that_is_told():
@@ -237,7 +243,7 @@ def leave_out_umap(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def flat(*told, **more) -> MaterialSpace:
         space = laid_out(*told, **more)
-        return replace(space, stored=np.zeros((len(space.vectors), 2), dtype=np.float32))
+        return embedded(space, np.zeros((len(space.vectors), 2), dtype=np.float32))
 
     monkeypatch.setattr(MaterialSpace, "of", flat)
     monkeypatch.setattr(MaterialSpace, "place", lambda self, bank: self.features.vector(bank)[:2])

@@ -1,13 +1,12 @@
 """From edits to the record of the protocol and its figures, with a tiny CLAP network of random weights."""
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from test_editing import QUICK, Speaker, flat_space, struck
+from test_editing import QUICK, Speaker, embedded, flat_space, struck
 
 from avmsf.editing.config import DistillationConfig
 from avmsf.evaluation.clap import Clap
@@ -36,7 +35,7 @@ def space_of_vectors(monkeypatch: pytest.MonkeyPatch) -> MaterialSpace:
     """Return a space whose embedding is two components of the vectors: UMAP would have to be compiled."""
     monkeypatch.setattr(MaterialSpace, "place", lambda self, bank: self.features.vector(bank)[[0, 31]])
     space = flat_space(Pitches())
-    return replace(space, stored=space.vectors[:, [0, 31]])
+    return embedded(space, space.vectors[:, [0, 31]])
 
 
 @pytest.fixture

@@ -17,14 +17,14 @@ from avmsf.capture import read_capture
 from avmsf.datasets import CaptureCollection
 from avmsf.errors import AvmsfError, EvaluationError, FitError
 from avmsf.evaluation.methods import method_named
-from avmsf.evaluation.modal_metrics import ModalRenderer, judge_modes, truth_at
-from avmsf.evaluation.objects import ObjectBodies, ObjectLooks, draw_stranger
+from avmsf.evaluation.modal_metrics import ModalRenderer, compare_modes, truth_at
+from avmsf.evaluation.objects import ObjectBodies, ObjectLooks, draw_other_recording
 from avmsf.evaluation.protocols import PROTOCOLS
 from avmsf.evaluation.report import write_summary
 from avmsf.evaluation.results import ENCODER, ResultsFolder
 from avmsf.evaluation.runner import Evaluation, RunProgress, Workers, run_objects
 from avmsf.evaluation.simple_methods import NearestRecording
-from avmsf.evaluation.splits import Judging, evaluate, split, spread
+from avmsf.evaluation.splits import MetricSettings, evaluate, split, spread
 from avmsf.evaluation.task import Method, Renderer, Task
 from avmsf.simulate.ground_truth import read_truth
 from factories.plate_set import NoBodies, PlateLooks, fill_plates
@@ -49,7 +49,7 @@ def planned(folder: Path, *methods: str | Method, protocol: str = "farthest", se
         PlateLooks(),
         NoBodies(),
         seed=seed,
-        judging=Judging(cdpam=False),
+        metric_settings=MetricSettings(cdpam=False),
     )
 
 
@@ -91,7 +91,7 @@ class Asking:
 
 
 def test_figures_are_those_of_the_one_line_of_evaluation(plates: Path, tmp_path: Path) -> None:
-    evaluation = replace(planned(plates, "nearest"), judging=Judging(level="raw", cdpam=False))
+    evaluation = replace(planned(plates, "nearest"), metric_settings=MetricSettings(level="raw", cdpam=False))
     run_objects(evaluation, ("a",), ResultsFolder(tmp_path / "results"))
     record = ResultsFolder(tmp_path / "results").read("a")
     assert record is not None
@@ -217,7 +217,7 @@ def refusals(plates: Path, other: Path) -> dict[str, Evaluation]:
         "protocol": planned(plates, "knn3", protocol="closest"),
         "seed": planned(plates, "knn3", seed=1),
         "dataset": replace(plan, title="plots"),
-        "metrics": replace(plan, judging=Judging(cdpam=False, cdpam_contacts=3)),
+        "metrics": replace(plan, metric_settings=MetricSettings(cdpam=False, cdpam_contacts=3)),
         "settings": replace(plan, settings={"views": 3}),
         "a": planned(other, "knn3"),
     }
@@ -278,18 +278,18 @@ def test_a_hidden_part_that_a_kill_left_is_no_other_thing(tmp_path: Path) -> Non
 def test_a_stranger_is_another_object_at_this_ones_rate_and_length(plates: Path) -> None:
     dataset = CaptureCollection(plates)
     train = read_capture(plates / "a").impacts
-    drawn = draw_stranger(dataset, "a", train, seed=3)
+    drawn = draw_other_recording(dataset, "a", train, seed=3)
     others = torch.cat([read_capture(plates / name).impacts.sounds for name in "bc"])
     assert (others == drawn).all(dim=1).any()
-    assert torch.equal(drawn, draw_stranger(dataset, "a", train, seed=3))
-    assert any(not torch.equal(drawn, draw_stranger(dataset, "a", train, seed=seed)) for seed in range(4, 8))
+    assert torch.equal(drawn, draw_other_recording(dataset, "a", train, seed=3))
+    assert any(not torch.equal(drawn, draw_other_recording(dataset, "a", train, seed=seed)) for seed in range(4, 8))
     # Half the rate and twice the length: resampled, then silence.
     slow = replace(train, sample_rate=4000.0, sounds=torch.zeros(10, 1500))
-    drawn = draw_stranger(dataset, "a", slow, seed=3)
+    drawn = draw_other_recording(dataset, "a", slow, seed=3)
     assert drawn.shape == (1500,)
     assert float(drawn[1001:].abs().max()) == 0.0 < float(drawn[:1000].abs().max())
     with raises(EvaluationError, name="a"):
-        draw_stranger(CaptureCollection(plates / "a"), "a", train, seed=0)
+        draw_other_recording(CaptureCollection(plates / "a"), "a", train, seed=0)
 
 
 @pytest.mark.parametrize(("count", "wanted"), [(10, 3), (3, 3), (2, 8), (7, 1), (33, 8)])
@@ -313,7 +313,7 @@ def test_methods_with_modes_are_judged_by_the_truth(tmp_path: Path) -> None:
     run_objects(planned(folder, Asking(asked.append)), ("a",), ResultsFolder(tmp_path / "again"))
     fitted = method_named("spline-gains").fit(replace(asked[0], train=train))
     assert isinstance(fitted, ModalRenderer)
-    expected = judge_modes(fitted, test.contacts, truth).figures()
+    expected = compare_modes(fitted, test.contacts, truth).figures()
     # Modes that are found again differ in their last digits.
     assert spline.figures == pytest.approx(expected, rel=1e-5)
     with raises(EvaluationError, name="names", value=("x.wav",)):
@@ -335,7 +335,7 @@ def test_cdpam_is_taken_of_a_few_contacts(plates: Path, tmp_path: Path, monkeypa
             return (predicted - truth).abs().sum(1).double()
 
     monkeypatch.setattr("avmsf.evaluation.splits._cdpam", Ear)
-    evaluation = replace(planned(plates, "nearest"), judging=Judging(level="raw", cdpam_contacts=3))
+    evaluation = replace(planned(plates, "nearest"), metric_settings=MetricSettings(level="raw", cdpam_contacts=3))
     run_objects(evaluation, ("a",), ResultsFolder(tmp_path))
     (record,) = ResultsFolder(tmp_path).records()
     train, test = split(read_capture(plates / "a").impacts, 0.2)
@@ -349,10 +349,10 @@ def test_at_full_scale_the_recordings_unit_does_not_matter(plates: Path, tmp_pat
     impacts = read_capture(plates / "a").impacts
     train, test = split(impacts, 0.2)
     sounds, loudest = NearestRecording(train).render(test.contacts), float(impacts.sounds.abs().max())
-    judge = partial(Judging(cdpam=False).judge, NearestRecording(train), truth=None)
-    one = judge(sounds, test, loudest=loudest)
-    other = judge(1e-3 * sounds, replace(test, sounds=1e-3 * test.sounds), loudest=1e-3 * loudest)
-    raw = Judging(level="raw", cdpam=False).judge(NearestRecording(train), sounds, test, None, loudest=loudest)
+    values = partial(MetricSettings(cdpam=False).values, NearestRecording(train), truth=None)
+    one = values(sounds, test, loudest=loudest)
+    other = values(1e-3 * sounds, replace(test, sounds=1e-3 * test.sounds), loudest=1e-3 * loudest)
+    raw = MetricSettings(level="raw", cdpam=False).values(NearestRecording(train), sounds, test, None, loudest=loudest)
     for metric in ("l1", "envelope"):
         assert other.values[metric] == pytest.approx(one.values[metric], rel=1e-4)
         assert raw.values[metric] == pytest.approx([loudest * each for each in one.values[metric]], rel=1e-4)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from avmsf.capture.impacts import Impacts
-from avmsf.evaluation.modal_metrics import common_delay, judge_modes, truth_from_first_sample
+from avmsf.evaluation.modal_metrics import common_delay, compare_modes, truth_from_first_sample
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.modes import ModalBank
 from avmsf.simulate.ground_truth import Truth
@@ -63,7 +63,7 @@ class Fitted:
 def figures(truth: Truth, samples: float) -> dict[str, float | None]:
     impacts = heard(truth, torch.full((COUNT,), -samples, dtype=torch.float64))
     moved = truth_from_first_sample(truth, impacts)
-    return judge_modes(Fitted(impacts, ModalBank(FREQUENCY, DAMPING)), impacts.contacts, moved).figures()
+    return compare_modes(Fitted(impacts, ModalBank(FREQUENCY, DAMPING)), impacts.contacts, moved).figures()
 
 
 @pytest.mark.parametrize("samples", [2.3, 40.0])

@@ -8,7 +8,7 @@ from avmsf.evaluation.methods import method_named
 from avmsf.evaluation.protocols import PROTOCOLS
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.runner import Evaluation, run_objects
-from avmsf.evaluation.splits import Judging
+from avmsf.evaluation.splits import MetricSettings
 from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
 from factories.plate_set import NoBodies, PlateLooks, fill_plates
 
@@ -28,7 +28,7 @@ def test_a_truth_of_other_recordings_costs_neither_the_other_objects_nor_the_fol
             methods,
             PlateLooks(),
             NoBodies(),
-            judging=Judging(cdpam=False),
+            metric_settings=MetricSettings(cdpam=False),
         )
         run_objects(evaluation, ("a", "b"), results)
         return {each.identifier: sum(one.failure is None for one in each.outcomes) for each in results.records()}

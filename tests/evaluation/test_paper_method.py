@@ -15,7 +15,7 @@ from avmsf.evaluation.methods import METHODS
 from avmsf.evaluation.protocols import PROTOCOLS
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.runner import Evaluation
-from avmsf.evaluation.splits import Judging
+from avmsf.evaluation.splits import MetricSettings
 from avmsf.evaluation.task import Task
 from avmsf.features.descriptors import ImageDescriptors
 from avmsf.features.encoder import Encoder
@@ -107,7 +107,7 @@ def test_methods_without_features_share_results_with_any_encoder(tmp_path: Path)
     def begin(name: str, encoder: str | None) -> None:
         evaluation = Evaluation(
             CaptureCollection(tmp_path), "plates", PROTOCOLS["farthest"], (METHODS[name],), PlateLooks(), NoBodies(),
-            judging=Judging(cdpam=False), encoder=encoder,
+            metric_settings=MetricSettings(cdpam=False), encoder=encoder,
         )  # fmt: skip
         evaluation.begin(ResultsFolder(tmp_path / "results"))
 

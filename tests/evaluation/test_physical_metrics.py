@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.modal_metrics import ModalRenderer, judge_modes, match_modes
+from avmsf.evaluation.modal_metrics import ModalRenderer, compare_modes, match_modes
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
 from avmsf.simulate.ground_truth import Truth
@@ -46,7 +46,7 @@ def amplitudes() -> torch.Tensor:
 
 
 def test_the_truth_itself_is_perfect():
-    scores = judge_modes(rendered(amplitudes()), CONTACTS, truth())
+    scores = compare_modes(rendered(amplitudes()), CONTACTS, truth())
     assert isinstance(rendered(amplitudes()), ModalRenderer)
     figures = scores.figures()
     assert figures["gain_error"] == pytest.approx(0.0, abs=1e-7)
@@ -72,14 +72,14 @@ def test_weights_are_the_energies_of_the_sounds():
         energies.append(float(sounds.double().square().sum() / rate))
     share = numbers(*energies) / sum(energies)
     # The mean of a sine's square is a half but for a term of damping over angular frequency, at most .003 here.
-    weight = judge_modes(rendered(amplitudes()), CONTACTS, one).weight
+    weight = compare_modes(rendered(amplitudes()), CONTACTS, one).weight
     assert torch.allclose(weight, share, rtol=5e-3)
 
 
 def test_a_modes_phase_and_a_contacts_polarity_are_free():
     phases = torch.exp(1j * numbers(0.3, 2.0, -1.0, 3.1))
     polarity = torch.where(torch.arange(12) % 3 == 0, -1.0, 1.0).double()
-    figures = judge_modes(rendered(polarity[:, None] * amplitudes() * phases), CONTACTS, truth()).figures()
+    figures = compare_modes(rendered(polarity[:, None] * amplitudes() * phases), CONTACTS, truth()).figures()
     assert figures["gain_error"] == pytest.approx(0.0, abs=1e-7)
     assert figures["mac"] == pytest.approx(1.0, rel=1e-9)
 
@@ -90,10 +90,10 @@ def test_what_a_listener_hears_is_not_free():
     wrong[:6, 0] *= -1
     one = truth()
     single = Truth(one.frequency[:1], one.damping[:1], one.gains[:, :1], one.quadrature[:, :1], one.names)
-    assert judge_modes(rendered(wrong), CONTACTS, truth()).figures()["mac"] < 0.9
+    assert compare_modes(rendered(wrong), CONTACTS, truth()).figures()["mac"] < 0.9
     # Of a single mode it is nothing but polarity.
     alone = Modes(ModalBank(single.frequency, single.damping), wrong[:, :1])
-    assert judge_modes(alone, CONTACTS, single).figures()["mac"] == pytest.approx(1.0, rel=1e-9)
+    assert compare_modes(alone, CONTACTS, single).figures()["mac"] == pytest.approx(1.0, rel=1e-9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,13 +110,13 @@ def test_gains_are_compared_along_the_impacts_directions():
     directions = torch.stack([(1 - along.square()).sqrt(), torch.zeros_like(along), along], dim=1)
     renderer = Directed(rendered(amplitudes()).bank, amplitudes())
     one = replace(truth(), gains=truth().gains * along[:, None], quadrature=truth().quadrature * along[:, None])
-    figures = judge_modes(renderer, CONTACTS, one, directions=directions).figures()
+    figures = compare_modes(renderer, CONTACTS, one, directions=directions).figures()
     assert figures["gain_error"] == pytest.approx(0.0, abs=1e-7)
 
 
 @pytest.mark.parametrize("factor", [0.0, 0.5, 1.1, 2.0])
 def test_a_level_is_a_gain_error_and_leaves_the_mac(factor):
-    figures = judge_modes(rendered(factor * amplitudes()), CONTACTS, truth()).figures()
+    figures = compare_modes(rendered(factor * amplitudes()), CONTACTS, truth()).figures()
     assert figures["gain_error"] == pytest.approx(abs(factor - 1), rel=1e-9)
     assert figures["mac"] == pytest.approx(1.0 if factor else 0.0, rel=1e-9)
 
@@ -130,7 +130,7 @@ def test_error_at_right_angles_follows_pythagoras():
     other *= 0.5 * g.norm(dim=0) / other.norm(dim=0)
     sines = Modes(ModalBank(one.frequency, one.damping), -1j * (g + other))
     # cos^2 of the angle between them is 1 / (1 + 1/4).
-    scores = judge_modes(sines, CONTACTS, replace(one, quadrature=0 * g))
+    scores = compare_modes(sines, CONTACTS, replace(one, quadrature=0 * g))
     assert torch.allclose(scores.gain_error, torch.full((4,), 0.5, dtype=torch.float64), rtol=1e-9)
     assert torch.allclose(scores.mac, torch.full((4,), 0.8, dtype=torch.float64), rtol=1e-9)
 
@@ -142,7 +142,7 @@ def test_unrelated_gains_have_a_mac_near_one_over_contacts():
     bank = ModalBank(torch.linspace(300, 9000, modes, dtype=torch.float64), torch.full((modes,), 10.0).double())
     one = Truth(bank.frequency, bank.damping, table[0], table[1], ("",) * contacts)
     places = torch.zeros(contacts, 3, dtype=torch.float64)
-    mac = judge_modes(Modes(bank, torch.complex(table[2], table[3])), places, one).figures()["mac"]
+    mac = compare_modes(Modes(bank, torch.complex(table[2], table[3])), places, one).figures()["mac"]
     # 1 / 200 for complex numbers; polarities chosen at best leave a little more.
     assert 1 / 200 < mac < 5 / 200
 
@@ -150,7 +150,7 @@ def test_unrelated_gains_have_a_mac_near_one_over_contacts():
 def test_frequencies_and_dampings_are_in_proportion():
     one = truth()
     bank = ModalBank(one.frequency * 1.001, one.damping * 2)
-    scores = judge_modes(Modes(bank, one.amplitudes), CONTACTS, one)
+    scores = compare_modes(Modes(bank, one.amplitudes), CONTACTS, one)
     assert torch.allclose(scores.frequency_error, torch.full((4,), 1e-3, dtype=torch.float64), rtol=1e-9)
     assert scores.figures()["frequency_error"] == pytest.approx(1e-3, rel=1e-9)
     assert scores.figures()["damping_error"] == pytest.approx(math.log(2), rel=1e-12)
@@ -159,7 +159,7 @@ def test_frequencies_and_dampings_are_in_proportion():
 def test_missing_modes_count_as_silence_and_others_as_false():
     one = truth()
     frequency = numbers(400, 900, 1700, 3900)
-    scores = judge_modes(rendered(amplitudes(), frequency), CONTACTS, one)
+    scores = compare_modes(rendered(amplitudes(), frequency), CONTACTS, one)
     assert scores.match.tolist() == [0, 1, 2, -1]
     missing = float(scores.weight[3])
     figures = scores.figures()
@@ -175,7 +175,7 @@ def test_missing_modes_count_as_silence_and_others_as_false():
 
 def test_a_method_that_finds_nothing_has_no_frequency_error():
     none = Modes(ModalBank(numbers(), numbers()), torch.zeros(12, 0, dtype=torch.complex128))
-    figures = judge_modes(none, CONTACTS, truth()).figures()
+    figures = compare_modes(none, CONTACTS, truth()).figures()
     assert (figures["found"], figures["gain_error"], figures["mac"]) == (0.0, pytest.approx(1.0), 0.0)
     assert figures["frequency_error"] is None
     assert figures["damping_error"] is None
@@ -205,15 +205,15 @@ def test_a_doublet_is_matched_in_order_and_a_mode_once():
 def test_what_cannot_be_compared_is_refused():
     one, good = truth(), rendered(amplitudes())
     with raises(EvaluationError, name="truth", value=12):
-        judge_modes(good, CONTACTS[:5], one)
+        compare_modes(good, CONTACTS[:5], one)
     with raises(EvaluationError, name="predicted", value=[12, 3]):
-        judge_modes(Modes(good.bank, one.amplitudes[:, :3]), CONTACTS, one)
+        compare_modes(Modes(good.bank, one.amplitudes[:, :3]), CONTACTS, one)
     with raises(EvaluationError, name="truth", value=0.0):
-        judge_modes(good, CONTACTS, replace(one, gains=0 * one.gains, quadrature=0 * one.gains))
+        compare_modes(good, CONTACTS, replace(one, gains=0 * one.gains, quadrature=0 * one.gains))
     broken = amplitudes()
     broken[3, 2] = math.nan
     with raises(EvaluationError, name="predicted", row=3):
-        judge_modes(rendered(broken), CONTACTS, one)
+        compare_modes(rendered(broken), CONTACTS, one)
     for widths, relative in ((-1.0, 0.1), (0.0, 0.0), (math.nan, 0.0)):
         with raises(EvaluationError, name="widths", value=(widths, relative)):
-            judge_modes(good, CONTACTS, one, widths=widths, relative=relative)
+            compare_modes(good, CONTACTS, one, widths=widths, relative=relative)

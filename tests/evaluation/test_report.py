@@ -17,7 +17,7 @@ from test_evaluation_run import planned
 
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.methods import METHODS
-from avmsf.evaluation.page import Heard, draw_spectrogram, keep_sound, listening_gain
+from avmsf.evaluation.page import StoredSound, draw_spectrogram, keep_sound, listening_gain
 from avmsf.evaluation.protocols import PUBLISHED, published_ratios
 from avmsf.evaluation.registry import title_of
 from avmsf.evaluation.report import write_page, write_summary
@@ -208,21 +208,21 @@ def test_a_kept_sound_is_as_loud_beside_the_recording_as_it_was(tmp_path: Path) 
     gain = listening_gain(recorded)
     for name, factor, peak in (("same", 1.0, 0.25), ("half", 0.5, 0.125), ("loud", 10.0, 1.0)):
         keep_sound(tmp_path / name, recorded * factor, sample_rate=8000.0, gain=gain)
-        heard = Heard.read(tmp_path / name)
+        heard = StoredSound.read(tmp_path / name)
         # One step of 16 bits.
         assert float(heard.samples.abs().max()) == pytest.approx(peak, abs=2e-4)
     keep_sound(tmp_path / "slow", recorded, sample_rate=400.0, gain=gain)
-    slow = Heard.read(tmp_path / "slow")
+    slow = StoredSound.read(tmp_path / "slow")
     assert (slow.sample_rate, len(slow.samples)) == (8000.0, 20 * 4000)
     keep_sound(tmp_path / "silent", torch.zeros(100), sample_rate=8000.0, gain=listening_gain(torch.zeros(100)))
     with raises(EvaluationError, file=tmp_path / "gone"):
-        Heard.read(tmp_path / "gone")
+        StoredSound.read(tmp_path / "gone")
 
 
 def test_a_pictures_line_is_where_the_tone_is(tmp_path: Path) -> None:
     time = torch.arange(16000) / 16000.0
     keep_sound(tmp_path / "tone", torch.sin(2 * math.pi * 1000 * time), sample_rate=16000.0, gain=0.5)
-    address = draw_spectrogram(Heard.read(tmp_path / "tone"), loudest=None, height=100)
+    address = draw_spectrogram(StoredSound.read(tmp_path / "tone"), loudest=None, height=100)
     picture = Image.open(io.BytesIO(base64.b64decode(address.partition(",")[2])))
     shades = torch.from_numpy(np.array(picture))
     # From the top, on a logarithmic scale of 60 Hz to 8 kHz; a Hann window is two bins, some rows, wide at 1 kHz.

@@ -24,7 +24,7 @@ from avmsf.field.uncertainty import (
 from avmsf.localization.locator import Locator
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
-from avmsf.plotting.uncertainty import draw_band, draw_doubt
+from avmsf.plotting.uncertainty import draw_band, draw_uncertainty
 from factories.believing_field import (
     BANK,
     DOWN,
@@ -218,10 +218,10 @@ def test_pictures_are_drawn_of_solids_and_of_sheets() -> None:
     field = sound_field(elastic_field(contacts, drawn_gains(contacts, seed=9)))
     points = bar_points()
     doubt = relative_gain_std(field, points)
-    sheet = draw_doubt(points, doubt, title="bar", struck=contacts, suggested=contacts[:2])
+    sheet = draw_uncertainty(points, doubt, title="bar", struck=contacts, suggested=contacts[:2])
     assert len(sheet.axes) == 2  # the sheet and its colors
     bent = points + torch.tensor([0.0, 0.0, 1.0]) * points[:, :1].square()
-    solid = draw_doubt(bent, doubt, title="bent", suggested=contacts[:3])
+    solid = draw_uncertainty(bent, doubt, title="bent", suggested=contacts[:3])
     assert len(solid.axes) == 7
     band = draw_band(spectrum_band(field, contacts[0]), title="one blow")
     assert band.axes[0].get_xlim() == (0.0, pytest.approx(1000.0, abs=5.0))
@@ -231,7 +231,7 @@ def test_marks_behind_the_object_are_not_drawn() -> None:
     generator = torch.Generator().manual_seed(0)
     ball = torch.nn.functional.normalize(torch.randn(3000, 3, generator=generator), dim=1)
     marks = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
-    picture = draw_doubt(ball, torch.ones(3000), title="ball", suggested=marks)
+    picture = draw_uncertainty(ball, torch.ones(3000), title="ball", suggested=marks)
     assert _numbers(picture) == [["1"], ["1"], ["1"], ["1"], ["2"], ["2"]]
 
 
@@ -240,7 +240,7 @@ def test_marks_on_the_other_side_of_a_wall_are_not_drawn() -> None:
     x, y = torch.meshgrid(torch.linspace(-1, 1, 60), torch.linspace(-1, 1, 60), indexing="ij")
     dish = torch.stack([x, y, 0.2 * (x.square() + y.square())], dim=2).reshape(-1, 3)
     marks, ways = torch.zeros(2, 3), torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
-    picture = draw_doubt(dish, torch.ones(3600), title="dish", suggested=marks, directions=ways)
+    picture = draw_uncertainty(dish, torch.ones(3600), title="dish", suggested=marks, directions=ways)
     assert _numbers(picture)[3:] == [["1"], ["2"], ["2"]]
 
 
@@ -266,6 +266,6 @@ def test_a_suggestion_that_no_side_shows_is_drawn_all_the_same() -> None:
     cube = 2 * torch.rand(6000, 3, generator=generator) - 1
     marks, ways = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]), torch.tensor([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     for directions in (None, ways):
-        shown = _numbers(draw_doubt(cube, torch.ones(6000), title="cube", suggested=marks, directions=directions))
+        shown = _numbers(draw_uncertainty(cube, torch.ones(6000), title="cube", suggested=marks, directions=directions))
         assert sum("1" in side for side in shown) > 1
         assert sum("2" in side for side in shown) == 1

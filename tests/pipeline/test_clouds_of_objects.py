@@ -12,7 +12,7 @@ from avmsf.evaluation.protocols import PROTOCOLS
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.runner import Evaluation, run_object
 from avmsf.evaluation.simple_methods import NearestRecording
-from avmsf.evaluation.splits import Judging
+from avmsf.evaluation.splits import MetricSettings
 from avmsf.evaluation.task import Task
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import write_splats
@@ -57,7 +57,7 @@ def test_methods_get_the_gaussians_of_their_object_and_views(tmp_path: Path) -> 
             (Asking(),),
             PlateLooks(),
             NoBodies(),
-            judging=Judging(cdpam=False),
+            metric_settings=MetricSettings(cdpam=False),
             clouds=given,
         )
         run_object(evaluation, "a", results)

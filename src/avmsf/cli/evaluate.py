@@ -28,7 +28,7 @@ from avmsf.evaluation.report import PAGE, SUMMARY, TABLES, write_figures, write_
 from avmsf.evaluation.report_tables import Section
 from avmsf.evaluation.results import IDENTITY, ResultsFolder, write_json
 from avmsf.evaluation.runner import Evaluation, RunProgress, Workers, run_objects
-from avmsf.evaluation.splits import Judging
+from avmsf.evaluation.splits import MetricSettings
 from avmsf.evaluation.summary import curves, draw_learning_curve
 from avmsf.evaluation.task import Look, Looking, Method
 from avmsf.modal.extraction.finders import finder_named
@@ -181,7 +181,7 @@ def evaluation_of(
         looks,
         ObjectBodies(dataset, kept, options.geometry, body, scene, device=device),
         options.seed,
-        Judging(level=options.amplitude_scale, cdpam=cdpam, cdpam_contacts=options.cdpam_contacts),
+        MetricSettings(level=options.amplitude_scale, cdpam=cdpam, cdpam_contacts=options.cdpam_contacts),
         finder_named(options.extraction, options.modes),
         {"scene": asdict(given), "paper": asdict(paper), "geometry": options.geometry, "body": asdict(body)},
         looks.cloud,

@@ -119,7 +119,7 @@ def draw_field(
     from avmsf.plotting.pictures import draw_gains, draw_modes, save_picture
     from avmsf.plotting.spectrograms import draw_spectrograms
     from avmsf.plotting.surfaces import draw_surface
-    from avmsf.plotting.uncertainty import draw_band, draw_doubt
+    from avmsf.plotting.uncertainty import draw_band, draw_uncertainty
 
     name = field.origin.capture or "field"
     modes = modes_words(len(field.bank), int((~field.is_mode).sum()))
@@ -140,7 +140,7 @@ def draw_field(
         )
     if has_posterior(field):
         std, title = relative_gain_std(field, points), f"uncertainty of the gains of {name}"
-        pictures["uncertainty"] = draw_doubt(points, std, title=title, struck=training_contacts(field))
+        pictures["uncertainty"] = draw_uncertainty(points, std, title=title, struck=training_contacts(field))
         pictures["spectrum"] = draw_band(
             spectrum_band(field, points[0]), title=f"{name}: one impact, with its uncertainty"
         )

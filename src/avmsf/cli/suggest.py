@@ -18,7 +18,7 @@ from avmsf.field.store import load
 from avmsf.field.suggest import Suggestions, suggest
 from avmsf.field.uncertainty import relative_gain_std, unedited_mixture
 from avmsf.plotting.pictures import save_picture
-from avmsf.plotting.uncertainty import draw_doubt
+from avmsf.plotting.uncertainty import draw_uncertainty
 
 _DRAWN_POINTS = 4000
 
@@ -52,7 +52,7 @@ def run(options: Options) -> int:
         doing("drawing the uncertainty")
         step = max(1, len(gains.points) // _DRAWN_POINTS)
         points = gains.points[::step]
-        picture = draw_doubt(
+        picture = draw_uncertainty(
             points,
             relative_gain_std(field, points),
             title=f"{field.origin.capture or 'field'}: uncertainty, and where to record next",

@@ -39,7 +39,7 @@ from avmsf.editing.material import change_material
 from avmsf.editing.reference import Reference
 from avmsf.errors import AvmsfWarning, CaptureError, EditError, EvaluationError, ExtractionError
 from avmsf.evaluation.clap import Clap
-from avmsf.evaluation.editing_objects import KnownObject, amplitudes_of, heard_modes
+from avmsf.evaluation.editing_objects import KnownObject, amplitudes_of, audible_modes
 from avmsf.evaluation.metrics import default_fft_sizes
 from avmsf.evaluation.mode_embedding import MaterialSpace
 from avmsf.fem.material import MATERIALS
@@ -255,7 +255,7 @@ class Generation:
         recording = Recording(f"generated from {task.words()!r}", made[None].numpy(), rate, "FLOAT")
         sound = torch.from_numpy(np.array(prepare(recording, CaptureSettings()).sound))[None]
         modes = extract_sounds(sound, sample_rate=rate, method=self.finder)
-        bank = heard_modes(modes.bank, torch.complex(modes.gains.double(), modes.quadrature.double()))
+        bank = audible_modes(modes.bank, torch.complex(modes.gains.double(), modes.quadrature.double()))
         return Edited(bank, sound.float(), rate)
 
 
@@ -308,7 +308,7 @@ def towards_words(
 def heard(edited: SoundField, task: EditTask) -> Edited:
     """Return a field's modes and sounds at the task's contacts."""
     amplitudes = amplitudes_of(edited, task.contacts)
-    bank = heard_modes(edited.bank, amplitudes, sample_rate=edited.sample_rate)
+    bank = audible_modes(edited.bank, amplitudes, sample_rate=edited.sample_rate)
     return Edited(bank, edited.render(task.contacts), edited.sample_rate)
 
 

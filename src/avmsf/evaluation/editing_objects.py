@@ -62,7 +62,7 @@ self-intersecting meshes. There is one of glass."""
 
 SHAPES = ("bowl", "mug", "plate", "pot")
 """Kinds of the simulated objects in the clusters."""
-STRANGERS = ("goblet", "tray")
+OTHER_SHAPES = ("goblet", "tray")
 """Kinds of the edited objects and of the references: no cluster has an object of the same shape."""
 POISSON = 0.27
 _MODES = 40
@@ -120,7 +120,7 @@ class KnownObject:
     @property
     def bank(self) -> ModalBank:
         """Its audible modes."""
-        return heard_modes(self.modes.bank, torch.complex(self.modes.gains.double(), self.modes.quadrature.double()))
+        return audible_modes(self.modes.bank, torch.complex(self.modes.gains.double(), self.modes.quadrature.double()))
 
     @cached_property
     def sound_field(self) -> SoundField:
@@ -139,7 +139,7 @@ class KnownObject:
         )
 
 
-def heard_modes(bank: ModalBank, amplitudes: Tensor, *, sample_rate: float = math.inf) -> ModalBank:
+def audible_modes(bank: ModalBank, amplitudes: Tensor, *, sample_rate: float = math.inf) -> ModalBank:
     """Return the modes below half the sample rate (Hz) that are within 60 dB of the loudest, in energy.
 
     `amplitudes` [contacts, modes] are complex or real; a mode's energy is their mean square over 4 d. A mode that an
@@ -277,7 +277,7 @@ def simulated_objects(
 
 
 def amplitudes_of(field: SoundField, contacts: Float64[Tensor, "contacts 3"]) -> Tensor:
-    """Return the complex amplitudes of a field's modes at contacts, for `heard_modes`."""
+    """Return the complex amplitudes of a field's modes at contacts, for `audible_modes`."""
     known = field.known(contacts)
     quadrature = torch.zeros_like(known.mean) if known.quadrature is None else known.quadrature
     return torch.complex(known.mean.double(), quadrature.double())

@@ -196,7 +196,7 @@ class GridField(FieldVariant):
     """A field whose settings are chosen from a grid on validation contacts, a part of the training contacts alone.
 
     The quarter of the training places that farthest-point sampling takes last is held out; every candidate is fitted
-    to the others and judged there by ENV (paper, supplement), the mean over contacts of the root mean square difference
+    to the others and scored there by ENV (paper, supplement), the mean over contacts of the root mean square difference
     of envelopes. The best is fitted to all training contacts; of equals the first. With fewer than six places nothing
     is held out, and the method's own settings are taken. Modes are those of all training contacts.
     """

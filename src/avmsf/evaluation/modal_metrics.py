@@ -190,7 +190,7 @@ class ModalScores:
         }
 
 
-def judge_modes(
+def compare_modes(
     renderer: ModalRenderer,
     contacts: Float[Tensor, "contacts 3"],
     truth: Truth,

@@ -165,7 +165,7 @@ class ObjectBodies:
             return stages.shape()
 
 
-def draw_stranger(dataset: Dataset, identifier: str, train: Impacts, *, seed: int) -> Float[Tensor, " samples"]:
+def draw_other_recording(dataset: Dataset, identifier: str, train: Impacts, *, seed: int) -> Float[Tensor, " samples"]:
     """Return a recording of another object of the dataset, at the rate and of the length of `train`.
 
     The draw depends on the seed and the object alone. Objects that cannot be read are passed over. Shorter recordings

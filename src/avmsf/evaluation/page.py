@@ -58,7 +58,7 @@ def keep_sound(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: flo
 
 
 @dataclass(frozen=True, eq=False)
-class Heard:
+class StoredSound:
     """A kept sound, read back."""
 
     content: bytes
@@ -67,7 +67,7 @@ class Heard:
     sample_rate: float
 
     @classmethod
-    def read(cls, path: Path) -> "Heard":
+    def read(cls, path: Path) -> "StoredSound":
         """Read a file that `keep_sound` wrote. Raises EvaluationError where it is gone or damaged."""
         try:
             content = path.read_bytes()
@@ -84,7 +84,7 @@ class Heard:
         return f"data:audio/flac;base64,{base64.b64encode(self.content).decode()}"
 
 
-def draw_spectrogram(heard: Heard, *, loudest: float | None, width: int = 240, height: int = 120) -> str:
+def draw_spectrogram(heard: StoredSound, *, loudest: float | None, width: int = 240, height: int = 120) -> str:
     """Return the address of a picture of a sound: time to the right, frequency upwards on a logarithmic scale.
 
     Colors span 80 dB below `loudest`, the largest magnitude of the recording it is compared with; None is its own.
@@ -95,18 +95,18 @@ def draw_spectrogram(heard: Heard, *, loudest: float | None, width: int = 240, h
     return _png((shown * 255).round().to(torch.uint8).numpy())
 
 
-def loudest_of(heard: Heard, *, width: int = 240, height: int = 120) -> float:
+def loudest_of(heard: StoredSound, *, width: int = 240, height: int = 120) -> float:
     """Return the level, dB, of the brightest point in a sound's picture."""
     return float(_levels(heard, width, height).max())
 
 
-def picture_span(heard: Heard) -> tuple[float, float, float]:
+def picture_span(heard: StoredSound) -> tuple[float, float, float]:
     """Return a picture's seconds, and its lowest and highest frequency, Hz."""
     highest = heard.sample_rate / 2
     return len(heard.samples) / heard.sample_rate, min(_LOWEST, highest / 50), highest
 
 
-def _levels(heard: Heard, width: int, height: int) -> Float64[Tensor, "height width"]:
+def _levels(heard: StoredSound, width: int, height: int) -> Float64[Tensor, "height width"]:
     _, lowest, highest = picture_span(heard)
     return log_spectrogram(
         heard.samples, sample_rate=heard.sample_rate, lowest=lowest, highest=highest, width=width, height=height
@@ -211,7 +211,7 @@ def _cell(words: str, *, best: bool) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class HeardContact:
+class StoredContact:
     """One test contact with stored sounds, and the predictions of all methods."""
 
     record: ObjectRecord
@@ -222,15 +222,15 @@ class HeardContact:
     made: tuple[tuple[CaseRecord, Outcome], ...]
 
 
-def _contacts(records: Sequence[ObjectRecord]) -> Iterator[HeardContact]:
+def _contacts(records: Sequence[ObjectRecord]) -> Iterator[StoredContact]:
     """Yield contacts with sounds: one of each object first, then a second one, and so on."""
     heard = [record for record in records if any(case.sounds for case in record.cases)]
-    chosen = [list(heard_contacts(heard[row])) for row in spread(len(heard), OBJECTS)]
+    chosen = [list(stored_contacts(heard[row])) for row in spread(len(heard), OBJECTS)]
     for place in range(max(map(len, chosen), default=0)):
         yield from (contacts[place] for contacts in chosen if place < len(contacts))
 
 
-def heard_contacts(record: ObjectRecord) -> Iterator[HeardContact]:
+def stored_contacts(record: ObjectRecord) -> Iterator[StoredContact]:
     """Yield an object's contacts with stored sounds."""
     files = {name: file for case in reversed(record.cases) for name, file in case.sounds.items()}
     for name, file in files.items():
@@ -240,7 +240,7 @@ def heard_contacts(record: ObjectRecord) -> Iterator[HeardContact]:
             for each in record.outcomes
             if each.case == case.key and name in each.sounds
         )
-        yield HeardContact(record, name, file, made)
+        yield StoredContact(record, name, file, made)
 
 
 def _listening(records: Sequence[ObjectRecord], folder: Path) -> str:
@@ -267,8 +267,8 @@ def _listening(records: Sequence[ObjectRecord], folder: Path) -> str:
     return f'<section id="listen"><h2>Spectrograms and sounds</h2><p>{escape(words)}</p>{blocks}</section>'
 
 
-def _contact_block(contact: HeardContact, folder: Path) -> str:
-    recorded = Heard.read(folder / contact.recorded)
+def _contact_block(contact: StoredContact, folder: Path) -> str:
+    recorded = StoredSound.read(folder / contact.recorded)
     loudest = loudest_of(recorded)
     seconds, lowest, highest = picture_span(recorded)
     span = f"{seconds:.2g} s, {lowest:.0f} Hz to {highest:.0f} Hz"
@@ -282,12 +282,12 @@ def _contact_block(contact: HeardContact, folder: Path) -> str:
             for metric, heading in (("l1", "L1"), ("l1_log", "L1-log"), ("relative_stft", "relative STFT"))
             if (values := outcome.values.get(metric)) is not None
         ]
-        heard = Heard.read(folder / outcome.sounds[contact.name])
+        heard = StoredSound.read(folder / outcome.sounds[contact.name])
         cards.append(_card(title, ", ".join(told), heard, loudest, contact.name))
     return f'<h4>{escape(contact.name)}</h4><div class="sounds">{"".join(cards)}</div>'
 
 
-def _card(title: str, words: str, heard: Heard, loudest: float, contact: str, *, kind: str = "") -> str:
+def _card(title: str, words: str, heard: StoredSound, loudest: float, contact: str, *, kind: str = "") -> str:
     said = escape(f"{title}, {contact}")
     return (
         f'<figure{kind}><img alt="Spectrogram: {said}" src="{draw_spectrogram(heard, loudest=loudest)}">'

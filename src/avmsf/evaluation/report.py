@@ -9,7 +9,7 @@ from torch import Tensor
 from avmsf._utils.files import write_whole
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.localization import read_map
-from avmsf.evaluation.page import Heard, heard_contacts, page
+from avmsf.evaluation.page import StoredSound, page, stored_contacts
 from avmsf.evaluation.report_tables import Section, markdown, sections
 from avmsf.evaluation.results import ObjectRecord, ResultsFolder, write_json
 from avmsf.evaluation.summary import missing_of, summarize, times_of
@@ -68,11 +68,13 @@ def _write_spectrograms(record: ObjectRecord, folder: Path) -> list[Path]:
     paths = []
     for label in labels:
         rows: dict[str, dict[str, Tensor]] = {}
-        for contact in heard_contacts(record):
+        for contact in stored_contacts(record):
             files = {outcome.method: outcome.sounds for case, outcome in contact.made if case.label == label}
             if files:
-                heard = Heard.read(folder / contact.recorded)
-                made = {method: Heard.read(folder / sounds[contact.name]).samples for method, sounds in files.items()}
+                heard = StoredSound.read(folder / contact.recorded)
+                made = {
+                    method: StoredSound.read(folder / sounds[contact.name]).samples for method, sounds in files.items()
+                }
                 rows[contact.name] = {_RECORDED: heard.samples, **made}
         if not rows:
             continue

@@ -26,12 +26,12 @@ from avmsf.evaluation.field_methods import configured
 from avmsf.evaluation.localization import located, write_map
 from avmsf.evaluation.methods import report_of
 from avmsf.evaluation.modal_metrics import truth_at, truth_from_first_sample, truth_of
-from avmsf.evaluation.objects import draw_stranger
+from avmsf.evaluation.objects import draw_other_recording
 from avmsf.evaluation.page import keep_sound, listening_gain
 from avmsf.evaluation.protocols import EvaluationProtocol
 from avmsf.evaluation.results import ENCODER, CaseRecord, ObjectRecord, Outcome, ResultsFolder, failure_of
-from avmsf.evaluation.splits import Judgement, Judging, align_split, spread
-from avmsf.evaluation.task import FromFiles, Look, Looking, Method, Renderer, Task, expect_renderer
+from avmsf.evaluation.splits import MetricSettings, MetricValues, align_split, spread
+from avmsf.evaluation.task import FromFiles, Looking, Method, Renderer, Task, expect_renderer
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.body_family import BodyFamily
 from avmsf.field.gains.elastic import CandidateBodies
@@ -68,7 +68,7 @@ class Evaluation:
     bodies: BodyMaker
     seed: int = 0
     """Random seed of the methods."""
-    judging: Judging = field(default_factory=Judging)
+    metric_settings: MetricSettings = field(default_factory=MetricSettings)
     finder: ModeFinder = field(default_factory=HighResolution)
     """Extraction of modes, once per case."""
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -94,7 +94,7 @@ class Evaluation:
         Raises EvaluationError where the folder holds other ones, and where a metric's package is not installed.
         """
         if not self.protocol.locating:
-            self.judging.prepare()
+            self.metric_settings.prepare()
         identity = {
             "version": version("avmsf"),
             "source": source_digest("avmsf.cli.evaluate"),
@@ -103,7 +103,7 @@ class Evaluation:
             "dataset": self.title,
             "seed": self.seed,
             "time_zero": self.time_zero,
-            "metrics": _plain(self.judging),
+            "metrics": _plain(self.metric_settings),
             "modes": _plain(self.finder),
             "settings": dict(self.settings),
         }
@@ -147,42 +147,45 @@ class _Recordings:
         self.train, self.test = align_split(self.train, self.test, modes=self.modes)
 
 
+@dataclass(frozen=True, eq=False)
+class ObjectData:
+    """What all cases of an object share; functions compute their results once."""
+
+    identifier: str
+    impacts: Impacts
+    """Recordings on which all methods are scored."""
+    features: Callable[..., FeatureField]
+    bodies: Callable[[], CandidateBodies]
+    family: Callable[[], BodyFamily]
+    stranger: Callable[[], Float[Tensor, " samples"]]
+    """Draws a recording of another object."""
+    truth: Truth | None = None
+    material: str | None = None
+    vertices: Float[Tensor, "vertices 3"] | None = None
+    """Of the object's mesh, meters."""
+    own_starts: Impacts | None = None
+    """Where `impacts` start at their peaks, the same recordings with the dataset's own starts, for fields that are not
+    of the paper's configuration: from its peak a recording's modes have phases of its own, which hide the signs of the
+    gains."""
+
+
 class CaseRun:
     """Runs methods in one case, with modes that are found once and kept in a file."""
 
     def __init__(
-        self,
-        evaluation: Evaluation,
-        identifier: str,
-        case: Case,
-        impacts: Impacts,
-        truth: Truth | None,
-        *,
-        folder: Path,
-        place: str,
-        look: Callable[[Look], FeatureField],
-        bodies: Callable[[], CandidateBodies],
-        family: Callable[[], BodyFamily],
-        material: str | None,
-        stranger: Callable[[], Float[Tensor, " samples"]],
-        vertices: Float[Tensor, "vertices 3"] | None,
-        listened: bool,
-        own_starts: Impacts | None = None,
+        self, evaluation: Evaluation, data: ObjectData, case: Case, *, folder: Path, number: int, listened: bool
     ) -> None:
-        """Prepare a case of an object; `place` is its own path beneath the results' folder.
-
-        All methods are scored on `impacts`. Where these start at their peaks, `own_starts` are the same recordings with
-        the dataset's own starts, for fields that are not of the paper's configuration: from its peak a recording's
-        modes have phases of its own, which hide the signs of the gains.
-        """
-        self.evaluation, self.identifier, self.case, self.impacts = evaluation, identifier, case, impacts
-        modes, finder = folder / "modes", evaluation.finder
-        self.scored = self.own = _Recordings(impacts, case, finder, modes / f"{place}.safetensors")
-        if own_starts is not None:
-            self.own = _Recordings(own_starts, case, finder, modes / f"{place} own starts.safetensors")
-        self.truth = None if truth is None else truth_at(truth, self.scored.test.names)
-        self.folder, self.place, self.look, self.stranger = folder, place, look, stranger
-        self.bodies, self.family, self.material, self.vertices = bodies, family, material, vertices
+        """Prepare the `number`-th case of an object; with `listened`, some of its sounds are stored in `folder`."""
+        self.evaluation, self.data, self.case, self.folder = evaluation, data, case, folder
+        self.place = f"{data.identifier}/{number:02d}"
+        path, finder = folder / "modes" / f"{self.place}.safetensors", evaluation.finder
+        self.scored = self.own = _Recordings(data.impacts, case, finder, path)
+        if data.own_starts is not None:
+            self.own = _Recordings(
+                data.own_starts, case, finder, path.with_name(f"{number:02d} own starts.safetensors")
+            )
+        self.truth = None if data.truth is None else truth_at(data.truth, self.scored.test.names)
+        self.features = partial(data.features, data.identifier, views=case.views)
         self.listened = spread(len(case.test), LISTENED) if listened else []
         self.shared = 0.0
 
@@ -201,14 +204,14 @@ class CaseRun:
             with torch.no_grad():
                 sounds = renderer.render(recordings.test.contacts, directions=recordings.test.directions)
             render_seconds = time.perf_counter() - begun
-            judgement, maps = self._judgement(method, recordings, renderer, sounds)
+            values, maps = self._values(method, recordings, renderer, sounds)
         except Exception as error:  # A fault in one method must not cost the others their hours.
             return Outcome(self.case.key, method.name, failure=failure_of(error))
         return Outcome(
             self.case.key,
             method.name,
-            judgement.values,
-            judgement.figures,
+            values.values,
+            values.figures,
             round(fit_seconds, 4),
             round(render_seconds, 4),
             self._keep_sounds(method.name, sounds),
@@ -222,21 +225,23 @@ class CaseRun:
         seconds, self.shared = known.shared_seconds + self.shared, 0.0
         return replace(known, sounds=sounds, shared_seconds=round(seconds, 4))
 
-    def _judgement(
+    def _values(
         self, method: Method, recordings: _Recordings, renderer: Renderer, sounds: Float[Tensor, "contacts samples"]
-    ) -> tuple[Judgement, dict[str, str]]:
+    ) -> tuple[MetricValues, dict[str, str]]:
         """Return the metrics, and the files of contacts' maps by the names of their recordings."""
         if not self.evaluation.protocol.locating:
-            loudest = float(self.impacts.sounds.abs().max())
-            return self.evaluation.judging.judge(renderer, sounds, self.scored.test, self.truth, loudest=loudest), {}
-        points, settings = self._shared(self.look)("surface").points, configured(method)
+            loudest = float(self.data.impacts.sounds.abs().max())
+            return self.evaluation.metric_settings.values(
+                renderer, sounds, self.scored.test, self.truth, loudest=loudest
+            ), {}
+        points, settings = self._shared(self.features)("surface").points, configured(method)
         published = settings is not None and settings.published
         found = located(
             renderer,
             recordings.train,
             recordings.test,
             points,
-            vertices=self.vertices,
+            vertices=self.data.vertices,
             published=published,
             map_rows=self.listened,
         )
@@ -245,21 +250,21 @@ class CaseRun:
             file = f"maps/{self.place}/{row:03d} {_file_word(method.name)}.safetensors"
             write_map(self.folder / file, each, truth=recordings.test.contacts[row])
             maps[recordings.test.names[row]] = file
-        return Judgement(dict(found.errors), {}), maps
+        return MetricValues(dict(found.errors), {}), maps
 
     def _task(self, recordings: _Recordings) -> Task:
         return Task(
-            name=self.identifier,
+            name=self.data.identifier,
             train=recordings.train,
-            contacts=self.impacts.contacts,
-            names=self.impacts.names,
+            contacts=self.data.impacts.contacts,
+            names=self.data.impacts.names,
             seed=self.evaluation.seed,
             modes=self._shared(recordings.modes),
-            features=self._shared(self.look),
-            bodies=self._shared(self.bodies),
-            stranger=self._shared(self.stranger),
-            family=self._shared(self.family),
-            material=self.material,
+            features=self._shared(self.features),
+            bodies=self._shared(self.data.bodies),
+            stranger=self._shared(self.data.stranger),
+            family=self._shared(self.data.family),
+            material=self.data.material,
             gaussians=self._gaussians,
             device=self.evaluation.device,
         )
@@ -274,10 +279,10 @@ class CaseRun:
     def _gaussians(self) -> GaussianCloud:
         if self.evaluation.clouds is None:
             raise EvaluationError.expected(
-                "Gaussians, views or a mesh", name=self.identifier, advice="give one, or omit the method"
+                "Gaussians, views or a mesh", name=self.data.identifier, advice="give one, or omit the method"
             )
         with self._sharing():
-            return self.evaluation.clouds(self.identifier, self.case.views)
+            return self.evaluation.clouds(self.data.identifier, self.case.views)
 
     @contextmanager
     def _sharing(self) -> Iterator[None]:
@@ -333,34 +338,23 @@ def run_object(
         record = _described(_of_same_recordings(record, digest, evaluation, results), impacts, facts, cases)
         results.write(record)
         # Each made once for all cases; so is the error of what cannot be made.
-        features = once(evaluation.features)
-        bodies = once(partial(evaluation.bodies, identifier))
-        family = once(partial(evaluation.bodies.family, identifier))
-        stranger = once(partial(draw_stranger, evaluation.dataset, identifier, impacts, seed=evaluation.seed))
+        data = ObjectData(
+            identifier,
+            impacts,
+            features=once(evaluation.features),
+            bodies=once(partial(evaluation.bodies, identifier)),
+            family=once(partial(evaluation.bodies.family, identifier)),
+            stranger=once(partial(draw_other_recording, evaluation.dataset, identifier, impacts, seed=evaluation.seed)),
+            truth=truth,
+            material=facts.material,
+            vertices=None if surface is None or not len(surface.faces) else surface.vertices,
+            own_starts=own,
+        )
         firsts = {case.label: case.key for case in reversed(cases)}
         for number, case in enumerate(cases, 1):
-            record = _run_case(
-                CaseRun(
-                    evaluation,
-                    identifier,
-                    case,
-                    impacts,
-                    truth,
-                    folder=results.path,
-                    place=f"{identifier}/{number:02d}",
-                    look=partial(features, identifier, views=case.views),
-                    bodies=bodies,
-                    family=family,
-                    material=facts.material,
-                    stranger=stranger,
-                    vertices=None if surface is None or not len(surface.faces) else surface.vertices,
-                    listened=firsts[case.label] == case.key,
-                    own_starts=own,
-                ),
-                record,
-                results,
-                log,
-            )
+            listened = firsts[case.label] == case.key
+            run = CaseRun(evaluation, data, case, folder=results.path, number=number, listened=listened)
+            record = _run_case(run, record, results, log)
 
 
 def _of_same_recordings(
@@ -423,7 +417,7 @@ def _run_case(
     """Run the methods that have no figures in a case, and return the object's record with them."""
     key = run.case.key
     for method in run.evaluation.methods:
-        digest = method.digest(run.identifier) if isinstance(method, FromFiles) else ""
+        digest = method.digest(run.data.identifier) if isinstance(method, FromFiles) else ""
         if record.done(key, method.name, digest):
             continue
         if log is not None:
@@ -479,21 +473,21 @@ def run_objects(
     `Evaluation.begin` and `run_object`, and EvaluationError where ray is needed and not installed.
     """
     who = workers or Workers()
-    heard = progress or (lambda event: None)
+    report = progress or (lambda event: None)
     if who.address is None and who.count == 1:
         evaluation.begin(results)
         for done, identifier in enumerate(identifiers):
 
             def log(words: str, identifier: str = identifier, done: int = done) -> None:
-                heard(RunProgress(f"{identifier}: {words}", done, len(identifiers)))
+                report(RunProgress(f"{identifier}: {words}", done, len(identifiers)))
 
             run_object(evaluation, identifier, results, log)
-            heard(RunProgress(f"{identifier}: done", done + 1, len(identifiers)))
+            report(RunProgress(f"{identifier}: done", done + 1, len(identifiers)))
         return
     ray = _ray()
     evaluation.begin(results)
     with _cluster(ray, who):
-        _run_remotely(ray, evaluation, identifiers, results, heard)
+        _run_remotely(ray, evaluation, identifiers, results, report)
 
 
 def _run_remotely(
@@ -501,13 +495,13 @@ def _run_remotely(
     evaluation: Evaluation,
     identifiers: Sequence[str],
     results: ResultsFolder,
-    heard: Callable[[RunProgress], None],
+    report: Callable[[RunProgress], None],
 ) -> None:
     # max_retries: a worker that was killed for memory would be killed again.
     remote = ray.remote(num_cpus=1, max_retries=0)(_run_alone)
     shared = ray.put((evaluation, results))
     pending: dict[Any, str] = {remote.remote(shared, identifier): identifier for identifier in identifiers}
-    heard(RunProgress(f"{len(pending)} objects on ray", 0, len(identifiers)))
+    report(RunProgress(f"{len(pending)} objects on ray", 0, len(identifiers)))
     try:
         while pending:
             # A time limit lets Ctrl-C through.
@@ -526,7 +520,7 @@ def _run_remotely(
                         name=identifier,
                         advice="run the command again, with fewer --workers if memory ran out",
                     ) from error
-                heard(RunProgress(f"{identifier}: done", len(identifiers) - len(pending), len(identifiers)))
+                report(RunProgress(f"{identifier}: done", len(identifiers) - len(pending), len(identifiers)))
     finally:
         for reference in pending:
             ray.cancel(reference, force=True)

@@ -26,7 +26,7 @@ from avmsf.evaluation.metrics import (
     relative_stft_error,
     validate,
 )
-from avmsf.evaluation.modal_metrics import ModalRenderer, judge_modes
+from avmsf.evaluation.modal_metrics import ModalRenderer, compare_modes
 from avmsf.evaluation.task import Renderer, expect_renderer
 from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.points import farthest_points
@@ -211,7 +211,7 @@ def score(
 
 
 @dataclass(frozen=True, eq=False)
-class Judgement:
+class MetricValues:
     """Metrics of one method's sounds at the test contacts."""
 
     values: dict[str, tuple[float | None, ...]]
@@ -221,7 +221,7 @@ class Judgement:
 
 
 @dataclass(frozen=True)
-class Judging:
+class MetricSettings:
     """Which metrics are computed."""
 
     convention: PaperConvention = PAPER
@@ -247,7 +247,7 @@ class Judging:
         if self.cdpam:
             _cdpam()
 
-    def judge(
+    def values(
         self,
         renderer: Renderer,
         sounds: Float[Tensor, "..."],
@@ -255,7 +255,7 @@ class Judging:
         truth: Truth | None,
         *,
         loudest: float,
-    ) -> Judgement:
+    ) -> MetricValues:
         """Compute the metrics of `renderer` at the test contacts; `truth`, if known, has the rows of `test`.
 
         Its time counts from the first sample of the recordings, as the renderer's does (`truth_from_first_sample`).
@@ -276,7 +276,7 @@ class Judging:
         }
         if self.cdpam:
             values["cdpam"] = self._cdpam_values(sounds, test)
-        return Judgement(values, {} if truth is None else _modal_figures(renderer, test, truth))
+        return MetricValues(values, {} if truth is None else _modal_figures(renderer, test, truth))
 
     def _cdpam_values(self, sounds: Float[Tensor, "contacts samples"], test: Impacts) -> tuple[float | None, ...]:
         rows = spread(len(test), self.cdpam_contacts or len(test))
@@ -296,7 +296,7 @@ def _modal_figures(renderer: Renderer, test: Impacts, truth: Truth) -> dict[str,
     """Return how near a method's modes and gains are to the truth; nothing of methods that have no modes."""
     if not isinstance(renderer, ModalRenderer):
         return {}
-    figures = judge_modes(renderer, test.contacts, truth, directions=test.directions).figures()
+    figures = compare_modes(renderer, test.contacts, truth, directions=test.directions).figures()
     # Gains at a single contact agree with any others.
     return {name: value for name, value in figures.items() if name != "mac" or len(test) > 1}
 

@@ -24,7 +24,7 @@ _INCHES = 4.0
 
 
 @styled
-def draw_doubt(
+def draw_uncertainty(
     points: Float[Tensor, "points 3"],
     doubt: Float[Tensor, " points"],
     *,
