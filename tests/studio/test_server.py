@@ -328,6 +328,7 @@ def test_a_reconstruction_needs_two_strikes(capture: Served) -> None:
     assert capture.ask("DELETE", "jobs/unknown").status == 404
 
 
+@pytest.mark.slow
 def test_a_reconstruction_that_fails_says_why_and_one_can_be_stopped(tmp_path: Path) -> None:
     folder = fill_plate(tmp_path / "plate")
     rows = (folder / "impacts.csv").read_text().splitlines()
@@ -549,6 +550,7 @@ def test_the_browsers_command_line_holds_no_secret(tmp_path: Path, monkeypatch: 
     assert (tmp_path / "open.html").stat().st_mode & 0o777 == 0o600
 
 
+@pytest.mark.slow
 def test_the_command_serves_until_it_is_told_to_end(tmp_path: Path) -> None:
     opened = open_plate(tmp_path / "opened")
     command = [sys.executable, "-c", "import sys; from avmsf.cli import main; sys.exit(main())", "studio"]
