@@ -59,13 +59,6 @@ def test_position_features_know_neither_the_objects_place_nor_its_size():
     assert elsewhere.half_diagonal == pytest.approx(7 * there.half_diagonal, rel=1e-6)
 
 
-def test_normals_follow_the_positions():
-    normals = torch.nn.functional.normalize(box() - 0.3, dim=1)
-    field = FeatureField.from_points(box(), normals=normals)
-    assert torch.equal(field.features[:, :3], FeatureField.from_points(box()).features)
-    assert torch.equal(field.features[:, 3:], normals)
-
-
 def test_a_mesh_gives_points_on_it_and_points_alone_are_kept():
     vertices = torch.tensor([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.0, 0.1, 0.0]])
     generator = torch.Generator().manual_seed(3)

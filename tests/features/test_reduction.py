@@ -28,17 +28,6 @@ def test_whitened_components_are_uncorrelated_and_of_unit_variance():
     assert float(reduced.mean(0).abs().max()) < 1e-5
 
 
-@pytest.mark.parametrize(("whitening", "deviations"), [(0.0, [1.0, 4 / 9, 1 / 9]), (0.5, [1.0, 2 / 3, 1 / 3])])
-def test_without_whitening_components_keep_their_proportions(whitening, deviations):
-    reduced = reduce(field(), 3, whitening=whitening)
-    found = reduced.features.double().square().mean(0).sqrt()
-    torch.testing.assert_close(found, torch.tensor(deviations, dtype=torch.float64), rtol=1e-4, atol=0)
-    if whitening == 0:
-        # A rotation and one scale: distances between points keep their proportions.
-        before, after = torch.pdist(field().features.double()), torch.pdist(reduced.features.double())
-        torch.testing.assert_close(after, before / 9, rtol=1e-4, atol=1e-4)
-
-
 def test_no_more_components_come_out_than_there_are():
     reduced = reduce(field(), 32)
     assert reduced.features.shape == (400, 3)
@@ -59,9 +48,6 @@ def test_features_that_tell_nothing_are_refused():
         reduce(alike, 2)
     with raises(SceneError, name="dim", value=0):
         reduce(field(), 0)
-    for whitening in (1.5, float("nan")):
-        with raises(SceneError, name="whitening"):
-            reduce(field(), 3, whitening=whitening)
 
 
 def test_a_size_is_the_root_mean_square_length():

@@ -113,15 +113,14 @@ def test_more_clusters_than_positions_are_refused():
         cluster(cloud(0), 1)
 
 
-def test_samples_lie_on_the_surface_evenly_with_its_normals():
+def test_samples_lie_on_the_surface_evenly():
     box = trimesh.creation.box(extents=(1.0, 2.0, 4.0))
     vertices, faces = torch.tensor(np.asarray(box.vertices)), torch.tensor(np.asarray(box.faces))
     samples = sample_surface(vertices, faces, 6000, generator=torch.Generator().manual_seed(0))
-    half = torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64)
-    # Outward, along one axis, on that side of the box.
-    assert torch.allclose((samples.points * samples.normals).sum(dim=1), samples.normals.abs() @ half, atol=1e-12)
-    assert torch.allclose(samples.normals.abs().sum(dim=1), torch.tensor(1.0, dtype=torch.float64), atol=1e-12)
-    shares = samples.normals.abs().mean(dim=0)
+    # On a side of the box, the one axis along which they are at its end.
+    ends = (samples.abs() - torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64)).abs() < 1e-12
+    assert bool(ends.any(dim=1).all())
+    shares = ends.double().mean(dim=0)
     areas = torch.tensor([8.0, 4.0, 2.0], dtype=torch.float64) / 14.0
     # Four standard errors of a share of 6000.
     assert bool(((shares - areas).abs() < 4 * (areas * (1 - areas) / 6000).sqrt()).all())
@@ -131,7 +130,8 @@ def test_triangles_without_area_are_passed_over_and_alone_refused():
     vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
     faces = torch.tensor([[0, 1, 1], [0, 1, 2], [2, 2, 2]])
     samples = sample_surface(vertices, faces, 50, generator=torch.Generator().manual_seed(0))
-    assert torch.equal(samples.normals, torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).expand(50, 3))
+    assert samples.shape == (50, 3)
+    assert float(samples[:, :2].sum(1).max()) <= 1.0
     with raises(CaptureError, name="surface", value=0.0):
         sample_surface(vertices, faces[[0, 2]], 5, generator=torch.Generator().manual_seed(0))
 

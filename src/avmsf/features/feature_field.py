@@ -15,7 +15,7 @@ from avmsf.gaussians.points import cluster, lattice, nearest_points, sample_surf
 from avmsf.mesh.surface import Surface
 
 GEOMETRY = "geometry"
-"""The encoder's name where features are the points' own positions and normals: the paper's row without visual input."""
+"""The encoder's name where features are the points' own positions: the paper's row without visual input."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,36 +44,22 @@ class FeatureField:
     """Whether the points are on the object's surface; not if they only fill the box of its contacts."""
 
     @classmethod
-    def from_mesh(
-        cls, surface: Surface, *, seed: Seed = None, count: int = 8192, normal_scale: float = 0.0
-    ) -> "FeatureField":
+    def from_mesh(cls, surface: Surface, *, seed: Seed = None, count: int = 8192) -> "FeatureField":
         """Return `count` points drawn evenly from a surface's triangles, with their positions as features.
 
-        `normal_scale` adds their normals, of this length, to positions of about unit size. The two sides of a thin wall
-        sound the same and have opposite normals, and a contact's nearest point may be on either side. So normals are
-        left out by default. A surface of points alone keeps its points, which have no normals.
+        Normals are no features: the two sides of a thin wall sound the same and have opposite ones, and a contact's
+        nearest point may be on either side. A surface of points alone keeps its points.
         """
         if len(surface.faces) == 0:
             return cls.from_points(surface.vertices)
-        samples = sample_surface(surface.vertices, surface.faces, count, generator=generator_of(seed))
-        return cls.from_points(
-            samples.points, normals=samples.normals if normal_scale else None, normal_scale=normal_scale
-        )
+        return cls.from_points(sample_surface(surface.vertices, surface.faces, count, generator=generator_of(seed)))
 
     @classmethod
-    def from_points(
-        cls,
-        points: Float[Tensor, "points 3"],
-        *,
-        normals: Float[Tensor, "points 3"] | None = None,
-        normal_scale: float = 1.0,
-    ) -> "FeatureField":
-        """Return the points with their positions, relative to the object's size, and their normals as features."""
+    def from_points(cls, points: Float[Tensor, "points 3"]) -> "FeatureField":
+        """Return the points with their positions, relative to the object's size, as features."""
         _expect_extent(points)
         middle = (points.amax(0) + points.amin(0)) / 2
-        positions = (points - middle) / _half_diagonal(points)
-        features = positions if normals is None else torch.cat([positions, normal_scale * normals], dim=1)
-        return cls(points.float(), features.float(), GEOMETRY)
+        return cls(points.float(), ((points - middle) / _half_diagonal(points)).float(), GEOMETRY)
 
     @classmethod
     def from_contacts(cls, contacts: Float[Tensor, "contacts 3"], *, count: int = 8192) -> "FeatureField":
@@ -110,18 +96,15 @@ class FeatureField:
         return Regions(groups.centers.float(), sums / sizes[:, None])
 
 
-def reduce(features: FeatureField, dim: int, *, whitening: float = 1.0) -> FeatureField:
+def reduce(features: FeatureField, dim: int) -> FeatureField:
     """Return the features' first `dim` principal components, with the encoder's name followed by what was done.
 
-    `whitening` says how even they become: at 1 each has variance 1 over the points; at 0 they keep the proportions
-    that they have, the first having variance 1. A component's sign is that of its largest loading, so that the same
-    features give the same components anywhere. Fewer come out where the features vary in fewer directions. Raises
-    SceneError for features that are all equal.
+    Each has variance 1 over the points. A component's sign is that of its largest loading, so that the same features
+    give the same components anywhere. Fewer come out where the features vary in fewer directions. Raises SceneError for
+    features that are all equal.
     """
     if dim < 1:
         raise SceneError.expected("at least 1", dim, name="dim")
-    if not 0.0 <= whitening <= 1.0:
-        raise SceneError.expected("0 to 1", whitening, name="whitening")
     values = features.features.double()
     values = values - values.mean(0)
     variances, directions = torch.linalg.eigh(values.T @ values / len(values))
@@ -138,8 +121,7 @@ def reduce(features: FeatureField, dim: int, *, whitening: float = 1.0) -> Featu
         )
     variances, directions = variances[:kept], directions[:, :kept]
     largest = directions.gather(0, directions.abs().argmax(0, keepdim=True))
-    sizes = variances ** (whitening / 2) * variances[0] ** ((1 - whitening) / 2)
-    reduced = values @ (directions * largest.sign()) / sizes
+    reduced = values @ (directions * largest.sign()) / variances.sqrt()
     return FeatureField(features.points, reduced.float(), f"{features.encoder}, {kept} components")
 
 

@@ -27,16 +27,6 @@ class Clusters:
     """Which group each point belongs to: that of the nearest center."""
 
 
-@dataclass(frozen=True, eq=False)
-class SurfaceSamples:
-    """Points drawn from a surface."""
-
-    points: Float[Tensor, "points 3"]
-    """Meters."""
-    normals: Float[Tensor, "points 3"]
-    """Unit normals of the faces that the points lie on, to the side from which a face runs counter-clockwise."""
-
-
 def farthest_points(points: Float[Tensor, "points 3"], count: int, *, start: int = 0) -> Int[Tensor, " chosen"]:
     """Return `count` rows, the first of them `start`, each the farthest from all that were chosen before it.
 
@@ -113,8 +103,8 @@ def cluster(points: Float[Tensor, "points 3"], count: int, *, iterations: int = 
 
 def sample_surface(
     vertices: Float[Tensor, "vertices 3"], faces: Int[Tensor, "faces 3"], count: int, *, generator: torch.Generator
-) -> SurfaceSamples:
-    """Draw `count` points from the triangles, evenly by area, with their faces' normals.
+) -> Float[Tensor, "points 3"]:
+    """Draw `count` points from the triangles, evenly by area.
 
     Raises CaptureError for a surface without area, from which no point can be drawn.
     """
@@ -126,10 +116,8 @@ def sample_surface(
         got = f"{mesh.area:g} m² of {len(vertices)} vertices, {len(faces)} faces"
         raise CaptureError.expected("triangles with an area", float(mesh.area), got=got, name="surface")
     seed = int(torch.randint(2**31 - 1, (1,), generator=generator))
-    places, rows = trimesh.sample.sample_surface(mesh, count, seed=seed)
-    # Of a triangle without area trimesh knows no normal; it is never drawn from.
-    normals = mesh.face_normals[rows]
-    return SurfaceSamples(torch.from_numpy(np.asarray(places)).to(vertices), torch.from_numpy(normals).to(vertices))
+    places = trimesh.sample.sample_surface(mesh, count, seed=seed)[0]
+    return torch.from_numpy(np.asarray(places)).to(vertices)
 
 
 def lattice(contacts: Float[Tensor, "contacts 3"], count: int) -> Float[Tensor, "points 3"]:

@@ -97,7 +97,7 @@ def lift_to_surface(
 ) -> Lifted:
     """Lift features onto points drawn evenly from a mesh, whose triangles hide what lies behind them."""
     generator = torch.Generator().manual_seed(config.seed)
-    points = sample_surface(surface.vertices, surface.faces, config.points, generator=generator).points
+    points = sample_surface(surface.vertices, surface.faces, config.points, generator=generator)
     weighting = _WEIGHTINGS[config.weighting]
     depth_map = depth_of_surface(surface)
     return lift_points(
