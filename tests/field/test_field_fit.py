@@ -120,7 +120,7 @@ def test_recordings_in_float64_give_the_same_field():
 def flipped(modes: Extraction) -> Extraction:
     order = torch.arange(len(modes.bank)).flip(0)
     return Extraction(
-        ModalBank(modes.bank.frequency[order], modes.bank.damping[order]),
+        modes.bank.take(order),
         modes.gains[:, order],
         modes.residual,
         modes.quadrature[:, order],

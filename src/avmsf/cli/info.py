@@ -24,7 +24,6 @@ from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
 from avmsf.field.uncertainty import has_posterior, relative_gain_std, spectrum_band, training_contacts
 from avmsf.gaussians.points import farthest_points
-from avmsf.modal.modes import ModalBank
 from avmsf.pipeline.record import RECORD, modes_words, recorded
 
 _DRAWN_POINTS, _LISTED_POINTS = 4000, 500
@@ -124,7 +123,7 @@ def draw_field(
     name = field.origin.capture or "field"
     modes = modes_words(len(field.bank), int((~field.is_mode).sum()))
     kept = field.is_mode
-    bank = ModalBank(field.bank.frequency[kept], field.bank.damping[kept])
+    bank = field.bank.take(kept)
     pictures = {
         "modes": draw_modes(field.bank, level, is_mode=field.is_mode, title=f"{modes} of {name}"),
         "gains": draw_gains(points, gains[:, kept], bank, title=f"gains of the modes of most energy of {name}"),

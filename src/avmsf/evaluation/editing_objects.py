@@ -157,7 +157,7 @@ def audible_modes(bank: ModalBank, amplitudes: Tensor, *, sample_rate: float = m
             advice="check the frequencies and amplitudes",
         )
     kept = energy >= energy.max() * 10.0 ** (_FAINTEST_DB / 10.0)
-    return ModalBank(bank.frequency[kept], bank.damping[kept])
+    return bank.take(kept)
 
 
 def recorded_objects(

@@ -36,7 +36,6 @@ from avmsf.localization.preprocess import (
     read_if_path,
     settings_for,
 )
-from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
 
 REJECT_ABOVE = 0.5
@@ -296,7 +295,7 @@ def predict_ringing(
     stop = start - min(round(_GUARD_SECONDS * rate), (start - last) // 4)
     begin = max(last, stop - round(_FIT_SECONDS * rate))
     audible = torch.nonzero(field.bank.frequency < min(0.5 * rate, highest or 0.5 * rate)).flatten()
-    bank = ModalBank(field.bank.frequency[audible], field.bank.damping[audible])
+    bank = field.bank.take(audible)
     extractor = Extractor.of(bank, sample_rate=rate, samples=stop - begin)
     values = extractor.extract(sound[begin:stop], color=None).values
     seconds = (start - begin) / rate

@@ -153,7 +153,7 @@ class StreamingLocalizer:
         self.later = last if last > self.window else None
         self.filter = scipy.signal.butter(2, cut, "highpass", fs=rate, output="sos") if cut > 0.0 else None
         strength = locator.gains[:, audible].abs().square().mean(0).sqrt()
-        bank = ModalBank(field.bank.frequency[audible], field.bank.damping[audible])
+        bank = field.bank.take(audible)
         self._modes = Ringing.of(bank, strength, sample_rate=rate, hop=self.hop, window=self.window)
         memory = self.hop * (_MEMORY_HOPS + 2 * _SKIPPED_HOPS) + round(_ONSET_SEARCH_SECONDS * rate)
         self._history_samples = (self.later or self.window) + memory

@@ -31,6 +31,10 @@ class ModalBank:
     def __len__(self) -> int:
         return self.frequency.shape[0]
 
+    def take(self, rows: Tensor) -> "ModalBank":
+        """Return the modes of these rows or of this mask."""
+        return ModalBank(self.frequency[rows], self.damping[rows])
+
 
 # A hammer's push takes time and sound takes time to the microphone, so that no recording starts as pure sines. The
 # contact decides a mode's strength and sign; what shifts its phase, pulse and path to the microphone, stays.

@@ -253,9 +253,9 @@ def test_what_the_chosen_explain_one_after_another_is_what_they_explain_together
     inner = gram(poles_of(bank, RATE), SAMPLES, power=0)
     energy = choose(inner, both.products, both.noise, given, significance=6.0, reach=1e-6)
     assert (energy[given] == 0).all()
-    alone = ModalBank(bank.frequency[given], bank.damping[given])
+    alone = bank.take(given)
     taken = (energy > 0) | given
-    together = ModalBank(bank.frequency[taken], bank.damping[taken])
+    together = bank.take(taken)
     assert float(energy.sum()) == pytest.approx(explained(sounds, together) - explained(sounds, alone), rel=1e-7)
     # The first to go explains most beside those given, of all.
     gained = [

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from avmsf.errors import ExtractionError
@@ -76,7 +76,7 @@ class HighResolution:
         # Hum and thuds are fitted beside the modes, or modes that are not there would stand in for them.
         toned = math.pi * bank.frequency > self.least_quality * bank.damping
         turning = math.pi * sample_rate - 2 * math.pi * bank.frequency > _LEAST_TURN * bank.damping
-        return _take(bank, toned & turning & (bank.damping >= _LEAST_FALL * sample_rate / samples))
+        return bank.take(toned & turning & (bank.damping >= _LEAST_FALL * sample_rate / samples))
 
     def _sift(
         self,
@@ -121,7 +121,7 @@ class HighResolution:
             )
             iterations = 20 if turn == len(rounds) else 6
             bank = refine(sounds, need(bank, range_db), sample_rate=sample_rate, iterations=iterations)
-            bank = need(_take(bank, bank.frequency >= lowest), range_db)
+            bank = need(bank.take(bank.frequency >= lowest), range_db)
         return bank
 
 
@@ -183,10 +183,6 @@ def expect_modes(modes: int) -> None:
 def lowest_frequency(samples: int, sample_rate: float) -> float:
     """Return the lowest frequency (Hz) at which sounds of this length let a mode be told from rumble."""
     return _PERIODS * sample_rate / samples
-
-
-def _take(bank: ModalBank, kept: Bool[Tensor, " modes"]) -> ModalBank:
-    return ModalBank(bank.frequency[kept], bank.damping[kept])
 
 
 def _level(sounds: Float[Tensor, "contacts samples"]) -> Float[Tensor, " contacts"]:

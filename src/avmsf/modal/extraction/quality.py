@@ -84,7 +84,7 @@ def measure_quality(
     pitched = bank.damping < bank.frequency
     standing = torch.nonzero(pitched & _stands_out(explained, moves.unexplained(), noise)).flatten()
     # A double of what is no mode itself may be the mode that both are of.
-    part = ModalBank(bank.frequency[standing], bank.damping[standing])
+    part = bank.take(standing)
     double = _doubles(part, amplitudes[:, standing], explained[:, standing].sum(0), level=_FALSE_MODES / len(bank))
     is_mode = torch.zeros(len(bank), dtype=torch.bool)
     is_mode[standing[~double]] = True

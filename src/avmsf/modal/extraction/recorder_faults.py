@@ -44,7 +44,7 @@ def rate_factors(modes: Extraction, impacts: Impacts) -> dict[str, float]:
     found = {}
     for row, name in enumerate(impacts.names):
         theirs = (power.sum(0) - power[row]) / max(1, len(power) - 1) >= _OTHERS_SHARE
-        bank = ModalBank(modes.bank.frequency[theirs], modes.bank.damping[theirs])
+        bank = modes.bank.take(theirs)
         explained = partial(_explained, impacts.sounds[row : row + 1].double(), bank, impacts.sample_rate)
         if len(bank) == 0 or explained(1.0) >= 0.5:
             continue

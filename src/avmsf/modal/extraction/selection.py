@@ -79,7 +79,7 @@ class Candidates:
 
     def take(self, rows: Int64[Tensor, " kept"]) -> "Candidates":
         """Return the given candidates alone."""
-        bank = ModalBank(self.bank.frequency[rows], self.bank.damping[rows])
+        bank = self.bank.take(rows)
         return Candidates(bank, self.products[:, :, rows], self.noise[:, rows])
 
     def join(self, other: "Candidates") -> "Candidates":
@@ -171,10 +171,10 @@ def prune(
         # By index, not by value: of two that are equal only one may go.
         least = torch.where(near & weak[None, :], total[None, :], torch.inf).argmin(1)
         kept = torch.nonzero(~weak | (least != torch.arange(len(bank)))).flatten()
-        bank, noise = ModalBank(bank.frequency[kept], bank.damping[kept]), noise[:, kept]
+        bank, noise = bank.take(kept), noise[:, kept]
         system, total = system.take(kept), total[kept]
     strongest = torch.argsort(total, descending=True)[:count].sort().values
-    return ModalBank(bank.frequency[strongest], bank.damping[strongest])
+    return bank.take(strongest)
 
 
 def _determinants(own: Float64[Tensor, "modes 2 2"]) -> Float64[Tensor, " modes"]:
