@@ -147,8 +147,3 @@ def test_a_scanned_bowl_is_round(shared: Path):
 def test_points_without_a_surface_are_refused(points, row, value):
     with raises(SceneError, row=row, name="points", value=value):
         find_symmetries(points, seed=0)
-
-
-def test_a_tolerance_is_positive():
-    with raises(SceneError, name="tolerance", value=0.0):
-        find_symmetries(torch.rand(300, 3), seed=0, tolerance=0.0)

@@ -1,13 +1,14 @@
 """Depth of many views fused on a grid: how far before the surface that most views see each place lies."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32
 
 from avmsf._utils.compiled import compiled, lane_count, run_lanes
+from avmsf.photographs.cameras import Camera, View
 from avmsf.reconstruction.visual_hull import Grid
 
 _BINS = 32
@@ -17,10 +18,19 @@ _BINS = 32
 class SeenDepth:
     """The depth of the first surface that one view sees."""
 
-    projection: Float64[np.ndarray, "3 4"]
-    """Takes places in the object frame, meters, to homogeneous pixels times their depth."""
+    camera: Camera
     depth: Float32[np.ndarray, "height width"]
     """Meters along the optical axis; 0 where nothing is known."""
+
+    @classmethod
+    def of(cls, view: View, depth: Float32[np.ndarray, "height width"]) -> "SeenDepth":
+        """Return the depth inside a view's mask: at the outline a pixel's depth is the background's in part."""
+        assert view.mask is not None
+        return cls(view.camera, np.where(view.mask.numpy() > 127, depth, np.float32(0.0)).astype(np.float32))
+
+    def moved(self, meters: float) -> "SeenDepth":
+        """Return the depth that lies so much farther away, where it is known."""
+        return replace(self, depth=np.where(self.depth > 0, self.depth + np.float32(meters), np.float32(0.0)))
 
 
 def fused_depth(
@@ -39,7 +49,8 @@ def fused_depth(
     rows = np.argwhere(where)
     counts = np.zeros((len(rows), _BINS), dtype=np.uint8)
     for each in views:
-        run_lanes(_count, lane_count(), each.projection, each.depth, grid.lowest, grid.spacing, rows, band, counts)
+        projection = (each.camera.intrinsics @ each.camera.world_to_camera[:3]).numpy()
+        run_lanes(_count, lane_count(), projection, each.depth, grid.lowest, grid.spacing, rows, band, counts)
     total = np.cumsum(counts, axis=1, dtype=np.float32)
     view_counts = total[:, -1]
     wanted = quantile * view_counts

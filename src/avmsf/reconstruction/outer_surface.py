@@ -78,7 +78,7 @@ def object_surface(views: Sequence[View], depth_map: DepthMap, *, cells: int = 1
     low, high = _box(hull > 0, grid, len(kept))
     diagonal = float(np.linalg.norm(high - low))
     hull, untouched = fair_hull(hull, outlines, grid, diagonal)
-    depths = [_Depth(view, depth_map(view.camera).detach().cpu().float().numpy()) for view in kept]
+    depths = [SeenDepth.of(view, depth_map(view.camera).detach().cpu().float().numpy()) for view in kept]
     bias = _bias(hull, grid, depths, diagonal)
     free, view_counts = _free(hull, grid, depths, bias, diagonal)
     seen = np.minimum(hull, _DEPTH_TOLERANCE * diagonal - free)
@@ -93,17 +93,6 @@ def object_surface(views: Sequence[View], depth_map: DepthMap, *, cells: int = 1
     rejected = tuple(view.name for view, each in zip(masked, right, strict=True) if not each)
     report = ShapeReport(len(kept), rejected, offset, bias, unseen, direction)
     return ObjectShape(grid, outer, seen, hollow, supposed, diagonal, report)
-
-
-class _Depth:
-    """What one view sees."""
-
-    def __init__(self, view: View, depth: np.ndarray) -> None:
-        assert view.mask is not None
-        self.camera = view.camera
-        self.projection = (view.camera.intrinsics @ view.camera.world_to_camera[:3]).numpy()
-        # At the outline a pixel's depth is the background's in part.
-        self.depth = np.where(view.mask.numpy() > 127, depth, np.float32(0.0)).astype(np.float32)
 
 
 def _rough(
@@ -147,7 +136,7 @@ def _box(
     return grid.places(rows.min(axis=0)), grid.places(rows.max(axis=0))
 
 
-def _bias(hull: Float32[np.ndarray, "x y z"], grid: Grid, depths: Sequence[_Depth], diagonal: float) -> float:
+def _bias(hull: Float32[np.ndarray, "x y z"], grid: Grid, depths: Sequence[SeenDepth], diagonal: float) -> float:
     """Return by how much depth lies behind the hull where it does so most often, meters.
 
     Most of a surface touches its hull; the depth of cavities lies behind it by lengths of all kinds.
@@ -171,13 +160,10 @@ def _bias(hull: Float32[np.ndarray, "x y z"], grid: Grid, depths: Sequence[_Dept
 
 
 def _free(
-    hull: Float32[np.ndarray, "x y z"], grid: Grid, depths: Sequence[_Depth], bias: float, diagonal: float
+    hull: Float32[np.ndarray, "x y z"], grid: Grid, depths: Sequence[SeenDepth], bias: float, diagonal: float
 ) -> tuple[Float32[np.ndarray, "x y z"], Float32[np.ndarray, "x y z"]]:
     """Return how far each cell lies before the surface that views see, meters, and how many see the cell."""
-    known = [
-        SeenDepth(each.projection, np.where(each.depth > 0, each.depth - np.float32(bias), np.float32(0.0)))
-        for each in depths
-    ]
+    known = [each.moved(-bias) for each in depths]
     least = max(3.0, _MIN_VIEW_FRACTION * len(depths))
     band = _BAND * diagonal
     free, view_counts = fused_depth(known, grid, hull > -2 * grid.spacing, band=band, quantile=_QUANTILE, least=least)

@@ -41,7 +41,6 @@ def find_symmetries(
     points: Float[Tensor, "points 3"],
     *,
     seed: Seed = None,
-    tolerance: float = TOLERANCE,
     limit: int = LIMIT,
 ) -> Symmetries:
     """Return the rotations and mirror planes that carry a cloud of an object's surface onto itself.
@@ -50,22 +49,20 @@ def find_symmetries(
     that dense parts lose most. Candidates come from the principal axes, from pairs of points with similar surfaces
     around them, and from compositions of symmetries already found; each is refined to its best fit.
 
-    **The tolerance.** One half of the points is moved onto the surface that the other half samples. The error is the
+    **The error.** One half of the points is moved onto the surface that the other half samples. The error is the
     root mean square of their distances from it, without what the distances are when nothing is moved (noise), in
     spacings of that half; a spacing below 1 or above 1.6 % of the object's diagonal counts as that. A distance counts
-    up to 3 spacings. So `tolerance` lets the whole surface be off by that many spacings, or a part of
-    (tolerance / 3)^2 of it, 1.6 % at the usual .38, have no counterpart at all.
+    up to 3 spacings. So the tolerance of .38 lets the whole surface be off by that many spacings, or
+    (.38 / 3)^2 = 1.6 % of it have no counterpart at all.
 
-    So an object that is damaged, or of which large parts are in no view, has only the symmetries of what is there.
+    An object that is damaged, or of which large parts are in no view, has only the symmetries of what is there.
     Compositions of two symmetries may have 1.15 times the error.
 
     Orders 2 to 12 are distinguished; an axis is continuous if every angle holds and no order holds better than the
     angles between its turns. Planes that contain a continuous axis and half turns across it follow from it and are not
     listed; of a ball, two of its axes are. Raises SceneError for points that are too few (240), not finite, or on one
-    line, and for a tolerance that is not positive.
+    line.
     """
-    if not tolerance > 0.0:
-        raise SceneError.expected("a number above 0", tolerance, name="tolerance")
     if limit < _MIN_POINTS:
         raise SceneError.expected(f"at least {_MIN_POINTS} points", limit, name="limit")
     random = np.random.default_rng(int(torch.randint(2**31 - 1, (1,), generator=generator_of(seed))))
@@ -75,7 +72,7 @@ def find_symmetries(
     surface = read_neighborhoods(places)
     halves = Halves.of(places, _QUERIES, bounds=_SPACINGS, generator=random)
     coarse = CoarseCloud.of(surface, halves.queries[:150])
-    group = Group(SymmetryTest(halves, tolerance))
+    group = Group(SymmetryTest(halves, TOLERANCE))
     for motion in _candidates(surface, coarse, random):
         group.consider(motion)
     group.drop_crowded_mirrors()
