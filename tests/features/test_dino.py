@@ -63,11 +63,6 @@ def test_the_map_is_the_models_own_grid(folder, rows, columns):
     torch.testing.assert_close(encoder.describe(picture), own_tokens(encoder, picture), rtol=0, atol=1e-4)
 
 
-def test_bytes_are_described_as_the_numbers_that_they_stand_for(folder):
-    encoder, picture = load(folder), (255 * image(28, 42)).round().to(torch.uint8)
-    assert torch.equal(encoder.describe(picture), encoder.describe(picture.float() / 255))
-
-
 @pytest.mark.parametrize(("height", "width"), [(43, 70), (29, 55), (5, 90), (71, 13)])
 def test_any_size_is_described_in_its_place(folder, height, width):
     encoder, picture = load(folder), image(height, width)
