@@ -6,8 +6,7 @@ import pytest
 import soundfile
 
 from avmsf.capture import read_capture
-from avmsf.cli import dataset as verb
-from avmsf.cli.options import dataset as options
+from avmsf.cli import main
 from avmsf.datasets import CaptureCollection, Dataset, ObjectFolderRaw, RealImpact, open_dataset
 from avmsf.errors import DatasetError
 from factories.capture_folder import fill
@@ -178,22 +177,22 @@ def test_a_collection_s_check_reads_no_sound(tmp_path: Path, monkeypatch: pytest
     assert d.problems[0].startswith("shape.obj")
 
 
-def test_the_verb_prints_what_is_there(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_prints_what_is_there(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_mesh(place / "raw/mesh_16k/2.obj")
-    assert verb.run(options.parse(["check", str(place / "raw/of")])) == 0
+    assert main(["check", str(place / "raw/of")]) == 0
     out = capsys.readouterr().out
     assert "1 of 1 object can" in out
     assert "2 recordings" in out
     assert "objects 11 to 20" in out
-    assert verb.run(options.parse(["check", str(place / "impact/RI"), "--json"])) == 0
+    assert main(["check", str(place / "impact/RI"), "--json"]) == 0
     streams = capsys.readouterr()
     assert '"identifier": "22_Cup"' in streams.out
     assert "49 of 50 objects" in streams.err
 
 
-def test_the_verb_ends_with_2_where_nothing_can_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_ends_with_2_where_nothing_can_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_raw(tmp_path / "of", {"2": ("0", "1")}, contacts=False)
-    assert verb.run(options.parse(["check", str(tmp_path / "of")])) == 2
+    assert main(["check", str(tmp_path / "of")]) == 2
     streams = capsys.readouterr()
     assert "contact coordinates" in streams.out
     assert str(tmp_path / "of") in streams.err
