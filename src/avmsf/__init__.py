@@ -21,8 +21,12 @@ if TYPE_CHECKING:
 __version__ = "0.9.0"
 
 # Imported when first used: torch takes seconds. The stub `__init__.pyi` lists the names, also for editors.
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, _, __all__ = lazy_loader.attach_stub(__name__, __file__)
 __all__ += ["read"]
+
+
+def __dir__() -> list[str]:
+    return __all__
 
 
 def read(folder: "str | Path", settings: "CaptureSettings | None" = None) -> "Capture":

@@ -186,22 +186,32 @@ def _fit_shape(
 ) -> StagedFit:
     method = finder_of(config)
     heard = {"impacts": train.digest(), "method": repr(method)}
-    listener.log(f"modes: {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
-    found = stages.keep(MODES, heard, lambda path: extract_once(train, method, path, needed=True))
-    modes, cache = extract_once(train, method, found.path), stages.folder / BODIES
+    cache = stages.folder / BODIES
 
     def bodies() -> CandidateBodies:
         listener.log("bodies: finite-element models of the object")
         return candidate_bodies(shape.surface(), config.body, impacts=train, cache=cache, log=listener.log)
 
-    def make(path: Path) -> None:
-        gains = estimator_for(
+    estimator = once(
+        lambda: estimator_for(
             config.gain_model,
             bodies,
             symmetries=shape.symmetries,
             features=shape.features,
             log=listener.log if shape.known else None,
         )
+    )
+
+    def find_modes(path: Path) -> None:
+        # First: what is wrong with the object's shape shows in less time than the modes take.
+        estimator()
+        listener.log(f"modes: {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
+        extract_once(train, method, path, needed=True)
+
+    found = stages.keep(MODES, heard, find_modes)
+    modes = extract_once(train, method, found.path)
+
+    def make(path: Path) -> None:
         supporting = supporting_poles(modes, train)
         listener.log(f"fit: a field of {modes_words(len(modes.bank), len(supporting))}")
         fitted = fit_field(
@@ -209,7 +219,7 @@ def _fit_shape(
             shape.features if config.gain_model == Visual.kind else shape.points,
             modes,
             config.fit,
-            gains=gains,
+            gains=estimator(),
             capture=capture.name,
             settings=capture.settings,
             checkpoint=stages.checkpoint(FIELD),
@@ -559,7 +569,10 @@ def object_shape(found: Surface | None, scene: SceneStages | None) -> tuple[Call
     if scene is None:
 
         def unknown() -> ObjectShape:
-            raise SceneError("surface: expected a mesh or views of the object in the folder, got none", name="surface")
+            raise SceneError(
+                "surface: expected a mesh or views of the object in the folder, got none; add surface.obj",
+                name="surface",
+            )
 
         return unknown, ""
     return once(scene.shape), f"{scene.cloud.digest} {scene.views.digest}"
