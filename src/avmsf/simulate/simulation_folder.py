@@ -1,8 +1,6 @@
 """A simulated object as a capture folder: what a user's own folder holds, and its truth beside that."""
 
 import os
-import shutil
-import uuid
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +9,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
+from avmsf._utils.files import new_folder
 from avmsf.capture.folder import write_capture
 from avmsf.errors import CaptureError, SimulationError
 from avmsf.mesh.textured_mesh import TexturedMesh
@@ -35,28 +34,19 @@ def write_simulation(
     Raises SimulationError where the folder exists and is not empty, and where it cannot be written.
     """
     folder = Path(folder)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise SimulationError(
-            f"{folder}: expected a new or empty folder, got other files; choose another name or remove it", file=folder
-        )
-    begun = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}")
     try:
-        _write_recordings(simulation, begun)
-        for sound in begun.glob("*.wav"):
-            _forget_the_hour(sound)
-        if simulation.recipe.surface:
-            write_textured(simulation.mesh, begun)
-        _write_views(simulation, begun, progress)
-        write_truth(simulation.truth, begun / TRUTH)
-        if folder.exists():
-            folder.rmdir()
-        os.rename(begun, folder)
-    except (OSError, CaptureError) as error:
+        with new_folder(folder, raising=SimulationError) as begun:
+            _write_recordings(simulation, begun)
+            for sound in begun.glob("*.wav"):
+                _forget_the_hour(sound)
+            if simulation.recipe.surface:
+                write_textured(simulation.mesh, begun)
+            _write_views(simulation, begun, progress)
+            write_truth(simulation.truth, begun / TRUTH)
+    except CaptureError as error:
         raise SimulationError(
             f"{folder}: expected a writable folder, got {error}; choose another folder", file=folder, value=str(error)
         ) from error
-    finally:
-        shutil.rmtree(begun, ignore_errors=True)
 
 
 def _write_recordings(simulation: Simulation, folder: Path) -> None:
