@@ -177,7 +177,7 @@ def _report(
             if pair is None:
                 figures |= {f"edit.{name}_{key}": value for name, value in values.items()}
     for name, space in spaces.items():
-        figures[f"edit.told_apart_{name}"] = space.told_apart()
+        figures[f"edit.told_apart_{name}"] = space.nearest_neighbor_accuracy()
         for target in sorted({score.target for score in scores}):
             figures[f"edit.spread_{name}_{target}"] = space.spread(target)
     figures["edit.seconds"] = seconds

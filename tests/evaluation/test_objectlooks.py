@@ -24,9 +24,7 @@ from factories.small_scene import slab, slab_views, write_surface_file
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*neither texture nor colors")
 
-CONFIG = SceneConfig(
-    views=ViewsConfig(rendered=24), lift=LiftConfig(encoder="descriptors", points=400, components=4, missing=0.0)
-)
+CONFIG = SceneConfig(views=ViewsConfig(rendered=24), lift=LiftConfig(encoder="descriptors", points=400, components=4))
 
 
 class OneObject:

@@ -14,12 +14,11 @@ a distance of 1 from the one it was made of. The order of the modes does not mat
 
 import math
 import warnings
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from importlib.metadata import version
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -29,77 +28,55 @@ from avmsf.errors import EvaluationError
 from avmsf.modal.modes import ModalBank
 
 
-class ModeFeatures(ABC):
-    """A way to describe a set of modes by a vector."""
-
-    @property
-    @abstractmethod
-    def name(self) -> str:
-        """What reports call it."""
-
-    @abstractmethod
-    def vector(self, bank: ModalBank) -> Float64[np.ndarray, " dim"]:
-        """Return the vector of a set of modes. Raises EvaluationError for a set that is empty or not of numbers."""
-
-    def record(self) -> dict[str, Any]:
-        """Return its name and settings, as a file holds them."""
-        return {"name": self.name, **asdict(self)}  # type: ignore[call-overload]
-
-
 @dataclass(frozen=True)
-class Pitches(ModeFeatures):
+class Pitches:
     """The frequencies alone, as in the paper: evenly spaced quantiles of their logarithms.
 
     Component k of n is the quantile (k + 1/2) / n of log2 f by Hazen's rule, over sqrt(n), so that the distance of two
     sets is the root mean square of their quantiles' differences in octaves.
     """
 
+    name: ClassVar[str] = "pitches"
+    """What reports call it."""
     count: int = 32
     """Quantiles."""
 
-    @property
-    def name(self) -> str:
-        """What reports call it."""
-        return "pitches"
-
     def vector(self, bank: ModalBank) -> Float64[np.ndarray, " dim"]:
-        """Return the quantiles."""
+        """Return the vector of a set of modes. Raises EvaluationError for a set that is empty or not of numbers."""
         frequency, _ = _logarithms(bank)
-        places = (np.arange(self.count) + 0.5) / self.count
-        return np.quantile(frequency, places, method="hazen") / math.sqrt(self.count)
+        levels = (np.arange(self.count) + 0.5) / self.count
+        return np.quantile(frequency, levels, method="hazen") / math.sqrt(self.count)
+
+    def record(self) -> dict[str, Any]:
+        """Return the name and the settings, as a file holds them."""
+        return {"name": self.name, **asdict(self)}
 
 
 @dataclass(frozen=True)
-class PitchesAndRings(ModeFeatures):
-    """The frequencies, and beside them how fast each pitch dies away.
+class PitchesAndRings(Pitches):
+    """The frequencies, and how fast each pitch decays.
 
     Frequencies alone hardly tell materials apart: sound runs equally fast, to 6 %, in ceramic, glass, iron and steel,
-    and an object of twice the size is an octave lower. How fast they ring out does. After the quantiles of `Pitches`
+    and an object of twice the size is an octave lower. How fast they decay does. After the quantiles of `Pitches`
     follows, at evenly spaced pitches, log2 of the damping there, the mean over all modes weighted by
     exp(-(distance in octaves / width)^2 / 2), over the square root of their number.
     """
 
-    count: int = 32
-    """Quantiles."""
+    name: ClassVar[str] = "pitches and rings"
     rings: int = 15
     """Pitches at which dampings are compared, from 125 Hz to 16 kHz: two an octave."""
     width: float = 0.5
     """Octaves."""
 
-    @property
-    def name(self) -> str:
-        """What reports call it."""
-        return "pitches and rings"
-
     def vector(self, bank: ModalBank) -> Float64[np.ndarray, " dim"]:
         """Return the quantiles and the dampings."""
         frequency, damping = _logarithms(bank)
-        places = np.linspace(math.log2(125.0), math.log2(16000.0), self.rings)
-        exponent = -0.5 * ((frequency[None] - places[:, None]) / self.width) ** 2
+        pitches = np.linspace(math.log2(125.0), math.log2(16000.0), self.rings)
+        exponent = -0.5 * ((frequency[None] - pitches[:, None]) / self.width) ** 2
         # Relative to the nearest mode's, lest all weights vanish far away from every mode.
         weights = np.exp(exponent - exponent.max(axis=1, keepdims=True))
         curve = weights @ damping / weights.sum(axis=1)
-        return np.concatenate([Pitches(self.count).vector(bank), curve / math.sqrt(self.rings)])
+        return np.concatenate([super().vector(bank), curve / math.sqrt(self.rings)])
 
 
 def _logarithms(bank: ModalBank) -> tuple[Float64[np.ndarray, " modes"], Float64[np.ndarray, " modes"]]:
@@ -139,7 +116,7 @@ class UmapSettings:
 class MaterialSpace:
     """Labelled objects by their modes; `MaterialSpace.of` makes one."""
 
-    features: ModeFeatures
+    features: Pitches
     materials: tuple[str, ...]
     """Each object's, row for row."""
     names: tuple[str, ...]
@@ -155,7 +132,7 @@ class MaterialSpace:
         seed: int = 0,
         *,
         names: Sequence[str] | None = None,
-        features: ModeFeatures | None = None,
+        features: Pitches | None = None,
         settings: UmapSettings | None = None,
     ) -> "MaterialSpace":
         """Return the space of labelled sets of modes; `features` are `Pitches()`, the paper's, unless others are given.
@@ -223,7 +200,7 @@ class MaterialSpace:
         own = self.embedding[self._rows(material)]
         return float(np.linalg.norm(own - own.mean(axis=0), axis=1).mean())
 
-    def told_apart(self) -> float:
+    def nearest_neighbor_accuracy(self) -> float:
         """Return the part of objects whose nearest other object, by the plain vectors, is of their own material.
 
         What a distance to a material can mean at all: objects drawn at random would have the materials' shares.
