@@ -164,7 +164,6 @@ def test_one_wrong_row_is_no_mistake_of_all() -> None:
     placement = check_placement(contacts, CLOUD)
     assert placement.mistake is None
     assert placement.off == (7,)
-    assert placement.off == (7,)
     assert "1 of 20 contacts" in placement.describe()
     assert placement.describe().endswith("check row 7")
     names = [f"impact {row + 2}" for row in range(20)]
