@@ -66,7 +66,7 @@ class _Announcer:
     """Reports what numba compiles from the moment that it listens, which imports numba."""
 
     def __init__(self, log: Callable[[str], None], meanwhile: Callable[[str], AbstractContextManager[None]]) -> None:
-        self.log, self.meanwhile, self.told, self.listening = log, meanwhile, set[str](), False
+        self.log, self.meanwhile, self.announced, self.listening = log, meanwhile, set[str](), False
         # A function is compiled within another that calls it; numba compiles in one thread at a time.
         self.running: list[AbstractContextManager[None]] = []
 
@@ -87,8 +87,8 @@ class _Announcer:
         message = f"compiling {_PARTS.get(part, part)} for this processor (once; the result is cached)"
         self.running.append(self.meanwhile(message) if ours else nullcontext())
         self.running[-1].__enter__()
-        if ours and part not in self.told:
-            self.told.add(part)
+        if ours and part not in self.announced:
+            self.announced.add(part)
             self.log(message)
 
 

@@ -26,7 +26,7 @@ _SPREAD_SIZES = np.array([1 / 0.03, 1 / 0.02, 1 / 0.02], dtype=np.float32)
 """The same for their spreads within a cell."""
 _GRADIENT_SIZE, _HARMONIC_SIZE, _CURVATURE_SIZE = np.float32(3), np.float32(8), np.float32(45)
 """The same for the logarithm of the mean gradient, for relative coefficients, and for curvatures."""
-_FAINT = np.float32(0.01)
+_MIN_GRADIENT = np.float32(0.01)
 """Gradient, in brightness (0 to 1) a pixel, below which an orientation is noise."""
 
 
@@ -83,7 +83,7 @@ def _orientations(brightness: _Plane, scale: float) -> list[_Plane]:
     for _ in range(_HARMONICS):
         power = power * turn
         magnitude = np.hypot(_smooth(_plane(power.real), scale), _smooth(_plane(power.imag), scale))
-        planes.append(_plane(magnitude / (mean + _FAINT)) * _HARMONIC_SIZE)
+        planes.append(_plane(magnitude / (mean + _MIN_GRADIENT)) * _HARMONIC_SIZE)
     return planes
 
 

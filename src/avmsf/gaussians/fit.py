@@ -347,9 +347,9 @@ class _Run:
             if config.reset_every and step % config.reset_every == 0 and step < last:
                 self._reset_opacities()
         elif step > last and step % config.densify_every == 0:
-            faint = self.cloud.opacities < config.least_opacity
-            if bool(faint.any()):
-                self._rebuild(torch.nonzero(~faint)[:, 0], None)
+            transparent = self.cloud.opacities < config.least_opacity
+            if bool(transparent.any()):
+                self._rebuild(torch.nonzero(~transparent)[:, 0], None)
 
     def _rebuild(self, rows: Tensor, fresh: GaussianCloud | None) -> None:
         """Keep the given rows, then add new Gaussians, about which the optimizer knows nothing yet."""

@@ -1,7 +1,7 @@
 """Where symmetries may be: principal axes, and pairs of points about which the surface is alike.
 
 Two points with their normals say which plane would mirror one onto the other, and about which axis by which angle one
-would turn into the other. Many pairs say something, most of it wrong; what they say is judged on a coarse picture of
+would turn into the other. Many pairs say something, most of it wrong; what they say is scored on a coarse picture of
 the cloud, and the best that differ are kept.
 """
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from avmsf._utils.compiled import compiled, lane_count, run_lanes
-from avmsf.gaussians.rasterizer.ellipses import FAINTEST
+from avmsf.gaussians.rasterizer.ellipses import MIN_ALPHA
 from avmsf.gaussians.rasterizer.pixels import PIXELS, SIDE, blend, blend_back, working_numbers
 from avmsf.gaussians.rasterizer.tiles import count_tiles, fill_tiles
 
@@ -26,9 +26,9 @@ _SCALE = np.float32(np.sqrt(0.5 / np.log(2.0)))
 """Takes standard deviations to such units that a Gaussian is 2 to minus their square."""
 
 
-_SLACK = 1e-4
+_REACH_MARGIN = 1e-4
 """By how much the squared reach is widened, so that rounding of the ellipse's edge loses no pixel that counts."""
-_FAINT = np.float32(np.log2(FAINTEST))
+_LOG2_MIN_ALPHA = np.float32(np.log2(MIN_ALPHA))
 
 
 _TILE_WORK = 8
@@ -63,7 +63,7 @@ class Blending(torch.autograd.Function):
         starts, rows, slots, ends = list_tiles(places, packed, reaches, size, lanes=lanes)
         bounds = _bounds(starts, lanes)
         kept = np.empty((len(starts) - 1, 3, PIXELS), np.float32)
-        listed = places, packed, starts, rows, bounds, paint, _FAINT, working_numbers(lanes)
+        listed = places, packed, starts, rows, bounds, paint, _LOG2_MIN_ALPHA, working_numbers(lanes)
         run_lanes(blend, lanes, *listed, *outputs, kept)
         ctx.kept = chosen, places, packed, starts, rows, slots, ends, bounds, paint, kept
         ctx.points = len(screen)
@@ -78,7 +78,7 @@ class Blending(torch.autograd.Function):
         parts = np.empty((len(rows), 10), np.float32)
         slopes = [each.contiguous().numpy() for each in (by_color, by_alpha, by_depth)]
         lanes = len(bounds) - 1
-        listed = places, packed, starts, rows, slots, bounds, paint, _FAINT, working_numbers(lanes)
+        listed = places, packed, starts, rows, slots, bounds, paint, _LOG2_MIN_ALPHA, working_numbers(lanes)
         run_lanes(blend_back, lanes, *listed, *slopes, kept, parts)
         run_lanes(
             _gather, lanes, parts, ends, chosen, packed, np.empty((lanes, 10)), *(each.numpy() for each in results)
@@ -118,7 +118,7 @@ def _pack(
     A packed row: p, r, s in units of `_SCALE`, log2 of opacity, red, green, blue, depth, half the height in pixels.
     """
     level = np.log2(opacities[:, 0].astype(np.float64))
-    reaches = np.maximum(level - math.log2(FAINTEST), 0.0) + _SLACK
+    reaches = np.maximum(level - math.log2(MIN_ALPHA), 0.0) + _REACH_MARGIN
     packed = np.zeros((len(screen), _WIDTH), np.float32)
     packed[:, :3], packed[:, 4:7] = ellipses * _SCALE, colors
     packed[:, 3], packed[:, 7], packed[:, 8] = level, depths[:, 0], np.sqrt(reaches) / packed[:, 2]

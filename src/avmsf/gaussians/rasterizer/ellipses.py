@@ -20,7 +20,7 @@ NEAR = 0.01
 """Gaussians with centers nearer than this to the camera's plane are not seen, meters (gsplat's default)."""
 _WIDEST = 1e30
 """Ellipses with larger variances, square pixels, are dropped: float32 cannot hold what follows from them."""
-FAINTEST = 1.0 / 255.0
+MIN_ALPHA = 1.0 / 255.0
 """A Gaussian counts at a pixel where it covers at least this much (3DGS)."""
 BLUR = 0.3
 """What is added to the variances in the image, square pixels (3DGS)."""
@@ -147,7 +147,7 @@ def project_points(
             continue
         x, y, z = _inside(centers[i], pose)
         opacity = 1.0 / (1.0 + math.exp(-float(logits[i])))
-        if z < NEAR or opacity < FAINTEST:
+        if z < NEAR or opacity < MIN_ALPHA:
             continue
         for j in range(3):
             scales[j] = math.exp(float(log_scales[i, j]))
@@ -158,7 +158,7 @@ def project_points(
         if not xx + yy < _WIDEST:
             continue
         across, down = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
-        reach = math.sqrt(2.0 * math.log(opacity / FAINTEST))
+        reach = math.sqrt(2.0 * math.log(opacity / MIN_ALPHA))
         wide, high = reach * math.sqrt(xx), reach * math.sqrt(yy)
         if across + wide <= 0 or across - wide >= lens[4] or down + high <= 0 or down - high >= lens[5]:
             continue

@@ -76,7 +76,7 @@ def _stretch(down, high):
 
 @compiled(error_model="numpy", fastmath=_FAST)
 @no_type_check
-def _cover(scratch, packed, row, middle, center, first, last, number, faint):
+def _cover(scratch, packed, row, middle, center, first, last, number, min_level):
     """Draw one Gaussian on a tile's pixels in the double rows from `first` to before `last`.
 
     `scratch` goes on with what is left for the next Gaussian, what is left in the end, red, green, blue, depth, and the
@@ -91,7 +91,7 @@ def _cover(scratch, packed, row, middle, center, first, last, number, faint):
         covered = min(_exponential(max(power, _LOWEST)), _OPAQUE)
         before, rest, previous = scratch[_LIVE + p], scratch[_REST + p], scratch[_NUMBER + p]
         after = before * (_ONE - covered)
-        counts = power >= faint
+        counts = power >= min_level
         drawn = counts & (after > _LEAST)
         weight = covered * before if drawn else _ZERO
         left = after if drawn else _ZERO
@@ -106,12 +106,12 @@ def _cover(scratch, packed, row, middle, center, first, last, number, faint):
 
 @compiled(error_model="numpy", fastmath=_FAST)
 @no_type_check
-def blend(lane, lanes, places, packed, starts, rows, bounds, paint, faint, numbers, color, alpha, depth, kept):
+def blend(lane, lanes, places, packed, starts, rows, bounds, paint, min_level, numbers, color, alpha, depth, kept):
     """Blend the tiles' lists into `color`, `alpha` and `depth`, and keep what the way back needs of every tile.
 
     Each lane takes the tiles from one of the `bounds` to the next. `kept` [tiles, 3, 64] gets what is left of each
-    pixel, the place in the list of the last Gaussian drawn, and the mean depth. Below `faint`, the binary logarithm of
-    what it covers, a Gaussian does not count. `numbers` are those of `working_numbers`.
+    pixel, the place in the list of the last Gaussian drawn, and the mean depth. Below `min_level`, the binary logarithm
+    of what it covers, a Gaussian does not count. `numbers` are those of `working_numbers`.
     """
     height, width = alpha.shape
     across = (width + SIDE - 1) // SIDE
@@ -130,7 +130,7 @@ def blend(lane, lanes, places, packed, starts, rows, bounds, paint, faint, numbe
             row = rows[starts[tile] + k]
             middle, center = places[row, 0] - left, places[row, 1] - top
             first, last = _stretch(center, packed[row, 8])
-            _cover(scratch, packed, row, np.float32(middle), np.float32(center), first, last, np.float32(k), faint)
+            _cover(scratch, packed, row, np.float32(middle), np.float32(center), first, last, np.float32(k), min_level)
             if k % 4 == 3:
                 most = _ZERO
                 for p in range(PIXELS):
@@ -151,7 +151,7 @@ def blend(lane, lanes, places, packed, starts, rows, bounds, paint, faint, numbe
 
 @compiled(error_model="numpy", fastmath=_FAST)
 @no_type_check
-def _uncover(scratch, packed, row, middle, center, first, last, number, faint, parts, slot):
+def _uncover(scratch, packed, row, middle, center, first, last, number, min_level, parts, slot):
     """Take one Gaussian off a tile's pixels again and write its sums of derivatives into `part` [10].
 
     `scratch` goes on with what this Gaussian left, the derivative by what it left times that, the loss's derivatives by
@@ -166,7 +166,7 @@ def _uncover(scratch, packed, row, middle, center, first, last, number, faint, p
         u, w = p_x * x + r_y * y, s_y * y
         power = peak - (u * u + w * w)
         raw = _exponential(max(power, _LOWEST))
-        drawn = (power >= faint) & (number <= scratch[_NUMBER + p])
+        drawn = (power >= min_level) & (number <= scratch[_NUMBER + p])
         covered = min(raw, _OPAQUE) if drawn else _ZERO
         passed = _ONE / (_ONE - covered)
         before, behind = scratch[_LIVE + p] * passed, scratch[_REST + p]
@@ -207,7 +207,7 @@ def blend_back(
     slots,
     bounds,
     paint,
-    faint,
+    min_level,
     numbers,
     by_color,
     by_alpha,
@@ -245,4 +245,4 @@ def blend_back(
             row, slot = rows[starts[tile] + k], slots[starts[tile] + k]
             middle, center = np.float32(places[row, 0] - left), np.float32(places[row, 1] - top)
             first, last = _stretch(places[row, 1] - top, packed[row, 8])
-            _uncover(scratch, packed, row, middle, center, first, last, np.float32(k), faint, parts, slot)
+            _uncover(scratch, packed, row, middle, center, first, last, np.float32(k), min_level, parts, slot)
