@@ -47,8 +47,8 @@ _LISTENED = 7
 _CHILD = """
 import json, sys
 from avmsf.field.store import load
-from avmsf.simulate.material import CERAMIC, GLASS
-from avmsf.tasks.material import change_material
+from avmsf.fem.material import CERAMIC, GLASS
+from avmsf.editing.material import change_material
 from benchmarks.step import peak_gigabytes
 
 field = load(sys.argv[1])
