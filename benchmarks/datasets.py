@@ -16,7 +16,7 @@ NAME = "43_IronMortar"
 _CHILD = """
 import json, resource, sys, time, warnings
 from avmsf.errors import CaptureWarning
-from avmsf.capture.datasets import open_dataset
+from avmsf.datasets import open_dataset
 from benchmarks.step import peak_gigabytes
 
 warnings.simplefilter("ignore", CaptureWarning)
