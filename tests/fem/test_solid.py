@@ -288,6 +288,16 @@ def apart(surface: Surface) -> Surface:
     return Surface(vertices, torch.cat([surface.faces, surface.faces + len(surface.vertices)]))
 
 
+def test_a_mesh_has_the_same_tetrahedra_each_time_and_a_damaged_copy_is_made_again(monkeypatch, tmp_path):
+    monkeypatch.setenv("AVMSF_CACHE", str(tmp_path))
+    first, second = fill(ball(), detail=0.2), fill(ball(), detail=0.2)
+    assert torch.equal(first.points, second.points)
+    assert torch.equal(first.cells, second.cells)
+    (stored,) = (tmp_path / "tetrahedra").iterdir()
+    stored.write_bytes(stored.read_bytes()[:100])
+    assert fill(ball(), detail=0.2).volume == pytest.approx(first.volume, rel=0.05)
+
+
 def test_filling_that_takes_too_long_says_so():
     with raises(SimulationError, name="timeout", value=0.01):
         fill(ball(subdivisions=1), timeout=0.01)

@@ -1,22 +1,29 @@
 """Any mesh or scan as tetrahedra, by pytetwild, which allows holes and self-intersections.
 
-pytetwild inserts the triangles in a random order, so two runs differ in their tetrahedra and somewhat in the body's
-frequencies (docs/limitations.md). Keep the solid, or the modes, to keep the sounds. It runs in a process of its own,
-for it may crash, and never ends on some meshes.
+pytetwild inserts the triangles in a random order, so two machines differ in their tetrahedra and somewhat in the body's
+frequencies (docs/limitations.md). On one machine a mesh has the same tetrahedra each time: they are stored by its
+digest. pytetwild runs in a process of its own, for it may crash, and never ends on some meshes.
 """
 
+import hashlib
 import importlib.util
+import io
 import os
 import subprocess
 import sys
 import tempfile
+import zipfile
+from contextlib import suppress
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64
 
+from avmsf._utils.caching import discard, keep_if_possible
 from avmsf._utils.children import end_child, start_child
+from avmsf._utils.files import write_whole
 from avmsf.errors import SimulationError
 from avmsf.fem import tetrahedra_worker
 from avmsf.fem.skin import Skin
@@ -35,6 +42,8 @@ _LID = 0.25
 """Part of the solid's surface that may close holes."""
 _LOST = 0.1
 """Part of the mesh, or of the volume of its parts, that may be left out."""
+_MAX_STORED = 300
+"""Fillings that are stored, some megabytes each; the oldest are removed."""
 
 
 def fill(surface: Surface, *, detail: float = 0.05, timeout: float = 600.0) -> Solid:
@@ -54,7 +63,7 @@ def fill(surface: Surface, *, detail: float = 0.05, timeout: float = 600.0) -> S
             f"expected a mesh that encloses a volume, got a flat sheet; {advice}", name="volume", value=0
         )
     coarse = skin.coarsened(_SHORTEST * detail * skin.size, turn=_TURN)
-    points, cells = _tetrahedralize(coarse, detail, timeout)
+    points, cells = _stored(coarse, detail, timeout)
     if not len(cells):
         raise SimulationError(
             f"expected a mesh that encloses a volume, got {skin.open_edges} open edges; {advice}",
@@ -70,6 +79,29 @@ def expect_detail(detail: float) -> None:
     """Raise SimulationError for what is no length of edges over the body's size."""
     if not 0 < detail < 1:
         raise SimulationError.expected("a part of the object's size, above 0 and below 1", detail, name="detail")
+
+
+def _stored(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return points and cells, stored in AVMSF_CACHE or ~/.cache/avmsf when they are first made."""
+    folder = Path(os.environ.get("AVMSF_CACHE") or os.path.expanduser("~/.cache/avmsf")) / "tetrahedra"
+    values = f"{version('pytetwild')} {detail} {_ENVELOPE} {skin.points.shape} {skin.points.dtype} {skin.faces.dtype}"
+    digest = hashlib.sha256(values.encode() + skin.points.tobytes() + skin.faces.tobytes()).hexdigest()
+    path = folder / f"{digest[:24]}.npz"
+    try:
+        with np.load(io.BytesIO(path.read_bytes())) as arrays:
+            return arrays["points"], arrays["cells"]
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+        points, cells = _tetrahedralize(skin, detail, timeout)
+
+    def write(temporary: Path) -> None:
+        with open(temporary, "wb") as file:
+            np.savez(file, points=points, cells=cells)
+
+    keep_if_possible(lambda: write_whole(path, write), path)
+    with suppress(OSError):
+        for old in sorted(folder.glob("*.npz"), key=lambda each: each.stat().st_mtime)[:-_MAX_STORED]:
+            discard(old)
+    return points, cells
 
 
 def _tetrahedralize(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarray, np.ndarray]:
