@@ -197,14 +197,14 @@ TURN = Rotation.from_euler("zyx", [28, 15, -40], degrees=True)
     ("case", "words"),
     [
         ("as they are", ""),
-        ("nan", "vertex 7: expected a finite float32 number as y, got nan"),
+        ("nan", "expected a finite float32 number as y of each vertex, got nan"),
         ("colors", "got Gaussians without f_dc_0, f_dc_1, f_dc_2"),
         ("y down", "(x, y, z) taken as (x, -y, -z)"),
         ("moved", "the Gaussians and the contacts are in different frames"),
         ("moved as stated", "once moved as dataparser_transforms.json"),
     ],
 )
-def test_check_opens_gaussians_and_tells_another_frame_which_reconstruct_refuses(
+def test_check_opens_gaussians_and_tells_another_frame_which_fit_refuses(
     tmp_path: Path, case: str, words: str, capsys: Streams
 ) -> None:
     folder = fill_plate(tmp_path / "plate", surface=False)
