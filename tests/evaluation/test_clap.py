@@ -174,6 +174,7 @@ def test_a_model_that_is_neither_here_nor_there_says_how_to_get_it(tmp_path, mon
     assert "hf download laion/clap-htsat-unfused --local-dir FOLDER" in str(caught.value)
 
 
+@pytest.mark.slow
 def test_a_failed_download_is_one_sentence_without_the_clients_exception(tmp_path, monkeypatch):
     from huggingface_hub import constants
 
