@@ -128,15 +128,15 @@ def spaces_of(labelled: Sequence[KnownObject], *, seed: int = 0) -> dict[str, Ma
     }
 
 
-def stranger(shape: SolvedShape, material: str, *, seed: int) -> KnownObject:
+def other_recording(shape: SolvedShape, material: str, *, seed: int) -> KnownObject:
     """Return a shape in a material and in a size of its own."""
     return shape.struck(MATERIALS[material], size=drawn_size(shape.kind, material, seed=100 + seed))
 
 
 def referred_task(own: SolvedShape, other: SolvedShape, transition: Transition, *, seed: int) -> EditTask:
     """Return one object to edit, with recordings of another shape in the new material."""
-    edited = stranger(own, transition.source, seed=seed)
-    heard = stranger(other, transition.target, seed=seed).impacts
+    edited = other_recording(own, transition.source, seed=seed)
+    heard = other_recording(other, transition.target, seed=seed).impacts
     name = f"{other.kind} of {transition.target}"
     reference = Reference.of(heard.sounds, sample_rate=heard.sample_rate, name=name)
     return EditTask(edited, transition.target, reference=reference, seed=seed)

@@ -28,7 +28,7 @@ from avmsf.evaluation.editing import (
     EditMethod,
     EditScore,
     EditTask,
-    Recast,
+    MaterialChange,
     judge,
     prompted_tasks,
     towards_reference,
@@ -44,11 +44,11 @@ from avmsf.evaluation.editing_objects import (
     PaperFields,
     recorded_objects,
 )
-from avmsf.evaluation.objects import ObjectLooks
+from avmsf.evaluation.objects import ObjectFeatures
 from avmsf.evaluation.protocols import EDITING_UMAP
 from avmsf.pipeline.config import DINO, PRESETS
 from avmsf.pipeline.features import choose_encoder
-from benchmarks.editing import labelled_objects, referred_task, spaces_of, strange_shapes, stranger
+from benchmarks.editing import labelled_objects, other_recording, referred_task, spaces_of, strange_shapes
 from benchmarks.editingfigures import write_figures
 from benchmarks.report import Options, Report, Table, log, show
 
@@ -175,8 +175,8 @@ def _paper_fields(dataset: Dataset, encoder: str, cache: Path, *, seed: int) -> 
     # Before the modes of all objects: without the encoder nothing else is worth its time.
     choose_encoder(lift, log=log)
     scene = replace(scene, splat=replace(scene.splat, seed=seed), lift=lift)
-    looks = ObjectLooks(dataset, cache, scene, lift)
-    return PaperFields(lambda name: looks(name, "paper"), replace(PUBLISHED, seed=seed), cache / "training")
+    inputs = ObjectFeatures(dataset, cache, scene, lift)
+    return PaperFields(lambda name: inputs(name, "paper"), replace(PUBLISHED, seed=seed), cache / "training")
 
 
 def simulated_cast(*, words: bool, seed: int = 0) -> Cast:
@@ -185,7 +185,7 @@ def simulated_cast(*, words: bool, seed: int = 0) -> Cast:
     labelled, shapes = labelled_objects(), strange_shapes()
     tasks: tuple[EditTask, ...]
     if words:
-        edited = [stranger(shape, each.source, seed=seed) for each in SEVEN_TRANSITIONS for shape in shapes]
+        edited = [other_recording(shape, each.source, seed=seed) for each in SEVEN_TRANSITIONS for shape in shapes]
         tasks = prompted_tasks(edited, SEVEN_TRANSITIONS, seed=seed)
     else:
         pairs = tuple(zip(shapes, shapes[::-1], strict=True))
@@ -221,7 +221,9 @@ def measure(
         methods = towards_words(model, settings, generated=generated, paper=paper)
     else:
         methods = tuple(
-            each for each in towards_reference(settings, paper=paper) if cast.known or not isinstance(each, Recast)
+            each
+            for each in towards_reference(settings, paper=paper)
+            if cast.known or not isinstance(each, MaterialChange)
         )
     scores = judge(cast.tasks, methods, spaces, clap=clap, progress=_tell_score)
     if record is not None:

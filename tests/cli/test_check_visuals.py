@@ -18,7 +18,7 @@ from avmsf.capture.filenames import pictures_in
 from avmsf.capture.placement import surface_points
 from avmsf.capture.settings import METRES
 from avmsf.cli import main
-from avmsf.cli.visuals import VisualInputs, visual_inputs
+from avmsf.cli.visuals import VisualInputs, inputs
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
 from avmsf.photographs.folder import find_shots, write_views
@@ -32,7 +32,7 @@ Streams = pytest.CaptureFixture[str]
 
 
 def found(folder: Path) -> VisualInputs:
-    visual = visual_inputs(folder, CaptureSettings())
+    visual = inputs(folder, CaptureSettings())
     assert visual is not None
     return visual
 

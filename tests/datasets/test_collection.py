@@ -66,7 +66,7 @@ def test_every_dataset_answers_alike(place: Path, path: str) -> None:
         assert len(impacts) == report.recordings
         # Separate names, so that training and test recordings can be told apart.
         assert len(set(impacts.names)) == len(impacts)
-    for ask in (dataset.facts, dataset.capture, dataset.look):
+    for ask in (dataset.facts, dataset.capture, dataset.source):
         with raises(DatasetError, name="object", value="teapot"):
             ask("teapot")
 
@@ -141,7 +141,7 @@ def test_a_collection_reads_what_read_capture_reads(place: Path) -> None:
     assert one.impacts.names == other.impacts.names
     assert one.impacts.sounds.equal(other.impacts.sounds)
     assert dataset.check().remarks == ("folders without impacts.csv are ignored: notes",)
-    assert dataset.look("bowl") is None
+    assert dataset.visual_source("bowl") is None
     with raises(DatasetError, name="object", value="plate") as caught:
         dataset.capture("plate")
     assert "10_plate?" in str(caught.value)
@@ -152,13 +152,13 @@ def test_a_capture_with_something_to_see_has_a_look(tmp_path: Path, sight: str) 
     fill(tmp_path / "cup", settings='name = "my cup"')
     (tmp_path / "cup/images").mkdir()
     dataset = CaptureCollection(tmp_path)
-    assert dataset.look("cup") is None
+    assert dataset.visual_source("cup") is None
     if "/" not in sight:
         (tmp_path / "cup/images").rmdir()
     (tmp_path / "cup" / sight).touch()
-    look = dataset.look("cup")
-    assert look is not None
-    assert (look.folder, look.settings.name, dataset.facts("cup").name) == (tmp_path / "cup", "my cup", "my cup")
+    source = dataset.visual_source("cup")
+    assert source is not None
+    assert (source.folder, source.settings.name, dataset.facts("cup").name) == (tmp_path / "cup", "my cup", "my cup")
 
 
 def test_a_collection_s_check_reads_no_sound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -61,13 +61,13 @@ def test_force_gain_and_pad_are_divided_out(folder: Path) -> None:
 
 def test_the_mesh_is_surface_and_look(folder: Path) -> None:
     dataset = ObjectFolderRaw(folder)
-    look = dataset.look("2")
-    assert look is not None
-    assert (look.folder / (look.settings.surface or "")).name == "model.obj"
+    source = dataset.visual_source("2")
+    assert source is not None
+    assert (source.folder / (source.settings.surface or "")).name == "model.obj"
     surface = dataset.capture("2").surface
     assert surface is not None
     assert torch.allclose(surface.vertices.norm(dim=1), torch.tensor(0.1), atol=1e-6)
-    assert dataset.look("10") is None
+    assert dataset.visual_source("10") is None
     assert dataset.capture("10").surface is None
 
 

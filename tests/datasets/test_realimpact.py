@@ -85,10 +85,10 @@ def test_a_turned_grid_with_places_in_common_is_heard_from_one_of_them(tmp_path:
 
 def test_the_mesh_is_surface_and_look(whole: Path) -> None:
     dataset = RealImpact(whole)
-    surface, look = dataset.capture(NAME).surface, dataset.look(NAME)
+    surface, source = dataset.capture(NAME).surface, dataset.visual_source(NAME)
     assert surface is not None
-    assert look is not None
-    assert (look.folder / (look.settings.surface or "")).is_file()
+    assert source is not None
+    assert (source.folder / (source.settings.surface or "")).is_file()
     assert len(surface.faces) == 1280
 
 
@@ -164,5 +164,5 @@ def test_samples_that_are_no_numbers_are_refused(folder: Path) -> None:
 
 def test_a_number_alone_is_told_whose_it_is(whole: Path) -> None:
     with raises(DatasetError, name="object", value="43") as caught:
-        RealImpact(whole).look("43")
+        RealImpact(whole).visual_source("43")
     assert "43_IronMortar?" in str(caught.value)

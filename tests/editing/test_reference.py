@@ -9,7 +9,7 @@ import pytest
 import soundfile
 import torch
 
-from avmsf.editing.clips import lasting, level, levelled, resampled
+from avmsf.editing.clips import level, levelled, resampled, with_length
 from avmsf.editing.material_statistics import MaterialStatistics
 from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
 from avmsf.editing.reference import Reference
@@ -74,7 +74,7 @@ def test_where_a_clip_ends_nothing_is_asked():
     targets = reference.targets(sound, 0, torch.Generator())
     assert torch.equal(targets[:, 1000:], sound[:, 1000:])
     # Until the 10 ms before the end it is the clip alone.
-    early = levelled(lasting(reference.clips, 4000), sound, sample_rate=RATE)
+    early = levelled(with_length(reference.clips, 4000), sound, sample_rate=RATE)
     torch.testing.assert_close(targets[:, :900], early[:, :900])
 
 

@@ -28,20 +28,20 @@ METHODS = ("nearest", "knn3", "knn-gains")
 def run_of(impacts: Impacts, folder: Path, own_starts: Impacts | None = None) -> CaseRun:
     methods = tuple(map(method_named, METHODS))
     metric_settings = MetricSettings(level="raw", cdpam=False)
-    looks, bodies = PlateLooks(), NoBodies()
+    inputs, bodies = PlateLooks(), NoBodies()
     protocol, dataset = PROTOCOLS["farthest"], CaptureCollection(folder)
     data = ObjectData(
         "a",
         impacts,
-        features=looks,
+        features=inputs,
         bodies=partial(bodies, "a"),
         family=partial(bodies.family, "a"),
-        stranger=lambda: torch.zeros(impacts.sounds.shape[1]),
+        other_recording=lambda: torch.zeros(impacts.sounds.shape[1]),
         own_starts=own_starts,
     )
-    evaluation = Evaluation(dataset, "plates", protocol, methods, looks, bodies, metric_settings=metric_settings)
+    evaluation = Evaluation(dataset, "plates", protocol, methods, inputs, bodies, metric_settings=metric_settings)
     case = Case("all", tuple(range(TRAIN)), tuple(range(TRAIN, COUNT)))
-    return CaseRun(evaluation, data, case, folder=folder, number=1, listened=False)
+    return CaseRun(evaluation, data, case, folder=folder, number=1, stores_sounds=False)
 
 
 def test_errors_of_baselines_do_not_depend_on_delays(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from avmsf.evaluation.editing import (
     SIMULATED_TRANSITIONS,
     EditTask,
     Generation,
-    Recast,
+    MaterialChange,
     Transition,
     Untouched,
     judge,
@@ -204,7 +204,7 @@ class Recorded:
     def capture(self, identifier: str) -> Capture:
         return Capture(identifier, plate_impacts(4), None)
 
-    def look(self, identifier: str) -> None:
+    def visual_source(self, identifier: str) -> None:
         return None
 
     def check(self) -> DatasetReport:
@@ -404,14 +404,14 @@ def test_every_transition_has_two_prompts_for_every_object():
 
 def test_physics_reaches_the_object_of_the_new_material(space):
     wanted = struck("wood")
-    (before, after) = judge([EditTask(struck("ceramic"), "wood")], (Untouched(), Recast()), {"flat": space})
-    made = Recast().edit(EditTask(struck("ceramic"), "wood"))
+    (before, after) = judge([EditTask(struck("ceramic"), "wood")], (Untouched(), MaterialChange()), {"flat": space})
+    made = MaterialChange().edit(EditTask(struck("ceramic"), "wood"))
     assert torch.allclose(made.bank.frequency, wanted.bank.frequency[: len(made.bank)], rtol=1e-6)
     assert torch.allclose(made.bank.damping, wanted.bank.damping[: len(made.bank)], rtol=1e-6)
     assert after.octaves["flat"] < 0.5 * before.octaves["flat"]
     assert after.umap["flat"] == pytest.approx(5.0)
     with raises(EvaluationError, name="material", value="metal"):
-        Recast().edit(EditTask(struck("ceramic"), "metal"))
+        MaterialChange().edit(EditTask(struck("ceramic"), "metal"))
 
 
 def test_the_spectral_distance_is_free_of_level():

@@ -18,7 +18,7 @@ from avmsf.datasets import CaptureCollection
 from avmsf.errors import AvmsfError, EvaluationError, FitError
 from avmsf.evaluation.methods import method_named
 from avmsf.evaluation.modal_metrics import ModalRenderer, compare_modes, truth_at
-from avmsf.evaluation.objects import ObjectBodies, ObjectLooks, draw_other_recording
+from avmsf.evaluation.objects import ObjectBodies, ObjectFeatures, draw_other_recording
 from avmsf.evaluation.protocols import PROTOCOLS
 from avmsf.evaluation.report import write_summary
 from avmsf.evaluation.results import ENCODER, ResultsFolder
@@ -413,7 +413,7 @@ def test_many_at_a_time_come_to_the_same_figures(plates: Path, tmp_path: Path) -
     evaluation = planned(plates, *CHEAP, "spline-gains")
     # Workers find what the package holds, and not what lies beside the tests.
     dataset, kept = evaluation.dataset, tmp_path / "features"
-    evaluation = replace(evaluation, features=ObjectLooks(dataset, kept), bodies=ObjectBodies(dataset, kept))
+    evaluation = replace(evaluation, features=ObjectFeatures(dataset, kept), bodies=ObjectBodies(dataset, kept))
     objects = evaluation.dataset.objects()
     run_objects(evaluation, objects, ResultsFolder(tmp_path / "one"))
     many = ResultsFolder(tmp_path / "many")

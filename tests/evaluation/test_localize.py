@@ -18,7 +18,7 @@ from avmsf.errors import LocationError
 from avmsf.evaluation import localization, report
 from avmsf.evaluation.field_methods import FieldMethod, GridField
 from avmsf.evaluation.localization import MAX_VERTICES, located, random_distance
-from avmsf.evaluation.objects import ObjectLooks
+from avmsf.evaluation.objects import ObjectFeatures
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.simple_methods import NearestRecording, WhiteNoise
 from avmsf.evaluation.task import Task
@@ -138,7 +138,7 @@ def test_heat_maps_have_the_true_contacts_and_the_papers_methods_their_own_dista
         drawn[title] = (found, truth)
         return Figure()
 
-    monkeypatch.setattr(ObjectLooks, "__call__", lambda looks, *given, **named: PlateLooks()(*given, **named))
+    monkeypatch.setattr(ObjectFeatures, "__call__", lambda inputs, *given, **named: PlateLooks()(*given, **named))
     monkeypatch.setattr(FieldMethod, "fit", quick)
     monkeypatch.setattr("avmsf.evaluation.runner.located", watched)
     monkeypatch.setattr(report, "draw_contact", draw)

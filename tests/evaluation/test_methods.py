@@ -95,7 +95,7 @@ def plate_task(train: Impacts, *, impacts: Impacts | None = None, seed: int = 0)
         modes=lambda: plate_extraction(train),
         features=lambda look: plate_features(200),
         bodies=plate_bodies,
-        stranger=lambda: torch.linspace(-1, 1, SAMPLES),
+        other_recording=lambda: torch.linspace(-1, 1, SAMPLES),
         family=plate_family,
     )
 
@@ -207,7 +207,7 @@ def test_a_random_impact_is_the_strangers_everywhere():
     sounds = made("random-impact").render(test.contacts)
     assert torch.equal(sounds, torch.linspace(-1, 1, SAMPLES).expand(len(test), -1))
     with raises(EvaluationError, name="stranger"):
-        METHODS["random-impact"].fit(replace(plate_task(train), stranger=no_stranger))
+        METHODS["random-impact"].fit(replace(plate_task(train), other_recording=no_stranger))
 
 
 def no_stranger():

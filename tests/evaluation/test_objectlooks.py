@@ -9,9 +9,9 @@ import torch
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
-from avmsf.datasets.dataset import DatasetReport, Look, ObjectFacts
+from avmsf.datasets.dataset import DatasetReport, ObjectFacts, VisualSource
 from avmsf.errors import SceneError
-from avmsf.evaluation.objects import ObjectLooks
+from avmsf.evaluation.objects import ObjectFeatures
 from avmsf.features.feature_field import FeatureField
 from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.ply import read_splats
@@ -45,8 +45,8 @@ class OneObject:
         contacts = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.2, 0.0], [0.1, 0.0, 0.1]], dtype=torch.float64)
         return Capture("slab", Impacts(contacts, torch.zeros(3, 8), 100.0, ("a", "b", "c")), self.surface)
 
-    def look(self, identifier: str) -> Look | None:
-        return None if self.seen is None else Look(self.seen)
+    def visual_source(self, identifier: str) -> VisualSource | None:
+        return None if self.seen is None else VisualSource(self.seen)
 
     def check(self) -> DatasetReport:
         return DatasetReport(self.name, ())
@@ -61,8 +61,8 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_looks_and_positions_are_of_the_same_points_and_made_once(seen: Path, tmp_path: Path) -> None:
-    looks = ObjectLooks(OneObject(seen), tmp_path, CONFIG)
-    aligned, bare, unaligned = (looks("slab", look) for look in ("visual", "positions", "unaligned"))
+    inputs = ObjectFeatures(OneObject(seen), tmp_path, CONFIG)
+    aligned, bare, unaligned = (inputs("slab", visual_input) for visual_input in ("visual", "positions", "unaligned"))
     assert torch.equal(aligned.points, bare.points)
     assert torch.equal(aligned.points, unaligned.points)
     assert bare.features.shape == (400, 3)
@@ -71,7 +71,7 @@ def test_looks_and_positions_are_of_the_same_points_and_made_once(seen: Path, tm
     assert not torch.allclose(aligned.features, unaligned.features)
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")}
     assert len(before) == 2
-    looks("slab", "visual")
+    inputs("slab", "visual")
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")} == before
 
 
@@ -79,16 +79,16 @@ def test_looks_and_positions_are_of_the_same_points_and_made_once(seen: Path, tm
 def test_the_papers_features_are_of_gaussians_even_where_a_mesh_is_there(seen: Path, tmp_path: Path) -> None:
     scene = replace(CONFIG, splat=SplatConfig(steps=30, start_points=400))
     paper = replace(PRESETS["paper"].scene.lift, encoder="descriptors")
-    looks = ObjectLooks(OneObject(seen), tmp_path, scene, paper)
-    features = looks("slab", "paper")
+    inputs = ObjectFeatures(OneObject(seen), tmp_path, scene, paper)
+    features = inputs("slab", "paper")
     (cloud,) = tmp_path.rglob("cloud.ply")
     assert {*map(tuple, features.points.tolist())} <= {*map(tuple, read_splats(cloud).centers.tolist())}
     # All that the encoder says, and no positions.
     assert features.features.shape[1] > 4 + 3
     assert "components" not in features.encoder
-    assert len(looks("slab", "visual").points) == 400
+    assert len(inputs("slab", "visual").points) == 400
     # The paper's ablations differ from it in nothing else.
-    bare, unaligned = looks("slab", "paper-positions"), looks("slab", "paper-unaligned")
+    bare, unaligned = inputs("slab", "paper-positions"), inputs("slab", "paper-unaligned")
     assert torch.equal(bare.points, features.points)
     assert torch.equal(bare.features, FeatureField.from_points(features.points).features)
     assert unaligned.features.shape == features.features.shape
@@ -97,20 +97,20 @@ def test_the_papers_features_are_of_gaussians_even_where_a_mesh_is_there(seen: P
 
 @pytest.mark.slow
 def test_fewer_views_are_kept_apart_from_all(seen: Path, tmp_path: Path) -> None:
-    looks = ObjectLooks(OneObject(seen), tmp_path, CONFIG)
-    few, every = looks("slab", "visual", 6), looks("slab", "visual")
+    inputs = ObjectFeatures(OneObject(seen), tmp_path, CONFIG)
+    few, every = inputs("slab", "visual", 6), inputs("slab", "visual")
     assert not torch.allclose(few.features, every.features)
     images = {place.name: len(list(place.rglob("images/*.png"))) for place in (tmp_path / "slab").iterdir()}
     assert images == {"6 views": 6, "all views": 72}
 
 
 def test_an_object_that_nothing_shows_has_positions_alone(tmp_path: Path) -> None:
-    looks = ObjectLooks(OneObject(None), tmp_path, CONFIG)
-    points = looks("slab", "positions").points
+    inputs = ObjectFeatures(OneObject(None), tmp_path, CONFIG)
+    points = inputs("slab", "positions").points
     assert points.amin(0).tolist() == pytest.approx([0.0, 0.0, 0.0], abs=0.02)
     assert points.amax(0).tolist() == pytest.approx([0.1, 0.2, 0.1], abs=0.02)
     with raises(SceneError, name="slab"):
-        looks("slab", "visual")
+        inputs("slab", "visual")
 
 
 def test_a_mesh_may_be_preferred_to_the_photographs_beside_it(tmp_path: Path) -> None:
@@ -128,12 +128,12 @@ def test_a_negative_number_of_views_is_refused() -> None:
 
 
 def test_the_surface_of_a_mesh_needs_no_views_and_is_that_of_a_fit(tmp_path: Path) -> None:
-    found = ObjectLooks(OneObject(None, slab()), tmp_path / "cache", CONFIG, seed=3)("slab", "surface")
+    found = ObjectFeatures(OneObject(None, slab()), tmp_path / "cache", CONFIG, seed=3)("slab", "surface")
     assert torch.equal(found.points, FeatureField.from_mesh(slab(), seed=3).points)
     assert not (tmp_path / "cache").exists()
 
 
 @pytest.mark.slow
 def test_the_surface_is_that_of_the_views_where_a_mesh_does_not_count(seen: Path, tmp_path: Path) -> None:
-    looks = ObjectLooks(OneObject(seen, slab()), tmp_path, CONFIG, meshes=False)
-    assert torch.equal(looks("slab", "surface").points, looks("slab", "positions").points)
+    inputs = ObjectFeatures(OneObject(seen, slab()), tmp_path, CONFIG, meshes=False)
+    assert torch.equal(inputs("slab", "surface").points, inputs("slab", "positions").points)

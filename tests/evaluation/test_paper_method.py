@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from avmsf.cli.evaluate import looks_of, settled_lifts
+from avmsf.cli.evaluate import inputs_of, settled_lifts
 from avmsf.datasets import CaptureCollection
 from avmsf.errors import EvaluationError, SceneError
 from avmsf.evaluation.field_methods import NETWORK, FieldMethod, GridField
@@ -53,7 +53,7 @@ def test_a_method_may_find_modes_in_its_own_way() -> None:
         modes=shared,
         features=lambda look: plate_features(),
         bodies=shared,
-        stranger=shared,
+        other_recording=shared,
     )
     pipeline = replace(NETWORK, extraction="short-time", fit=replace(QUICK, steps=1, correction_rate=0.0))
     field = FieldMethod("quick", pipeline, "paper", published=True).fit(task)
@@ -91,13 +91,13 @@ def test_encoders_are_loaded_once_on_the_device_and_only_for_who_reads_them(monk
         return ImageDescriptors()
 
     monkeypatch.setattr(DinoEncoder, "load", load)
-    read = looks_of([METHODS["knn3"], METHODS["white-noise"], METHODS["diffsound"]], PROTOCOLS["farthest"])
+    read = inputs_of([METHODS["knn3"], METHODS["white-noise"], METHODS["diffsound"]], PROTOCOLS["farthest"])
     assert settled_lifts(LiftConfig(), read, device="cpu")[0] == LiftConfig()
-    assert settled_lifts(LiftConfig(), looks_of([METHODS["field-auto"]], PROTOCOLS["localize"]))[0] == LiftConfig()
+    assert settled_lifts(LiftConfig(), inputs_of([METHODS["field-auto"]], PROTOCOLS["localize"]))[0] == LiftConfig()
     assert loaded == []
     # Recordings are located at the points that features have.
-    assert looks_of([METHODS["nearest"]], PROTOCOLS["localize"]) == {"surface"}
-    read = looks_of([METHODS["field"], METHODS["field-auto"], METHODS["paper-grid"]], PROTOCOLS["farthest"])
+    assert inputs_of([METHODS["nearest"]], PROTOCOLS["localize"]) == {"surface"}
+    read = inputs_of([METHODS["field"], METHODS["field-auto"], METHODS["paper-grid"]], PROTOCOLS["farthest"])
     assert read == {"visual", "surface", "paper"}
     assert settled_lifts(LiftConfig(), read, device="cpu")[0].encoder == DINO
     assert loaded == [(DINO, "cpu")]

@@ -11,7 +11,7 @@ import torch
 import trimesh
 
 from avmsf.errors import CaptureError, ExportError
-from avmsf.export.geometry import Look, read_look
+from avmsf.export.geometry import DisplayGeometry, read_display_geometry
 from avmsf.export.gltf import write_gltf
 from avmsf.export.one_phase import approximation_error
 from avmsf.mesh.textured_mesh import TexturedMesh
@@ -144,7 +144,11 @@ def test_viewers_show_the_mesh_or_the_points(tmp_path):
     vertices, faces = torch.from_numpy(np.array(box.vertices)).float(), torch.from_numpy(np.array(box.faces))
     red = torch.zeros(len(faces), 3, 3)
     red[..., 0] = 1.0
-    write_gltf(table(), tmp_path / "mesh.glb", look=Look.of_mesh(TexturedMesh.build(vertices, faces, colors=red)))
+    write_gltf(
+        table(),
+        tmp_path / "mesh.glb",
+        geometry=DisplayGeometry.of_mesh(TexturedMesh.build(vertices, faces, colors=red)),
+    )
     shown = trimesh.load(tmp_path / "mesh.glb", process=False).dump()[0]
     assert len(shown.faces) == 12
     assert shown.volume == pytest.approx(0.2 * 0.1 * 0.3, rel=1e-5)
@@ -169,7 +173,9 @@ def test_the_objects_axis_points_up_and_coordinates_stay_in_its_frame(tmp_path, 
     box.apply_translation(np.eye(3)[axis])
     vertices, faces = torch.from_numpy(np.array(box.vertices)).float(), torch.from_numpy(np.array(box.faces))
     field = table()
-    write_gltf(field, tmp_path / "a.glb", look=Look.of_mesh(TexturedMesh.build(vertices, faces)), **words)
+    write_gltf(
+        field, tmp_path / "a.glb", geometry=DisplayGeometry.of_mesh(TexturedMesh.build(vertices, faces)), **words
+    )
     scene = trimesh.load(tmp_path / "a.glb", process=False)
     shown = scene.dump()[0]
     np.testing.assert_allclose(shown.centroid, [0.0, 1.0, 0.0], atol=1e-6)
@@ -188,10 +194,10 @@ def test_a_texture_becomes_the_corners_colors():
         coordinates=torch.tensor([[[0.1, 0.1], [0.9, 0.1], [0.1, 0.9]]]),
         textures=[picture],
     )
-    look = Look.of_mesh(mesh)
-    upper = int((look.vertices[:, 1] == 1).nonzero()[0])
-    assert look.colors[upper].tolist() == [0.0, 1.0, 0.0]
-    assert look.colors.sum() == 1.0
+    geometry = DisplayGeometry.of_mesh(mesh)
+    upper = int((geometry.vertices[:, 1] == 1).nonzero()[0])
+    assert geometry.colors[upper].tolist() == [0.0, 1.0, 0.0]
+    assert geometry.colors.sum() == 1.0
 
 
 def test_a_mesh_too_fine_for_viewers_is_reduced_and_keeps_its_colors(tmp_path, monkeypatch):
@@ -199,10 +205,10 @@ def test_a_mesh_too_fine_for_viewers_is_reduced_and_keeps_its_colors(tmp_path, m
     upper = ball.vertices[:, 2] > 0
     ball.visual.vertex_colors = np.where(upper[:, None], [255, 0, 0, 255], [0, 0, 255, 255]).astype(np.uint8)
     ball.export(tmp_path / "ball.ply")
-    whole, remarks = read_look(tmp_path / "ball.ply", table())
+    whole, remarks = read_display_geometry(tmp_path / "ball.ply", table())
     assert (len(whole.faces), remarks) == (5120, ())
     monkeypatch.setattr("avmsf.export.geometry.MAX_FACES", 1000)
-    few, (remark,) = read_look(tmp_path / "ball.ply", table())
+    few, (remark,) = read_display_geometry(tmp_path / "ball.ply", table())
     assert 500 < len(few.faces) <= 1000
     assert "5,120" in remark
     np.testing.assert_allclose(few.vertices.norm(dim=1), 0.6, atol=0.02)
@@ -210,7 +216,7 @@ def test_a_mesh_too_fine_for_viewers_is_reduced_and_keeps_its_colors(tmp_path, m
     np.testing.assert_allclose(few.colors[high], torch.tensor([[1.0, 0.0, 0.0]]).expand(int(high.sum()), 3), atol=0.01)
     monkeypatch.setattr("avmsf.mesh.io.MAX_FACES", 5000)
     with raises(CaptureError, file="ball.ply", value=5120):
-        read_look(tmp_path / "ball.ply", table())
+        read_display_geometry(tmp_path / "ball.ply", table())
 
 
 def test_a_field_without_modes_is_refused(tmp_path):

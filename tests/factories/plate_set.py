@@ -7,7 +7,7 @@ import torch
 
 from avmsf.capture import Capture, write_capture
 from avmsf.errors import SceneError, SimulationError
-from avmsf.evaluation.task import Look
+from avmsf.evaluation.task import VisualInput
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.body_family import BodyFamily
 from avmsf.field.gains.elastic import CandidateBodies
@@ -66,8 +66,8 @@ def _surface(plate: Plate) -> Surface:
 class PlateLooks:
     """Positions of a plate, and no looks."""
 
-    def __call__(self, identifier: str, look: Look, views: int | None = None) -> FeatureField:
-        if look not in ("surface", "positions"):
+    def __call__(self, identifier: str, visual_input: VisualInput, views: int | None = None) -> FeatureField:
+        if visual_input not in ("surface", "positions"):
             raise SceneError(f"{identifier}: nothing shows its look")
         return FeatureField.from_points(plate_surface_points(plate_named(identifier), 200))
 

@@ -57,7 +57,7 @@ def test_a_spheres_silhouette_has_the_area_of_its_cone() -> None:
 
 def test_depth_and_normals_of_a_sphere() -> None:
     camera = facing(96, focal=200.0, distance=DISTANCE)
-    sight = MeshTracer(sphere()).look(camera)
+    sight = MeshTracer(sphere()).cast(camera)
     rays = camera.rays()
     along = rays[..., 2] * DISTANCE
     under = along.square() - DISTANCE**2 + RADIUS**2
@@ -173,13 +173,13 @@ def test_smooth_where_it_is_round_and_sharp_at_edges() -> None:
 def test_both_sides_are_seen_and_normals_look_back() -> None:
     for flip in ([0, 1, 2], [0, 2, 1]):
         mesh = TexturedMesh.build(torch.tensor([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]]), torch.tensor([flip]))
-        sight = MeshTracer(mesh).look(facing(9))
+        sight = MeshTracer(mesh).cast(facing(9))
         assert sight.normals[4, 4].tolist() == [0, 0, -1]
         assert sight.depth[4, 4].item() == pytest.approx(1.0, abs=1e-12)
 
 
 def test_no_ray_slips_through_between_faces() -> None:
-    sight = MeshTracer(sphere(4)).look(facing(400, focal=1900.0, distance=DISTANCE))
+    sight = MeshTracer(sphere(4)).cast(facing(400, focal=1900.0, distance=DISTANCE))
     assert bool((sight.faces >= 0).all())
 
 
@@ -192,14 +192,14 @@ def test_a_mesh_far_from_the_origin_is_seen_as_sharply() -> None:
     pose = camera.world_to_camera.clone()
     pose[:3, 3] -= pose[:3, :3] @ away
     (here,) = render_views(near, [camera])
-    there = MeshTracer(moved).look(Camera(pose, camera.focal, camera.principal, 48, 48))
+    there = MeshTracer(moved).cast(Camera(pose, camera.focal, camera.principal, 48, 48))
     assert here.mask is not None
     assert bool(((there.faces >= 0) == (here.mask > 127)).float().mean() > 0.99)
 
 
 def test_a_camera_inside_and_one_that_looks_away() -> None:
     inside = Camera(torch.eye(4, dtype=torch.float64), (20.0, 20.0), (16.0, 16.0), 32, 32)
-    assert bool((MeshTracer(sphere(2)).look(inside).faces >= 0).all())
+    assert bool((MeshTracer(sphere(2)).cast(inside).faces >= 0).all())
     away = Camera(torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)), (20.0, 20.0), (16.0, 16.0), 32, 32)  # fmt: skip  # noqa: E501
     pose = away.world_to_camera.clone()
     pose[2, 3] = -1.0

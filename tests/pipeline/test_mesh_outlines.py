@@ -16,7 +16,7 @@ from avmsf.mesh.surface import write_surface
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.folder import write_views
 from avmsf.photographs.mesh_views import MeshTracer
-from avmsf.pipeline.frame_check import compare_outlines, expect_contacts_in_views, judge_outlines
+from avmsf.pipeline.frame_check import check_outlines, compare_outlines, expect_contacts_in_views
 from factories.plate_capture import fill_plate
 from factories.raising import raises
 from factories.small_scene import slab, slab_views
@@ -44,22 +44,22 @@ def test_a_mesh_agrees_with_pictures_of_it_and_a_larger_one_differs_by_its_area(
 
 def test_what_the_masks_pixels_explain_is_not_spoken_of() -> None:
     settings = CaptureSettings()
-    assert judge_outlines(slab(), VIEWS, settings) is None
-    assert judge_outlines(scaled(1.01), VIEWS, settings) is None
+    assert check_outlines(slab(), VIEWS, settings) is None
+    assert check_outlines(scaled(1.01), VIEWS, settings) is None
     bare = [replace(view, mask=None) for view in VIEWS]
-    assert judge_outlines(scaled(2.0), bare, settings) is None
+    assert check_outlines(scaled(2.0), bare, settings) is None
 
 
 def test_a_tenth_of_wrong_masks_does_not_matter() -> None:
     wrong = [
         replace(view, mask=torch.full_like(view.mask, 255)) if row % 10 == 0 else view for row, view in enumerate(VIEWS)
     ]
-    assert judge_outlines(slab(), wrong, CaptureSettings()) is None
+    assert check_outlines(slab(), wrong, CaptureSettings()) is None
 
 
 @pytest.mark.parametrize("surface", [scaled(1.1), scaled(0.9), Surface(slab().vertices + 0.02, slab().faces)])
 def test_a_mesh_of_another_size_or_place_is_told(surface: Surface) -> None:
-    warning = judge_outlines(surface, VIEWS, CaptureSettings())
+    warning = check_outlines(surface, VIEWS, CaptureSettings())
     assert warning is not None
     assert warning.name == "surface"
     assert 0.05 < warning.value < 1.0
@@ -69,10 +69,10 @@ def test_a_mesh_of_another_size_or_place_is_told(surface: Surface) -> None:
 def test_cameras_in_another_unit_are_refused_with_it(unit: str) -> None:
     """A mesh and contacts in meters, cameras in another unit that the settings do not name; and the other way round."""
     with raises(CaptureError, name="surface_unit", value=pytest.approx(1 / METRES[unit])) as caught:
-        judge_outlines(scaled(METRES[unit]), VIEWS, CaptureSettings())
+        check_outlines(scaled(METRES[unit]), VIEWS, CaptureSettings())
     assert f'views_unit = "{unit}"' in str(caught.value)
     with raises(CaptureError, name="surface_unit", value=pytest.approx(METRES[unit])) as caught:
-        judge_outlines(scaled(1 / METRES[unit]), VIEWS, CaptureSettings())
+        check_outlines(scaled(1 / METRES[unit]), VIEWS, CaptureSettings())
     assert f'unit = "{unit}" and surface_unit = "{unit}"' in str(caught.value)
 
 

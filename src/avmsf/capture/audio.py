@@ -29,7 +29,7 @@ MAX_CHANNEL_DIFFERENCE = 0.01
 """Share of a channel, root mean square, that another channel times a constant may leave of it where both hold one
 sound: 40 dB down, less than the noise of a usable recording (`HIGHEST_NOISE_DB` in measure.py is 20)."""
 _BITS = {"PCM_S8": 8, "PCM_U8": 8, "PCM_16": 16, "PCM_24": 24, "PCM_32": 32}
-FAINT_CHANNEL = 0.1
+MIN_CHANNEL_LEVEL = 0.1
 """Level of a channel over the loudest one's below which it is not used: a muted or far microphone's, 20 dB down."""
 OFFSET_SIGNIFICANCE = 1e-6
 """Probability by which noise without an offset would look as if it had one."""
@@ -104,7 +104,7 @@ class Recording:
                 value=len(self.channels),
             )
         levels = {each: float(np.std(self.channels[each - 1])) for each in left}
-        return next(each for each in left if levels[each] >= FAINT_CHANNEL * levels[loudest])
+        return next(each for each in left if levels[each] >= MIN_CHANNEL_LEVEL * levels[loudest])
 
     def response(
         self, number: int | None = None, *, force_channel: int | None = None

@@ -123,10 +123,10 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
         if each.file != first[each.digest]
     ]
     listed = {report.file for report in reports}
-    stray = [name for name in _wav_files(folder) if name not in listed]
-    if stray:
-        lack = f"{counted(len(stray), 'wav file')} {'has' if len(stray) == 1 else 'have'} no row in {TABLE}"
-        problems.append(f"{lack}: {', '.join(stray[:5])}{', …' * (len(stray) > 5)}")
+    unlisted = [name for name in _wav_files(folder) if name not in listed]
+    if unlisted:
+        lack = f"{counted(len(unlisted), 'wav file')} {'has' if len(unlisted) == 1 else 'have'} no row in {TABLE}"
+        problems.append(f"{lack}: {', '.join(unlisted[:5])}{', …' * (len(unlisted) > 5)}")
     readable = not refused and all(report.readable for report in reports)
     remarks = [UNCUT] if uncut else []
     names = [report.file for report in reports]

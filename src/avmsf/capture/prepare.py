@@ -185,9 +185,9 @@ def deconvolve(
     begin, isolated = isolate(force, pulse)
     later = sound[begin:]
     size = next_fast_len(len(later) + len(isolated), real=True)
-    push, heard = rfft(isolated / pulse.height, size), rfft(later, size)
+    push, recorded = rfft(isolated / pulse.height, size), rfft(later, size)
     power = np.abs(push) ** 2
-    whole = irfft(heard * push.conj() / (power + regularization * power.max()), size)
+    whole = irfft(recorded * push.conj() / (power + regularization * power.max()), size)
     # What the last samples hold of the response is the part of the push that came before its peak.
     # The zeros keep negative times, of which there are at most the window's length, apart from these.
     return whole[size - (pulse.start - begin) :], whole[: len(sound) - pulse.peak]

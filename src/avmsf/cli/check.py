@@ -16,7 +16,7 @@ from avmsf.cli.alignment import AlignmentReport
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.check import Options
 from avmsf.cli.printing import console, decimals, next_command, print_json, say, table
-from avmsf.cli.visuals import misplaced, visual_inputs
+from avmsf.cli.visuals import inputs, misplaced
 from avmsf.datasets import DatasetReport, ObjectReport, open_dataset
 from avmsf.errors import CaptureError, CaptureWarning, ExtractionError
 from avmsf.modal.extraction.extract import Extraction, extract_modes
@@ -36,7 +36,7 @@ def run(options: Options) -> int:
     settings = None if options.settings is None else CaptureSettings.read(options.settings)
     screen = console(errors=options.json)
     doing(f"reading {options.capture}")
-    visual = visual_inputs(options.capture, settings)
+    visual = inputs(options.capture, settings)
     outside = [] if visual is None else misplaced(options.capture, settings, visual)
     factor = next((each.value for each in outside if each.name == "unit"), None)
     proposals = propose_settings(options.capture, settings, factor=factor)

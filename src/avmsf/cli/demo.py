@@ -50,7 +50,7 @@ CONFIG = PipelineConfig(
 )
 FIELD, GAUSSIANS, SHAPE, PAGE = "mug.safetensors", "mug.ply", "mug-surface.ply", "mug.html"
 SCORES, RECORD = "scores.md", "demo.json"
-_HEARD = 2
+_MAX_SOUNDS = 2
 """Contacts whose sounds and spectrograms are written."""
 
 
@@ -105,23 +105,23 @@ def _go_all_the_way(
     shutil.move(folder / CACHE / CLOUD, folder / GAUSSIANS)
     field = load(folder / FIELD)
     scores = compare(field, train, test, made.modes)
-    heard = test.take(farthest_points(test.contacts, min(_HEARD, len(test))).tolist())
+    held_out = test.take(farthest_points(test.contacts, min(_MAX_SOUNDS, len(test))).tolist())
     surface = surface_of(field.gain_field) or made.surface
     write_webpage(field, folder / PAGE, object=folder / GAUSSIANS, surface=surface, strikes=test)
     if made.surface is not None:
         shutil.move(made.surface, folder / SHAPE)
     shutil.rmtree(folder / CACHE)
-    _write_sounds(folder / "sounds", field, train, heard)
+    _write_sounds(folder / "sounds", field, train, held_out)
     poles = modes_words(len(field.bank), int((~field.is_mode).sum()))
     pictures = {
         "modes": draw_modes(
             made.modes.bank, levels(amplitudes(made.modes)), is_mode=field.is_mode, title=f"{poles} of the mug"
         ),
         "spectrograms": draw_spectrograms(
-            heard.sounds,
-            field.render(heard.contacts, directions=heard.directions),
+            held_out.sounds,
+            field.render(held_out.contacts, directions=held_out.directions),
             sample_rate=field.sample_rate,
-            names=[f"impact {row + 1}" for row in range(len(heard))],
+            names=[f"impact {row + 1}" for row in range(len(held_out))],
             title="held-out impacts",
         ),
         "scores": draw_scores(
@@ -149,13 +149,13 @@ def _title(train: Impacts, test: Impacts) -> str:
     return f"{parts_words(train, test)}; lower is better; L1-log counts noise, which the last row lacks"
 
 
-def _write_sounds(folder: Path, field: SoundField, train: Impacts, heard: Impacts) -> None:
+def _write_sounds(folder: Path, field: SoundField, train: Impacts, held_out: Impacts) -> None:
     """Write recorded, rendered and averaged sounds on one scale."""
-    rendered = field.render(heard.contacts, directions=heard.directions)
-    averaged = MeanWaveform(train).render(heard.contacts)
-    factor = Level("peak", -1.0).factor(torch.cat([heard.sounds, rendered, averaged]))
-    for row in range(len(heard)):
-        for kind, sounds in (("1-recorded", heard.sounds), ("2-model", rendered), ("3-mean-of-nearest", averaged)):
+    rendered = field.render(held_out.contacts, directions=held_out.directions)
+    averaged = MeanWaveform(train).render(held_out.contacts)
+    factor = Level("peak", -1.0).factor(torch.cat([held_out.sounds, rendered, averaged]))
+    for row in range(len(held_out)):
+        for kind, sounds in (("1-recorded", held_out.sounds), ("2-model", rendered), ("3-mean-of-nearest", averaged)):
             path = folder / f"impact-{row + 1}-{kind}.wav"
             write_sound(path, factor * sounds[row], sample_rate=field.sample_rate, coding="float32")
 

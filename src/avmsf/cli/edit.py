@@ -99,14 +99,14 @@ def run(options: Options) -> int:
     try:
         new = _edited(options, old)
     except KeyboardInterrupt:
-        kept = _beside(options.output, "checkpoint")
+        kept = _next_to(options.output, "checkpoint")
         where = f"from {kept}, or delete it" if kept.exists() else "from the start"
         say(f"avmsf edit: interrupted; run the same command again to continue {where}")
         return INTERRUPTED
     save(new, options.output)
     if options.steering.asked:
         for ending in ("checkpoint", "preview.wav", "clap.json"):
-            _beside(options.output, ending).unlink(missing_ok=True)
+            _next_to(options.output, ending).unlink(missing_ok=True)
     edits = new.origin.report[EDITS][len(old.origin.report.get(EDITS, [])) :]
     before, after = ModeLevels.of(old), ModeLevels.of(new)
     screen = console(errors=options.json)
@@ -187,10 +187,10 @@ def _guided(options: GuideOptions, field: SoundField, *, output: Path, old: Mate
     State and preview are written next to `output`, its later file, so that the same command continues to the same
     result. `old` is the field's material, needed only for `like_material`.
     """
-    preview, checkpoint = _beside(output, "preview.wav"), _beside(output, "checkpoint")
+    preview, checkpoint = _next_to(output, "preview.wav"), _next_to(output, "checkpoint")
     curve: ClapCurve | None = None
     if options.clap is not None and options.prompt is not None:
-        clap, kept = Clap.load(options.clap), _beside(output, "clap.json")
+        clap, kept = Clap.load(options.clap), _next_to(output, "clap.json")
         curve = ClapCurve(clap, options.prompt, field, kept, resumed=checkpoint.exists())
     # After CLAP: a wrong name of its network is refused before the large model is loaded.
     guide = _guide(options, field, old)
@@ -239,7 +239,7 @@ def _guide(options: GuideOptions, field: SoundField, old: Material | None) -> Gu
     )
 
 
-def _beside(output: Path, ending: str) -> Path:
+def _next_to(output: Path, ending: str) -> Path:
     """Return the path of a part of an unfinished edit: next to its later file."""
     return output.with_name(f"{output.name}.{ending}")
 

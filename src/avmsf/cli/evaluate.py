@@ -22,7 +22,7 @@ from avmsf.errors import EvaluationError
 from avmsf.evaluation.cases import Growing, Predefined
 from avmsf.evaluation.field_methods import configured
 from avmsf.evaluation.methods import RecordedMethod, method_named
-from avmsf.evaluation.objects import SUBSETS, ObjectBodies, ObjectLooks, choose_objects, members
+from avmsf.evaluation.objects import SUBSETS, ObjectBodies, ObjectFeatures, choose_objects, members
 from avmsf.evaluation.protocols import LEARNING_CURVE, PREDEFINED, PUBLISHED, EvaluationProtocol, protocol_named
 from avmsf.evaluation.report import PAGE, SUMMARY, TABLES, write_figures, write_page, write_summary
 from avmsf.evaluation.report_tables import Section
@@ -30,7 +30,7 @@ from avmsf.evaluation.results import IDENTITY, ResultsFolder, write_json
 from avmsf.evaluation.runner import Evaluation, RunProgress, Workers, run_objects
 from avmsf.evaluation.splits import MetricSettings
 from avmsf.evaluation.summary import curves, draw_learning_curve
-from avmsf.evaluation.task import Look, Looking, Method
+from avmsf.evaluation.task import Method, ReadsFeatures, VisualInput
 from avmsf.modal.extraction.finders import finder_named
 from avmsf.pipeline.config import AUTO, PRESETS, LiftConfig, SceneConfig, TimeZero, ViewsConfig
 from avmsf.pipeline.features import choose_encoder, settled
@@ -167,24 +167,26 @@ def evaluation_of(
     if device is not None:
         usable_device(device, raising=EvaluationError, kinds=TRAINABLE)
     kept = (options.cache or folder / "features").resolve()
-    lift, paper = settled_lifts(options.lift, looks_of(methods, protocol), device=device)
+    lift, paper = settled_lifts(options.lift, inputs_of(methods, protocol), device=device)
     given = SceneConfig(ViewsConfig(source=options.visual_source), options.splat, options.lift)
     scene = replace(given, lift=lift)
     # With the shape from photographs, no method may read the mesh.
-    looks = ObjectLooks(dataset, kept, scene, paper, device, meshes=options.geometry != "gaussians", seed=options.seed)
+    inputs = ObjectFeatures(
+        dataset, kept, scene, paper, device, meshes=options.geometry != "gaussians", seed=options.seed
+    )
     cdpam = not options.no_cdpam and "cdpam" in protocol.metrics
     return Evaluation(
         dataset,
         title,
         protocol,
         methods,
-        looks,
+        inputs,
         ObjectBodies(dataset, kept, options.geometry, body, scene, device=device),
         options.seed,
         MetricSettings(level=options.amplitude_scale, cdpam=cdpam, cdpam_contacts=options.cdpam_contacts),
         finder_named(options.extraction, options.modes),
         {"scene": asdict(given), "paper": asdict(paper), "geometry": options.geometry, "body": asdict(body)},
-        looks.cloud,
+        inputs.cloud,
         device,
         None if lift == options.lift else lift.encoder,
         options.time_zero,
@@ -236,9 +238,9 @@ def run_shown(
 
 
 def settled_lifts(
-    lift: LiftConfig, looks: Collection[Look], *, device: str | None = None
+    lift: LiftConfig, inputs: Collection[VisualInput], *, device: str | None = None
 ) -> tuple[LiftConfig, LiftConfig]:
-    """Return the settings of features, and those of the paper's form, with the encoders that `looks` are made with.
+    """Return the settings of features, and those of the paper's form, with the encoders that `inputs` are made with.
 
     Without a look at views no encoder is loaded. The replacement of DINOv2 is printed. Raises SceneError where a look
     is the paper's and its encoder is not available.
@@ -246,15 +248,15 @@ def settled_lifts(
     paper = PRESETS["paper"].scene.lift
     if lift.encoder != AUTO:
         return lift, replace(paper, encoder=lift.encoder)
-    if any(look.startswith("paper") for look in looks):
+    if any(visual_input.startswith("paper") for visual_input in inputs):
         choose_encoder(paper, log=say, device=device)
         return replace(lift, encoder=paper.encoder), paper
-    return settled(lift, log=say, device=device) if set(looks) - {"surface"} else lift, paper
+    return settled(lift, log=say, device=device) if set(inputs) - {"surface"} else lift, paper
 
 
-def looks_of(methods: Sequence[Method], protocol: EvaluationProtocol) -> frozenset[Look]:
+def inputs_of(methods: Sequence[Method], protocol: EvaluationProtocol) -> frozenset[VisualInput]:
     """Return the features that an evaluation reads: those of its methods, and the points that locate recordings."""
-    read = {method.look for method in methods if isinstance(method, Looking)}
+    read = {method.visual_input for method in methods if isinstance(method, ReadsFeatures)}
     return frozenset(read | {"surface"} if protocol.locating else read)
 
 

@@ -20,7 +20,7 @@ from avmsf.editing.modal_edit import EDITS
 from avmsf.errors import ExportError
 from avmsf.export.faust import contacts_path, fitted, write_faust
 from avmsf.export.formats import PAGE_SUFFIXES, POINTS
-from avmsf.export.geometry import Look, holds_gaussians, read_look, read_object
+from avmsf.export.geometry import DisplayGeometry, holds_gaussians, read_display_geometry, read_object
 from avmsf.export.gltf import write_gltf
 from avmsf.export.paper_demo import SCENE, is_demo, read_demo, write_demo
 from avmsf.export.sampled_field import SampledField, spread_rows
@@ -247,14 +247,14 @@ def _gltf(field: SoundField | SampledField, options: Options) -> Written:
     source, meters = _object(field, options)
     cloud = _gaussians(source, meters, sampled)
     if cloud is not None and isinstance(source, Path):
-        beside, content = options.output.with_suffix(".gaussians.ply"), source.read_bytes()
-        check_free(beside, force=options.overwrite)
-        seen = Look.of_gaussians(cloud, sampled)
-        written = write_gltf(sampled, options.output, look=seen, up=options.up, force=options.overwrite)
-        copied = write_file(beside, content, force=options.overwrite)
+        cloud_file, content = options.output.with_suffix(".gaussians.ply"), source.read_bytes()
+        check_free(cloud_file, force=options.overwrite)
+        seen = DisplayGeometry.of_gaussians(cloud, sampled)
+        written = write_gltf(sampled, options.output, geometry=seen, up=options.up, force=options.overwrite)
+        copied = write_file(cloud_file, content, force=options.overwrite)
         return replace(written, sizes={**written.sizes, **copied})
-    shown, remarks = (None, ()) if source is None else read_look(source, sampled, meters=meters)
-    written = write_gltf(sampled, options.output, look=shown, up=options.up, force=options.overwrite)
+    shown, remarks = (None, ()) if source is None else read_display_geometry(source, sampled, meters=meters)
+    written = write_gltf(sampled, options.output, geometry=shown, up=options.up, force=options.overwrite)
     return replace(written, remarks=remarks + written.remarks)
 
 

@@ -139,7 +139,7 @@ def draw_field(
         )
     if has_posterior(field):
         std, title = relative_gain_std(field, points), f"uncertainty of the gains of {name}"
-        pictures["uncertainty"] = draw_uncertainty(points, std, title=title, struck=training_contacts(field))
+        pictures["uncertainty"] = draw_uncertainty(points, std, title=title, contacts=training_contacts(field))
         pictures["spectrum"] = draw_band(
             spectrum_band(field, points[0]), title=f"{name}: one impact, with its uncertainty"
         )

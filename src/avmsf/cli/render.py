@@ -22,7 +22,7 @@ from avmsf.modal.modes import ForcePulse
 
 _MUCH_SOFTER = 20.0
 """Decibels below the recorded impact from which a softer hammer's sound is noted."""
-_QUIET_DBFS = -20.0
+_LOW_LEVEL_DBFS = -20.0
 """Peak in decibels of full scale below which sounds are noted as quiet."""
 
 
@@ -69,8 +69,8 @@ def run(options: Options) -> int:
 
 def _softer(hard: Float[Tensor, " samples"], soft: Float[Tensor, " samples"]) -> float:
     """Return by how many decibels a softer hammer lowers the recorded impact's peak; 0 where that is not known."""
-    loud, faint = (float(each.abs().max()) for each in (hard, soft))
-    return 20 * math.log10(loud / faint) if loud > 0 and faint > 0 else 0.0
+    loud, low = (float(each.abs().max()) for each in (hard, soft))
+    return 20 * math.log10(loud / low) if loud > 0 and low > 0 else 0.0
 
 
 def _say_level(peak_dbfs: float, softer: float, options: Options) -> None:
@@ -85,7 +85,7 @@ def _say_level(peak_dbfs: float, softer: float, options: Options) -> None:
             f"note: a contact time of {1e3 * options.contact_time:.3g} ms lowers the peak by {softer:.0f} dB; add "
             "--normalize peak or --level-db, or a shorter --contact-time"
         )
-    elif options.normalize == "none" and -math.inf < peak_dbfs < _QUIET_DBFS:
+    elif options.normalize == "none" and -math.inf < peak_dbfs < _LOW_LEVEL_DBFS:
         say(f"note: the loudest sound peaks at {peak_dbfs:.1f} dBFS, which is quiet; add --normalize peak")
 
 

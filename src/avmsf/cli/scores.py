@@ -49,11 +49,11 @@ def compare(field: SoundField, train: Impacts, test: Impacts, modes: Extraction)
 def parts_words(train: Impacts, test: Impacts) -> str:
     """Return how many positions are held out and how many are trained on, with the recordings where these are more."""
     owners = places_of(torch.cat([train.contacts, test.contacts]).double()).tolist()
-    heard, left = len(set(owners[: len(train)])), len(set(owners[len(train) :]))
+    recorded, left = len(set(owners[: len(train)])), len(set(owners[len(train) :]))
     repeats = (
-        "" if (heard, left) == (len(train), len(test)) else f" ({len(test)} and {counted(len(train), 'recording')})"
+        "" if (recorded, left) == (len(train), len(test)) else f" ({len(test)} and {counted(len(train), 'recording')})"
     )
-    return f"{counted(left, 'position')} not trained on, {heard} trained on{repeats}"
+    return f"{counted(left, 'position')} not trained on, {recorded} trained on{repeats}"
 
 
 def quality_words(field: SoundField, path: Path) -> list[str]:

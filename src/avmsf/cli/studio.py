@@ -27,7 +27,7 @@ def run(options: Options) -> int:
         opened,
         port=options.port,
         browser=not options.no_browser,
-        log=lambda address: _tell(address, json=options.json),
+        log=lambda address: _print(address, json=options.json),
         config=StudioConfig(options.model, options.modes, preset=options.preset),
     )
     say("closed")
@@ -37,7 +37,7 @@ def run(options: Options) -> int:
     return 0
 
 
-def _tell(address: str, *, json: bool) -> None:
+def _print(address: str, *, json: bool) -> None:
     say(f"open {address}   (Ctrl-C ends)")
     if json:
         print_json({"address": address})

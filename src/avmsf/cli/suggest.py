@@ -56,7 +56,7 @@ def run(options: Options) -> int:
             points,
             relative_gain_std(field, points),
             title=f"{field.origin.capture or 'field'}: uncertainty, and where to record next",
-            struck=gains.contacts,
+            contacts=gains.contacts,
             suggested=found.contacts,
             directions=found.directions,
         )

@@ -21,7 +21,7 @@ from avmsf.photographs.folder import find_shots, read_views
 from avmsf.photographs.nerf_json import stated_moves
 from avmsf.photographs.segmentation import find_foreground
 from avmsf.photographs.shots import listed, mask_names
-from avmsf.pipeline.frame_check import LONGEST, MAX_VIEWS, expect_contacts_in_views, expect_on_object, judge_outlines
+from avmsf.pipeline.frame_check import LONGEST, MAX_VIEWS, check_outlines, expect_contacts_in_views, expect_on_object
 from avmsf.pipeline.scene import scaled, without_far
 from avmsf.pipeline.sources import find_source, find_splats
 
@@ -62,7 +62,7 @@ class VisualInputs:
         return f"the object is shown by: {'; '.join(found) or 'no photographs, video, mesh or Gaussians'}"
 
 
-def visual_inputs(folder: Path, settings: CaptureSettings | None) -> VisualInputs | None:
+def inputs(folder: Path, settings: CaptureSettings | None) -> VisualInputs | None:
     """Return what a folder holds of an object's look; None for a folder or settings that cannot be read."""
     try:
         settings = settings or settings_of(folder)
@@ -109,7 +109,7 @@ def expect_shape(folder: Path, capture: Capture) -> None:
         except FitError as error:
             raise FitError(f"{error}{advice}", **error.attributes) from error
         return
-    visual = visual_inputs(folder, capture.settings)
+    visual = inputs(folder, capture.settings)
     if visual is not None and not visual.reconstructs and visual.unused:
         raise SceneError(
             f"{folder}: expected the object's shape, got none; {'; '.join(visual.unused[:3])}{advice}",
@@ -135,14 +135,14 @@ def misplaced(folder: Path, settings: CaptureSettings | None, visual: VisualInpu
     names = [row.cells["file"] for row in rows] if len(rows) == len(contacts) else []
     stated = stated_moves(folder, meters=settings.views_meters)
     found = list[AvmsfWarning | AvmsfError]()
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CaptureWarning)
         try:
             if visual.cameras is not None:
                 views = read_views(folder, longest=LONGEST, max_views=MAX_VIEWS, meters=settings.views_meters)
                 views = find_foreground(views)
                 surface = None if visual.mesh is None else find_surface(folder, settings)
-                outlines = None if surface is None else judge_outlines(surface, views, settings)
+                outlines = None if surface is None else check_outlines(surface, views, settings)
                 found += [] if outlines is None else [outlines]
                 expect_contacts_in_views(contacts, views, settings, stated=stated)
             if visual.gaussians is not None:
@@ -152,7 +152,7 @@ def misplaced(folder: Path, settings: CaptureSettings | None, visual: VisualInpu
             found.append(error)
     # The error says what the cameras' axes show, and which photographs are missing the camera file's check.
     left_out = ("missing images", "cameras", *(["axes"] if found else []))
-    warned = [each.message for each in told if isinstance(each.message, CaptureWarning)]
+    warned = [each.message for each in caught if isinstance(each.message, CaptureWarning)]
     return [*(each for each in warned if each.name not in left_out), *found]
 
 
@@ -187,11 +187,11 @@ def _masked(folder: Path, names: dict[str, Path], masks: dict[str, Path], proble
     """Return how many photographs have a mask; add to `problems` masks of no photograph, and masks that are missing."""
     places = {name: [*mask_names(name, folder), *([masks[name]] if name in masks else [])] for name in names}
     known = {path for each in places.values() for path in each}
-    strange = [path for path in pictures_in(folder / "masks", deep=True) if path not in known]
-    if strange:
-        shown = listed([path.relative_to(folder).as_posix() for path in strange])
+    unmatched = [path for path in pictures_in(folder / "masks", deep=True) if path not in known]
+    if unmatched:
+        shown = listed([path.relative_to(folder).as_posix() for path in unmatched])
         problems.append(
-            f"{counted(len(strange), 'mask')} without a photograph of that name: {shown}; a mask is masks/NAME.png"
+            f"{counted(len(unmatched), 'mask')} without a photograph of that name: {shown}; a mask is masks/NAME.png"
         )
     bare = [
         name

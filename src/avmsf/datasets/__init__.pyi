@@ -2,9 +2,9 @@ from .collection import CaptureCollection as CaptureCollection
 from .collection import open_dataset as open_dataset
 from .dataset import Dataset as Dataset
 from .dataset import DatasetReport as DatasetReport
-from .dataset import Look as Look
 from .dataset import ObjectFacts as ObjectFacts
 from .dataset import ObjectReport as ObjectReport
+from .dataset import VisualSource as VisualSource
 from .numbering import shared_objects as shared_objects
 from .objectfolder import ObjectFolderRaw as ObjectFolderRaw
 from .realimpact import RealImpact as RealImpact

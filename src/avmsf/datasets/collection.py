@@ -10,7 +10,7 @@ from avmsf.capture.folder import Capture, read_capture
 from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.table import TABLE, read_strikes
 from avmsf.capture.together import common_rate
-from avmsf.datasets.dataset import Dataset, DatasetReport, Look, ObjectFacts, ObjectReport
+from avmsf.datasets.dataset import Dataset, DatasetReport, ObjectFacts, ObjectReport, VisualSource
 from avmsf.datasets.detect import detect_dataset
 from avmsf.datasets.numbering import in_order, refuse_unknown
 from avmsf.datasets.objectfolder import ObjectFolderRaw
@@ -74,13 +74,13 @@ class CaptureCollection:
         except CaptureError as error:
             raise DatasetError(str(error), **error.attributes) from error
 
-    def look(self, identifier: str) -> Look | None:
+    def visual_source(self, identifier: str) -> VisualSource | None:
         """Return the capture's folder where there is anything in it to see. Raises DatasetError for an unknown one and
         for settings that cannot be read."""
         folder = self._folder_of(identifier)
         try:
             settings = settings_of(folder)
-            return Look(folder, settings) if _shows(folder, settings) else None
+            return VisualSource(folder, settings) if _shows(folder, settings) else None
         except CaptureError as error:
             raise DatasetError(f"{folder}: {error}", **error.attributes) from error
 

@@ -23,7 +23,7 @@ class ObjectFacts:
 
 
 @dataclass(frozen=True)
-class Look:
+class VisualSource:
     """Visual source of an object."""
 
     folder: Path
@@ -77,7 +77,7 @@ class Dataset(Protocol):
         """Read one object's recordings. Raises DatasetError for an unknown or an incomplete one."""
         ...
 
-    def look(self, identifier: str) -> Look | None:
+    def visual_source(self, identifier: str) -> VisualSource | None:
         """Return the object's visual source; None where there is neither mesh nor photograph."""
         ...
 

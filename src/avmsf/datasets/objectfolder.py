@@ -16,7 +16,7 @@ from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.folder import Capture
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.together import find_surface
-from avmsf.datasets.dataset import DatasetReport, Look, ObjectFacts, ObjectReport
+from avmsf.datasets.dataset import DatasetReport, ObjectFacts, ObjectReport, VisualSource
 from avmsf.datasets.numbering import (
     REALIMPACT_NAMES,
     in_order,
@@ -100,9 +100,9 @@ class ObjectFolderRaw:
         entries, problems = self._examine(identifier)
         origin = f"{self.name}, object {identifier}"
         refuse_few(len(entries), origin=origin, reasons=problems or [self._no_contacts])
-        look = self.look(identifier)
+        source = self.visual_source(identifier)
         try:
-            surface = None if look is None else find_surface(look.folder, look.settings)
+            surface = None if source is None else find_surface(source.folder, source.settings)
         except CaptureError as error:
             raise DatasetError(f"{origin}: {error}", **error.attributes) from error
         return build_capture(
@@ -114,7 +114,7 @@ class ObjectFolderRaw:
             remarks=problems,
         )
 
-    def look(self, identifier: str) -> Look | None:
+    def visual_source(self, identifier: str) -> VisualSource | None:
         """Return the object's scanned mesh; None where the meshes' archive was not unpacked here."""
         self._check_known(identifier)
         return find_mesh(self.folder, identifier)
@@ -241,7 +241,7 @@ def _usual_gain(entries: list[_Entry]) -> float | None:
     return known.most_common(1)[0][0] if known else None
 
 
-def find_mesh(folder: Path, identifier: str) -> Look | None:
+def find_mesh(folder: Path, identifier: str) -> VisualSource | None:
     """Return an object's mesh from the dataset's folder, a `mesh` folder in it, or beside it; None where there is none.
 
     How the archives are laid out inside is not known for certain, so a mesh may be called `<object>.obj`, or be the one
@@ -252,7 +252,7 @@ def find_mesh(folder: Path, identifier: str) -> Look | None:
         deep = sorted(path for path in (place / identifier).rglob("*") if path.suffix.lower() in _MESH_SUFFIXES)
         for path in (*flat, *deep):
             if path.is_file():
-                return Look(path.parent, CaptureSettings(surface=path.name))
+                return VisualSource(path.parent, CaptureSettings(surface=path.name))
     return None
 
 

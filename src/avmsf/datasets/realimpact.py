@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from avmsf.capture.audio import Recording
 from avmsf.capture.folder import Capture
 from avmsf.capture.settings import CaptureSettings
-from avmsf.datasets.dataset import DatasetReport, Look, ObjectFacts, ObjectReport
+from avmsf.datasets.dataset import DatasetReport, ObjectFacts, ObjectReport, VisualSource
 from avmsf.datasets.numbering import (
     REALIMPACT_NAMES,
     in_order,
@@ -112,11 +112,11 @@ class RealImpact:
         )
         return replace(capture, surface=surface)
 
-    def look(self, identifier: str) -> Look | None:
+    def visual_source(self, identifier: str) -> VisualSource | None:
         """Return the object's textured mesh; None where it is missing."""
         self._check_known(identifier)
         folder = self.folder / identifier / FOLDER
-        return Look(folder, CaptureSettings(surface=MESH)) if (folder / MESH).is_file() else None
+        return VisualSource(folder, CaptureSettings(surface=MESH)) if (folder / MESH).is_file() else None
 
     def check(self) -> DatasetReport:
         """Report which files are there and which are missing, from names and headers alone."""

@@ -25,7 +25,7 @@ def resampled(
     return torch.from_numpy(found).to(sounds)
 
 
-def lasting(sounds: Float[Tensor, "contacts samples"], samples: int) -> Float[Tensor, "contacts lasting"]:
+def with_length(sounds: Float[Tensor, "contacts samples"], samples: int) -> Float[Tensor, "contacts lasting"]:
     """Return sounds of `samples` samples: cut at the end, or continued by silence."""
     missing = samples - sounds.shape[1]
     return torch.nn.functional.pad(sounds, (0, missing)) if missing > 0 else sounds[:, :samples]

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.editing.clips import lasting, levelled, resampled
+from avmsf.editing.clips import levelled, resampled, with_length
 from avmsf.editing.config import DistillationConfig, check_prompt
 from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
 from avmsf.errors import AvmsfWarning, EditError
@@ -184,7 +184,7 @@ class DecoderDistillation:
                 # Not before the error is gone: its traceback holds the tensors that filled the memory.
                 self._halve()
             back = resampled(torch.stack(made), sample_rate=self.model.sample_rate, wanted=self.sample_rate)
-            return levelled(lasting(back.to(sounds), sounds.shape[1]), sounds, sample_rate=self.sample_rate)
+            return levelled(with_length(back.to(sounds), sounds.shape[1]), sounds, sample_rate=self.sample_rate)
 
     def _cleaned(
         self, clips: Float[Tensor, "batch samples"], level: Float[Tensor, " batch"], seeds: list[int]

@@ -17,7 +17,7 @@ from avmsf.capture.measure import check_impulsive, find_clipping
 from avmsf.capture.onset import find_second_impact
 from avmsf.capture.prepare import prepare, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
-from avmsf.editing.clips import lasting, levelled, resampled
+from avmsf.editing.clips import levelled, resampled, with_length
 from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
 from avmsf.editing.start_search import band_spectrum, search_start
 from avmsf.errors import AvmsfWarning, CaptureError, EditError
@@ -73,7 +73,7 @@ class Reference:
         clips = [read_clip(path, sample_rate=sample_rate) for path in found]
         longest = max(len(clip) for clip in clips)
         name = found[0].name if len(found) == 1 else f"{found[0].name} and {len(found) - 1} more"
-        padded = torch.cat([lasting(clip[None], longest) for clip in clips])
+        padded = torch.cat([with_length(clip[None], longest) for clip in clips])
         return cls(padded, tuple(len(clip) for clip in clips), sample_rate, name)
 
     def describe(self) -> dict[str, Any]:
@@ -97,7 +97,7 @@ class Reference:
     ) -> tuple[Float[Tensor, "contacts samples"], Float[Tensor, "contacts samples"]]:
         """Return the nearest clip of each sound, and its share in the target: 1, and falling to 0 before its end."""
         samples = sounds.shape[1]
-        clips = lasting(self.clips, samples).to(sounds)
+        clips = with_length(self.clips, samples).to(sounds)
         distance = torch.cdist(band_spectrum(sounds), band_spectrum(clips), p=1.0)
         chosen = distance.argmin(dim=1)
         targets = levelled(clips[chosen], sounds, sample_rate=self.sample_rate)

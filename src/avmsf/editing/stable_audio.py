@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from avmsf._utils.arrays import Seed, generator_of
 from avmsf._utils.device import usable_device
 from avmsf._utils.hub import is_hub_name, why_not
-from avmsf.editing.clips import lasting
+from avmsf.editing.clips import with_length
 from avmsf.editing.config import STABLE_AUDIO, check_prompt
 from avmsf.errors import EditError
 
@@ -134,7 +134,7 @@ class StableAudio:
         # from the end of what it is given, it would hear that end.
         sounding = math.ceil(samples / self._hop) + self._reach
         given = min(self._frames, sounding + self._reach)
-        rows = lasting(waveforms.flatten(0, 1), given * self._hop).reshape(*waveforms.shape[:2], -1)
+        rows = with_length(waveforms.flatten(0, 1), given * self._hop).reshape(*waveforms.shape[:2], -1)
         latents = self._encoded(rows)
         if given == self._frames:
             return latents

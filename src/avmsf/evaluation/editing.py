@@ -22,7 +22,7 @@ from avmsf._utils.files import write_whole
 from avmsf.capture.audio import Recording
 from avmsf.capture.prepare import prepare
 from avmsf.capture.settings import CaptureSettings
-from avmsf.editing.clips import lasting, level
+from avmsf.editing.clips import level, with_length
 from avmsf.editing.config import DistillationConfig, GuidedEditConfig
 from avmsf.editing.distillation import AudioDiffusion, DecoderDistillation
 from avmsf.editing.guided import (
@@ -49,7 +49,7 @@ from avmsf.modal.extraction.finders import HighResolution, ModeFinder, ShortTime
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.spectra import magnitude_stft
 
-_LISTENED = 8
+_MAX_STORED_SOUNDS = 8
 """Contacts at which an edited object is rendered."""
 PROMPTS: Mapping[str, tuple[str, str]] = {
     "wood": ("a single knock on a wooden object, short and dull", "tapping a hollow wooden bowl with a mallet"),
@@ -116,7 +116,7 @@ class EditTask:
     @property
     def contacts(self) -> Float[Tensor, "contacts 3"]:
         """Contacts of the rendered sounds."""
-        return self.object.impacts.contacts[:_LISTENED]
+        return self.object.impacts.contacts[:_MAX_STORED_SOUNDS]
 
     def words(self) -> str:
         """Return the prompt. Raises EvaluationError where there is none."""
@@ -179,11 +179,11 @@ class Untouched:
 
     def edit(self, task: EditTask) -> Edited:
         """Return the object's own sounds."""
-        return heard(task.object.sound_field, task)
+        return sound(task.object.sound_field, task)
 
 
 @dataclass(frozen=True)
-class Recast:
+class MaterialChange:
     """The laws of elasticity with both materials' constants, which the other methods do not have."""
 
     name: str = "physics"
@@ -196,11 +196,11 @@ class Recast:
                     f"expected a material of {', '.join(MATERIALS)}, got {material!r}", name="material", value=material
                 )
         old, new = MATERIALS[task.object.material], MATERIALS[task.target]
-        return heard(change_material(task.object.sound_field, old, new), task)
+        return sound(change_material(task.object.sound_field, old, new), task)
 
 
 @dataclass(frozen=True, eq=False)
-class Steered:
+class Guided:
     """Guided editing with a parameterization."""
 
     name: str
@@ -221,7 +221,7 @@ class Steered:
                 previews.append((progress.step, progress.preview))
 
         edited = edit_towards(field, self.guide(task), config=config, parameters=self.parameters, progress=keep)
-        return replace(heard(edited, task), previews=tuple(previews))
+        return replace(sound(edited, task), previews=tuple(previews))
 
 
 @runtime_checkable
@@ -268,10 +268,10 @@ def towards_reference(config: Mapping[str, Any] | None = None, *, paper: bool = 
     settings, parameters = config or {}, PUBLISHED if paper else HIERARCHICAL
     return (
         Untouched(),
-        Steered("unconstrained", _reference, INDEPENDENT, settings),
-        Steered("searched", _reference, SEARCHED, settings),
-        Steered(parameters.name, _reference, parameters, settings),
-        Recast(),
+        Guided("unconstrained", _reference, INDEPENDENT, settings),
+        Guided("searched", _reference, SEARCHED, settings),
+        Guided(parameters.name, _reference, parameters, settings),
+        MaterialChange(),
     )
 
 
@@ -300,12 +300,12 @@ def towards_words(
     return (
         Untouched(),
         *generation,
-        Steered("audio-sds", guide, INDEPENDENT, settings),
-        Steered(parameters.name, guide, parameters, settings),
+        Guided("audio-sds", guide, INDEPENDENT, settings),
+        Guided(parameters.name, guide, parameters, settings),
     )
 
 
-def heard(edited: SoundField, task: EditTask) -> Edited:
+def sound(edited: SoundField, task: EditTask) -> Edited:
     """Return a field's modes and sounds at the task's contacts."""
     amplitudes = amplitudes_of(edited, task.contacts)
     bank = audible_modes(edited.bank, amplitudes, sample_rate=edited.sample_rate)
@@ -406,11 +406,11 @@ def judge(
 
 def clap_curve(made: Edited, prompt: str, clap: Clap) -> tuple[tuple[int, float], ...]:
     """Return the steps of an edit's previews and their CLAP scores; silent previews have none."""
-    heard = [(step, sound) for step, sound in made.previews if bool(sound.any())]
-    if not heard:
+    sound = [(step, sound) for step, sound in made.previews if bool(sound.any())]
+    if not sound:
         return ()
-    scores = clap.score(torch.stack([sound for _, sound in heard]), [prompt], sample_rate=made.sample_rate)
-    return tuple((step, float(score)) for (step, _), score in zip(heard, scores, strict=True))
+    scores = clap.score(torch.stack([sound for _, sound in sound]), [prompt], sample_rate=made.sample_rate)
+    return tuple((step, float(score)) for (step, _), score in zip(sound, scores, strict=True))
 
 
 def write_scores(scores: Sequence[EditScore], spaces: Mapping[str, MaterialSpace], path: Path) -> None:
@@ -434,14 +434,14 @@ def spectral_distance(made: Edited, reference: Reference) -> float:
             name="reference",
             value=reference.sample_rate,
         )
-    clips = lasting(reference.clips, made.sounds.shape[1]).double()
-    heard, wanted = (
+    clips = with_length(reference.clips, made.sounds.shape[1]).double()
+    sound, wanted = (
         sounds / level(sounds, sample_rate=made.sample_rate)[:, None] for sounds in (made.sounds.double(), clips)
     )
     sizes = default_fft_sizes(made.sample_rate)
-    errors = torch.zeros(len(heard), len(wanted), dtype=torch.float64)
+    errors = torch.zeros(len(sound), len(wanted), dtype=torch.float64)
     for size in sizes:
-        own, aims = (magnitude_stft(sounds, fft_size=size, hop=max(1, size // 4)) for sounds in (heard, wanted))
+        own, aims = (magnitude_stft(sounds, fft_size=size, hop=max(1, size // 4)) for sounds in (sound, wanted))
         sums = torch.stack([(one - aims).abs().sum(dim=(1, 2)) for one in own])
         errors += sums / aims.sum(dim=(1, 2)) / len(sizes)
     return float(errors.amin(dim=1).mean())

@@ -227,8 +227,8 @@ class SolvedShape:
             elastic.frequency, torch.diag(rayleigh(elastic.frequency, material)), highest=HIGHEST * sample_rate
         )
         middle = 0.5 * (elastic.nodes.amax(0) + elastic.nodes.amin(0))
-        heard = radiated(elastic, vibration, middle + torch.tensor(_MICROPHONE, dtype=torch.float64))
-        body = SoundingBody(elastic, vibration, heard, Hammer())
+        sound = radiated(elastic, vibration, middle + torch.tensor(_MICROPHONE, dtype=torch.float64))
+        body = SoundingBody(elastic, vibration, sound, Hammer())
         places = elastic.nodes[self._spread[:_CONTACTS]]
         directions = -elastic.normals(places)
         amplitudes = body.gains(places, directions)

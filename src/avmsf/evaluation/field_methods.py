@@ -11,7 +11,7 @@ import torch
 
 from avmsf.capture.impacts import Impacts, rows_by_place
 from avmsf.errors import FitError
-from avmsf.evaluation.task import Look, Method, Task
+from avmsf.evaluation.task import Method, Task, VisualInput
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit, held_out
@@ -39,7 +39,7 @@ class FieldMethod:
     """What tables call it."""
     pipeline: PipelineConfig = NETWORK
     """Settings of all stages."""
-    look: Look = "visual"
+    visual_input: VisualInput = "visual"
     """What is read of the object's points."""
     published: bool = False
     """Whether modes are found as `pipeline` says, in place of those that all methods share, and recordings are located
@@ -47,7 +47,7 @@ class FieldMethod:
 
     def fit(self, task: Task) -> SoundField:
         """Fit the field. Raises AvmsfError where modes, features or field cannot be made."""
-        return self.fitted(task, task.train, task.features(self.look), self.modes(task), self.pipeline.fit)
+        return self.fitted(task, task.train, task.features(self.visual_input), self.modes(task), self.pipeline.fit)
 
     def modes(self, task: Task) -> Extraction:
         """Return the modes of a task's training recordings."""
@@ -80,9 +80,9 @@ class FieldVariant:
         return self.method.name
 
     @property
-    def look(self) -> Look:
+    def visual_input(self) -> VisualInput:
         """What is read of the object's points."""
-        return self.method.look
+        return self.method.visual_input
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class UninformedField(FieldVariant):
         config = self.method.pipeline.fit
         steps = config.warmup_steps + config.steps
         config = replace(config, warmup_steps=0, steps=steps, correction_rate=self.correction_rate)
-        return self.method.fitted(task, task.train, task.features(self.look), start, config)
+        return self.method.fitted(task, task.train, task.features(self.visual_input), start, config)
 
 
 def configured(method: Method) -> FieldMethod | None:
@@ -205,7 +205,7 @@ class GridField(FieldVariant):
 
     def fit(self, task: Task) -> SoundField:
         """Choose and fit the field, whose report has what was chosen. Raises as FieldMethod."""
-        features, modes, base = task.features(self.look), self.method.modes(task), self.method.pipeline.fit
+        features, modes, base = task.features(self.visual_input), self.method.modes(task), self.method.pipeline.fit
         fitted = partial(self.method.fitted, task)
         held = held_out(task.train.contacts, base.validation)
         if len(rows_by_place(task.train.contacts)) < _FEWEST_TO_VALIDATE or not held:

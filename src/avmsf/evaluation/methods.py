@@ -37,7 +37,7 @@ from avmsf.evaluation.simple_methods import (
     SplineGains,
     WhiteNoise,
 )
-from avmsf.evaluation.task import Look, Method, Renderer, Task
+from avmsf.evaluation.task import Method, Renderer, Task, VisualInput
 from avmsf.fem.material import MATERIALS
 from avmsf.field.config import GainModel
 from avmsf.field.sound_field import SoundField
@@ -259,7 +259,7 @@ def _count(task: Task) -> int:
 
 BASELINES = (
     Baseline("white-noise", lambda task: WhiteNoise(task.train, seed=task.seed)),
-    Baseline("random-impact", lambda task: RandomImpact(task.stranger(), task.train.sample_rate)),
+    Baseline("random-impact", lambda task: RandomImpact(task.other_recording(), task.train.sample_rate)),
     Baseline("nearest", lambda task: NearestRecording(task.train)),
     Baseline("knn3", lambda task: MeanWaveform(task.train, count=_count(task))),
     Baseline("knn3-directions", lambda task: MeanWaveform(task.train, count=_count(task), by_direction=True)),
@@ -275,15 +275,15 @@ have noise beside them, as the field has: without it all is silent between modes
 _PRESET = PRESETS["paper"]
 
 
-def _paper(name: str, look: Look = "paper", **fit: Any) -> FieldMethod:
+def _paper(name: str, visual_input: VisualInput = "paper", **fit: Any) -> FieldMethod:
     """Return the preset `paper` with one of its two dampings, shared unless `fit` names the other."""
     settings = {"damping": "shared", **fit}
-    return FieldMethod(name, replace(_PRESET, fit=replace(_PRESET.fit, **settings)), look, published=True)
+    return FieldMethod(name, replace(_PRESET, fit=replace(_PRESET.fit, **settings)), visual_input, published=True)
 
 
-def _quick(name: str, look: Look = "visual", **fit: Any) -> FieldMethod:
+def _quick(name: str, visual_input: VisualInput = "visual", **fit: Any) -> FieldMethod:
     """Return the network with the quick settings but for those of `fit`."""
-    return FieldMethod(name, replace(NETWORK, fit=replace(NETWORK.fit, **fit)), look)
+    return FieldMethod(name, replace(NETWORK, fit=replace(NETWORK.fit, **fit)), visual_input)
 
 
 def _process(name: str, model: GainModel) -> FieldMethod:

@@ -21,7 +21,7 @@ from avmsf.datasets.numbering import ABLATION, NON_SYMMETRIC
 from avmsf.errors import AvmsfError, EvaluationError, SceneError
 from avmsf.evaluation.modal_metrics import simulated
 from avmsf.evaluation.protocols import EvaluationProtocol
-from avmsf.evaluation.task import Look
+from avmsf.evaluation.task import VisualInput
 from avmsf.features.feature_field import FeatureField
 from avmsf.features.store import load_features
 from avmsf.fem.body_family import BodyFamily, body_family
@@ -36,7 +36,7 @@ from avmsf.pipeline.stages import StageFolder
 from avmsf.reconstruction import ObjectShape
 from avmsf.simulate import sim20
 
-NAMES: Mapping[Look, str] = {
+NAMES: Mapping[VisualInput, str] = {
     "unaligned": "unaligned.safetensors",
     "paper": "paper.safetensors",
     "paper-positions": "paper.safetensors",
@@ -46,7 +46,7 @@ NAMES: Mapping[Look, str] = {
 
 
 @dataclass(frozen=True)
-class ObjectLooks:
+class ObjectFeatures:
     """Makes the features of a dataset's objects, each in a folder of its own beneath `cache`."""
 
     dataset: Dataset
@@ -61,26 +61,28 @@ class ObjectLooks:
     seed: int = 0
     """Seed of the points on a mesh."""
 
-    def __call__(self, identifier: str, look: Look, views: int | None = None) -> FeatureField:
-        """Return what `look` means for an object, from at most `views` views, or from all for None.
+    def __call__(self, identifier: str, visual_input: VisualInput, views: int | None = None) -> FeatureField:
+        """Return what `visual_input` means for an object, from at most `views` views, or from all for None.
 
         `positions` are those of the same points that looks are lifted onto, so that the two differ in nothing else; of
         an object that nothing shows, they are its surface's, or fill the box of its contacts. `surface` is as in
         `avmsf fit`, and needs no views of an object with a mesh. Raises SceneError for the looks of an object that
         nothing shows, and DatasetError for an unknown one.
         """
-        surface = self.dataset.capture(identifier).surface if look == "surface" and self.meshes else None
+        surface = self.dataset.capture(identifier).surface if visual_input == "surface" and self.meshes else None
         if surface is not None:
             return FeatureField.from_mesh(surface, seed=self.seed)
-        bare = look == "surface" or look.endswith("positions")
-        if bare and self.dataset.look(identifier) is None:
+        bare = visual_input == "surface" or visual_input.endswith("positions")
+        if bare and self.dataset.visual_source(identifier) is None:
             return self._bare(identifier)
-        lift = self.paper if look.startswith("paper") else self.config.lift
-        if look == "surface" and lift.encoder == AUTO:
+        lift = self.paper if visual_input.startswith("paper") else self.config.lift
+        if visual_input == "surface" and lift.encoder == AUTO:
             # Positions do not depend on the encoder.
             lift = replace(lift, encoder=DESCRIPTORS)
-        lift = replace(lift, symmetry=not look.endswith("unaligned"))
-        stages = self._stages(identifier, replace(self.config, lift=lift), views, name=NAMES.get(look, FEATURES))
+        lift = replace(lift, symmetry=not visual_input.endswith("unaligned"))
+        stages = self._stages(
+            identifier, replace(self.config, lift=lift), views, name=NAMES.get(visual_input, FEATURES)
+        )
         with stages.stages.lock("avmsf evaluate", wait=NO_LIMIT):
             features = load_features(stages.features.path)
         return FeatureField.from_points(features.points) if bare else features
@@ -98,7 +100,7 @@ class ObjectLooks:
 
     def _stages(self, identifier: str, config: SceneConfig, views: int | None, name: str = FEATURES) -> SceneStages:
         """Return the stages from what shows an object. Raises SceneError where nothing does."""
-        seen = self.dataset.look(identifier)
+        seen = self.dataset.visual_source(identifier)
         if seen is None:
             raise SceneError(f"{identifier}: expected a mesh or photographs in the dataset, got none", name=identifier)
         config = replace(config, views=replace(config.views, count=views or 0))
@@ -150,7 +152,7 @@ class ObjectBodies:
         return surface if self.geometry == "mesh" else roughened(surface, NOISE, seed=self.seed)
 
     def _shape(self, identifier: str) -> ObjectShape:
-        seen = self.dataset.look(identifier)
+        seen = self.dataset.visual_source(identifier)
         if seen is None:
             raise SceneError(f"{identifier}: expected a mesh or photographs in the dataset, got none", name=identifier)
         scene = replace(self.scene, views=replace(self.scene.views, source=ViewsConfig().source))

@@ -84,32 +84,32 @@ class StoredSound:
         return f"data:audio/flac;base64,{base64.b64encode(self.content).decode()}"
 
 
-def draw_spectrogram(heard: StoredSound, *, loudest: float | None, width: int = 240, height: int = 120) -> str:
+def draw_spectrogram(sound: StoredSound, *, loudest: float | None, width: int = 240, height: int = 120) -> str:
     """Return the address of a picture of a sound: time to the right, frequency upwards on a logarithmic scale.
 
     Colors span 80 dB below `loudest`, the largest magnitude of the recording it is compared with; None is its own.
     """
-    levels = _levels(heard, width, height)
+    levels = _levels(sound, width, height)
     top = float(levels.max()) if loudest is None else loudest
     shown = ((levels - top) / RANGE_DB + 1).clamp(0, 1).flip(0)
     return _png((shown * 255).round().to(torch.uint8).numpy())
 
 
-def loudest_of(heard: StoredSound, *, width: int = 240, height: int = 120) -> float:
+def loudest_of(sound: StoredSound, *, width: int = 240, height: int = 120) -> float:
     """Return the level, dB, of the brightest point in a sound's picture."""
-    return float(_levels(heard, width, height).max())
+    return float(_levels(sound, width, height).max())
 
 
-def picture_span(heard: StoredSound) -> tuple[float, float, float]:
+def picture_span(sound: StoredSound) -> tuple[float, float, float]:
     """Return a picture's seconds, and its lowest and highest frequency, Hz."""
-    highest = heard.sample_rate / 2
-    return len(heard.samples) / heard.sample_rate, min(_LOWEST, highest / 50), highest
+    highest = sound.sample_rate / 2
+    return len(sound.samples) / sound.sample_rate, min(_LOWEST, highest / 50), highest
 
 
-def _levels(heard: StoredSound, width: int, height: int) -> Float64[Tensor, "height width"]:
-    _, lowest, highest = picture_span(heard)
+def _levels(sound: StoredSound, width: int, height: int) -> Float64[Tensor, "height width"]:
+    _, lowest, highest = picture_span(sound)
     return log_spectrogram(
-        heard.samples, sample_rate=heard.sample_rate, lowest=lowest, highest=highest, width=width, height=height
+        sound.samples, sample_rate=sound.sample_rate, lowest=lowest, highest=highest, width=width, height=height
     )
 
 
@@ -224,8 +224,8 @@ class StoredContact:
 
 def _contacts(records: Sequence[ObjectRecord]) -> Iterator[StoredContact]:
     """Yield contacts with sounds: one of each object first, then a second one, and so on."""
-    heard = [record for record in records if any(case.sounds for case in record.cases)]
-    chosen = [list(stored_contacts(heard[row])) for row in spread(len(heard), OBJECTS)]
+    sound = [record for record in records if any(case.sounds for case in record.cases)]
+    chosen = [list(stored_contacts(sound[row])) for row in spread(len(sound), OBJECTS)]
     for place in range(max(map(len, chosen), default=0)):
         yield from (contacts[place] for contacts in chosen if place < len(contacts))
 
@@ -253,8 +253,8 @@ def _listening(records: Sequence[ObjectRecord], folder: Path) -> str:
             break
         size += len(block)
         facts = contact.record
-        told = facts.name if facts.name in ("", facts.identifier) else f"{facts.identifier}: {facts.name}"
-        title = ", ".join(filter(None, (told or facts.identifier, facts.material)))
+        label = facts.name if facts.name in ("", facts.identifier) else f"{facts.identifier}: {facts.name}"
+        title = ", ".join(filter(None, (label or facts.identifier, facts.material)))
         found.setdefault(title, []).append(block)
     if not found:
         return ""
@@ -277,20 +277,20 @@ def _contact_block(contact: StoredContact, folder: Path) -> str:
     for case, outcome in contact.made:
         title = f"{outcome.method}, {case.label}" if several else outcome.method
         row = case.test.index(contact.name)
-        told = [
+        label = [
             f"{heading} {figure(values[row])}"
             for metric, heading in (("l1", "L1"), ("l1_log", "L1-log"), ("relative_stft", "relative STFT"))
             if (values := outcome.values.get(metric)) is not None
         ]
-        heard = StoredSound.read(folder / outcome.sounds[contact.name])
-        cards.append(_card(title, ", ".join(told), heard, loudest, contact.name))
+        sound = StoredSound.read(folder / outcome.sounds[contact.name])
+        cards.append(_card(title, ", ".join(label), sound, loudest, contact.name))
     return f'<h4>{escape(contact.name)}</h4><div class="sounds">{"".join(cards)}</div>'
 
 
-def _card(title: str, words: str, heard: StoredSound, loudest: float, contact: str, *, kind: str = "") -> str:
+def _card(title: str, words: str, sound: StoredSound, loudest: float, contact: str, *, kind: str = "") -> str:
     said = escape(f"{title}, {contact}")
     return (
-        f'<figure{kind}><img alt="Spectrogram: {said}" src="{draw_spectrogram(heard, loudest=loudest)}">'
-        f'<audio controls preload="none" aria-label="Sound: {said}" src="{heard.address}"></audio>'
+        f'<figure{kind}><img alt="Spectrogram: {said}" src="{draw_spectrogram(sound, loudest=loudest)}">'
+        f'<audio controls preload="none" aria-label="Sound: {said}" src="{sound.address}"></audio>'
         f"<figcaption><b>{escape(title)}</b>{escape(words)}</figcaption></figure>"
     )

@@ -71,17 +71,17 @@ def _write_spectrograms(record: ObjectRecord, folder: Path) -> list[Path]:
         for contact in stored_contacts(record):
             files = {outcome.method: outcome.sounds for case, outcome in contact.made if case.label == label}
             if files:
-                heard = StoredSound.read(folder / contact.recorded)
+                sound = StoredSound.read(folder / contact.recorded)
                 made = {
                     method: StoredSound.read(folder / sounds[contact.name]).samples for method, sounds in files.items()
                 }
-                rows[contact.name] = {_RECORDED: heard.samples, **made}
+                rows[contact.name] = {_RECORDED: sound.samples, **made}
         if not rows:
             continue
         methods = list(dict.fromkeys(method for row in rows.values() for method in row))
         title = f"{record.identifier}: {label}"
         figure = draw_method_spectrograms(
-            rows, methods, sample_rate=heard.sample_rate, highest=0.5 * record.sample_rate, title=title
+            rows, methods, sample_rate=sound.sample_rate, highest=0.5 * record.sample_rate, title=title
         )
         word = "".join(mark if mark.isalnum() or mark in "-_" else "-" for mark in label)
         name = record.identifier if len(labels) == 1 else f"{record.identifier} {word}"

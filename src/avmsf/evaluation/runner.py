@@ -31,7 +31,7 @@ from avmsf.evaluation.page import keep_sound, listening_gain
 from avmsf.evaluation.protocols import EvaluationProtocol
 from avmsf.evaluation.results import ENCODER, CaseRecord, ObjectRecord, Outcome, ResultsFolder, failure_of
 from avmsf.evaluation.splits import MetricSettings, MetricValues, align_split, spread
-from avmsf.evaluation.task import FromFiles, Looking, Method, Renderer, Task, expect_renderer
+from avmsf.evaluation.task import FromFiles, Method, ReadsFeatures, Renderer, Task, expect_renderer
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.body_family import BodyFamily
 from avmsf.field.gains.elastic import CandidateBodies
@@ -64,7 +64,7 @@ class Evaluation:
     protocol: EvaluationProtocol
     methods: tuple[Method, ...]
     features: Callable[..., FeatureField]
-    """Of an object's identifier, a `Look` and the maximum of `views`, as `ObjectLooks`."""
+    """Of an object's identifier, a `VisualInput` and the maximum of `views`, as `ObjectFeatures`."""
     bodies: BodyMaker
     seed: int = 0
     """Random seed of the methods."""
@@ -111,7 +111,7 @@ class Evaluation:
 
     def _described(self, method: Method) -> str:
         """Return what tells a method apart from another of its name. Methods that read no features share any folder."""
-        read = self.encoder is not None and isinstance(method, Looking) and method.look != "surface"
+        read = self.encoder is not None and isinstance(method, ReadsFeatures) and method.visual_input != "surface"
         return f"{method!r}{ENCODER}{self.encoder}" if read else repr(method)
 
 
@@ -123,7 +123,7 @@ def _plain(settings: Any) -> Any:
     return {"kind": type(settings).__name__, **values}
 
 
-LISTENED = 3
+MAX_STORED_SOUNDS = 3
 """Test contacts of an experiment whose sounds are kept to be listened to."""
 _RECORDED = "recorded"
 """What the recordings' own files are called beside the methods'."""
@@ -157,7 +157,7 @@ class ObjectData:
     features: Callable[..., FeatureField]
     bodies: Callable[[], CandidateBodies]
     family: Callable[[], BodyFamily]
-    stranger: Callable[[], Float[Tensor, " samples"]]
+    other_recording: Callable[[], Float[Tensor, " samples"]]
     """Draws a recording of another object."""
     truth: Truth | None = None
     material: str | None = None
@@ -173,9 +173,9 @@ class CaseRun:
     """Runs methods in one case, with modes that are found once and kept in a file."""
 
     def __init__(
-        self, evaluation: Evaluation, data: ObjectData, case: Case, *, folder: Path, number: int, listened: bool
+        self, evaluation: Evaluation, data: ObjectData, case: Case, *, folder: Path, number: int, stores_sounds: bool
     ) -> None:
-        """Prepare the `number`-th case of an object; with `listened`, some of its sounds are stored in `folder`."""
+        """Prepare the `number`-th case of an object; with `stores_sounds`, some of its sounds go into `folder`."""
         self.evaluation, self.data, self.case, self.folder = evaluation, data, case, folder
         self.place = f"{data.identifier}/{number:02d}"
         path, finder = folder / "modes" / f"{self.place}.safetensors", evaluation.finder
@@ -186,7 +186,7 @@ class CaseRun:
             )
         self.truth = None if data.truth is None else truth_at(data.truth, self.scored.test.names)
         self.features = partial(data.features, data.identifier, views=case.views)
-        self.listened = spread(len(case.test), LISTENED) if listened else []
+        self.stores_sounds = spread(len(case.test), MAX_STORED_SOUNDS) if stores_sounds else []
         self.shared = 0.0
 
     def outcome(self, method: Method) -> Outcome:
@@ -243,7 +243,7 @@ class CaseRun:
             points,
             vertices=self.data.vertices,
             published=published,
-            map_rows=self.listened,
+            map_rows=self.stores_sounds,
         )
         maps = {}
         for row, each in found.maps.items():
@@ -262,7 +262,7 @@ class CaseRun:
             modes=self._shared(recordings.modes),
             features=self._shared(self.features),
             bodies=self._shared(self.data.bodies),
-            stranger=self._shared(self.data.stranger),
+            other_recording=self._shared(self.data.other_recording),
             family=self._shared(self.data.family),
             material=self.data.material,
             gaussians=self._gaussians,
@@ -297,7 +297,7 @@ class CaseRun:
         """Write the sounds to listen to, and return their files by the names of their recordings."""
         kept = {}
         word = _file_word(name)
-        for row in self.listened:
+        for row in self.stores_sounds:
             file = f"sounds/{self.place}/{row:03d} {word}.flac"
             test = self.scored.test
             keep_sound(
@@ -344,7 +344,9 @@ def run_object(
             features=once(evaluation.features),
             bodies=once(partial(evaluation.bodies, identifier)),
             family=once(partial(evaluation.bodies.family, identifier)),
-            stranger=once(partial(draw_other_recording, evaluation.dataset, identifier, impacts, seed=evaluation.seed)),
+            other_recording=once(
+                partial(draw_other_recording, evaluation.dataset, identifier, impacts, seed=evaluation.seed)
+            ),
             truth=truth,
             material=facts.material,
             vertices=None if surface is None or not len(surface.faces) else surface.vertices,
@@ -352,8 +354,8 @@ def run_object(
         )
         firsts = {case.label: case.key for case in reversed(cases)}
         for number, case in enumerate(cases, 1):
-            listened = firsts[case.label] == case.key
-            run = CaseRun(evaluation, data, case, folder=results.path, number=number, listened=listened)
+            stores_sounds = firsts[case.label] == case.key
+            run = CaseRun(evaluation, data, case, folder=results.path, number=number, stores_sounds=stores_sounds)
             record = _run_case(run, record, results, log)
 
 

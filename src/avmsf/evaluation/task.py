@@ -71,7 +71,7 @@ def expect_renderer(given: Any) -> Renderer:
     return renderer
 
 
-Look = Literal["surface", "positions", "visual", "unaligned", "paper", "paper-positions", "paper-unaligned"]
+VisualInput = Literal["surface", "positions", "visual", "unaligned", "paper", "paper-positions", "paper-unaligned"]
 """Features of an object's points. `surface`: positions of points on its mesh, or as `positions` without one.
 `positions`: only the positions of the points that visual features are of. `visual`: positions with visual features,
 pooled over the object's symmetries; `unaligned`: without pooling. `paper`: the paper's features of Gaussians;
@@ -108,11 +108,11 @@ class Task:
     """Random seed of the method."""
     modes: Callable[[], Extraction]
     """Extracts the modes of `train`, row for row."""
-    features: Callable[[Look], FeatureField]
+    features: Callable[[VisualInput], FeatureField]
     """Computes the features of the object's points. Raises SceneError without visual input."""
     bodies: Callable[[], CandidateBodies]
     """Computes the candidate FE models of the object. Raises AvmsfError where its shape is unknown or unfit."""
-    stranger: Callable[[], Float[Tensor, " samples"]]
+    other_recording: Callable[[], Float[Tensor, " samples"]]
     """Draws, by `seed`, the recording of another object, at the sample rate and of the length of `train`. Raises
     EvaluationError where there is no other object."""
     family: Callable[[], BodyFamily] = _no_family
@@ -140,11 +140,11 @@ class Method(Protocol):
 
 
 @runtime_checkable
-class Looking(Protocol):
+class ReadsFeatures(Protocol):
     """A method that reads features of the object's points."""
 
     @property
-    def look(self) -> Look:
+    def visual_input(self) -> VisualInput:
         """Which ones it reads."""
         ...
 

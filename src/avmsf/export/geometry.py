@@ -145,7 +145,7 @@ def check_fits(places: Float[np.ndarray, "places 3"], points: Float[Tensor, "poi
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class DisplayGeometry:
     """Geometry to show: triangles with colors, or points."""
 
     vertices: Float[Tensor, "vertices 3"]
@@ -158,12 +158,12 @@ class Look:
     """Red, green, blue as displayed (sRGB), 0 to 1; None for gray."""
 
     @classmethod
-    def of_points(cls, sampled: SampledField) -> "Look":
+    def of_points(cls, sampled: SampledField) -> "DisplayGeometry":
         """Return the field's points."""
         return cls(sampled.points, torch.zeros(0, 3, dtype=torch.int64), sampled.normals)
 
     @classmethod
-    def of_mesh(cls, mesh: TexturedMesh) -> "Look":
+    def of_mesh(cls, mesh: TexturedMesh) -> "DisplayGeometry":
         """Return a mesh; a vertex is split if its normal or color differs between faces.
 
         Textures become vertex colors.
@@ -174,14 +174,16 @@ class Look:
         return cls(kept[:, :3], torch.from_numpy(rows.reshape(-1, 3)), kept[:, 3:6], kept[:, 6:])
 
     @classmethod
-    def of_gaussians(cls, cloud: GaussianCloud, sampled: SampledField) -> "Look":
+    def of_gaussians(cls, cloud: GaussianCloud, sampled: SampledField) -> "DisplayGeometry":
         """Return the centers of Gaussians in their colors."""
         colors = (0.5 + ZEROTH * cloud.harmonics[:, 0]).clamp(0.0, 1.0)
         normals = sampled.normals[sampled.nearest(cloud.centers)]
         return cls(cloud.centers, torch.zeros(0, 3, dtype=torch.int64), normals, colors)
 
 
-def read_look(source: Path | Surface, sampled: SampledField, *, meters: float = 1.0) -> tuple[Look, tuple[str, ...]]:
+def read_display_geometry(
+    source: Path | Surface, sampled: SampledField, *, meters: float = 1.0
+) -> tuple[DisplayGeometry, tuple[str, ...]]:
     """Read a mesh whose coordinates count `meters` each, and notes on differences from the file.
 
     A `Surface` is in meters. Meshes of more than `MAX_FACES` triangles are reduced. Raises `ExportError` for one that
@@ -195,7 +197,7 @@ def read_look(source: Path | Surface, sampled: SampledField, *, meters: float = 
     check_fits(mesh.vertices.double().numpy(), sampled.points, path)
     faces = len(mesh.faces)
     if faces <= MAX_FACES:
-        return Look.of_mesh(mesh), ()
+        return DisplayGeometry.of_mesh(mesh), ()
     corners = mesh.vertices[mesh.faces].reshape(-1, 3).numpy()
     painted = (255.0 * _corner_colors(mesh)).round().byte().reshape(-1, 3).numpy()
     solid = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), vertex_colors=painted, process=False)
@@ -205,7 +207,7 @@ def read_look(source: Path | Surface, sampled: SampledField, *, meters: float = 
     shown = torch.from_numpy(np.array(small.visual.vertex_colors[:, :3], dtype=np.float32)) / 255.0
     vertices = torch.from_numpy(np.array(small.vertices)).float()
     remark = f"{path or 'the surface'} has {faces:,} triangles, too many for a browser: {len(corner_rows):,} are shown"
-    return Look.of_mesh(TexturedMesh.build(vertices, corner_rows, colors=shown[corner_rows])), (remark,)
+    return DisplayGeometry.of_mesh(TexturedMesh.build(vertices, corner_rows, colors=shown[corner_rows])), (remark,)
 
 
 def _corner_colors(mesh: TexturedMesh) -> Float[Tensor, "faces 3 3"]:

@@ -20,7 +20,7 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from avmsf.export.formats import GLTF_SUFFIXES, Axis
-from avmsf.export.geometry import Look
+from avmsf.export.geometry import DisplayGeometry
 from avmsf.export.one_phase import approximation_error, importance, shared_dampings, signed_amplitudes
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.writing import Written, check_suffix, generator, no_modes, write_file
@@ -39,7 +39,12 @@ _TURNS: dict[Axis, tuple[float, float, float, float]] = {
 
 
 def write_gltf(
-    sampled: SampledField, path: str | Path, *, look: Look | None = None, up: Axis = "z", force: bool = False
+    sampled: SampledField,
+    path: str | Path,
+    *,
+    geometry: DisplayGeometry | None = None,
+    up: Axis = "z",
+    force: bool = False,
 ) -> Written:
     """Write the object, or its points, and one modal model, with the modes sorted by energy.
 
@@ -53,7 +58,7 @@ def write_gltf(
     damping = shared_dampings(sampled)
     order = importance(sampled, damping)
     gains = signed_amplitudes(sampled)
-    content = _glb(_document(sampled, look or Look.of_points(sampled), up, order, gains, damping))
+    content = _glb(_document(sampled, geometry or DisplayGeometry.of_points(sampled), up, order, gains, damping))
     sizes = write_file(path, content, force=force)
     error = approximation_error(sampled, sine=gains, cosine=None, damping=damping)
     return Written(sizes, _remarks(sampled), error.waveform, error.spectrum_db)
@@ -88,7 +93,7 @@ class _Buffer:
 
 def _document(
     sampled: SampledField,
-    look: Look,
+    geometry: DisplayGeometry,
     up: Axis,
     order: Int[Tensor, " modes"],
     gains: Float[Tensor, "points modes"],
@@ -107,17 +112,17 @@ def _document(
     }
     primitive: dict[str, Any] = {
         "attributes": {
-            "POSITION": buffer.add(look.vertices.numpy(), bounds=True, target=_VERTICES),
-            "NORMAL": buffer.add(torch.nn.functional.normalize(look.normals, dim=1).numpy(), target=_VERTICES),
+            "POSITION": buffer.add(geometry.vertices.numpy(), bounds=True, target=_VERTICES),
+            "NORMAL": buffer.add(torch.nn.functional.normalize(geometry.normals, dim=1).numpy(), target=_VERTICES),
         },
-        "mode": _TRIANGLES if len(look.faces) else _POINTS,
+        "mode": _TRIANGLES if len(geometry.faces) else _POINTS,
         "material": 0,
     }
-    if look.colors is not None:
-        primitive["attributes"]["COLOR_0"] = buffer.add(_linear(look.colors).numpy(), target=_VERTICES)
-    if len(look.faces):
-        primitive["indices"] = buffer.add(look.faces.reshape(-1).numpy(), target=_INDICES)
-    shade = 1.0 if look.colors is not None else float(_linear(torch.tensor(_GRAY)))
+    if geometry.colors is not None:
+        primitive["attributes"]["COLOR_0"] = buffer.add(_linear(geometry.colors).numpy(), target=_VERTICES)
+    if len(geometry.faces):
+        primitive["indices"] = buffer.add(geometry.faces.reshape(-1).numpy(), target=_INDICES)
+    shade = 1.0 if geometry.colors is not None else float(_linear(torch.tensor(_GRAY)))
     surface = {"baseColorFactor": [shade] * 3 + [1.0], "metallicFactor": 0.0, "roughnessFactor": 0.6}
     document = {
         "asset": {"version": "2.0", "generator": generator()},

@@ -109,8 +109,8 @@ def write_grid(field: SampledField, folder: str | Path, grid: Grid | None = None
             note = LOWEST_NOTE + place
             name = f"{SOUNDS}/{place + 1:03d}-{number + 1}.wav"
             level = f"{20 * math.log10(loudest):.2f}" if loudest > 0 else "-inf"
-            blow = [f"{layer.force:g}", f"{layer.contact_time:g}", note, *range_, f"{samples / rate:.6g}", level, row]
-            records.append((sound, [name, *where, *blow]))
+            impact = [f"{layer.force:g}", f"{layer.contact_time:g}", note, *range_, f"{samples / rate:.6g}", level, row]
+            records.append((sound, [name, *where, *impact]))
 
     def fill(place: Path) -> None:
         (place / SOUNDS).mkdir()

@@ -170,9 +170,9 @@ def _mode(field: SampledField, mode: int, damping: Float64[Tensor, " modes"]) ->
 
 def _function(field: SampledField, row: int, frequencies: Float64[np.ndarray, " lines"]) -> dict[str, Any]:
     # The direction is the axis nearest to that of the impact, which is opposite to the normal.
-    blow = -field.normals[row].double()
-    axis = int(blow.abs().argmax())
-    direction = (axis + 1) * (1 if float(blow[axis]) > 0 else -1)
+    force = -field.normals[row].double()
+    axis = int(force.abs().argmax())
+    direction = (axis + 1) * (1 if float(force[axis]) > 0 else -1)
     return {
         "type": 58,
         "binary": 1,

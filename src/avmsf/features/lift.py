@@ -101,8 +101,8 @@ def by_presence(visibility: Visibility) -> Float[Tensor, " points"]:
 def by_visibility(visibility: Visibility) -> Float[Tensor, " points"]:
     """Weigh a view by how surely it sees a point, and by the pixels that it spends on a piece of surface there."""
     focal = visibility.camera.focal
-    nearness = torch.where(visibility.share > 0, focal[0] * focal[1] / visibility.depth**2, 0.0)
-    return visibility.share * nearness
+    resolution = torch.where(visibility.share > 0, focal[0] * focal[1] / visibility.depth**2, 0.0)
+    return visibility.share * resolution
 
 
 def lift(

@@ -22,7 +22,7 @@ ANGLES = 36
 REACH = 3.0
 """Distance in point spacings up to which the nearest point is a counterpart."""
 
-Counterparts = tuple[Int[Tensor, "members points"], Bool[Tensor, "members points"]]
+SymmetricPoints = tuple[Int[Tensor, "members points"], Bool[Tensor, "members points"]]
 """Of every member of an orbit and every point: which row its counterpart is, and whether there is one."""
 
 
@@ -99,7 +99,7 @@ def _orbits(
     angles: int,
     log: Callable[[str], None] = lambda _: None,
     reach: float = REACH,
-) -> list[Counterparts]:
+) -> list[SymmetricPoints]:
     """Return the counterparts under every rotation, and then under every mirror plane."""
     if not symmetries:
         return []
@@ -111,16 +111,16 @@ def _orbits(
     for rotation in symmetries.rotations:
         log(f"symmetric points under {rotation}")
         turned = [rotation.turn(places, angle) for angle in rotation.angles(angles)[1:]]
-        orbits.append(_counterparts(turned, tree, limit))
+        orbits.append(_symmetric_points(turned, tree, limit))
     for mirror in symmetries.mirrors:
         log(f"symmetric points under {mirror}")
-        orbits.append(_counterparts([mirror.reflect(places)], tree, limit))
+        orbits.append(_symmetric_points([mirror.reflect(places)], tree, limit))
     return orbits
 
 
-def _counterparts(
+def _symmetric_points(
     moved: list[Float[Tensor, "points 3"]], tree: cKDTree, reach: Float[Tensor, " points"]
-) -> Counterparts:
+) -> SymmetricPoints:
     itself = torch.arange(len(reach))
     rows, found = [itself], [torch.ones_like(itself, dtype=torch.bool)]
     for places in moved:

@@ -69,9 +69,9 @@ def describe_neighborhoods(
         means = weights @ cloud / total[:, None]
         second = (weights @ products.reshape(-1, 9) / total[:, None]).reshape(-1, 3, 3)
         spread = np.linalg.eigvalsh(second - means[:, :, None] * means[:, None, :])
-        lean = means - centers
-        along = np.abs(np.einsum("ni,ni->n", lean, normals))
-        across = np.sqrt(np.maximum((lean**2).sum(axis=1) - along**2, 0.0))
+        offset = means - centers
+        along = np.abs(np.einsum("ni,ni->n", offset, normals))
+        across = np.sqrt(np.maximum((offset**2).sum(axis=1) - along**2, 0.0))
         scaled = np.sqrt(np.maximum(spread, 0.0)) / radius
         columns.append(np.c_[total / radius**2, scaled, along / radius, across / radius])
     columns.append(_spin_images(centers, normals, cloud, areas, squares, radius=diagonal * _SHELLS[-1]))

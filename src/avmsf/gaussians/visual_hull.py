@@ -87,8 +87,8 @@ def _carve(
         projection = view.camera.intrinsics.numpy() @ pose[:3]
         run_lanes(_vote, lane_count(), projection, mask, lowest + 0.5 * spacing, spacing, seen, against)
     agreed = against <= wrong_fraction * seen
-    looks = seen[agreed & (seen > 0)]
-    enough = 0.5 * float(np.quantile(looks, 0.9)) if len(looks) else 1.0
+    counts = seen[agreed & (seen > 0)]
+    enough = 0.5 * float(np.quantile(counts, 0.9)) if len(counts) else 1.0
     return agreed & (seen >= max(1.0, enough))
 
 

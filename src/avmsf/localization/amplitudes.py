@@ -25,7 +25,7 @@ _COHERENT = 0.5
 """Correlation between the errors of two modes from which on they are looked at together."""
 _BAND = 512
 """Samples of the frames that the noise's power is measured in, at most."""
-_QUIET = 0.25
+_NOISE_QUANTILE = 0.25
 """Part of the bands, and of their frames, that count as quiet."""
 
 
@@ -100,11 +100,11 @@ class Extractor:
         energy = float(sound.double().square().sum())
         if color is None:
             return Amplitudes(values, torch.zeros_like(self.bank.frequency), products[0], energy)
-        power, quiet = self._noise(sound, values, color)
+        power, floor = self._noise(sound, values, color)
         place = self.bank.frequency / (0.5 * self.sample_rate) * (len(power) - 1)
         left = place.floor().long().clamp(0, len(power) - 2)
         noise = torch.lerp(power[left], power[left + 1], place - left)
-        return Amplitudes(values, noise, products[0], max(energy - self.samples * quiet, 0.0))
+        return Amplitudes(values, noise, products[0], max(energy - self.samples * floor, 0.0))
 
     def _noise(
         self, sound: Float[Tensor, " samples"], values: Complex128[Tensor, " modes"], color: Residual
@@ -128,9 +128,9 @@ class Extractor:
         shape = shape.clamp_min(1e-6 * float(shape.mean()))
         # Bands that resampling has emptied are the quietest of all, and tell nothing of the noise in the others.
         held = max(2, int(self.highest / (0.5 * self.sample_rate) * len(own)))
-        level = shape * torch.quantile((own / shape)[:held], _QUIET)
-        quiet = float(shape[:held].sum()) / len(shape) * _steady((cells / shape)[:, :held])
-        return torch.maximum(own, level), quiet
+        level = shape * torch.quantile((own / shape)[:held], _NOISE_QUANTILE)
+        floor = float(shape[:held].sum()) / len(shape) * _steady((cells / shape)[:, :held])
+        return torch.maximum(own, level), floor
 
 
 def _separate(
@@ -183,8 +183,8 @@ def _steady(cells: Float64[Tensor, "frames bands"]) -> float:
     Noise's power in a cell is distributed exponentially, so that a quiet cell tells the mean. What dies away is no
     noise, however broad: its later cells are quiet.
     """
-    quiet = torch.kthvalue(cells.flatten(), max(1, round(_QUIET * cells.numel()))).values
-    return float(quiet) / -math.log1p(-_QUIET)
+    floor = torch.kthvalue(cells.flatten(), max(1, round(_NOISE_QUANTILE * cells.numel()))).values
+    return float(floor) / -math.log1p(-_NOISE_QUANTILE)
 
 
 def _at(values: Float64[Tensor, " bins"], count: int) -> Float64[Tensor, " bands"]:

@@ -275,8 +275,8 @@ class StreamingLocalizer:
         """Add the modal amplitudes of the residual in the window from sample `start` on."""
         first = len(state.residual) - (state.clock - start)
         last = first + self.window
-        quiet = state.residual[max(0, first - self.window) : first]
-        noise = float(quiet.square().mean()) if len(quiet) else 0.0
+        before = state.residual[max(0, first - self.window) : first]
+        noise = float(before.square().mean()) if len(before) else 0.0
         found = self._modes.fit(state.residual[first:last], noise)
         explained = self._modes.render(found, state.clock - start)
         residual = torch.cat([state.residual[:first], state.residual[first:] - explained])
@@ -291,7 +291,7 @@ class StreamingLocalizer:
         return torch.from_numpy(passed), torch.from_numpy(after)
 
 
-_QUIET = 1e-12
+_MIN_NOISE_RATIO = 1e-12
 """Noise over the power of what is fitted, that is assumed at least: rounding."""
 _FAINTEST = 1e-3
 """Strength over the strongest mode's, that every mode has at least beforehand."""
@@ -347,7 +347,7 @@ class Ringing:
         if not modal > 0.0:
             return torch.zeros_like(self.poles)
         factor = modal / float(self.values.sum())
-        share = max(noise, _QUIET * energy / len(sound)) / factor
+        share = max(noise, _MIN_NOISE_RATIO * energy / len(sound)) / factor
         products = sound.to(torch.complex128) @ self.window
         both = torch.cat([products.imag, products.real]) * self.scale
         sine, cosine = (self.scale * (self.vectors @ ((both @ self.vectors) / (self.values + share)))).chunk(2)

@@ -50,7 +50,7 @@ UNLIT = Lighting(ambient=1.0, sky=0.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class RayHits:
     """What of a mesh lies behind the center of each pixel."""
 
     faces: Int[Tensor, "height width"]
@@ -80,7 +80,7 @@ class MeshTracer:
         placed = ((vertices - self.middle) / self.size).astype(np.float32)
         TriangleMesh(self.scene, placed, self.faces.astype(np.int32))
 
-    def look(self, camera: Camera) -> Sight:
+    def cast(self, camera: Camera) -> RayHits:
         """Return what lies behind the center of each pixel."""
         faces = torch.full((camera.height, camera.width), -1)
         depth = torch.full((camera.height, camera.width), torch.inf, dtype=torch.float64)
@@ -90,7 +90,7 @@ class MeshTracer:
             faces[rows, columns] = torch.from_numpy(hits.faces)
             depth[rows, columns] = torch.from_numpy(hits.depth)
             normals[rows, columns] = torch.from_numpy(self._normals(hits).astype(np.float64))
-        return Sight(faces, depth, normals)
+        return RayHits(faces, depth, normals)
 
     def photograph(
         self, camera: Camera, *, name: str, lighting: Lighting, background: tuple[float, float, float], supersample: int

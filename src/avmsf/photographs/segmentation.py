@@ -348,10 +348,10 @@ def _bounds(
     if len(directions) < 2:
         return None
     lines, places = np.array(directions), np.array(positions)
-    beside = np.eye(3) - lines[:, :, None] * lines[:, None, :]
-    if np.linalg.eigvalsh(beside.sum(axis=0))[0] < 1e-6 * len(lines):
+    across = np.eye(3) - lines[:, :, None] * lines[:, None, :]
+    if np.linalg.eigvalsh(across.sum(axis=0))[0] < 1e-6 * len(lines):
         return None
-    center = np.linalg.solve(beside.sum(axis=0), np.einsum("ijk,ik->j", beside, places))
+    center = np.linalg.solve(across.sum(axis=0), np.einsum("ijk,ik->j", across, places))
     # The median, for a mask that leaked into the background is far too large.
     radius = 1.25 * float(np.median(np.array(angles) * np.linalg.norm(places - center, axis=1)))
     return center - radius, center + radius

@@ -54,8 +54,8 @@ def without_camera(shots: Sequence[Shot], folder: Path) -> list[str]:
     else:
         folders = {shot.image.parent for shot in shots}
         candidates = {path for parent in folders for path in pictures_in(parent, deep=False)}
-    strangers = [path for path in candidates if path.resolve() not in known]
-    return sorted(path.relative_to(images).as_posix() if images.is_dir() else path.name for path in strangers)
+    unlisted = [path for path in candidates if path.resolve() not in known]
+    return sorted(path.relative_to(images).as_posix() if images.is_dir() else path.name for path in unlisted)
 
 
 def refuse_many(count: int, where: Path) -> None:

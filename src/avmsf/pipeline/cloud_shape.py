@@ -16,7 +16,7 @@ from avmsf.reconstruction import ObjectShape, object_surface
 
 _FEWEST = 100
 """Gaussians; what encloses an object is not known from fewer."""
-_FAINT = 0.05
+_MIN_OPACITY = 0.05
 """Opacity below which a Gaussian does not show where the object is."""
 _FEWEST_MASKS = 3
 """Masks from which outlines are taken; with fewer, pictures of the Gaussians have them."""
@@ -70,10 +70,10 @@ def _visible(cloud: GaussianCloud) -> GaussianCloud:
                 name=each.name,
                 value=found,
             )
-    visible = cloud.detach().take(cloud.opacities.detach() >= _FAINT)
+    visible = cloud.detach().take(cloud.opacities.detach() >= _MIN_OPACITY)
     if len(visible) < _FEWEST:
         raise SceneError(
-            f"opacities: expected {_FEWEST} Gaussians or more of at least {_FAINT}, got {len(visible)} of "
+            f"opacities: expected {_FEWEST} Gaussians or more of at least {_MIN_OPACITY}, got {len(visible)} of "
             f"{len(cloud)}; fit the Gaussians again, with more steps or better masks",
             name="opacities",
             value=len(visible),

@@ -43,7 +43,7 @@ from avmsf.photographs import read_views
 from avmsf.photographs.nerf_json import stated_moves
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import CACHE, CACHED_FIELD, PipelineConfig
-from avmsf.pipeline.frame_check import expect_contacts_in_views, expect_on_object, judge_outlines
+from avmsf.pipeline.frame_check import check_outlines, expect_contacts_in_views, expect_on_object
 from avmsf.pipeline.guess import expect_no_recordings, guess_field
 from avmsf.pipeline.record import capture_settings_of, finder_of, modes_words, supporting_poles, with_record
 from avmsf.pipeline.scene import ProgressListener, SceneStages
@@ -185,7 +185,7 @@ def _fit_shape(
     listener: ProgressListener,
 ) -> StagedFit:
     method = finder_of(config)
-    heard = {"impacts": train.digest(), "method": repr(method)}
+    recorded = {"impacts": train.digest(), "method": repr(method)}
     cache = stages.folder / BODIES
 
     def bodies() -> CandidateBodies:
@@ -208,7 +208,7 @@ def _fit_shape(
         listener.log(f"modes: {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
         extract_once(train, method, path, needed=True)
 
-    found = stages.keep(MODES, heard, find_modes)
+    found = stages.keep(MODES, recorded, find_modes)
     modes = extract_once(train, method, found.path)
 
     def make(path: Path) -> None:
@@ -239,7 +239,7 @@ def _fit_shape(
             return True
         return False
 
-    recipe = {**heard, "features": shape.digest, "fit": asdict(config.fit), "modes": found.digest}
+    recipe = {**recorded, "features": shape.digest, "fit": asdict(config.fit), "modes": found.digest}
     recipe |= {"gain_model": config.gain_model, "name": capture.name}
     recipe |= {"body": asdict(config.body), "settings": asdict(capture.settings), "surface": shape.surface_digest}
     kept = stages.keep(FIELD, recipe, make, usable=is_final)
@@ -493,7 +493,7 @@ def _shape_of_views(capture: Capture, config: PipelineConfig, scene: SceneStages
     if scene.source is not None and scene.source.kind == "cameras":
         # Before Gaussians, which take minutes.
         views = read_views(scene.views.path)
-        warning = None if capture.surface is None else judge_outlines(capture.surface, views, settings)
+        warning = None if capture.surface is None else check_outlines(capture.surface, views, settings)
         if warning is not None:
             warnings.warn(warning, stacklevel=2)
         expect_contacts_in_views(impacts.contacts, views, settings, stated=stated)

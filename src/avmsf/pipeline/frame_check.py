@@ -58,7 +58,7 @@ def compare_outlines(
         scale = min(1.0, longest / max(view.camera.width, view.camera.height))
         width, height = max(1, round(scale * view.camera.width)), max(1, round(scale * view.camera.height))
         camera = _scaled(view.camera.resized(width, height), 1.0 / factor)
-        outline = (tracer.look(camera).faces >= 0).numpy()
+        outline = (tracer.cast(camera).faces >= 0).numpy()
         mask = cv2.resize(view.mask.numpy(), (width, height), interpolation=cv2.INTER_AREA) > 127
         either, differs = outline | mask, outline ^ mask
         far = _distance_to_edge(mask) > 1.0 + MASK_PIXELS * scale
@@ -67,7 +67,7 @@ def compare_outlines(
     return OutlineDifference(*np.median(np.array(found), axis=0).tolist())
 
 
-def judge_outlines(surface: Surface, views: Sequence[View], settings: CaptureSettings) -> CaptureWarning | None:
+def check_outlines(surface: Surface, views: Sequence[View], settings: CaptureSettings) -> CaptureWarning | None:
     """Return a warning for a mesh that differs from the masks of photographs by more than their accuracy.
 
     Its `value` is the difference as a part of the area. None where they agree, and where no view has a mask; `settings`
@@ -123,7 +123,7 @@ def expect_contacts_in_views(
     hull = _hull(chosen)
     if hull is None:
         shares = {
-            words: _share_inside(contacts, mended) * bool(_hull(mended)) for words, mended in _conventions(chosen)
+            words: _share_inside(contacts, changed) * bool(_hull(changed)) for words, changed in _conventions(chosen)
         }
         likely = max(shares, key=shares.__getitem__)
         found = [remark.message for remark in check_cameras([view.camera for view in chosen])]
@@ -149,8 +149,8 @@ def expect_contacts_in_views(
     if inside:
         return
     name = unit_named(factor * settings.meters)
-    mended = f'write unit = "{name}" in capture.toml' if name else "scale the contacts or the cameras"
-    reason = f"and inside when multiplied by {factor:.4g}; {mended}"
+    changed = f'write unit = "{name}" in capture.toml' if name else "scale the contacts or the cameras"
+    reason = f"and inside when multiplied by {factor:.4g}; {changed}"
     if factor == 1:
         reason = "and no change of unit explains it" if placement is None else placement.describe(what="masks' hull")
     raise CaptureError(

@@ -24,7 +24,7 @@ from avmsf.pipeline.config import ViewsConfig
 from avmsf.pipeline.stages import Kept, StageFolder, digest_files
 
 Kind = Literal["cameras", "photographs", "video", "mesh"]
-Tell = Callable[[str], None]
+Log = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Source:
     @property
     def digest(self) -> str:
         """Of all that decides the views."""
-        return digest_files(self.files, beneath=self.folder)
+        return digest_files(self.files, root=self.folder)
 
 
 def find_source(folder: Path, settings: CaptureSettings, *, prefer: Literal["best", "mesh"] = "best") -> Source | None:
@@ -64,8 +64,8 @@ def find_source(folder: Path, settings: CaptureSettings, *, prefer: Literal["bes
         named = [transforms] if model is None else sorted(each for each in model.iterdir() if each.is_file())
         return Source("cameras", (*named, *images, *masks, *sorted(folder.glob("*.ply"))), folder, folder)
     if surface is not None and shaped:
-        beside = (*pictures_in(surface.parent, deep=False), *sorted(surface.parent.glob("*.mtl")))
-        return Source("mesh", (surface, *beside), surface, folder)
+        companions = (*pictures_in(surface.parent, deep=False), *sorted(surface.parent.glob("*.mtl")))
+        return Source("mesh", (surface, *companions), surface, folder)
     if len(images) >= MIN_IMAGES or (images and photographs != folder):
         if len(images) < MIN_IMAGES:
             raise SceneError.expected(
@@ -87,7 +87,7 @@ def find_splats(folder: Path) -> Path | None:
 
 
 def keep_views(
-    source: Source, stages: StageFolder, config: ViewsConfig, *, settings: CaptureSettings, log: Tell
+    source: Source, stages: StageFolder, config: ViewsConfig, *, settings: CaptureSettings, log: Log
 ) -> Kept:
     """Make the folder `views` of a source's views, with masks, or return it where it is as it should be.
 
@@ -132,7 +132,7 @@ def _matters(kind: Kind) -> Sequence[str]:
     return ("rendered", "count") if kind == "mesh" else ("longest", "masks", "count")
 
 
-def _photographed(folder: Path, config: ViewsConfig, *, meters: float, log: Tell) -> tuple[View, ...]:
+def _photographed(folder: Path, config: ViewsConfig, *, meters: float, log: Log) -> tuple[View, ...]:
     views = read_views(folder, longest=config.longest, meters=meters)
     bare = sum(view.mask is None for view in views)
     if config.masks and bare:
@@ -141,14 +141,14 @@ def _photographed(folder: Path, config: ViewsConfig, *, meters: float, log: Tell
     return views
 
 
-def _rendered(path: Path, config: ViewsConfig, *, settings: CaptureSettings, log: Tell) -> tuple[View, ...]:
+def _rendered(path: Path, config: ViewsConfig, *, settings: CaptureSettings, log: Log) -> tuple[View, ...]:
     mesh = read_textured_mesh(path, meters=settings.surface_meters)
     cameras = orbit_cameras(mesh.surface, size=config.rendered)
     log(f"views: rendering {len(cameras)} of {path.name}")
     return render_views(mesh, cameras)
 
 
-def _keep_motion(source: Source, stages: StageFolder, config: ViewsConfig, *, log: Tell) -> Kept:
+def _keep_motion(source: Source, stages: StageFolder, config: ViewsConfig, *, log: Log) -> Kept:
     """Return a folder of `images` and the COLMAP model `sparse/0` that was found for them."""
     recipe: dict[str, str | int] = {"files": source.digest, "seed": config.seed}
     if source.kind == "video":

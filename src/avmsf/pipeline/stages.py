@@ -124,15 +124,15 @@ class StageFolder:
 def digest_of(path: Path) -> str:
     """Return a digest of a file's content, or of the names and contents of all files in a folder."""
     if path.is_dir():
-        return digest_files((each for each in path.rglob("*") if each.is_file()), beneath=path)
-    return digest_files([path], beneath=path.parent)
+        return digest_files((each for each in path.rglob("*") if each.is_file()), root=path)
+    return digest_files([path], root=path.parent)
 
 
-def digest_files(paths: Iterable[Path], *, beneath: Path) -> str:
-    """Return a digest of files' contents and of their names relative to the folder `beneath`, in sorted order."""
+def digest_files(paths: Iterable[Path], *, root: Path) -> str:
+    """Return a digest of files' contents and of their names relative to the folder `root`, in sorted order."""
     digest = hashlib.sha256()
     for path in sorted(paths):
-        digest.update(f"{path.relative_to(beneath).as_posix()}\0{path.stat().st_size}\0".encode())
+        digest.update(f"{path.relative_to(root).as_posix()}\0{path.stat().st_size}\0".encode())
         with open(path, "rb") as file:
             while block := file.read(_BLOCK):
                 digest.update(block)

@@ -49,11 +49,11 @@ def draw_contact(
     marks.append((contact.position, _FOUND))
     if truth is not None:
         marks.append((truth, _TRUTH))
-    likely, alike = (
+    likely, distance = (
         _marked(points, colors, marks)[rows] for colors in (contact_colors(contact), _distance_colors(contact))
     )
     figure = draw_cloud(
-        points[rows], {"probability": likely, "cosine distance": alike}, title=_title(title, marks), sides=sides
+        points[rows], {"probability": likely, "cosine distance": distance}, title=_title(title, marks), sides=sides
     )
     low, high = _span(contact)
     for line, (first, last, words, heat) in enumerate(

@@ -61,13 +61,13 @@ def draw_edit(before: ModeLevels, after: ModeLevels, *, sample_rate: float, titl
     tops = [each.level_db(loudest).max().item() for _, each, _ in drawn if bool((each.size > 0).any())]
     top = max([0.0, *tops])
     for name, modes, color in drawn:
-        heard = (modes.size > 0).numpy()
+        audible = (modes.size > 0).numpy()
         frequency, t60 = modes.frequency.numpy(), modes.t60.numpy()
-        level = np.maximum(modes.level_db(loudest).numpy()[heard], top - _RANGE_DB)
-        levels.vlines(frequency[heard], top - _RANGE_DB, level, colors=color, linewidths=1.2, alpha=0.7)
-        levels.plot(frequency[heard], level, "o", color=color, markersize=4, label=name)
-        rings.plot(frequency[heard], t60[heard], "o", color=color, markersize=4, alpha=0.8)
-        rings.plot(frequency[~heard], t60[~heard], "o", color=color, markersize=4, mfc="none")
+        level = np.maximum(modes.level_db(loudest).numpy()[audible], top - _RANGE_DB)
+        levels.vlines(frequency[audible], top - _RANGE_DB, level, colors=color, linewidths=1.2, alpha=0.7)
+        levels.plot(frequency[audible], level, "o", color=color, markersize=4, label=name)
+        rings.plot(frequency[audible], t60[audible], "o", color=color, markersize=4, alpha=0.8)
+        rings.plot(frequency[~audible], t60[~audible], "o", color=color, markersize=4, mfc="none")
     for one, other in zip(_places(before), _places(after), strict=True):
         rings.plot([one[0], other[0]], [one[1], other[1]], color="gray", linewidth=0.5, alpha=0.5, zorder=0)
     _count(counts, drawn)

@@ -26,22 +26,22 @@ _INCHES = 4.0
 @styled
 def draw_uncertainty(
     points: Float[Tensor, "points 3"],
-    doubt: Float[Tensor, " points"],
+    std: Float[Tensor, " points"],
     *,
     title: str,
-    struck: Float[Tensor, "struck 3"] | None = None,
+    contacts: Float[Tensor, "struck 3"] | None = None,
     suggested: Float[Tensor, "suggested 3"] | None = None,
     directions: Float[Tensor, "suggested 3"] | None = None,
 ) -> Figure:
     """Draw the relative standard deviation of gains (`relative_gain_std`) on an object's points (object frame, meters).
 
-    From six sides. Recorded contacts, `struck`, are marked by crosses, `suggested` ones by their numbers, each where it
+    From six sides. Recorded `contacts` are marked by crosses, `suggested` ones by their numbers, each where it
     is visible: no point is in front of it, and the impact, whose `directions` may be given, points away from the
     viewer, so that the two sides of a wall are distinguished. A suggested one that no side shows is drawn in a white
     disc, on the side that most faces it. An object that is flat along an axis is drawn once, in its plane.
     """
-    places, values = points.double().numpy(), doubt.double().numpy()
-    crosses, numbers = (None if each is None else each.double().numpy() for each in (struck, suggested))
+    places, values = points.double().numpy(), std.double().numpy()
+    crosses, numbers = (None if each is None else each.double().numpy() for each in (contacts, suggested))
     extent = np.ptp(places, axis=0)
     flat = np.flatnonzero(extent <= _FLAT * extent.max())
     frames = [view_from(side).T for side in ALL_SIDES] if len(flat) == 0 else [_plane(int(flat[0]))]
@@ -57,7 +57,7 @@ def draw_uncertainty(
         away = None if directions is None or len(frames) == 1 else directions.double().numpy()
         hidden = _number(grid, frames, places, numbers, away)
     figure.colorbar(drawn, ax=list(grid), shrink=0.7, label="standard deviation of gains / rms gain")
-    known = [words for words, each in (("× recorded", struck), ("numbers: suggested", suggested)) if each is not None]
+    known = [words for words, each in (("× recorded", contacts), ("numbers: suggested", suggested)) if each is not None]
     known += ["white discs: hidden contacts"] * hidden
     figure.suptitle("\n".join([title, ", ".join(known)] if known else [title]))
     return figure

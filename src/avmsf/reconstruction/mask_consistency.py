@@ -68,15 +68,15 @@ def consistent_masks(views: Sequence[View], outlines: Sequence[Outline], grid: G
     if not solid.any():
         return np.ones(len(outlines), dtype=bool)
     cut = np.array([_left_out(each, grid, solid) for each in outlines])
-    suspect = cut > max(_CUT, _TIMES_MEDIAN * float(np.median(cut)))
-    if not suspect.any():
-        return ~suspect
+    inconsistent = cut > max(_CUT, _TIMES_MEDIAN * float(np.median(cut)))
+    if not inconsistent.any():
+        return ~inconsistent
     # Half a cell larger, for cells are coarse.
     values = np.maximum(values + 0.5 * np.float32(grid.spacing), -grid.spacing)
     tracer = MeshTracer(TexturedMesh.plain(closed_surface(values, grid)))
     beyond = np.array([_beyond(view, each, tracer) for view, each in zip(views, outlines, strict=True)])
     shown = beyond > max(_BEYOND, _TIMES_MEDIAN * float(np.median(beyond)))
-    return ~(suspect & (shown | (cut > _CUT_ALONE)))
+    return ~(inconsistent & (shown | (cut > _CUT_ALONE)))
 
 
 def _left_out(outline: Outline, grid: Grid, solid: Bool[np.ndarray, "x y z"]) -> float:
@@ -87,5 +87,5 @@ def _left_out(outline: Outline, grid: Grid, solid: Bool[np.ndarray, "x y z"]) ->
 def _beyond(view: View, outline: Outline, tracer: MeshTracer) -> float:
     """Return the part of a mask, without its outermost pixel, in which a view does not see a surface."""
     inside = outline.inside > 1
-    seen = (tracer.look(view.camera).faces >= 0).numpy()
+    seen = (tracer.cast(view.camera).faces >= 0).numpy()
     return float((inside & ~seen).sum() / max(int(inside.sum()), 1))

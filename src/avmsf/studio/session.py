@@ -24,7 +24,7 @@ _DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 """Names that are no files on Windows, where a capture may be opened next."""
 _LONGEST_NAME = 200
 """Bytes: files' names have 255 at most, of which the ending and what a half-written file is called need some."""
-_MOST_ALIKE = 1000
+_MAX_COPIES = 1000
 MOST_UNDONE = 100
 """Maximum number of undo steps."""
 
@@ -128,14 +128,14 @@ class Session:
 
     def keep(self, field: SoundField, stem: str) -> Path:
         """Write a field that is not the current one to a new file of the folder: `stem`, with a number if it exists."""
-        for name in (stem, *(f"{stem} {number}" for number in range(2, _MOST_ALIKE))):
+        for name in (stem, *(f"{stem} {number}" for number in range(2, _MAX_COPIES))):
             path = self.home / f"{name}{SUFFIX}"
             try:
                 _write_new(field, path)
             except RequestError:
                 continue
             return path
-        wanted = f"fewer than {_MOST_ALIKE} files called {stem}"
+        wanted = f"fewer than {_MAX_COPIES} files called {stem}"
         raise StudioError.expected(wanted, got="more", file=self.home, name=stem, advice="move them away")
 
     def check_current(self, base: int) -> None:

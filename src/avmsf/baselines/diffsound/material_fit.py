@@ -170,13 +170,13 @@ def predicted_sound(
 
     `frequency` is undamped, Hz. Raises EvaluationError where no mode is in the band.
     """
-    heard = damped_frequency(frequency, damping)
-    inside = (heard > BAND[0]) & (heard < BAND[1])
+    audible = damped_frequency(frequency, damping)
+    inside = (audible > BAND[0]) & (audible < BAND[1])
     if not bool(inside.any()):
         raise EvaluationError(f"expected modes from {BAND[0]:g} to {BAND[1]:g} Hz, got none", name="frequency", value=0)
     ones = torch.ones(1, int(inside.sum()))
-    sound = synthesize(ones, heard[inside], damping[inside], samples=SAMPLES, sample_rate=RATE)[0]
-    return sound / sound.detach().abs().max(), heard[inside]
+    sound = synthesize(ones, audible[inside], damping[inside], samples=SAMPLES, sample_rate=RATE)[0]
+    return sound / sound.detach().abs().max(), audible[inside]
 
 
 def damped_frequency(
@@ -262,8 +262,8 @@ class _Problem:
         """Return where a descent by optimal transport ends."""
 
         def loss(point: Float64[Tensor, "3"], step: int) -> Float[Tensor, ""]:
-            sound, heard = self.sound(point)
-            return self.spectra.transport(sound, heard, row=step % len(self.spectra.clips))
+            sound, audible = self.sound(point)
+            return self.spectra.transport(sound, audible, row=step % len(self.spectra.clips))
 
         rate = _TRANSPORT_RATE * _PUBLISHED_STEPS[0] / max(steps, 1)
         return self._descend(start, loss, steps, rate=rate, decay=_TRANSPORT_DECAY ** (10.0 / max(steps, 1)))[0]

@@ -123,8 +123,8 @@ def leveled(fit: MaterialFit, curve: DampingCurve, train: Impacts, residual: Res
     """
     elastic = fit.modes()
     damping = curve(elastic.frequency)
-    heard = damped_frequency(elastic.frequency, damping)
-    inside = torch.nonzero((heard > 1.0) & (heard < 0.5 * train.sample_rate)).flatten()
+    audible = damped_frequency(elastic.frequency, damping)
+    inside = torch.nonzero((audible > 1.0) & (audible < 0.5 * train.sample_rate)).flatten()
     if not len(inside):
         raise EvaluationError(
             f"expected modes below {0.5 * train.sample_rate:g} Hz, got none; give the mesh's unit",
@@ -132,7 +132,7 @@ def leveled(fit: MaterialFit, curve: DampingCurve, train: Impacts, residual: Res
             value=0,
         )
     elastic = _some(elastic, inside)
-    bank = ModalBank(heard[inside], damping[inside])
+    bank = ModalBank(audible[inside], damping[inside])
     weight = _weights(_displacements(elastic, bank, train.contacts, train.directions), bank, train, weighted=weighted)
     report = {
         "stiffness": fit.stiffness, "poisson": fit.poisson, "thickness": fit.thickness, "difference": fit.difference,
@@ -229,12 +229,12 @@ class DiffSoundLocator:
         The sound starts about at its onset and has the renderer's sample rate. Raises LocationError where it is silent
         or not finite.
         """
-        heard = sound.detach().cpu()[: self.renderer.samples].double()
-        if not bool(torch.isfinite(heard).all()) or not bool(heard.any()):
+        audible = sound.detach().cpu()[: self.renderer.samples].double()
+        if not bool(torch.isfinite(audible).all()) or not bool(audible.any()):
             raise LocationError(
                 "sound: expected finite samples that are not all 0, got others; record the impact again", name="sound"
             )
-        sine, cosine = fit_gains(heard[None], self.renderer.bank, sample_rate=self.renderer.sample_rate)
+        sine, cosine = fit_gains(audible[None], self.renderer.bank, sample_rate=self.renderer.sample_rate)
         return cosine_distance(
             self.gains.to(torch.complex64), torch.complex(sine[0], cosine[0]), self.renderer.bank.frequency
         )

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
 
-from avmsf.editing.clips import lasting, resampled
+from avmsf.editing.clips import resampled, with_length
 
 RATE = 32_000.0
 """Hz."""
@@ -65,9 +65,9 @@ class PatchCodec:
 
 def spectra(sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> Complex[Tensor, "contacts bins frames"]:
     """Return spectra of the first 2 s at 32 kHz; shorter sounds are continued by silence. Hann windows, centered."""
-    heard = lasting(resampled(sounds.float(), sample_rate=sample_rate, wanted=RATE), SAMPLES)
+    clips = with_length(resampled(sounds.float(), sample_rate=sample_rate, wanted=RATE), SAMPLES)
     found = torch.stft(
-        heard, FFT, HOP, window=torch.hann_window(FFT), center=True, pad_mode="constant", return_complex=True
+        clips, FFT, HOP, window=torch.hann_window(FFT), center=True, pad_mode="constant", return_complex=True
     )
     return found[:, : PATCHES * BINS]
 
@@ -98,7 +98,7 @@ def sounds_of(
         found = torch.polar(magnitudes, (now - _MOMENTUM * before).angle())
         before = now
     sounds = torch.istft(found, FFT, HOP, window=window, length=SAMPLES)
-    return lasting(resampled(sounds, sample_rate=RATE, wanted=sample_rate), samples)
+    return with_length(resampled(sounds, sample_rate=RATE, wanted=sample_rate), samples)
 
 
 def _patches(logs: Float[Tensor, "contacts bins frames"]) -> Float[Tensor, "contacts patches values"]:

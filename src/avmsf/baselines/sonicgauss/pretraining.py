@@ -116,7 +116,7 @@ def _kept(path: Path, recipe: ObjectRecipe) -> TrainingObject | None:
     return TrainingObject(cloud, state["contacts"], state["sounds"], float(state["sample_rate"]))
 
 
-_TOLD = 25
+_LOG_EVERY = 25
 """Steps between words of progress."""
 _CURVE = 20
 """Points of the loss curve that is kept."""
@@ -165,7 +165,7 @@ def pretrain(
     logs.clear()
 
     def say(step: int, loss: float) -> None:
-        if log is not None and step % _TOLD == 0:
+        if log is not None and step % _LOG_EVERY == 0:
             log(f"step {step} of {config.training.steps}: loss {loss:.4f}, {time.process_time() - begun:.0f} s")
 
     losses = train(network.parameters(), clips.loss(network.train()), len(owners), config.training, seed=seed, log=say)

@@ -38,7 +38,7 @@ from avmsf.baselines.sonicgauss.training import (
     train,
 )
 from avmsf.capture.impacts import Impacts
-from avmsf.editing.clips import lasting, resampled
+from avmsf.editing.clips import resampled, with_length
 from avmsf.errors import EvaluationError
 from avmsf.gaussians.cloud import GaussianCloud
 
@@ -273,7 +273,7 @@ class PublishedRenderer(TunedRenderer):
         latents = integrate(lambda z, s: model.velocity(z, s, tokens, seconds=seconds), noise, steps=self.steps)
         sound = model.autoencoder.decode(latents.mT).sample.mean(1).float().cpu()
         rate = float(model.autoencoder.config.sampling_rate)
-        return self.peak * lasting(resampled(sound, sample_rate=rate, wanted=self.sample_rate), self.samples)[0]
+        return self.peak * with_length(resampled(sound, sample_rate=rate, wanted=self.sample_rate), self.samples)[0]
 
 
 def fit_published(
@@ -320,7 +320,9 @@ def _encoded(
     """Return means and deviations of the recordings' latents; published training draws from them anew each time."""
     autoencoder = model.autoencoder
     rate, samples = float(autoencoder.config.sampling_rate), FRAMES * int(autoencoder.hop_length)
-    sounds = lasting(resampled(impacts.sounds.float() / peak, sample_rate=impacts.sample_rate, wanted=rate), samples)
+    sounds = with_length(
+        resampled(impacts.sounds.float() / peak, sample_rate=impacts.sample_rate, wanted=rate), samples
+    )
     channels = int(autoencoder.config.audio_channels)
     found = [
         autoencoder.encode(each[None, None].expand(-1, channels, -1).to(_device_of(model))).latent_dist

@@ -212,11 +212,11 @@ def project_points_back(
         _, xy, yy, determinant = _variances(axes)
 
         # p = D^(-1/2), r = -p xy / yy, s = yy^(-1/2), where D = xx - xy^2 / yy.
-        steep, lean = math.sqrt(yy / determinant), xy / yy
+        steep, slant = math.sqrt(yy / determinant), xy / yy
         by_p, by_r, by_s = float(by_ellipses[i, 0]), float(by_ellipses[i, 1]), float(by_ellipses[i, 2])
-        by_xx = -0.5 * steep * steep * steep * (by_p - lean * by_r)
-        by_xy = -2.0 * lean * by_xx - steep / yy * by_r
-        by_yy = lean * lean * by_xx + lean * steep / yy * by_r - 0.5 * by_s / (yy * math.sqrt(yy))
+        by_xx = -0.5 * steep * steep * steep * (by_p - slant * by_r)
+        by_xy = -2.0 * slant * by_xx - steep / yy * by_r
+        by_yy = slant * slant * by_xx + slant * steep / yy * by_r - 0.5 * by_s / (yy * math.sqrt(yy))
         for j in range(3):
             by_axes[0, j] = 2.0 * by_xx * axes[0, j] + by_xy * axes[1, j]
             by_axes[1, j] = 2.0 * by_yy * axes[1, j] + by_xy * axes[0, j]

@@ -60,13 +60,13 @@ def _slope(x: float, y: float, z: float, count: int, weights: Float64[np.ndarray
         xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
         first, last = -_C3 * weights[9], -_C3 * weights[15]
         product, tesseral = _C3_PRODUCT * weights[10], _C3_TESSERAL * weights[14]
-        beside, across = -_C3_FLAT * weights[11], -_C3_FLAT * weights[13]
+        along, across = -_C3_FLAT * weights[11], -_C3_FLAT * weights[13]
         zonal = _C3_ZONAL * weights[12]
-        by_x += 6.0 * first * xy + product * yz - 2.0 * beside * xy - 6.0 * zonal * xz
+        by_x += 6.0 * first * xy + product * yz - 2.0 * along * xy - 6.0 * zonal * xz
         by_x += across * (4.0 * zz - 3.0 * xx - yy) + 2.0 * tesseral * xz + 3.0 * last * (xx - yy)
-        by_y += 3.0 * first * (xx - yy) + product * xz + beside * (4.0 * zz - xx - 3.0 * yy) - 6.0 * zonal * yz
+        by_y += 3.0 * first * (xx - yy) + product * xz + along * (4.0 * zz - xx - 3.0 * yy) - 6.0 * zonal * yz
         by_y += -2.0 * across * xy - 2.0 * tesseral * yz - 6.0 * last * xy
-        by_z += product * xy + 8.0 * beside * yz + zonal * (6.0 * zz - 3.0 * xx - 3.0 * yy)
+        by_z += product * xy + 8.0 * along * yz + zonal * (6.0 * zz - 3.0 * xx - 3.0 * yy)
         by_z += 8.0 * across * xz + tesseral * (xx - yy)
     return by_x, by_y, by_z
 

@@ -72,13 +72,13 @@ class HighResolution:
         noise = noise_power(sounds, bins=noise_bins(samples)).clamp_min(_MIN_NOISE_POWER)
         pairs = candidates(sounds, noise, sample_rate=sample_rate, lowest=lowest, significance=chance)
         found = merge(*pairs, duration=samples / sample_rate)
-        bank = self._sift(sounds.to(torch.float64), found, noise, sample_rate, lowest)
+        bank = self._prune(sounds.to(torch.float64), found, noise, sample_rate, lowest)
         # Hum and thuds are fitted beside the modes, or modes that are not there would stand in for them.
         toned = math.pi * bank.frequency > self.least_quality * bank.damping
         turning = math.pi * sample_rate - 2 * math.pi * bank.frequency > _LEAST_TURN * bank.damping
         return bank.take(toned & turning & (bank.damping >= _LEAST_FALL * sample_rate / samples))
 
-    def _sift(
+    def _prune(
         self,
         sounds: Float64[Tensor, "contacts samples"],
         found: ModalBank,
