@@ -66,7 +66,7 @@ def test_every_dataset_answers_alike(place: Path, path: str) -> None:
         assert len(impacts) == report.recordings
         # Separate names, so that training and test recordings can be told apart.
         assert len(set(impacts.names)) == len(impacts)
-    for ask in (dataset.facts, dataset.capture, dataset.source):
+    for ask in (dataset.facts, dataset.capture, dataset.visual_source):
         with raises(DatasetError, name="object", value="teapot"):
             ask("teapot")
 

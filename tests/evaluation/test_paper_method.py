@@ -35,7 +35,7 @@ def test_the_method_is_the_preset_with_one_damping(name: str, damping: Any) -> N
     field = method.method if isinstance(method, GridField) else method
     preset = PRESETS["paper"]
     assert field.pipeline == replace(preset, fit=replace(preset.fit, damping=damping))
-    assert (field.look, field.published) == ("paper", True)
+    assert (field.visual_input, field.published) == ("paper", True)
 
 
 def test_a_method_may_find_modes_in_its_own_way() -> None:

@@ -7,7 +7,7 @@ import torch
 
 from avmsf.datasets import CaptureCollection
 from avmsf.errors import SceneError
-from avmsf.evaluation.objects import ObjectLooks
+from avmsf.evaluation.objects import ObjectFeatures
 from avmsf.evaluation.protocols import PROTOCOLS
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.runner import Evaluation, run_object
@@ -26,7 +26,7 @@ def test_given_gaussians_are_read_and_an_object_that_nothing_shows_is_refused(tm
         fill_plate(tmp_path / "set" / name, surface=False)
     given = cloud(200)
     write_splats(given, tmp_path / "set" / "shown" / "splats.ply")
-    looks = ObjectLooks(CaptureCollection(tmp_path / "set"), tmp_path / "cache")
+    looks = ObjectFeatures(CaptureCollection(tmp_path / "set"), tmp_path / "cache")
     assert torch.equal(looks.cloud("shown").centers, given.centers)
     assert torch.equal(looks.cloud("shown", views=12).centers, given.centers)
     with pytest.raises(SceneError):

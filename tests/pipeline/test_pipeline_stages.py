@@ -102,11 +102,11 @@ def test_the_order_of_files_does_not_matter_but_what_stands_in_which_does(tmp_pa
     for name, words in (("a", "1"), ("b", "2"), ("c", "12")):
         (tmp_path / name).write_text(words)
     a, b = tmp_path / "a", tmp_path / "b"
-    digest = digest_files([a, b], beneath=tmp_path)
-    assert digest == digest_files([b, a], beneath=tmp_path)
+    digest = digest_files([a, b], root=tmp_path)
+    assert digest == digest_files([b, a], root=tmp_path)
     a.write_text("2")
     b.write_text("1")
-    assert digest != digest_files([a, b], beneath=tmp_path)
+    assert digest != digest_files([a, b], root=tmp_path)
 
 
 def test_an_interrupted_stage_finds_its_checkpoint_unless_its_recipe_has_changed(tmp_path: Path) -> None:
