@@ -30,8 +30,8 @@ from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.extraction.quality import measure_quality
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig
-from avmsf.simulate.example import EXAMPLE_FOLDER
 from avmsf.simulate.ground_truth import read_truth
+from avmsf.simulate.recipe import EXAMPLE_FOLDER
 from benchmarks.field import QUICK_LOOK, filled_estimator
 from benchmarks.look import slab
 from benchmarks.material import STRUCK, example_capture, shared_data, surface_features

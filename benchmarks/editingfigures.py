@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from avmsf._utils.text_files import read_json
+from avmsf._utils.text import read_json
 from avmsf.errors import AvmsfError, EvaluationError
 from avmsf.plotting.edits import Move, draw_clap_curves, draw_embedding
 from avmsf.plotting.pictures import save_picture

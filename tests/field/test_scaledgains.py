@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from avmsf._utils.records import RecordError
+from avmsf._utils.text import RecordError
 from avmsf.field.scaled_gains import ScaledGains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save

@@ -10,7 +10,7 @@ import pytest
 import torch
 import trimesh
 
-from avmsf._utils.text_files import MAX_TEXT_BYTES
+from avmsf._utils.text import MAX_TEXT_BYTES
 from avmsf.errors import CaptureError
 from avmsf.mesh import read_surface
 from avmsf.mesh.io import MAX_GLTF_BYTES, load_mesh

@@ -3,6 +3,7 @@
 import math
 import operator
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import Any, SupportsIndex
 
 import numpy as np
@@ -14,6 +15,8 @@ from avmsf.errors import ArrayError
 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
 """A tensor, a numpy array, or nested lists of numbers."""
+_LONGEST = 80
+"""Characters of a single value."""
 
 
 def as_vectors(values: ArrayLike, name: str, *, count: int | None = None) -> Float[Tensor, "rows 3"]:
@@ -100,3 +103,20 @@ Seed = int | torch.Generator | None
 def generator_of(seed: Seed) -> torch.Generator:
     """Return the generator of a seed."""
     return seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(0 if seed is None else seed)
+
+
+def short_repr(value: Any) -> str:
+    """Return a dataclass's name and fields in one line, tensors by their type and shape. For use as `__repr__`."""
+    shown = (f"{each.name}={_short(getattr(value, each.name))}" for each in fields(value) if each.repr)
+    return f"{type(value).__name__}({', '.join(shown)})"
+
+
+def _short(value: object) -> str:
+    if isinstance(value, Tensor):
+        return f"{str(value.dtype).removeprefix('torch.')}{list(value.shape)}"
+    if isinstance(value, torch.nn.Module):
+        return f"<{type(value).__name__}>"
+    if isinstance(value, tuple | list | dict) and len(value) > 3:
+        return f"<{len(value)} items>"
+    text = repr(value)
+    return text if len(text) <= _LONGEST else f"<{type(value).__name__}>"

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from avmsf._utils.text_files import read_json
+from avmsf._utils.text import read_json
 from avmsf.errors import AvmsfError
 
 HUB_SECONDS = 5.0

@@ -15,7 +15,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from avmsf._utils.files import way_out, write_whole
-from avmsf._utils.text_files import read_json
+from avmsf._utils.text import read_json
 from avmsf.errors import AvmsfError, FolderInUseError
 
 WAIT = 3.0

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.capture.audio import EIGHT_BIT, LOSSLESS, Recording, clipped_samples
 from avmsf.capture.onset import SECONDS_BEFORE, find_second_impact, find_second_push
 from avmsf.capture.prepare import Prepared, remove_rumble

@@ -18,7 +18,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf._utils.files import unwritable
-from avmsf._utils.text_files import read_toml
+from avmsf._utils.text import read_toml
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.measure import HIGHEST_NOISE_DB, decibels, noise_level
 from avmsf.capture.onset import SECONDS_BEFORE, find_onset, find_pulse

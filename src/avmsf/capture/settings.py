@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, get_args
 
-from avmsf._utils.text_files import read_toml
+from avmsf._utils.text import read_toml
 from avmsf.errors import CaptureError
 
 SETTINGS = "capture.toml"

@@ -13,7 +13,7 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 
 from avmsf._utils.files import is_lfs_pointer
-from avmsf._utils.text_files import read_text
+from avmsf._utils.text import read_text
 from avmsf.capture.filenames import missing_recording
 from avmsf.capture.settings import METRES, CaptureSettings
 from avmsf.errors import CaptureError, CaptureWarning, Location

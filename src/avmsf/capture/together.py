@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.capture.filenames import find_surface_file
 from avmsf.capture.placement import Placement, check_placement, contacted_part, surface_points
 from avmsf.capture.prepare import shortest_allowed

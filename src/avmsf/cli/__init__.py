@@ -17,7 +17,7 @@ from types import FrameType
 from typing import TextIO
 
 import avmsf
-from avmsf._utils.wording import printable
+from avmsf._utils.text import printable
 from avmsf.cli.heartbeat import beating, meanwhile, verbosity
 from avmsf.errors import NO_MEMORY, AvmsfError, AvmsfWarning, lacks_memory
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.capture import CaptureReport, CaptureSettings, Impacts, check, read_capture
 from avmsf.capture.measure import shared_problems
 from avmsf.capture.proposals import Proposal, propose_settings, settings_text, write_settings

@@ -37,7 +37,7 @@ from avmsf.pipeline.scene import CLOUD, ProgressListener
 from avmsf.pipeline.stages import StageFolder
 from avmsf.plotting.pictures import draw_modes, draw_scores, save_picture
 from avmsf.plotting.spectrograms import draw_spectrograms
-from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER
+from avmsf.simulate.recipe import EXAMPLE, EXAMPLE_FOLDER
 
 TRAIN = 12
 """Impacts that the field is fitted to; it is evaluated at the others."""

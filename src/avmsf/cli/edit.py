@@ -12,8 +12,7 @@ from rich.table import Table
 from torch import Tensor
 
 from avmsf._utils.files import write_whole
-from avmsf._utils.text_files import read_json
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted, read_json
 from avmsf.capture.settings import METRES
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.contacts import contacts_at, refuse_far

@@ -10,7 +10,7 @@ from typing import Any
 from rich.console import Console
 
 from avmsf._utils.device import TRAINABLE, usable_device
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.options.common import spelled
 from avmsf.cli.options.evaluate import Options, deciding, words_of

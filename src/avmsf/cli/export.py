@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.capture.filenames import find_surface_file
 from avmsf.capture.folder import read_capture
 from avmsf.capture.impacts import Impacts

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-from avmsf._utils.wording import printable
+from avmsf._utils.text import printable
 
 SILENCE_SECONDS = 4.0
 """After which a line is repeated: with the delays of a busy machine no silence is longer than five."""

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.capture import CaptureSettings, Impacts, read_capture
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.mode_table import levels, listed, mode_rows, mode_table

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.cli.fit import features_words
 from avmsf.cli.options.info import Options
 from avmsf.cli.printing import console, say

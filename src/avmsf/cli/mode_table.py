@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.cli.printing import decimals, figure, table
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.quality import ModeQuality

@@ -2,7 +2,7 @@
 
 from dataclasses import asdict
 
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.capture import read_capture
 from avmsf.cli.alignment import AlignmentReport
 from avmsf.cli.mode_table import amplitudes, levels, listed, mode_rows, mode_table, quality_rows

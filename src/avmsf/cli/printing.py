@@ -14,7 +14,7 @@ from rich.progress import Task, TextColumn
 from rich.table import Table
 from rich.text import Text
 
-from avmsf._utils.wording import printable
+from avmsf._utils.text import printable
 from avmsf.cli.heartbeat import printed, verbosity
 
 _WIDTH = 120

@@ -6,7 +6,7 @@ from types import TracebackType
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TimeRemainingColumn
 
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.cli.heartbeat import doing, verbosity
 from avmsf.cli.printing import SafeColumn, console, say
 from avmsf.pipeline.scene import ProgressListener

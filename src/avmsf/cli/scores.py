@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from rich.table import Table
 
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.capture import Impacts
 from avmsf.capture.impacts import places_of
 from avmsf.cli.heartbeat import verbosity

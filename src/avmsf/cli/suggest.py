@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.console import Console
 
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.suggest import PICTURE, TABLE, Options

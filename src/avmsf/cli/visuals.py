@@ -7,7 +7,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.capture.filenames import find_surface_file, pictures_in, unused_files
 from avmsf.capture.folder import Capture
 from avmsf.capture.placement import expect_placed, surface_points

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from avmsf._utils.text_files import parse_json, read_text
+from avmsf._utils.text import parse_json, read_text
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.folder import Capture
 from avmsf.capture.settings import CaptureSettings

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.editing.modal_edit import EDITS, Slider, adjust_modes, edited, muted
 from avmsf.errors import EditError
 from avmsf.fem.material import MATERIALS, Material, material_named

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.errors import EditError
 from avmsf.field.gain_field import Gains
 from avmsf.field.scaled_gains import ScaledGains, fitted_gains

@@ -11,7 +11,7 @@ from typing import Protocol, runtime_checkable
 from jaxtyping import Float64
 from torch import Tensor
 
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.capture.impacts import Impacts, rows_by_place
 from avmsf.errors import EvaluationError
 from avmsf.gaussians.points import closest_points, farthest_points

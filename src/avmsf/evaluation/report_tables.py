@@ -5,7 +5,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.evaluation.protocols import BASELINE, COMPUTATION, PROTOCOLS, published, published_ratios
 from avmsf.evaluation.registry import kind_of, title_of
 from avmsf.evaluation.results import ObjectRecord

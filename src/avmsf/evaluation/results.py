@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from avmsf._utils.files import write_whole
-from avmsf._utils.text_files import read_json
+from avmsf._utils.text import read_json
 from avmsf.errors import AvmsfError, EvaluationError
 
 IDENTITY, OBJECTS = "protocol.json", "objects"

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_floats
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, ExtractionError, FitError, PositionWarning

@@ -19,7 +19,7 @@ from jaxtyping import Float, Shaped
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avmsf._utils.text_files import read_json
+from avmsf._utils.text import read_json
 from avmsf.errors import ExportError
 from avmsf.export.formats import Precision
 from avmsf.export.one_phase import approximation_error, signed_amplitudes

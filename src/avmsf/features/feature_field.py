@@ -8,8 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from avmsf._utils.arrays import Seed, generator_of
-from avmsf._utils.summary import short_repr
+from avmsf._utils.arrays import Seed, generator_of, short_repr
 from avmsf.errors import FitError, SceneError
 from avmsf.gaussians.points import cluster, lattice, nearest_points, sample_surface
 from avmsf.mesh.surface import Surface

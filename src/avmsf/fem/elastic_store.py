@@ -19,9 +19,8 @@ from torch import Tensor
 
 from avmsf._utils.caching import keep_if_possible
 from avmsf._utils.files import write_whole
-from avmsf._utils.records import count_of
 from avmsf._utils.state import read_tensors
-from avmsf._utils.text_files import parse_json
+from avmsf._utils.text import count_of, parse_json
 from avmsf.errors import SimulationError
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.material import NOMINAL, Material

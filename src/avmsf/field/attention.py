@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from avmsf._utils.records import RecordError, count_of, like, record_of
+from avmsf._utils.text import RecordError, count_of, like, record_of
 from avmsf.features.feature_field import FeatureField, Regions
 from avmsf.field.config import AttentionShape
 from avmsf.field.gain_field import GainField, Gains, TrainableGains

@@ -4,7 +4,7 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Literal
 
-from avmsf._utils.wording import changes_repr
+from avmsf._utils.text import changes_repr
 from avmsf.errors import FitError
 from avmsf.modal.config import scaled_fft_size
 

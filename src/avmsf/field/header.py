@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from avmsf._utils.headers import read_header_text
-from avmsf._utils.text_files import parse_json
+from avmsf._utils.text import parse_json
 from avmsf.errors import AvmsfError, FieldFileError
 
 FORMAT = 8

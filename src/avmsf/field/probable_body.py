@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from avmsf._utils.records import like
+from avmsf._utils.text import like
 from avmsf.fem.material import MATERIALS, NOMINAL, STIFFEST, Material, largest_factor
 from avmsf.fem.supports import FREE
 from avmsf.field.gains.elastic import FREQUENCY_ERRORS

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 
-from avmsf._utils.records import RecordError, count_of, like
-from avmsf._utils.summary import short_repr
+from avmsf._utils.arrays import short_repr
+from avmsf._utils.text import RecordError, count_of, like
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.elastic_store import mode_sizes, mode_skeleton, mode_tensors, restored_modes
 from avmsf.field.attention import AttentionGains

@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Bool, Complex, Float, Float64
 from torch import Tensor
 
-from avmsf._utils.arrays import ArrayLike, as_count, as_directions, as_numbers, as_vectors
-from avmsf._utils.summary import short_repr
+from avmsf._utils.arrays import ArrayLike, as_count, as_directions, as_numbers, as_vectors, short_repr
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import PositionWarning

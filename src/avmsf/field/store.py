@@ -24,8 +24,8 @@ from safetensors.torch import save as to_bytes
 from torch import Tensor
 
 from avmsf._utils.files import write_whole
-from avmsf._utils.records import RecordError, count_of, like, record_of
 from avmsf._utils.state import read_tensors
+from avmsf._utils.text import RecordError, count_of, like, record_of
 from avmsf.capture.audio import HIGHEST_RATE, LOWEST_RATE, MAX_PEAK, MAX_SAMPLES
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import FieldFileError

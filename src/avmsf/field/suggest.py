@@ -10,9 +10,8 @@ from jaxtyping import Bool, Float, Float64, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avmsf._utils.arrays import ArrayLike, as_vectors
+from avmsf._utils.arrays import ArrayLike, as_vectors, short_repr
 from avmsf._utils.progress import working
-from avmsf._utils.summary import short_repr
 from avmsf.errors import FitError
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.model import MixtureGains

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from avmsf._utils.summary import short_repr
+from avmsf._utils.arrays import short_repr
 
 
 @dataclass(frozen=True, eq=False)

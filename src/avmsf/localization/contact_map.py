@@ -14,9 +14,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avmsf._utils.arrays import ArrayLike, as_floats, as_vectors
-from avmsf._utils.summary import short_repr
-from avmsf._utils.wording import counted
+from avmsf._utils.arrays import ArrayLike, as_floats, as_vectors, short_repr
+from avmsf._utils.text import counted
 from avmsf.errors import AvmsfError, LocationError
 from avmsf.field.sound_field import SoundField
 from avmsf.symmetry.find import find_symmetries

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike
 from avmsf._utils.progress import working
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.capture.audio import Recording, refuse_silence
 from avmsf.capture.onset import find_onset, find_pulse
 from avmsf.capture.prepare import remove_rumble, shortest_allowed

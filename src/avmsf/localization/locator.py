@@ -10,8 +10,7 @@ from jaxtyping import Complex64, Complex128, Float, Float32, Float64
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from avmsf._utils.arrays import ArrayLike, as_floats
-from avmsf._utils.summary import short_repr
+from avmsf._utils.arrays import ArrayLike, as_floats, short_repr
 from avmsf.errors import LocationError
 from avmsf.field.sound_field import SoundField
 from avmsf.localization.amplitudes import Amplitudes, DetunedModes, Extractor

@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_floats, as_rate
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.measure import check_impulsive, find_clipping
 from avmsf.capture.onset import Pulse, find_second_impact, find_second_push

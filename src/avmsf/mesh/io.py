@@ -17,7 +17,7 @@ import trimesh
 from PIL import Image
 
 from avmsf._utils.files import is_lfs_pointer
-from avmsf._utils.text_files import parse_json, read_json
+from avmsf._utils.text import parse_json, read_json
 from avmsf.errors import AvmsfError, CaptureError
 
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from avmsf._utils.summary import short_repr
+from avmsf._utils.arrays import short_repr
 
 PERIOD = 131_072
 """Samples after which the sequence repeats: 3 s at 44.1 kHz."""

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from avmsf._utils.summary import short_repr
+from avmsf._utils.arrays import short_repr
 from avmsf.errors import CaptureError
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from avmsf._utils.files import new_folder
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.errors import CaptureError, Remark
 from avmsf.mesh.io import load_parts
 from avmsf.photographs.cameras import Camera, View

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf._utils.text_files import read_json
+from avmsf._utils.text import read_json
 from avmsf.capture.filenames import PICTURE_SUFFIXES
 from avmsf.capture.placement import Mistake
 from avmsf.errors import CaptureError, Location, Remark

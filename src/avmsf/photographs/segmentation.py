@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.shots import listed

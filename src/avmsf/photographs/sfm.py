@@ -21,7 +21,7 @@ import numpy as np
 
 from avmsf._utils.children import end_child, ending_of, start_child
 from avmsf._utils.files import unwritable
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.capture.filenames import PICTURE_SUFFIXES, pictures_in
 from avmsf.errors import CaptureError, Remark
 from avmsf.photographs.images import Picture, PictureSizeError, read_mask, read_picture

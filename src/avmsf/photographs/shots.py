@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.capture.filenames import pictures_in
 from avmsf.errors import CaptureError, Remark
 from avmsf.photographs.cameras import View

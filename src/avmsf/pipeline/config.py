@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Literal, get_args
 
-from avmsf._utils.wording import changes_repr
+from avmsf._utils.text import changes_repr
 from avmsf.errors import FitError, SceneError, SimulationError
 from avmsf.field.config import PAPER, FitConfig, GainModel
 from avmsf.gaussians.config import SplatConfig

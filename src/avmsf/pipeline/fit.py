@@ -17,7 +17,7 @@ from rich.progress import Progress as Bar
 from avmsf._utils.caching import once
 from avmsf._utils.files import write_whole
 from avmsf._utils.progress import is_live, repeated
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.capture.placement import surface_points
 from avmsf.capture.settings import settings_of

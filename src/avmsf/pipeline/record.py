@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.field.sound_field import SoundField

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.capture.filenames import no_views
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import SceneError

@@ -13,7 +13,7 @@ import avmsf
 from avmsf._utils.caching import discard, source_digest
 from avmsf._utils.files import way_out, write_whole
 from avmsf._utils.locks import WAIT, write_lock
-from avmsf._utils.text_files import read_json
+from avmsf._utils.text import read_json
 from avmsf.errors import CaptureError
 
 _BLOCK = 1 << 20

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from avmsf._utils.files import write_whole
 from avmsf._utils.state import read_tensors
-from avmsf._utils.text_files import parse_json
+from avmsf._utils.text import parse_json
 from avmsf.errors import SimulationError
 
 FORMAT = 2

@@ -24,7 +24,7 @@ import soundfile
 
 from avmsf._utils.files import write_whole
 from avmsf._utils.locks import write_lock
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.capture.audio import Recording, SoundBytes, decode_recording, read_recording
 from avmsf.capture.check import CaptureReport, check
 from avmsf.capture.measure import RecordingReport, measure

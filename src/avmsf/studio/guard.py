@@ -14,7 +14,7 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from avmsf._utils.text_files import parse_json
+from avmsf._utils.text import parse_json
 from avmsf.export.web import directives_of, policy_text
 from avmsf.studio.responses import RequestError, bad_request, response_to
 

@@ -19,7 +19,7 @@ import anyio
 import anyio.to_thread
 
 from avmsf._utils.children import ending_of
-from avmsf._utils.wording import printable
+from avmsf._utils.text import printable
 from avmsf.errors import AvmsfError
 from avmsf.studio.responses import bad_request
 

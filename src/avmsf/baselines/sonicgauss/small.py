@@ -13,8 +13,8 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from avmsf._utils.files import write_whole
-from avmsf._utils.records import record_of
 from avmsf._utils.state import read_tensors
+from avmsf._utils.text import record_of
 from avmsf.baselines.sonicgauss.conditioning import (
     CHANNELS,
     ContactEncoding,

@@ -9,8 +9,7 @@ import tyro
 from avmsf.cli.options.common import Flag, Printing, parse_options
 from avmsf.cli.options.paths import CacheFolder, InputError, OutputFolder
 from avmsf.errors import SimulationError
-from avmsf.simulate.example import EXAMPLE
-from avmsf.simulate.recipe import ObjectRecipe
+from avmsf.simulate.recipe import EXAMPLE, ObjectRecipe
 from avmsf.simulate.sim20 import SET, sim20_recipe
 
 

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Complex128, Float, Float32, Float64, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avmsf._utils.records import RecordError, count_of, like
-from avmsf._utils.summary import short_repr
+from avmsf._utils.arrays import short_repr
+from avmsf._utils.text import RecordError, count_of, like
 from avmsf.capture.impacts import places_of
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.elastic_store import mode_sizes, mode_skeleton, mode_tensors, restored_modes

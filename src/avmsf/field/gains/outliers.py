@@ -40,7 +40,7 @@ import torch
 from jaxtyping import Complex128, Float, Float32, Float64, Int
 from torch import Tensor
 
-from avmsf._utils.wording import counted
+from avmsf._utils.text import counted
 from avmsf.capture.filenames import number_key
 from avmsf.capture.impacts import places_of
 from avmsf.field.gains.family import KernelFamily, Sites

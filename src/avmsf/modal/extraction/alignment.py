@@ -29,7 +29,7 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from avmsf._utils.summary import short_repr
+from avmsf._utils.arrays import short_repr
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.prepare import margin_length
 from avmsf.modal.extraction.finders import HighResolution

@@ -17,9 +17,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from avmsf._utils.arrays import short_repr
 from avmsf._utils.caching import keep_if_possible, source_digest
 from avmsf._utils.files import write_whole
-from avmsf._utils.summary import short_repr
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExtractionError

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from avmsf._utils.text_files import MAX_TOML_BYTES, parse_json, read_json, read_text, read_toml
+from avmsf._utils.text import MAX_TOML_BYTES, parse_json, read_json, read_text, read_toml
 
 
 def test_line_ends_and_marks_do_not_matter(tmp_path: Path) -> None:

@@ -1,0 +1,120 @@
+"""Text: words for messages, and text, JSON and TOML that others wrote, bounded in size and depth, with their values.
+
+What reads raises `OSError` where the file cannot be read and `ValueError` for contents that cannot be used, so that
+each reader gives its own error with the file's name.
+"""
+
+import io
+import json
+import sys
+import tomllib
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+from avmsf.errors import AvmsfError
+
+MAX_TEXT_BYTES = 16 << 20
+"""Largest table or JSON that is read: 25,000 frames of a transforms.json, or 200,000 rows of a table of contacts.
+JSON of this length takes at most about 0.5 GB as Python objects."""
+MAX_TOML_BYTES = 16 << 10
+"""Largest TOML file that is read: four times all settings of a capture with a comment each. Python's reader takes time
+and memory that grow with the square of a dotted key's length: 1 s and 0.3 GB for one of this length."""
+_MAX_CHANGES = 4
+"""Settings that a configuration names."""
+_HIDDEN = [*range(0x20), 0x7F, *range(0x80, 0xA0), *range(0x202A, 0x202F), *range(0x2066, 0x206A)]
+"""Control characters of terminals (C0, DEL, C1), and those that reverse the direction of what follows."""
+_ESCAPES = {code: chr(code).encode("unicode_escape").decode() for code in _HIDDEN if chr(code) not in "\n\t"}
+_Record = TypeVar("_Record")
+
+
+def changes_repr(config: Any) -> str:
+    """Return a configuration's name and what differs from its defaults, in one line. For use as `__repr__`."""
+    usual = type(config)()
+    pairs = ((each.name, getattr(config, each.name)) for each in fields(config))
+    changed = [f"{name}={value!r}" for name, value in pairs if value != getattr(usual, name)]
+    more = [f"and {len(changed) - _MAX_CHANGES} more"] if len(changed) > _MAX_CHANGES else []
+    return f"{type(config).__name__}({', '.join(changed[:_MAX_CHANGES] + more)})"
+
+
+def printable(text: str) -> str:
+    """Return text with control characters, except line feeds and tabs, as escape sequences that a terminal shows."""
+    return text.translate(_ESCAPES)
+
+
+def counted(number: int, thing: str) -> str:
+    """Return a number with its noun, whose plural ends in s: "1 file", "2 files"."""
+    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
+
+
+def read_text(path: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> str:
+    """Return a file's UTF-8 text without a byte-order mark, lines ended by a line feed whatever the file has."""
+    with open(path, "rb") as file:
+        content = file.read(max_bytes + 1)
+    if len(content) > max_bytes:
+        raise ValueError(f"expected at most {max_bytes:,} bytes, got more")
+    return io.StringIO(content.decode("utf-8-sig"), newline=None).read()
+
+
+def parse_json(text: str, *, max_characters: int = MAX_TEXT_BYTES) -> Any:
+    """Return what a JSON text holds."""
+    if len(text) > max_characters:
+        raise ValueError(f"expected at most {max_characters:,} characters of JSON, got {len(text):,}")
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("expected a few levels of lists and objects, got hundreds") from error
+
+
+def read_json(path: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> Any:
+    """Return what a JSON file holds."""
+    return parse_json(read_text(path, max_bytes=max_bytes), max_characters=max_bytes)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return the table of a TOML file."""
+    text = read_text(path, max_bytes=MAX_TOML_BYTES)
+    try:
+        return tomllib.loads(text)
+    except RecursionError as error:
+        raise ValueError("expected a few levels of tables, got hundreds") from error
+
+
+class RecordError(AvmsfError, ValueError):
+    """A value of a file's record is missing, unknown or of another type or size: `name` is its key."""
+
+
+def record_of(example: _Record, values: Any, name: str) -> _Record:
+    """Return a record of settings from a dict of exactly the example's fields, each of the type that it has there.
+
+    `example` is a dataclass's instance; `name` is what errors call the record. Raises RecordError for fields that are
+    missing or unknown or of another type, and for what is not a dict.
+    """
+    like(values, {}, name)
+    examples = {each.name: getattr(example, each.name) for each in fields(example)}  # type: ignore[arg-type]
+    if values.keys() != examples.keys():
+        differing = sorted(values.keys() ^ examples.keys())
+        raise RecordError(
+            f"{name}: expected exactly its own keys; missing or unknown: {', '.join(differing)}",
+            name=f"{name}.{differing[0]}",
+            value=values.get(differing[0]),
+        )
+    return type(example)(**{each: like(value, examples[each], f"{name}.{each}") for each, value in values.items()})
+
+
+def like(value: Any, example: Any, name: str) -> Any:
+    """Return a JSON value as the type of `example`. Raises RecordError where it is of another."""
+    if isinstance(example, tuple) and isinstance(value, list):
+        return tuple(like(each, example[0], name) for each in value)
+    if isinstance(example, float) and type(value) is int and abs(value) <= sys.float_info.max:
+        return float(value)
+    if type(value) is not type(example):
+        raise RecordError(f"{name}: expected {type(example).__name__}, got {value!r}", name=name, value=value)
+    return value
+
+
+def count_of(value: Any, name: str, *, least: int = 1) -> int:
+    """Return a whole number of `least` or more. Raises RecordError for other values."""
+    if like(value, 1, name) < least:
+        raise RecordError(f"{name}: expected {least} or more, got {value}", name=name, value=value)
+    return int(value)
