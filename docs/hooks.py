@@ -42,7 +42,8 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
     sections["Reference"][1:1] = [{"Command line": _command_pages()}, {"Python packages": _package_pages()}]
     for title, name in ROOT_PAGES.items():
         page = name.lower()
-        _generated[page] = (REPOSITORY / name).read_text()
+        # Links from the root lead into this folder.
+        _generated[page] = (REPOSITORY / name).read_text().replace("](docs/", "](")
         sections["Development"].append({title: page})
     return config
 
