@@ -38,7 +38,10 @@ def number_key(name: str) -> list[tuple[bool, int, str]]:
 
 
 def find_surface_file(folder: Path, settings: CaptureSettings) -> Path | None:
-    """Return the surface file that the settings name, or the first of the usual names; None where there is none."""
+    """Return the surface file that the settings name, or the first of the usual names; None where there is none.
+
+    Raises CaptureError for a name outside the folder.
+    """
     if settings.surface is not None:
         named = Path(settings.surface)
         if named.is_absolute() or ".." in named.parts:

@@ -242,8 +242,8 @@ def settled_lifts(
 ) -> tuple[LiftConfig, LiftConfig]:
     """Return the settings of features, and those of the paper's form, with the encoders that `inputs` are made with.
 
-    Without a look at views no encoder is loaded. The replacement of DINOv2 is printed. Raises SceneError where a look
-    is the paper's and its encoder is not available.
+    Where no method reads views no encoder is loaded. The replacement of DINOv2 is printed. Raises SceneError where one
+    reads the paper's features and their encoder is not available.
     """
     paper = PRESETS["paper"].scene.lift
     if lift.encoder != AUTO:

@@ -28,7 +28,7 @@ from avmsf.pipeline.sources import find_source, find_splats
 
 @dataclass(frozen=True)
 class VisualInputs:
-    """What a folder holds of an object's look, in plain values."""
+    """What in a folder shows the object, in plain values."""
 
     photographs: int
     cameras: str | None
@@ -63,7 +63,7 @@ class VisualInputs:
 
 
 def inputs(folder: Path, settings: CaptureSettings | None) -> VisualInputs | None:
-    """Return what a folder holds of an object's look; None for a folder or settings that cannot be read."""
+    """Return what in a folder shows the object; None for a folder or settings that cannot be read."""
     try:
         settings = settings or settings_of(folder)
         surface = find_surface_file(folder, settings)

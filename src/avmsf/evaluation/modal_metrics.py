@@ -255,6 +255,7 @@ def match_modes(
     Two modes can be one where their frequencies differ by at most `widths` half-power widths of the true mode (damping
     / pi, Hz) or, if that is more, `relative` of its frequency. Of all ways to pair them that is taken in which the sum
     over pairs of 1 - (difference / allowed)^2 is largest: many pairs, and close ones rather than a chain of bad ones.
+    Raises EvaluationError for widths that allow nothing.
     """
     if not (widths >= 0.0 and relative >= 0.0 and math.isfinite(widths + relative) and widths + relative > 0.0):
         raise EvaluationError(

@@ -64,10 +64,10 @@ class ObjectFeatures:
     def __call__(self, identifier: str, visual_input: VisualInput, views: int | None = None) -> FeatureField:
         """Return what `visual_input` means for an object, from at most `views` views, or from all for None.
 
-        `positions` are those of the same points that looks are lifted onto, so that the two differ in nothing else; of
-        an object that nothing shows, they are its surface's, or fill the box of its contacts. `surface` is as in
-        `avmsf fit`, and needs no views of an object with a mesh. Raises SceneError for the looks of an object that
-        nothing shows, and DatasetError for an unknown one.
+        `positions` are those of the same points that features are lifted onto, so that the two differ in nothing else;
+        of an object that nothing shows, they are its surface's, or fill the box of its contacts. `surface` is as in
+        `avmsf fit`, and needs no views of an object with a mesh. Raises SceneError for the features of an object
+        that nothing shows, and DatasetError for an unknown one.
         """
         surface = self.dataset.capture(identifier).surface if visual_input == "surface" and self.meshes else None
         if surface is not None:

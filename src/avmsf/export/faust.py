@@ -84,7 +84,10 @@ def _numbers_at_a_point(field: SampledField) -> int:
 
 
 def faust_library(field: SampledField, *, noise: bool) -> str:
-    """Return the definitions; `strike(contact, force, contactTime, gate)` is the sound."""
+    """Return the definitions; `strike(contact, force, contactTime, gate)` is the sound.
+
+    Raises ExportError for more than `MAX_NUMBERS`.
+    """
     points, modes = field.sine.shape
     numbers = points * _numbers_at_a_point(field) + noise * field.samples
     if numbers > MAX_NUMBERS:

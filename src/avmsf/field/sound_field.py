@@ -68,7 +68,7 @@ class FieldQuality:
     standard_error: float = 0.0
     """Of the difference between the field's error and the smaller one of nearest recordings, over the positions."""
     nearest: float | None = None
-    """Of the nearest recording at another position; None in fields of avmsf 0.8 and older."""
+    """Of the nearest recording at another position; None in fields of versions before 0.9."""
 
     @classmethod
     def of(cls, record: Mapping[str, Any]) -> "FieldQuality":

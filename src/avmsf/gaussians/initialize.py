@@ -43,7 +43,7 @@ def starting_cloud(
     """Return one Gaussian a point, `scale` mean distances to its 3 nearest neighbors wide (3DGS, section 5.1).
 
     Round, or where normals are known a disc across the normal, `flatness` times as thick as wide. Where points
-    coincide, the width is a thousandth of their bounding box's diagonal at least.
+    coincide, the width is a thousandth of their bounding box's diagonal at least. Raises SceneError where all do.
     """
     count = len(start.points)
     places = start.points.double().numpy()

@@ -75,7 +75,8 @@ def prepare_photographs(
 ) -> list[Photograph]:
     """Return the views that can be compared: all, or before random colors those with a mask.
 
-    A mask without the object says nothing that is worth believing: its view is left out. `visual_hull` warns of it.
+    A mask without the object says nothing of its shape: its view is left out. `visual_hull` warns of it. Raises
+    SceneError where fewer than 3 views are left.
     """
     kept = [view for view in views if view.mask is None or bool((view.mask > 127).any())]
     if background is None:

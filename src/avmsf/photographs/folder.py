@@ -78,7 +78,10 @@ def read_views(
 
 
 def find_shots(folder: Path) -> tuple[Path, Shots]:
-    """Return the folder that paths count from, and the shots of the camera file in it."""
+    """Return the folder that paths count from, and the shots of the camera file in it.
+
+    Raises CaptureError where there is none.
+    """
     if folder.suffix.lower() == ".json" and not folder.is_dir():
         if not folder.is_file():
             raise CaptureError(f"{folder}: expected a camera file, got none", file=folder)

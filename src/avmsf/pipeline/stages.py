@@ -1,4 +1,4 @@
-"""What each stage of a reconstruction made, kept in a folder beside the record of what it was made from."""
+"""What each stage of a fit made, kept in a folder next to the record of what it was made from."""
 
 import hashlib
 import json

@@ -79,7 +79,10 @@ def extract_modes(recordings: Capture | Impacts, method: ModeFinder | None = Non
 def extract_sounds(
     sounds: Float[Tensor, "contacts samples"], *, sample_rate: float, method: ModeFinder | None = None
 ) -> Extraction:
-    """Return what `extract_modes` does, from bare sounds that start at their onset; a single one is enough here."""
+    """Return what `extract_modes` does, from bare sounds that start at their onset; a single one is enough here.
+
+    Raises ExtractionError for samples that are not finite, and where there is no mode.
+    """
     if not bool(torch.isfinite(sounds).all()):
         row = int(torch.nonzero(~torch.isfinite(sounds))[0, 0])
         raise ExtractionError.expected(

@@ -38,7 +38,7 @@ def narrow_band(
     reach = fft_size // hop // 2
     lags = torch.arange(-reach, reach + 1)
     weights = torch.nn.functional.pad(window, (0, 1))[fft_size // 2 + lags * hop]
-    # A frame's time zero is its own beginning: at its center half the transform has passed, `lag` frames on bin x lag.
+    # A frame's time zero is its own beginning: at its center half the transform has passed, and one hop for each lag.
     bins = torch.arange(fft_size // 2 + 1)
     passed = torch.remainder(bins[:, None] * (lags[None, :] * hop - fft_size // 2), fft_size)
     turns = passed.to(sounds.dtype) * (2 * math.pi / fft_size)
