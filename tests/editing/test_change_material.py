@@ -97,7 +97,7 @@ def test_a_plate_of_another_material_and_size_is_the_one_in_closed_form(size):
     faster = math.sqrt(OTHER.young / OTHER.density / (steel.young / steel.density)) / size
     undamped = 3000.0
     expected = plate_modes(plate_of(OTHER, size=size), size * CONTACTS, highest=undamped * faster)
-    # A plate's gains are pseudo-velocities, see `simulate.plate`.
+    # A plate's gains are pseudo-velocities, see `oracles.plate`.
     found = change_material(plate_field(steel, highest=undamped), steel, OTHER, size=size, law=VELOCITY)
     torch.testing.assert_close(found.bank.frequency, expected.frequency, rtol=1e-13, atol=0)
     torch.testing.assert_close(found.bank.damping, expected.damping, rtol=1e-13, atol=0)
