@@ -135,7 +135,7 @@ def _model_folder(source: str | Path) -> tuple[Path, str]:
             got=f"none: they could not be downloaded ({why_not(error)})",
             name="encoder",
             advice=f"save {', '.join(_FILES)} from https://huggingface.co/{name}/tree/main in one FOLDER and use "
-            "--encoder FOLDER, or use --encoder descriptors, which needs no download",
+            "--lift.encoder FOLDER, or use --lift.encoder descriptors, which needs no download",
         ) from error
 
 
@@ -192,6 +192,6 @@ def _transformers() -> Any:
             "the package transformers for DINOv2",
             got=f"an import error ({error})",
             name="transformers",
-            advice="pip install 'avmsf[vision]', or use --encoder descriptors",
+            advice="pip install 'avmsf[vision]', or use --lift.encoder descriptors",
         ) from error
     return transformers
