@@ -37,6 +37,7 @@ REFUSED = (
     "fit empty --until features",
     "fit empty --until surface",
     "fit good --until surface -o s.stl",
+    "fit good --until surface --train-count 4",
     "fit empty",
     "fit empty --material glass",
     "info wrong.safetensors",

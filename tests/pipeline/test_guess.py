@@ -195,3 +195,8 @@ def test_a_mesh_and_a_material_give_a_field_from_the_command_line(tmp_path: Path
     capsys.readouterr()
     assert main(["fit", str(tmp_path), *words, "--train-count", "3"]) == 2
     assert "--train-count" in capsys.readouterr().err
+
+
+def test_what_needs_recordings_is_refused_beside_a_material() -> None:
+    with raises(FitError, name="gain_model"):
+        avmsf.fit("mug.ply", "network", material="ceramic")

@@ -271,6 +271,6 @@ class Places:
         """Return the case that trains on the chosen contacts: first recordings first, then the repeated ones."""
         taken = [self.rows[int(place)] for place in chosen]
         train = [rows[0] for rows in taken] + sorted(row for rows in taken for row in rows[1:])
-        sound = set(train)
-        test = tuple(row for row in range(self.recordings) if row not in sound)
+        used = set(train)
+        test = tuple(row for row in range(self.recordings) if row not in used)
         return Case(label, tuple(train), test, fold)

@@ -179,7 +179,7 @@ class Untouched:
 
     def edit(self, task: EditTask) -> Edited:
         """Return the object's own sounds."""
-        return sound(task.object.sound_field, task)
+        return edited_at(task.object.sound_field, task)
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ class MaterialChange:
                     f"expected a material of {', '.join(MATERIALS)}, got {material!r}", name="material", value=material
                 )
         old, new = MATERIALS[task.object.material], MATERIALS[task.target]
-        return sound(change_material(task.object.sound_field, old, new), task)
+        return edited_at(change_material(task.object.sound_field, old, new), task)
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +221,7 @@ class Guided:
                 previews.append((progress.step, progress.preview))
 
         edited = edit_towards(field, self.guide(task), config=config, parameters=self.parameters, progress=keep)
-        return replace(sound(edited, task), previews=tuple(previews))
+        return replace(edited_at(edited, task), previews=tuple(previews))
 
 
 @runtime_checkable
@@ -305,7 +305,7 @@ def towards_words(
     )
 
 
-def sound(edited: SoundField, task: EditTask) -> Edited:
+def edited_at(edited: SoundField, task: EditTask) -> Edited:
     """Return a field's modes and sounds at the task's contacts."""
     amplitudes = amplitudes_of(edited, task.contacts)
     bank = audible_modes(edited.bank, amplitudes, sample_rate=edited.sample_rate)
@@ -406,11 +406,11 @@ def judge(
 
 def clap_curve(made: Edited, prompt: str, clap: Clap) -> tuple[tuple[int, float], ...]:
     """Return the steps of an edit's previews and their CLAP scores; silent previews have none."""
-    sound = [(step, sound) for step, sound in made.previews if bool(sound.any())]
-    if not sound:
+    previews = [(step, sound) for step, sound in made.previews if bool(sound.any())]
+    if not previews:
         return ()
-    scores = clap.score(torch.stack([sound for _, sound in sound]), [prompt], sample_rate=made.sample_rate)
-    return tuple((step, float(score)) for (step, _), score in zip(sound, scores, strict=True))
+    scores = clap.score(torch.stack([sound for _, sound in previews]), [prompt], sample_rate=made.sample_rate)
+    return tuple((step, float(score)) for (step, _), score in zip(previews, scores, strict=True))
 
 
 def write_scores(scores: Sequence[EditScore], spaces: Mapping[str, MaterialSpace], path: Path) -> None:
@@ -435,13 +435,13 @@ def spectral_distance(made: Edited, reference: Reference) -> float:
             value=reference.sample_rate,
         )
     clips = with_length(reference.clips, made.sounds.shape[1]).double()
-    sound, wanted = (
+    leveled, wanted = (
         sounds / level(sounds, sample_rate=made.sample_rate)[:, None] for sounds in (made.sounds.double(), clips)
     )
     sizes = default_fft_sizes(made.sample_rate)
-    errors = torch.zeros(len(sound), len(wanted), dtype=torch.float64)
+    errors = torch.zeros(len(leveled), len(wanted), dtype=torch.float64)
     for size in sizes:
-        own, aims = (magnitude_stft(sounds, fft_size=size, hop=max(1, size // 4)) for sounds in (sound, wanted))
+        own, aims = (magnitude_stft(sounds, fft_size=size, hop=max(1, size // 4)) for sounds in (leveled, wanted))
         sums = torch.stack([(one - aims).abs().sum(dim=(1, 2)) for one in own])
         errors += sums / aims.sum(dim=(1, 2)) / len(sizes)
     return float(errors.amin(dim=1).mean())

@@ -100,7 +100,7 @@ def common_delay(truth: Truth, impacts: Impacts) -> float:
     energies = truth.amplitudes.abs().square().sum(dim=0) * torch.diagonal(equations.gram).reshape(2, -1).mean(dim=0)
     poles = torch.complex(-truth.damping, 2 * math.pi * truth.frequency)
 
-    def residual(delays: torch.Tensor) -> torch.Tensor:
+    def mismatch(delays: torch.Tensor) -> torch.Tensor:
         turns = torch.exp((delays[:, None] + skipped / impacts.sample_rate) * poles)
         return turns.abs().square() @ energies - 2 * (turns @ products).real
 
@@ -109,9 +109,9 @@ def common_delay(truth: Truth, impacts: Impacts) -> float:
     most = round(skipped / impacts.sample_rate / step)
     delays = torch.arange(-most, most + 1).double() * step
     # In parts, for the table of all delays and modes may be large.
-    best = float(delays[int(torch.cat([residual(part) for part in torch.split(delays, 4096)]).argmin())])
+    best = float(delays[int(torch.cat([mismatch(part) for part in torch.split(delays, 4096)]).argmin())])
     found = minimize_scalar(
-        lambda delay: float(residual(torch.tensor([delay], dtype=torch.float64))),
+        lambda delay: float(mismatch(torch.tensor([delay], dtype=torch.float64))),
         bounds=(best - step, best + step),
         method="bounded",
         options={"xatol": 1e-6 * step},
@@ -120,8 +120,8 @@ def common_delay(truth: Truth, impacts: Impacts) -> float:
 
 
 def _path(dataset: Dataset, identifier: str) -> Path | None:
-    visual_input = dataset.visual_source(identifier)
-    return visual_input.folder / TRUTH if visual_input is not None and (visual_input.folder / TRUTH).is_file() else None
+    source = dataset.visual_source(identifier)
+    return source.folder / TRUTH if source is not None and (source.folder / TRUTH).is_file() else None
 
 
 Amplitudes = Complex128[Tensor, "contacts modes"]

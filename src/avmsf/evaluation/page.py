@@ -224,8 +224,8 @@ class StoredContact:
 
 def _contacts(records: Sequence[ObjectRecord]) -> Iterator[StoredContact]:
     """Yield contacts with sounds: one of each object first, then a second one, and so on."""
-    sound = [record for record in records if any(case.sounds for case in record.cases)]
-    chosen = [list(stored_contacts(sound[row])) for row in spread(len(sound), OBJECTS)]
+    stored = [record for record in records if any(case.sounds for case in record.cases)]
+    chosen = [list(stored_contacts(stored[row])) for row in spread(len(stored), OBJECTS)]
     for place in range(max(map(len, chosen), default=0)):
         yield from (contacts[place] for contacts in chosen if place < len(contacts))
 
@@ -277,13 +277,13 @@ def _contact_block(contact: StoredContact, folder: Path) -> str:
     for case, outcome in contact.made:
         title = f"{outcome.method}, {case.label}" if several else outcome.method
         row = case.test.index(contact.name)
-        label = [
+        scores = [
             f"{heading} {figure(values[row])}"
             for metric, heading in (("l1", "L1"), ("l1_log", "L1-log"), ("relative_stft", "relative STFT"))
             if (values := outcome.values.get(metric)) is not None
         ]
         sound = StoredSound.read(folder / outcome.sounds[contact.name])
-        cards.append(_card(title, ", ".join(label), sound, loudest, contact.name))
+        cards.append(_card(title, ", ".join(scores), sound, loudest, contact.name))
     return f'<h4>{escape(contact.name)}</h4><div class="sounds">{"".join(cards)}</div>'
 
 

@@ -97,7 +97,7 @@ class Evaluation:
             self.metric_settings.prepare()
         identity = {
             "version": version("avmsf"),
-            "source": source_digest("avmsf.cli.evaluate"),
+            "source": [source_digest(__name__), source_digest("avmsf.evaluation.methods")],
             "protocol": self.protocol.name,
             "choosing": repr(self.protocol.choosing),
             "dataset": self.title,
@@ -186,7 +186,7 @@ class CaseRun:
             )
         self.truth = None if data.truth is None else truth_at(data.truth, self.scored.test.names)
         self.features = partial(data.features, data.identifier, views=case.views)
-        self.stores_sounds = spread(len(case.test), MAX_STORED_SOUNDS) if stores_sounds else []
+        self.stored_rows = spread(len(case.test), MAX_STORED_SOUNDS) if stores_sounds else []
         self.shared = 0.0
 
     def outcome(self, method: Method) -> Outcome:
@@ -243,7 +243,7 @@ class CaseRun:
             points,
             vertices=self.data.vertices,
             published=published,
-            map_rows=self.stores_sounds,
+            map_rows=self.stored_rows,
         )
         maps = {}
         for row, each in found.maps.items():
@@ -297,7 +297,7 @@ class CaseRun:
         """Write the sounds to listen to, and return their files by the names of their recordings."""
         kept = {}
         word = _file_word(name)
-        for row in self.stores_sounds:
+        for row in self.stored_rows:
             file = f"sounds/{self.place}/{row:03d} {word}.flac"
             test = self.scored.test
             keep_sound(

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float64
 
-from avmsf._utils.caching import discard, keep_if_possible
+from avmsf._utils.caching import discard, keep_if_possible, source_digest
 from avmsf._utils.children import end_child, start_child
 from avmsf._utils.files import write_whole
 from avmsf.errors import SimulationError
@@ -84,7 +84,8 @@ def expect_detail(detail: float) -> None:
 def _stored(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarray, np.ndarray]:
     """Return points and cells, stored in AVMSF_CACHE or ~/.cache/avmsf when they are first made."""
     folder = Path(os.environ.get("AVMSF_CACHE") or os.path.expanduser("~/.cache/avmsf")) / "tetrahedra"
-    values = f"{version('pytetwild')} {detail} {_ENVELOPE} {skin.points.shape} {skin.points.dtype} {skin.faces.dtype}"
+    code = f"{version('pytetwild')} {source_digest(tetrahedra_worker.__name__)}"
+    values = f"{code} {detail} {_ENVELOPE} {skin.points.shape} {skin.points.dtype} {skin.faces.dtype}"
     digest = hashlib.sha256(values.encode() + skin.points.tobytes() + skin.faces.tobytes()).hexdigest()
     path = folder / f"{digest[:24]}.npz"
     try:

@@ -222,7 +222,7 @@ def _check_gltf(record: Any) -> None:
             )
     _check_at_most(MAX_PARTS, len(record.get("nodes", ())), "nodes")
     # Four vectors (position, normal, color, texture) for each corner; an array without a buffer is zeros in memory.
-    _check_at_most(12 * MAX_FACES, sum(each["count"] for each in record.get("accessors", ())), "values")
+    _check_at_most(12 * MAX_FACES, sum(abs(each["count"]) for each in record.get("accessors", ())), "values")
 
 
 def _normalized(record: Any) -> list[dict[str, Any]]:

@@ -129,6 +129,9 @@ def fit(
         if material is not None:
             if isinstance(source, Capture):
                 raise FitError.expected("a mesh or a folder with material=", "Capture", name="capture")
+            if features is not None or config.gain_model not in (AUTO, Elastic.kind):
+                name = "gain_model" if features is None else "features"
+                raise FitError.expected("recordings", "material=, which needs none", name=name, advice="leave one out")
             settings = settings_of(source) if isinstance(source, Path) else CaptureSettings()
             views = isinstance(source, Path) and source.is_dir() and not _is_mesh(find_surface(source, settings))
             with _stage_folder(cache, source if views and isinstance(source, Path) else None) as stages:

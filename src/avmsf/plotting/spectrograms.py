@@ -125,11 +125,11 @@ def draw_method_spectrograms(
         loudest: float | None = None
         for axes, method in zip(row, methods, strict=True):
             if method in sounds:
-                audible = _first_second(sounds[method], sample_rate=sample_rate)
-                levels = log_spectrogram(audible, sample_rate=sample_rate, lowest=bottom, highest=top)
+                start = _first_second(sounds[method], sample_rate=sample_rate)
+                levels = log_spectrogram(start, sample_rate=sample_rate, lowest=bottom, highest=top)
                 loudest = float(levels.max()) if loudest is None else loudest
-                mesh = _draw(axes, levels - loudest, _hop(len(audible), _WIDTH) / sample_rate, (bottom, top))
-                longest = max(longest, len(audible) / sample_rate)
+                mesh = _draw(axes, levels - loudest, _hop(len(start), _WIDTH) / sample_rate, (bottom, top))
+                longest = max(longest, len(start) / sample_rate)
         row[0].set_ylabel(f"{contact}\nfrequency (Hz)")
     for axes in grid.flat:
         _set_axes(axes, longest or SECONDS, (bottom, top))
@@ -144,8 +144,8 @@ def draw_method_spectrograms(
 
 
 def _first_second(sound: Float[Tensor, " samples"], *, sample_rate: float) -> Float64[Tensor, " kept"]:
-    audible = sound[: max(1, round(SECONDS * sample_rate))].double()
-    return audible / audible.abs().max().clamp_min(torch.finfo(torch.float64).tiny)
+    start = sound[: max(1, round(SECONDS * sample_rate))].double()
+    return start / start.abs().max().clamp_min(torch.finfo(torch.float64).tiny)
 
 
 def _hop(samples: int, width: int) -> int:

@@ -165,7 +165,7 @@ def clip_spectra(impacts: Impacts) -> ClipSpectra:
 
 def predicted_sound(
     frequency: Float64[Tensor, " modes"], damping: Float64[Tensor, " modes"]
-) -> tuple[Float[Tensor, " samples"], Float64[Tensor, " heard"]]:
+) -> tuple[Float[Tensor, " samples"], Float64[Tensor, " audible"]]:
     """Return the sum of the modes with equal amplitudes, of peak 1, and the damped frequencies of those in the band.
 
     `frequency` is undamped, Hz. Raises EvaluationError where no mode is in the band.
@@ -246,7 +246,7 @@ class _Problem:
     bounds: Float64[Tensor, "2 3"]
     """The least and the largest point."""
 
-    def sound(self, point: Float64[Tensor, "3"]) -> tuple[Float[Tensor, " samples"], Float64[Tensor, " heard"]]:
+    def sound(self, point: Float64[Tensor, "3"]) -> tuple[Float[Tensor, " samples"], Float64[Tensor, " audible"]]:
         frequency = (point[0].exp() * self.family.squares(point[1], point[2])).sqrt() / (2.0 * math.pi)
         return predicted_sound(frequency, self.curve(frequency))
 

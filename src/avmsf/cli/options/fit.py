@@ -146,6 +146,11 @@ class Options(Printing):
         if self.material is not None:
             material_named(self.material, option="--material")
             self._check_material()
+        ignored = ("train_fraction", "train_count", "features") if self.until is not None else ()
+        for name in ignored:
+            if getattr(self, name) is not None:
+                option = f"--{name.replace('_', '-')}"
+                raise FitError.expected("no --until, which ends before the fit", self.until, name=option)
         if self.until is not None or (self.material is not None and self.capture.is_dir()):
             expect_views(self.capture, settings)
         elif self.material is None:
