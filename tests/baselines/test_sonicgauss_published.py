@@ -229,7 +229,7 @@ def task(*, seed: int = 0) -> Task:
         modes=_unknown,
         features=_unknown,
         bodies=_unknown,
-        stranger=_unknown,
+        other_recording=_unknown,
         gaussians=lambda: cloud(60),
     )
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -81,7 +82,7 @@ def test_a_file_names_its_tensors_and_itself(tmp_path):
         field().gain_field.state_dict()
     )
     assert record["format"] == FORMAT
-    assert record["version"] == "0.1.0"
+    assert record["version"] == version("avmsf")
     assert record["sample_rate"] == 8000.0
     assert record["origin"]["capture"] == "a plate"
     assert record["origin"]["per_newton"] is True

@@ -218,7 +218,7 @@ def test_pictures_are_drawn_of_solids_and_of_sheets() -> None:
     field = sound_field(elastic_field(contacts, drawn_gains(contacts, seed=9)))
     points = bar_points()
     doubt = relative_gain_std(field, points)
-    sheet = draw_uncertainty(points, doubt, title="bar", struck=contacts, suggested=contacts[:2])
+    sheet = draw_uncertainty(points, doubt, title="bar", contacts=contacts, suggested=contacts[:2])
     assert len(sheet.axes) == 2  # the sheet and its colors
     bent = points + torch.tensor([0.0, 0.0, 1.0]) * points[:, :1].square()
     solid = draw_uncertainty(bent, doubt, title="bent", suggested=contacts[:3])
