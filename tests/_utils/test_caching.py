@@ -12,16 +12,11 @@ import trimesh
 from avmsf._utils import caching
 from avmsf._utils.compiled import compiled
 from avmsf._utils.files import write_whole
-from avmsf.cli import main
 from avmsf.errors import AvmsfWarning, FieldFileError, FitError
-from avmsf.field.store import load
 from avmsf.mesh.surface import Surface
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig
-from factories.plate_capture import TINY, fill_plate
 from factories.raising import raises, warns
-
-Streams = pytest.CaptureFixture[str]
 
 
 def a_file(path: Path) -> Path:
@@ -51,15 +46,6 @@ def test_what_is_wrong_with_the_work_itself_is_no_matter_of_the_disk(tmp_path: P
 
     with pytest.raises(FitError):
         caching.keep_if_possible(refuse, tmp_path / "kept")
-
-
-@pytest.mark.slow
-def test_a_fit_does_without_the_files_that_it_goes_on_from(tmp_path: Path, capsys: Streams) -> None:
-    folder, output = fill_plate(tmp_path / "plate"), tmp_path / "field.safetensors"
-    (tmp_path / "field.safetensors.modes").mkdir()
-    assert main(["fit", str(folder), "--output", str(output), "--gain-model", "smooth", *TINY]) == 0
-    assert "Is a directory" in capsys.readouterr().err
-    assert len(load(output).bank)
 
 
 def test_a_loop_is_compiled_where_it_cannot_be_kept(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -128,11 +128,11 @@ class CdpamNetwork:
     change that response by so little that the rounding of 32-bit sums would be a part of the distance.
     """
 
-    convolutions: tuple[tuple[Float[Tensor, "outputs inputs taps"], Float[Tensor, "outputs 1"]], ...]
-    """Of each layer of the encoder: weights and bias."""
+    convolutions: tuple[tuple[Float[Tensor, "_ _ _"], Float[Tensor, "_ 1"]], ...]
+    """Of each layer of the encoder: weights [outputs, inputs, taps] and bias [outputs, 1]."""
     head_layers: tuple[tuple[Float64[Tensor, "_ _"], Float64[Tensor, " _"], Float64[Tensor, " _"]], ...]
     """Of each layer of the distance: weights, bias, and what its differences are multiplied by."""
-    _silences: dict[int, tuple[Float[Tensor, "outputs samples"], ...]] = field(default_factory=dict, repr=False)
+    _silences: dict[int, tuple[Float[Tensor, "_ _"], ...]] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, weights: CdpamWeights) -> "CdpamNetwork":
