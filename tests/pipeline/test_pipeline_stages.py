@@ -4,7 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from avmsf.errors import CaptureError
 from avmsf.pipeline.stages import StageFolder, digest_files
+from factories.raising import raises
 
 
 class Maker:
@@ -129,3 +131,12 @@ def test_an_interrupted_stage_finds_its_checkpoint_unless_its_recipe_has_changed
         folder.keep("cloud.ply", {"steps": ended}, go_on)
         assert not checkpoint.exists()
     assert found == [True, False]
+
+
+def test_a_folder_that_cannot_be_written_is_named_with_the_option_for_another(tmp_path: Path) -> None:
+    make = Maker()
+    (tmp_path / "cloud.ply.stage.json").mkdir()
+    with raises(CaptureError, file=tmp_path / "cloud.ply") as caught:
+        StageFolder(tmp_path).keep("cloud.ply", {}, make)
+    assert "--cache" in str(caught.value)
+    assert make.runs == 0

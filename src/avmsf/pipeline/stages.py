@@ -99,12 +99,13 @@ class StageFolder:
             self._log(f"{self._counted.index(name) + 1} of {len(self._counted)}: {Path(name).stem}{cached}")
         if not fresh:
             return Kept(path, known["digest"], float(known["seconds"]), fresh=False)
-        _write(record, {"recipe": wanted, "digest": None, "seconds": 0.0})
+        with self._explaining(name):
+            _write(record, {"recipe": wanted, "digest": None, "seconds": 0.0})
         begun = time.monotonic()
         make(path)
         with self._explaining(name):
             digest, seconds = digest_of(path), time.monotonic() - begun
-        _write(record, {"recipe": wanted, "digest": digest, "seconds": round(seconds, 3)})
+            _write(record, {"recipe": wanted, "digest": digest, "seconds": round(seconds, 3)})
         discard(self.checkpoint(name))
         return Kept(path, digest, seconds, fresh=True)
 
@@ -113,12 +114,15 @@ class StageFolder:
         """Turn an OSError into a CaptureError with advice."""
         try:
             yield
-        except OSError as error:
-            reason = error.strerror or str(error)
+        except (OSError, CaptureError) as error:
+            cause = error.__cause__ if isinstance(error, CaptureError) else error
+            if not isinstance(cause, OSError):
+                raise
+            reason = cause.strerror or str(cause)
             path = self.path(name)
             raise CaptureError.expected(
-                "a readable and writable path", reason, file=path, advice=f"{way_out(error)} by --cache"
-            ) from error
+                "a readable and writable path", reason, file=path, advice=f"{way_out(cause)} by --cache"
+            ) from cause
 
 
 def digest_of(path: Path) -> str:
