@@ -183,11 +183,10 @@ class MixtureGains(GainField):
         both = (self.mixture.weights * energy).reshape(*self.mixture.weights.shape[:2], 2, modes).sum(2)
         best = both.flatten(0, 1).argmax(0)
         scale = self.mixture.quadratic.reshape(*self.mixture.weights.shape[:2], 2, modes).sum(2) / count
-        for mode in range(modes):
-            row, share = divmod(int(best[mode]), len(self.mixture.noise_shares))
-            family, kernel = self._family_of(row)
-            cross = family.between(sites, self.training, kernel)[0]
-            own = family.between(sites, sites, kernel)[0]
+        rows, shares = best // len(self.mixture.noise_shares), best % len(self.mixture.noise_shares)
+        kernels = self._kernels_between(sites, sites, rows), self._kernels_between(sites, self.training, rows)
+        for mode, (row, share) in enumerate(zip(rows.tolist(), shares.tolist(), strict=True)):
+            own, cross = (each[row] for each in kernels)
             noise = float(self.mixture.noise_variance[share, mode])
             known = self.mixture.kernels[row] + noise * torch.eye(count, dtype=torch.float64)
             half = torch.linalg.solve_triangular(torch.linalg.cholesky(known), cross.T, upper=False)
@@ -406,13 +405,19 @@ class MixtureGains(GainField):
         for rows in torch.split(torch.arange(len(sites)), size):
             yield sites.take(rows)
 
-    def _family_of(self, row: int) -> tuple[KernelFamily, Int[Tensor, " one"]]:
-        """Return the family of a kept kernel, and its row there."""
+    def _kernels_between(
+        self, sites: Sites, others: Sites, rows: Int[Tensor, " rows"]
+    ) -> dict[int, Float64[Tensor, "sites others"]]:
+        """Return the kept kernels of some rows between two sets of impacts, by row; each family's all at once."""
+        found: dict[int, Float64[Tensor, "sites others"]] = {}
+        first = 0
         for family, kept in zip(self.families, self.kept, strict=True):
-            if row < len(kept):
-                return family, kept[row : row + 1]
-            row -= len(kept)
-        raise AssertionError(row)
+            used = torch.unique(rows[(rows >= first) & (rows < first + len(kept))])
+            if len(used):
+                between = family.between(sites, others, kept[used - first])
+                found.update(zip(used.tolist(), between, strict=True))
+            first += len(kept)
+        return found
 
 
 def _expect_sound(tensors: Mapping[str, Tensor]) -> None:

@@ -65,6 +65,14 @@ class Symmetric(KernelFamily):
         """Return the kernels between the impacts and each image of the others, group by group."""
         return torch.cat(list(self._moved(sites, others)))
 
+    def between(self, sites: Sites, others: Sites, kept: Int[Tensor, " kept"]) -> Float64[Tensor, "kept sites others"]:
+        """Return some kernels between two sets of impacts, motion by motion: all images at once take much memory."""
+        found = torch.zeros(len(kept), len(sites), len(others), dtype=torch.float64)
+        shares = torch.split(self.shares[kept], len(self._bases[0].shares), dim=1)
+        for share, moved in zip(shares, self._moved(sites, others), strict=True):
+            found += torch.einsum("hb,bso->hso", share, moved)
+        return found
+
     def diagonal(self, sites: Sites) -> Float64[Tensor, "basis sites"]:
         """Return the kernels between each impact and its own images."""
         each = [self.basis(sites.take(row), sites.take(row))[:, 0] for row in torch.split(torch.arange(len(sites)), 1)]
