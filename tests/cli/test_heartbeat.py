@@ -5,7 +5,6 @@ import sys
 import time
 from collections.abc import Callable
 
-import numba
 import pytest
 from rich.console import Console
 from rich.file_proxy import FileProxy
@@ -69,27 +68,6 @@ def test_steps_of_a_fit_are_seen_in_a_pipe(monkeypatch: pytest.MonkeyPatch) -> N
 
     run_check(work, monkeypatch)
     assert "step 7 of 90, spectral loss 0.500 ... " in stream.getvalue()
-
-
-@pytest.mark.usefixtures("fast")
-def test_what_goes_on_is_told_again_after_a_compilation(monkeypatch: pytest.MonkeyPatch) -> None:
-    stream = io.StringIO()
-    monkeypatch.setattr(sys, "stderr", stream)
-
-    def twice(value: float) -> float:
-        return 2 * value
-
-    twice.__module__ = "avmsf.gaussians.rasterizer.tiles"
-
-    def work() -> None:
-        doing("sorting")
-        assert numba.njit(twice)(1.5) == 3.0
-        compiled = len(stream.getvalue())
-        wait_for(lambda: "sorting ... " in stream.getvalue()[compiled:])
-        assert "sorting ... " in stream.getvalue()[compiled:]
-
-    run_check(work, monkeypatch)
-    assert stream.getvalue().count("compiling") >= 1
 
 
 @pytest.mark.usefixtures("fast")

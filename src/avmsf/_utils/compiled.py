@@ -2,10 +2,8 @@
 
 import os
 import shutil
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -45,8 +43,6 @@ class _Compiled:
     def made(self) -> Callable[..., Any]:
         import numba
 
-        if _announcer is not None:
-            _announcer.listen()
         try:
             made: Callable[..., Any] = numba.njit(cache=_has_space(), **self.options)(self.function)
         except RuntimeError:
@@ -60,67 +56,6 @@ def _has_space() -> bool:
     folder = Path(os.environ.get("NUMBA_CACHE_DIR") or __file__)
     existing = next(each for each in (folder, *folder.absolute().parents) if each.exists())
     return shutil.disk_usage(existing).free > _CACHE_BYTES
-
-
-class _Announcer:
-    """Reports what numba compiles from the moment that it listens, which imports numba."""
-
-    def __init__(self, log: Callable[[str], None], meanwhile: Callable[[str], AbstractContextManager[None]]) -> None:
-        self.log, self.meanwhile, self.announced, self.listening = log, meanwhile, set[str](), False
-        # A function is compiled within another that calls it; numba compiles in one thread at a time.
-        self.running: list[AbstractContextManager[None]] = []
-
-    def listen(self) -> None:
-        if not self.listening:
-            from numba.core import event
-
-            event.Listener.register(_Announcer)
-            event.register("numba:compile", self)  # type: ignore[no-untyped-call]
-            self.listening = True
-
-    def notify(self, event: Any) -> None:
-        if not event.is_start:
-            self.running.pop().__exit__(None, None, None)
-            return
-        package, _, rest = event.data["dispatcher"].py_func.__module__.partition(".")
-        part, ours = rest.partition(".")[0], package == __package__.partition(".")[0]
-        message = f"compiling {_PARTS.get(part, part)} for this processor (once; the result is cached)"
-        self.running.append(self.meanwhile(message) if ours else nullcontext())
-        self.running[-1].__enter__()
-        if ours and part not in self.announced:
-            self.announced.add(part)
-            self.log(message)
-
-
-_announcer: _Announcer | None = None
-
-
-@contextmanager
-def announced(log: Callable[[str], None], meanwhile: Callable[[str], AbstractContextManager[None]]) -> Iterator[None]:
-    """Report what is compiled: to `log` once for each part of the package, and by `meanwhile` for as long as it takes.
-
-    Nothing is reported where all is cached.
-    """
-    global _announcer
-    _announcer = announcer = _Announcer(log, meanwhile)
-    if "numba" in sys.modules:
-        announcer.listen()
-    try:
-        yield
-    finally:
-        _announcer = None
-        if announcer.listening:
-            from numba.core import event
-
-            event.unregister("numba:compile", announcer)  # type: ignore[no-untyped-call]
-
-
-_PARTS = {
-    "field": "the fit",
-    "reconstruction": "distances",
-    "modal": "the search for modes",
-    "gaussians": "the rasterizer",
-}
 
 
 def lane_count() -> int:

@@ -9,7 +9,7 @@ import textwrap
 import threading
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
 from difflib import get_close_matches
 from importlib import import_module
 from itertools import takewhile
@@ -18,7 +18,7 @@ from typing import TextIO
 
 import avmsf
 from avmsf._utils.text import printable
-from avmsf.cli.heartbeat import beating, meanwhile, verbosity
+from avmsf.cli.heartbeat import beating, verbosity
 from avmsf.errors import NO_MEMORY, AvmsfError, AvmsfWarning, lacks_memory
 
 VERBS = {
@@ -117,7 +117,7 @@ def _run(words: list[str]) -> int:
             from avmsf.cli.printing import announcing_folders
 
             paths = [getattr(options, name, None) for name in _OUTPUTS]
-            with _compilation_announced(), announcing_folders(path.parent for path in paths if path is not None):
+            with announcing_folders(path.parent for path in paths if path is not None):
                 code: int = verb.run(options)
         except Exception as error:
             if not isinstance(error, AvmsfError) and not lacks_memory(error):
@@ -212,18 +212,6 @@ def _loading(*, quiet: bool) -> Iterator[None]:
         yield
     finally:
         print("\r           \r", end="", file=sys.stderr, flush=True)
-
-
-def _compilation_announced() -> AbstractContextManager[None]:
-    """Let the standard error say what is compiled, for it takes seconds; verbs that compile nothing import nothing."""
-    module = sys.modules.get("avmsf._utils.compiled")
-    if module is None:
-        return nullcontext()
-    # Imports rich, which help on the whole does not need.
-    from avmsf.cli.printing import say
-
-    announced: AbstractContextManager[None] = module.announced(say, meanwhile)
-    return announced
 
 
 def _verb_first(words: Sequence[str]) -> list[str]:

@@ -66,18 +66,6 @@ def doing(text: str) -> None:
     _activity.text = text
 
 
-@contextmanager
-def meanwhile(text: str) -> Iterator[None]:
-    """Show `text` as the activity while the block runs; then the earlier one again, unless another has begun."""
-    before = _activity.text, _activity.since
-    _activity.text, _activity.since = text, time.monotonic()
-    try:
-        yield
-    finally:
-        if _activity.text == text:
-            _activity.text, _activity.since = before
-
-
 def _without_numbers(text: str) -> str:
     return re.sub(r"[-+.e\d]+", "", text)
 
