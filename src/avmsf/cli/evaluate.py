@@ -12,8 +12,7 @@ from rich.console import Console
 from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf._utils.text import counted
 from avmsf.cli import INTERRUPTED
-from avmsf.cli.options.common import spelled
-from avmsf.cli.options.evaluate import Options, deciding, words_of
+from avmsf.cli.options.evaluate import Options, words_of
 from avmsf.cli.printing import console, decimals, next_command, next_step, print_json, say, table
 from avmsf.cli.progress import ProgressBar
 from avmsf.datasets import CaptureCollection, open_dataset
@@ -36,7 +35,7 @@ from avmsf.pipeline.config import AUTO, PRESETS, LiftConfig, SceneConfig, TimeZe
 from avmsf.pipeline.features import choose_encoder, settled
 from avmsf.plotting.pictures import save_picture
 
-OPTIONS = {PREDEFINED: ("--test",), LEARNING_CURVE: ("--counts", "--starts", "--metric")}
+OPTIONS = {PREDEFINED: ("test",), LEARNING_CURVE: ("counts", "starts", "metric")}
 """Options of one protocol alone."""
 _SHOWN = 5
 """Failures that are printed; the report lists all."""
@@ -103,10 +102,9 @@ def run(options: Options) -> int:
 
 def _protocol_of(options: Options) -> EvaluationProtocol:
     """Return the protocol with its own options, and print which of those that were given it does not use."""
-    protocol, given = protocol_named(options.protocol), spelled(options)
-    usual = spelled(Options(options.protocol, options.data))
+    protocol, usual = protocol_named(options.protocol), Options(options.protocol, options.data)
     for owner, names in OPTIONS.items():
-        unused = [name for name in names if given.get(name) != usual.get(name)]
+        unused = [f"--{name}" for name in names if getattr(options, name) != getattr(usual, name)]
         if unused and owner != protocol.name:
             say(f"note: {', '.join(unused)}: not used by {protocol.name}, only by {owner}")
     if protocol.name == LEARNING_CURVE:
@@ -190,7 +188,6 @@ def evaluation_of(
         device,
         None if lift == options.lift else lift.encoder,
         options.time_zero,
-        options=deciding(options),
     )
 
 

@@ -17,8 +17,6 @@ IDENTITY, OBJECTS = "protocol.json", "objects"
 """The file that identifies the evaluation, and the folder of the objects' files."""
 ENCODER = ", encoder "
 """What comes between a method's description and the encoder of the features that it reads."""
-_OPTIONS = "options"
-"""Key of the command line's options in the file: they explain the identity and are no part of it."""
 _MAX_BYTES = 64 << 20
 """Largest file of results that is read: three million values, as of 100 contacts by 10 metrics in 3000 cases."""
 
@@ -102,14 +100,11 @@ class ResultsFolder:
 
     path: Path
 
-    def begin(
-        self, identity: Mapping[str, Any], methods: Mapping[str, str], options: Mapping[str, str] | None = None
-    ) -> None:
+    def begin(self, identity: Mapping[str, Any], methods: Mapping[str, str]) -> None:
         """Use the folder for results of this identity, or continue with those that it holds.
 
         `identity` holds plain values that determine the results; `methods` describes each method. Methods may be added
-        later. `options` are those of a command line, as it spelled them, for messages. Raises EvaluationError where the
-        folder's results are of another identity, or a method has changed.
+        later. Raises EvaluationError where the folder's results are of another identity, or a method has changed.
         """
         wanted = json.loads(json.dumps(dict(identity)))
         place = self.path / IDENTITY
@@ -123,28 +118,20 @@ class ResultsFolder:
                 name="output",
                 advice="choose a new --output",
             )
-        kept, typed = known.pop("methods"), known.pop(_OPTIONS, {})
-        for key in dict.fromkeys((*wanted, *known)):
-            if wanted.get(key) != known.get(key):
-                raise self._of_another(key, wanted, known, *_different(options or {}, typed))
+        kept = known.pop("methods")
+        if wanted != known:
+            raise self._of_another(*_first_difference(wanted, known))
         for name in methods:
             if name in kept and kept[name] != methods[name]:
                 raise self._of_another_method(name, methods[name], kept[name])
-        given = {_OPTIONS: dict(options or typed)} if options or typed else {}
-        write_json(place, {**wanted, **given, "methods": {**kept, **methods}})
+        write_json(place, {**wanted, "methods": {**kept, **methods}})
 
-    def _of_another(
-        self, key: str, wanted: Mapping[str, Any], known: Mapping[str, Any], asked: str, found: str
-    ) -> EvaluationError:
-        """Return the error for results of another identity; `asked` and `found` are the options that differ."""
-        if key == "source":
-            message = "made by this version of avmsf, got those of another, whose code differs; choose another --output"
-        elif asked and key not in ("version", "protocol", "dataset"):
-            message = f"made {asked}, got those made {found}; give the same options, or choose another --output"
-        else:
-            message = f"of {key} {_brief(wanted.get(key))}, got {_brief(known.get(key))}; choose another --output"
-        text = f"{self.path}: expected results {message}"
-        return EvaluationError(text, file=self.path, name=key, value=known.get(key))
+    def _of_another(self, name: str, wanted: object, found: object) -> EvaluationError:
+        differing = f"of {name} {_brief(wanted)}, got {_brief(found)}"
+        if name.startswith("source"):
+            differing = "made by this version of avmsf, got those of another, whose code differs"
+        text = f"{self.path}: expected results {differing}; give the same options, or choose another --output"
+        return EvaluationError(text, file=self.path, name=name, value=found)
 
     def _of_another_method(self, name: str, wanted: str, known: str) -> EvaluationError:
         parts = [each.partition(ENCODER) for each in (wanted, known)]
@@ -241,16 +228,14 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _different(asked: Mapping[str, str], found: Mapping[str, str]) -> tuple[str, str]:
-    """Return the options that differ between two command lines, as each spelled them; nothing where one is unknown."""
-    names = [name for name in dict.fromkeys((*asked, *found)) if asked.get(name) != found.get(name)]
-    if not (asked and found and names):
-        return "", ""
-    both = [
-        ", ".join(f"with {each[name]}" if name in each else f"without {name}" for name in names)
-        for each in (asked, found)
-    ]
-    return both[0], both[1]
+def _first_difference(wanted: Mapping[str, Any], found: Mapping[str, Any]) -> tuple[str, Any, Any]:
+    """Return the first setting in which two sets of nested ones differ, as `outer.inner`, and its two values."""
+    name = next(key for key in (*wanted, *found) if wanted.get(key) != found.get(key))
+    ours, theirs = wanted.get(name), found.get(name)
+    if not (isinstance(ours, Mapping) and isinstance(theirs, Mapping)):
+        return name, ours, theirs
+    inner, ours, theirs = _first_difference(ours, theirs)
+    return f"{name}.{inner}", ours, theirs
 
 
 def _brief(value: object) -> str:

@@ -85,9 +85,6 @@ class Evaluation:
     """The same dataset with its own starts, for fields that are not of the paper's configuration; None where all
     methods are fitted to the sounds that they are scored on."""
 
-    options: Mapping[str, str] = field(default_factory=dict)
-    """What a command line spelled of all this, by option, for messages."""
-
     def begin(self, results: ResultsFolder) -> None:
         """Take a folder for this evaluation's results.
 
@@ -107,7 +104,7 @@ class Evaluation:
             "modes": _plain(self.finder),
             "settings": dict(self.settings),
         }
-        results.begin(identity, {method.name: self._described(method) for method in self.methods}, self.options)
+        results.begin(identity, {method.name: self._described(method) for method in self.methods})
 
     def _described(self, method: Method) -> str:
         """Return what tells a method apart from another of its name. Methods that read no features share any folder."""

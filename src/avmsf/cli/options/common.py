@@ -1,16 +1,13 @@
 """What the options of all verbs have in common: how they are parsed and checked."""
 
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, fields, is_dataclass
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, get_type_hints
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Literal, TypeVar, get_type_hints
 
 import tyro
 
 from avmsf.cli.options.paths import InputError, path_mark
 from avmsf.pipeline.config import PRESETS, Preset
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 """An option that is off unless it is given."""
@@ -83,26 +80,3 @@ def preset_values(preset: Preset, **names: str) -> dict[str, Any]:
 def option_of(name: str) -> str:
     """Return the option of a field without a prefix."""
     return f"--{name.replace('_', '-')}"
-
-
-def spelled(options: object, *, without: Collection[str] = (), prefix: str = "") -> dict[str, str]:
-    """Return how the command line spells options, by their names; those that nothing was given for are left out.
-
-    `without` are the fields that do not count.
-    """
-    words: dict[str, str] = {}
-    for each in fields(cast("DataclassInstance", options)):
-        if each.name in without:
-            continue
-        value, name = getattr(options, each.name), prefix + each.name.replace("_", "-")
-        if is_dataclass(value):
-            words |= spelled(value, prefix=f"{name}.")
-        elif isinstance(value, bool):
-            # A flag has no form for off; a setting within a group has one.
-            off = f"--{prefix}no-{name.removeprefix(prefix)}" if prefix else None
-            words |= {f"--{name}": f"--{name}"} if value else {f"--{name}": off} if off else {}
-        elif value is not None and value != ():
-            several = value if isinstance(value, tuple) else (value,)
-            text = " ".join(f"{each:g}" if isinstance(each, float) else str(each) for each in several)
-            words[f"--{name}"] = f"--{name} {text}"
-    return words

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from avmsf.cli.options.checks import expect_device, expect_modes
-from avmsf.cli.options.common import Flag, Printing, parse_options, spelled
+from avmsf.cli.options.common import Flag, Printing, parse_options
 from avmsf.cli.options.paths import CacheFolder, Existing, OutputFolder
 from avmsf.datasets.detect import detect_dataset
 from avmsf.errors import EvaluationError
@@ -112,18 +112,6 @@ class Options(Printing):
         expect_device(self.device, raising=EvaluationError)
         expect_modes(self.modes)
         detect_dataset(self.data)
-
-
-_NO_MATTER = (
-    *("protocol", "data", "methods", "objects", "output", "cache", "metric", "workers", "ray", "device"),
-    *("contact_data", "figures", "json", "quiet", "verbose"),
-)
-"""Options that do not decide a result, or that a folder of results has as something else than an option."""
-
-
-def deciding(options: Options) -> dict[str, str]:
-    """Return the options that decide results as the command line spells them, by name."""
-    return spelled(options, without=_NO_MATTER)
 
 
 def parse(words: Sequence[str]) -> Options:
