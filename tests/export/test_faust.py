@@ -103,15 +103,6 @@ def test_silence_before_the_first_blow(tmp_path):
     assert heard[3 * BLOCK :].any()
 
 
-def test_losses_are_said(tmp_path):
-    words = " ".join(write_faust(table(spatial=True, noisy=True), tmp_path / "a.dsp").remarks)
-    assert "dampings" in words
-    assert "the noise restarts" in words
-    words = " ".join(write_faust(table(noisy=True), tmp_path / "b.dsp", noise=False).remarks)
-    assert "noise is left out" in words
-    assert "noiseDraw" not in (tmp_path / "b.dsp").read_text()
-
-
 def test_the_name_cannot_break_out_of_its_string():
     field = table()
     named = SampledField(

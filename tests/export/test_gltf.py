@@ -13,7 +13,6 @@ import trimesh
 from avmsf.errors import CaptureError, ExportError
 from avmsf.export.geometry import DisplayGeometry, read_display_geometry
 from avmsf.export.gltf import write_gltf
-from avmsf.export.one_phase import approximation_error
 from avmsf.mesh.textured_mesh import TexturedMesh
 from factories.made_tables import MODES, POINTS, apart, summed, table
 from factories.raising import raises
@@ -129,14 +128,6 @@ def test_phases_alone_change_the_waveform_and_hardly_the_spectrum(tmp_path):
     assert 0.0 < written.spectrum_error_db < 0.7
     # A table without phases is written as it is.
     assert write_gltf(table(), tmp_path / "plain.glb").spectrum_error_db < 1e-4
-
-
-@pytest.mark.parametrize("factor", [0.5, 2.0])
-def test_a_level_that_is_missed_is_told_in_decibels(factor):
-    field = table()
-    found = approximation_error(field, sine=factor * field.sine, cosine=None, damping=field.damping)
-    assert found.waveform == pytest.approx(abs(factor - 1.0), rel=1e-3)
-    assert found.spectrum_db == pytest.approx(6.02, abs=0.1)
 
 
 def test_viewers_show_the_mesh_or_the_points(tmp_path):

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from avmsf.errors import ExportError
-from avmsf.export.paper_demo import Demo, discs, is_demo, read_demo, write_demo
+from avmsf.export.paper_demo import Demo, is_demo, read_demo, write_demo
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import read_splats
 from factories.made_tables import MODES, POINTS, RATE, SAMPLES, apart, summed, table
@@ -110,14 +110,6 @@ def test_the_gaussians_are_those_given_or_discs_on_the_surface(tmp_path):
     torch.testing.assert_close(read_splats(tmp_path / "given" / "scene.ply").harmonics, given.harmonics)
     with raises(ExportError, name="cloud", value=3):
         write_demo(field, tmp_path / "few", cloud=given.take(torch.arange(3)))
-
-
-def test_discs_face_down_where_the_surface_does():
-    field = cosines()
-    field.normals[0] = torch.tensor([0.0, 0.0, -1.0])
-    w, x, y, z = discs(field).rotations[0].tolist()
-    assert 1 - 2 * (x * x + y * y) == pytest.approx(-1.0)
-    assert (w, z) == (0.0, 0.0)
 
 
 def test_offsets_alone_at_the_top_are_understood(tmp_path):

@@ -31,18 +31,19 @@ def test_a_folder_lists_its_files_and_their_sizes(tmp_path):
     assert Written(sizes).size == sum(path.stat().st_size for path in (tmp_path / "out").rglob("*") if path.is_file())
 
 
-def test_a_folder_with_files_is_written_to_only_if_asked_and_others_stay(tmp_path):
-    write_folder(tmp_path / "out", fill("a.txt"), {})
-    (tmp_path / "out" / "a.txt").write_text("mine")
+def test_an_export_is_replaced_only_if_asked_and_nothing_else_is(tmp_path):
+    write_folder(tmp_path / "out", fill("a.txt", "in/c.txt"), {})
     with raises(ExportError, file=tmp_path / "out", name="--overwrite"):
-        write_folder(tmp_path / "out", fill("a.txt", "b.txt"), {})
-    assert listed(tmp_path) == ["out/a.txt", "out/manifest.json"]
-    assert (tmp_path / "out" / "a.txt").read_text() == "mine"
+        write_folder(tmp_path / "out", fill("b.txt"), {})
+    write_folder(tmp_path / "out", fill("b.txt"), {}, force=True)
+    assert listed(tmp_path) == ["out/b.txt", "out/manifest.json"]
     (tmp_path / "out" / "notes.txt").write_text("mine")
-    write_folder(tmp_path / "out", fill("a.txt", "b.txt"), {}, force=True)
-    assert (tmp_path / "out" / "a.txt").read_text() == "a.txt"
-    assert (tmp_path / "out" / "notes.txt").read_text() == "mine"
-    assert listed(tmp_path) == ["out/a.txt", "out/b.txt", "out/manifest.json", "out/notes.txt"]
+    with raises(ExportError, file=tmp_path / "out", name="--overwrite", value=["notes.txt"]):
+        write_folder(tmp_path / "out", fill("a.txt"), {}, force=True)
+    (tmp_path / "out" / "manifest.json").write_text('{"files": ["b.txt", "manifest.json", "notes.txt"]}')
+    with raises(ExportError, file=tmp_path / "out", value=["b.txt", "manifest.json", "notes.txt"]):
+        write_folder(tmp_path / "out", fill("a.txt"), {}, force=True)
+    assert listed(tmp_path) == ["out/b.txt", "out/manifest.json", "out/notes.txt"]
 
 
 def test_what_fails_half_way_leaves_all_as_it_was(tmp_path):

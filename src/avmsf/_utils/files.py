@@ -81,22 +81,26 @@ def copy_whole(source: Path, path: Path, *, raising: type[AvmsfError] = FieldFil
 
 
 @contextmanager
-def new_folder(folder: Path, *, raising: type[AvmsfError]) -> Iterator[Path]:
-    """Yield a temporary folder, which in the end takes the name `folder`: that is complete or absent.
+def new_folder(folder: Path, *, raising: type[AvmsfError], replace: bool = False) -> Iterator[Path]:
+    """Yield a temporary folder, which in the end takes the name `folder`: that is complete, or as it was.
 
-    Raises `raising` where the folder exists and is not empty, or cannot be written.
+    With `replace` all that was in the folder is deleted then. Raises `raising` where the folder cannot be written, and
+    without `replace` where it exists and is not empty.
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if not replace and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise raising.expected(
             "a new or empty folder", got="an existing one", file=folder, advice="choose another name or remove it"
         )
-    begun = temporary_path(folder)
+    begun, old = temporary_path(folder), temporary_path(folder)
     try:
         begun.mkdir(parents=True)
         yield begun
-        if folder.exists():
+        if replace and folder.exists():
+            os.rename(folder, old)
+        elif folder.exists():
             folder.rmdir()
         os.rename(begun, folder)
+        shutil.rmtree(old, ignore_errors=True)
     except OSError as error:
         raise unwritable(folder, error, raising=raising) from error
     finally:

@@ -8,6 +8,7 @@ float32, dampings [M] or [N, M] in 1/s. The demo's player starts every mode as a
 
 import json
 import math
+import shutil
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,6 +89,8 @@ def write_demo(
         sound = {"generator": generator(), "file": MODAL, "modes": len(field.frequency), "duration": _seconds(field)}
         sound |= {"sampleRate": field.sample_rate, "phase": "cosine", "arrays": tensors}
         (place / variant / MANIFEST).write_text(json.dumps(sound, indent=1) + "\n")
+        for other in others:
+            shutil.copytree(folder / other, place / other)
 
     manifest = {"name": field.name, "count": len(field), "file": PICKING, "arrays": places, "scene": SCENE}
     sizes = write_folder(folder, fill, {**manifest, "variants": sorted([variant, *others])}, force=force)

@@ -1,8 +1,6 @@
 """Output of exports: atomic files, and folders, that replace others only if asked to, and notes on losses."""
 
 import json
-import os
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -12,7 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Shaped
 
-from avmsf._utils.files import temporary_path, way_out, write_whole
+from avmsf._utils.files import new_folder, write_whole
+from avmsf._utils.text import read_json
 from avmsf.errors import ExportError
 
 MANIFEST = "manifest.json"
@@ -97,27 +96,41 @@ def check_free(path: Path, *, folder: bool = False, force: bool = False) -> None
 def write_folder(
     folder: Path, fill: Callable[[Path], None], manifest: Mapping[str, object], *, force: bool = False
 ) -> dict[Path, int]:
-    """Let `fill` write files into a temporary folder, add the manifest, and move all to `folder`; return the sizes.
+    """Let `fill` write files into a temporary folder, add the manifest, rename it to `folder`; return the sizes.
 
-    The manifest lists the files. With `force` they replace those of the same names, and others stay. Raises
-    `ExportError` for a folder with files, unless `force` is set.
+    The manifest lists the files. Raises `ExportError` for a folder with files; with `force` it is replaced if it has
+    the files of an export and no others.
     """
     check_free(folder, folder=True, force=force)
+    if folder.exists() and any(folder.iterdir()):
+        _check_export(folder)
+    # What a link leads to is replaced, and the link stays.
+    with new_folder(folder.resolve(), raising=ExportError, replace=force) as place:
+        fill(place)
+        names = [*_files_in(place), MANIFEST]
+        content = {"generator": generator(), **manifest, "files": names}
+        (place / MANIFEST).write_text(json.dumps(content, indent=1) + "\n")
+        return {folder / name: (place / name).stat().st_size for name in names}
+
+
+def _check_export(folder: Path) -> None:
+    """Raise `ExportError` for a folder with other files than those that its manifest, written here, lists."""
     try:
-        temporary = temporary_path(folder.resolve())
-        temporary.mkdir(parents=True)
-        try:
-            fill(temporary)
-            names = sorted(str(path.relative_to(temporary)) for path in temporary.rglob("*") if path.is_file())
-            content = {"generator": generator(), **manifest, "files": [*names, MANIFEST]}
-            (temporary / MANIFEST).write_text(json.dumps(content, indent=1) + "\n")
-            sizes = {folder / name: (temporary / name).stat().st_size for name in [*names, MANIFEST]}
-            for path in sizes:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                os.replace(temporary / path.relative_to(folder), path)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise ExportError.expected("a writable folder", reason, file=folder, advice=way_out(error)) from error
-    return sizes
+        manifest = read_json(folder / MANIFEST)
+        exported = set(manifest["files"]) if str(manifest["generator"]).startswith("avmsf ") else set()
+    except (OSError, ValueError, KeyError, TypeError):
+        exported = set()
+    others = [name for name in _files_in(folder) if name not in exported]
+    if others:
+        raise ExportError.expected(
+            "a folder with the files of an export alone",
+            others,
+            got=f"{others[0]} in it",
+            file=folder,
+            name="--overwrite",
+            advice="choose another folder, or remove its files",
+        )
+
+
+def _files_in(folder: Path) -> list[str]:
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())

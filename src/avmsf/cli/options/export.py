@@ -88,7 +88,7 @@ class Options(Printing):
     unit: Unit = "m"
     """Unit of --position and --contact-table."""
     overwrite: Flag = False
-    """Replace files that exist. Files of other names in a folder are not changed."""
+    """Replace a file, or the folder of an earlier export, that exists."""
     forces: tuple[float, ...] = (1.0,)
     """wavs: forces of the layers, in newtons if the field knows forces, otherwise relative; written from soft to
     loud."""
