@@ -4,13 +4,13 @@ import base64
 import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 
 import numpy as np
 import soundfile
 import torch
 from jaxtyping import Float, Float64, UInt8
+from jinja2 import Environment, PackageLoader
 from matplotlib import colormaps
 from PIL import Image
 from scipy.signal import resample_poly
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from avmsf._utils.files import write_whole
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.report_tables import Grid, Section, figure
+from avmsf.evaluation.report_tables import Section, figure
 from avmsf.evaluation.results import CaseRecord, ObjectRecord, Outcome
 from avmsf.evaluation.splits import spread
 from avmsf.export.web import report_directives, with_policy
@@ -127,87 +127,19 @@ LARGEST = 13_000_000
 OBJECTS = 4
 """Objects with sounds on the page, evenly spaced over all."""
 
-_STYLE = """
-:root { color-scheme: light; }
-* { box-sizing: border-box; }
-body { margin: 0 auto; padding: 1.5rem; max-width: 84rem; font: 1rem/1.5 system-ui, sans-serif; color: #1c1c1e;
-  background: #fff; }
-h1, h2, h3 { line-height: 1.2; }
-h2 { margin-top: 2.5rem; border-top: 1px solid #ccc; padding-top: 1rem; }
-p { max-width: 70ch; }
-nav ul { display: flex; flex-wrap: wrap; gap: .2rem 1.2rem; padding: 0; list-style: none; }
-a { color: #0b57a4; }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-caption { position: absolute; clip-path: inset(50%); width: 1px; height: 1px; overflow: hidden; }
-th, td { padding: .3rem .55rem; border-bottom: 1px solid #ddd; text-align: right; white-space: nowrap; }
-th:first-child, td.words { text-align: left; }
-td.words { white-space: normal; min-width: 12rem; }
-tbody tr:hover { background: #f3f6fa; }
-.best { font-weight: 700; }
-.sounds { display: grid; grid-template-columns: repeat(auto-fill, minmax(15rem, 1fr)); gap: 1rem; margin: 0 0 2rem; }
-figure { margin: 0; border: 1px solid #ccc; border-radius: .4rem; padding: .5rem; }
-figure.recorded { border: 2px solid #0b57a4; }
-figure img { width: 100%; height: 8rem; display: block; image-rendering: auto; background: #000; }
-figure audio { width: 100%; height: 2.2rem; margin-top: .4rem; display: block; }
-figcaption { font-size: .9rem; }
-figcaption b { display: block; overflow-wrap: anywhere; }
-:focus-visible { outline: 3px solid #e08a00; outline-offset: 2px; }
-"""
-_SCRIPT = """
-document.addEventListener("play", (event) => {
-  for (const each of document.querySelectorAll("audio")) if (each !== event.target) each.pause();
-}, true);
-"""
-
 
 def page(parts: Sequence[Section], records: Sequence[ObjectRecord], folder: Path) -> str:
     """Return the complete page; sounds are read from the results' folder. Raises EvaluationError for a missing one."""
-    title, *others = parts
-    blocks = [_section(part, f"part{number}") for number, part in enumerate(others, 1)]
-    listening = _listening(records, folder)
-    links = [(f"part{number}", part.title) for number, part in enumerate(others, 1)]
-    if listening:
-        blocks.insert(1, listening)
-        links.insert(1, ("listen", "Spectrograms and sounds"))
-    entries = "".join(f'<li><a href="#{place}">{escape(words)}</a></li>' for place, words in links)
-    opening = "".join(f"<p>{escape(words)}</p>" for words in title.words)
-    whole = (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title.title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n"
-        f'<header><h1>{escape(title.title)}</h1>{opening}</header>\n<nav aria-label="Parts of the report">'
-        f"<ul>{entries}</ul></nav>\n<main>\n"
-        + "\n".join(blocks)
-        + f"\n</main>\n<script>{_SCRIPT}</script>\n</body>\n</html>\n"
+    opening, *others = parts
+    environment = Environment(loader=PackageLoader("avmsf.evaluation", ""), autoescape=True, trim_blocks=True)
+    whole = environment.get_template("report.html.jinja").render(
+        opening=opening, parts=others, listening=_listening(records, folder), range_db=f"{RANGE_DB:g}", is_text=_is_text
     )
     return with_policy(whole, report_directives(whole))
 
 
-def _section(part: Section, place: str) -> str:
-    words = "".join(f"<p>{escape(each)}</p>" for each in part.words)
-    remarks = "".join(f"<p>{escape(each)}</p>" for each in part.remarks)
-    table = "" if part.grid is None else _table(part.grid, part.title)
-    return f'<section id="{place}"><h2>{escape(part.title)}</h2>{words}{table}{remarks}</section>'
-
-
-def _table(grid: Grid, title: str) -> str:
-    head = "".join(f'<th scope="col">{escape(column)}</th>' for column in grid.columns)
-    rows = "".join(
-        f'<tr><th scope="row">{escape(first)}</th>'
-        + "".join(_cell(cell, best=(number, place) in grid.best) for place, cell in enumerate(cells, 1))
-        + "</tr>"
-        for number, (first, *cells) in enumerate(grid.rows)
-    )
-    return (
-        f'<div class="wide" tabindex="0" role="region" aria-label="{escape(title)}"><table><caption>{escape(title)}'
-        f"</caption><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>"
-    )
-
-
-def _cell(words: str, *, best: bool) -> str:
-    kind = "best" if best else "words" if any(mark.isalpha() and mark != "e" for mark in words) else ""
-    return f'<td class="{kind}">{escape(words)}</td>' if kind else f"<td>{escape(words)}</td>"
+def _is_text(cell: str) -> bool:
+    return any(mark.isalpha() and mark != "e" for mark in cell)
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,36 +175,44 @@ def stored_contacts(record: ObjectRecord) -> Iterator[StoredContact]:
         yield StoredContact(record, name, file, made)
 
 
-def _listening(records: Sequence[ObjectRecord], folder: Path) -> str:
-    """Return the part with spectrograms and sounds, as many contacts as fit the page; or an empty text."""
-    found: dict[str, list[str]] = {}
+@dataclass(frozen=True)
+class _Card:
+    """One sound on the page."""
+
+    title: str
+    words: str
+    picture: str
+    """Address of its spectrogram."""
+    sound: str
+    """Address of its file."""
+
+    @property
+    def size(self) -> int:
+        return len(self.picture) + len(self.sound)
+
+
+def _listening(records: Sequence[ObjectRecord], folder: Path) -> dict[str, list[tuple[str, list[_Card]]]]:
+    """Return the names of contacts and their sounds by the titles of their objects, as many as fit the page."""
+    found: dict[str, list[tuple[str, list[_Card]]]] = {}
     size = 0
     for contact in _contacts(records):
-        block = _contact_block(contact, folder)
-        if size + len(block) > LARGEST:
+        cards = list(_cards(contact, folder))
+        size += sum(card.size for card in cards)
+        if size > LARGEST:
             break
-        size += len(block)
         facts = contact.record
         label = facts.name if facts.name in ("", facts.identifier) else f"{facts.identifier}: {facts.name}"
         title = ", ".join(filter(None, (label or facts.identifier, facts.material)))
-        found.setdefault(title, []).append(block)
-    if not found:
-        return ""
-    words = (
-        "Test contacts. The recording comes first; all sounds of a contact are scaled by the same gain, except those "
-        "that would clip, which are scaled to full scale. Spectrograms show time to the right and frequency upwards on "
-        "a logarithmic scale; colors span 80 dB below the recording's loudest point."
-    )
-    blocks = "".join(f"<h3>{escape(title)}</h3>{''.join(each)}" for title, each in found.items())
-    return f'<section id="listen"><h2>Spectrograms and sounds</h2><p>{escape(words)}</p>{blocks}</section>'
+        found.setdefault(title, []).append((contact.name, cards))
+    return found
 
 
-def _contact_block(contact: StoredContact, folder: Path) -> str:
+def _cards(contact: StoredContact, folder: Path) -> Iterator[_Card]:
     recorded = StoredSound.read(folder / contact.recorded)
     loudest = loudest_of(recorded)
     seconds, lowest, highest = picture_span(recorded)
     span = f"{seconds:.2g} s, {lowest:.0f} Hz to {highest:.0f} Hz"
-    cards = [_card("recorded", span, recorded, loudest, contact.name, kind=' class="recorded"')]
+    yield _Card("recorded", span, draw_spectrogram(recorded, loudest=loudest), recorded.address)
     several = len({case.label for case, _ in contact.made}) > 1
     for case, outcome in contact.made:
         title = f"{outcome.method}, {case.label}" if several else outcome.method
@@ -283,14 +223,4 @@ def _contact_block(contact: StoredContact, folder: Path) -> str:
             if (values := outcome.values.get(metric)) is not None
         ]
         sound = StoredSound.read(folder / outcome.sounds[contact.name])
-        cards.append(_card(title, ", ".join(scores), sound, loudest, contact.name))
-    return f'<h4>{escape(contact.name)}</h4><div class="sounds">{"".join(cards)}</div>'
-
-
-def _card(title: str, words: str, sound: StoredSound, loudest: float, contact: str, *, kind: str = "") -> str:
-    said = escape(f"{title}, {contact}")
-    return (
-        f'<figure{kind}><img alt="Spectrogram: {said}" src="{draw_spectrogram(sound, loudest=loudest)}">'
-        f'<audio controls preload="none" aria-label="Sound: {said}" src="{sound.address}"></audio>'
-        f"<figcaption><b>{escape(title)}</b>{escape(words)}</figcaption></figure>"
-    )
+        yield _Card(title, ", ".join(scores), draw_spectrogram(sound, loudest=loudest), sound.address)
