@@ -19,10 +19,11 @@ from avmsf.errors import AvmsfError, EvaluationError, FitError
 from avmsf.evaluation.methods import method_named
 from avmsf.evaluation.modal_metrics import ModalRenderer, compare_modes, truth_at
 from avmsf.evaluation.objects import ObjectBodies, ObjectFeatures, draw_other_recording
+from avmsf.evaluation.parallel import RunProgress, Workers, run_objects
 from avmsf.evaluation.protocols import PROTOCOLS
 from avmsf.evaluation.report import write_summary
 from avmsf.evaluation.results import ENCODER, ResultsFolder
-from avmsf.evaluation.runner import Evaluation, RunProgress, Workers, run_objects
+from avmsf.evaluation.runner import Evaluation
 from avmsf.evaluation.simple_methods import NearestRecording
 from avmsf.evaluation.splits import MetricSettings, evaluate, split, spread
 from avmsf.evaluation.task import Method, Renderer, Task

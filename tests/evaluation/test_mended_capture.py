@@ -5,9 +5,10 @@ from pathlib import Path
 
 from avmsf.datasets import CaptureCollection
 from avmsf.evaluation.methods import method_named
+from avmsf.evaluation.parallel import run_objects
 from avmsf.evaluation.protocols import PROTOCOLS
 from avmsf.evaluation.results import ResultsFolder
-from avmsf.evaluation.runner import Evaluation, run_objects
+from avmsf.evaluation.runner import Evaluation
 from avmsf.evaluation.splits import MetricSettings
 from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
 from factories.plate_set import NoBodies, PlateLooks, fill_plates

@@ -18,12 +18,12 @@ from test_evaluation_run import planned
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.methods import METHODS
 from avmsf.evaluation.page import StoredSound, draw_spectrogram, keep_sound, listening_gain
+from avmsf.evaluation.parallel import run_objects
 from avmsf.evaluation.protocols import PUBLISHED, published_ratios
 from avmsf.evaluation.registry import title_of
 from avmsf.evaluation.report import write_page, write_summary
 from avmsf.evaluation.report_tables import WARNING, Grid, Section, figure, markdown, sections
 from avmsf.evaluation.results import CaseRecord, ObjectRecord, Outcome, ResultsFolder, natural
-from avmsf.evaluation.runner import run_objects
 from avmsf.evaluation.summary import Mean, missing_of, object_figures, summarize
 from factories.plate_set import fill_plates
 from factories.raising import raises

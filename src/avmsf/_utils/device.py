@@ -29,6 +29,21 @@ def without_denormals() -> Iterator[None]:
         torch.set_flush_denormal(before)
 
 
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch and numba compute on one thread: sums in one order, and workers that do not stall each other."""
+    import numba
+
+    threads, kernels = torch.get_num_threads(), numba.get_num_threads()
+    torch.set_num_threads(1)
+    numba.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        numba.set_num_threads(kernels)
+
+
 def usable_device(
     name: str | torch.device | None, *, raising: type[AvmsfError], kinds: Sequence[str] = ()
 ) -> torch.device:

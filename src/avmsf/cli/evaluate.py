@@ -22,11 +22,12 @@ from avmsf.evaluation.cases import Growing, Predefined
 from avmsf.evaluation.field_methods import configured
 from avmsf.evaluation.methods import RecordedMethod, method_named
 from avmsf.evaluation.objects import SUBSETS, ObjectBodies, ObjectFeatures, choose_objects, members
+from avmsf.evaluation.parallel import RunProgress, Workers, run_objects
 from avmsf.evaluation.protocols import LEARNING_CURVE, PREDEFINED, PUBLISHED, EvaluationProtocol, protocol_named
 from avmsf.evaluation.report import PAGE, SUMMARY, TABLES, write_figures, write_page, write_summary
 from avmsf.evaluation.report_tables import Section
 from avmsf.evaluation.results import IDENTITY, ResultsFolder, write_json
-from avmsf.evaluation.runner import Evaluation, RunProgress, Workers, run_objects
+from avmsf.evaluation.runner import Evaluation
 from avmsf.evaluation.splits import MetricSettings
 from avmsf.evaluation.summary import curves, draw_learning_curve
 from avmsf.evaluation.task import Method, ReadsFeatures, VisualInput

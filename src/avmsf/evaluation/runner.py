@@ -1,7 +1,6 @@
-"""Running an evaluation: all methods in all cases of an object, each result stored at once; in parallel on ray."""
+"""Running an evaluation: all methods in all cases of an object, each result stored at once."""
 
 import hashlib
-import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -9,15 +8,14 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Protocol, runtime_checkable
 
-import numba
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from avmsf._utils.caching import Given, Result, once, source_digest
+from avmsf._utils.device import one_thread
 from avmsf.capture.impacts import Impacts
 from avmsf.datasets.dataset import Dataset, ObjectFacts
 from avmsf.errors import AvmsfError, EvaluationError
@@ -250,6 +248,9 @@ class CaseRun:
         return MetricValues(dict(found.errors), {}), maps
 
     def _task(self, recordings: _Recordings) -> Task:
+        make = self.evaluation.clouds
+        known = None if make is None else self._shared(partial(make, self.data.identifier, self.case.views))
+        clouds = {} if known is None else {"gaussians": known}
         return Task(
             name=self.data.identifier,
             train=recordings.train,
@@ -262,8 +263,8 @@ class CaseRun:
             other_recording=self._shared(self.data.other_recording),
             family=self._shared(self.data.family),
             material=self.data.material,
-            gaussians=self._gaussians,
             device=self.evaluation.device,
+            **clouds,
         )
 
     def _shared(self, make: Callable[Given, Result]) -> Callable[Given, Result]:
@@ -272,14 +273,6 @@ class CaseRun:
                 return make(*given, **named)
 
         return made
-
-    def _gaussians(self) -> GaussianCloud:
-        if self.evaluation.clouds is None:
-            raise EvaluationError.expected(
-                "Gaussians, views or a mesh", name=self.data.identifier, advice="give one, or omit the method"
-            )
-        with self._sharing():
-            return self.evaluation.clouds(self.data.identifier, self.case.views)
 
     @contextmanager
     def _sharing(self) -> Iterator[None]:
@@ -389,19 +382,6 @@ def _described(record: ObjectRecord, impacts: Impacts, facts: ObjectFacts, cases
     )
 
 
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Let torch and numba compute on one thread: sums in one order, and workers that do not stall each other."""
-    threads, kernels = torch.get_num_threads(), numba.get_num_threads()
-    torch.set_num_threads(1)
-    numba.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-        numba.set_num_threads(kernels)
-
-
 def digest_of(impacts: Impacts, truth: Truth | None) -> str:
     """Return a digest of all that figures depend on of an object's recordings and truth."""
     digest = hashlib.sha256(impacts.digest().encode())
@@ -431,138 +411,3 @@ def _run_case(
 def _named(case: Case, impacts: Impacts) -> CaseRecord:
     train, test = (tuple(impacts.names[row] for row in rows) for rows in (case.train, case.test))
     return CaseRecord(case.key, case.label, train, test)
-
-
-@dataclass(frozen=True)
-class Workers:
-    """Processes that compute."""
-
-    count: int = 1
-    """Number of parallel objects on this computer; with 1 and no address, ray is not needed."""
-    address: str | None = None
-    """A ray cluster's address, or `auto`; its computers must see data and results under the same paths."""
-
-    def __post_init__(self) -> None:
-        if self.count < 1:
-            raise EvaluationError(f"expected 1 worker or more, got {self.count}", name="workers", value=self.count)
-
-
-@dataclass(frozen=True)
-class RunProgress:
-    """Progress of an evaluation."""
-
-    words: str
-    """The stage that has begun or ended."""
-    done: int
-    """Number of finished objects."""
-    total: int
-
-
-def run_objects(
-    evaluation: Evaluation,
-    identifiers: Sequence[str],
-    results: ResultsFolder,
-    *,
-    workers: Workers | None = None,
-    progress: Callable[[RunProgress], None] | None = None,
-) -> None:
-    """Evaluate the objects, and keep each figure as it comes; what has figures already is not computed again.
-
-    Each object is computed on one thread, so that figures do not depend on the number of workers. Raises as
-    `Evaluation.begin` and `run_object`, and EvaluationError where ray is needed and not installed.
-    """
-    who = workers or Workers()
-    report = progress or (lambda event: None)
-    if who.address is None and who.count == 1:
-        evaluation.begin(results)
-        for done, identifier in enumerate(identifiers):
-
-            def log(words: str, identifier: str = identifier, done: int = done) -> None:
-                report(RunProgress(f"{identifier}: {words}", done, len(identifiers)))
-
-            run_object(evaluation, identifier, results, log)
-            report(RunProgress(f"{identifier}: done", done + 1, len(identifiers)))
-        return
-    ray = _ray()
-    evaluation.begin(results)
-    with _cluster(ray, who):
-        _run_remotely(ray, evaluation, identifiers, results, report)
-
-
-def _run_remotely(
-    ray: ModuleType,
-    evaluation: Evaluation,
-    identifiers: Sequence[str],
-    results: ResultsFolder,
-    report: Callable[[RunProgress], None],
-) -> None:
-    # max_retries: a worker that was killed for memory would be killed again.
-    remote = ray.remote(num_cpus=1, max_retries=0)(_run_alone)
-    shared = ray.put((evaluation, results))
-    pending: dict[Any, str] = {remote.remote(shared, identifier): identifier for identifier in identifiers}
-    report(RunProgress(f"{len(pending)} objects on ray", 0, len(identifiers)))
-    try:
-        while pending:
-            # A time limit lets Ctrl-C through.
-            ready, _ = ray.wait(list(pending), num_returns=1, timeout=1.0)
-            for reference in ready:
-                identifier = pending.pop(reference)
-                try:
-                    ray.get(reference)
-                except ray.exceptions.RayError as error:
-                    cause = getattr(error, "cause", None)
-                    if isinstance(cause, Exception) and not isinstance(cause, ray.exceptions.RayError):
-                        raise cause from None
-                    raise EvaluationError.expected(
-                        "a worker process that finishes",
-                        got=f"one that ended early ({str(error).splitlines()[0]})",
-                        name=identifier,
-                        advice="run the command again, with fewer --workers if memory ran out",
-                    ) from error
-                report(RunProgress(f"{identifier}: done", len(identifiers) - len(pending), len(identifiers)))
-    finally:
-        for reference in pending:
-            ray.cancel(reference, force=True)
-
-
-def _run_alone(shared: tuple[Evaluation, ResultsFolder], identifier: str) -> None:
-    evaluation, results = shared
-    run_object(evaluation, identifier, results)
-
-
-@contextmanager
-def _cluster(ray: ModuleType, workers: Workers) -> Iterator[None]:
-    settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
-    if workers.address is None:
-        settings |= {"num_cpus": workers.count, "include_dashboard": False, "address": "local"}
-    else:
-        settings["address"] = workers.address
-    try:
-        ray.init(**settings)
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        wanted, advice = "a cluster to connect to", "check that it runs and has this address"
-        if workers.address is None:
-            wanted, advice = "ray to start on this computer", "use --workers 1, which needs no ray"
-        reason = " ".join(str(error).split())
-        raise EvaluationError.expected(wanted, workers.address, got=reason, name="ray", advice=advice) from error
-    try:
-        yield
-    finally:
-        ray.shutdown()
-
-
-def _ray() -> ModuleType:
-    # One computer needs no authentication, and no usage is reported.
-    for name, value in {
-        "RAY_AUTH_MODE": "disabled",
-        "RAY_USAGE_STATS_ENABLED": "0",
-        "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
-    }.items():
-        os.environ.setdefault(name, value)
-    try:
-        import ray
-    except ImportError as error:
-        raise EvaluationError.expected(
-            "an installed package", name="ray", advice="pip install 'avmsf[scale]', or omit --workers and --ray"
-        ) from error
-    return ray
