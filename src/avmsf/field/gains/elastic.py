@@ -202,12 +202,12 @@ class Elastic(KernelFamily):
         """Return what `shape_log_prior` averages, for each pair of a factor and an error and all or some modes."""
         chosen = log_frequency if modes is None else log_frequency[modes]
         square, constant = self._apart(FACTORS, chosen, log_frequency)
-        errors = torch.tensor(FREQUENCY_ERRORS, dtype=torch.float64)
-        shares = (1.0 - _EXCEPTIONS) * torch.eye(len(errors), dtype=torch.float64) + _EXCEPTIONS / len(errors)
-        logs = torch.log(shares / (errors * math.sqrt(2.0 * math.pi)))
-        each = [square * (-0.5 / error**2) for error in FREQUENCY_ERRORS]
-        pairs = [torch.logsumexp(torch.stack([a + b for a, b in zip(each, row, strict=True)]), dim=0) for row in logs]
-        return (torch.stack(pairs, dim=1) + constant[:, None, None, None]).flatten(0, 1)
+        own = [square * (-0.5 / error**2) - math.log(error * math.sqrt(2.0 * math.pi)) for error in FREQUENCY_ERRORS]
+        densities = torch.stack(own, dim=1)
+        # A mode has its body's error or, as an exception, any.
+        exception = torch.logsumexp(densities, dim=1, keepdim=True) + math.log(_EXCEPTIONS / len(FREQUENCY_ERRORS))
+        found = torch.logaddexp(densities + math.log(1.0 - _EXCEPTIONS), exception)
+        return (found + constant[:, None, None, None]).flatten(0, 1)
 
     def _apart(
         self,
