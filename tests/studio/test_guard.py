@@ -1,15 +1,12 @@
 """Who is let in: every way in that is no page's of ours is refused, and told nothing."""
 
 import contextlib
-import os
 import socket
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-from avmsf.studio.guard import LOOPBACK, NOTHING_HERE, Guard, contained, new_token
-from avmsf.studio.responses import RequestError
+from avmsf.studio.guard import LOOPBACK, NOTHING_HERE, Guard, new_token
 from avmsf.studio.routes import PAGE
 from event_loop import run_async
 from opened_plate import blow, open_plate
@@ -116,6 +113,10 @@ def test_another_sites_page_is_refused(server: Served, origin: str, method: str)
         "revisions/1/leak.bin",
         "plate.safetensors",
         "../__init__.py",
+        "page/",
+        "page/vendor/",
+        "strikes/",
+        "revisions/1/",
     ],
 )
 def test_nothing_outside_of_what_is_shown_can_be_read(server: Served, place: str) -> None:
@@ -123,26 +124,6 @@ def test_nothing_outside_of_what_is_shown_can_be_read(server: Served, place: str
     assert answer.status == 404
     assert b"outside" not in answer.content
     assert b"hidden" not in answer.content
-
-
-@pytest.mark.parametrize("place", ["page/", "page", "strikes/", "revisions/1/", "page/vendor/", "capture/strikes/"])
-def test_no_folder_is_listed(server: Served, place: str) -> None:
-    assert server.get(place).status in (404, 405)
-    assert b"main.js" not in server.get(place).content
-
-
-def test_a_link_leads_nowhere_else(tmp_path: Path) -> None:
-    (tmp_path / "in").mkdir()
-    (tmp_path / "out.bin").write_text("out")
-    (tmp_path / "in" / "out.bin").symlink_to(tmp_path / "out.bin")
-    (tmp_path / "in" / "loop.bin").symlink_to("loop.bin")
-    os.mkfifo(tmp_path / "in" / "pipe.bin")
-    (tmp_path / "in" / "fine.bin").write_text("fine")
-    assert contained(tmp_path / "in", "fine.bin").read_text() == "fine"
-    for name in ("out.bin", "loop.bin", "pipe.bin", "../out.bin", "/etc/passwd", "", ".", "x" * 5000):
-        with pytest.raises(RequestError) as refused:
-            contained(tmp_path / "in", name)
-        assert (refused.value.status, str(refused.value)) == (404, NOTHING_HERE)
 
 
 def test_a_huge_upload_is_refused_by_its_length_alone(server: Served) -> None:
@@ -173,14 +154,6 @@ def test_a_huge_upload_without_a_length_is_refused_while_it_comes(server: Served
 def test_words_have_a_smaller_limit_than_recordings(server: Served) -> None:
     assert server.ask("POST", "locate", bytes(LARGEST)).status == 422
     assert server.ask("POST", "locate", bytes(LARGEST + 1)).status == 413
-
-
-@pytest.mark.parametrize("body", [b"", b"[1]", b"{", b"\xff\xfe", b"null"])
-def test_what_is_no_object_is_refused(server: Served, body: bytes) -> None:
-    for place in ("edit", "undo", "save"):
-        answer = server.ask("POST", place, body)
-        assert answer.status == 400
-        assert "expected a JSON object" in answer.words["error"]
 
 
 def test_the_token_does_not_leak_to_other_sites(server: Served) -> None:

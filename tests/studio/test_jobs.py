@@ -117,20 +117,6 @@ def test_a_finish_that_breaks_is_an_error_and_the_next_job_runs(
     assert "Traceback" in capsys.readouterr().err
 
 
-def test_a_worker_that_cannot_start_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    async def hear() -> list[Any]:
-        jobs = Jobs()
-        job = jobs.start("test", {}, same, (str(tmp_path / "missing"),))
-        events = [event async for _, event in job.listen()]
-        assert jobs.current is None
-        await jobs.close()
-        return events
-
-    [last] = run_async(asyncio.wait_for(hear(), 20))
-    assert "test failed (FileNotFoundError" in last["error"]
-    assert "Traceback" in capsys.readouterr().err
-
-
 def test_a_result_that_is_being_taken_in_is_told_whoever_stops_the_job() -> None:
     async def stop_late() -> tuple[bool, list[Any]]:
         begun, go = asyncio.Event(), asyncio.Event()
@@ -213,21 +199,6 @@ def test_cancelling_ends_all_processes_also_of_a_worker_that_does_not_end_itself
     first, last = run_async(cancel())
     assert time.monotonic() - begun < 5
     assert last == {"stage": "cancelled", "words": "stopped"}
-    assert gone(first["processes"])
-
-
-@pytest.mark.skipif(not Path("/proc").is_dir(), reason="processes are looked up in /proc")
-def test_closing_ends_what_runs() -> None:
-    async def close() -> list[Any]:
-        jobs = Jobs()
-        job = jobs.start("test", {}, same, pair(LIFELINE))
-        async for _ in job.listen():
-            break
-        await jobs.close()
-        return job.events
-
-    first, last = run_async(close())
-    assert last["stage"] == "cancelled"
     assert gone(first["processes"])
 
 

@@ -42,22 +42,3 @@ def test_a_page_shows_and_plays_the_object_without_a_network(
     assert page.evaluate("refused") == []
     assert [each for each in asked if not each.startswith((address, "data:", "blob:"))] == []
     context.close()
-
-
-def test_only_a_page_with_gaussians_carries_what_draws_them(tmp_path: Path) -> None:
-    sizes = {}
-    for kind in ("mesh", "gaussians"):
-        write_webpage(plate_table(), tmp_path / f"{kind}.html", object=plate_object(kind, tmp_path))
-        sizes[kind] = (tmp_path / f"{kind}.html").stat().st_size
-    assert sizes["gaussians"] - sizes["mesh"] > 3_000_000
-
-
-def test_a_folder_that_is_opened_without_a_server_says_so(browser: "Browser", tmp_path: Path) -> None:
-    write_webpage(plate_table(), tmp_path / "folder")
-    page = browser.new_page()
-    page.goto((tmp_path / "folder" / "index.html").as_uri())
-    page.wait_for_timeout(300)
-    assert page.inner_text("h1") == "Nothing to show"
-    for words in ("from a web server", "python -m http.server", "--to web --output page.html"):
-        assert words in words_on(page)
-    page.close()

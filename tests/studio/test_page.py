@@ -10,7 +10,7 @@ import soundfile
 import torch
 
 from page_plate import SIDES, plate_shapes, plate_table
-from plate_page import LIVE, Open, answer, on_screen, upload, wav, words_on
+from plate_page import LIVE, Open, answer, on_screen, wav, words_on
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page, Request, Route
@@ -79,6 +79,8 @@ def test_keys_turn_and_strike_what_is_in_the_middle(plain: "Page") -> None:
     # The eye looks at the plate's middle from 0.75, -1, 0.85, and meets its face on the way.
     met = torch.tensor([0.75, -1.0, 0.85]) * 0.01 / 0.85
     assert (last_place(page) - met).norm() < SPACING
+    page.keyboard.press("Shift+Enter")
+    assert page.evaluate("avmsf.studio.last.force") == 10
     page.keyboard.press("ArrowRight")
     assert np.hypot(*np.subtract(on_screen(page, (0.1, 0.0, 0.01)), before)) > 5
 
@@ -129,14 +131,6 @@ def test_the_table_tells_pitch_decay_and_level_at_the_contact(plain: "Page") -> 
     assert first == str(int(table.sine[row].abs().argmax()))
 
 
-def test_the_page_renders_what_python_does(plain: "Page") -> None:
-    page = plain
-    row = 40
-    sound = page.evaluate(f"avmsf.renderOffline([{{ row: {row}, force: 2 }}], 0.25).then((sound) => [...sound])")
-    expected = plate_table().render(torch.tensor([row]), force=2.0)[0, : len(sound)]
-    assert (torch.tensor(sound) - expected).abs().max() < 1e-4 * expected.abs().max()
-
-
 def test_a_dropped_recording_is_located_and_painted(visit: Open) -> None:
     sent: list[bytes] = []
     table = plate_table()
@@ -183,24 +177,6 @@ def test_a_dropped_recording_is_located_and_painted(visit: Open) -> None:
     assert box is not None
     assert abs(box["y"] + box["height"] / 2 - y) < 3
     assert 0 < box["x"] - x < 30
-
-
-def test_a_strike_is_changed_only_as_this_page_knows_it(visit: Open) -> None:
-    asked: list[tuple[str, str, str | None]] = []
-
-    def hear(route: "Route", request: "Request") -> None:
-        asked.append((request.method, request.url.partition("/capture/strikes/")[2], request.headers.get("if-match")))
-        answer(route, {})
-
-    page = visit(before=lambda page: page.route("**/capture/strikes/**", hear))
-    page.evaluate(
-        """() => import(new URL("page/server.js", location)).then(async ({ server }) => {
-             await server.redoStrike("wavs/a b.wav", new Blob(["RIFF"]), { digest: "d1" });
-             await server.removeStrike("002.wav", { digest: "d2" });
-             await server.removeStrike("003.wav");
-           })"""
-    )
-    assert asked == [("PUT", "wavs/a%20b.wav", "d1"), ("DELETE", "002.wav", "d2"), ("DELETE", "003.wav", None)]
 
 
 def test_the_microphone_records_what_is_heard(visit: Open) -> None:
@@ -273,64 +249,6 @@ def test_what_the_browser_lacks_is_said_and_the_rest_works(visit: Open, before: 
     assert page.locator("tbody tr").count() == 6
 
 
-def test_a_field_without_geometry_is_told_and_offers_no_blow(visit: Open) -> None:
-    broken: list[str] = []
-
-    def empty(page: "Page") -> None:
-        def bend(route: "Route") -> None:
-            manifest = route.fetch().json()
-            for name in ("points", "normals", "sine"):
-                manifest["tensors"][name]["shape"][0] = 0
-            answer(route, {**manifest, "points": 0})
-
-        page.on("pageerror", lambda error: broken.append(str(error)))
-        page.route("**/manifest.json", bend)
-
-    page = visit(before=empty)
-    assert "This field has no geometry" in words_on(page, ".bad")
-    assert page.is_disabled("text=Strike again")
-    assert page.is_disabled("text=Strike at random")
-    page.evaluate("avmsf.strike(0)")
-    assert "no contacts to strike" in words_on(page, ".bad")
-    assert broken == []
-    page.click("#tab-modes")
-    assert page.locator("tr[data-mode='3'] td").all_inner_texts() == ["4", "1600.0", "0.432", "–"]
-
-
-def test_a_row_is_forgotten_when_the_contacts_are_others(visit: Open) -> None:
-    page = visit()
-    page.evaluate("avmsf.strike(1000)")
-    page.evaluate("avmsf.studio.take({ ...avmsf.studio.bundle })")
-    assert page.evaluate("avmsf.studio.row") == 1000
-    page.evaluate(
-        """() => {
-             const { bundle } = avmsf.studio, { tensors } = bundle;
-             const few = (name, width) => tensors[name].slice(0, 10 * width);
-             const cut = { points: few("points", 3), normals: few("normals", 3), sine: few("sine", 6) };
-             const manifest = { ...bundle.manifest, points: 10 };
-             avmsf.studio.take({ ...bundle, manifest, tensors: { ...tensors, ...cut, cosine: few("cosine", 6) } });
-           }"""
-    )
-    assert page.evaluate("avmsf.studio.row") is None
-    page.click("text=Strike again")
-    assert page.evaluate("avmsf.studio.row") < 10
-
-
-def test_a_mode_is_chosen_by_keys_and_keeps_them(visit: Open) -> None:
-    page = visit()
-    page.click("#tab-modes")
-    choose = page.locator("tr[data-mode='2'] button")
-    choose.focus()
-    page.keyboard.press("Enter")
-    assert page.locator("tbody button[aria-pressed='true']").count() == 1
-    assert choose.get_attribute("aria-pressed") == "true"
-    assert page.evaluate("avmsf.painted() !== null")
-    page.evaluate("avmsf.strike(5)")
-    page.keyboard.press(" ")
-    assert choose.get_attribute("aria-pressed") == "false"
-    assert page.evaluate("avmsf.painted()") is None
-
-
 def test_a_file_dropped_on_a_page_without_a_server_does_not_replace_it(plain: "Page") -> None:
     page = plain
     kept = page.evaluate(
@@ -355,40 +273,3 @@ def test_all_fits_on_a_telephone(visit: Open) -> None:
     for name in ("modes", "find", "edit"):
         page.click(f"#tab-{name}")
         assert page.evaluate("document.getElementById('sheets').scrollWidth") <= 390
-
-
-def test_what_was_found_goes_when_another_recording_is_looked_for(visit: Open) -> None:
-    probability = torch.exp(-torch.arange(plate_table().points.shape[0]) / 50.0)
-    region = {"probability": 0.9, "radius": 0.012, "surface_fraction": 0.031}
-    found = {"position": [0.0, 0.0, 0.01], "row": 5, "probability": packed(probability), "credible_region": region}
-    silence = {"error": "the recording: expected a blow, found noise alone: record it again"}
-    answers = [({"impacts": [found]}, 200), (silence, 422), ({"impacts": [found]}, 200)]
-    page = visit(live=LIVE, before=lambda page: page.route("**/locate", lambda route: answer(route, *answers.pop(0))))
-    page.click("#tab-find")
-
-    def expect_found(name: str) -> None:
-        page.set_input_files("#sheet-find input[type=file]", upload(name))
-        page.wait_for_selector(f"text={name}: 1 impact")
-        assert page.evaluate("avmsf.painted() !== null && avmsf.studio.view.marks.has('found')")
-
-    def expect_nothing() -> None:
-        assert "1 impact" not in page.inner_text("#sheet-find")
-        assert page.evaluate("avmsf.painted() === null && !avmsf.studio.view.marks.has('found')")
-
-    expect_found("first.wav")
-    page.set_input_files("#sheet-find input[type=file]", upload("noise.wav"))
-    page.wait_for_selector("text=found noise alone")
-    expect_nothing()
-    expect_found("second.wav")
-    page.set_input_files("#sheet-find input[type=file]", upload("table.csv", b"file,x,y,z"))
-    page.wait_for_selector("text=table.csv: expected a WAV file")
-    expect_nothing()
-
-
-def test_all_sliders_have_names(visit: Open) -> None:
-    page = visit(live=LIVE)
-    names = ["Force of a click", "Contact time", "Volume", "Size", "Pitch", "Decay time", "Brightness", "Level"]
-    known = {name: page.get_by_role("slider", name=name, include_hidden=True).count() for name in names}
-    # Of pitch and decay time there is one for all modes and one for a single one.
-    assert known == {**dict.fromkeys(names, 1), "Pitch": 2, "Decay time": 2}
-    assert page.locator("input[type=range]").count() == sum(known.values())

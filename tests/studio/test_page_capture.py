@@ -38,16 +38,6 @@ LOUD_MICROPHONE = """
       }
     };"""
 """One that has to be allowed first, and is overdriven by a tone from the very beginning."""
-GONE = """
-    window.gone = true;
-    window.asked = 0;
-    const add = Worklet.prototype.addModule;
-    Worklet.prototype.addModule = function (address) {
-      if (!String(address).includes("recorder")) return add.call(this, address);
-      window.asked++;
-      return gone ? Promise.reject(new DOMException("gone", "AbortError")) : add.call(this, address);
-    };"""
-"""What a worklet asks for goes past the routes of a test: a server that has no recorder while `gone`."""
 ADDRESSES = """
     window.addresses = new Set();
     const [create, revoke] = [URL.createObjectURL, URL.revokeObjectURL];
@@ -304,29 +294,6 @@ def test_the_outbox_promises_only_what_is_written(visit: Open) -> None:
     }
 
 
-def test_a_blow_is_recorded_without_the_server_and_what_fails_is_said(visit: Open) -> None:
-    def before(page: "Page") -> None:
-        page.add_init_script(LOUD_MICROPHONE + GONE)
-        page.route("**/locate", lambda route: route.abort())
-
-    page = visit(live=LIVE, before=before)
-    assert page.evaluate("asked") == 1, "before a blow is recorded, while the server surely is there"
-    page.click("#tab-find")
-    page.click("#sheet-find >> text=● Record")
-    page.wait_for_selector("text=The recorder could not be loaded")
-    page.wait_for_selector("#sheet-find >> text=● Record")
-    assert page.evaluate("streams[0].getTracks()[0].readyState") == "ended"
-    page.evaluate("gone = false")
-    for number in (1, 2):
-        page.click("#sheet-find >> text=● Record")
-        page.wait_for_selector("text=impact detected")
-        page.click("text=■ Stop")
-        page.wait_for_selector("text=The server does not answer")
-        page.evaluate("document.querySelectorAll('#words .word').forEach((word) => word.remove())")
-        assert page.evaluate(f"streams[{number}].getTracks()[0].readyState") == "ended"
-        page.evaluate("gone = true")
-
-
 def test_a_place_found_on_another_field_is_not_painted_and_searches_do_not_meet(visit: Open) -> None:
     held: list[Route] = []
     asked: list[int] = []
@@ -421,40 +388,3 @@ def test_a_recording_that_the_server_refuses_is_not_offered_to_be_kept(capturing
     page.set_input_files("#sheet-capture input[type=file]", upload())
     page.wait_for_selector("text=Measure again")
     assert keep.is_enabled(), "a server that does not answer has refused nothing"
-
-
-def test_what_the_check_refuses_may_still_be_put_in_place_of_what_it_does_not_know(capturing: Any) -> None:
-    page, server = capturing()
-    strike_once(page)
-    other = {"error": "the recording: expected 48000 Hz as the other strikes, found 16000 Hz"}
-    page.route("**/capture/check", lambda route: answer(route, other, 422))
-    page.click("[aria-label='Record 001.wav again']")
-    page.set_input_files("#sheet-capture input[type=file]", upload())
-    page.wait_for_selector("text=expected 48000 Hz as the other strikes, found 16000 Hz")
-    told = page.inner_text("#sheet-capture .group:has(> .waveform) .warning")
-    assert "cannot be kept" not in told
-    assert "replace 001.wav" in told
-    with page.expect_response("**/capture/strikes/001.wav"):
-        page.click("button:text-is('Replace')")
-    assert server.asked == [("PUT", "001.wav", "d1")]
-
-
-@pytest.mark.parametrize("gone", [None, {"error": "there is nothing at this address"}])
-def test_a_studio_that_was_started_again_is_told_to_be_elsewhere(capturing: Any, gone: dict[str, str] | None) -> None:
-    page, server = capturing()
-    page.mouse.click(*on_screen(page, HERE))
-    page.route("**/capture/**", lambda route: route.abort() if gone is None else answer(route, gone, 404))
-    page.set_input_files("#sheet-capture input[type=file]", upload())
-    page.wait_for_selector("text=Measure again")
-    told = page.inner_text("#sheet-capture .group:has(> .waveform) .warning")
-    assert "prints a new address" in told
-    assert "stored in this browser" in told
-    assert "at the same port" in told, "a browser keeps what it stores by host and port"
-    page.click("text=Save recording")
-    page.wait_for_selector("text=The recording is not lost, and is sent again until the server answers")
-    assert "prints a new address" in words_on(page)
-    assert page.evaluate(STORED) == [[FOLDER, True]]
-    page.unroute("**/capture/**")
-    page.reload()
-    page.wait_for_selector("text=1 impact")
-    assert len(server.strikes) == 1, "a page of the same host and port sends it by itself, for nobody has refused it"

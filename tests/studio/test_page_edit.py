@@ -1,10 +1,7 @@
 """The page changes a field: nothing that a slider says is lost, no other tab's change is overwritten."""
 
-import contextlib
 import json
-import math
-import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,23 +9,17 @@ import numpy as np
 import pytest
 import torch
 
-from avmsf.editing.guided import GuidedEditProgress
 from avmsf.export.sampled_field import SampledField
-from avmsf.field.store import load
-from avmsf.studio.worker import EventWriter
-from opened_plate import open_plate, plate_field
 from page_plate import lay_out, plate_table
 from plate_page import LIVE, Open, Serve, answer, upload, words_on
-from served import Served, served
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Locator, Page, Request, Route
+    from playwright.sync_api import Locator, Page, Request, Route
 
 
 pytestmark = pytest.mark.page
 
 
-KEPT = "the field was changed during the guided edit, whose result was saved to "
 STALE = "expected a change of revision 2, found one of revision 1: another tab has changed the field"
 
 
@@ -46,10 +37,6 @@ class EditServer:
         """Whether answers to edits wait until `let_go`."""
         self.then: Callable[[], None] | None = None
         """What happens once between the next answer and what the page fetches upon it."""
-        self.led: list[GuidedEditProgress] = []
-        """The steps of a lead."""
-        self.beside: str | None = None
-        """The file in which a lead is kept that another tab has forestalled; None where it is what is heard."""
         self._waiting: list[Callable[[], None]] = []
         self._let_go = False
         """Whether a lead's events are told as soon as they are asked for: they may be asked for after `let_go`."""
@@ -121,22 +108,9 @@ class EditServer:
             self.state = ({}, self.state[1])
 
     def _lead(self, route: "Route") -> None:
-        with tempfile.TemporaryFile("w+") as told:
-            for step in self.led:
-                EventWriter(told).guided_edit(step)
-            told.seek(0)
-            steps = told.read().splitlines()
-        if self.beside is None:
-            self.change()
-            last = {"remarks": []}
-        else:
-            last = {"file": self.beside, "remarks": [KEPT + self.beside, "a remark on what the other tab did"]}
-        lines = [*steps, json.dumps({"revision": self.revision, **last})]
-        if self.then is not None:
-            self.then()
-            self.then = None
-        body = "".join(f"data: {line}\n\n" for line in lines)
-        route.fulfill(content_type="text/event-stream", body=body)
+        self.change()
+        last = json.dumps({"revision": self.revision, "remarks": []})
+        route.fulfill(content_type="text/event-stream", body=f"data: {last}\n\n")
 
 
 @pytest.fixture
@@ -223,43 +197,6 @@ def test_an_edit_is_heard_undone_and_saved(edits: Any) -> None:
         ("save", 3),
         ("save", 4),
     ]
-
-
-@contextlib.contextmanager
-def edited_plate(browser: "Browser", home: Path) -> Iterator[tuple["Page", Served]]:
-    """Yield the page's tab of edits with its real server."""
-    with contextlib.ExitStack() as opened:
-        server = opened.enter_context(served(open_plate(home / "home"), home / "scratch"))
-        # The driver waits by evaluating words in the page, which its policy forbids.
-        page = browser.new_context(bypass_csp=True).new_page()
-        opened.callback(page.context.close)
-        visit_edits(page, server)
-        yield page, server
-
-
-def visit_edits(page: "Page", server: Served) -> None:
-    page.goto(f"http://127.0.0.1:{server.port}/{server.token}/")
-    page.evaluate("window.avmsf.ready.then(() => null)")
-    page.click("#tab-edit")
-
-
-def test_what_a_slider_says_when_save_is_clicked_is_saved(browser: "Browser", tmp_path: Path) -> None:
-    with edited_plate(browser, tmp_path) as (page, server):
-        page.fill("#sheet-edit input[aria-label='Name of the new field']", "higher")
-        for _ in range(10):
-            move(page, "Pitch")
-        page.click("text=Save as")
-        page.wait_for_selector("text=Saved:")
-        saved = load(tmp_path / "home" / "higher.safetensors")
-        torch.testing.assert_close(saved.bank.frequency, plate_field().bank.frequency * STEP**10, rtol=1e-6, atol=0)
-        # The new file is what the sliders are relative to from then on, and nothing is sent after it.
-        assert shown(page, "Pitch") == ["× 1.00"]
-        page.wait_for_timeout(400)
-        heard = server.manifest()["live"]
-        assert heard["sliders"]["pitch"] == 1.0
-        assert page.evaluate("avmsf.studio.revision") == heard["revision"]
-        expected = (saved.bank.frequency[saved.audible]).tolist()
-        assert page.evaluate("[...avmsf.studio.bundle.tensors.frequency]") == pytest.approx(expected, rel=1e-9)
 
 
 def test_another_tabs_edit_is_not_overwritten_in_silence(edits: Any) -> None:
@@ -480,33 +417,3 @@ def test_what_an_object_is_of_changes_nothing_by_itself(edits: Any) -> None:
         {"from": "iron", "to": None},
         {"from": "steel", "to": None},
     ]
-
-
-def test_a_lead_says_at_once_that_it_begins_and_at_its_end_what_changed(edits: Any) -> None:
-    page, server = edits()
-    server.led = led_by((math.nan, 1.0), (0.92, 1.01), (0.75, 1.1), (0.31, 1.249), (math.nan, 1.249))
-    page.set_input_files("#sheet-edit input[type=file]", upload())
-    page.wait_for_selector("text=Started")
-    server.let_go()
-    page.wait_for_selector("text=Guided edit finished: pitch × 1.25, loss from 0.92 to 0.31")
-    assert "Undo reverts it" in words_on(page)
-
-
-def led_by(*steps: tuple[float, float]) -> list[GuidedEditProgress]:
-    """Return a descent of these losses, NaN for none, and pitches."""
-    count = len(steps)
-    return [GuidedEditProgress(step, count, *each, 1.0, None) for step, each in enumerate(steps, start=1)]
-
-
-def test_a_lead_that_another_tab_forestalled_is_told_to_be_kept_beside(edits: Any) -> None:
-    page, server = edits()
-    server.led, server.beside = led_by((0.92, 1.01), (0.31, 1.249)), "/home/plate edited.safetensors"
-    page.set_input_files("#sheet-edit input[type=file]", upload())
-    page.wait_for_selector("text=Started")
-    server.change(size=2.0)
-    server.let_go()
-    page.wait_for_selector(f"#words >> text={KEPT}/home/plate edited.safetensors")
-    assert page.evaluate("avmsf.studio.revision") == 2
-    assert shown(page, "Size") == ["× 2.00"]
-    assert "Guided edit finished" not in words_on(page)
-    assert "Undo" not in words_on(page)

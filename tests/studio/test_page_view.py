@@ -126,21 +126,6 @@ def picture(page: "Page") -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"), dtype=float)
 
 
-@pytest.mark.parametrize("kind", ["mesh", "gaussians", "points"])
-def test_paint_is_seen_and_comes_off(visit: Open, kind: str) -> None:
-    page = visit(kind=kind)
-    page.evaluate("document.getElementById('hint').hidden = true")
-    bare = picture(page)
-    page.click("#tab-modes")
-    page.click("tr[data-mode='1']")
-    page.evaluate("document.getElementById('legend').style.visibility = 'hidden'")
-    painted = picture(page)
-    assert (np.abs(painted - bare).max(axis=2) > 40).mean() > 0.02
-    page.evaluate("document.getElementById('unpaint').click()")
-    assert page.evaluate("document.getElementById('legend').hidden")
-    assert (np.abs(picture(page) - bare).max(axis=2) > 40).mean() < 1e-4
-
-
 @pytest.mark.parametrize("kind", ["gaussians", "points"])
 def test_the_surface_is_shown_struck_and_painted_in_the_place_of_the_object(visit: Open, kind: str) -> None:
     page = visit(kind=kind, surface=True)
@@ -175,52 +160,6 @@ def test_the_surface_is_shown_struck_and_painted_in_the_place_of_the_object(visi
     page.click("#other-look")
     page.wait_for_selector("text=Show " + ("Gaussians" if kind == "gaussians" else "points"))
     assert (np.abs(picture(page) - surface).max(axis=2) > 40).mean() < 1e-4
-
-
-def test_without_a_surface_there_is_nothing_to_choose(plain: "Page") -> None:
-    assert plain.is_hidden("#other-look")
-
-
-def test_an_object_that_is_replaced_leaves_nothing(plain: "Page") -> None:
-    """Its geometry, material and textures are given back."""
-    gone = in_module(
-        plain,
-        "objectlayers",
-        """async ({ MeshLayer }, _, three) => {
-          const { PointGrid } = await import(new URL("page/nearest.js", document.baseURI));
-          const map = new three.DataTexture(new Uint8Array(4), 1, 1);
-          const mesh = new three.Mesh(new three.BoxGeometry(), new three.MeshStandardMaterial({ map }));
-          const scene = new three.Group().add(mesh);
-          const layer = new MeshLayer(scene, new PointGrid(Float32Array.of(0, 0, 0, 1, 1, 1)), 0.5);
-          layer.paint(new Uint8Array(6));
-          const gone = [];
-          const parts = { map, geometry: mesh.geometry, material: mesh.material, painted: layer.painted.geometry };
-          for (const [name, part] of Object.entries(parts)) part.addEventListener("dispose", () => gone.push(name));
-          layer.dispose();
-          return gone.sort();
-        }""",
-    )
-    assert gone == ["geometry", "map", "material", "painted"]
-
-
-def test_another_object_bears_no_paint_of_the_last(visit: Open) -> None:
-    page = visit(kind="mesh")
-    page.click("#tab-modes")
-    page.click("tr[data-mode='1']")
-    disposed = page.evaluate(
-        """async () => {
-             const { view, bundle } = avmsf.studio;
-             let disposed = 0;
-             const { dispose } = view.layer;
-             view.layer.dispose = function () { disposed++; dispose.call(this); };
-             const object = { kind: "points", file: null };
-             await view.replace({ ...bundle, manifest: { ...bundle.manifest, object } });
-             return disposed;
-           }"""
-    )
-    assert disposed == 1
-    assert page.evaluate("avmsf.painted()") is None
-    assert page.is_hidden("#legend")
 
 
 def turned(page: "Page") -> bool:
@@ -277,21 +216,6 @@ def test_force_mallet_and_volume_are_heeded(visit: Open) -> None:
     before = page.evaluate("avmsf.studio.engine.level")
     page.locator(".slider", has_text="Volume").locator("input").fill("200")
     assert page.evaluate("avmsf.studio.engine.level") == pytest.approx(4 * before)
-
-
-def test_keys_strike_hardest_with_shift_and_once_when_held(plain: "Page") -> None:
-    page = plain
-    page.click("#look")
-    page.locator("#stage canvas").focus()
-    page.keyboard.press("Shift+Enter")
-    assert page.evaluate("avmsf.studio.last.force") == 10
-    page.evaluate("window.blows = 0; avmsf.studio.addEventListener('struck', () => window.blows++)")
-    for _ in range(5):
-        page.keyboard.down("Enter")
-    page.keyboard.up("Enter")
-    page.keyboard.press("Enter")
-    assert page.evaluate("blows") == 2
-    assert page.evaluate("avmsf.studio.last.force") == 1
 
 
 INKED = """(name) => {

@@ -3,8 +3,6 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import pytest
-
 from avmsf.studio.guard import policy_of
 from avmsf.studio.opening import open_target
 from avmsf.studio.routes import PAGE
@@ -26,9 +24,8 @@ def test_no_script_of_a_network_is_allowed() -> None:
     assert "'unsafe-eval'" not in policy
 
 
-@pytest.mark.parametrize("kind", ["mesh", "gaussians"])
-def test_the_page_needs_no_more_than_it_is_allowed(browser: "Browser", kind: str, tmp_path: Path) -> None:
-    shown = plate_object(kind, tmp_path)
+def test_the_page_needs_no_more_than_it_is_allowed(browser: "Browser", tmp_path: Path) -> None:
+    shown = plate_object("gaussians", tmp_path)
     opened = open_plate(tmp_path / "home")
     with served(open_target(opened.field, object=shown), tmp_path / "scratch") as server:
         context = browser.new_context()

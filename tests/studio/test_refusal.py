@@ -14,7 +14,6 @@ import torch
 from avmsf.errors import LocationError, StudioError
 from avmsf.studio.locate import Finder
 from avmsf.studio.opening import open_target
-from avmsf.studio.responses import echo
 from avmsf.studio.server import serve
 from factories.capture_folder import fill
 from factories.raising import raises
@@ -91,20 +90,6 @@ def test_a_computation_that_leads_nowhere_asks_for_other_values(
     refused(plate.ask("POST", "locate", blow()), 422)
 
 
-def test_recordings_need_no_temporary_folder(capture: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*arguments: object, **options: object) -> str:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr("tempfile.mkdtemp", full)
-    recording = blow(9)
-    assert capture.ask("POST", "capture/check", recording).status == 200
-    added = capture.ask("POST", PLACE, recording)
-    assert added.status == 201
-    assert capture.ask("PUT", f"capture/strikes/{added.words['file']}", blow(8)).status == 200
-    # There is no field to locate on, which is said after the recording was read.
-    refused(capture.ask("POST", "locate", recording), 409)
-
-
 def test_a_full_temporary_folder_is_named_as_the_cause(plate: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*arguments: object, **options: object) -> str:
         raise OSError(errno.ENOSPC, "No space left on device", "/tmp")
@@ -173,20 +158,6 @@ def test_a_file_name_that_is_not_unicode_is_answered(tmp_path: Path) -> None:
 def test_a_body_that_is_no_request_is_refused(plate: Served, place: str, body: bytes) -> None:
     refused(plate.ask("POST", place, body), 400, 409)
     assert plate.manifest()["live"]["revision"] == 1
-
-
-def test_echoes_are_short_and_printable() -> None:
-    deep: Any = []
-    for _ in range(100_000):
-        deep = [deep]
-    values = (deep, "x" * 10**6, ["y" * 1000] * 1000, {str(k): k for k in range(10_000)}, 10**4000, "\ud800\x1b[2J")
-    for value in values:
-        assert len(echo(value)) <= 100
-        assert echo(value).isprintable()
-        echo(value).encode()
-    assert echo("pitch") == "'pitch'"
-    while deep:  # else freeing it would itself be a recursion
-        deep = deep.pop()
 
 
 @pytest.mark.parametrize(

@@ -154,12 +154,6 @@ def test_blows_overlap_from_the_very_sample_on_at_which_they_begin(page: "Page",
     assert error(heard(page, blows), together(table, places, table.samples)) < 1e-6
 
 
-def test_sixty_four_blows_sound_at_once(page: "Page", table: SampledField) -> None:
-    places = [(number % 6, 1.0 + number / 64, 400 * number) for number in range(64)]
-    blows = [{"row": row, "force": force, "when": frame / RATE} for row, force, frame in places]
-    assert error(heard(page, blows), together(table, places, table.samples)) < 1e-6
-
-
 @pytest.mark.parametrize("rate", [11_025.0, 44_100.0])
 def test_modes_are_the_same_at_any_sample_rate(page: "Page", table: SampledField, rate: float) -> None:
     samples = round(rate)
@@ -321,8 +315,8 @@ def limited(page: "Page", *pieces: Any, ahead: int = 24) -> list[tuple[np.ndarra
 @pytest.mark.parametrize("ahead", [0, 24])
 def test_the_limiter_leaves_alone_what_fits_and_holds_the_rest(any_page: "Page", ahead: int) -> None:
     """Late by what it looks ahead; nothing else is changed, down to the last bit, before and after it was at work."""
-    time = np.arange(3 * 16_000)
-    quiet, loud = 0.96 * np.sin(time / 7), 30 * np.sin(time[:16_000] / 7)
+    time = np.arange(2 * 16_000)
+    quiet, loud = 0.96 * np.sin(time / 7), 30 * np.sin(time[:4000] / 7)
     (first, worked), (held, at_work), (last, _) = limited(
         any_page, quiet.tolist(), loud.tolist(), quiet.tolist(), ahead=ahead
     )
@@ -332,7 +326,7 @@ def test_the_limiter_leaves_alone_what_fits_and_holds_the_rest(any_page: "Page",
     assert at_work
     assert np.abs(held).max() < 0.98 + 1e-12
     assert np.abs(held[-200:]).max() > 0.9
-    np.testing.assert_array_equal(last[-16_000:], quiet[-16_000 - ahead : len(quiet) - ahead])
+    np.testing.assert_array_equal(last[-8000:], quiet[-8000 - ahead : len(quiet) - ahead])
 
 
 def test_a_loud_attack_keeps_its_shape(any_page: "Page") -> None:
@@ -377,19 +371,6 @@ def test_blows_in_quick_succession_cost_no_more_than_may_sound_at_once(page: "Pa
         np.testing.assert_allclose(found["sound"], expected, rtol=0, atol=0.0121)
 
 
-def test_the_page_is_told_when_a_sound_is_turned_down(any_page: "Page") -> None:
-    any_page.evaluate("""SoundEngine.start(bundle).then((engine) => {
-      window.engine = engine;
-      window.told = [];
-      engine.onlimited = (limited) => told.push(limited);
-      addEventListener("pointerdown", () => engine.strike(0, { force: 40 }), { once: true });
-    })""")
-    any_page.mouse.click(5, 5)
-    any_page.wait_for_function("told.length === 2")
-    assert any_page.evaluate("told") == [True, False]
-    any_page.evaluate("engine.close()")
-
-
 def test_volume_and_recordings_are_heard(any_page: "Page") -> None:
     """A recording of ones leaves at the level of the blows, and at half of it once the volume is halved."""
     levels = any_page.evaluate(
@@ -412,14 +393,13 @@ def test_volume_and_recordings_are_heard(any_page: "Page") -> None:
     assert levels == pytest.approx([0.5, 0.5, 0.25, 0.25], rel=1e-5)
 
 
-@pytest.mark.parametrize("state", ["suspended", "interrupted"])
-def test_a_sound_that_the_browser_holds_back_is_asked_for_and_told(any_page: "Page", state: str) -> None:
+def test_a_sound_that_the_browser_holds_back_is_asked_for_and_told(any_page: "Page") -> None:
     """Safari calls it interrupted after a telephone call, and does not resume by itself."""
     found = any_page.evaluate(
-        """async (state) => {
+        """async () => {
              const engine = await SoundEngine.start(bundle);
              let asked = 0;
-             Object.defineProperty(engine.context, "state", { value: state, configurable: true });
+             Object.defineProperty(engine.context, "state", { value: "interrupted", configurable: true });
              engine.context.resume = async () => { asked++; };
              const held = new Promise((resolve) => { engine.onheld = resolve; });
              engine.strike(0);
@@ -431,8 +411,7 @@ def test_a_sound_that_the_browser_holds_back_is_asked_for_and_told(any_page: "Pa
              delete engine.context.state;
              engine.close();
              return [asked, first, then];
-           }""",
-        state,
+           }"""
     )
     assert found == [1, True, False]
 
@@ -513,20 +492,6 @@ def test_a_damaged_bundle_is_told(any_page: "Page", change: dict[str, Any], word
     any_page.unroute("**/manifest.json")
     any_page.unroute("**/odd.bin")
     assert words in said
-
-
-def test_half_precision_is_read(any_page: "Page") -> None:
-    halves = np.array([0.0, 1.0, -2.5, 6.1e-5, 1e-7, 65504.0, 0.333], dtype="<f2")
-    manifest = {
-        "format": 1,
-        "tensors": {"sine": {"file": "half.bin", "offset": 0, "dtype": "float16", "shape": [len(halves)]}},
-    }
-    any_page.route("**/manifest.json", lambda route: route.fulfill(json=manifest))
-    any_page.route("**/half.bin", lambda route: route.fulfill(body=halves.tobytes()))
-    found = any_page.evaluate("loadBundle().then(({ tensors }) => Array.from(tensors.sine))")
-    any_page.unroute("**/manifest.json")
-    any_page.unroute("**/half.bin")
-    assert found == halves.astype(np.float64).tolist()
 
 
 def test_a_page_in_one_file_sounds_the_same_from_a_disk(

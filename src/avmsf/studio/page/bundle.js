@@ -48,22 +48,15 @@ async function fetched(name, base) {
 
 function readTensor(buffer, offset, dtype, shape, what) {
   const count = shape.reduce((product, size) => product * size, 1);
-  const bytes = { float64: 8, float32: 4, float16: 2 }[dtype];
-  if (bytes === undefined) throw new Error(`${what} has the unknown type ${dtype}`);
+  const kind = ARRAYS[dtype];
+  if (kind === undefined) throw new Error(`${what} has the unknown type ${dtype}`);
+  const bytes = kind.BYTES_PER_ELEMENT;
   if (offset + count * bytes > buffer.byteLength)
     throw new Error(`${what}: expected ${offset + count * bytes} bytes, got ${buffer.byteLength}; export the page again`);
-  const tensor = dtype === "float16"
-    ? Float32Array.from(new Uint16Array(buffer, offset, count), halfToNumber) : new ARRAYS[dtype](buffer, offset, count);
+  const tensor = new kind(buffer, offset, count);
   for (let place = 0; place < count; place++) {
     if (!Number.isFinite(tensor[place]))
       throw new Error(`${what}: expected numbers, got ${tensor[place]} at index ${place}; export the page again`);
   }
   return tensor;
-}
-
-function halfToNumber(bits) {
-  const sign = bits & 0x8000 ? -1 : 1, exponent = (bits >> 10) & 31, fraction = bits & 1023;
-  if (exponent === 0) return sign * fraction * 2 ** -24;
-  if (exponent === 31) return fraction ? NaN : sign * Infinity;
-  return sign * (1 + fraction / 1024) * 2 ** (exponent - 15);
 }
