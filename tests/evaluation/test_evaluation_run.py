@@ -277,7 +277,7 @@ def test_a_hidden_part_that_a_kill_left_is_no_other_thing(tmp_path: Path) -> Non
     assert ResultsFolder(tmp_path).identity() == {"protocol": "farthest", "methods": {}}
 
 
-def test_a_stranger_is_another_object_at_this_ones_rate_and_length(plates: Path) -> None:
+def test_another_recording_is_of_another_object_at_this_ones_rate_and_length(plates: Path) -> None:
     dataset = CaptureCollection(plates)
     train = read_capture(plates / "a").impacts
     drawn = draw_other_recording(dataset, "a", train, seed=3)
