@@ -11,8 +11,8 @@ import io
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import takewhile
@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 import soundfile
 
-from avmsf._utils.files import write_whole
+from avmsf._utils.files import copy_whole, write_whole
 from avmsf._utils.locks import write_lock
 from avmsf._utils.text import counted
 from avmsf.capture.audio import Recording, SoundBytes, decode_recording, read_recording
-from avmsf.capture.check import CaptureReport, check
+from avmsf.capture.check import check
 from avmsf.capture.measure import RecordingReport, measure
 from avmsf.capture.prepare import prepare
 from avmsf.capture.settings import CaptureSettings, settings_of
@@ -42,9 +42,9 @@ from avmsf.capture.table import (
     read_cells,
     read_rows,
 )
-from avmsf.errors import AvmsfError, CaptureError, FolderInUseError, RecordingLengthError
+from avmsf.errors import AvmsfError, CaptureError
 from avmsf.pipeline.config import CACHE
-from avmsf.studio.responses import RequestError, bad_request
+from avmsf.studio.responses import bad_request
 
 COMMAND = "avmsf studio"
 """What other processes wait for, in their messages."""
@@ -100,16 +100,13 @@ def _finite(query: Mapping[str, str], name: str) -> float:
     return value
 
 
-def read_upload(content: bytes, *, name: str = "the recording") -> Recording:
+def read_upload(content: bytes) -> Recording:
     """Return a recording that the page has sent.
 
-    Raises CaptureError for a file that is no sound, and RequestError (413) for one of excessive length: compressed
-    silence of hours takes a few bytes.
+    Raises CaptureError for a file that is no sound, and for one of excessive length: compressed silence of hours takes
+    a few bytes.
     """
-    try:
-        return decode_recording(SoundBytes(content), name)
-    except RecordingLengthError as error:
-        raise RequestError(413, str(error), **error.attributes) from error
+    return decode_recording(SoundBytes(content), "the recording")
 
 
 class ImpactTable:
@@ -209,7 +206,7 @@ class CaptureEditor:
         problems: list[str] = []
         ready = False
         if len(impacts) >= 2:
-            report = _checked(self.folder, tuple(_states(self.folder)), settings)
+            report = check(self.folder, settings)
             problems, ready = list(report.problems), report.readable and all(each["readable"] for each in impacts)
         return {"folder": str(self.folder), "strikes": impacts, "problems": problems, "ready": ready}
 
@@ -218,13 +215,10 @@ class CaptureEditor:
         settings = self.settings
         found = []
         for row in ImpactTable(self.folder).rows:
-            try:
+            with suppress(AvmsfError):
                 impact = parse_row(row, settings)
-                present = self._readable(impact.file).is_file()
-            except AvmsfError:
-                continue
-            if present:
-                found.append(impact)
+                if self._readable(impact.file).is_file():
+                    found.append(impact)
         return found
 
     def check(self, content: bytes) -> dict[str, Any]:
@@ -241,7 +235,9 @@ class CaptureEditor:
             digest = hashlib.sha256(content).hexdigest()
             for index, row in enumerate(table.rows):
                 impact = self._described(index, row, settings)
-                if impact["digest"] == digest and _same(impact["contact"], contact.point):
+                # Equal but for the conversion of units.
+                same_place = impact["contact"] and math.dist(impact["contact"], contact.point) < 1e-9
+                if impact["digest"] == digest and same_place:
                     return impact
             recording = read_upload(content)
             self._check_usable(recording, newtons=contact.newtons)
@@ -291,20 +287,13 @@ class CaptureEditor:
             table.remove(index)
             (self.folder / file).unlink(missing_ok=True)
 
-    @contextmanager
-    def _lock(self) -> Iterator[None]:
+    def _lock(self) -> AbstractContextManager[None]:
         """Lock the table and the recordings against other studios.
 
-        Raises RequestError (503) if another one holds the lock for long; the page then sends the recording again.
+        Raises FolderInUseError if another one holds the lock for long; the page then sends the recording again.
         """
-        with ExitStack() as held:
-            try:
-                lock = write_lock(self.folder / CACHE, "capture", command=COMMAND, wait=_LOCK_TIMEOUT_SECONDS)
-                held.enter_context(lock)
-            except FolderInUseError as error:
-                message = f"{error}, and try again; nothing was changed"
-                raise RequestError(503, message, file=error.file, value=error.value) from error
-            yield
+        wait = _LOCK_TIMEOUT_SECONDS
+        return write_lock(self.folder / CACHE, "capture", command=COMMAND, wait=wait, advice=", and try again")
 
     def _described(self, index: int, row: Row, settings: CaptureSettings) -> dict[str, Any]:
         values: dict[str, Any] = {"row": index, "file": file_of(row), "contact": None, "direction": None}
@@ -336,14 +325,9 @@ class CaptureEditor:
         indices = table.rows_of(file)
         lines = [table.rows[index].line for index in indices]
         if len(lines) > 1:
-            raise RequestError(
-                409,
-                f"{TABLE}, rows {', '.join(map(str, lines))}: expected one row of {file}, got {len(lines)}; correct "
-                "the table",
-                file=TABLE,
-                row=lines[1],
-                name=file,
-                value=lines,
+            got = f"rows {', '.join(map(str, lines))}"
+            raise bad_request(
+                file, f"one row of {file}", lines, got=got, advice="correct the table", status=409, file=TABLE
             )
         path = self.folder / file
         if path.resolve() != path:
@@ -374,13 +358,10 @@ class CaptureEditor:
         prepared = prepare(recording, settings, newtons=newtons)
         report = measure(recording, prepared, settings=settings, line=0)
         rates = []
-        for row in ImpactTable(self.folder).rows:
-            if file_of(row) != replaced:
-                try:
-                    with soundfile.SoundFile(self._readable(parse_row(row, settings).file)) as other:
-                        rates.append(float(other.samplerate))
-                except (AvmsfError, soundfile.LibsndfileError, OSError):
-                    continue
+        for impact in self.impacts():
+            with suppress(soundfile.LibsndfileError, OSError):
+                if impact.file != replaced:
+                    rates.append(float(soundfile.info(self.folder / impact.file).samplerate))
         common_rate = max(set(rates), key=rates.count) if rates else recording.sample_rate
         if recording.sample_rate != common_rate:
             wanted = f"{common_rate:g} Hz, as in the {counted(len(rates), 'recording')} before"
@@ -405,25 +386,12 @@ class CaptureEditor:
         write_whole(self.folder / file, lambda path: path.write_bytes(content), raising=CaptureError)
 
     def _set_aside(self, file: str) -> None:
-        """Keep a recording in the cache too: by a hard link, which needs no space, or as a copy."""
+        """Keep a copy of a recording in the cache."""
         path = self.folder / file
-        if not path.is_file():
-            return
-        content = path.read_bytes()
-        digest = hashlib.sha256(content).hexdigest()[:12]
-        saved = self.folder / CACHE / REMOVED / f"{path.stem}-{digest}{path.suffix}"
-        if saved.is_file():
-            return
-        try:
-            saved.parent.mkdir(parents=True, exist_ok=True)
-            os.link(path, saved)
-        except OSError:
-            write_whole(saved, lambda path: path.write_bytes(content), raising=CaptureError)
-
-
-def _same(one: tuple[float, ...] | None, other: tuple[float, ...]) -> bool:
-    """Whether two contacts are equal but for the conversion of units."""
-    return one is not None and math.dist(one, other) < 1e-9
+        if path.is_file():
+            digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+            saved = self.folder / CACHE / REMOVED / f"{path.stem}-{digest}{path.suffix}"
+            copy_whole(path, saved, raising=CaptureError)
 
 
 def _plain(report: RecordingReport) -> dict[str, Any]:
@@ -442,12 +410,6 @@ def _measured(path: Path, state: object, impact: Strike, settings: CaptureSettin
     return report, hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-@lru_cache(maxsize=1)
-def _checked(folder: Path, states: object, settings: CaptureSettings) -> CaptureReport:
-    """Return the report on the folder, for which every recording is read once more."""
-    return check(folder, settings)
-
-
 def _state(path: Path) -> tuple[int, int, int] | None:
     """Return what changes where a file does; None for none."""
     try:
@@ -455,10 +417,3 @@ def _state(path: Path) -> tuple[int, int, int] | None:
     except OSError:
         return None
     return state.st_mtime_ns, state.st_size, state.st_ino
-
-
-def _states(folder: Path) -> Iterator[tuple[str, object]]:
-    """Yield the states of all files of a folder but those of hidden ones, which are not the capture's."""
-    for parent, folders, names in os.walk(folder):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        yield from ((os.path.join(parent, name), _state(Path(parent, name))) for name in sorted(names))

@@ -11,12 +11,12 @@ import torch
 from starlette.responses import JSONResponse
 
 from avmsf._utils.files import way_out
-from avmsf.errors import AvmsfError, StudioError, lacks_memory
+from avmsf.errors import AvmsfError, FolderInUseError, RecordingLengthError, StudioError, lacks_memory
 
 UNUSABLE = 422
 """Status of what was understood and cannot be used, as a recording of silence."""
-
-
+_STATUSES: Mapping[type[AvmsfError], int] = {FolderInUseError: 503, RecordingLengthError: 413}
+"""Other statuses of errors that are no `RequestError`."""
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 NUMERIC_ERRORS = (ValueError, ArithmeticError, torch.linalg.LinAlgError)  # type: ignore[attr-defined]
 """Errors of edits and searches for valid numbers that give no result."""
@@ -57,8 +57,9 @@ class Answer(JSONResponse):
 
 def response_to(error: AvmsfError) -> Answer:
     """Return the response: the error's message, and the `more` of a `RequestError`."""
-    status = error.status if isinstance(error, RequestError) else UNUSABLE
-    more = error.more if isinstance(error, RequestError) else {}
+    status, more = _STATUSES.get(type(error), UNUSABLE), dict[str, Any]()
+    if isinstance(error, RequestError):
+        status, more = error.status, dict(error.more)
     return Answer({"error": " ".join(str(error).split()), **more}, status)
 
 
