@@ -81,13 +81,12 @@ def test_strikes_are_heard_as_they_were_recorded(tmp_path: Path) -> None:
     sounds = 3.0 * torch.randn(2, 500, generator=torch.Generator().manual_seed(0))
     contacts = torch.tensor([[0.1, 0.0, 0.0], [0.0, 0.1, 0.0]], dtype=torch.float64)
     strikes = Impacts(contacts, sounds, RATE, ("a.wav", "../b.wav"), directions=-contacts.float() * 10)
-    make_bundle(struck_table(shared=True), strikes=strikes, live={"revision": 1}).write(tmp_path / "page")
+    make_bundle(struck_table(shared=True), strikes=strikes).write(tmp_path / "page")
     manifest = json.loads((tmp_path / "page" / "manifest.json").read_text())
     assert [each["name"] for each in manifest["strikes"]] == ["a.wav", "../b.wav"]
     assert [each["sound"] for each in manifest["strikes"]] == ["strikes/001.wav", "strikes/002.wav"]
     assert manifest["strikes"][1]["contact"] == [0.0, 0.1, 0.0]
     assert manifest["strikes"][1]["direction"] == [0.0, -1.0, 0.0]
-    assert manifest["live"] == {"revision": 1}
     for row, each in enumerate(manifest["strikes"]):
         sound, rate = soundfile.read(tmp_path / "page" / each["sound"], dtype="float32")
         assert rate == RATE

@@ -2,6 +2,7 @@
 
 import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -80,9 +81,10 @@ def plate_object(kind: str, folder: Path) -> Path | None:
     return path
 
 
-def lay_out(folder: Path, table: SampledField, **bundle: Any) -> Path:
-    """Write the page with a field."""
-    make_bundle(table, **bundle).write(folder)
+def lay_out(folder: Path, table: SampledField, *, live: dict[str, Any] | None = None, **bundle: Any) -> Path:
+    """Write the page with a field, and with what a server would tell of itself."""
+    made = make_bundle(table, **bundle)
+    replace(made, manifest={**made.manifest, "live": live}).write(folder)
     shutil.copy(PAGE / "index.html", folder)
     shutil.copytree(PAGE, folder / "page")
     return folder

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.page
 WATCH = "window.refused = []; addEventListener('securitypolicyviolation', (e) => refused.push(e.violatedDirective));"
 
 
-@pytest.mark.parametrize(("kind", "name"), [("mesh", "page.html"), ("gaussians", "page.html"), ("mesh", "folder")])
+@pytest.mark.parametrize(("kind", "name"), [("gaussians", "page.html"), ("mesh", "folder")])
 def test_a_page_shows_and_plays_the_object_without_a_network(
     browser: "Browser", kind: str, name: str, tmp_path: Path, serve: Callable[[Path], str]
 ) -> None:

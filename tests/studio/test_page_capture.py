@@ -346,31 +346,6 @@ def test_a_place_found_on_another_field_is_not_painted_and_searches_do_not_meet(
     page.wait_for_selector("text=late.wav: 1 impact")
 
 
-def test_a_file_that_is_no_recording_ends_the_search_before_it(visit: Open) -> None:
-    held: list[Route] = []
-    page = visit(live=LIVE, before=lambda page: page.route("**/locate", lambda route: held.append(route)))
-    page.click("#tab-find")
-    busy = "#sheet-find progress"
-    for outcome in ({"impacts": []}, {"error": "found noise alone"}):
-        page.set_input_files("#sheet-find input[type=file]", upload("older.wav"))
-        page.wait_for_selector(busy)
-        page.set_input_files("#sheet-find input[type=file]", upload("table.csv", b"file,x,y,z"))
-        page.wait_for_selector("text=table.csv: expected a WAV file")
-        assert page.is_hidden(busy), "nothing is looked for any more"
-        with page.expect_response("**/locate"):
-            answer(held.pop(), outcome, 422 if "error" in outcome else 200)
-        page.wait_for_timeout(200)
-        assert "older.wav" not in page.inner_text("#sheet-find")
-        assert "table.csv: expected a WAV file" in words_on(page), "the last word is on the last file"
-        assert "noise alone" not in words_on(page)
-    page.set_input_files("#sheet-find input[type=file]", upload("newer.wav"))
-    page.wait_for_selector(busy)
-    page.wait_for_timeout(100)
-    answer(held.pop(), {"impacts": []})
-    page.wait_for_selector("text=No impact detected")
-    assert "newer.wav" in page.inner_text("#sheet-find")
-
-
 def test_a_recording_that_the_server_refuses_is_not_offered_to_be_kept(capturing: Any) -> None:
     page, _ = capturing()
     silent = {"error": "the recording: expected a blow, found silence: record it again"}

@@ -57,15 +57,14 @@ def make_bundle(
     surface: Path | Surface | None = None,
     strikes: Impacts | None = None,
     limit: int = MAX_POINTS,
-    live: Mapping[str, Any] | None = None,
     mute: bool = False,
 ) -> Bundle:
     """Return a field's bundle at `limit` contacts at most.
 
     `object` is the geometry to show: a mesh with coordinates in units of `meters`, Gaussians, or by default the
     contacts. `surface`, in meters, is an alternative to switch to, such as the surface of the field's body. `strikes`
-    are recorded impacts for comparison, `live` describes the server of the page. A field without modes is allowed if
-    `mute`, for an object that is not recorded yet. Raises `ExportError`.
+    are recorded impacts for comparison. A field without modes is allowed if `mute`, for an object that is not recorded
+    yet. Raises `ExportError`.
     """
     remarks: tuple[str, ...] = ()
     if isinstance(field, SoundField):
@@ -87,7 +86,7 @@ def make_bundle(
     if other.kind == "mesh":
         files[SURFACE] = other.content
     records, sounds = _strikes(strikes, sampled)
-    manifest = _manifest(sampled, tensors, shown, records, live)
+    manifest = _manifest(sampled, tensors, shown, records)
     manifest["surface"] = {"kind": "mesh", "file": SURFACE} if SURFACE in files else None
     return Bundle(manifest, {**files, **sounds}, remarks + shown.remarks + other.remarks)
 
@@ -135,11 +134,7 @@ def _strikes(strikes: Impacts | None, field: SampledField) -> tuple[list[dict[st
 
 
 def _manifest(
-    field: SampledField,
-    tensors: dict[str, Any],
-    shown: ObjectFile,
-    strikes: list[dict[str, Any]],
-    live: Mapping[str, Any] | None,
+    field: SampledField, tensors: dict[str, Any], shown: ObjectFile, strikes: list[dict[str, Any]]
 ) -> dict[str, Any]:
     return {
         "format": FORMAT,
@@ -155,5 +150,5 @@ def _manifest(
         "tensors": tensors,
         "object": {"kind": shown.kind, "file": shown.name},
         "strikes": strikes,
-        "live": None if live is None else dict(live),
+        "live": None,
     }

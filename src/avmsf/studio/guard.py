@@ -146,13 +146,13 @@ def contained(folder: Path, name: str) -> Path:
     return path
 
 
-async def read_json_object(request: Request, *, largest: int = MAX_JSON_BYTES) -> dict[str, object]:
-    """Return the JSON object of a request. Raises RequestError for other content, and for more than `largest` bytes."""
+async def read_json_object(request: Request) -> dict[str, object]:
+    """Return a request's JSON object. Raises RequestError for other content, and above `MAX_JSON_BYTES`."""
     body = bytearray()
     async for part in request.stream():
         body += part
-        if len(body) > largest:
-            raise too_large(largest)
+        if len(body) > MAX_JSON_BYTES:
+            raise too_large(MAX_JSON_BYTES)
     try:
         words = parse_json(body.decode())
     except ValueError as error:

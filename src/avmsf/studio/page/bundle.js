@@ -6,9 +6,9 @@ let live = false;
 const ARRAYS = { float64: Float64Array, float32: Float32Array };
 
 /** Return the URL of one of the page's files. A page that is one file carries them in `avmsfInlined`, as base64. */
-export function fileUrl(name, { base = document.baseURI } = {}) {
+function fileUrl(name) {
   const inlined = globalThis.avmsfInlined?.[name];
-  if (inlined === undefined) return new URL(name, base).href;
+  if (inlined === undefined) return new URL(name, document.baseURI).href;
   if (inlined.url === undefined) {
     const bytes = Uint8Array.from(atob(inlined.base64), (letter) => letter.charCodeAt(0));
     inlined.url = URL.createObjectURL(new Blob([bytes], { type: inlined.type }));
@@ -21,24 +21,24 @@ export function fileUrl(name, { base = document.baseURI } = {}) {
  * Return {manifest, tensors, url(file)}: tensors by name (points, normals, frequency, damping, sine, cosine, noise) as
  * flat arrays, row by row; `url` gives the address of a file that the manifest names. Throws with words for the reader.
  */
-export async function loadBundle({ base = document.baseURI } = {}) {
-  const manifest = await (await fetched("manifest.json", base)).json();
+export async function loadBundle() {
+  const manifest = await (await fetched("manifest.json")).json();
   if (manifest.format !== FORMAT)
     throw new Error(`expected a field of format ${FORMAT}, got ${manifest.format}; export it again with this version`);
   live = Boolean(manifest.live);
   const files = {};
   const tensors = {};
   for (const [name, { file, offset, dtype, shape }] of Object.entries(manifest.tensors)) {
-    files[file] ??= await (await fetched(file, base)).arrayBuffer();
+    files[file] ??= await (await fetched(file)).arrayBuffer();
     tensors[name] = readTensor(files[file], offset, dtype, shape, `${file}: ${name}`);
   }
   // Modes that all start as sines have no cosines to send.
   tensors.cosine ??= new Float32Array(tensors.sine.length);
-  return { manifest, tensors, url: (file) => fileUrl(file, { base }) };
+  return { manifest, tensors, url: fileUrl };
 }
 
-async function fetched(name, base) {
-  const response = await fetch(fileUrl(name, { base }), { cache: "no-cache" }).catch(() => null);
+async function fetched(name) {
+  const response = await fetch(fileUrl(name), { cache: "no-cache" }).catch(() => null);
   if (response?.ok) return response;
   const moved = "a restarted studio prints a new address: open it";
   if (response === null)

@@ -73,7 +73,7 @@ export function strikeSheet(studio) {
     element(
       "div",
       { className: "row" },
-      button("Strike again", () => studio.strike(studio.row ?? studio.modes.loudestRow)),
+      button("Strike again", () => studio.strikeAgain()),
       button("Strike at random", () => studio.strike(Math.floor(Math.random() * studio.modes.points))),
     ),
     measuredStrikes(studio),
