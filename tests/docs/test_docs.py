@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import inspect
+import json
 import pkgutil
 import re
 import shlex
@@ -76,3 +77,11 @@ def test_every_link_of_the_docs_leads_to_a_file_and_a_heading(page: Path) -> Non
         target = (page.parent / path).resolve() if path else page
         assert target.exists(), link
         assert not anchor or anchor in _anchors(target), link
+
+
+def test_the_notebook_is_stored_without_outputs() -> None:
+    """`make docs` executes it."""
+    notebook = json.loads((REPOSITORY / "docs" / "tutorials" / "quickstart.ipynb").read_text())
+    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert cells
+    assert all(not cell["outputs"] and cell["execution_count"] is None for cell in cells)
