@@ -55,6 +55,8 @@ def test_one_capture_and_one_object_will_do(plates: Path, tmp_path: Path, monkey
     assert run(parse(["shots", str(plates / "a"), *CHEAP])) == 0
     summary = json.loads((tmp_path / "evaluation" / "a" / "shots" / "summary.json").read_text())
     assert list(summary["cases"]) == ["8 shots", "4 shots", "2 shots", "1 shot"]
+    assert run(parse(["shots", str(plates / "a"), *CHEAP, "--counts", "3", "--starts", "2", "--output", "three"])) == 0
+    assert list(json.loads((tmp_path / "three" / "summary.json").read_text())["cases"]) == ["3 shots"]
     assert run(parse(["farthest", str(plates), "--objects", "b", *CHEAP])) == 0
     summary = json.loads((tmp_path / "evaluation" / "plates" / "farthest" / "summary.json").read_text())
     assert summary["objects"] == 1
@@ -83,10 +85,9 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("protocol", ["shots", "learning-curve"])
-def test_files_are_of_one_set_of_training_recordings(protocol: str, plates: Path, tmp_path: Path) -> None:
+def test_files_are_of_one_set_of_training_recordings(plates: Path, tmp_path: Path) -> None:
     method = f"recorded:{plates}"
-    options = parse([protocol, str(plates), "--methods", f"knn3,{method}", "--output", str(tmp_path / "results")])
+    options = parse(["shots", str(plates), "--methods", f"knn3,{method}", "--output", str(tmp_path / "results")])
     with raises(EvaluationError, name="method", value=method):
         options.check_inputs()
     parse(["closest", str(plates), "--methods", method]).check_inputs()

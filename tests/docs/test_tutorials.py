@@ -28,7 +28,7 @@ SMALL = {
         *("--gain-model", "smooth", "--modes", "8", "--steps", "4"),
     ),
     "evaluate": ("--modes", "8"),
-    "evaluate learning-curve": ("--methods", "knn3", "--counts", "3", "--starts", "1", "--modes", "8"),
+    "evaluate shots": ("--methods", "knn3", "--counts", "3", "--starts", "1", "--modes", "8"),
 }
 """For each verb, settings that take seconds; the pages' own take minutes."""
 LONG = ("avmsf simulate", "avmsf fit scan")

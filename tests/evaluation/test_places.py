@@ -11,7 +11,7 @@ from avmsf.capture import CaptureSettings, read_capture
 from avmsf.capture.impacts import Impacts
 from avmsf.cli.scores import parts_words
 from avmsf.errors import CaptureWarning, EvaluationError
-from avmsf.evaluation.cases import Choosing, Closest, Farthest, Growing, LeaveOneOut, Places, Shots
+from avmsf.evaluation.cases import Choosing, Closest, Farthest, LeaveOneOut, Places, Shots
 from avmsf.evaluation.splits import split
 from factories.raising import raises
 
@@ -41,9 +41,7 @@ def test_a_fraction_is_of_places(times: int) -> None:
 
 
 @pytest.mark.parametrize("apart", [0.0, 0.002])
-@pytest.mark.parametrize(
-    "choosing", [Farthest(), Closest(), LeaveOneOut(), Shots(), Growing()], ids=lambda each: type(each).__name__
-)
+@pytest.mark.parametrize("choosing", [Farthest(), Closest(), LeaveOneOut(), Shots(), Shots((3, 2), starts=2)], ids=repr)
 def test_repeats_measured_again_stay_on_one_side(choosing: Choosing, apart: float) -> None:
     impacts = repeated(apart=apart)
     found = [(case.label, case.train, case.test) for case in choosing.cases(impacts)]

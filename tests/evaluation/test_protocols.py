@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import pytest
 import torch
@@ -96,6 +97,24 @@ def test_shots_are_nested_and_judged_by_the_same_contacts() -> None:
 
 def test_shots_that_an_object_has_no_contacts_for_are_left_out() -> None:
     assert [case.label for case in Shots().cases(struck(5))] == ["4 shots", "2 shots", "1 shot"]
+
+
+def test_shots_from_several_starts_have_test_contacts_of_their_own() -> None:
+    impacts = struck(20)
+    cases = Shots((6, 3), starts=2).cases(impacts)
+    assert len({case.key for case in cases}) == 4
+    for first, own in ((0, cases[:2]), (10, cases[2:])):
+        assert {case.fold for case in own} == {f"from {impacts.names[first]}"}
+        assert own[0].train[0] == own[1].train[0] == first
+        assert own[0].test == own[1].test == tuple(sorted(set(range(20)) - set(own[0].train)))
+
+
+@pytest.mark.parametrize(
+    ("settings", "name", "value"), [({"counts": (0, 3)}, "counts", [0, 3]), ({"starts": 0}, "starts", 0)]
+)
+def test_shots_that_mean_nothing_are_refused(settings: dict[str, Any], name: str, value: object) -> None:
+    with raises(EvaluationError, name=name, value=value):
+        Shots(**settings)
 
 
 def test_fewer_views_change_nothing_but_the_views() -> None:

@@ -47,7 +47,7 @@ RENAMED = {
     "reconstruct": "fit",
     "view-cloud": "info",
     "show": "info",
-    "efficiency": "evaluate learning-curve",
+    "efficiency": "evaluate shots",
     "help": "--help",
     "version": "--version",
     "-V": "--version",

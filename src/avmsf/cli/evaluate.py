@@ -13,30 +13,28 @@ from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf._utils.text import counted
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.options.evaluate import Options, words_of
-from avmsf.cli.printing import console, decimals, next_command, next_step, print_json, say, table
+from avmsf.cli.printing import console, next_command, next_step, print_json, say, table
 from avmsf.cli.progress import ProgressBar
 from avmsf.datasets import CaptureCollection, open_dataset
 from avmsf.datasets.dataset import Dataset
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.cases import Growing, Predefined
+from avmsf.evaluation.cases import Predefined, Shots
 from avmsf.evaluation.field_methods import configured
 from avmsf.evaluation.methods import RecordedMethod, method_named
 from avmsf.evaluation.objects import SUBSETS, ObjectBodies, ObjectFeatures, choose_objects, members
 from avmsf.evaluation.parallel import RunProgress, Workers, run_objects
-from avmsf.evaluation.protocols import LEARNING_CURVE, PREDEFINED, PUBLISHED, EvaluationProtocol, protocol_named
+from avmsf.evaluation.protocols import PREDEFINED, PUBLISHED, SHOTS, EvaluationProtocol, protocol_named
 from avmsf.evaluation.report import PAGE, SUMMARY, TABLES, write_figures, write_page, write_summary
 from avmsf.evaluation.report_tables import Section
-from avmsf.evaluation.results import IDENTITY, ResultsFolder, write_json
+from avmsf.evaluation.results import IDENTITY, ResultsFolder
 from avmsf.evaluation.runner import Evaluation
 from avmsf.evaluation.splits import MetricSettings
-from avmsf.evaluation.summary import curves, draw_learning_curve
 from avmsf.evaluation.task import Method, ReadsFeatures, VisualInput
 from avmsf.modal.extraction.finders import finder_named
 from avmsf.pipeline.config import AUTO, PRESETS, LiftConfig, SceneConfig, TimeZero, ViewsConfig
 from avmsf.pipeline.features import choose_encoder, settled
-from avmsf.plotting.pictures import save_picture
 
-OPTIONS = {PREDEFINED: ("test",), LEARNING_CURVE: ("counts", "starts", "metric")}
+OPTIONS = {PREDEFINED: ("test",), SHOTS: ("counts", "starts")}
 """Options of one protocol alone."""
 _SHOWN = 5
 """Failures that are printed; the report lists all."""
@@ -88,16 +86,14 @@ def run(options: Options) -> int:
     screen = console(errors=options.json)
     for part in parts[1:3]:
         _print(part, screen)
-    drawn = _draw_curves(results, objects, options, screen) if protocol.name == LEARNING_CURVE else {}
     _print_failures(summary["failures"], screen)
     screen.print(f"wrote {SUMMARY}, {TABLES} and {PAGE} in {folder}", soft_wrap=True)
     for path in figures:
         screen.print(f"wrote {path}", soft_wrap=True)
     if options.json:
-        print_json({**summary, "results": str(folder), **({"curves": drawn} if drawn else {})})
+        print_json({**summary, "results": str(folder)})
     next_step(f"open {shlex.quote(str(folder / PAGE))} in a browser")
-    other = "farthest" if protocol.name == LEARNING_CURVE else LEARNING_CURVE
-    next_command(f"avmsf evaluate {other}", options.data)
+    next_command(f"avmsf evaluate {'farthest' if protocol.name == SHOTS else SHOTS}", options.data)
     return 0
 
 
@@ -108,8 +104,8 @@ def _protocol_of(options: Options) -> EvaluationProtocol:
         unused = [f"--{name}" for name in names if getattr(options, name) != getattr(usual, name)]
         if unused and owner != protocol.name:
             say(f"note: {', '.join(unused)}: not used by {protocol.name}, only by {owner}")
-    if protocol.name == LEARNING_CURVE:
-        return replace(protocol, choosing=Growing(options.counts, options.starts))
+    if protocol.name == SHOTS:
+        return replace(protocol, choosing=Shots(options.counts, options.starts))
     return replace(protocol, choosing=Predefined(words_of(options.test))) if protocol.name == PREDEFINED else protocol
 
 
@@ -120,34 +116,6 @@ def _print_failures(failures: Sequence[Mapping[str, Any]], screen: Console) -> N
     if failures:
         failed = counted(len(failures), "failure")
         screen.print(f"{failed}, listed in {TABLES}; run the command again to retry", soft_wrap=True)
-
-
-def _draw_curves(
-    results: ResultsFolder, objects: Sequence[str], options: Options, screen: Console
-) -> dict[str, dict[str, Any]]:
-    """Write and print each object's learning curves; return their values by object and method."""
-    drawn = {}
-    for name in objects:
-        record = results.read(name)
-        assert record is not None
-        try:
-            found = curves(record, metric=options.metric)
-        except EvaluationError as error:
-            screen.print(f"failed: {error}", soft_wrap=True)
-            continue
-        starts = counted(options.starts, "choice")
-        title = f"{record.identifier}: {counted(record.contacts, 'contact')}, {starts} of training contacts"
-        picture, values = (results.path / name / f"learning-curve.{ending}" for ending in ("png", "json"))
-        save_picture(draw_learning_curve(found, metric=options.metric, title=title), picture)
-        drawn[name] = {curve.method: curve.values() for curve in found}
-        write_json(values, {"object": name, "metric": options.metric, "methods": drawn[name]})
-        counts = sorted({count for curve in found for count in curve.counts})
-        by_method = [(curve.method, dict(zip(curve.counts, curve.mean, strict=True))) for curve in found]
-        rows = [[method, *(decimals(means.get(count), 3) for count in counts)] for method, means in by_method]
-        heading = f"{options.metric} of {name} by the number of training contacts"
-        screen.print(table(heading, ("method", *map(str, counts)), rows))
-        screen.print(f"wrote {picture} and {values}", soft_wrap=True)
-    return drawn
 
 
 def evaluation_of(

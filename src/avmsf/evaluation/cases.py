@@ -16,11 +16,6 @@ from avmsf.capture.impacts import Impacts, rows_by_place
 from avmsf.errors import EvaluationError
 from avmsf.gaussians.points import closest_points, farthest_points
 
-COUNTS = (3, 4, 6, 8, 12, 16, 24, 32, 48)
-"""Default numbers of training contacts."""
-_LEFT = 0.25
-"""Fraction of the contacts to test on with the default numbers."""
-
 
 @dataclass(frozen=True)
 class Case:
@@ -120,85 +115,34 @@ class LeaveOneOut:
 
 @dataclass(frozen=True)
 class Shots:
-    """Nested subsets of training contacts, all with the same test contacts."""
+    """Nested subsets of training contacts by farthest-point sampling, all with the same test contacts."""
 
     counts: tuple[int, ...] = (16, 8, 4, 2, 1)
     """Numbers of training contacts; those that would leave no test contact are omitted."""
-
-    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
-        """Return a case for each number; the test contacts are those left by the largest."""
-        places = Places.of(impacts)
-        counts = [count for count in self.counts if count < len(places.rows)] or [places.expect(min(self.counts))]
-        order = farthest_points(places.contacts, max(counts)).tolist()
-        test = places.case("", order).test
-        cases = [places.case(f"{count} shots" if count > 1 else "1 shot", order[:count]) for count in counts]
-        return tuple(Case(case.label, case.train, test) for case in cases)
-
-
-@dataclass(frozen=True)
-class Growing:
-    """Growing subsets of training contacts by farthest-point sampling, from several first contacts.
-
-    The subsets of one start are nested, and have the same test contacts: those left by the largest.
-    """
-
-    counts: tuple[int, ...] = ()
-    """Numbers of training contacts; by default those of `COUNTS` that leave a quarter of the contacts."""
-    starts: int = 3
-    """Number of first contacts, evenly spaced in the table."""
+    starts: int = 1
+    """Number of first contacts, evenly spaced in the table, each with subsets and test contacts of its own."""
 
     def __post_init__(self) -> None:
-        if any(count < 1 for count in self.counts):
-            raise EvaluationError(
-                f"expected numbers of contacts of 1 or more, got {list(self.counts)}",
-                name="counts",
-                value=list(self.counts),
-            )
+        if not self.counts or min(self.counts) < 1:
+            raise EvaluationError.expected("numbers of contacts of 1 or more", list(self.counts), name="counts")
         if self.starts < 1:
-            raise EvaluationError(f"expected 1 start or more, got {self.starts}", name="starts", value=self.starts)
+            raise EvaluationError.expected("1 start or more", self.starts, name="starts")
 
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
-        """Return a case for each start and number. Raises EvaluationError for a number that leaves no test contact."""
+        """Return a case for each number and start; the test contacts are those left by the largest number."""
         places = Places.of(impacts)
         total = len(places.rows)
-        counts = self._counts(total)
-        firsts = dict.fromkeys(round(number * total / self.starts) for number in range(self.starts))
-        orders = {first: farthest_points(places.contacts, max(counts), start=first).tolist() for first in firsts}
-        tests = {first: places.case("", order).test for first, order in orders.items()}
-        return tuple(
-            Case(
-                label_of(count),
-                places.case("", order[:count]).train,
-                tests[first],
-                fold=f"from {impacts.names[places.rows[first][0]]}",
-            )
-            for count in counts
-            for first, order in orders.items()
-        )
-
-    def _counts(self, places: int) -> tuple[int, ...]:
-        if not self.counts:
-            counts = tuple(count for count in COUNTS if count <= (1.0 - _LEFT) * places)
-            if counts:
-                return counts
-            raise EvaluationError(
-                f"expected more contacts than {places} to train on {min(COUNTS)} and test on a quarter; record more, "
-                "or give the numbers of contacts",
-                name="contacts",
-                value=places,
-            )
-        if max(self.counts) >= places:
-            raise EvaluationError(
-                f"expected at most {places - 1} of {places} contacts to train on, got {max(self.counts)}",
-                name="counts",
-                value=max(self.counts),
-            )
-        return tuple(sorted(set(self.counts)))
-
-
-def label_of(count: int) -> str:
-    """Return the label of a number of contacts."""
-    return counted(count, "place")
+        counts = [count for count in self.counts if count < total] or [places.expect(min(self.counts))]
+        cases = []
+        for first in dict.fromkeys(round(number * total / self.starts) for number in range(self.starts)):
+            order = farthest_points(places.contacts, max(counts), start=first).tolist()
+            test = places.case("", order).test
+            fold = f"from {impacts.names[places.rows[first][0]]}" if self.starts > 1 else ""
+            cases += [
+                Case(f"{count} shots" if count > 1 else "1 shot", places.case("", order[:count]).train, test, fold)
+                for count in counts
+            ]
+        return tuple(cases)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ The paper's metrics are described in words only, so that the convention ours are
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from avmsf.evaluation.cases import Choosing, Closest, Farthest, FewerViews, Growing, LeaveOneOut, Predefined, Shots
+from avmsf.evaluation.cases import Choosing, Closest, Farthest, FewerViews, LeaveOneOut, Predefined, Shots
 from avmsf.evaluation.registry import expect_protocol
 
 BASELINE = "knn3"
@@ -28,19 +28,7 @@ _TABLE = (
     "field-elastic",
     "field-auto",
 )
-LEARNING_CURVE, PREDEFINED = "learning-curve", "predefined"
-_CURVES = (
-    BASELINE,
-    "knn3-directions",
-    "knn-gains",
-    "spline-gains",
-    "field-positions",
-    "field-smooth",
-    "field-elastic",
-    "field-auto",
-)
-"""Default methods: those that need no photographs of the object. All but the network, `field-positions`, take seconds
-for each value."""
+PREDEFINED, SHOTS = "predefined", "shots"
 _ABLATED = ("field-positions", "field-no-initialization", "field-unaligned", "field-no-residual")
 
 
@@ -82,17 +70,10 @@ PROTOCOLS = {
             PREDEFINED, "Test on the recordings that are named; train on those at other contacts.", Predefined()
         ),
         EvaluationProtocol(
-            "shots",
-            "Train on nested subsets of 16, 8, 4, 2 and 1 contacts; test on the same others.",
+            SHOTS,
+            "Train on nested subsets of contacts by farthest-point sampling; test on those left by the largest.",
             Shots(),
             subset="ablation",
-        ),
-        EvaluationProtocol(
-            LEARNING_CURVE,
-            "Train on growing subsets of contacts, chosen by farthest-point sampling; test on those left by the last.",
-            Growing(),
-            _CURVES,
-            metrics=("l1", "l1_log", "envelope", *OWN_METRICS),
         ),
         EvaluationProtocol(
             "views",

@@ -12,7 +12,6 @@ PROTOCOL_NAMES = (
     "closest",
     "predefined",
     "shots",
-    "learning-curve",
     "views",
     "ablation",
     "non-symmetric",
@@ -58,8 +57,6 @@ _PATH_TITLES = {
     "recorded": "sounds of another system, from files",
     "sonicgauss-small": "SonicGauss's objective at a small size, trained from scratch on simulated objects",
 }
-_SEVERAL_SETS = ("shots", "learning-curve")
-"""Protocols that test a recording after training on several sets of others."""
 
 
 def expect_protocol(name: str) -> None:
@@ -85,7 +82,7 @@ def expect_method(name: str) -> None:
 
 def expect_suited(method: str, protocol: str) -> None:
     """Raise `EvaluationError` for a method whose sounds cannot be those of the protocol's training recordings."""
-    if method.startswith(RECORDED) and protocol in _SEVERAL_SETS:
+    if method.startswith(RECORDED) and protocol == "shots":
         raise EvaluationError(
             f"{method}: expected a protocol that tests each recording once, got {protocol}, which trains on several "
             "sets of recordings, and the folder holds the sounds of one; choose farthest, closest, predefined or "

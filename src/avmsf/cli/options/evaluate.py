@@ -27,8 +27,8 @@ class Options(Printing):
     """
 
     protocol: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="PROTOCOL")]]
-    """The experiment: farthest, leave-one-out, closest, predefined, shots, learning-curve, views, ablation,
-    non-symmetric, localize or grid."""
+    """The experiment: farthest, leave-one-out, closest, predefined, shots, views, ablation, non-symmetric,
+    localize or grid."""
     data: tyro.conf.Positional[
         Annotated[
             Path, tyro.conf.arg(metavar="DATA"), Existing("a dataset, capture folders or one capture", ("a folder",))
@@ -46,13 +46,10 @@ class Options(Printing):
     results."""
     test: Annotated[tuple[str, ...], tyro.conf.arg(metavar="RECORDING ...")] = ()
     """predefined: names of the recordings to test on, such as 009.wav, separated by commas or blanks."""
-    counts: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = ()
-    """learning-curve: numbers of training contacts; by default 3, 4, 6, 8, 12, 16, ... as long as a quarter of the
-    contacts is held out."""
-    starts: int = 3
-    """learning-curve: number of first contacts, evenly spaced in the table, that the choices start from."""
-    metric: Literal["relative_stft", "l1", "l1_log", "envelope"] = "relative_stft"
-    """learning-curve: metric to draw."""
+    counts: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = (16, 8, 4, 2, 1)
+    """shots: numbers of training contacts."""
+    starts: int = 1
+    """shots: number of first contacts, evenly spaced in the table, that the choices start from."""
     visual_source: Literal["best", "mesh"] = "best"
     """Source of the visual features. best: photographs if there are any, by Gaussians, otherwise the mesh. mesh: the
     mesh, onto its own surface."""
