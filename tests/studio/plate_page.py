@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 FIELD_ABILITIES = ["locate", "edit", "save", "like"]
 LIVE = {"revision": 1, "undo": False, "abilities": FIELD_ABILITIES, "mode": "field", "rows": [0, 1, 2, 3, 4, 5]}
+LIVE |= {"materials": ["ceramic", "glass", "wood", "iron", "steel"], "jobKind": None}
 Serve = Callable[..., str]
 Open = Callable[..., "Page"]
 

@@ -227,6 +227,13 @@ def read_sound(path: str | Path, *, channel: int | None = None) -> tuple[Float[T
     return torch.from_numpy(sound.astype(np.float32)), recording.sample_rate
 
 
+def wav_bytes(samples: Shaped[np.ndarray, "frames *channels"], rate: int) -> bytes:
+    """Return a wav file of float32 samples at `rate`, Hz: to be written as a whole, whose errors say why they are."""
+    memory = io.BytesIO()
+    soundfile.write(memory, samples.astype(np.float32), rate, subtype="FLOAT", format="WAV")
+    return memory.getvalue()
+
+
 def refuse_rate(rate: float, name: str) -> None:
     """Raise `CaptureError` unless the rate lies between 100 Hz and 192 kHz."""
     if not LOWEST_RATE <= rate <= HIGHEST_RATE:

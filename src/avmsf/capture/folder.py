@@ -1,16 +1,14 @@
 """A capture folder: `impacts.csv`, its wav files, perhaps `capture.toml` and a surface; read and written whole."""
 
 import csv
-import io
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
-import soundfile
 import torch
 
 from avmsf._utils.files import new_folder
-from avmsf.capture.audio import read_recording
+from avmsf.capture.audio import read_recording, wav_bytes
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.measure import RecordingReport, measure, shared_problems
 from avmsf.capture.placement import contacted_part
@@ -118,10 +116,8 @@ def _write_files(capture: Capture, folder: Path, *, onsets_within: float | None)
     rate, speed = _whole_rate(impacts.sample_rate)
     for name, sound in zip(names, impacts.sounds.numpy(), strict=True):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        memory = io.BytesIO()
-        soundfile.write(memory, sound, rate, subtype="FLOAT", format="WAV")
         # Soundfile's own error of a full disk does not say that it is full.
-        (folder / name).write_bytes(memory.getvalue())
+        (folder / name).write_bytes(wav_bytes(sound, rate))
     header, columns = list(REQUIRED), [impacts.contacts]
     if impacts.directions is not None:
         header, columns = [*header, *DIRECTION], [*columns, impacts.directions]

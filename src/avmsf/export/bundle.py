@@ -6,7 +6,6 @@ frequency has a large phase error after a second; amplitudes are float32. Record
 field's unit.
 """
 
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -14,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import soundfile
 from jaxtyping import Shaped
 
+from avmsf.capture.audio import wav_bytes
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExportError
 from avmsf.export.formats import MAX_POINTS
@@ -119,9 +118,8 @@ def _strikes(strikes: Impacts | None, field: SampledField) -> tuple[list[dict[st
         raise ExportError.expected(wanted, strikes.sample_rate, name="strikes", advice=advice)
     records, files = [], {}
     for row, name in enumerate(strikes.names):
-        path, memory = f"strikes/{row + 1:03d}.wav", io.BytesIO()
-        soundfile.write(memory, strikes.sounds[row].float().numpy(), round(field.sample_rate), "FLOAT", format="WAV")
-        files[path] = memory.getvalue()
+        path = f"strikes/{row + 1:03d}.wav"
+        files[path] = wav_bytes(strikes.sounds[row].numpy(), round(field.sample_rate))
         records.append(
             {
                 "name": name,

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import soundfile
 import torch
 from jaxtyping import Float32, Float64, Int
 from torch import Tensor
 
+from avmsf.capture.audio import wav_bytes
 from avmsf.errors import ExportError
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.writing import Written, write_folder
@@ -158,9 +158,7 @@ def _wav(sound: Float32[Tensor, " samples"], rate: int) -> bytes:
     if not bool(sound.isfinite().all()):
         advice = "fit the field again, or export smaller forces"
         raise ExportError.expected("finite numbers", got="NaN or infinity", name="samples", advice=advice)
-    memory = io.BytesIO()
-    soundfile.write(memory, sound.numpy(), rate, subtype="FLOAT", format="WAV")
-    return memory.getvalue()
+    return wav_bytes(sound.numpy(), rate)
 
 
 def _table(records: Sequence[Sequence[object]]) -> str:

@@ -19,13 +19,12 @@ from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import numpy as np
 import soundfile
 
 from avmsf._utils.files import copy_whole, write_whole
 from avmsf._utils.locks import write_lock
 from avmsf._utils.text import counted
-from avmsf.capture.audio import Recording, SoundBytes, decode_recording, read_recording
+from avmsf.capture.audio import Recording, SoundBytes, decode_recording, read_recording, wav_bytes
 from avmsf.capture.check import check
 from avmsf.capture.measure import RecordingReport, measure
 from avmsf.capture.prepare import prepare
@@ -379,10 +378,7 @@ class CaptureEditor:
     def _write(self, file: str, content: bytes, recording: Recording) -> None:
         """Write what was sent, to the last bit where it is a wav file, else the same samples as one."""
         if not (content[:4] == b"RIFF" and content[8:12] == b"WAVE"):
-            memory = io.BytesIO()
-            samples = recording.channels.T.astype(np.float32)
-            soundfile.write(memory, samples, round(recording.sample_rate), subtype="FLOAT", format="WAV")
-            content = memory.getvalue()
+            content = wav_bytes(recording.channels.T, round(recording.sample_rate))
         write_whole(self.folder / file, lambda path: path.write_bytes(content), raising=CaptureError)
 
     def _set_aside(self, file: str) -> None:

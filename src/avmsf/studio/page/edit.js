@@ -21,7 +21,6 @@ const SINGLE = {
   pitch: ["Pitch", { low: 0.5, high: 2, value: 1, words: factor }],
   decay: ["Decay time", { low: 0.1, high: 10, value: 1, words: factor }],
 };
-const MATERIALS = ["ceramic", "glass", "wood", "plastic", "iron", "polycarbonate", "steel"];
 
 /** `load()` fetches the server's present bundle and takes it. */
 export function editSheet(studio, load) {
@@ -37,13 +36,12 @@ export function editSheet(studio, load) {
     single.set(studio.bank, values);
     changes.moved();
   });
-  const names = studio.live.materials ?? MATERIALS;
   const select = (none, onchange) =>
     element(
       "select",
       { onchange },
       element("option", { value: "" }, none),
-      ...names.map((name) => element("option", { value: name }, name)),
+      ...studio.live.materials.map((name) => element("option", { value: name }, name)),
     );
   // What the object is of counts where it shall be of another material or size, and changes nothing by itself.
   const changesMaterial = () => to.value !== "" || sliders.size.value !== sliders.size.rest;

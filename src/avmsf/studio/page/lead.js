@@ -5,7 +5,7 @@ import { JobProgress } from "./jobprogress.js";
 import { server } from "./server.js";
 
 /** What the server calls this kind of job. */
-const KIND = "guided edit";
+export const LEADING = "guided edit";
 
 /** `hold(work, "minutes")` keeps the field from being changed by hand while work goes on. */
 export function leadGroup(studio, changes, hold) {
@@ -45,9 +45,9 @@ export function leadGroup(studio, changes, hold) {
     const text = element("input", { type: "text", "aria-label": "Description of the sound", placeholder });
     rows.push(text, button("Towards this text", () => lead(() => server.edit(studio.revision, { prompt: text.value }))));
   }
-  // One that was under way before the page was loaded goes on. Without a capture there are no jobs of other kinds.
-  const { job, jobKind = studio.can("reconstruct") ? null : KIND } = studio.live;
-  if (job && jobKind === KIND) hold(() => follow(job), "minutes");
+  // One that was under way before the page was loaded goes on.
+  const { job, jobKind } = studio.live;
+  if (job && jobKind === LEADING) hold(() => follow(job), "minutes");
 
   return element(
     "div",

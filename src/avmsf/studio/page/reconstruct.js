@@ -2,11 +2,10 @@
 
 import { attempt, button, element, say } from "./dom.js";
 import { JobProgress } from "./jobprogress.js";
+import { LEADING } from "./lead.js";
 import { server } from "./server.js";
 
 const FEWEST = 2;
-/** Another kind of job, which the tab that began it shows. */
-const LEADING = "guided edit";
 
 export function reconstructGroup(studio) {
   const words = element("p", { className: "faint" });
@@ -44,7 +43,7 @@ export function reconstructGroup(studio) {
     } else say(`The sound field is ready. Open it with: avmsf studio ${field}`, { name: "job" });
   };
 
-  // A job that was under way before the page was loaded goes on.
+  // A job that was under way before the page was loaded goes on; an edit is shown by the tab that began it.
   const { job, jobKind } = studio.live;
   if (job && jobKind !== LEADING) follow(job);
 
