@@ -12,7 +12,6 @@ from types import MappingProxyType
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Int
 
 from avmsf._utils.caching import key_of, source_digest
 from avmsf._utils.compiled import lane_count
@@ -147,7 +146,9 @@ class BodyMaker:
         cache: Path | None = None,
         log: Callable[[str], None] | None = None,
     ) -> None:
-        _expect_settings(count, dofs)
+        for name, value, least in (("count", count, 1), ("dofs", dofs, FEWEST)):
+            if value < least:
+                raise SimulationError.expected(f"{least} or more", value, name=name)
         self._given = surface
         self._shape = None if isinstance(surface, Surface) else surface
         self._count, self._dofs, self._material, self._cache = count, dofs, material, cache
@@ -201,8 +202,7 @@ class BodyMaker:
             if body.support is None:
                 fine = self._body(body.wall, fine=True)
             else:
-                solid = self._solid(body.wall, self._dofs)
-                fine = replace(body, elastic=self._solved_once(body.wall, self._dofs, solid, body.support), fine=True)
+                fine = replace(body, elastic=self._modes(body.wall, self._dofs, body.support), fine=True)
         except SimulationError as error:
             self._log(f"{body.name}: using the coarse mesh: {error}")
             fine = body
@@ -239,7 +239,7 @@ class BodyMaker:
             solid = self._solid(body.wall, few)
             for support in (None, *supports_of(SecondOrder.of(solid))):
                 try:
-                    modes = self._solved_once(body.wall, few, solid, support, perturbed=fine)
+                    modes = self._modes(body.wall, few, support, perturbed=fine, solid=solid)
                     yield NominalBody(body.wall, modes, fine, support)
                 except SimulationError as error:
                     if support is None:
@@ -309,7 +309,7 @@ class BodyMaker:
     def _converged(self, wall: float | None) -> ElasticModes:
         """Return modes of one body, of twice as many degrees of freedom where their frequencies still change much."""
         dofs = self._dofs
-        modes = self._modes(wall, dofs, perturbed=True)
+        modes = self._modes(wall, dofs)
         # The thickness of a shape's wall is found with such elements, and makes up for their stiffness.
         if dofs <= TRIAL or (self._shape is not None and wall is not None):
             return modes
@@ -320,7 +320,7 @@ class BodyMaker:
             return modes
         if error > LARGEST_ERROR:
             try:
-                finer = self._modes(wall, 2 * dofs, perturbed=True)
+                finer = self._modes(wall, 2 * dofs)
                 modes, error = finer, _frequency_error(modes, finer)
             except SimulationError as failure:
                 self._log(f"{body_name(wall)}: no finer mesh ({failure})")
@@ -331,35 +331,33 @@ class BodyMaker:
             )
         return modes
 
-    def _solved_once(
-        self, wall: float | None, dofs: int, solid: Solid, support: Support | None, *, perturbed: bool = True
+    def _modes(
+        self,
+        wall: float | None,
+        dofs: int,
+        support: Support | None = None,
+        *,
+        perturbed: bool = True,
+        solid: Solid | None = None,
     ) -> ElasticModes:
-        """Return the modes of tetrahedra that are held, or free without a support, read from where they are kept."""
-        fixed = None if support is None else support.nodes(SecondOrder.of(solid))
-        kept = self._kept(wall, dofs, support, perturbed=perturbed)
-        return modes_once(kept, lambda: self._solved(solid, dofs, fixed, perturbed=perturbed), log=self._log)
+        """Return the modes of one body, read from where they are kept; `solid` is known where others need it too."""
 
-    def _modes(self, wall: float | None, dofs: int, *, perturbed: bool) -> ElasticModes:
-        """Return the modes of one free body, read from where they are kept."""
-        kept = self._kept(wall, dofs, perturbed=perturbed)
-        return modes_once(
-            kept, lambda: self._solved(self._solid(wall, dofs), dofs, None, perturbed=perturbed), log=self._log
-        )
+        def solved() -> ElasticModes:
+            body = self._solid(wall, dofs) if solid is None else solid
+            size = count_dofs(body)
+            self._log(f"{self._count} elastic modes of {size} degrees of freedom")
+            fixed = None if support is None else support.nodes(SecondOrder.of(body))
+            try:
+                return elastic_modes(body, self._material, count=self._count, fixed=fixed, perturbed=perturbed)
+            except MemoryError as error:
+                raise SimulationError(
+                    f"expected enough memory for {size} degrees of freedom, got too little; use "
+                    f"{max(dofs // 2, FEWEST)} (--body.dofs), or close other programs",
+                    name="dofs",
+                    value=size,
+                ) from error
 
-    def _solved(
-        self, solid: Solid, dofs: int, fixed: Int[np.ndarray, " fixed"] | None, *, perturbed: bool
-    ) -> ElasticModes:
-        size = count_dofs(solid)
-        self._log(f"{self._count} elastic modes of {size} degrees of freedom")
-        try:
-            return elastic_modes(solid, self._material, count=self._count, fixed=fixed, perturbed=perturbed)
-        except MemoryError as error:
-            raise SimulationError(
-                f"expected enough memory for {size} degrees of freedom, got too little; use "
-                f"{max(dofs // 2, FEWEST)} (--body.dofs), or close other programs",
-                name="dofs",
-                value=size,
-            ) from error
+        return modes_once(self._kept(wall, dofs, support, perturbed=perturbed), solved, log=self._log)
 
     def _solid(self, wall: float | None, dofs: int) -> Solid:
         """Return tetrahedra with about so many degrees of freedom."""
@@ -424,20 +422,9 @@ def _frequency_error(coarse: ElasticModes, fine: ElasticModes) -> float:
     return change / max((len(fine.nodes) / len(coarse.nodes)) ** 1.5 - 1.0, 1.0)
 
 
-def _expect_settings(count: int, dofs: int) -> None:
-    if count < 1:
-        raise SimulationError(f"count: expected 1 mode or more, got {count}", name="count", value=count)
-    if dofs < FEWEST:
-        raise SimulationError(f"dofs: expected {FEWEST} or more, got {dofs}", name="dofs", value=dofs)
-
-
 def _expect_walls(walls: Sequence[float | None] | None) -> None:
     if walls is not None and not len(walls):
-        raise SimulationError(
-            "walls: expected thicknesses in meters, or None for a solid body, got an empty list",
-            name="walls",
-            value=[],
-        )
+        raise SimulationError.expected("thicknesses in meters, or None for a solid body", [], name="walls")
     for row, wall in enumerate(walls or ()):
         if wall is not None and not 0 < wall < float("inf"):
             raise SimulationError.expected("more than 0 m, or None for a solid body", wall, row=row, name="walls")
