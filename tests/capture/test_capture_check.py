@@ -64,7 +64,8 @@ def test_it_goes_on_past_everything_that_is_broken(tmp_path: Path) -> None:
     assert "0.39" in problems["c.wav"]
     assert "'left'" in problems["f.wav"]
     assert report.recordings[2].double_hit_seconds == pytest.approx(0.4, abs=0.01)
-    rates, repeated, unlisted = report.problems
+    missing, rates, repeated, unlisted = report.problems
+    assert missing.startswith("gone.wav")
     assert "8000 Hz" in rates
     assert "5, 6" in repeated
     assert "stray.wav" in unlisted
@@ -144,11 +145,11 @@ def test_a_missing_file_may_be_one_that_no_row_has(tmp_path: Path) -> None:
     folder = fill(tmp_path, rows=("a.wav,0.1,0,0", "b.wav,0,0.2,0", "d.wav,0,0,0.3"))
     with raises(CaptureError, file="d.wav", value="c.wav"):
         read_capture(folder)
-    assert "c.wav" in check(folder).recordings[2].problems[0]
+    assert any("c.wav?" in problem for problem in check(folder).problems)
     (folder / "c.wav").unlink()
     with raises(CaptureError, file="d.wav", value=None):
         read_capture(folder)
-    (problem,) = check(folder).recordings[2].problems
+    (problem,) = check(folder).problems
     assert "a.wav" not in problem
     assert "b.wav" not in problem
 

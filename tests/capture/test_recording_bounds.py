@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from avmsf.capture import audio, check, filenames, read_capture, read_sound
+from avmsf.capture import check, read_capture, read_sound
 from avmsf.capture.audio import MAX_PEAK, MAX_SAMPLES, MIN_PEAK
 from avmsf.capture.table import MAX_ROWS
 from avmsf.errors import CaptureError
@@ -67,17 +67,12 @@ def test_a_compressed_file_is_measured_by_its_header(tmp_path: Path) -> None:
         read_sound(name)
 
 
-def test_many_missing_files_are_counted_once_and_few_names_are_guessed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    searches = []
-    monkeypatch.setattr(filenames, "get_close_matches", lambda *given, **kept: searches.append(given) or [])
+def test_many_missing_files_are_counted_once(tmp_path: Path) -> None:
     folder = fill(tmp_path, rows=(*ROWS, *(f"aa{number}.wav,0,0,0.1" for number in range(200))))
     report = check(folder)
     assert [row.readable for row in report.recordings] == [True] * 3 + [False] * 200
     assert all(row.problems for row in report.recordings[3:])
     assert len([problem for problem in report.problems if "200 of 203" in problem]) == 1
-    assert len(searches) == 3
     with raises(CaptureError, file="impacts.csv", name="file", value=[f"aa{number}.wav" for number in range(200)]):
         read_capture(folder)
 
@@ -94,11 +89,3 @@ def test_settings_beyond_reason_are_refused(tmp_path: Path, settings: str) -> No
     report = check(fill(tmp_path, settings=settings))
     assert not report.readable
     assert "capture.toml" in report.problems[0]
-
-
-def test_a_misspelt_name_is_sought_among_the_first_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(filenames, "_MAX_NAMES_COMPARED", 1)
-    # A disk may list a folder in any order.
-    monkeypatch.setattr(Path, "iterdir", lambda folder: iter([folder / "z.wav", folder / "hit_on_rim.wav"]))
-    with raises(CaptureError, file="hit_on_rin.wav", value="hit_on_rim.wav"):
-        audio.read_recording(tmp_path / "hit_on_rin.wav")

@@ -98,7 +98,8 @@ class Recording:
         if not all(self._agree(loudest, each) for each in left):
             raise CaptureError(
                 f"{self.name}: expected one channel with the sound, got {len(self.channels)} different ones; write "
-                "response_channel = 1 (or another, counted from 1) in capture.toml, or save it as mono",
+                "response_channel, counted from 1, in capture.toml (`avmsf check` proposes one where it can, and the "
+                "hammer's force_channel), or save it as mono",
                 file=self.name,
                 name="response_channel",
                 value=len(self.channels),

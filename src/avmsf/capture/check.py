@@ -1,7 +1,7 @@
 """Everything that is wrong with a capture folder, found without stopping at the first thing."""
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,19 +18,16 @@ from avmsf.capture.table import (
     TABLE,
     Row,
     Strike,
-    advice_for_missing,
     fitting_units,
     is_missing,
-    missing_recording_of,
     parse_row,
     read_rows,
+    refuse_missing,
     refuse_repeated_files,
 )
 from avmsf.capture.together import check_contacts, check_levels, check_surface, common_length, common_rate, find_surface
 from avmsf.errors import CaptureError
 
-MAX_SUGGESTIONS = 3
-"""Missing files for which a similar name is sought: each search compares up to a thousand names."""
 UNCUT = "all recordings start with the impact, as impulse responses do, and are not cut"
 
 
@@ -73,9 +70,8 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
     problems = [str(each) for each in warned]
     reports, strikes, sounds = list[RecordingReport](), list[Strike](), list[_Sound]()
     far = dict[int, float]()
-    missing, files = list[str](), [row.cells["file"].replace("\\", "/") for row in rows]
     for row in rows:
-        strike, prepared, report = _check_row(folder, row, settings=settings, missing=missing, far=far, files=files)
+        strike, prepared, report = _check_row(folder, row, settings=settings, far=far)
         reports.append(report)
         if strike is not None:
             strikes.append(strike)
@@ -97,12 +93,11 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
     with _collected(refused):
         refuse_repeated_files(strikes)
     with _collected(refused):
+        refuse_missing(folder, strikes)
+    with _collected(refused):
         surface = find_surface(folder, settings)
         if surface is not None and strikes:
             problems += map(str, check_surface(strikes, surface, settings=settings))
-    if len(missing) > MAX_SUGGESTIONS:
-        lack = f"{TABLE}: expected a file for each row, got none for {len(missing)} of {len(rows)}"
-        refused.append(f"{lack}; {advice_for_missing(folder, missing, files)}")
     comparable = len(sounds) > 1 and len({each.rate for each in sounds}) == 1
     uncut = comparable and are_uncut([each.start for each in sounds], rate=sounds[0].rate, settings=settings)
     if uncut:
@@ -154,27 +149,17 @@ def _wav_files(folder: Path) -> list[str]:
 
 
 def _check_row(
-    folder: Path,
-    row: Row,
-    *,
-    settings: CaptureSettings,
-    missing: list[str],
-    far: dict[int, float],
-    files: Sequence[str],
+    folder: Path, row: Row, *, settings: CaptureSettings, far: dict[int, float]
 ) -> tuple[Strike | None, Prepared | None, RecordingReport]:
     """Return one row parsed as far as possible, its sound, and its report.
 
-    Its file is added to `missing` where it is, and the largest coordinate of a contact too far away, by its line, to
-    `far`. `files` are those of all rows.
+    The largest coordinate of a contact too far away is added, by its line, to `far`.
     """
     strike = None
     try:
         strike = parse_row(row, settings)
         if is_missing(folder / strike.file):
-            missing.append(strike.file)
-            if len(missing) > MAX_SUGGESTIONS:
-                raise CaptureError(f"{strike.file}: expected a sound file, got none", file=strike.file)
-            raise missing_recording_of(folder, strike.file, files)
+            raise CaptureError(f"{strike.file}: expected a sound file, got none", file=strike.file)
         prepared, report = read_strike(folder, strike, settings=settings)
     except CaptureError as error:
         if error.name == "unit":

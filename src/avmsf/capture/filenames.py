@@ -1,6 +1,5 @@
 """Names by which the files of a folder are recognized; importing this loads nothing that computes."""
 
-import heapq
 import re
 from collections.abc import Collection
 from difflib import get_close_matches
@@ -22,8 +21,6 @@ _OTHER_NAMES = {
     **dict.fromkeys((".xlsx", ".xls", ".ods"), "export the table as impacts.csv"),
 }
 """Endings of shapes, pictures and tables that are not read, and what to do."""
-_MAX_NAMES_COMPARED = 1000
-"""File names among which a misspelt one is sought: a tenth of a second."""
 _OF_VIEWS = frozenset(("transforms.json", "images", "sparse", "cameras.bin", "cameras.txt", *SURFACE_FILES, *SPLATS))
 
 
@@ -120,7 +117,7 @@ def _nearest_name(path: Path, used: Collection[Path]) -> str | None:
     wanted = _numbers(path.name)
     unused = (other.name for other in path.parent.iterdir() if other not in used)
     others = (name for name in unused if not wanted or _numbers(name) in (wanted, []))
-    names = {name.lower(): name for name in heapq.nsmallest(_MAX_NAMES_COMPARED, others)}
+    names = {name.lower(): name for name in sorted(others)}
     found = get_close_matches(path.name.lower(), names, n=1, cutoff=0.7)
     return names[found[0]] if found else None
 

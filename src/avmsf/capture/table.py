@@ -191,7 +191,7 @@ def read_strikes(folder: Path, settings: CaptureSettings) -> tuple[list[Strike],
         rows, remarks = read_rows(folder)
         strikes = [parse_row(row, settings) for row in rows]
         refuse_repeated_files(strikes)
-        _refuse_missing(folder, strikes)
+        refuse_missing(folder, strikes)
     return strikes, remarks
 
 
@@ -208,20 +208,29 @@ def refuse_repeated_files(strikes: Sequence[Strike]) -> None:
         lines[strike.file] = strike.line
 
 
-def _refuse_missing(folder: Path, strikes: Sequence[Strike]) -> None:
+def refuse_missing(folder: Path, strikes: Sequence[Strike]) -> None:
     """Raise one `CaptureError` where recordings are missing; for a single one with the file that may be meant."""
-    missing = [strike.file for strike in strikes if is_missing(folder / strike.file)]
+    files = [strike.file for strike in strikes]
+    missing = [file for file in files if is_missing(folder / file)]
+    if not missing:
+        return
+    moved = ((file, _path_below(folder, file, files)) for file in missing)
+    file, below = next(((file, below) for file, below in moved if below is not None), (missing[0], None))
+    if len(missing) == 1 and below is not None:
+        message = f"{file}: expected a sound file, got none; write {below} in {TABLE}"
+        raise CaptureError(message, file=folder / file, name="file", value=below)
     if len(missing) == 1:
-        raise missing_recording_of(folder, missing[0], [strike.file for strike in strikes])
-    if missing:
-        shown = f"{', '.join(missing[:5])}{', …' * (len(missing) > 5)}"
-        raise CaptureError(
-            f"{folder / TABLE}: expected a file for each row, got none for {len(missing)} of {len(strikes)} "
-            f"({shown}); {advice_for_missing(folder, missing, [strike.file for strike in strikes])}",
-            file=folder / TABLE,
-            name="file",
-            value=missing,
-        )
+        advice, used = f"copy it there, or remove its row from {TABLE}", {folder / each for each in files}
+        raise missing_recording(folder / file, file, advice=advice, used=used)
+    shown = f"{', '.join(missing[:5])}{', …' * (len(missing) > 5)}"
+    advice = "copy them there, or correct their names" if below is None else f"write {below} in place of {file}"
+    raise CaptureError(
+        f"{folder / TABLE}: expected a file for each row, got none for {len(missing)} of {len(strikes)} ({shown}); "
+        f"{advice}",
+        file=folder / TABLE,
+        name="file",
+        value=missing,
+    )
 
 
 def is_missing(path: Path) -> bool:
@@ -230,25 +239,6 @@ def is_missing(path: Path) -> bool:
         return not path.exists()
     except OSError:
         return False
-
-
-def missing_recording_of(folder: Path, file: str, files: Sequence[str]) -> CaptureError:
-    """Return the error of a recording of a table that does not exist; `files` are those of all rows."""
-    below = _path_below(folder, file, files)
-    if below is not None:
-        message = f"{file}: expected a sound file, got none; write {below} in {TABLE}"
-        return CaptureError(message, file=folder / file, name="file", value=below)
-    advice = f"copy it there, or remove its row from {TABLE}"
-    return missing_recording(folder / file, file, advice=advice, used={folder / each for each in files})
-
-
-def advice_for_missing(folder: Path, missing: Sequence[str], files: Sequence[str]) -> str:
-    """Return what to do where several recordings of a table do not exist; `files` are those of all rows."""
-    for file in missing:
-        below = _path_below(folder, file, files)
-        if below is not None:
-            return f"write {below} in place of {file}, and so on"
-    return "copy them there, or correct their names"
 
 
 def _path_below(folder: Path, file: str, files: Sequence[str]) -> str | None:
