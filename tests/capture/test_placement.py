@@ -9,10 +9,11 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from avmsf.capture import CaptureSettings
-from avmsf.capture.placement import FACTORS, Mistake, check_placement, contacted_part, surface_points
+from avmsf.capture.placement import FACTORS, Mistake, check_placement
 from avmsf.capture.table import parse_row, read_rows
 from avmsf.errors import CaptureError
 from avmsf.mesh import Surface, read_surface
+from avmsf.mesh.surface import contacted_part, surface_points
 from factories.raising import raises
 
 Y_UP = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)

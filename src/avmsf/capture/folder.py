@@ -11,14 +11,13 @@ from avmsf._utils.files import new_folder
 from avmsf.capture.audio import read_recording, wav_bytes
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.measure import RecordingReport, measure, shared_problems
-from avmsf.capture.placement import contacted_part
 from avmsf.capture.prepare import Prepared, prepare
 from avmsf.capture.settings import SETTINGS, CaptureSettings, settings_of
 from avmsf.capture.starts import build_impacts, shorten
 from avmsf.capture.table import DIRECTION, FORCE, REQUIRED, TABLE, Strike, in_folder, read_strikes
 from avmsf.capture.together import check_contacts, check_levels, check_surface, common_rate, find_surface
 from avmsf.errors import CaptureError, CaptureWarning
-from avmsf.mesh.surface import Surface, write_surface
+from avmsf.mesh.surface import Surface, contacted_part, write_surface
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,13 +9,11 @@ from functools import cached_property
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf.errors import CaptureError, FitError
-from avmsf.mesh.surface import Surface
+from avmsf.mesh.surface import MOST_POINTS
 
 TOLERANCE = 0.05
 """Distance from the surface, over the object's diagonal, up to which a contact lies on it.
@@ -37,8 +35,8 @@ RESOLUTION = 1 / 200
 """Distance over the diagonal below which contacts lie equally well: points are no surface, nor contacts exact."""
 ODDS = 3.0
 """Nats of a contact that is a mistake of its own, as one of twenty is."""
-MOST_CONTACTS, MOST_POINTS = 200, 20_000
-"""As many are compared, evenly taken from all, in search for the similarity."""
+MOST_CONTACTS = 200
+"""As many, and as many points as `MOST_POINTS`, are compared, evenly taken from all, in search for the similarity."""
 UNITS = {1e-3: "mm", 1e-2: "cm", 0.0254: "inches", 0.3048: "feet"}
 FACTORS = (1.0, *(power for size in (1000.0, 100.0, 10.0, 25.4, 0.0254, 0.3048) for power in (size, 1 / size)))
 
@@ -243,48 +241,6 @@ def expect_placed(
         name="contacts",
         value=float(placement.distances.max()),
     )
-
-
-def surface_points(surface: Surface, *, count: int = MOST_POINTS) -> Float[Tensor, "points 3"]:
-    """Return points all over a surface, always the same: `count` on its triangles, evenly by area, and its vertices."""
-    vertices = surface.vertices.double()
-    if not len(surface.faces):
-        return vertices
-    # Takes half a second to import, which what reads no mesh does without.
-    import trimesh
-
-    mesh = trimesh.Trimesh(vertices.numpy(), surface.faces.numpy(), process=False)
-    if not mesh.area > 0:
-        return vertices
-    return torch.cat([torch.from_numpy(np.array(trimesh.sample.sample_surface(mesh, count, seed=0)[0])), vertices])
-
-
-def contacted_part(surface: Surface, contacts: Float[Tensor, "contacts 3"]) -> tuple[Surface, list[float]]:
-    """Return a surface without connected parts larger than the one that contacts lie on, such as a table.
-
-    The second value is the areas in square meters, of the part that is kept and of those left out; empty where the
-    contacts lie on the largest or on several.
-    """
-    if not len(surface.faces) or not len(contacts):
-        return surface, []
-    import trimesh
-
-    mesh = trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=False)
-    rows = np.unique(mesh.vertices[mesh.faces].reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1, 3)
-    edges = np.concatenate([rows[:, [0, 1]], rows[:, [1, 2]]])
-    links = coo_array((np.ones(len(edges)), edges.T), shape=(rows.max() + 1,) * 2)
-    label = connected_components(links, directed=False)[1][rows[:, 0]]
-    if not label.any() or not mesh.area > 0:
-        return surface, []
-    points, faces = trimesh.sample.sample_surface(mesh, MOST_POINTS, seed=0)
-    parts = label[faces[cKDTree(points).query(contacts.double().numpy())[1]]]
-    part, areas = int(np.bincount(parts).argmax()), np.bincount(label, weights=mesh.area_faces)
-    left = areas > areas[part]
-    if not left.any() or np.mean(parts != part) > WRONG_ROWS:
-        return surface, []
-    kept = surface.faces[torch.from_numpy(~left[label])]
-    used, corners = torch.unique(kept, return_inverse=True)
-    return Surface(surface.vertices[used], corners), [float(areas[part]), *map(float, areas[left])]
 
 
 class _Search:

@@ -22,12 +22,13 @@ from avmsf._utils.text import read_toml
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.measure import HIGHEST_NOISE_DB, decibels, noise_level
 from avmsf.capture.onset import SECONDS_BEFORE, find_onset, find_pulse
-from avmsf.capture.placement import check_placement, surface_points
+from avmsf.capture.placement import check_placement
 from avmsf.capture.prepare import prepare, remove_rumble
 from avmsf.capture.settings import METRES, SETTINGS, CaptureSettings, settings_of
 from avmsf.capture.table import Row, Strike, parse_row, read_rows
 from avmsf.capture.together import NARROWEST, WIDEST, find_surface, fitting_units_of
 from avmsf.errors import CaptureError
+from avmsf.mesh.surface import surface_points
 
 MIN_PUSH_SHARE = 0.5
 """Share of its energy that a hammer's channel has within its push and one width on either side: most of it. The

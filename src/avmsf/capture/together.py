@@ -11,12 +11,12 @@ import torch
 
 from avmsf._utils.text import counted
 from avmsf.capture.filenames import find_surface_file
-from avmsf.capture.placement import Placement, check_placement, contacted_part, surface_points
+from avmsf.capture.placement import Placement, check_placement
 from avmsf.capture.prepare import shortest_allowed
 from avmsf.capture.settings import METRES, CaptureSettings
 from avmsf.capture.table import TABLE, Strike, fitting_units, parse_row, read_rows
 from avmsf.errors import CaptureError, CaptureWarning, Location
-from avmsf.mesh.surface import Surface, read_surface
+from avmsf.mesh.surface import Surface, contacted_part, read_surface, surface_points
 
 WIDEST = 10.0
 """Meters across beyond which contacts are more likely in another unit."""

@@ -10,13 +10,14 @@ from PIL import Image
 from avmsf._utils.text import counted
 from avmsf.capture.filenames import find_surface_file, pictures_in, unused_files
 from avmsf.capture.folder import Capture
-from avmsf.capture.placement import expect_placed, surface_points
+from avmsf.capture.placement import expect_placed
 from avmsf.capture.proposals import contacts_of
 from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.table import read_rows
 from avmsf.capture.together import find_surface
 from avmsf.errors import AvmsfError, AvmsfWarning, CaptureError, CaptureWarning, FitError, SceneError
 from avmsf.gaussians.ply import read_splats
+from avmsf.mesh.surface import surface_points
 from avmsf.photographs.folder import find_shots, read_views
 from avmsf.photographs.nerf_json import stated_moves
 from avmsf.photographs.segmentation import find_foreground

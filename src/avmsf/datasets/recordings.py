@@ -14,13 +14,13 @@ from avmsf.capture.audio import Recording
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.measure import measure, shared_problems
-from avmsf.capture.placement import check_placement, surface_points
+from avmsf.capture.placement import check_placement
 from avmsf.capture.prepare import Prepared, prepare
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.starts import build_impacts, shorten
 from avmsf.capture.together import common_rate
 from avmsf.errors import CaptureError, CaptureWarning, DatasetError
-from avmsf.mesh.surface import Surface
+from avmsf.mesh.surface import Surface, surface_points
 
 MIN_RECORDINGS = 2
 MAX_SHOWN = 5

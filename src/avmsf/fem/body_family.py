@@ -11,10 +11,10 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from avmsf.errors import SimulationError
-from avmsf.fem.candidate_bodies import WALL_TRIAL, WALLS, Shape, walled_solid
+from avmsf.fem.candidate_bodies import WALL_TRIAL, WALLS
 from avmsf.fem.isotropic import IsotropicModes, isotropic_modes
 from avmsf.fem.mesh_check import CheckedSurface, checked
-from avmsf.fem.mesh_filling import filled_solid, wall_solids
+from avmsf.fem.mesh_filling import Shape, filled_solid, wall_solids, walled_solid
 from avmsf.fem.solid import Solid
 from avmsf.fem.walls import Wall, wall_of
 from avmsf.mesh.surface import Surface

@@ -9,19 +9,18 @@ from importlib.metadata import version
 from pathlib import Path
 from threading import Lock
 from types import MappingProxyType
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from avmsf._utils.caching import key_of, source_digest
 from avmsf._utils.compiled import lane_count
-from avmsf.errors import SceneError, SimulationError
+from avmsf.errors import SimulationError
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.elastic_store import modes_once
 from avmsf.fem.elements import SecondOrder
 from avmsf.fem.material import LARGEST_ERROR, NOMINAL, Material
 from avmsf.fem.mesh_check import CheckedSurface, checked
-from avmsf.fem.mesh_filling import FEWEST, TRIANGLES, count_dofs, expect_memory, filled_solid, wall_solids
+from avmsf.fem.mesh_filling import FEWEST, Shape, count_dofs, expect_memory, filled_solid, wall_solids, walled_solid
 from avmsf.fem.solid import Solid
 from avmsf.fem.supports import Support, supports_of
 from avmsf.mesh.surface import Surface
@@ -43,31 +42,6 @@ _REMESHING = Lock()
 """Held while the skin of a wall is remeshed, which several threads wait for."""
 _MEANS = frozenset({"memory", "timeout", "pytetwild"})
 """Names of errors that are no fault of a surface or its wall."""
-
-
-@runtime_checkable
-class Shape(Protocol):
-    """An object's shape as seen from outside, which a wall of any thickness may have."""
-
-    @property
-    def thickness_range(self) -> tuple[float, float] | None:
-        """Least and largest thickness of a wall that is worth a trial, meters; None for an object without a cavity."""
-        ...
-
-    def as_seen(self) -> Surface:
-        """Return the closed surface of what was seen, both sides of walls included."""
-        ...
-
-    def shell(self, thickness: float, *, faces: int) -> Surface:
-        """Return the closed surface of a wall, meters thick, behind the outer side. Raises SceneError without one.
-
-        Each of its sides has about so many triangles.
-        """
-        ...
-
-    def digest(self) -> str:
-        """Return a digest of all that decides the surfaces."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -400,15 +374,6 @@ class BodyMaker:
         content.update(vertices.tobytes())
         content.update(faces.tobytes())
         return content.hexdigest()
-
-
-def walled_solid(shape: Shape, thickness: float, dofs: int, *, log: Callable[[str], None]) -> Solid:
-    """Return the elements of a wall of a shape, meters thick. Raises SimulationError where it cannot be made."""
-    try:
-        surface = shape.shell(thickness, faces=round(0.5 * TRIANGLES * dofs))
-    except SceneError as error:
-        raise SimulationError(str(error), **error.attributes) from error
-    return filled_solid(checked(surface, log=log), dofs, wall=thickness)
 
 
 def _frequency_error(coarse: ElasticModes, fine: ElasticModes) -> float:

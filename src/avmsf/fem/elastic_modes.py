@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
-from avmsf.capture.placement import surface_points
 from avmsf.errors import SimulationError
 from avmsf.fem.eigen import Vibrations, lowest_vibrations, rigid_motions
 from avmsf.fem.elements import SecondOrder, elements_of, mass, stiffness
@@ -19,7 +18,7 @@ from avmsf.fem.material import Material
 from avmsf.fem.perturbation import Perturbations, perturbations
 from avmsf.fem.solid import Solid, no_tetrahedra
 from avmsf.mesh.closest_point import Closest, ClosestPoints
-from avmsf.mesh.surface import Surface
+from avmsf.mesh.surface import Surface, surface_points
 
 _PENDULUM = 1e-9
 """Squared frequency over the largest, below which a body turns about the nodes that it is held at: rounding alone."""

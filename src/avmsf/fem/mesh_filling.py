@@ -5,13 +5,14 @@ import math
 from collections.abc import Callable, Iterator
 from operator import itemgetter
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 
-from avmsf.errors import SimulationError
+from avmsf.errors import SceneError, SimulationError
 from avmsf.fem.elements import SecondOrder
-from avmsf.fem.mesh_check import CheckedSurface, simplified
+from avmsf.fem.mesh_check import CheckedSurface, checked, simplified
 from avmsf.fem.shell import shell
 from avmsf.fem.skin import Skin
 from avmsf.fem.solid import Solid
@@ -49,6 +50,31 @@ _PEAK = 377e6, 40_000, 1.1
 """Bytes that modes take at their peak, of how many degrees of freedom, and the power they grow by (benchmarks/fem)."""
 _CAUTION = 2.0
 """Factor on that, for lumps take more than the walls it was measured on."""
+
+
+@runtime_checkable
+class Shape(Protocol):
+    """An object's shape as seen from outside, which a wall of any thickness may have."""
+
+    @property
+    def thickness_range(self) -> tuple[float, float] | None:
+        """Least and largest thickness of a wall that is worth a trial, meters; None for an object without a cavity."""
+        ...
+
+    def as_seen(self) -> Surface:
+        """Return the closed surface of what was seen, both sides of walls included."""
+        ...
+
+    def shell(self, thickness: float, *, faces: int) -> Surface:
+        """Return the closed surface of a wall, meters thick, behind the outer side. Raises SceneError without one.
+
+        Each of its sides has about so many triangles.
+        """
+        ...
+
+    def digest(self) -> str:
+        """Return a digest of all that decides the surfaces."""
+        ...
 
 
 def expect_memory(dofs: int) -> None:
@@ -94,6 +120,15 @@ def filled_solid(checked: CheckedSurface, dofs: int, *, wall: float | None = Non
         return fill(_surface(skin), detail=detail, timeout=_FILLING_SECONDS)
 
     return _near(filled, dofs, first=first)
+
+
+def walled_solid(shape: Shape, thickness: float, dofs: int, *, log: Callable[[str], None]) -> Solid:
+    """Return the elements of a wall of a shape, meters thick. Raises SimulationError where it cannot be made."""
+    try:
+        surface = shape.shell(thickness, faces=round(0.5 * TRIANGLES * dofs))
+    except SceneError as error:
+        raise SimulationError(str(error), **error.attributes) from error
+    return filled_solid(checked(surface, log=log), dofs, wall=thickness)
 
 
 def wall_solids(checked: CheckedSurface, dofs: int) -> Callable[[float], Solid]:

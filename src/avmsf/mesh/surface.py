@@ -1,4 +1,4 @@
-"""The object's shape, as triangles or as points."""
+"""The object's shape, as triangles or as points; points all over it, and the part that contacts lie on."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +14,10 @@ from avmsf.errors import ArrayError, CaptureError
 
 SurfaceKind = Literal["ply", "obj", "glb"]
 """Formats that surfaces are written in."""
+MOST_POINTS = 20_000
+"""Points on the triangles of a surface."""
+_ELSEWHERE = 0.1
+"""Part of the contacts up to which those nearest to another part of a surface count as single mistakes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,3 +92,48 @@ def write_surface(surface: Surface, path: Path, *, kind: SurfaceKind = "ply") ->
 
     shape = trimesh.PointCloud(vertices) if cloud else trimesh.Trimesh(vertices, faces, process=False)  # type: ignore[no-untyped-call]
     shape.export(path, file_type=kind)
+
+
+def surface_points(surface: Surface, *, count: int = MOST_POINTS) -> Float[Tensor, "points 3"]:
+    """Return points all over a surface, always the same: `count` on its triangles, evenly by area, and its vertices."""
+    vertices = surface.vertices.double()
+    if not len(surface.faces):
+        return vertices
+    # Takes half a second to import, which what reads no mesh does without.
+    import trimesh
+
+    mesh = trimesh.Trimesh(vertices.numpy(), surface.faces.numpy(), process=False)
+    if not mesh.area > 0:
+        return vertices
+    return torch.cat([torch.from_numpy(np.array(trimesh.sample.sample_surface(mesh, count, seed=0)[0])), vertices])
+
+
+def contacted_part(surface: Surface, contacts: Float[Tensor, "contacts 3"]) -> tuple[Surface, list[float]]:
+    """Return a surface without connected parts larger than the one that contacts lie on, such as a table.
+
+    The second value is the areas in square meters, of the part that is kept and of those left out; empty where the
+    contacts lie on the largest or on several.
+    """
+    if not len(surface.faces) or not len(contacts):
+        return surface, []
+    import trimesh
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    mesh = trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=False)
+    rows = np.unique(mesh.vertices[mesh.faces].reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1, 3)
+    edges = np.concatenate([rows[:, [0, 1]], rows[:, [1, 2]]])
+    links = coo_array((np.ones(len(edges)), edges.T), shape=(rows.max() + 1,) * 2)
+    label = connected_components(links, directed=False)[1][rows[:, 0]]
+    if not label.any() or not mesh.area > 0:
+        return surface, []
+    points, faces = trimesh.sample.sample_surface(mesh, MOST_POINTS, seed=0)
+    parts = label[faces[cKDTree(points).query(contacts.double().numpy())[1]]]
+    part, areas = int(np.bincount(parts).argmax()), np.bincount(label, weights=mesh.area_faces)
+    left = areas > areas[part]
+    if not left.any() or np.mean(parts != part) > _ELSEWHERE:
+        return surface, []
+    kept = surface.faces[torch.from_numpy(~left[label])]
+    used, corners = torch.unique(kept, return_inverse=True)
+    return Surface(surface.vertices[used], corners), [float(areas[part]), *map(float, areas[left])]

@@ -7,11 +7,12 @@ import numpy as np
 import torch
 
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.placement import expect_placed, surface_points
+from avmsf.capture.placement import expect_placed
 from avmsf.errors import SimulationError
-from avmsf.fem.candidate_bodies import BodyMaker, Shape
+from avmsf.fem.candidate_bodies import BodyMaker
+from avmsf.fem.mesh_filling import Shape
 from avmsf.field.gains.elastic import CandidateBodies
-from avmsf.mesh.surface import Surface
+from avmsf.mesh.surface import Surface, surface_points
 from avmsf.pipeline.config import BodyConfig
 
 

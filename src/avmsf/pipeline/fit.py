@@ -19,7 +19,6 @@ from avmsf._utils.files import write_whole
 from avmsf._utils.progress import is_live, repeated
 from avmsf._utils.text import counted
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
-from avmsf.capture.placement import surface_points
 from avmsf.capture.settings import settings_of
 from avmsf.capture.together import find_surface
 from avmsf.errors import AvmsfError, FitError, SceneError
@@ -37,7 +36,7 @@ from avmsf.field.store import load, save
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh import Surface
 from avmsf.mesh.closest_point import ClosestPoints
-from avmsf.mesh.surface import read_surface, write_surface
+from avmsf.mesh.surface import read_surface, surface_points, write_surface
 from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.photographs import read_views
 from avmsf.photographs.nerf_json import stated_moves

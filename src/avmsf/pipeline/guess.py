@@ -13,10 +13,11 @@ from avmsf.capture.table import TABLE, read_cells
 from avmsf.capture.together import NARROWEST, WIDEST
 from avmsf.errors import FitError, SimulationError
 from avmsf.features.feature_field import FeatureField
-from avmsf.fem.candidate_bodies import NominalBody, Shape, nominal_bodies
+from avmsf.fem.candidate_bodies import NominalBody, nominal_bodies
 from avmsf.fem.damping import damped, rayleigh
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.material import Material, material_named
+from avmsf.fem.mesh_filling import Shape
 from avmsf.fem.radiation import radiated_pressure
 from avmsf.field.config import FitConfig
 from avmsf.field.scaled_gains import BodyGains
