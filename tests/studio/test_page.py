@@ -249,22 +249,6 @@ def test_what_the_browser_lacks_is_said_and_the_rest_works(visit: Open, before: 
     assert page.locator("tbody tr").count() == 6
 
 
-def test_a_file_dropped_on_a_page_without_a_server_does_not_replace_it(plain: "Page") -> None:
-    page = plain
-    kept = page.evaluate(
-        """() => ["dragover", "drop"].map((name) => {
-             const dataTransfer = new DataTransfer();
-             dataTransfer.items.add(new File(["RIFF"], "blow.wav"));
-             const event = new DragEvent(name, { dataTransfer, cancelable: true });
-             window.dispatchEvent(event);
-             return event.defaultPrevented;
-           })"""
-    )
-    assert kept == [True, True]
-    assert "no server" in words_on(page)
-    assert page.locator("#drop-target").is_hidden()
-
-
 def test_all_fits_on_a_telephone(visit: Open) -> None:
     page = visit(live=LIVE, viewport={"width": 390, "height": 760})
     assert page.evaluate("document.documentElement.scrollWidth") <= 390

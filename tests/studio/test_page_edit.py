@@ -353,19 +353,6 @@ def test_a_measured_strike_is_compared_with_the_model(visit: Open) -> None:
     assert page.locator(".mark .dot[data-strike]").count() == 0
 
 
-def test_a_recording_is_heard(visit: Open) -> None:
-    page = visit(strikes=True)
-    page.click("#sheet-strike li:has-text('100.wav') >> text=Recording")
-    page.wait_for_function(
-        """() => {
-             const samples = new Float32Array(avmsf.studio.engine.analyser.fftSize);
-             avmsf.studio.engine.analyser.getFloatTimeDomainData(samples);
-             return samples.some((value) => Math.abs(value) > 1e-3);
-           }"""
-    )
-    assert page.evaluate("avmsf.studio.last === undefined"), "without a blow of the model"
-
-
 def test_what_an_object_is_of_changes_nothing_by_itself(edits: Any) -> None:
     page, server = edits()
     page.get_by_label("Present material").select_option("wood")

@@ -90,14 +90,6 @@ def test_a_computation_that_leads_nowhere_asks_for_other_values(
     refused(plate.ask("POST", "locate", blow()), 422)
 
 
-def test_a_full_temporary_folder_is_named_as_the_cause(plate: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*arguments: object, **options: object) -> str:
-        raise OSError(errno.ENOSPC, "No space left on device", "/tmp")
-
-    monkeypatch.setattr("tempfile.mkdtemp", full)
-    assert "No space left" in refused(plate.ask("POST", "lead?base=1", blow()), 507)
-
-
 def test_a_server_without_a_temporary_folder_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened = open_plate(tmp_path / "opened")
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "none"))

@@ -27,7 +27,6 @@ import trimesh
 from filelock import FileLock
 
 from avmsf._utils.files import copy_whole
-from avmsf.cli import main
 from avmsf.editing.material import change_material
 from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import AvmsfError, StudioError
@@ -566,21 +565,6 @@ def test_the_command_serves_until_it_is_told_to_end(tmp_path: Path) -> None:
     assert rest == "closed\n"
     assert json.loads(out) == {"address": address}
     assert list((tmp_path / "temporary").iterdir()) == []
-
-
-def test_the_command_says_what_it_needs(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    assert main(["studio", "nothing.safetensors"]) == 2
-    assert "nothing.safetensors: expected a field, a capture folder" in capsys.readouterr().err
-    monkeypatch.setitem(sys.modules, "avmsf.studio.server", None)
-    monkeypatch.setitem(sys.modules, "uvicorn", None)
-    del sys.modules["avmsf.studio.server"]
-    monkeypatch.delitem(sys.modules, "avmsf.studio.server", raising=False)
-    present = tmp_path / "field.safetensors"
-    present.write_bytes(b"")
-    assert main(["studio", str(present)]) == 2
-    assert "pip install 'avmsf[studio]'" in capsys.readouterr().err
 
 
 def test_a_folder_of_strikes_alone_is_clicked_where_its_contacts_are(tmp_path: Path) -> None:
