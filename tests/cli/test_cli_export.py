@@ -300,7 +300,7 @@ def test_a_page_is_a_folder_or_one_file(field_file: Path, tmp_path: Path, capsys
 def test_what_follows_names_what_was_written(
     to: str, name: str, named: str, field_file: Path, tmp_path: Path, capsys: Streams
 ) -> None:
-    words = ["export", str(field_file), "--to", to, "--output", str(tmp_path / name), "--contacts", "3"]
+    words = ["export", str(field_file), "--to", to, "--output", str(tmp_path / name), "--contacts", "4"]
     assert main([*words, *(["--forces", "1", "2", "--seconds", "0.01"] if to == "wavs" else [])]) == 0
     (following,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("next: ")]
     assert named in following

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, Shaped
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf._utils.text import read_json
@@ -27,7 +26,7 @@ from avmsf.export.one_phase import approximation_error, signed_amplitudes
 from avmsf.export.sampled_field import SampledField, outward_normals
 from avmsf.export.writing import MANIFEST, Written, generator, pack, write_folder
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.initialize import ZEROTH
+from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
 
 PICKING, SCENE, MODAL = "picking.bin", "scene.ply", "modal.bin"
@@ -64,10 +63,11 @@ def write_demo(
     """Write the demo's folder; where there is no `cloud` whose centers are the field's points, with a disc at each.
 
     Modes have the field's level and start as cosines, whatever their phase is in the field. With `force`, other
-    variants of the same Gaussians stay in the folder. Raises `ExportError`, also where it holds variants of others.
+    variants of the same Gaussians stay in the folder. Raises `ExportError`, also where it holds variants of others, and
+    without a `cloud` `SceneError` for fewer than four points.
     """
     folder = Path(folder)
-    shown = discs(field) if cloud is None else cloud
+    shown = _discs(field) if cloud is None else cloud
     if len(shown) != len(field):
         wanted, advice = f"one for each of {len(field)} points", "sample the field at the Gaussians' centers"
         raise ExportError.expected(wanted, len(shown), name="cloud", advice=advice)
@@ -97,6 +97,12 @@ def write_demo(
     written = torch.from_numpy(gains.astype(np.float32))
     error = approximation_error(field, sine=None, cosine=written, damping=field.damping)
     return Written(sizes, tuple(_remarks(field, others)), error.waveform, error.spectrum_db)
+
+
+def _discs(field: SampledField) -> GaussianCloud:
+    """Return a flat gray Gaussian at each point, tangent to the surface, as wide as the distance between points."""
+    start = StartPoints(field.points, torch.full_like(field.points, 0.7), field.normals)
+    return starting_cloud(start, degree=0, scale=0.6, opacity=0.95, flatness=0.1)
 
 
 def _gains(field: SampledField, precision: Precision) -> Float[np.ndarray, "points modes"]:
@@ -298,29 +304,3 @@ def is_demo(folder: Path) -> bool:
 
 def _seconds(field: SampledField) -> float:
     return field.samples / field.sample_rate
-
-
-_GRAY = 0.7
-
-
-def discs(field: SampledField) -> GaussianCloud:
-    """Return a flat gray Gaussian at each point, tangent to the surface, as wide as the distance between points."""
-    places = field.points.double().numpy()
-    if len(places) > 1:
-        apart = np.median(cKDTree(places).query(places, k=min(4, len(places)))[0][:, 1:], axis=1)
-    else:
-        apart = np.ones(1) * 0.01
-    width = torch.from_numpy(np.maximum(apart, 1e-6)).float() * 0.6
-    scales = torch.stack([width, width, 0.1 * width], dim=1)
-    # The rotation of the third axis onto the normal, as a quaternion.
-    rotated = torch.cat([1.0 + field.normals[:, 2:], -field.normals[:, 1:2], field.normals[:, :1]], dim=1)
-    rotated = torch.cat([rotated, torch.zeros(len(field), 1)], dim=1)
-    below = field.normals[:, 2] < -1 + 1e-6
-    rotated[below] = torch.tensor([0.0, 1.0, 0.0, 0.0])
-    return GaussianCloud(
-        field.points.float(),
-        torch.nn.functional.normalize(rotated, dim=1),
-        scales.log(),
-        torch.full((len(field),), 3.0),
-        torch.full((len(field), 1, 3), (_GRAY - 0.5) / ZEROTH),
-    )
