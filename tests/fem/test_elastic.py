@@ -279,12 +279,6 @@ def test_interpolation_is_exact_for_second_degree_and_takes_the_nearest_place(mo
     assert torch.allclose(field.gains(above, along)[:, 0], (expected * along).sum(dim=1), atol=1e-14)
 
 
-def test_two_runs_are_the_same_to_the_last_bit(bracket, modes):
-    again = elastic_modes(bracket, STEEL, count=8)
-    assert torch.equal(again.frequency, modes.frequency)
-    assert torch.equal(again.shapes, modes.shapes)
-
-
 def test_highest_leaves_out_what_lies_above(bracket, modes):
     limit = float(modes.frequency[3]) + 1.0
     assert torch.equal(elastic_modes(bracket, STEEL, count=8, highest=limit).frequency, modes.frequency[:4])

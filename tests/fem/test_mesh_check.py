@@ -18,11 +18,8 @@ from avmsf.fem.tetrahedra import fill
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.level_set import enclose
 from avmsf.mesh.surface import Surface
+from factories.looked_at import surface_of
 from factories.raising import raises
-
-
-def surface_of(mesh: trimesh.Trimesh) -> Surface:
-    return Surface(torch.from_numpy(np.array(mesh.vertices)).float(), torch.from_numpy(np.array(mesh.faces)))
 
 
 def surface_in(skin: Skin) -> Surface:

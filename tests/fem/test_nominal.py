@@ -15,12 +15,9 @@ from avmsf.fem.candidate_bodies import BodyMaker, NominalBody, nominal_bodies
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import NOMINAL
 from avmsf.mesh.surface import Surface, read_surface
+from factories.looked_at import surface_of
 from factories.raising import raises
 from oracles.block import block
-
-
-def surface_of(mesh: trimesh.Trimesh) -> Surface:
-    return Surface(torch.from_numpy(np.array(mesh.vertices)).float(), torch.from_numpy(np.array(mesh.faces)))
 
 
 def sheet(sides: tuple[int, int] = (12, 9), size: tuple[float, float] = (0.24, 0.17)) -> Surface:

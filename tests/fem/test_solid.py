@@ -18,12 +18,9 @@ from avmsf.fem.solid import Solid
 from avmsf.fem.tetrahedra import fill
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.surface import Surface
+from factories.looked_at import surface_of
 from factories.raising import raises
 from oracles.block import block
-
-
-def surface_of(mesh: trimesh.Trimesh) -> Surface:
-    return Surface(torch.from_numpy(np.array(mesh.vertices)).float(), torch.from_numpy(np.array(mesh.faces)))
 
 
 def ball(radius: float = 0.05, subdivisions: int = 3) -> Surface:

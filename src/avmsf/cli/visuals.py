@@ -7,7 +7,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from avmsf._utils.text import counted
+from avmsf._utils.text import counted, listed
 from avmsf.capture.filenames import find_surface_file, pictures_in, unused_files
 from avmsf.capture.folder import Capture
 from avmsf.capture.placement import expect_placed
@@ -21,7 +21,7 @@ from avmsf.mesh.surface import surface_points
 from avmsf.photographs.folder import find_shots, read_views
 from avmsf.photographs.nerf_json import stated_moves
 from avmsf.photographs.segmentation import find_foreground
-from avmsf.photographs.shots import listed, mask_names
+from avmsf.photographs.shots import mask_names
 from avmsf.pipeline.frame_check import LONGEST, MAX_VIEWS, check_outlines, expect_contacts_in_views, expect_on_object
 from avmsf.pipeline.scene import scaled, without_far
 from avmsf.pipeline.sources import find_source, find_splats

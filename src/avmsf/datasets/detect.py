@@ -4,6 +4,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Literal
 
+from avmsf._utils.text import listed
 from avmsf.capture.table import TABLE
 from avmsf.errors import DatasetError
 
@@ -69,15 +70,11 @@ def _explain(folder: Path) -> tuple[str, str | tuple[str, ...]]:
     archives = tuple(path.name for path in paths if path.suffix.lower() in ARCHIVES)
     if archives:
         command = "unzip" if archives[0].endswith(".zip") else "tar -xf"
-        return f"got archives, {_listed(archives)}; unpack them, `{command} {archives[0]}` in {folder}", archives
+        return f"got archives, {listed(archives, most=8)}; unpack them, `{command} {archives[0]}` in {folder}", archives
     names = tuple(path.name + "/" * path.is_dir() for path in paths)
     numbers = any(path.name.isdecimal() and path.is_dir() for path in paths)
     advice = "; if numbers are ObjectFolder Real's objects, unpack audio_data_1_10.tar.gz and so on here" * numbers
-    return f"got {_listed(names)}{advice}" if names else "got an empty folder", names
-
-
-def _listed(names: tuple[str, ...]) -> str:
-    return ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
+    return f"got {listed(names, most=8)}{advice}" if names else "got an empty folder", names
 
 
 def _no_folder(path: Path) -> DatasetError:

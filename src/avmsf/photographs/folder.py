@@ -15,13 +15,13 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from avmsf._utils.files import new_folder
-from avmsf._utils.text import counted
+from avmsf._utils.text import counted, listed
 from avmsf.errors import CaptureError, Remark
 from avmsf.mesh.io import load_parts
 from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.colmap import PLACES, find_model, read_colmap, read_points
 from avmsf.photographs.nerf_json import load_record, read_transforms
-from avmsf.photographs.shots import Findings, Shot, Shots, listed, read_view, without_camera
+from avmsf.photographs.shots import Findings, Shot, Shots, read_view, without_camera
 
 MIN_VIEWS = 3
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -13,12 +13,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf._utils.text import read_json
+from avmsf._utils.text import listed, read_json
 from avmsf.capture.filenames import PICTURE_SUFFIXES
 from avmsf.capture.placement import Mistake
 from avmsf.errors import CaptureError, Location, Remark
 from avmsf.photographs.lenses import Lens
-from avmsf.photographs.shots import Shot, Shots, listed, refuse_many
+from avmsf.photographs.shots import Shot, Shots, refuse_many
 
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")

@@ -13,10 +13,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 
-from avmsf._utils.text import counted
+from avmsf._utils.text import counted, listed
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.photographs.cameras import Camera, View
-from avmsf.photographs.shots import listed
 
 MIN_VIEWS = 3
 # Parts of a first mask smaller than this against its largest are taken for spots in the background.

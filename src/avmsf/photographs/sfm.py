@@ -21,11 +21,11 @@ import numpy as np
 
 from avmsf._utils.children import end_child, ending_of, start_child
 from avmsf._utils.files import unwritable
-from avmsf._utils.text import counted
+from avmsf._utils.text import counted, listed
 from avmsf.capture.filenames import PICTURE_SUFFIXES, pictures_in
 from avmsf.errors import CaptureError, Remark
 from avmsf.photographs.images import Picture, PictureSizeError, read_mask, read_picture
-from avmsf.photographs.shots import listed, mask_names
+from avmsf.photographs.shots import mask_names
 
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 WORKER = Path(__file__).with_name("sfm_worker.py")

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf._utils.text import counted
+from avmsf._utils.text import counted, listed
 from avmsf.capture.filenames import pictures_in
 from avmsf.errors import CaptureError, Remark
 from avmsf.photographs.cameras import View
@@ -76,12 +76,6 @@ def mask_names(name: str, folder: Path) -> list[Path]:
     """Return the paths where the mask of the photograph of this name may be, the likeliest first."""
     path = PurePosixPath(name)
     return [folder / "masks" / path.with_suffix(".png"), folder / "masks" / f"{path}.png"]
-
-
-def listed(names: Sequence[str], *, most: int = 5) -> str:
-    """Return the first names and how many more there are."""
-    more = len(names) - most
-    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 @dataclass

@@ -1,7 +1,7 @@
 """Symmetries of an object: rotations about an axis and mirror planes, each with how well it was found to hold."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf._utils.text import count_of, like
 from avmsf.errors import SceneError
 
 
@@ -122,25 +123,26 @@ class Symmetries:
 
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> "Symmetries":
-        """Read what `to_dict` returned, now or earlier. Raises SceneError for anything else, and names the entry."""
-        rotations = [
-            RotationalSymmetry(
-                _vector(each, "axis", place, unit=True),
-                _vector(each, "point", place),
-                _order(each, place),
-                _number(each, "error", place),
+        """Read what `to_dict` returned, now or earlier. Raises SceneError for anything else."""
+        try:
+            rotations = tuple(
+                RotationalSymmetry(
+                    _vector(each, "axis", unit=True),
+                    _vector(each, "point"),
+                    None if each["order"] is None else count_of(each["order"], "order", least=2),
+                    _number(each, "error"),
+                )
+                for each in stored["rotations"]
             )
-            for each, place in _entries(stored, "rotations")
-        ]
-        mirrors = [
-            MirrorSymmetry(
-                _vector(each, "normal", place, unit=True), _vector(each, "point", place), _number(each, "error", place)
+            mirrors = tuple(
+                MirrorSymmetry(_vector(each, "normal", unit=True), _vector(each, "point"), _number(each, "error"))
+                for each in stored["mirrors"]
             )
-            for each, place in _entries(stored, "mirrors")
-        ]
-        rejected = math.inf if stored.get("rejected", 0) is None else _number(stored, "rejected", "symmetries")
-        spacing, tolerance = (_number(stored, name, "symmetries") for name in ("spacing", "tolerance"))
-        return cls(tuple(rotations), tuple(mirrors), spacing, tolerance, rejected)
+            rejected = math.inf if stored["rejected"] is None else _number(stored, "rejected")
+            return cls(rotations, mirrors, _number(stored, "spacing"), _number(stored, "tolerance"), rejected)
+        except (ValueError, TypeError, KeyError) as error:
+            advice = "find the symmetries again"
+            raise SceneError.expected("numbers as they are stored", got=repr(error), name="symmetries", advice=advice) from error
 
 
 def _numbers(values: Float[Tensor, " 3"]) -> str:
@@ -148,37 +150,16 @@ def _numbers(values: Float[Tensor, " 3"]) -> str:
     return " ".join(f"{round(value, 4) + 0.0:.4g}" for value in values.tolist())
 
 
-def _entries(stored: Mapping[str, Any], name: str) -> list[tuple[Mapping[str, Any], str]]:
-    entries = stored.get(name) if isinstance(stored, Mapping) else None
-    if not isinstance(entries, Sequence) or not all(isinstance(each, Mapping) for each in entries):
-        raise _damaged("symmetries", name, "a list of entries", entries)
-    return [(each, f"symmetries.{name}[{number}]") for number, each in enumerate(entries)]
-
-
-def _number(entry: Mapping[str, Any], name: str, place: str) -> float:
-    value = entry.get(name)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise _damaged(place, name, "a number", value)
-    return float(value)
-
-
-def _vector(entry: Mapping[str, Any], name: str, place: str, *, unit: bool = False) -> Float[Tensor, " 3"]:
-    value = entry.get(name)
-    numbers = value if isinstance(value, Sequence) and not isinstance(value, str) else []
-    finite = len(numbers) == 3 and all(isinstance(each, int | float) and math.isfinite(each) for each in numbers)
-    if not finite or (unit and abs(math.hypot(*numbers) - 1.0) > 1e-6):
-        raise _damaged(place, name, "a unit vector" if unit else "three numbers", value)
-    return torch.tensor(numbers, dtype=torch.float64)
-
-
-def _order(entry: Mapping[str, Any], place: str) -> int | None:
-    value = entry.get("order")
-    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 2):
-        raise _damaged(place, "order", "2 or more, or null for any angle", value)
+def _number(entry: Mapping[str, Any], name: str) -> float:
+    value = float(like(entry[name], 1.0, name))
+    if not math.isfinite(value):
+        raise ValueError(f"{name}: expected a finite number, got {value}")
     return value
 
 
-def _damaged(place: str, name: str, wanted: str, value: Any) -> SceneError:
-    return SceneError.expected(
-        wanted, value, got=repr(value), name=f"{place}.{name}", advice="find the symmetries again"
-    )
+def _vector(entry: Mapping[str, Any], name: str, *, unit: bool = False) -> Float[Tensor, " 3"]:
+    value = like(entry[name], (1.0,), name)
+    length = math.hypot(*value)
+    if len(value) != 3 or not math.isfinite(length) or (unit and abs(length - 1.0) > 1e-6):
+        raise ValueError(f"{name}: expected {'a unit vector' if unit else 'three numbers'}, got {value}")
+    return torch.tensor(value, dtype=torch.float64)
