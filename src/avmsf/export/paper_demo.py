@@ -86,7 +86,12 @@ def write_demo(
         write_splats(shown, place / SCENE)
         (place / variant).mkdir()
         (place / variant / MODAL).write_bytes(modal)
-        sound = {"generator": generator(), "file": MODAL, "modes": len(field.frequency), "duration": _seconds(field)}
+        sound = {
+            "generator": generator(),
+            "file": MODAL,
+            "modes": len(field.frequency),
+            "duration": field.samples / field.sample_rate,
+        }
         sound |= {"sampleRate": field.sample_rate, "phase": "cosine", "arrays": tensors}
         (place / variant / MANIFEST).write_text(json.dumps(sound, indent=1) + "\n")
         for other in others:
@@ -300,7 +305,3 @@ def _unreadable(path: Path, error: OSError, advice: str) -> ExportError:
 def is_demo(folder: Path) -> bool:
     """Return whether a folder has the layout of the demo."""
     return (folder / MANIFEST).is_file() and (folder / PICKING).is_file()
-
-
-def _seconds(field: SampledField) -> float:
-    return field.samples / field.sample_rate

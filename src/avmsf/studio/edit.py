@@ -15,7 +15,7 @@ from avmsf.editing.config import STABLE_AUDIO
 from avmsf.editing.material import LAWS, change_material, infer_material
 from avmsf.editing.modal_edit import EDITS, adjust_modes, remarks
 from avmsf.errors import EditError
-from avmsf.fem.material import MATERIALS, material_named
+from avmsf.fem.material import material_named
 from avmsf.field.sound_field import SoundField
 from avmsf.studio.responses import bad_request
 
@@ -149,8 +149,6 @@ class Sliders:
 REST = Sliders()
 """Sliders that change nothing."""
 _RESTS = {"size": 1.0, "pitch": 1.0, "decay": 1.0, "brightness": 0.0}
-MATERIAL_NAMES = tuple(MATERIALS)
-"""What the page can offer."""
 
 
 def _mode(row: Any) -> ModeChange:
@@ -228,11 +226,6 @@ class GuidedEditTarget:
             return {**task, "prompt": self.prompt, "model": model}
         (place / "like.wav").write_bytes(self.like)
         return {**task, "recording": str(place / "like.wav")}
-
-
-def is_guided(words: Mapping[str, Any]) -> bool:
-    """Whether an edit asks for a descent and not for sliders."""
-    return words.get("prompt") is not None
 
 
 def text_model(given: str | None) -> str | None:

@@ -32,18 +32,8 @@ _repr.maxlevel = 3
 class RequestError(StudioError):
     """A request that is not done, with its HTTP status and `more` entries for the answer."""
 
-    def __init__(
-        self,
-        status: int,
-        message: str,
-        *,
-        file: Path | str | None = None,
-        row: int | None = None,
-        name: str | None = None,
-        value: Any = None,
-        more: Mapping[str, Any] | None = None,
-    ) -> None:
-        super().__init__(message, file=file, row=row, name=name, value=value)
+    def __init__(self, status: int, message: str, *, more: Mapping[str, Any] | None = None, **attributes: Any) -> None:
+        super().__init__(message, **attributes)
         self.status, self.more = status, more or {}
 
 

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from avmsf.editing.modal_edit import EDITS, remarks
+from avmsf.fem.material import MATERIALS
 from avmsf.field.store import load, save
 from avmsf.pipeline.config import Preset
 from avmsf.studio.capture import CaptureEditor, read_upload
-from avmsf.studio.edit import MATERIAL_NAMES, GuidedEditTarget, Sliders, is_guided, text_model
+from avmsf.studio.edit import GuidedEditTarget, Sliders, text_model
 from avmsf.studio.files import Showcase
 from avmsf.studio.jobs import Event, Job, Jobs, Result, Threads
 from avmsf.studio.locate import Searches
@@ -92,7 +93,7 @@ class Studio:
     async def edit(self, words: dict[str, Any]) -> dict[str, Any]:
         """Set the sliders, or start to optimize the field towards a recording or a text. Raises the errors of edits."""
         base = base_of(words)
-        if is_guided(words):
+        if words.get("prompt") is not None:
             return await self._lead(base, GuidedEditTarget.read(words, model=self.model))
         sliders = Sliders.read(words, modes=len(self.session.current.require_field().bank))
         return self._changed(await self._compute(self.session.edit, base, sliders))
@@ -230,7 +231,7 @@ class Studio:
             "sliders": revision.sliders.to_json(),
             "remarks": [*self.showcase.current.remarks, *revision.remarks],
             "rows": rows,
-            "materials": list(MATERIAL_NAMES),
+            "materials": list(MATERIALS),
             "job": None if running is None else running.identifier,
             "jobKind": None if running is None else running.kind,
             "noObject": self.jobs.failure(_MAKING),
