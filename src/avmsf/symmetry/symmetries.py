@@ -142,7 +142,9 @@ class Symmetries:
             return cls(rotations, mirrors, _number(stored, "spacing"), _number(stored, "tolerance"), rejected)
         except (ValueError, TypeError, KeyError) as error:
             advice = "find the symmetries again"
-            raise SceneError.expected("numbers as they are stored", got=repr(error), name="symmetries", advice=advice) from error
+            raise SceneError.expected(
+                "numbers as they are stored", got=repr(error), name="symmetries", advice=advice
+            ) from error
 
 
 def _numbers(values: Float[Tensor, " 3"]) -> str:
