@@ -1,7 +1,7 @@
 """Everything that is wrong with a capture folder, found without stopping at the first thing."""
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,6 +29,10 @@ from avmsf.capture.together import check_contacts, check_levels, check_surface, 
 from avmsf.errors import CaptureError
 
 UNCUT = "all recordings start with the impact, as impulse responses do, and are not cut"
+TEXT_ORDER = (
+    f"the rows of {TABLE} have the files in the order of text (1, 10, 2), not of numbers (1, 2, 10): make sure that "
+    "the contacts are in this order, too"
+)
 
 
 @dataclass(frozen=True)
@@ -111,25 +115,12 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
             problems += map(str, common_length(lengths, names, rate=rate, settings=settings)[1])
         with _collected(refused):
             problems += map(str, check_levels([each.peak for each in sounds], names))
-    first = {each.digest: each.file for each in reversed(sounds)}
-    problems += [
-        f"{each.file}: the same sound as {first[each.digest]}, to the last bit: copy the right file, or remove its row"
-        for each in sounds
-        if each.file != first[each.digest]
-    ]
-    listed = {report.file for report in reports}
-    unlisted = [name for name in _wav_files(folder) if name not in listed]
-    if unlisted:
-        lack = f"{counted(len(unlisted), 'wav file')} {'has' if len(unlisted) == 1 else 'have'} no row in {TABLE}"
-        problems.append(f"{lack}: {', '.join(unlisted[:5])}{', …' * (len(unlisted) > 5)}")
+    problems += _copies(sounds) + _unlisted(folder, {report.file for report in reports})
     readable = not refused and all(report.readable for report in reports)
     remarks = [UNCUT] if uncut else []
     names = [report.file for report in reports]
     if names == sorted(names) != sorted(names, key=number_key):
-        remarks.append(
-            f"the rows of {TABLE} have the files in the order of text (1, 10, 2), not of numbers (1, 2, 10): make sure "
-            "that the contacts are in this order, too"
-        )
+        remarks.append(TEXT_ORDER)
     return CaptureReport(readable, tuple(reports), tuple(refused + problems), tuple(remarks))
 
 
@@ -142,10 +133,25 @@ def _collected(refused: list[str]) -> Iterator[None]:
         refused.append(str(error))
 
 
-def _wav_files(folder: Path) -> list[str]:
-    """Return the names of a capture's wav files; hidden ones, such as what the studio has removed, are none of it."""
+def _copies(sounds: Sequence[_Sound]) -> list[str]:
+    """Return a sentence for each sound that is another one's copy."""
+    first = {each.digest: each.file for each in reversed(sounds)}
+    return [
+        f"{each.file}: the same sound as {first[each.digest]}, to the last bit: copy the right file, or remove its row"
+        for each in sounds
+        if each.file != first[each.digest]
+    ]
+
+
+def _unlisted(folder: Path, listed: set[str]) -> list[str]:
+    """Return a sentence on wav files without a row; hidden ones, such as what the studio has removed, are left out."""
     names = (path.relative_to(folder) for path in folder.rglob("*.wav"))
-    return sorted(name.as_posix() for name in names if not any(part.startswith(".") for part in name.parts))
+    found = sorted(name.as_posix() for name in names if not any(part.startswith(".") for part in name.parts))
+    unlisted = [name for name in found if name not in listed]
+    if not unlisted:
+        return []
+    lack = f"{counted(len(unlisted), 'wav file')} {'has' if len(unlisted) == 1 else 'have'} no row in {TABLE}"
+    return [f"{lack}: {', '.join(unlisted[:5])}{', …' * (len(unlisted) > 5)}"]
 
 
 def _check_row(
