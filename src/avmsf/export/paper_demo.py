@@ -86,13 +86,9 @@ def write_demo(
         write_splats(shown, place / SCENE)
         (place / variant).mkdir()
         (place / variant / MODAL).write_bytes(modal)
-        sound = {
-            "generator": generator(),
-            "file": MODAL,
-            "modes": len(field.frequency),
-            "duration": field.samples / field.sample_rate,
-        }
-        sound |= {"sampleRate": field.sample_rate, "phase": "cosine", "arrays": tensors}
+        sound = {"generator": generator(), "file": MODAL, "modes": len(field.frequency)}
+        sound |= {"duration": field.samples / field.sample_rate, "sampleRate": field.sample_rate}
+        sound |= {"phase": "cosine", "arrays": tensors}
         (place / variant / MANIFEST).write_text(json.dumps(sound, indent=1) + "\n")
         for other in others:
             shutil.copytree(folder / other, place / other)
