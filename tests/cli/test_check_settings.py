@@ -41,9 +41,12 @@ def test_a_user_s_settings_are_not_overwritten(rumbling: Path, capsys: pytest.Ca
     assert (rumbling / "capture.toml").read_text() == "seconds = 0.5\n"
 
 
-def test_other_settings_are_not_mixed_with_written_ones(rumbling: Path, tmp_path: Path) -> None:
+def test_other_settings_are_not_mixed_with_written_ones_nor_with_a_dataset(rumbling: Path, tmp_path: Path) -> None:
     other = tmp_path / "other.toml"
     other.write_text("seconds = 0.5\n")
+    assert main(["check", str(tmp_path)]) == 0
+    assert main(["check", str(tmp_path), "--settings", str(other)]) == 2
+    assert main(["check", str(tmp_path), "--write-settings"]) == 2
     assert main(["check", str(rumbling), "--settings", str(other), "--write-settings"]) == 2
     assert not (rumbling / "capture.toml").exists()
 

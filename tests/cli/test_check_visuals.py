@@ -17,12 +17,12 @@ from avmsf.capture import CaptureSettings
 from avmsf.capture.filenames import pictures_in
 from avmsf.capture.settings import METRES
 from avmsf.cli import main
-from avmsf.cli.visuals import VisualInputs, inputs
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
 from avmsf.mesh.surface import surface_points
 from avmsf.photographs.folder import find_shots, write_views
 from avmsf.photographs.shots import without_camera
+from avmsf.pipeline.visuals import VisualInputs, inputs
 from factories.capture_folder import fill
 from factories.plate_capture import fill_plate
 from factories.small_scene import slab, slab_views, write_surface_file

@@ -182,9 +182,27 @@ def test_gaussians_made_elsewhere_are_looked_at_from_all_sides(kept: Path, tmp_p
 def test_features_serve_the_fit_of_another_command(kept: Path, capture: Path, tmp_path: Path, capsys: Streams) -> None:
     output = tmp_path / "field.safetensors"
     words = ["fit", str(capture), "--features", str(kept / "features.safetensors"), "--output", str(output), *TINY]
-    assert main(words) == 0
+    assert main([*words, "--gain-model", "network"]) == 0
     capsys.readouterr()
     assert torch.equal(load(output).gain_field.points, load(kept / "field.safetensors").gain_field.points)
+
+
+def test_a_gain_model_without_features_reads_the_shape_of_views_and_no_encoder(
+    kept: Path, capture: Path, tmp_path: Path, capsys: Streams
+) -> None:
+    shutil.copytree(kept, tmp_path / "cache")
+    words = ["fit", str(capture), "--cache", str(tmp_path / "cache"), "--gain-model", "smooth", *SMALL_SPLAT, *TINY]
+    stages = {}
+    for given in ([], ["--features", str(kept / "features.safetensors")]):
+        assert main([*words, "--lift.encoder", "facebook/dinov2-base", *given, "--json"]) == 0
+        values = json.loads(capsys.readouterr().out)
+        assert values["surface"] is not None
+        stages[len(given)] = [each["stage"] for each in values["stages"]]
+    assert stages == {
+        0: ["views", "cloud", "features", "surface", "modes", "fit"],
+        2: ["views", "cloud", "surface", "modes", "fit"],
+    }
+    assert len(load_features(tmp_path / "cache" / "points.safetensors").points) > 100
 
 
 def test_clouds_and_features_are_drawn(kept: Path, tmp_path: Path, capsys: Streams) -> None:

@@ -11,16 +11,15 @@ from avmsf._utils.text import counted
 from avmsf.capture import CaptureReport, CaptureSettings, Impacts, check, read_capture
 from avmsf.capture.measure import shared_problems
 from avmsf.capture.proposals import Proposal, propose_settings, settings_text, write_settings
-from avmsf.capture.settings import SETTINGS
 from avmsf.cli.alignment import AlignmentReport
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.check import Options
 from avmsf.cli.printing import console, decimals, next_command, print_json, say, table
-from avmsf.cli.visuals import inputs, misplaced
 from avmsf.datasets import DatasetReport, ObjectReport, open_dataset
 from avmsf.errors import CaptureError, CaptureWarning, ExtractionError
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.extraction.finders import HighResolution
+from avmsf.pipeline.visuals import inputs, misplaced
 
 UNREADABLE = 2
 _STRONGEST = 32
@@ -107,13 +106,6 @@ def _modes(folder: Path, settings: CaptureSettings | None) -> tuple[Extraction, 
 
 def _write(options: Options, proposals: Sequence[Proposal], screen: Console) -> None:
     """Write the proposals and print them; raise `CaptureError` where they cannot be written."""
-    if options.settings is not None:
-        raise CaptureError(
-            f"expected --write-settings without --settings, got both; the new {SETTINGS} would not contain those of "
-            f"{options.settings}",
-            file=options.settings,
-            name="--write-settings",
-        )
     try:
         path = write_settings(options.capture, proposals)
     except CaptureError:

@@ -33,7 +33,6 @@ from avmsf.cli.scores import (
     score_table,
     score_values,
 )
-from avmsf.cli.visuals import expect_shape
 from avmsf.errors import FitError
 from avmsf.evaluation.splits import Scores, split
 from avmsf.features.store import load_features, read_report
@@ -45,6 +44,7 @@ from avmsf.pipeline.fit import fit_in_stages, guess_in_stages, keep_surface, obj
 from avmsf.pipeline.record import capture_settings_of, modes_words
 from avmsf.pipeline.scene import SceneStages
 from avmsf.pipeline.stages import Kept, StageFolder
+from avmsf.pipeline.visuals import expect_shape
 from avmsf.plotting.pictures import save_picture
 from avmsf.plotting.surfaces import draw_surface
 from avmsf.symmetry.symmetries import Symmetries
@@ -75,7 +75,7 @@ def _fit(options: Options, settings: CaptureSettings) -> None:
     if options.without_shape:
         capture = replace(capture, surface=None, folder=None)
     elif options.features is None:
-        expect_shape(options.capture, capture)
+        expect_shape(capture)
     train, test = _parts(capture, options)
     features, described = None, None
     if options.features is not None:

@@ -41,12 +41,13 @@ from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.photographs import read_views
 from avmsf.photographs.nerf_json import stated_moves
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.pipeline.config import CACHE, CACHED_FIELD, PipelineConfig
+from avmsf.pipeline.config import CACHE, CACHED_FIELD, DESCRIPTORS, PipelineConfig
 from avmsf.pipeline.frame_check import check_outlines, expect_contacts_in_views, expect_on_object
 from avmsf.pipeline.guess import expect_no_recordings, guess_field
 from avmsf.pipeline.record import capture_settings_of, finder_of, modes_words, supporting_poles, with_record
-from avmsf.pipeline.scene import ProgressListener, SceneStages
+from avmsf.pipeline.scene import FEATURES, ProgressListener, SceneStages
 from avmsf.pipeline.stages import Kept, StageFolder
+from avmsf.pipeline.visuals import expect_shape
 from avmsf.reconstruction import ObjectShape
 from avmsf.symmetry.find import find_symmetries
 from avmsf.symmetry.symmetries import Symmetries
@@ -55,6 +56,8 @@ SURFACE = "surface.ply"
 """What the stage of the object's surface calls its output, in meters."""
 MODES, FIELD = "modes.safetensors", CACHED_FIELD
 """What the last stages call their outputs."""
+POINTS = "points.safetensors"
+"""What the stage of the features is called where the gain model reads none: their points are the object's."""
 OFF_MESH = 0.02
 """Distance of a Gaussian from a mesh, over its size, up to which it is of its surface: three pixels of a photograph in
 which the object is 150 pixels wide."""
@@ -144,6 +147,8 @@ def fit(
                 name="capture",
                 value=type(source).__name__,
             )
+        if features is None:
+            expect_shape(source)
         views = _scene(source, config, features, StageFolder(Path()), listener) is not None
         with _stage_folder(cache, source.folder if views else None) as stages:
             return load(fit_in_stages(source, config, stages, features=features, listener=listener).field)
@@ -433,11 +438,23 @@ def _scene(
 
     None where the folder shows nothing but points.
     """
-    needed = not _is_mesh(capture.surface) or config.gain_model in (NETWORK, Visual.kind)
-    if not needed or capture.folder is None or features is not None:
+    reads = features is None and config.gain_model in (NETWORK, Visual.kind)
+    # The network needs no surface.
+    needed = reads or (config.gain_model != NETWORK and not _is_mesh(capture.surface))
+    if not needed or capture.folder is None:
         return None
+    settings, name = config.scene, FEATURES
+    if not reads:
+        # Of the features only the points and their symmetries are read, which are the same for any encoder.
+        settings, name = replace(settings, lift=replace(settings.lift, encoder=DESCRIPTORS)), POINTS
     scene = SceneStages(
-        capture.folder, stages, config.scene, settings=capture.settings, listener=listener, device=config.device
+        capture.folder,
+        stages,
+        settings,
+        settings=capture.settings,
+        listener=listener,
+        name=name,
+        device=config.device,
     )
     points = capture.surface is not None and not _is_mesh(capture.surface)
     return None if not scene or (points and scene.source is not None and scene.source.kind == "mesh") else scene
@@ -453,11 +470,11 @@ def _shape(
 ) -> _Shape:
     scene = _scene(capture, config, features, stages, listener)
     outputs = () if scene is None else scene.outputs
-    # The network needs no surface.
     shaped = config.gain_model != NETWORK and (scene is not None or _is_mesh(capture.surface))
     stages.count((*outputs, *((SURFACE,) if shaped else ()), MODES, FIELD), listener.counting)
     if scene is not None:
-        return _shape_of_views(capture, config, scene, listener)
+        given = None if features is None else (features, report)
+        return _shape_of_views(capture, config, scene, given, listener)
     points = _points_of(capture, config, features, listener.log)
     surface, digest = object_shape(capture.surface, None)
     made = _surface_stage(stages, surface, digest, listener) if shaped else {}
@@ -489,7 +506,14 @@ def _symmetries(capture: Capture, config: PipelineConfig) -> Symmetries | None:
     return find_symmetries(points, seed=generator)
 
 
-def _shape_of_views(capture: Capture, config: PipelineConfig, scene: SceneStages, listener: ProgressListener) -> _Shape:
+def _shape_of_views(
+    capture: Capture,
+    config: PipelineConfig,
+    scene: SceneStages,
+    given: tuple[FeatureField, Mapping[str, Any]] | None,
+    listener: ProgressListener,
+) -> _Shape:
+    """Return the shape that views show; `given` are features with their report, in place of those of the views."""
     impacts, settings = capture.impacts, capture.settings
     stated = stated_moves(scene.folder, meters=settings.views_meters)
     if scene.source is not None and scene.source.kind == "cameras":
@@ -502,7 +526,7 @@ def _shape_of_views(capture: Capture, config: PipelineConfig, scene: SceneStages
     if scene.splats is not None:
         points = read_splats(scene.cloud.path).centers
         expect_on_object(impacts.contacts, points, names=impacts.names, what="Gaussians", stated=stated)
-    features = load_features(scene.features.path)
+    features, report = given or (load_features(scene.features.path), read_report(scene.features.path))
     surface, digest = object_shape(capture.surface, scene)
     made = scene.made()
     if config.gain_model != NETWORK:
@@ -517,9 +541,8 @@ def _shape_of_views(capture: Capture, config: PipelineConfig, scene: SceneStages
         features = moved_onto(features, seen)
     # Structure from motion knows nothing of the frame that the contacts are in.
     found_frame = scene.source is not None and scene.source.kind in ("photographs", "video")
-    if scene.splats is None:
+    if scene.splats is None or given is not None:
         expect_on_object(impacts.contacts, features.points, names=impacts.names, stated=stated, strict=found_frame)
-    report = read_report(scene.features.path)
 
     def symmetries() -> Symmetries | None:
         found = report.get("symmetries")

@@ -1,17 +1,18 @@
 """Options of `avmsf check`."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from avmsf.capture.settings import SETTINGS
 from avmsf.capture.table import TABLE, read_rows
 from avmsf.cli.options.checks import read_settings
-from avmsf.cli.options.common import Flag, Printing, parse_options
+from avmsf.cli.options.common import Flag, Printing
 from avmsf.cli.options.paths import Existing, SettingsFile
 from avmsf.datasets.detect import detect_dataset
+from avmsf.errors import CaptureError
 
 
 @dataclass(frozen=True)
@@ -48,14 +49,19 @@ class Options(Printing):
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
+        if self.write_settings and self.settings is not None:
+            raise CaptureError(
+                f"expected --write-settings without --settings, got both; the new {SETTINGS} would not contain those "
+                f"of {self.settings}",
+                file=self.settings,
+                name="--write-settings",
+            )
         if self.is_dataset:
             detect_dataset(self.capture)
+            for option, given in (("--settings", self.settings), ("--write-settings", self.write_settings or None)):
+                if given is not None:
+                    raise CaptureError.expected("a capture with it", "a dataset", file=self.capture, name=option)
         elif not self.json:
             # JSON reports also what is wrong with the folder as a whole.
             read_settings(self.capture, self.settings)
             read_rows(self.capture)
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return parse_options(Options, "check", words)

@@ -98,8 +98,8 @@ def inputs(folder: Path, settings: CaptureSettings | None) -> VisualInputs | Non
     )
 
 
-def expect_shape(folder: Path, capture: Capture) -> None:
-    """Raise where a folder was meant to show the object and a field would know the contacts' positions alone.
+def expect_shape(capture: Capture) -> None:
+    """Raise where a capture's folder was meant to show the object and a field would know the positions alone.
 
     FitError for a surface in another frame than the contacts, SceneError for files that nothing reads.
     """
@@ -110,7 +110,8 @@ def expect_shape(folder: Path, capture: Capture) -> None:
         except FitError as error:
             raise FitError(f"{error}{advice}", **error.attributes) from error
         return
-    visual = inputs(folder, capture.settings)
+    folder = capture.folder
+    visual = None if folder is None else inputs(folder, capture.settings)
     if visual is not None and not visual.reconstructs and visual.unused:
         raise SceneError(
             f"{folder}: expected the object's shape, got none; {'; '.join(visual.unused[:3])}{advice}",
