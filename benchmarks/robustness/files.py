@@ -69,7 +69,7 @@ def run_verb(*words: str) -> None:
     """Run a verb in this process, without what turns errors into exit codes; raises AvmsfError for a refusal."""
     verb, options = (import_module(f"avmsf.cli.{home}{words[0]}") for home in ("", "options."))
     with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
-        code = verb.run(options.parse(words[1:]))
+        code = verb.run(options.Options.parse(words[1:]))
     # `check` refuses a capture by its code: its report says why.
     if code == 2:
         raise AvmsfError(" ".join(words))

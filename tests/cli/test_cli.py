@@ -328,12 +328,12 @@ def test_fit_takes_a_single_recording(tmp_path: Path, capsys: Streams) -> None:
 
 def test_a_single_silent_recording_is_one_error(tmp_path: Path, capsys: Streams) -> None:
     from avmsf.cli.fit import run
-    from avmsf.cli.options.fit import parse
+    from avmsf.cli.options.fit import Options
 
     folder, output = keep_one(fill_plate(tmp_path / "plate"), np.zeros(4000)), tmp_path / "field.safetensors"
     words = [str(folder), "--output", str(output), *TINY]
     with raises(CaptureError, file="001.wav", name=None, value=0.0):
-        run(parse(words))
+        run(Options.parse(words))
     capsys.readouterr()
     assert main(["fit", *words]) == 2
     assert error_line(capsys)
@@ -419,13 +419,13 @@ def test_a_surface_in_another_unit_is_refused_once(tmp_path: Path, capsys: Strea
 
 
 def test_a_presets_settings_hold_where_the_options_say_nothing() -> None:
-    from avmsf.cli.options.fit import parse
+    from avmsf.cli.options.fit import Options
 
     words = ["bowl", "--output", "bowl.safetensors"]
-    assert parse(words).config == FitConfig()
-    paper = parse([*words, "--preset", "paper"])
+    assert Options.parse(words).config == FitConfig()
+    paper = Options.parse([*words, "--preset", "paper"])
     assert (paper.config, paper.gain_model, paper.extraction) == (PAPER, "network", "short-time")
-    mixed = parse(["--preset", "paper", *words, "--steps", "7", "--extraction", "high-resolution"])
+    mixed = Options.parse(["--preset", "paper", *words, "--steps", "7", "--extraction", "high-resolution"])
     assert (mixed.config.steps, mixed.config.clusters, mixed.extraction) == (7, PAPER.clusters, "high-resolution")
 
 

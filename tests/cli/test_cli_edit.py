@@ -14,7 +14,7 @@ import torch
 from avmsf.cli import edit, main
 from avmsf.cli.edit import old_material, run
 from avmsf.cli.options.checks import OutputError
-from avmsf.cli.options.edit import parse
+from avmsf.cli.options.edit import Options
 from avmsf.cli.progress import ProgressBar
 from avmsf.editing.material import RATIO_ONLY, change_material, rayleigh_damping
 from avmsf.editing.material_statistics import MaterialStatistics
@@ -54,7 +54,7 @@ def field(tmp_path: Path) -> Path:
 
 def edited(field: Path, *words: str, name: str = "new") -> SoundField:
     output = field.with_name(f"{name}.safetensors")
-    options = parse([str(field), "--output", str(output), *words])
+    options = Options.parse([str(field), "--output", str(output), *words])
     options.check_inputs()
     assert run(options) == 0
     return load(output)
@@ -246,7 +246,7 @@ def test_towards_a_recording_and_an_interrupted_edit_goes_on(
 
     monkeypatch.setattr(ProgressBar, "step", impatient)
     command = [str(field), "--output", str(field.with_name("part.safetensors")), *words]
-    assert run(parse(command)) == 130
+    assert run(Options.parse(command)) == 130
     assert f"from {field.with_name('part.safetensors.checkpoint')}" in capsys.readouterr().err
     assert not field.with_name("part.safetensors").exists()
     preview, rate = soundfile.read(field.with_name("part.safetensors.preview.wav"))

@@ -56,6 +56,7 @@ WRONG: dict[str, dict[str, Any]] = {
     "fit plate --output f.safetensors --validation 2": {"name": "validation", "value": 2.0},
     "fit plate --output f.safetensors --material glass --train-count 4": {"name": "--train-count"},
     "fit plate --output f.safetensors --material wodo": {"name": "--material", "value": "wodo"},
+    "fit plate/surface.ply --output f.safetensors": {"file": "surface.ply", "name": "--material"},
     "fit plate --output f.wav": {"file": "f.wav", "name": "suffix", "value": ".wav"},
     "edit field.safetensors --pitch 2 --output f": {"file": "f", "name": "suffix", "value": ""},
     "fit plate --until gaussians --output f.obj": {"file": "f.obj", "name": "suffix", "value": ".obj"},
@@ -118,7 +119,7 @@ def test_one_line_says_what_is_wrong(words: str, place: Path, capsys: Streams, m
     before = {path.name for path in place.iterdir()}
     verb, *arguments = words.split()
     with raises(AvmsfError, **WRONG[words]) as caught:
-        options = import_module(f"avmsf.cli.options.{verb}").parse(arguments)
+        options = import_module(f"avmsf.cli.options.{verb}").Options.parse(arguments)
         options.check_inputs()
         import_module(f"avmsf.cli.{verb}").run(options)
     capsys.readouterr()

@@ -16,7 +16,7 @@ import trimesh
 
 from avmsf.cli import main
 from avmsf.cli.export import run
-from avmsf.cli.options.export import parse
+from avmsf.cli.options.export import Options
 from avmsf.editing.material import change_material
 from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import AvmsfError, CaptureWarning
@@ -308,7 +308,7 @@ def test_what_follows_names_what_was_written(
 
 
 def export(words: list[str]) -> None:
-    options = parse(words)
+    options = Options.parse(words)
     options.check_inputs()
     run(options)
 

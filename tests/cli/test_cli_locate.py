@@ -13,7 +13,7 @@ from torch import Tensor
 
 from avmsf.cli import main
 from avmsf.cli.locate import run
-from avmsf.cli.options.locate import parse
+from avmsf.cli.options.locate import Options
 from avmsf.errors import LocationError
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save
@@ -70,7 +70,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
 
 
 def located(words: list[str], capsys: Streams) -> tuple[dict, str]:
-    assert run(parse([*words, "--json"])) == 0
+    assert run(Options.parse([*words, "--json"])) == 0
     out, err = capsys.readouterr()
     return json.loads(out), err
 
@@ -110,7 +110,7 @@ def test_a_surer_region_is_larger(place: Place, capsys: Streams) -> None:
 
 
 def test_plain_words_go_to_the_standard_output(place: Place, capsys: Streams) -> None:
-    assert run(parse([place.field, place.wav("plain.wav", place.blow(STRUCK))])) == 0
+    assert run(Options.parse([place.field, place.wav("plain.wav", place.blow(STRUCK))])) == 0
     out, _ = capsys.readouterr()
     assert "impact at (" in out
     assert "90 % within" in out
@@ -149,7 +149,7 @@ def test_a_known_force_counts(place: Place, capsys: Streams) -> None:
     assert shares[1] == pytest.approx(shares[2], abs=0.05)
     assert len({round(share, 3) for share in shares}) > 1
     with raises(LocationError, name="force.expected", value=0.0):
-        run(parse([place.field, hit, "--force", "0"]))
+        run(Options.parse([place.field, hit, "--force", "0"]))
 
 
 def test_another_rate_and_clipping_are_said(place: Place, capsys: Streams) -> None:
@@ -175,7 +175,7 @@ def test_recordings_without_a_blow_on_the_object_have_no_place(place: Place, tmp
         place.wav("other.wav", place.blow(STRUCK, bank=other)): "a mismatch ratio of",
     }
     for path, reason in cases.items():
-        assert run(parse([place.field, path, "--json", "--output", str(tmp_path)])) == 2
+        assert run(Options.parse([place.field, path, "--json", "--output", str(tmp_path)])) == 2
         out, err = capsys.readouterr()
         (values,) = json.loads(out)["impacts"]
         assert values["status"] == "not located"
@@ -217,7 +217,7 @@ def test_a_captures_settings_say_how_recordings_are_read(place: Place, tmp_path:
     noise = torch.randn(len(blow), generator=torch.Generator().manual_seed(9), dtype=torch.float64)
     path = place.folder / "stereo.wav"
     soundfile.write(path, torch.stack([0.1 * noise, blow / blow.abs().max()], dim=1).numpy(), RATE, subtype="FLOAT")
-    assert run(parse([place.field, str(path)])) == 2
+    assert run(Options.parse([place.field, str(path)])) == 2
     assert "response_channel" in capsys.readouterr().out
     (tmp_path / "capture.toml").write_text("response_channel = 2\n")
     printed, _ = located([place.field, str(path), "--settings", str(tmp_path / "capture.toml")], capsys)

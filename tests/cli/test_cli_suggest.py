@@ -10,7 +10,7 @@ import torch
 
 from avmsf.cli import suggest as command
 from avmsf.cli.options.checks import OutputError
-from avmsf.cli.options.suggest import parse
+from avmsf.cli.options.suggest import Options
 from avmsf.cli.suggest import run
 from avmsf.errors import FitError
 from avmsf.field.store import save
@@ -29,7 +29,7 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_list_to_walk_by_is_what_is_printed(field: Path, tmp_path: Path, capsys: Streams) -> None:
-    assert run(parse([str(field), "--count", "3", "--output", str(tmp_path / "next"), "--json"])) == 0
+    assert run(Options.parse([str(field), "--count", "3", "--output", str(tmp_path / "next"), "--json"])) == 0
     out, err = capsys.readouterr()
     printed = json.loads(out)
     assert "uncertainty of the gains" in err
@@ -57,7 +57,7 @@ def test_directions_that_candidates_bring_are_not_said_to_go_straight_in(
     for directions, straight in ((None, True), (slanted.expand(6, 3), False)):
         impacts = SimpleNamespace(contacts=contacts, directions=directions, names=tuple("abcdef"))
         monkeypatch.setattr(command, "read_capture", lambda *_, made=impacts: SimpleNamespace(impacts=made))
-        assert run(parse([str(field), "--count", "2", "--candidates", str(tmp_path)])) == 0
+        assert run(Options.parse([str(field), "--count", "2", "--candidates", str(tmp_path)])) == 0
         out, _ = capsys.readouterr()
         assert "nx, ny, nz" in out
         assert ("perpendicular" in out) == straight
@@ -68,7 +68,7 @@ def test_gains_without_directions_say_none(tmp_path: Path, capsys: Streams) -> N
     contacts = bar_contacts(6)
     path = tmp_path / "bar.safetensors"
     save(sound_field(positional_field(contacts, drawn_gains(contacts, seed=1))), path)
-    assert run(parse([str(path), "--count", "1"])) == 0
+    assert run(Options.parse([str(path), "--count", "1"])) == 0
     out, _ = capsys.readouterr()
     assert "after" in out.splitlines()[3]
     assert "nx" not in out
@@ -77,14 +77,14 @@ def test_gains_without_directions_say_none(tmp_path: Path, capsys: Streams) -> N
 
 def test_what_cannot_be_done_is_said_before_any_work(field: Path, tmp_path: Path) -> None:
     with raises(FitError, name="count", value=0):
-        run(parse([str(field), "--count", "0"]))
+        run(Options.parse([str(field), "--count", "0"]))
     settings = tmp_path / "capture.toml"
     settings.write_text("")
     with raises(FitError, name="--settings"):
-        parse([str(field), "--settings", str(settings)]).check_inputs()
+        Options.parse([str(field), "--settings", str(settings)]).check_inputs()
     blocked = tmp_path / "file"
     blocked.write_text("")
     with raises(OutputError, file=blocked, value="file"):
-        parse([str(field), "--output", str(blocked)]).check_inputs()
+        Options.parse([str(field), "--output", str(blocked)]).check_inputs()
     with raises(FitError, name="--unseen"):
-        parse([str(field), "--unseen", "--candidates", str(tmp_path)]).check_inputs()
+        Options.parse([str(field), "--unseen", "--candidates", str(tmp_path)]).check_inputs()

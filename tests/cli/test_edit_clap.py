@@ -9,7 +9,7 @@ from test_cli_edit import PLACES, RATE, Echo, ceramic
 
 from avmsf.cli import edit, main
 from avmsf.cli.edit import run
-from avmsf.cli.options.edit import parse
+from avmsf.cli.options.edit import Options
 from avmsf.cli.progress import ProgressBar
 from avmsf.editing.modal_edit import EDITS, adjust_modes
 from avmsf.errors import AvmsfError
@@ -39,7 +39,7 @@ def test_the_curve_is_stored_drawn_and_shown(
     drawn: dict[str, Figure] = {}
     monkeypatch.setattr(edit, "save_picture", lambda figure, path: drawn.update({path.name: figure}))
     output, folder = tmp_path / "new.safetensors", tmp_path / "look"
-    assert run(parse([*words, "--output", str(output), "--plots", str(folder)])) == 0
+    assert run(Options.parse([*words, "--output", str(output), "--plots", str(folder)])) == 0
     new, clap = load(output), Clap.load(tmp_path / "clap")
     curve = new.origin.report[EDITS][-1]["clap"]
     assert curve["steps"] == [0, 2, 4, 5]
@@ -63,7 +63,7 @@ def test_an_interrupted_edit_has_the_whole_curve(
         found: dict = load(tmp_path / name).origin.report[EDITS][-1]["clap"]
         return found
 
-    assert run(parse([*words, "--output", str(tmp_path / "whole.safetensors")])) == 0
+    assert run(Options.parse([*words, "--output", str(tmp_path / "whole.safetensors")])) == 0
     shown = ProgressBar.step
 
     def impatient(bar: ProgressBar, stage: str, done: int, total: int, message: str) -> None:
@@ -74,22 +74,22 @@ def test_an_interrupted_edit_has_the_whole_curve(
     part = [*words, "--output", str(tmp_path / "part.safetensors")]
     with monkeypatch.context() as patched:
         patched.setattr(ProgressBar, "step", impatient)
-        assert run(parse(part)) == 130
+        assert run(Options.parse(part)) == 130
     kept = tmp_path / "part.safetensors.clap.json"
     save_clap(tmp_path / "other", seed=1)
     with raises(AvmsfError, file="part.safetensors.clap.json", name="digest"):
-        run(parse([*part[:-3], str(tmp_path / "other"), *part[-2:]]))
+        run(Options.parse([*part[:-3], str(tmp_path / "other"), *part[-2:]]))
     text = kept.read_text(encoding="utf-8")
     kept.write_text("{}", encoding="utf-8")
     with raises(AvmsfError, file="part.safetensors.clap.json", name=None):
-        run(parse(part))
+        run(Options.parse(part))
     kept.write_text(text, encoding="utf-8")
-    assert run(parse(part)) == 0
+    assert run(Options.parse(part)) == 0
     assert report("part.safetensors") == report("whole.safetensors")
     assert not kept.exists()
     # Without a state to go on from, old scores are of another edit.
     kept.write_text(text, encoding="utf-8")
-    assert run(parse([*part, "--preview-every", "3"])) == 0
+    assert run(Options.parse([*part, "--preview-every", "3"])) == 0
     assert report("part.safetensors")["steps"] == [0, 3, 5]
 
 
@@ -100,6 +100,6 @@ def test_scores_need_a_prompt_and_previews(given: tuple[str, ...], tmp_path: Pat
     save(ceramic(), tmp_path / "plate.safetensors")
     (tmp_path / "a.wav").write_bytes(b"")
     words = [str(tmp_path / "plate.safetensors"), "--output", str(tmp_path / "new.safetensors"), "--clap", "x"]
-    options = parse([*words, *(str(tmp_path / each) if each == "a.wav" else each for each in given)])
+    options = Options.parse([*words, *(str(tmp_path / each) if each == "a.wav" else each for each in given)])
     with raises(AvmsfError, name="--clap"):
         options.check_inputs()

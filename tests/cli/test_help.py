@@ -5,9 +5,9 @@ from collections.abc import Callable
 import pytest
 
 from avmsf.cli import RENAMED, main
-from avmsf.cli.options.edit import parse as parse_edit
-from avmsf.cli.options.fit import parse as parse_fit
-from avmsf.cli.options.simulate import parse as parse_simulate
+from avmsf.cli.options.edit import Options as EditOptions
+from avmsf.cli.options.fit import Options as FitOptions
+from avmsf.cli.options.simulate import Options as SimulateOptions
 from avmsf.errors import AvmsfError
 from factories.raising import raises
 
@@ -15,19 +15,19 @@ Streams = pytest.CaptureFixture[str]
 
 
 def test_an_option_may_have_another_name_than_its_attribute() -> None:
-    edit = parse_edit(["field", "-o", "new", "--to-material", "wood", "--scale", "2"])
+    edit = EditOptions.parse(["field", "-o", "new", "--to-material", "wood", "--scale", "2"])
     assert (edit.change.material, edit.change.size) == ("wood", 2.0)
 
 
 @pytest.mark.parametrize(
     ("parse", "words", "option", "value"),
     [
-        (parse_fit, "mug", "--lift.feature-size", 0.0),
-        (parse_fit, "mug", "--splat.wrong-masks", 2.0),
-        (parse_edit, "field -o new", "--free-modes", 0),
-        (parse_edit, "field -o new", "--contacts-per-step", 0),
-        (parse_simulate, "", "--elastic-modes", 0),
-        (parse_simulate, "", "--impacts", 1),
+        (FitOptions.parse, "mug", "--lift.feature-size", 0.0),
+        (FitOptions.parse, "mug", "--splat.wrong-masks", 2.0),
+        (EditOptions.parse, "field -o new", "--free-modes", 0),
+        (EditOptions.parse, "field -o new", "--contacts-per-step", 0),
+        (SimulateOptions.parse, "", "--elastic-modes", 0),
+        (SimulateOptions.parse, "", "--impacts", 1),
     ],
 )
 def test_an_error_names_a_setting_as_its_option(

@@ -33,7 +33,7 @@ def test_the_command_can_be_given_as_it_stands(tmp_path: Path) -> None:
     assert "41 mm" in words
     program, verb, *arguments = shlex.split(words[words.index("avmsf suggest") :])
     assert (program, verb) == ("avmsf", "suggest")
-    assert suggest.parse(arguments).field == path
+    assert suggest.Options.parse(arguments).field == path
 
 
 def test_without_a_contact_no_command_is_named() -> None:

@@ -12,7 +12,7 @@ import trimesh
 from avmsf.cli import main
 from avmsf.cli.info import gains_at
 from avmsf.cli.options.checks import OutputError
-from avmsf.cli.options.fit import parse
+from avmsf.cli.options.fit import Options
 from avmsf.errors import EvaluationError
 from avmsf.field.store import save
 from avmsf.mesh import Surface, read_surface
@@ -66,7 +66,7 @@ def test_a_fit_leaves_its_surface_and_says_where(tmp_path: Path, capsys: Streams
 
 def test_what_cannot_be_written_is_refused_first(tmp_path: Path, capsys: Streams) -> None:
     with raises(OutputError, name="suffix", value=".stl"):
-        parse([str(tmp_path), "--until", "surface", "-o", str(tmp_path / "surface.stl")]).check_inputs()
+        Options.parse([str(tmp_path), "--until", "surface", "-o", str(tmp_path / "surface.stl")]).check_inputs()
     assert main(["fit", str(tmp_path), "--until", "surface", "--output", str(tmp_path / "surface.obj")]) == 2
     assert "surface.obj" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

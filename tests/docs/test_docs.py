@@ -39,7 +39,7 @@ def _anchors(page: Path) -> set[str]:
 @pytest.mark.parametrize("command", _commands())
 def test_every_command_of_the_docs_parses(command: str) -> None:
     _, verb, *arguments = shlex.split(command)
-    import_module(f"avmsf.cli.options.{verb}").parse(arguments)
+    import_module(f"avmsf.cli.options.{verb}").Options.parse(arguments)
 
 
 @pytest.mark.parametrize("block", _blocks("python"))

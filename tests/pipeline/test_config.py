@@ -8,8 +8,8 @@ import pytest
 
 import avmsf
 from avmsf.capture import Capture, CaptureSettings
-from avmsf.cli.options.fit import parse as parse_fit
-from avmsf.cli.options.modes import parse as parse_modes
+from avmsf.cli.options.fit import Options as FitOptions
+from avmsf.cli.options.modes import Options as ModesOptions
 from avmsf.errors import FitError
 from avmsf.field.config import FitConfig
 from avmsf.field.store import load
@@ -26,7 +26,7 @@ PUBLISHED = ("warmup_gains", "warmup_weights", "spectral_norm", "residual_start"
 
 def test_the_default_preset_is_the_default() -> None:
     assert PRESETS["default"] == PipelineConfig()
-    assert parse_fit(["mug"]).pipeline == PRESETS["default"]
+    assert FitOptions.parse(["mug"]).pipeline == PRESETS["default"]
 
 
 def test_the_paper_preset_deviates_nowhere_that_there_is_a_switch_for() -> None:
@@ -50,22 +50,22 @@ def test_the_paper_preset_deviates_nowhere_that_there_is_a_switch_for() -> None:
 
 
 def test_commands_start_from_the_preset_and_change_what_is_said() -> None:
-    assert parse_fit(["mug", "--preset", "paper"]).pipeline == PRESETS["paper"]
+    assert FitOptions.parse(["mug", "--preset", "paper"]).pipeline == PRESETS["paper"]
     words = ["mug", "--lift.encoder", "descriptors", "--preset", "paper", "--steps", "7"]
-    mixed = parse_fit(words).pipeline
+    mixed = FitOptions.parse(words).pipeline
     assert (mixed.fit.steps, mixed.fit.clusters) == (7, 256)
     assert (mixed.scene.lift.encoder, mixed.scene.lift.onto) == ("descriptors", "gaussians")
 
 
 def test_modes_start_from_the_preset_too() -> None:
     paper = PRESETS["paper"]
-    modes = parse_modes(["mug", "--preset", "paper", "--modes", "5"]).pipeline
+    modes = ModesOptions.parse(["mug", "--preset", "paper", "--modes", "5"]).pipeline
     assert (modes.extraction, modes.time_zero, modes.modes) == (paper.extraction, paper.time_zero, 5)
-    assert parse_modes(["mug"]).pipeline == PRESETS["default"]
+    assert ModesOptions.parse(["mug"]).pipeline == PRESETS["default"]
 
 
 def test_a_seed_is_that_of_all_stages() -> None:
-    made = parse_fit(["mug", "--seed", "4"]).pipeline
+    made = FitOptions.parse(["mug", "--seed", "4"]).pipeline
     assert {made.fit.seed, made.scene.views.seed, made.scene.splat.seed, made.scene.lift.seed} == {4}
 
 
@@ -74,30 +74,30 @@ def test_no_setting_of_a_preset_is_left_out_by_the_commands(monkeypatch: pytest.
     other = PipelineConfig("smooth", BodyConfig(wall=0.5), scene, FitConfig(steps=6), "short-time", 5, "peak", "cpu")
     assert all(getattr(other, each.name) != getattr(PipelineConfig(), each.name) for each in fields(other))
     monkeypatch.setattr("avmsf.cli.options.common.PRESETS", {"default": PipelineConfig(), "paper": other})
-    assert parse_fit(["mug", "--preset", "paper"]).pipeline == other
+    assert FitOptions.parse(["mug", "--preset", "paper"]).pipeline == other
 
 
 def test_the_start_of_sounds_is_the_presets_before_the_captures_own() -> None:
     own = CaptureSettings(seconds=1.0, time_zero="peak")
     assert capture_settings_of(PipelineConfig(), own) == own
     assert capture_settings_of(PRESETS["paper"], replace(own, time_zero="onset")) == own
-    assert capture_settings_of(parse_fit(["mug", "--output", "f", "--time-zero", "onset"]).pipeline, own) == replace(
-        own, time_zero="onset"
-    )
+    assert capture_settings_of(
+        FitOptions.parse(["mug", "--output", "f", "--time-zero", "onset"]).pipeline, own
+    ) == replace(own, time_zero="onset")
 
 
 def test_the_table_of_the_docs_selects_the_preset_but_for_what_the_paper_leaves_open() -> None:
     page = (Path(__file__).parents[2] / "docs" / "paper-map.md").read_text(encoding="utf-8")
     table = page.partition("## The paper's form of each stage")[2].partition("\n\n`evaluate`")[0]
     words = [word for options in re.findall(r"`(--[^`]*)`", table.partition("|---|")[2]) for word in options.split()]
-    found, paper = parse_fit(["mug", *words]).pipeline, PRESETS["paper"]
+    found, paper = FitOptions.parse(["mug", *words]).pipeline, PRESETS["paper"]
     silent = {name: getattr(paper.fit, name) for name in ("width", "hidden", "layers", "warmup_rate")}
     assert replace(found, fit=replace(found.fit, **silent)) == paper
 
 
 def test_a_preset_that_there_is_not_is_refused() -> None:
     with pytest.raises(SystemExit):
-        parse_fit(["mug", "--preset", "quick"])
+        FitOptions.parse(["mug", "--preset", "quick"])
 
 
 def test_a_capture_with_another_start_of_sounds_than_the_presets_is_refused() -> None:

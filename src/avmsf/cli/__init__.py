@@ -107,7 +107,7 @@ def _run(words: list[str]) -> int:
     with warnings.catch_warnings(), _interrupting() as received, heart:
         try:
             # Options import nothing that computes: help and mistakes are answered before torch is loaded for seconds.
-            options = import_module(f"avmsf.cli.options.{words[0]}").parse(words[1:])
+            options = import_module(f"avmsf.cli.options.{words[0]}").Options.parse(words[1:])
             options.check_inputs()
             verbosity.quiet, verbosity.verbose = options.quiet, options.verbose
             with _loading(quiet=options.quiet):

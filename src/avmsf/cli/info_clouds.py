@@ -6,7 +6,6 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -56,7 +55,8 @@ def describe_features(options: Options) -> dict[str, Any]:
 def _draw_cloud(cloud: GaussianCloud, options: Options, folder: Path) -> None:
     colors = plain_colors(cloud)
     title = f"{options.file.name}: {counted(len(cloud), 'Gaussian')}"
-    _write(draw_cloud(cloud.centers, {"color": colors}, title=title, up=_UP[options.up]), folder / "cloud.png")
+    save_picture(draw_cloud(cloud.centers, {"color": colors}, title=title, up=_UP[options.up]), folder / "cloud.png")
+    say(f"wrote {folder / 'cloud.png'}")
 
 
 def _draw_features(features: FeatureField, report: dict[str, Any], options: Options, folder: Path) -> None:
@@ -65,7 +65,8 @@ def _draw_features(features: FeatureField, report: dict[str, Any], options: Opti
     rows["features"] = component_colors(without_positions(features).features)
     title = f"{options.file.name}: {features.encoder} on {len(features.points)} points"
     figure = draw_cloud(features.points, rows, title=title, symmetries=symmetries, up=_UP[options.up])
-    _write(figure, folder / "features.png")
+    save_picture(figure, folder / "features.png")
+    say(f"wrote {folder / 'features.png'}")
 
 
 def _colors_of(path: Path, features: FeatureField) -> Float[Tensor, "points 3"]:
@@ -81,11 +82,6 @@ def _colors_of(path: Path, features: FeatureField) -> Float[Tensor, "points 3"]:
             value=len(cloud),
         )
     return plain_colors(cloud.take(torch.from_numpy(rows)))
-
-
-def _write(picture: Figure, path: Path) -> None:
-    save_picture(picture, path)
-    say(f"wrote {path}")
 
 
 def without_positions(features: FeatureField) -> FeatureField:

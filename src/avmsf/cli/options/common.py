@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Literal, TypeVar, get_type_hints
+from typing import Any, Literal, Self, TypeVar, get_type_hints
 
 import tyro
 
@@ -25,6 +25,11 @@ class Common:
     """Print only results, warnings and errors."""
     verbose: Flag = False
     """Print each step of the work as it begins."""
+
+    @classmethod
+    def parse(cls, words: Sequence[str]) -> Self:
+        """Return the options that the words spell, see `parse_options`; the module has the verb's name."""
+        return parse_options(cls, cls.__module__.rpartition(".")[2], words)
 
     def check_inputs(self) -> None:
         """Raise for the first path that cannot be used, see `paths`, and for what a command's own checks find."""

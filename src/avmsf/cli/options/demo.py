@@ -1,6 +1,5 @@
 """Options of `avmsf demo`."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -8,8 +7,11 @@ from typing import Annotated
 import tyro
 
 from avmsf.cli.options.checks import OutputError
-from avmsf.cli.options.common import Printing, parse_options
+from avmsf.cli.options.common import Printing
 from avmsf.cli.options.paths import NewFolder
+
+STAGES = ".demo"
+"""Folder in the demo's that keeps what its stages make."""
 
 
 @dataclass(frozen=True)
@@ -22,20 +24,15 @@ class Options(Printing):
     """
 
     folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="FOLDER"), NewFolder()]] = Path("demo")
-    """Folder for all results, new or empty."""
+    """Folder for all results, new, empty, or of an earlier or interrupted demo, which goes on from where it was."""
 
     def check_inputs(self) -> None:
-        """Raise the package's errors for a folder that cannot be written or holds files."""
+        """Raise the package's errors for a folder that cannot be written or holds files that are not of a demo."""
         super().check_inputs()
-        if self.folder.is_dir() and any(self.folder.iterdir()):
+        if self.folder.is_dir() and any(self.folder.iterdir()) and not (self.folder / STAGES).is_dir():
             raise OutputError.expected(
-                "a new or empty folder",
+                "a new or empty folder, or an earlier demo's",
                 "one with files",
                 file=self.folder,
-                advice="choose another folder, or remove the earlier demo",
+                advice="choose another",
             )
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return parse_options(Options, "demo", words)

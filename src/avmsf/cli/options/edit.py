@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -10,7 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from avmsf.cli.options.checks import OutputError, expect_device, expect_writable
-from avmsf.cli.options.common import Printing, Unit, option_of, parse_options
+from avmsf.cli.options.common import Printing, Unit, option_of
 from avmsf.cli.options.paths import NEW_TENSORS, FieldFile, NewFile, PlotsFolder
 from avmsf.editing.config import STABLE_AUDIO, DistillationConfig, GuidedEditConfig, check_prompt
 from avmsf.errors import EditError
@@ -229,11 +228,6 @@ class Options(Printing):
         if self.plots is not None:
             for name in (MODES, SPECTROGRAMS, BEFORE, AFTER, CURVE):
                 expect_writable(self.plots / name)
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return parse_options(Options, "edit", words)
 
 
 def _changed(options: Any) -> list[str]:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from avmsf.cli.options.checks import expect_device, expect_modes
-from avmsf.cli.options.common import Flag, Printing, parse_options
+from avmsf.cli.options.common import Flag, Printing
 from avmsf.cli.options.paths import CacheFolder, Existing, OutputFolder
 from avmsf.datasets.detect import detect_dataset
 from avmsf.errors import EvaluationError
@@ -109,11 +109,6 @@ class Options(Printing):
         expect_device(self.device, raising=EvaluationError)
         expect_modes(self.modes)
         detect_dataset(self.data)
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return parse_options(Options, "evaluate", words)
 
 
 def words_of(given: Sequence[str]) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Self
 
 import tyro
 
@@ -137,12 +137,12 @@ class Options(Printing):
         if not self.field.is_dir():
             read_record(self.field)
 
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    if ("--to", "sfz") in pairwise(words):
-        raise ExportError.expected("--to wavs, which writes an SFZ instrument too", "sfz", name="--to")
-    return parse_options(Options, "export", words)
+    @classmethod
+    def parse(cls, words: Sequence[str]) -> Self:
+        """Return the options that the words spell."""
+        if ("--to", "sfz") in pairwise(words):
+            raise ExportError.expected("--to wavs, which writes an SFZ instrument too", "sfz", name="--to")
+        return parse_options(cls, "export", words)
 
 
 def unused_options(options: Options) -> list[str]:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import tyro
 
@@ -154,6 +154,11 @@ class Options(Printing):
         if self.until is not None or (self.material is not None and self.capture.is_dir()):
             expect_views(self.capture, settings)
         elif self.material is None:
+            if not self.capture.is_dir():
+                advice = "--material NAME computes a field of a mesh without recordings"
+                raise FitError.expected(
+                    "a capture folder", got="a file", file=self.capture, name="--material", advice=advice
+                )
             expect_rows(self.capture, settings)
 
     def _check_split(self) -> None:
@@ -182,10 +187,10 @@ class Options(Printing):
                 value="--material",
             )
 
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell, with the preset's settings as defaults."""
-    values = preset_values(preset_of(words), fit="config")
-    scene = values.pop("scene")
-    values |= {each.name: getattr(scene, each.name) for each in fields(scene)}
-    return parse_options(partial(Options, **values), "fit", words)
+    @classmethod
+    def parse(cls, words: Sequence[str]) -> Self:
+        """Return the options that the words spell, with the preset's settings as defaults."""
+        values = preset_values(preset_of(words), fit="config")
+        scene = values.pop("scene")
+        values |= {each.name: getattr(scene, each.name) for each in fields(scene)}
+        return parse_options(partial(cls, **values), "fit", words)

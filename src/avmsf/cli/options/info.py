@@ -1,6 +1,5 @@
 """Options of `avmsf info`."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -8,7 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from avmsf.cli.options.checks import expect_capture
-from avmsf.cli.options.common import Printing, parse_options
+from avmsf.cli.options.common import Printing
 from avmsf.cli.options.paths import Existing, OtherCapture, PlotsFolder, SettingsFile
 from avmsf.features.header import holds_features
 from avmsf.field.header import read_record
@@ -53,8 +52,3 @@ class Options(Printing):
             read_record(self.file)
             if self.capture is not None:
                 expect_capture(self.capture, self.settings)
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return parse_options(Options, "info", words)

@@ -1,6 +1,5 @@
 """Options of `avmsf locate`."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from avmsf.cli.options.checks import OutputError
-from avmsf.cli.options.common import Flag, Printing, Unit, parse_options
+from avmsf.cli.options.common import Flag, Printing, Unit
 from avmsf.cli.options.paths import ContactTable, Existing, FieldFile, OutputFolder, SettingsFile
 from avmsf.errors import AvmsfError
 
@@ -73,8 +72,3 @@ class Options(Printing):
             raise OutputError.expected(
                 "a probability between 0 and 1, such as 0.9", self.probability, name="--probability"
             )
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return parse_options(Options, "locate", words)

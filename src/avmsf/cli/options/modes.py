@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Self
 
 import tyro
 
@@ -44,9 +45,9 @@ class Options(Printing):
         """The settings that modes depend on, with the defaults of all others."""
         return PipelineConfig(extraction=self.extraction, modes=self.modes, time_zero=self.time_zero)
 
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell, with the preset's settings as defaults."""
-    values = preset_values(preset_of(words))
-    own = {name: values[name] for name in ("extraction", "modes", "time_zero", "preset")}
-    return parse_options(partial(Options, **own), "modes", words)
+    @classmethod
+    def parse(cls, words: Sequence[str]) -> Self:
+        """Return the options that the words spell, with the preset's settings as defaults."""
+        values = preset_values(preset_of(words))
+        own = {name: values[name] for name in ("extraction", "modes", "time_zero", "preset")}
+        return parse_options(partial(cls, **own), "modes", words)

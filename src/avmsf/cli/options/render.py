@@ -1,7 +1,6 @@
 """Options of `avmsf render`."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -9,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from avmsf.cli.options.checks import OutputError
-from avmsf.cli.options.common import Flag, Printing, Unit, parse_options
+from avmsf.cli.options.common import Flag, Printing, Unit
 from avmsf.cli.options.paths import ContactTable, FieldFile, NewFile, PositionList
 from avmsf.modal.config import PulseShape
 from avmsf.simulate.recipe import LONGEST
@@ -90,8 +89,3 @@ class Options(Printing):
             raise OutputError.expected(f"seconds from 0 to {LONGEST:g}", self.contact_time, name="--contact-time")
         if self.seconds is not None and not 0 < self.seconds < math.inf:
             raise OutputError.expected("more than 0", self.seconds, name="--seconds")
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return parse_options(Options, "render", words)

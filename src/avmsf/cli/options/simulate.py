@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Self
 
 import tyro
 
@@ -50,13 +50,13 @@ class Options(Printing):
                 "a mesh: obj, ply, glb or stl", got="no such file or folder", file=mesh, advice="check the name"
             )
 
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    options = parse_options(Options, "simulate", words, default=Options())
-    # A second time from the named object's recipe: what is asked for may be a default, and not that object's.
-    recipe = None if options.list else _recipe_of(options.what)
-    return options if recipe is None else parse_options(Options, "simulate", words, default=Options(recipe=recipe))
+    @classmethod
+    def parse(cls, words: Sequence[str]) -> Self:
+        """Return the options that the words spell."""
+        options = parse_options(cls, "simulate", words, default=cls())
+        # A second time from the named object's recipe: what is asked for may be a default, and not that object's.
+        recipe = None if options.list else _recipe_of(options.what)
+        return options if recipe is None else parse_options(cls, "simulate", words, default=cls(recipe=recipe))
 
 
 def _recipe_of(what: str | None) -> ObjectRecipe | None:

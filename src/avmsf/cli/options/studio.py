@@ -1,6 +1,5 @@
 """Options of `avmsf studio`."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from avmsf.cli.options.checks import expect_modes
-from avmsf.cli.options.common import Flag, Printing, parse_options
+from avmsf.cli.options.common import Flag, Printing
 from avmsf.cli.options.paths import Existing, ShapeFile
 from avmsf.errors import StudioError
 from avmsf.pipeline.config import Preset
@@ -60,8 +59,3 @@ class Options(Printing):
             raise StudioError(
                 "expected a field, a capture folder, a folder of images or a mesh, got none", name="target"
             )
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return parse_options(Options, "studio", words)

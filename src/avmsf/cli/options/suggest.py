@@ -1,12 +1,11 @@
 """Options of `avmsf suggest`."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import tyro
 
 from avmsf.cli.options.checks import expect_capture
-from avmsf.cli.options.common import Flag, Printing, parse_options
+from avmsf.cli.options.common import Flag, Printing
 from avmsf.cli.options.paths import FieldFile, OtherCapture, OutputFolder, SettingsFile
 from avmsf.errors import FitError
 
@@ -45,8 +44,3 @@ class Options(Printing):
             raise FitError("--unseen: expected it without --candidates, got both; leave one out", name="--unseen")
         if self.candidates is not None:
             expect_capture(self.candidates, self.settings)
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return parse_options(Options, "suggest", words)
