@@ -45,7 +45,7 @@ def test_the_demos_page_and_sounds_do_not_depend_on_delays(tmp_path: Path, monke
     shown: list[Impacts] = []
 
     def fit_in_stages(capture: object, config: object, stages: StageFolder, **named: object) -> StagedFit:
-        stages.folder.mkdir()
+        stages.folder.mkdir(exist_ok=True)
         stages.path(CLOUD).touch()
         save(field, stages.path("field.safetensors"))
         return StagedFit(stages.path("field.safetensors"), (), {}, modes)

@@ -4,19 +4,18 @@ import json
 import shlex
 import shutil
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from avmsf._utils.files import way_out
+from avmsf._utils.files import copy_whole, way_out
 from avmsf.capture import Impacts, check, read_capture
 from avmsf.cli.mode_table import amplitudes, levels
 from avmsf.cli.options.checks import OutputError
-from avmsf.cli.options.demo import Options
+from avmsf.cli.options.demo import STAGES, Options
 from avmsf.cli.printing import console, figure, json_text, print_json, print_text, say
 from avmsf.cli.progress import ProgressBar
 from avmsf.cli.scores import compare, parts_words, score_markdown, score_table, score_values
@@ -30,7 +29,7 @@ from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
 from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.points import farthest_points
-from avmsf.pipeline.config import CACHE, DESCRIPTORS, LiftConfig, PipelineConfig, SceneConfig
+from avmsf.pipeline.config import DESCRIPTORS, LiftConfig, PipelineConfig, SceneConfig
 from avmsf.pipeline.fit import fit_in_stages
 from avmsf.pipeline.record import modes_words
 from avmsf.pipeline.scene import CLOUD, ProgressListener
@@ -56,8 +55,12 @@ _MAX_SOUNDS = 2
 
 def run(options: Options) -> int:
     """Fill the folder, then print a summary."""
-    with _filled_whole(options.folder) as begun, ProgressBar() as bar:
-        scores, strikes, report = _go_all_the_way(begun, bar.listener)
+    try:
+        with ProgressBar() as bar:
+            scores, strikes, report = _go_all_the_way(options.folder, bar.listener)
+    except OSError as error:
+        path, reason = error.filename or options.folder, error.strerror or str(error)
+        raise OutputError.expected("a writable path", reason, file=path, advice=way_out(error)) from error
     screen = console(errors=options.json)
     screen.print(score_table(_title(*strikes), scores))
     words = closing_words(options.folder, scores, *strikes, report)
@@ -69,48 +72,31 @@ def run(options: Options) -> int:
     return 0
 
 
-@contextmanager
-def _filled_whole(folder: Path) -> Iterator[Path]:
-    """Give a folder to fill inside of an empty `folder`, which gets its content at the end, or nothing."""
-    begun, known = folder / ".unfinished", folder.exists()
-    try:
-        begun.mkdir(parents=True)
-        yield begun
-        for each in begun.iterdir():
-            each.rename(folder / each.name)
-    except OSError as error:
-        path, reason = error.filename or folder, error.strerror or str(error)
-        raise OutputError.expected("a writable path", reason, file=path, advice=way_out(error)) from error
-    finally:
-        shutil.rmtree(begun, ignore_errors=True)
-        if not known:
-            with suppress(OSError):
-                folder.rmdir()
-
-
 def _go_all_the_way(
     folder: Path, listener: ProgressListener
 ) -> tuple[dict[str, Scores], tuple[Impacts, Impacts], Mapping[str, Any]]:
     """Fill `folder`; return the scores, the impacts fitted to and scored on, and the field's report."""
-    shutil.copytree(EXAMPLE_FOLDER, folder / "capture")
+    if not (folder / "capture").is_dir():
+        begun = folder / STAGES / "capture"
+        shutil.copytree(EXAMPLE_FOLDER, begun, dirs_exist_ok=True)
+        begun.rename(folder / "capture")
     report = check(folder / "capture")
     wrong = sum(bool(each.problems) for each in report.recordings)
     listener.log(f"check: {len(report.recordings)} recordings, {wrong} with problems")
     capture = replace(read_capture(folder / "capture"), name="mug")
     train, test = split(capture.impacts, TRAIN)
-    made = fit_in_stages(capture, CONFIG, StageFolder(folder / CACHE), train=train, listener=listener)
+    made = fit_in_stages(capture, CONFIG, StageFolder(folder / STAGES), train=train, listener=listener)
     train, test = made.modes.aligned(train), made.modes.aligned(test)
     listener.log("page: a web page, sounds, figures and scores")
-    shutil.move(made.field, folder / FIELD)
-    shutil.move(folder / CACHE / CLOUD, folder / GAUSSIANS)
+    copy_whole(made.field, folder / FIELD)
+    copy_whole(folder / STAGES / CLOUD, folder / GAUSSIANS)
     field = load(folder / FIELD)
     scores = compare(field, train, test, made.modes)
     held_out = test.take(farthest_points(test.contacts, min(_MAX_SOUNDS, len(test))).tolist())
     surface = surface_of(field.gain_field) or made.surface
-    write_webpage(field, folder / PAGE, object=folder / GAUSSIANS, surface=surface, strikes=test)
+    write_webpage(field, folder / PAGE, object=folder / GAUSSIANS, surface=surface, strikes=test, force=True)
     if made.surface is not None:
-        shutil.move(made.surface, folder / SHAPE)
-    shutil.rmtree(folder / CACHE)
+        copy_whole(made.surface, folder / SHAPE)
     _write_sounds(folder / "sounds", field, train, held_out)
     poles = modes_words(len(field.bank), int((~field.is_mode).sum()))
     pictures = {

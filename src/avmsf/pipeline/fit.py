@@ -147,7 +147,7 @@ def fit(
                 name="capture",
                 value=type(source).__name__,
             )
-        if features is None:
+        if features is None and source.folder is not None:
             expect_shape(source)
         views = _scene(source, config, features, StageFolder(Path()), listener) is not None
         with _stage_folder(cache, source.folder if views else None) as stages:
