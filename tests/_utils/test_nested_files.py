@@ -6,10 +6,8 @@ from pathlib import Path
 import pytest
 
 from avmsf.datasets.objectfolder import CONTACT_LISTS, read_contacts
-from avmsf.errors import AvmsfError, DatasetError, EvaluationError, ExportError
+from avmsf.errors import AvmsfError, DatasetError, EvaluationError
 from avmsf.evaluation.results import IDENTITY, ResultsFolder
-from avmsf.export.paper_demo import read_demo
-from avmsf.export.writing import MANIFEST
 from avmsf.pipeline.stages import StageFolder
 
 NESTED = "[" * 100_000
@@ -26,7 +24,6 @@ def read_lines(path: Path) -> None:
         (CONTACT_LISTS[0], lambda path: read_contacts([path]), DatasetError),
         (CONTACT_LISTS[1], read_lines, DatasetError),
         (IDENTITY, lambda path: ResultsFolder(path.parent).identity(), EvaluationError),
-        (MANIFEST, lambda path: read_demo(path.parent), ExportError),
     ],
 )
 def test_a_nested_file_is_refused(

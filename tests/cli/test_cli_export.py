@@ -20,7 +20,6 @@ from avmsf.cli.options.export import Options
 from avmsf.editing.material import change_material
 from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import AvmsfError, CaptureWarning
-from avmsf.export.paper_demo import read_demo
 from avmsf.export.sampled_field import SampledField
 from avmsf.field.config import FitConfig
 from avmsf.field.scaled_gains import BodyGains
@@ -32,6 +31,7 @@ from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from factories.believing_field import ELASTIC, bar, bar_points
 from factories.capture_folder import fill
+from factories.demo_layout import read_arrays
 from factories.made_fields import BANK, SIDES, directional, positional, saved
 
 Streams = pytest.CaptureFixture[str]
@@ -132,38 +132,22 @@ def test_without_noise_is_a_flag(field_file: Path, tmp_path: Path) -> None:
     assert "noiseDraw" not in (tmp_path / "a.dsp").read_text()
 
 
-def test_the_demo_goes_out_in_and_out_again(field_file: Path, tmp_path: Path) -> None:
+def test_the_demo_has_the_given_gaussians(field_file: Path, tmp_path: Path) -> None:
     cloud = gaussians(tmp_path / "plate.ply")
-    first, again = tmp_path / "demo", tmp_path / "again"
-    words = ["--to", "avmsf-demo", "--output", str(first), "--object", str(tmp_path / "plate.ply")]
-    assert main(["export", str(field_file), *words]) == 0
-    demo = read_demo(first)
-    torch.testing.assert_close(demo.field.points, cloud.centers)
+    words = ["--to", "avmsf-demo", "--object", str(tmp_path / "plate.ply")]
+    assert main(["export", str(field_file), *words, "--output", str(tmp_path / "demo")]) == 0
+    assert torch.equal(read_arrays(tmp_path / "demo")["means"], cloud.centers)
     true = SampledField.of(load(field_file), cloud.centers)
-    torch.testing.assert_close(demo.field.cosine.abs(), torch.hypot(true.sine, true.cosine))
-    words = ["--to", "avmsf-demo", "--output", str(again), "--contacts", "11", "--variant", "glass"]
-    assert main(["export", str(first), *words]) == 0
-    assert json.loads((again / "manifest.json").read_text())["variants"] == ["glass"]
-    short = read_demo(again)
-    rows = [int((cloud.centers - point).norm(dim=1).argmin()) for point in short.field.points]
+    gains = read_arrays(tmp_path / "demo" / "original")["gains"]
+    torch.testing.assert_close(gains.abs(), torch.hypot(true.sine, true.cosine))
+    words += ["--output", str(tmp_path / "few"), "--contacts", "11", "--variant", "glass"]
+    assert main(["export", str(field_file), *words]) == 0
+    assert json.loads((tmp_path / "few" / "manifest.json").read_text())["variants"] == ["glass"]
+    points = read_arrays(tmp_path / "few")["means"]
+    rows = [int((cloud.centers - point).norm(dim=1).argmin()) for point in points]
     assert len(set(rows)) == 11
-    torch.testing.assert_close(short.field.cosine, demo.field.cosine[rows])
-    torch.testing.assert_close(read_splats(again / "scene.ply").harmonics, cloud.harmonics[rows])
-
-
-def test_a_demo_is_read_into_any_other_format(field_file: Path, tmp_path: Path) -> None:
-    assert main(["export", str(field_file), "--to", "avmsf-demo", "--output", str(tmp_path / "demo")]) == 0
-    words = ["--to", "wavs", "--output", str(tmp_path / "wavs"), "--contacts", "3"]
-    assert main(["export", str(tmp_path / "demo"), *words]) == 0
-    demo = read_demo(tmp_path / "demo").field
-    with (tmp_path / "wavs" / "samples.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == 3
-    scale = json.loads((tmp_path / "wavs" / "manifest.json").read_text())["scale"]
-    for row in rows:
-        point = demo.nearest(torch.tensor([[float(row[axis]) for axis in "xyz"]]))
-        sound, _ = soundfile.read(tmp_path / "wavs" / row["file"])
-        np.testing.assert_allclose(sound, scale * demo.render(point)[0].numpy(), atol=1e-6)
+    torch.testing.assert_close(read_arrays(tmp_path / "few" / "glass")["gains"], gains[rows])
+    torch.testing.assert_close(read_splats(tmp_path / "few" / "scene.ply").harmonics, cloud.harmonics[rows])
 
 
 def test_wavs_have_the_layers_asked_for(field_file: Path, tmp_path: Path) -> None:
@@ -427,9 +411,9 @@ def test_contacts_are_given_in_one_way(field_file: Path, tmp_path: Path) -> None
 
 def test_an_option_that_a_format_does_not_use_is_noted(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
     words = ["export", str(field_file), "--to", "faust", "-o", str(tmp_path / "a.dsp"), "--contacts", "3", "--quiet"]
-    assert main([*words, "--rate", "8000", "--seconds", "1"]) == 0
+    assert main([*words, "--variant", "wood", "--seconds", "1"]) == 0
     notes = [line for line in capsys.readouterr().err.splitlines() if "is not used by --to faust" in line]
-    assert [line.split()[1] for line in notes] == ["--seconds", "--rate"]
+    assert [line.split()[1] for line in notes] == ["--seconds", "--variant"]
 
 
 def test_a_captures_surface_is_shown(field_file: Path, tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from avmsf.export.faust import contacts_path, fitted, write_faust
 from avmsf.export.formats import PAGE_SUFFIXES, POINTS
 from avmsf.export.geometry import DisplayGeometry, holds_gaussians, read_display_geometry, read_object
 from avmsf.export.gltf import write_gltf
-from avmsf.export.paper_demo import SCENE, is_demo, read_demo, write_demo
+from avmsf.export.paper_demo import write_demo
 from avmsf.export.sampled_field import SampledField, spread_rows
 from avmsf.export.samples import INSTRUMENT, Grid, Layer, hertz_layers, write_grid
 from avmsf.export.uff import write_universal
@@ -46,7 +46,7 @@ def run(options: Options) -> int:
     """Read, write, and print the size and what is left out."""
     for sentence in unused_options(options):
         say(f"note: {sentence}")
-    field = _read(options)
+    field = load(options.field)
     written = _WRITERS[options.to](field, options)
     for remark in written.remarks:
         say(f"note: {remark}")
@@ -103,51 +103,22 @@ def _following(options: Options) -> str:
             return f"open {output} in the paper's web demo"
 
 
-def _read(options: Options) -> SoundField | SampledField:
-    if options.field.is_dir():
-        if not is_demo(options.field):
-            raise ExportError(
-                f"{options.field}: expected a field file, or a folder in the layout of the paper's demo, got another "
-                "folder; name the .safetensors that avmsf fit wrote",
-                file=options.field,
-                name="field",
-            )
-        variant = None if options.to == "avmsf-demo" else options.variant
-        return read_demo(options.field, variant=variant, sample_rate=options.rate).field
-    return load(options.field)
-
-
-def _sampled(field: SoundField | SampledField, options: Options) -> SampledField:
+def _sampled(field: SoundField, options: Options) -> SampledField:
     """Return the field at the contacts of the options, or at its own points spread over the object."""
     if options.contacts_given:
-        return _at_given(field, options)
-    most = options.contacts or POINTS[options.to]
-    if isinstance(field, SoundField):
-        points = points_on_object(field.gain_field)
-        sampled, held = SampledField.of(field, points, limit=most), len(points)
-    else:
-        sampled, held = field if len(field) <= most else field.take(field.spread(most)), len(field)
-    if len(sampled) < held and options.contacts is None:
-        say(f"note: written: {len(sampled)} of the field's {counted(held, 'contact')}; --contacts sets the number")
+        contacts = given_contacts(options.position, options.contact_table, unit=options.unit)
+        refuse_far(contacts, field, advice=", see --unit")
+        note_off(contacts, field)
+        return SampledField.of(field, contacts.places, directions=contacts.directions)
+    points = points_on_object(field.gain_field)
+    sampled = SampledField.of(field, points, limit=options.contacts or POINTS[options.to])
+    if len(sampled) < len(points) and options.contacts is None:
+        held = counted(len(points), "contact")
+        say(f"note: written: {len(sampled)} of the field's {held}; --contacts sets the number")
     return sampled
 
 
-def _at_given(field: SoundField | SampledField, options: Options) -> SampledField:
-    """Return the field at the contacts of --position or --contact-table, in this order."""
-    if isinstance(field, SampledField):
-        raise ExportError.expected(
-            "a field file for --position and --contact-table",
-            got="a folder of the demo's layout, which has only its own points",
-            file=options.field,
-            name="--position",
-        )
-    contacts = given_contacts(options.position, options.contact_table, unit=options.unit)
-    refuse_far(contacts, field, advice=", see --unit")
-    note_off(contacts, field)
-    return SampledField.of(field, contacts.places, directions=contacts.directions)
-
-
-def _object(field: SoundField | SampledField, options: Options) -> tuple[Path | Surface | None, float]:
+def _object(field: SoundField, options: Options) -> tuple[Path | Surface | None, float]:
     """Return what shows the object, and what its coordinates count in meters; print where there is nothing.
 
     A capture's own mesh is shown, otherwise the surface of the body that the field's gains are computed on, otherwise
@@ -160,11 +131,11 @@ def _object(field: SoundField | SampledField, options: Options) -> tuple[Path | 
         return options.object, METRES[options.object_unit]
     path, meters = _captured(options)
     if path is None:
-        body = surface_of(field.gain_field) if isinstance(field, SoundField) else None
+        body = surface_of(field.gain_field)
         if body is not None:
             return body, 1.0
         path, meters = _reconstructed(options), 1.0
-    length = _length(field)
+    length = length_of(field.gain_field)
     if length == 1.0 or path is None:
         return path, meters
     if path.suffix.lower() == ".ply" and path.is_file() and holds_gaussians(path):
@@ -179,14 +150,9 @@ def _object(field: SoundField | SampledField, options: Options) -> tuple[Path | 
     return path, meters * length
 
 
-def _length(field: SoundField | SampledField) -> float:
-    """Return lengths on the field's object over those on the object that was recorded."""
-    return length_of(field.gain_field) if isinstance(field, SoundField) else 1.0
-
-
-def _note_size(field: SoundField | SampledField, path: Path) -> None:
-    if _length(field) != 1.0:
-        say(f"note: the field was edited to {_length(field):g} times its size; {path} is not scaled and has to have it")
+def _note_size(field: SoundField, path: Path) -> None:
+    if (length := length_of(field.gain_field)) != 1.0:
+        say(f"note: the field was edited to {length:g} times its size; {path} is not scaled and has to have it")
 
 
 def _captured(options: Options) -> tuple[Path | None, float]:
@@ -221,7 +187,7 @@ def _gaussians(path: Path | Surface | None, meters: float, field: SampledField) 
     return read_splats(path)
 
 
-def _web(field: SoundField | SampledField, options: Options) -> Written:
+def _web(field: SoundField, options: Options) -> Written:
     source, meters = _object(field, options)
     return write_webpage(
         field,
@@ -234,15 +200,15 @@ def _web(field: SoundField | SampledField, options: Options) -> Written:
     )
 
 
-def _recordings(field: SoundField | SampledField, capture: Path | None) -> Impacts | None:
+def _recordings(field: SoundField, capture: Path | None) -> Impacts | None:
     """Return a capture's recordings; None for an edited field, which is not to sound like them."""
-    if capture is not None and isinstance(field, SoundField) and field.origin.report.get(EDITS):
+    if capture is not None and field.origin.report.get(EDITS):
         say("note: the field is edited, so the page has no recordings to compare it with")
         return None
     return None if capture is None else read_capture(capture).impacts
 
 
-def _gltf(field: SoundField | SampledField, options: Options) -> Written:
+def _gltf(field: SoundField, options: Options) -> Written:
     sampled = _sampled(field, options)
     source, meters = _object(field, options)
     cloud = _gaussians(source, meters, sampled)
@@ -258,7 +224,7 @@ def _gltf(field: SoundField | SampledField, options: Options) -> Written:
     return replace(written, remarks=remarks + written.remarks)
 
 
-def _faust(field: SoundField | SampledField, options: Options) -> Written:
+def _faust(field: SoundField, options: Options) -> Written:
     sampled, noise = _sampled(field, options), not options.no_noise
     if options.contacts is None and not options.contacts_given:
         asked = len(sampled)
@@ -268,10 +234,8 @@ def _faust(field: SoundField | SampledField, options: Options) -> Written:
     return write_faust(sampled, options.output, noise=noise, force=options.overwrite)
 
 
-def _demo(field: SoundField | SampledField, options: Options) -> Written:
-    scene = options.field / SCENE
-    source = scene if options.object is None and scene.is_file() else options.object
-    most = options.contacts or POINTS["avmsf-demo"]
+def _demo(field: SoundField, options: Options) -> Written:
+    source, most = options.object, options.contacts or POINTS["avmsf-demo"]
     sampled = _sampled(field, options)
     cloud = _gaussians(source, 1.0, sampled)
     if source is not None:
@@ -283,28 +247,21 @@ def _demo(field: SoundField | SampledField, options: Options) -> Written:
             file=source,
             name="--object",
         )
-    if cloud is not None and isinstance(field, SoundField):
+    if cloud is not None:
         if len(cloud) > most:
             cloud = cloud.take(spread_rows(cloud.centers, most))
         sampled = SampledField.of(field, cloud.centers)
-    elif cloud is not None:
-        cloud = cloud.take(_rows_of(cloud, sampled))
     return write_demo(
         sampled,
         options.output,
         cloud=cloud,
-        variant=options.variant or "original",
+        variant=options.variant,
         precision=options.precision,
         force=options.overwrite,
     )
 
 
-def _rows_of(cloud: GaussianCloud, sampled: SampledField) -> torch.Tensor:
-    """Return the Gaussian nearest to each of the field's points."""
-    return torch.cat([(cloud.centers - point).norm(dim=1).argmin()[None] for point in sampled.points])
-
-
-def _wavs(field: SoundField | SampledField, options: Options) -> Written:
+def _wavs(field: SoundField, options: Options) -> Written:
     forces, times = options.forces, options.contact_times
     if len(times) == 1:
         times = times * len(forces)
@@ -331,13 +288,13 @@ def _loud(sampled: SampledField) -> SampledField:
     return sampled.take(loud)
 
 
-def _uff(field: SoundField | SampledField, options: Options) -> Written:
+def _uff(field: SoundField, options: Options) -> Written:
     return write_universal(
         _sampled(field, options), options.output, functions=options.functions, force=options.overwrite
     )
 
 
-_WRITERS: dict[str, Callable[[SoundField | SampledField, Options], Written]] = {
+_WRITERS: dict[str, Callable[[SoundField, Options], Written]] = {
     "web": _web,
     "gltf": _gltf,
     "faust": _faust,

@@ -1,7 +1,6 @@
 from .bundle import make_bundle as make_bundle
 from .faust import write_faust as write_faust
 from .gltf import write_gltf as write_gltf
-from .paper_demo import read_demo as read_demo
 from .paper_demo import write_demo as write_demo
 from .sampled_field import SampledField as SampledField
 from .samples import write_grid as write_grid

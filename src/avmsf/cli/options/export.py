@@ -45,7 +45,7 @@ _OUTPUTS: dict[Format, NewFile | NewFolder] = {
     "uff": NewFile(UNIVERSAL_SUFFIXES),
 }
 """What each format writes."""
-_OF_SOME = {"rate"}.union(*_USED.values())
+_OF_SOME = {name for used in _USED.values() for name in used}
 
 
 @dataclass(frozen=True)
@@ -62,10 +62,10 @@ class Options(Printing):
         Annotated[
             Path,
             tyro.conf.arg(metavar="FIELD"),
-            Existing("a sound field, as avmsf fit writes it", ("a sound field", "a folder")),
+            Existing("a sound field, as avmsf fit writes it", ("a sound field",)),
         ]
     ]
-    """Field file, as `avmsf fit` writes it; or a folder in the layout of the paper's demo."""
+    """Field file, as `avmsf fit` writes it."""
     to: Format
     """Format to write."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE|FOLDER")]
@@ -105,12 +105,10 @@ class Options(Printing):
     """faust, wavs: write the modes without the residual noise."""
     functions: int = 16
     """uff: number of points whose frequency response functions are written in addition to the mode shapes."""
-    variant: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """avmsf-demo: name of the sound among those of one object, to write ("original") or to read."""
+    variant: Annotated[str, tyro.conf.arg(metavar="NAME")] = "original"
+    """avmsf-demo: name of the sound among those of one object."""
     precision: Precision = "float32"
     """avmsf-demo: number format of the gains."""
-    rate: float | None = None
-    """Sample rate in Hz of a field in the demo's layout, which does not hold it."""
 
     @property
     def contacts_given(self) -> bool:
@@ -134,8 +132,7 @@ class Options(Printing):
         if self.contacts is not None and self.contacts < 1:
             raise ExportError.expected("1 or more", self.contacts, name="--contacts")
         _OUTPUTS[self.to].check(self.output)
-        if not self.field.is_dir():
-            read_record(self.field)
+        read_record(self.field)
 
     @classmethod
     def parse(cls, words: Sequence[str]) -> Self:
@@ -147,10 +144,10 @@ class Options(Printing):
 
 def unused_options(options: Options) -> list[str]:
     """Return a sentence for each given option that the format does not use."""
-    used = _USED[options.to] + (("variant", "rate") if options.field.is_dir() else ())
+    used = _USED[options.to]
     sentences = []
     for each in fields(options):
         if each.name in _OF_SOME and each.name not in used and getattr(options, each.name) != each.default:
-            others = ", ".join(name for name, known in _USED.items() if each.name in known) or "the demo's folders"
+            others = ", ".join(name for name, known in _USED.items() if each.name in known)
             sentences.append(f"{option_of(each.name)} is not used by --to {options.to}, only by {others}")
     return sentences
