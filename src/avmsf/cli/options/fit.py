@@ -10,7 +10,7 @@ import tyro
 
 from avmsf.capture.filenames import expect_views
 from avmsf.cli.options.checks import OutputError, expect_device, expect_modes, expect_rows, read_settings
-from avmsf.cli.options.common import Flag, Printing, parse_options, preset_of, preset_values
+from avmsf.cli.options.common import Flag, Printing, option_of, parse_options, preset_of, preset_values
 from avmsf.cli.options.paths import CacheFolder, Existing, NewFile, PlotsFolder, SettingsFile
 from avmsf.errors import EvaluationError, FitError
 from avmsf.fem.material import material_named
@@ -145,12 +145,7 @@ class Options(Printing):
         settings = read_settings(self.capture, self.settings)
         if self.material is not None:
             material_named(self.material, option="--material")
-            self._check_material()
-        ignored = ("train_fraction", "train_count", "features") if self.until is not None else ()
-        for name in ignored:
-            if getattr(self, name) is not None:
-                option = f"--{name.replace('_', '-')}"
-                raise FitError.expected("no --until, which ends before the fit", self.until, name=option)
+        self._check_unused()
         if self.until is not None or (self.material is not None and self.capture.is_dir()):
             expect_views(self.capture, settings)
         elif self.material is None:
@@ -171,21 +166,20 @@ class Options(Printing):
                 name="--train-fraction",
             )
 
-    def _check_material(self) -> None:
-        """Raise FitError for options that need recordings, given with --material."""
-        names = ("train_fraction", "train_count", "features", "until", "time_zero")
-        given = [name for name in names if getattr(self, name) is not None]
-        if self.gain_model not in ("auto", "elastic"):
-            given.append("gain_model")
-        if self.body.supports == "try":
-            given.append("body.supports")
-        if given:
-            option = f"--{given[0].replace('_', '-')}"
-            raise FitError(
-                f"{option}: expected recordings, got --material, which computes a field without them; leave one out",
-                name=option,
-                value="--material",
-            )
+    def _check_unused(self) -> None:
+        """Raise FitError for options that nothing would read."""
+        fitted = ("train_fraction", "train_count", "start", "features", "without_shape")
+        unused = [(name, "until") for name in fitted if self.until is not None]
+        if self.material is not None:
+            unused += [(name, "material") for name in (*fitted, "until", "time_zero")]
+            unused += [("gain_model", "material")] if self.gain_model not in ("auto", "elastic") else []
+            unused += [("body.supports", "material")] if self.body.supports == "try" else []
+        for name, other in unused:
+            if "." in name or getattr(self, name):
+                chosen = getattr(self, other)
+                raise FitError.expected(f"no --{other} with it", chosen, name=option_of(name), advice="leave one out")
+        if self.start and self.train_fraction is None and self.train_count is None:
+            raise FitError.expected("--train-fraction or --train-count with it", got="neither", name="--start")
 
     @classmethod
     def parse(cls, words: Sequence[str]) -> Self:
