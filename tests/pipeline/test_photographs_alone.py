@@ -14,7 +14,7 @@ from avmsf.mesh import read_surface
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.photographs.folder import write_views
 from avmsf.pipeline.config import CACHE
-from avmsf.pipeline.fit import SURFACE
+from avmsf.pipeline.shape import SURFACE
 from avmsf.simulate.recipe import EXAMPLE, EXAMPLE_FOLDER
 from factories.plate_capture import TINY, fill_plate
 from factories.small_scene import SMALL_SPLAT, slab_views

@@ -5,7 +5,7 @@ import trimesh
 
 from avmsf.features.feature_field import FeatureField
 from avmsf.mesh import Surface
-from avmsf.pipeline.fit import OFF_MESH, moved_onto
+from avmsf.pipeline.shape import OFF_MESH, moved_onto
 
 BALL = trimesh.creation.icosphere(4, 0.1)
 SURFACE = Surface(torch.from_numpy(BALL.vertices).float(), torch.from_numpy(BALL.faces))

@@ -12,8 +12,8 @@ from avmsf.field.store import save
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
 from avmsf.pipeline.config import CACHE
-from avmsf.pipeline.fit import FIELD, SURFACE
 from avmsf.pipeline.scene import CLOUD
+from avmsf.pipeline.shape import FIELD, SURFACE
 from avmsf.studio.opening import find_reconstructed, open_target
 from opened_plate import plate_field
 from served import served

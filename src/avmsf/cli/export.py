@@ -36,7 +36,7 @@ from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh.surface import Surface
 from avmsf.pipeline.config import CACHE
-from avmsf.pipeline.fit import SURFACE
+from avmsf.pipeline.shape import SURFACE
 
 _DEAD_DB = 40.0
 """Energy of a contact below the loudest one's, dB, from which on it is no key of a sample set by default."""

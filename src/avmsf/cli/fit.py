@@ -40,9 +40,10 @@ from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh.surface import Surface, SurfaceKind, read_surface, write_surface
-from avmsf.pipeline.fit import fit_in_stages, guess_in_stages, keep_surface, object_shape
+from avmsf.pipeline.fit import fit_in_stages, guess_in_stages
 from avmsf.pipeline.record import capture_settings_of, modes_words
 from avmsf.pipeline.scene import SceneStages
+from avmsf.pipeline.shape import keep_surface, object_shape
 from avmsf.pipeline.stages import Kept, StageFolder
 from avmsf.pipeline.visuals import expect_shape
 from avmsf.plotting.pictures import save_picture

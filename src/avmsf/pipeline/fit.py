@@ -1,21 +1,16 @@
 """From a capture to a field in one call: its shape, from a mesh or from views, its modes, and its gains."""
 
-import hashlib
 import tempfile
-import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
 from rich.console import Console
 from rich.progress import Progress as Bar
 
 from avmsf._utils.caching import once
-from avmsf._utils.files import write_whole
 from avmsf._utils.progress import is_live, repeated
 from avmsf._utils.text import counted
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
@@ -23,7 +18,6 @@ from avmsf.capture.settings import settings_of
 from avmsf.capture.together import find_surface
 from avmsf.errors import AvmsfError, FitError, SceneError
 from avmsf.features.feature_field import FeatureField
-from avmsf.features.store import load_features, read_report
 from avmsf.fem.material import Material, material_named
 from avmsf.field.config import AUTO, NETWORK, GainModel
 from avmsf.field.fit import Progress
@@ -33,34 +27,18 @@ from avmsf.field.gains.estimator import estimator_for
 from avmsf.field.gains.positional import Visual
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
-from avmsf.gaussians.ply import read_splats
 from avmsf.mesh import Surface
-from avmsf.mesh.closest_point import ClosestPoints
-from avmsf.mesh.surface import read_surface, surface_points, write_surface
+from avmsf.mesh.surface import read_surface
 from avmsf.modal.extraction.extract import Extraction, extract_once
-from avmsf.photographs import read_views
-from avmsf.photographs.nerf_json import stated_moves
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.pipeline.config import CACHE, CACHED_FIELD, DESCRIPTORS, PipelineConfig
-from avmsf.pipeline.frame_check import check_outlines, expect_contacts_in_views, expect_on_object
+from avmsf.pipeline.config import CACHE, PipelineConfig
 from avmsf.pipeline.guess import expect_no_recordings, guess_field
 from avmsf.pipeline.record import capture_settings_of, finder_of, modes_words, supporting_poles, with_record
-from avmsf.pipeline.scene import FEATURES, ProgressListener, SceneStages
-from avmsf.pipeline.stages import Kept, StageFolder
+from avmsf.pipeline.scene import ProgressListener, SceneStages
+from avmsf.pipeline.shape import FIELD, MODES, FitShape, is_mesh, object_shape, scene_of, shape_of
+from avmsf.pipeline.stages import StageFolder
 from avmsf.pipeline.visuals import expect_shape
-from avmsf.reconstruction import ObjectShape
-from avmsf.symmetry.find import find_symmetries
-from avmsf.symmetry.symmetries import Symmetries
 
-SURFACE = "surface.ply"
-"""What the stage of the object's surface calls its output, in meters."""
-MODES, FIELD = "modes.safetensors", CACHED_FIELD
-"""What the last stages call their outputs."""
-POINTS = "points.safetensors"
-"""What the stage of the features is called where the gain model reads none: their points are the object's."""
-OFF_MESH = 0.02
-"""Distance of a Gaussian from a mesh, over its size, up to which it is of its surface: three pixels of a photograph in
-which the object is 150 pixels wide."""
 BODIES = "bodies"
 """Folder of elastic modes in the cache, kept by content."""
 _FEW = 8
@@ -135,7 +113,7 @@ def fit(
                 name = "gain_model" if features is None else "features"
                 raise FitError.expected("recordings", "material=, which needs none", name=name, advice="leave one out")
             settings = settings_of(source) if isinstance(source, Path) else CaptureSettings()
-            views = isinstance(source, Path) and source.is_dir() and not _is_mesh(find_surface(source, settings))
+            views = isinstance(source, Path) and source.is_dir() and not is_mesh(find_surface(source, settings))
             with _stage_folder(cache, source if views and isinstance(source, Path) else None) as stages:
                 return load(guess_in_stages(source, material, config, stages, settings=settings, listener=listener))
         if isinstance(source, Path):
@@ -149,7 +127,7 @@ def fit(
             )
         if features is None and source.folder is not None:
             expect_shape(source)
-        views = _scene(source, config, features, StageFolder(Path()), listener) is not None
+        views = scene_of(source, config, features, StageFolder(Path()), listener) is not None
         with _stage_folder(cache, source.folder if views else None) as stages:
             return load(fit_in_stages(source, config, stages, features=features, listener=listener).field)
 
@@ -179,14 +157,14 @@ def fit_in_stages(
         if len(train) < _FEW:
             listener.log(f"expected {_FEW} recordings or more to predict gains between contacts well, got {len(train)}")
         # Before the modes: what is wrong with the object's shape shows in less time than they take.
-        shape = _shape(capture, config, features, features_report or {}, stages, listener)
+        shape = shape_of(capture, config, features, features_report or {}, stages, listener)
         return _fit_shape(capture, train, shape, config, stages, listener)
 
 
 def _fit_shape(
     capture: Capture,
     train: Impacts,
-    shape: "_Shape",
+    shape: FitShape,
     config: PipelineConfig,
     stages: StageFolder,
     listener: ProgressListener,
@@ -279,7 +257,7 @@ def guess_in_stages(
             expect_no_recordings(source)
             name = name or source.resolve().name
             mesh = find_surface(source, settings)
-            if not _is_mesh(mesh):
+            if not is_mesh(mesh):
                 scene = SceneStages(
                     source, stages, config.scene, settings=settings, listener=listener, device=config.device
                 )
@@ -380,235 +358,3 @@ def _expect_start(capture: Capture, config: PipelineConfig) -> None:
             name="time_zero",
             advice="read the capture with CaptureSettings of this time_zero, or set time_zero=None",
         )
-
-
-def _is_mesh(surface: Surface | None) -> bool:
-    return surface is not None and len(surface.faces) > 0
-
-
-def _no_shape(config: PipelineConfig) -> str:
-    """Return the note on a capture without a shape, which says also what its gain model has to do without."""
-    lacks = " and no elastic mode shapes" if config.gain_model == AUTO else ""
-    return (
-        f"nothing shows the object's shape: points that fill the bounding box of its contacts are used{lacks}. Add a "
-        "mesh (surface.obj), photographs, a video or Gaussians"
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class _Shape:
-    """What a field may read of an object's points, and its surface."""
-
-    points: FeatureField
-    """The object's points with their positions as features, or with those that were given."""
-    features: FeatureField
-    """What the network reads: image features, or positions where there are none."""
-    symmetries: Callable[[], Symmetries | None]
-    """Finds the symmetries of the object's shape."""
-    surface: Callable[[], Surface | ObjectShape]
-    """Makes the object's mesh, or the shape that its views show. Raises SceneError without either."""
-    surface_digest: str
-    """Of what the surface is made of."""
-    made: Mapping[str, Kept]
-    """The stages that made it."""
-    report: Mapping[str, Any]
-    """How the features were made."""
-    known: bool = True
-    """Whether anything shows the shape."""
-
-    @property
-    def digest(self) -> str:
-        """Of the points and the features."""
-        digest = hashlib.sha256()
-        for each in (self.points, self.features):
-            digest.update(each.encoder.encode())
-            for tensor in (each.points, each.features):
-                digest.update(tensor.contiguous().numpy().tobytes())
-        return digest.hexdigest()
-
-
-def _scene(
-    capture: Capture,
-    config: PipelineConfig,
-    features: FeatureField | None,
-    stages: StageFolder,
-    listener: ProgressListener,
-) -> SceneStages | None:
-    """Return the stages of the views that a fit needs: for a shape without a mesh, and for features.
-
-    None where the folder shows nothing but points.
-    """
-    reads = features is None and config.gain_model in (NETWORK, Visual.kind)
-    # The network needs no surface.
-    needed = reads or (config.gain_model != NETWORK and not _is_mesh(capture.surface))
-    if not needed or capture.folder is None:
-        return None
-    settings, name = config.scene, FEATURES
-    if not reads:
-        # Of the features only the points and their symmetries are read, which are the same for any encoder.
-        settings, name = replace(settings, lift=replace(settings.lift, encoder=DESCRIPTORS)), POINTS
-    scene = SceneStages(
-        capture.folder,
-        stages,
-        settings,
-        settings=capture.settings,
-        listener=listener,
-        name=name,
-        device=config.device,
-    )
-    points = capture.surface is not None and not _is_mesh(capture.surface)
-    return None if not scene or (points and scene.source is not None and scene.source.kind == "mesh") else scene
-
-
-def _shape(
-    capture: Capture,
-    config: PipelineConfig,
-    features: FeatureField | None,
-    report: Mapping[str, Any],
-    stages: StageFolder,
-    listener: ProgressListener,
-) -> _Shape:
-    scene = _scene(capture, config, features, stages, listener)
-    outputs = () if scene is None else scene.outputs
-    shaped = config.gain_model != NETWORK and (scene is not None or _is_mesh(capture.surface))
-    stages.count((*outputs, *((SURFACE,) if shaped else ()), MODES, FIELD), listener.counting)
-    if scene is not None:
-        given = None if features is None else (features, report)
-        return _shape_of_views(capture, config, scene, given, listener)
-    points = _points_of(capture, config, features, listener.log)
-    surface, digest = object_shape(capture.surface, None)
-    made = _surface_stage(stages, surface, digest, listener) if shaped else {}
-    known = capture.surface is not None or features is not None
-    return _Shape(points, points, lambda: _symmetries(capture, config), surface, digest, made, report, known)
-
-
-def _points_of(
-    capture: Capture, config: PipelineConfig, features: FeatureField | None, log: Callable[[str], None]
-) -> FeatureField:
-    """Return the object's points: the described ones, else of its surface, else those that fill the contacts' box."""
-    if features is not None:
-        expect_on_object(capture.impacts.contacts, features.points, names=capture.impacts.names)
-        return features
-    if config.gain_model == NETWORK:
-        log("no visual features were given: the network reads positions alone")
-    if capture.surface is None:
-        log(_no_shape(config))
-        return FeatureField.from_contacts(capture.impacts.contacts)
-    expect_on_object(capture.impacts.contacts, surface_points(capture.surface), names=capture.impacts.names)
-    return FeatureField.from_mesh(capture.surface, seed=config.fit.seed)
-
-
-def _symmetries(capture: Capture, config: PipelineConfig) -> Symmetries | None:
-    if capture.surface is None:
-        return None
-    generator = torch.Generator().manual_seed(config.fit.seed)
-    points = FeatureField.from_mesh(capture.surface, seed=generator).points
-    return find_symmetries(points, seed=generator)
-
-
-def _shape_of_views(
-    capture: Capture,
-    config: PipelineConfig,
-    scene: SceneStages,
-    given: tuple[FeatureField, Mapping[str, Any]] | None,
-    listener: ProgressListener,
-) -> _Shape:
-    """Return the shape that views show; `given` are features with their report, in place of those of the views."""
-    impacts, settings = capture.impacts, capture.settings
-    stated = stated_moves(scene.folder, meters=settings.views_meters)
-    if scene.source is not None and scene.source.kind == "cameras":
-        # Before Gaussians, which take minutes.
-        views = read_views(scene.views.path)
-        warning = None if capture.surface is None else check_outlines(capture.surface, views, settings)
-        if warning is not None:
-            warnings.warn(warning, stacklevel=2)
-        expect_contacts_in_views(impacts.contacts, views, settings, stated=stated)
-    if scene.splats is not None:
-        points = read_splats(scene.cloud.path).centers
-        expect_on_object(impacts.contacts, points, names=impacts.names, what="Gaussians", stated=stated)
-    features, report = given or (load_features(scene.features.path), read_report(scene.features.path))
-    surface, digest = object_shape(capture.surface, scene)
-    made = scene.made()
-    if config.gain_model != NETWORK:
-        made |= _surface_stage(scene.stages, surface, digest, listener)
-    seen = capture.surface
-    if seen is None and "surface" in made:
-        # Gaussians lie up to a wall's thickness below the surface, where a wall's other side may be nearer.
-        seen = read_surface(made["surface"].path)
-    # The paper's network reads the Gaussians' own centers.
-    centers = config.gain_model == NETWORK and config.scene.lift.onto == "gaussians"
-    if seen is not None and "cloud" in made and not centers:
-        features = moved_onto(features, seen)
-    # Structure from motion knows nothing of the frame that the contacts are in.
-    found_frame = scene.source is not None and scene.source.kind in ("photographs", "video")
-    if scene.splats is None or given is not None:
-        expect_on_object(impacts.contacts, features.points, names=impacts.names, stated=stated, strict=found_frame)
-
-    def symmetries() -> Symmetries | None:
-        found = report.get("symmetries")
-        return None if found is None else Symmetries.from_dict(found)
-
-    return _Shape(FeatureField.from_points(features.points), features, symmetries, surface, digest, made, report)
-
-
-def _surface_stage(
-    stages: StageFolder, surface: Callable[[], Surface | ObjectShape], digest: str, listener: ProgressListener
-) -> dict[str, Kept]:
-    """Return the stage of the object's surface; none where its shape is unknown."""
-    try:
-        return {"surface": keep_surface(stages, surface, digest)}
-    except SceneError as error:
-        listener.log(f"no surface is written: {error}")
-        return {}
-
-
-def moved_onto(features: FeatureField, surface: Surface) -> FeatureField:
-    """Return features of Gaussians at the places of a mesh nearest to them, without those farther than `OFF_MESH`.
-
-    As they are where most are farther, for the two are in different frames then, and where there are no triangles.
-    """
-    triangles = surface.vertices.double().numpy()[surface.faces.numpy()]
-    sides = triangles[:, 1:] - triangles[:, :1]
-    triangles = triangles[np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) > 0]
-    if not len(triangles):
-        return features
-    found = ClosestPoints(triangles)(features.points.double().numpy())
-    size = float((surface.vertices.amax(0) - surface.vertices.amin(0)).norm())
-    near = found.distances <= OFF_MESH * size
-    if 2 * near.sum() < len(near):
-        return features
-    places = (triangles[found.rows] * found.weights[:, :, None]).sum(axis=1)[near]
-    rows = torch.from_numpy(near)
-    return replace(features, points=torch.from_numpy(places).to(features.points), features=features.features[rows])
-
-
-def object_shape(found: Surface | None, scene: SceneStages | None) -> tuple[Callable[[], Surface | ObjectShape], str]:
-    """Return what makes the object's shape, and the digest of what it is made of: its mesh before its views.
-
-    `found` is the surface that the folder holds. What is returned raises SceneError where the shape is unknown.
-    """
-    if found is not None and len(found.faces):
-        digest = hashlib.sha256(found.vertices.contiguous().numpy().tobytes())
-        digest.update(found.faces.contiguous().numpy().tobytes())
-        return lambda: found, digest.hexdigest()
-    if scene is None:
-
-        def unknown() -> ObjectShape:
-            raise SceneError(
-                "surface: expected a mesh or views of the object in the folder, got none; add surface.obj",
-                name="surface",
-            )
-
-        return unknown, ""
-    return once(scene.shape), f"{scene.cloud.digest} {scene.views.digest}"
-
-
-def keep_surface(stages: StageFolder, make: Callable[[], Surface | ObjectShape], digest: str) -> Kept:
-    """Return the file of the object's surface, made where what is kept is of something else. Raises as `make`."""
-
-    def write(path: Path) -> None:
-        shape = make()
-        surface = shape if isinstance(shape, Surface) else shape.as_seen()
-        write_whole(path, lambda place: write_surface(surface, place), raising=SceneError)
-
-    return stages.keep(SURFACE, {"of": digest}, write)

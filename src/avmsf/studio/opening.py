@@ -13,8 +13,8 @@ from avmsf.capture.table import TABLE
 from avmsf.errors import StudioError
 from avmsf.export.geometry import holds_gaussians
 from avmsf.pipeline.config import CACHE
-from avmsf.pipeline.fit import FIELD, SURFACE
 from avmsf.pipeline.scene import CLOUD
+from avmsf.pipeline.shape import FIELD, SURFACE
 from avmsf.pipeline.sources import find_source, find_splats
 
 MESHES = (".obj", ".ply", ".glb", ".stl")
