@@ -112,7 +112,9 @@ def _fit(options: Options, settings: CaptureSettings) -> None:
         screen.print(f"the object's surface is {made.surface}", soft_wrap=True)
     screen.print(f"wrote {path}", soft_wrap=True)
     if test is not None:
-        next_step("the same command without --train-fraction and --train-count, to fit to all recordings")
+        next_step(
+            "the same command without --train-fraction and --train-count, and another --output, fits all recordings"
+        )
     else:
         next_command("avmsf render", path, "--position X Y Z -o impact.wav")
     if fitted.quality is not None and fitted.quality.level > 0:

@@ -230,7 +230,7 @@ class CheckedSurface:
         held = self.mean_thickness
         if held is not None and wall > _HOLLOW * held:
             raise SimulationError(
-                f"expected a wall of at most {1000 * _HOLLOW * held:.2g} mm in a mesh that is {1000 * held:.2g} mm "
+                f"expected a wall of at most {1000 * _HOLLOW * held:.3g} mm in a mesh that is {1000 * held:.3g} mm "
                 "thick on average, got a thicker one; use a solid body",
                 name="wall",
                 value=wall,

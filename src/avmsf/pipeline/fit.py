@@ -117,6 +117,9 @@ def fit(
             with _stage_folder(cache, source if views and isinstance(source, Path) else None) as stages:
                 return load(guess_in_stages(source, material, config, stages, settings=settings, listener=listener))
         if isinstance(source, Path):
+            if source.is_file():
+                advice = "material=NAME computes a field of a mesh without recordings"
+                raise FitError.expected("a capture folder", got="a file", file=source, name="material", advice=advice)
             source = read_capture(source, capture_settings_of(config, settings_of(source)))
         if not isinstance(source, Capture):
             raise FitError(
