@@ -13,7 +13,8 @@ from avmsf.capture.audio import read_recording
 from avmsf.capture.onset import find_second_push
 from avmsf.capture.prepare import prepare
 from avmsf.features.feature_field import FeatureField
-from avmsf.simulate.recipe import EXAMPLE_FOLDER, example_mesh
+from avmsf.simulate.recipe import EXAMPLE_FOLDER
+from avmsf.simulate.simulation_folder import example_mesh
 from tests.oracles.plate import Plate, plate_surface_points, sample_contacts, strike
 
 REPOSITORY = Path(__file__).resolve().parents[1]

@@ -27,8 +27,7 @@ from avmsf.export.sampled_field import SampledField
 from avmsf.export.web import page_files
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
-from avmsf.simulate.recipe import example_mesh
-from avmsf.simulate.simulation_folder import write_textured
+from avmsf.simulate.simulation_folder import example_mesh, write_textured
 from benchmarks.report import Report, Table
 from benchmarks.studiosound import ARGUMENTS, CHROMIUM
 

@@ -17,7 +17,8 @@ from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh import read_surface
 from avmsf.pipeline.config import LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
-from avmsf.simulate.recipe import EXAMPLE, example_mesh
+from avmsf.simulate.recipe import EXAMPLE
+from avmsf.simulate.simulation_folder import example_mesh
 from factories.plate_field import QUICK
 
 METHODS = {

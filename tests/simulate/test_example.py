@@ -13,7 +13,8 @@ from avmsf.modal.modes import ModalBank
 from avmsf.photographs import read_views
 from avmsf.photographs.mesh_views import MeshTracer
 from avmsf.simulate.ground_truth import read_truth
-from avmsf.simulate.recipe import EXAMPLE, EXAMPLE_FOLDER, example_mesh
+from avmsf.simulate.recipe import EXAMPLE, EXAMPLE_FOLDER
+from avmsf.simulate.simulation_folder import example_mesh
 
 
 def test_the_example_was_made_by_its_recipe() -> None:

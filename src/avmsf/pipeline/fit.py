@@ -118,16 +118,11 @@ def fit(
                 return load(guess_in_stages(source, material, config, stages, settings=settings, listener=listener))
         if isinstance(source, Path):
             if source.is_file():
-                advice = "material=NAME computes a field of a mesh without recordings"
-                raise FitError.expected("a capture folder", got="a file", file=source, name="material", advice=advice)
+                wanted = "a capture folder, or material=NAME with a mesh"
+                raise FitError.expected(wanted, got="a file without", file=source, name="material")
             source = read_capture(source, capture_settings_of(config, settings_of(source)))
         if not isinstance(source, Capture):
-            raise FitError(
-                f"capture: expected a Capture or a folder, got {type(source).__name__}; read a folder by "
-                "avmsf.read(folder)",
-                name="capture",
-                value=type(source).__name__,
-            )
+            raise FitError.expected("a Capture or a folder", type(source).__name__, name="capture")
         if features is None and source.folder is not None:
             expect_shape(source)
         views = scene_of(source, config, features, StageFolder(Path()), listener) is not None

@@ -6,14 +6,11 @@ import math
 from dataclasses import asdict, dataclass, field, fields, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from avmsf._utils.caching import source_digest
 from avmsf.errors import SimulationError
 from avmsf.fem.material import material_named
-
-if TYPE_CHECKING:
-    from avmsf.mesh.textured_mesh import TexturedMesh
 
 LONGEST = 0.02
 """Longest contact of an impact, seconds."""
@@ -227,10 +224,3 @@ EXAMPLE = ObjectRecipe(
 """`avmsf simulate example` makes it anew; `--surface` adds the mesh."""
 EXAMPLE_FOLDER = Path(__file__).parents[1] / "example"
 """The capture folder that the package ships, made of that recipe: recordings and photographs, no mesh."""
-
-
-def example_mesh() -> "TexturedMesh":
-    """Return the mesh, in its colors, that the example's recordings and photographs were computed from."""
-    from avmsf.simulate.shapes import make_shape, textured
-
-    return textured(make_shape(EXAMPLE.kind, seed=EXAMPLE.seed, size=EXAMPLE.size, wall=EXAMPLE.thickness))

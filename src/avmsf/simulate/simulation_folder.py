@@ -16,7 +16,8 @@ from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.folder import write_views
 from avmsf.photographs.mesh_views import orbit_cameras, render_views
 from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
-from avmsf.simulate.recipe import AXES, ObjectRecipe
+from avmsf.simulate.recipe import AXES, EXAMPLE, ObjectRecipe
+from avmsf.simulate.shapes import make_shape, textured
 from avmsf.simulate.simulation import Simulation, simulate_object
 
 _CIRCLES = 3
@@ -192,3 +193,8 @@ def simulate_set(
             stage(f"{recipe.views} views" if recipe.views else "files")
             write_simulation(simulation, folder / name)
         log(SetProgress(name, done + 1, len(recipes), "exists" if whole[name] else "done"))
+
+
+def example_mesh() -> TexturedMesh:
+    """Return the mesh, in its colors, that the example's recordings and photographs were computed from."""
+    return textured(make_shape(EXAMPLE.kind, seed=EXAMPLE.seed, size=EXAMPLE.size, wall=EXAMPLE.thickness))
