@@ -16,11 +16,12 @@ def resampled(
 ) -> Float[Tensor, "contacts resampled"]:
     """Return sounds at another sample rate, Hz, by a polyphase filter; they are not differentiable in what was given.
 
-    What lies above half the lower of the two rates is lost. Dtype and device stay.
+    What lies above half the lower of the two rates is lost. Dtype and device stay. The ratio of the rates is the
+    nearest with a denominator up to 20,000, exact for all rates in use.
     """
     if sample_rate == wanted:
         return sounds
-    ratio = Fraction(wanted / sample_rate).limit_denominator(4096)
+    ratio = (Fraction(wanted) / Fraction(sample_rate)).limit_denominator(20_000)
     found = resample_poly(sounds.detach().cpu().double().numpy(), ratio.numerator, ratio.denominator, axis=1)
     return torch.from_numpy(found).to(sounds)
 

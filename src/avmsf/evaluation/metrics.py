@@ -16,13 +16,12 @@ CDPAM is in `avmsf.evaluation.cdpam`; modes are compared with true ones in `avms
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 
-import scipy
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from avmsf.editing import clips
 from avmsf.errors import EvaluationError
 from avmsf.modal.config import scaled_fft_size
 from avmsf.modal.spectra import envelope, htk_filters, log_mel, magnitude_stft
@@ -80,10 +79,9 @@ def validate_sounds(sounds: Sounds, *, what: str = "sounds") -> None:
 
 
 def resampled(sounds: Float64[Tensor, "contacts samples"], *, sample_rate: float, wanted: float) -> Sounds:
-    """Return sounds at another sample rate (Hz) by a polyphase filter, band-limited to the new rate.
+    """Return sounds at another sample rate (Hz), as `avmsf.editing.clips.resampled`.
 
-    The ratio of the rates is the nearest with a denominator up to 20,000, exact for all rates in use. Raises
-    EvaluationError for a rate that is not a positive number, or less than a thousandth of the wanted one.
+    Raises EvaluationError for a rate that is not a positive number, or less than a thousandth of the wanted one.
     """
     if not (math.isfinite(sample_rate) and sample_rate >= 1e-3 * wanted):
         raise EvaluationError(
@@ -92,10 +90,7 @@ def resampled(sounds: Float64[Tensor, "contacts samples"], *, sample_rate: float
             name="sample_rate",
             value=sample_rate,
         )
-    if sample_rate == wanted:
-        return sounds
-    ratio = (Fraction(wanted) / Fraction(sample_rate)).limit_denominator(20000)
-    return torch.from_numpy(scipy.signal.resample_poly(sounds.numpy(), ratio.numerator, ratio.denominator, axis=1))
+    return clips.resampled(sounds, sample_rate=sample_rate, wanted=wanted)
 
 
 def default_fft_sizes(sample_rate: float) -> tuple[int, ...]:

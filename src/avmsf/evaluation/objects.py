@@ -3,13 +3,10 @@
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from fractions import Fraction
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.signal import resample_poly
 from torch import Tensor
 
 from avmsf._utils.locks import NO_LIMIT
@@ -18,6 +15,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.datasets import CaptureCollection
 from avmsf.datasets.dataset import Dataset
 from avmsf.datasets.numbering import ABLATION, NON_SYMMETRIC
+from avmsf.editing.clips import resampled
 from avmsf.errors import AvmsfError, EvaluationError, SceneError
 from avmsf.evaluation.modal_metrics import simulated
 from avmsf.evaluation.protocols import EvaluationProtocol
@@ -181,21 +179,12 @@ def draw_other_recording(dataset: Dataset, identifier: str, train: Impacts, *, s
         except AvmsfError:
             continue
         row = int(torch.randint(len(impacts), (), generator=generator))
-        sound = _at_rate(impacts.sounds[row], impacts.sample_rate, train.sample_rate)
+        (sound,) = resampled(impacts.sounds[row][None], sample_rate=impacts.sample_rate, wanted=train.sample_rate)
         samples = train.sounds.shape[1]
         return torch.nn.functional.pad(sound, (0, max(0, samples - len(sound))))[:samples].to(train.sounds.dtype)
     raise EvaluationError.expected(
         f"another readable object in {dataset.name}", name=identifier, advice="download more of the dataset"
     )
-
-
-def _at_rate(sound: Float[Tensor, " samples"], found: float, wanted: float) -> Float[Tensor, " resampled"]:
-    if found == wanted:
-        return sound
-    ratio = Fraction(wanted).limit_denominator(1000) / Fraction(found).limit_denominator(1000)
-    ratio = ratio.limit_denominator(1000)
-    resampled = resample_poly(sound.double().numpy(), ratio.numerator, ratio.denominator)
-    return torch.from_numpy(resampled.astype(np.float32))
 
 
 ABLATED, NOT_SYMMETRIC = "ablation", "non-symmetric"
