@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Literal, Self, TypeVar, get_type_hints
+from typing import Any, Literal, TypeVar, get_type_hints
 
 import tyro
 
@@ -27,7 +27,7 @@ class Common:
     """Print each step of the work as it begins."""
 
     @classmethod
-    def parse(cls, words: Sequence[str]) -> Self:
+    def parse(cls: type[T], words: Sequence[str]) -> T:
         """Return the options that the words spell, see `parse_options`; the module has the verb's name."""
         return parse_options(cls, cls.__module__.rpartition(".")[2], words)
 

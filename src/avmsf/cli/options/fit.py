@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
 import tyro
 
@@ -182,7 +182,7 @@ class Options(Printing):
             raise FitError.expected("--train-fraction or --train-count with it", got="neither", name="--start")
 
     @classmethod
-    def parse(cls, words: Sequence[str]) -> Self:
+    def parse(cls, words: Sequence[str]) -> "Options":
         """Return the options that the words spell, with the preset's settings as defaults."""
         values = preset_values(preset_of(words), fit="config")
         scene = values.pop("scene")

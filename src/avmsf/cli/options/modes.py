@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Self
 
 import tyro
 
@@ -46,7 +45,7 @@ class Options(Printing):
         return PipelineConfig(extraction=self.extraction, modes=self.modes, time_zero=self.time_zero)
 
     @classmethod
-    def parse(cls, words: Sequence[str]) -> Self:
+    def parse(cls, words: Sequence[str]) -> "Options":
         """Return the options that the words spell, with the preset's settings as defaults."""
         values = preset_values(preset_of(words))
         own = {name: values[name] for name in ("extraction", "modes", "time_zero", "preset")}

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Self
+from typing import Annotated
 
 import tyro
 
@@ -51,7 +51,7 @@ class Options(Printing):
             )
 
     @classmethod
-    def parse(cls, words: Sequence[str]) -> Self:
+    def parse(cls, words: Sequence[str]) -> "Options":
         """Return the options that the words spell."""
         options = parse_options(cls, "simulate", words, default=cls())
         # A second time from the named object's recipe: what is asked for may be a default, and not that object's.
