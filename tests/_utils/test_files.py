@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from avmsf._utils.files import way_out, write_whole
+from avmsf._utils.files import new_folder, way_out, write_whole
 from avmsf.errors import ExportError
 from avmsf.export.writing import write_folder
 from factories.raising import raises
@@ -62,3 +62,20 @@ def test_new_files_and_folders_have_the_mode_of_the_umask_which_stays_as_it_is(
     modes = [(tmp_path / name).stat().st_mode & 0o777 for name in ("file", "folder", "folder/inside")]
     assert modes == [0o640, 0o750, 0o640]
     assert changed == []
+
+
+def test_a_folder_that_cannot_be_replaced_stays_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "mine").touch()
+    rename, renamed = os.rename, list[Path]()
+
+    def second_fails(source: Path, target: Path) -> None:
+        renamed.append(source)
+        if len(renamed) == 2:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        rename(source, target)
+
+    monkeypatch.setattr("avmsf._utils.files.os.rename", second_fails)
+    with raises(ExportError), new_folder(tmp_path / "folder", raising=ExportError, replace=True) as begun:
+        (begun / "new").touch()
+    assert [path.name for path in tmp_path.rglob("*")] == ["folder", "mine"]

@@ -99,7 +99,12 @@ def new_folder(folder: Path, *, raising: type[AvmsfError], replace: bool = False
             os.rename(folder, old)
         elif folder.exists():
             folder.rmdir()
-        os.rename(begun, folder)
+        try:
+            os.rename(begun, folder)
+        except OSError:
+            if old.exists():
+                os.rename(old, folder)
+            raise
         shutil.rmtree(old, ignore_errors=True)
     except OSError as error:
         raise unwritable(folder, error, raising=raising) from error
