@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from avmsf._utils.text import counted
+from avmsf._utils.text import counted, listed
 from avmsf.capture.filenames import number_key
 from avmsf.capture.folder import read_strike
 from avmsf.capture.measure import RecordingReport
@@ -143,15 +143,15 @@ def _copies(sounds: Sequence[_Sound]) -> list[str]:
     ]
 
 
-def _unlisted(folder: Path, listed: set[str]) -> list[str]:
+def _unlisted(folder: Path, named: set[str]) -> list[str]:
     """Return a sentence on wav files without a row; hidden ones, such as what the studio has removed, are left out."""
     names = (path.relative_to(folder) for path in folder.rglob("*.wav"))
     found = sorted(name.as_posix() for name in names if not any(part.startswith(".") for part in name.parts))
-    unlisted = [name for name in found if name not in listed]
+    unlisted = [name for name in found if name not in named]
     if not unlisted:
         return []
     lack = f"{counted(len(unlisted), 'wav file')} {'has' if len(unlisted) == 1 else 'have'} no row in {TABLE}"
-    return [f"{lack}: {', '.join(unlisted[:5])}{', …' * (len(unlisted) > 5)}"]
+    return [f"{lack}: {listed(unlisted)}"]
 
 
 def _check_row(

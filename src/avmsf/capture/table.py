@@ -13,7 +13,7 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 
 from avmsf._utils.files import is_lfs_pointer
-from avmsf._utils.text import read_text
+from avmsf._utils.text import listed, read_text
 from avmsf.capture.filenames import missing_recording
 from avmsf.capture.settings import METRES, CaptureSettings
 from avmsf.errors import CaptureError, CaptureWarning, Location
@@ -222,11 +222,10 @@ def refuse_missing(folder: Path, strikes: Sequence[Strike]) -> None:
     if len(missing) == 1:
         advice, used = f"copy it there, or remove its row from {TABLE}", {folder / each for each in files}
         raise missing_recording(folder / file, file, advice=advice, used=used)
-    shown = f"{', '.join(missing[:5])}{', …' * (len(missing) > 5)}"
     advice = "copy them there, or correct their names" if below is None else f"write {below} in place of {file}"
     raise CaptureError(
-        f"{folder / TABLE}: expected a file for each row, got none for {len(missing)} of {len(strikes)} ({shown}); "
-        f"{advice}",
+        f"{folder / TABLE}: expected a file for each row, got none for {len(missing)} of {len(strikes)} "
+        f"({listed(missing)}); {advice}",
         file=folder / TABLE,
         name="file",
         value=missing,

@@ -128,7 +128,7 @@ class ResultsFolder:
 
     def _of_another(self, name: str, wanted: object, found: object) -> EvaluationError:
         differing = f"of {name} {_brief(wanted)}, got {_brief(found)}"
-        if name.startswith("source"):
+        if name == "source":
             differing = "made by this version of avmsf, got those of another, whose code differs"
         text = f"{self.path}: expected results {differing}; give the same options, or choose another --output"
         return EvaluationError(text, file=self.path, name=name, value=found)

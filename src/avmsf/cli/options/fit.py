@@ -168,16 +168,20 @@ class Options(Printing):
 
     def _check_unused(self) -> None:
         """Raise FitError for options that nothing would read."""
+        given = {each.name for each in fields(self) if getattr(self, each.name) != each.default}
+        if self.gain_model == "elastic":
+            given.discard("gain_model")
+        if self.body.supports == "try":
+            given.add("body.supports")
         fitted = ("train_fraction", "train_count", "start", "features", "without_shape")
-        unused = [(name, "until") for name in fitted if self.until is not None]
-        if self.material is not None:
-            unused += [(name, "material") for name in (*fitted, "until", "time_zero")]
-            unused += [("gain_model", "material")] if self.gain_model not in ("auto", "elastic") else []
-            unused += [("body.supports", "material")] if self.body.supports == "try" else []
-        for name, other in unused:
-            if "." in name or getattr(self, name):
-                chosen = getattr(self, other)
-                raise FitError.expected(f"no --{other} with it", chosen, name=option_of(name), advice="leave one out")
+        unread = {"until": fitted, "material": (*fitted, "until", "time_zero", "gain_model", "body.supports")}
+        for other, names in unread.items():
+            for name in names if getattr(self, other) else ():
+                if name in given:
+                    chosen = getattr(self, other)
+                    raise FitError.expected(
+                        f"no --{other} with it", chosen, name=option_of(name), advice="leave one out"
+                    )
         if self.start and self.train_fraction is None and self.train_count is None:
             raise FitError.expected("--train-fraction or --train-count with it", got="neither", name="--start")
 

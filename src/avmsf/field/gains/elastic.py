@@ -234,7 +234,7 @@ class Elastic(KernelFamily):
     def _along(self, sites: Sites) -> Float64[Tensor, "sites shapes"]:
         if sites is self.reference:
             return self._known
-        # Covariances ask for the same impacts, and the same known ones, once for each mode.
+        # Covariances ask for the same impacts several times in a row.
         latest = self._latest
         found = next((along for known, along in latest if known is sites), None)
         if found is None:
