@@ -12,7 +12,7 @@ from avmsf.cli import main
 from avmsf.cli.fit import summary
 from avmsf.cli.heartbeat import verbosity
 from avmsf.cli.options import suggest
-from avmsf.cli.scores import body_warnings, order_words, outlier_words, quality_words
+from avmsf.cli.scores import advice_on_labels, body_warnings, outlier_words, quality_words
 from avmsf.errors import FieldFileError
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
@@ -140,5 +140,5 @@ def test_an_outlier_says_first_what_was_done_and_has_figures_only_for_verbose(mo
 
 
 def test_another_order_of_the_recordings_is_told_if_there_is_one() -> None:
-    assert order_words(field_with({"order": "sorted by number"})) == ["sorted by number"]
-    assert order_words(field_with({"order": None})) == order_words(field_with({})) == []
+    assert advice_on_labels(field_with({"advice": "sorted by number"})) == ["sorted by number"]
+    assert advice_on_labels(field_with({"advice": None})) == advice_on_labels(field_with({})) == []

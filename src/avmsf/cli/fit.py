@@ -24,9 +24,9 @@ from avmsf.cli.options.fit import Options
 from avmsf.cli.printing import console, figure, next_command, next_step, print_json, print_result, say, table
 from avmsf.cli.progress import ProgressBar
 from avmsf.cli.scores import (
+    advice_on_labels,
     body_warnings,
     compare,
-    order_words,
     outlier_words,
     parts_words,
     quality_words,
@@ -96,7 +96,7 @@ def _fit(options: Options, settings: CaptureSettings) -> None:
         if options.output is not None:
             copy_whole(made.field, options.output)
     screen, path = console(errors=options.json), options.output or made.field
-    for sentence in (*order_words(fitted), *describe_alignment(made.modes, train)):
+    for sentence in (*advice_on_labels(fitted), *describe_alignment(made.modes, train)):
         screen.print(sentence, soft_wrap=True)
     doing("comparing the field with the recordings that it was not fitted to")
     scores = {} if test is None else compare(fitted, train, test, made.modes)

@@ -71,9 +71,9 @@ def body_warnings(field: SoundField) -> list[str]:
     return [f"warning: {field.body.warning}"] if field.body is not None and field.body.warning else []
 
 
-def order_words(field: SoundField) -> list[str]:
-    """Return the other order in which the recordings agree with the contacts; empty where there is none."""
-    return [field.origin.report["order"]] if field.origin.report.get("order") else []
+def advice_on_labels(field: SoundField) -> list[str]:
+    """Return in which other order or levels the recordings agree with the contacts; empty where in none."""
+    return [field.origin.report["advice"]] if field.origin.report.get("advice") else []
 
 
 def outlier_words(field: SoundField) -> list[str]:

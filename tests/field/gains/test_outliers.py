@@ -10,6 +10,7 @@ from torch import Tensor
 
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.levels import two_levels
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.gains.outliers import (
@@ -179,6 +180,22 @@ def test_recordings_given_to_rows_in_another_order_are_found_with_the_order() ->
         assert found is not None
         assert torch.equal(found[1], order)
         assert better_order(given, families, rows, gains, true.points.float(), directional=True) is None
+
+
+@pytest.mark.parametrize(("first", "level"), [(3, -10.0), (10, 6.0), (15, 20.0)])
+def test_recordings_of_two_levels_are_found_with_where_the_second_begins(first: int, level: float) -> None:
+    true = _sites()
+    families = [kind(true, 1.4) for kind in (Unstructured, Smooth, ThinPlate)]
+    for gains, expected in (
+        (_gains(true), (first, level)),
+        # Where places say nothing of the gains, no level is wrong.
+        (replace(_gains(true), values=torch.view_as_complex(draw(CONTACTS, MODES, 2, seed=7))), None),
+    ):
+        moved = gains.values.clone()
+        moved[first:] *= 10 ** (level / 20)
+        points = true.points.float()
+        assert two_levels(families, replace(gains, values=moved), points, directional=True) == expected
+        assert two_levels(families, gains, points, directional=True) is None
 
 
 def test_a_recording_of_another_gain_is_named_as_such() -> None:

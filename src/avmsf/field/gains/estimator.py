@@ -26,6 +26,7 @@ from avmsf.field.config import AUTO, NETWORK, GainModel
 from avmsf.field.gains.elastic import CandidateBodies, Elastic
 from avmsf.field.gains.family import KernelFamily, Sites, sites_along
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, matched, total_evidence
+from avmsf.field.gains.levels import two_levels
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.gains.outliers import Fit, Judgment, assess_contacts, better_order, predicts_better
@@ -45,7 +46,7 @@ KNOWN = (*FAMILIES, Visual.kind)
 """All families. Looks must be asked for by name: with the built-in descriptors of four simulated objects they made the
 errors between 0.4 % smaller and 1.7 % larger without a body, and changed nothing with one."""
 _UPDATED = 64
-"""Contacts that a body is updated from, or orders are compared at, at most."""
+"""Contacts that a body is updated from, or orders and levels are compared at, at most."""
 _PREDICTS = 1.4
 """Nats per mode that a free body has to add, below which supports are tried. A plate clamped at an edge and taken for
 free adds .5, a free one 2.3; mugs add 1.1 (held at the base) and 1.5, an aircraft .8 to 1.3."""
@@ -154,7 +155,8 @@ class MixtureEstimator(GainRecipe):
         weights = _body_weights(model, families, fit.measured)
         report = _report(bodies, families, weights, missing) | _outlier_report(judgment, case, used)
         report["thickness"] = None if thickness is None else asdict(thickness)
-        report["order"] = None if judgment.informative else _better_order(fit, bodies)
+        advice = _two_levels(fit, bodies)
+        report["advice"] = advice if advice or judgment.informative else _better_order(fit, bodies)
         return replace(model, report=report), used
 
     def _expect_inputs(self, case: GainCase, groups: Sequence[Group]) -> None:
@@ -265,6 +267,11 @@ class _Fit:
         """Return the gains at some contacts."""
         return replace(self.measured, values=self.measured.values[rows])
 
+    @cached_property
+    def compared(self) -> Int[Tensor, " rows"]:
+        """Contacts at which orders and levels are compared, as recorded."""
+        return farthest_points(self.sites.points, min(_UPDATED, len(self.sites))).sort().values
+
     def families(self, rows: Int[Tensor, " rows"], bodies: Sequence[NominalBody]) -> list[KernelFamily]:
         """Return the families of these contacts; the elastic ones come last, in the order of the bodies."""
         sites, size = self.sites.take(rows), 2.0 * self.case.features.half_diagonal
@@ -356,10 +363,24 @@ def _assessed(fit: _Fit, model: MixtureGains, body: NominalBody | None) -> Judgm
     return assess_contacts(fitted([]), elastic, fit.sites, model.sites(points), fit.measured)
 
 
+def _two_levels(fit: _Fit, bodies: Sequence[NominalBody]) -> str | None:
+    """Return from which recording on the level is another, and what to do; None where levels agree."""
+    names, rows = fit.case.train.names, fit.compared
+    families, points = fit.families(rows, bodies), fit.case.features.points
+    found = two_levels(families, fit.at(rows), points, directional=fit.directional)
+    if found is None:
+        return None
+    first, level = found
+    return (
+        f"the recordings from {names[int(rows[first])]} on are {abs(level):.0f} dB "
+        f"{'louder' if level > 0 else 'weaker'} than those before let expect, as if the gain, the microphone's place "
+        "or the force's scale had changed: bring all to one level, or fit each group by itself"
+    )
+
+
 def _better_order(fit: _Fit, bodies: Sequence[NominalBody]) -> str | None:
     """Return in which order the recordings agree with the contacts far better, and what to change; None for none."""
-    names = fit.case.train.names
-    rows = farthest_points(fit.sites.points, min(_UPDATED, len(names))).sort().values
+    names, rows = fit.case.train.names, fit.compared
     points, directional = fit.case.features.points, fit.directional
     found = better_order(names, fit.families(rows, bodies), rows, fit.measured, points, directional=directional)
     if found is None:
