@@ -4,12 +4,14 @@ Run as a script, with the job's path. It imports nothing of the package and no o
 copies of libraries that torch and Pillow bring too, and the process aborts where two of them meet.
 """
 
-import itertools
 import json
 import os
 import sys
 import threading
 from pathlib import Path
+
+LONGEST = 1600
+"""Pixels of the longer side on which features are sought."""
 
 
 def main(job_path: str) -> None:
@@ -22,17 +24,16 @@ def main(job_path: str) -> None:
     database, images = folder / "database.db", folder / "images"
     pycolmap.set_random_seed(job["seed"])
     _say("features")
-    reader = pycolmap.ImageReaderOptions(camera_model=job["camera_model"])
+    reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
     if job["masks"]:
         reader.mask_path = str(folder / "masks")
-    extraction = pycolmap.FeatureExtractionOptions(num_threads=job["threads"], max_image_size=job["longest"])
+    extraction = pycolmap.FeatureExtractionOptions(num_threads=job["threads"], max_image_size=LONGEST)
     extraction.sift.max_num_features = job["features"]
-    mode = pycolmap.CameraMode.SINGLE if job["shared_camera"] else pycolmap.CameraMode.PER_IMAGE
     pycolmap.extract_features(
         database,
         images,
         image_names=job["names"],
-        camera_mode=mode,
+        camera_mode=pycolmap.CameraMode.SINGLE,
         reader_options=reader,
         extraction_options=extraction,
         device=pycolmap.Device.cpu,
@@ -47,15 +48,7 @@ def main(job_path: str) -> None:
     (folder / "models").mkdir()
     options = pycolmap.IncrementalPipelineOptions(num_threads=job["threads"], random_seed=job["seed"], min_model_size=3)
     options.mapper.random_seed = options.triangulation.random_seed = job["seed"]
-    count = itertools.count(3)
-    found = pycolmap.incremental_mapping(
-        database,
-        images,
-        folder / "models",
-        options=options,
-        initial_image_pair_callback=lambda: print(f"[2/{len(job['names'])}]", flush=True),
-        next_image_callback=lambda: print(f"[{next(count)}/{len(job['names'])}]", flush=True),
-    )
+    found = pycolmap.incremental_mapping(database, images, folder / "models", options=options)
     models = []
     for number, model in sorted(found.items()):
         # COLMAP reads no WebP: such images stand under another name in the job's folder.
@@ -64,14 +57,7 @@ def main(job_path: str) -> None:
         model.write(folder / "models" / str(number))
         # An image that a model merely knows of has no pose in it.
         names = sorted(image.name for image in model.images.values() if image.has_pose)
-        models.append(
-            {
-                "number": number,
-                "names": names,
-                "points": model.num_points3D(),
-                "error": model.compute_mean_reprojection_error(),
-            }
-        )
+        models.append({"number": number, "names": names})
     (folder / "result.json").write_text(json.dumps(models), encoding="utf-8")
 
 
