@@ -1,8 +1,7 @@
 """Photographs out of a video: from each stretch of time its sharpest frame."""
 
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -13,58 +12,44 @@ from avmsf.errors import CaptureError, CaptureWarning
 
 SHARPNESS_PIXELS = 480
 """Pixels of the longer side on which sharpness is judged: less would hide a slight blur, more measures the noise."""
+_CONVERT = "convert it to MP4 (H.264)"
 
 
-@dataclass(frozen=True)
-class PickedFrame:
-    """One frame of a video, written as an image."""
-
-    path: Path
-    number: int
-    """Counted from 0."""
-    sharpness: float
-    """Variance of the Laplacian of the brightness, 0 to 255; comparable between frames that show much the same."""
-
-
-def pick_frames(
-    path: str | Path,
-    folder: str | Path,
-    *,
-    count: int,
-    suffix: str = ".png",
-    progress: Callable[[int, int], None] | None = None,
-) -> tuple[PickedFrame, ...]:
+def pick_frames(path: str | Path, folder: str | Path, *, count: int) -> None:
     """Divide a video into `count` spans of equal length and write the sharpest frame of each into a new folder.
 
-    Images are called frame_000123.png by their number in the video and stand upright, as the video's rotation tag
-    says. The video is read once, with two frames in memory, unless it turns out to be of another length than it
-    claims, in which case it is read again. `progress` is called with the frames read and their number as claimed.
-    `folder` is whole or absent. Raises CaptureError where the video cannot be read, has fewer than `count` frames, or
-    `folder` exists and is not empty; warns with CaptureWarning of a video that ends early.
+    Images are called frame_000123.png by their number in the video, from 0, and stand upright, as the video's rotation
+    tag says. The video is read once, with two frames in memory, unless it turns out to be of another length than it
+    claims, in which case it is read again. `folder` is whole or absent. Raises CaptureError where the video cannot be
+    read, has fewer than `count` frames, or `folder` exists and is not empty; warns with CaptureWarning of a video that
+    ends early.
     """
-    path, folder = Path(path), Path(folder)
+    path = Path(path)
     if count < 1:
-        raise CaptureError(f"count: expected at least 1 frame, got {count}", name="count", value=count)
-    if suffix not in (".png", ".jpg"):
-        raise CaptureError(f"suffix: expected .png or .jpg, got {suffix!r}", name="suffix", value=suffix)
+        raise CaptureError.expected("at least 1 frame", count, name="count")
     claimed = _claimed_frames(path)
-    with new_folder(folder, raising=CaptureError) as begun:
-        total = claimed if claimed >= count else _read(path, lambda number, frame: None, progress, claimed)
+    with new_folder(Path(folder), raising=CaptureError) as begun:
+        total = claimed if claimed >= count else sum(1 for _ in _frames(path))
         while True:
-            _check_enough(path, total, count)
-            read, picked = _pick(path, begun, total=total, count=count, suffix=suffix, progress=progress)
+            if total == 0:
+                got = "none that can be read"
+                raise CaptureError.expected(
+                    "a video with frames", 0, got=got, file=path, name="frames", advice=_CONVERT
+                )
+            if total < count:
+                wanted, advice = f"a video of at least {count} frames", f"choose at most {total}"
+                raise CaptureError.expected(wanted, total, file=path, name="count", advice=advice)
+            read = _pick(path, begun, total=total, count=count)
             if read == total:
                 break
             # What was picked belongs to spans of another length.
-            for frame in picked:
-                frame.path.unlink(missing_ok=True)
+            for picked in begun.iterdir():
+                picked.unlink()
             total = read
     if total < 0.95 * claimed:
-        message = (
-            f"{path}: expected {claimed} frames as its header says, got {total}; the frames are selected from these"
-        )
-        warnings.warn(CaptureWarning(message, file=path, name="frames", value=total), stacklevel=2)
-    return tuple(PickedFrame(folder / frame.path.name, frame.number, frame.sharpness) for frame in picked)
+        wanted, advice = f"{claimed} frames as its header says", "the frames are selected from these"
+        warning = CaptureWarning.expected(wanted, total, file=path, name="frames", advice=advice)
+        warnings.warn(warning, stacklevel=2)
 
 
 def sharpness(frame: np.ndarray) -> float:
@@ -81,56 +66,38 @@ def sharpness(frame: np.ndarray) -> float:
     return float(cv2.Laplacian(gray, cv2.CV_32F).var())
 
 
-def _pick(
-    path: Path, folder: Path, *, total: int, count: int, suffix: str, progress: Callable[[int, int], None] | None
-) -> tuple[int, list[PickedFrame]]:
-    """Write the sharpest frame of each span of a video of `total` frames; return how many it had, and the frames."""
-    picked: list[PickedFrame] = []
-    best: list[tuple[float, int, np.ndarray]] = []
-    span = 0
-
-    def keep() -> None:
-        value, number, frame = best.pop()
-        target = folder / f"frame_{number:06d}{suffix}"
-        if not cv2.imwrite(str(target), frame):
-            raise OSError(f"{target.name} was not written")
-        picked.append(PickedFrame(target, number, value))
-
-    def consider(number: int, frame: np.ndarray) -> None:
-        nonlocal span
+def _pick(path: Path, folder: Path, *, total: int, count: int) -> int:
+    """Write the sharpest frame of each span of a video of `total` frames; return how many it had."""
+    read, span, sharpest, best = 0, 0, -1.0, (0, np.empty(0))
+    for number, frame in enumerate(_frames(path)):
         # The last span takes in frames beyond the total, should there be any.
         own = min(number * count // total, count - 1)
-        if own > span and best:
-            keep()
-        span = own
+        if own > span:
+            _write(folder, *best)
+            span, sharpest = own, -1.0
         value = sharpness(frame)
-        if not best or value > best[0][0]:
-            best[:] = [(value, number, frame)]
+        if value > sharpest:
+            sharpest, best = value, (number, frame)
+        read = number + 1
+    if read:
+        _write(folder, *best)
+    return read
 
-    read = _read(path, consider, progress, total)
-    if best:
-        keep()
-    return read, picked
+
+def _write(folder: Path, number: int, frame: np.ndarray) -> None:
+    target = folder / f"frame_{number:06d}.png"
+    if not cv2.imwrite(str(target), frame):
+        raise OSError(f"{target.name} was not written")
 
 
-def _read(
-    path: Path,
-    consider: Callable[[int, np.ndarray], None],
-    progress: Callable[[int, int], None] | None,
-    total: int,
-) -> int:
-    """Hand each frame, with its number, to `consider`; return how many there were."""
+def _frames(path: Path) -> Iterator[np.ndarray]:
     video = _open(path)
     try:
-        number = 0
         while True:
             there, frame = video.read()
             if not there:
-                return number
-            consider(number, frame)
-            number += 1
-            if progress is not None:
-                progress(number, max(total, number))
+                return
+            yield frame
     finally:
         video.release()
 
@@ -145,26 +112,11 @@ def _claimed_frames(path: Path) -> int:
 
 def _open(path: Path) -> cv2.VideoCapture:
     if not path.is_file():
-        raise CaptureError(f"{path}: expected a video file, got none", file=path)
+        raise CaptureError.expected("a video file", file=path)
     video = cv2.VideoCapture(str(path))
     if not video.isOpened():
         video.release()
-        raise CaptureError.expected(
-            "a video", got="a file that cannot be read", file=path, name="format", advice="convert it to MP4 (H.264)"
-        )
+        got = "a file that cannot be read"
+        raise CaptureError.expected("a video", got=got, file=path, name="format", advice=_CONVERT)
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
     return video
-
-
-def _check_enough(path: Path, total: int, count: int) -> None:
-    if total == 0:
-        raise CaptureError(
-            f"{path}: expected a video with frames, got none that can be read; convert it to MP4 (H.264)",
-            file=path,
-            name="frames",
-            value=0,
-        )
-    if total < count:
-        raise CaptureError.expected(
-            f"a video of at least {count} frames", total, file=path, name="count", advice=f"choose at most {total}"
-        )
