@@ -13,12 +13,12 @@ from avmsf.features.lift import Lifted
 from avmsf.mesh import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import View
-from avmsf.photographs.mesh_views import Lighting, orbit_cameras, render_views
+from avmsf.photographs.mesh_views import orbit_cameras, render_views
 from avmsf.pipeline.config import LiftConfig
 from avmsf.pipeline.features import MadeFeatures, finish_features, lift_to_surface
 from tests.oracles.plate import Plate
 
-LIGHT = Lighting(ambient=0.3, sky=0.7, direction=(0.5, 0.3, 0.8))
+AMBIENT = 0.3
 """One lamp in one place, which lights an object's symmetric parts differently."""
 
 
@@ -45,7 +45,7 @@ def speckled(surface: Surface, *, seed: int) -> TexturedMesh:
 def pictures(mesh: TexturedMesh, *, count: int, size: int) -> tuple[View, ...]:
     """Return pictures from three elevations before black."""
     cameras = orbit_cameras(mesh.surface, size=size, azimuths=count // 3)
-    return render_views(mesh, cameras, lighting=LIGHT, background=(0.0, 0.0, 0.0))
+    return render_views(mesh, cameras, ambient=AMBIENT, background=(0.0, 0.0, 0.0))
 
 
 def lift_pictures(surface: Surface, views: tuple[View, ...], *, points: int = 8192) -> Lifted:

@@ -37,7 +37,7 @@ def depth_of(mesh: trimesh.Trimesh, *, behind: float = 0.0) -> DepthMap:
     tracer = MeshTracer(TexturedMesh.plain(surface_of(mesh)))
 
     def depth(camera: Camera) -> torch.Tensor:
-        found = tracer.cast(camera).depth
+        found = tracer.depth(camera)
         return torch.where(torch.isfinite(found), found + behind, 0.0)
 
     return depth

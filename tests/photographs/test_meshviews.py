@@ -14,7 +14,7 @@ from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.mesh import Surface
 from avmsf.mesh.textured_mesh import GRAY, TexturedMesh, read_textured_mesh
 from avmsf.photographs.cameras import Camera
-from avmsf.photographs.mesh_views import FOCAL, UNLIT, Lighting, MeshTracer, orbit_cameras, render_views
+from avmsf.photographs.mesh_views import FOCAL, SKY, MeshTracer, orbit_cameras, render_views
 from factories.raising import raises, warns
 
 RADIUS, DISTANCE = 0.1, 0.5
@@ -55,27 +55,24 @@ def test_a_spheres_silhouette_has_the_area_of_its_cone() -> None:
     assert float(view.coverage.sum()) == pytest.approx(area, rel=2e-3)
 
 
-def test_depth_and_normals_of_a_sphere() -> None:
+def test_depth_of_a_sphere() -> None:
     camera = facing(96, focal=200.0, distance=DISTANCE)
-    sight = MeshTracer(sphere()).cast(camera)
+    depth = MeshTracer(sphere()).depth(camera)
     rays = camera.rays()
     along = rays[..., 2] * DISTANCE
     under = along.square() - DISTANCE**2 + RADIUS**2
-    hit = sight.faces >= 0
+    hit = torch.isfinite(depth)
     assert bool((hit == (under > 0)).float().mean() > 0.998)
-    assert bool(torch.isinf(sight.depth[~hit]).all())
     clear = hit & (under > 0.1 * RADIUS**2)
     reach = along - under.clamp(min=0).sqrt()
     # Facets cut at most 3e-4 of the radius off; at this slant their depth changes by three times that.
-    assert float((sight.depth - reach * rays[..., 2])[clear].abs().max()) < 1e-3 * RADIUS
-    normals = (rays * reach[..., None] - torch.tensor([0.0, 0.0, DISTANCE], dtype=torch.float64)) / RADIUS
-    assert float((sight.normals - normals)[clear].norm(dim=-1).max()) < 0.01
+    assert float((depth - reach * rays[..., 2])[clear].abs().max()) < 1e-3 * RADIUS
 
 
 def test_an_unlit_picture_of_a_texture_is_the_texture() -> None:
     texture = noise(64)
     # One pixel a texel: the ray through a pixel's center meets the texel's center.
-    (view,) = render_views(card(texture), [facing()], lighting=UNLIT, supersample=1)
+    (view,) = render_views(card(texture), [facing()], ambient=1.0, supersample=1)
     assert np.array_equal(view.image.numpy(), texture)
     assert view.mask is not None
     assert bool((view.mask == 255).all())
@@ -92,7 +89,7 @@ def test_a_checkerboards_fields_are_seen_where_they_lie() -> None:
         width=240,
         height=200,
     )
-    (view,) = render_views(mesh, [camera], lighting=UNLIT)
+    (view,) = render_views(mesh, [camera], ambient=1.0)
     centers = (torch.arange(8) + 0.5) * 0.6 / 8 - 0.3
     for row, y in enumerate(centers.tolist()):
         for column, x in enumerate(centers.tolist()):
@@ -103,7 +100,7 @@ def test_a_checkerboards_fields_are_seen_where_they_lie() -> None:
 
 def test_texels_finer_than_pixels_give_their_mean() -> None:
     fine = (np.indices((500, 500)).sum(axis=0) % 2 * 255).astype(np.uint8)[..., None].repeat(3, axis=2)
-    (view,) = render_views(card(fine), [facing()], lighting=UNLIT, supersample=1)
+    (view,) = render_views(card(fine), [facing()], ambient=1.0, supersample=1)
     # 7.8 texels a pixel: without smaller copies, rays would see black, white or what lies between by turns.
     assert float((view.image[2:-2, 2:-2].float() - 127.5).abs().max()) <= 1
 
@@ -112,7 +109,7 @@ def test_textures_repeat() -> None:
     texture = noise(16)
     mesh = card(texture)
     again = TexturedMesh.build(mesh.vertices, mesh.faces, coordinates=4 * mesh.coordinates - 1, textures=mesh.textures)
-    (view,) = render_views(again, [facing()], lighting=UNLIT, supersample=1)
+    (view,) = render_views(again, [facing()], ambient=1.0, supersample=1)
     assert np.array_equal(view.image.numpy(), np.tile(texture, (4, 4, 1)))
 
 
@@ -120,7 +117,7 @@ def test_colors_between_corners_are_their_mean() -> None:
     vertices = torch.tensor([[-0.3, -0.3, 0.0], [0.3, -0.3, 0.0], [0.0, 0.3, 0.0]])
     mesh = TexturedMesh.build(vertices, torch.tensor([[0, 1, 2]]), colors=torch.eye(3)[None])
     camera = facing(65)
-    (view,) = render_views(mesh, [camera], lighting=UNLIT)
+    (view,) = render_views(mesh, [camera], ambient=1.0)
     pixels, _ = camera.project(vertices.mean(0, keepdim=True))
     across, down = pixels[0].long().tolist()
     # A pixel is a 60th of the side: the colors change by 4 from one to the next.
@@ -131,7 +128,7 @@ def test_a_mask_says_how_much_of_a_pixel_is_covered() -> None:
     # The card's edges lie a third and two thirds into pixels of 0.01 m.
     vertices = torch.tensor([[-0.1 - 1 / 300, -0.2, 0], [0.1 + 2 / 300, -0.2, 0], [0.1 + 2 / 300, 0.2, 0], [-0.1 - 1 / 300, 0.2, 0]])  # fmt: skip  # noqa: E501
     mesh = TexturedMesh.build(vertices, torch.tensor([[0, 1, 2], [0, 2, 3]]), colors=torch.full((2, 3, 3), 0.2))
-    (view,) = render_views(mesh, [facing()], lighting=UNLIT, supersample=3, background=(1.0, 0.5, 0.0))
+    (view,) = render_views(mesh, [facing()], ambient=1.0, supersample=3, background=(1.0, 0.5, 0.0))
     assert view.mask is not None
     assert view.mask[32, 20:24].tolist() == [0, 85, 255, 255]
     assert view.mask[32, 40:44].tolist() == [255, 255, 170, 0]
@@ -143,7 +140,6 @@ def test_a_mask_says_how_much_of_a_pixel_is_covered() -> None:
 def test_faces_are_as_bright_as_the_part_of_the_sky_that_they_see() -> None:
     box = trimesh.creation.box((0.2, 0.2, 0.2))
     mesh = TexturedMesh.plain(Surface(torch.tensor(box.vertices).float(), torch.tensor(box.faces)))
-    light = Lighting(ambient=0.2, sky=0.7, direction=(2.0, -1.0, 2.0))
     for axis in range(3):
         for sign in (-1.0, 1.0):
             position = torch.zeros(3)
@@ -151,9 +147,8 @@ def test_faces_are_as_bright_as_the_part_of_the_sky_that_they_see() -> None:
             camera = Camera.looking(
                 position, torch.zeros(3), up=torch.eye(3)[(axis + 1) % 3], focal=100.0, width=32, height=32
             )
-            (view,) = render_views(mesh, [camera], lighting=light)
-            slant = sign * light.direction[axis] / 3
-            expected = 255 * GRAY * (0.2 + 0.7 * (1 + slant) / 2)
+            (view,) = render_views(mesh, [camera], ambient=0.2)
+            expected = 255 * GRAY * (0.2 + 0.8 * (1 + sign * SKY[axis]) / 2)
             assert np.allclose(view.image[16, 16].numpy(), expected, atol=0.51)
 
 
@@ -170,17 +165,17 @@ def test_smooth_where_it_is_round_and_sharp_at_edges() -> None:
     assert float((mesh.normals[~lid][..., :2] * outward).sum(-1).min()) > math.cos(math.radians(3.76))
 
 
-def test_both_sides_are_seen_and_normals_look_back() -> None:
+def test_both_sides_are_seen_in_the_light_of_their_front() -> None:
     for flip in ([0, 1, 2], [0, 2, 1]):
         mesh = TexturedMesh.build(torch.tensor([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]]), torch.tensor([flip]))
-        sight = MeshTracer(mesh).cast(facing(9))
-        assert sight.normals[4, 4].tolist() == [0, 0, -1]
-        assert sight.depth[4, 4].item() == pytest.approx(1.0, abs=1e-12)
+        assert MeshTracer(mesh).depth(facing(9))[4, 4].item() == pytest.approx(1.0, abs=1e-12)
+        (view,) = render_views(mesh, [facing(9)], ambient=0.0)
+        assert np.allclose(view.image[4, 4].numpy(), 255 * GRAY * (1 - SKY[2]) / 2, atol=0.51)
 
 
 def test_no_ray_slips_through_between_faces() -> None:
-    sight = MeshTracer(sphere(4)).cast(facing(400, focal=1900.0, distance=DISTANCE))
-    assert bool((sight.faces >= 0).all())
+    depth = MeshTracer(sphere(4)).depth(facing(400, focal=1900.0, distance=DISTANCE))
+    assert bool(torch.isfinite(depth).all())
 
 
 def test_a_mesh_far_from_the_origin_is_seen_as_sharply() -> None:
@@ -192,14 +187,14 @@ def test_a_mesh_far_from_the_origin_is_seen_as_sharply() -> None:
     pose = camera.world_to_camera.clone()
     pose[:3, 3] -= pose[:3, :3] @ away
     (here,) = render_views(near, [camera])
-    there = MeshTracer(moved).cast(Camera(pose, camera.focal, camera.principal, 48, 48))
+    there = MeshTracer(moved).depth(Camera(pose, camera.focal, camera.principal, 48, 48))
     assert here.mask is not None
-    assert bool(((there.faces >= 0) == (here.mask > 127)).float().mean() > 0.99)
+    assert bool((torch.isfinite(there) == (here.mask > 127)).float().mean() > 0.99)
 
 
 def test_a_camera_inside_and_one_that_looks_away() -> None:
     inside = Camera(torch.eye(4, dtype=torch.float64), (20.0, 20.0), (16.0, 16.0), 32, 32)
-    assert bool((MeshTracer(sphere(2)).cast(inside).faces >= 0).all())
+    assert bool(torch.isfinite(MeshTracer(sphere(2)).depth(inside)).all())
     away = Camera(torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)), (20.0, 20.0), (16.0, 16.0), 32, 32)  # fmt: skip  # noqa: E501
     pose = away.world_to_camera.clone()
     pose[2, 3] = -1.0
@@ -223,12 +218,10 @@ def test_orbits_are_the_72_views() -> None:
     for camera in cameras[::7]:
         pixels, _ = camera.project(torch.zeros(1, 3))
         assert pixels[0].tolist() == pytest.approx([512, 512], abs=1e-3)
-    small = orbit_cameras(
-        ball, size=256, elevations=(90 - 1e-3, 10.0), azimuths=3, unit=1.0, distance=2.0, up=(0.0, 1.0, 0.0)
-    )
+    small = orbit_cameras(ball, size=256, elevations=(90 - 1e-3, 10.0), azimuths=3, up=(0.0, 1.0, 0.0))
     assert len(small) == 6
     assert small[0].focal[0] == FOCAL / 4
-    assert small[0].position.tolist() == pytest.approx([0, 2, 0], abs=1e-3)
+    assert small[0].position.tolist() == pytest.approx([0, 5 * unit, 0], abs=1e-3)
 
 
 def test_progress_counts_views() -> None:
@@ -256,7 +249,7 @@ def test_textured_files_look_as_what_they_were_written_from(tmp_path: Path, kind
     (shape if kind == "obj" else trimesh.Scene([shape])).export(tmp_path / f"card.{kind}")
     read = read_textured_mesh(tmp_path / f"card.{kind}")
     assert len(read.vertices) == 4
-    (view,) = render_views(read, [facing()], lighting=UNLIT, supersample=1)
+    (view,) = render_views(read, [facing()], ambient=1.0, supersample=1)
     assert np.array_equal(view.image.numpy(), texture)
 
 
@@ -271,7 +264,7 @@ def test_parts_keep_their_own_textures(tmp_path: Path) -> None:
         scene.add_geometry(box, transform=trimesh.transformations.translation_matrix([0.3 * number - 0.15, 0, 0]))
     scene.export(tmp_path / "two.glb")
     read = read_textured_mesh(tmp_path / "two.glb")
-    (view,) = render_views(read, [facing()], lighting=UNLIT)
+    (view,) = render_views(read, [facing()], ambient=1.0)
     assert view.image[32, 16].tolist() == [255, 0, 0]
     assert view.image[32, 48].tolist() == [0, 0, 255]
 
@@ -391,7 +384,7 @@ def test_scanned_objects_fill_the_places_of_their_vertices(shared: Path, name: s
 def test_the_blue_cup_is_blue_and_the_spoons_handle_red(shared: Path) -> None:
     for name, channel in (("blue_cup", 2), ("spoon", 0)):
         mesh = read_textured_mesh(shared / "meshes" / name / "textured.obj")
-        (view,) = render_views(mesh, orbit_cameras(mesh.surface, size=96)[6:7], lighting=UNLIT)
+        (view,) = render_views(mesh, orbit_cameras(mesh.surface, size=96)[6:7], ambient=1.0)
         assert view.coverage is not None
         colors = view.color[view.coverage == 1]
         assert bool((colors[:, channel] >= colors.amax(dim=1)).float().mean() > 0.4)

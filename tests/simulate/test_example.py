@@ -58,6 +58,6 @@ def test_the_example_shows_its_shape_in_photographs_alone() -> None:
     assert float(nearest(contacts.numpy()).distances.max()) < 1e-6  # meters
     for view in read_views(EXAMPLE_FOLDER)[::12]:
         assert view.mask is not None
-        depth = MeshTracer(TexturedMesh.plain(shape)).cast(view.camera).depth
+        depth = MeshTracer(TexturedMesh.plain(shape)).depth(view.camera)
         # Masks are smooth at outlines: a pixel there may be on either side.
         assert float((torch.isfinite(depth) != (view.mask > 127)).float().mean()) < 0.005

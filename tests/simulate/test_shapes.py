@@ -9,7 +9,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from avmsf.errors import SimulationError
-from avmsf.photographs.mesh_views import UNLIT, orbit_cameras, render_views
+from avmsf.photographs.mesh_views import orbit_cameras, render_views
 from avmsf.simulate.shapes import KINDS, Shape, make_shape, textured
 from avmsf.simulate.shapes.body import Body
 from avmsf.simulate.shapes.turned import Profile, Turned
@@ -246,7 +246,7 @@ def test_pictures_show_the_colors() -> None:
     shape = made("fluted")
     mesh = textured(shape)
     assert enclosed(mesh.vertices.double().numpy()[mesh.faces.numpy()]) == pytest.approx(shape.solid.volume, rel=1e-5)
-    (view,) = render_views(mesh, orbit_cameras(shape.surface, size=64, elevations=(45.0,), azimuths=1), lighting=UNLIT)
+    (view,) = render_views(mesh, orbit_cameras(shape.surface, size=64, elevations=(45.0,), azimuths=1), ambient=1.0)
     assert view.coverage is not None
     seen = view.image[view.coverage == 1.0].double() / 255.0
     assert len(seen) > 200

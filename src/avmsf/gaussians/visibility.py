@@ -102,7 +102,7 @@ def depth_of_surface(surface: Surface) -> DepthMap:
     tracer = MeshTracer(TexturedMesh.plain(surface))
 
     def cast(camera: Camera) -> Float[Tensor, "height width"]:
-        depth = tracer.cast(camera).depth
+        depth = tracer.depth(camera)
         return torch.where(torch.isfinite(depth), depth, 0.0)
 
     return cast

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.errors import CaptureError
@@ -26,39 +26,15 @@ MOST_RAYS = 1 << 19
 """Rays cast at once: about 100 bytes each."""
 
 
-@dataclass(frozen=True)
-class Lighting:
-    """Light on a matte surface: some from everywhere, some from a sky, a half sphere of even brightness.
-
-    A face that leans by an angle t from the middle of the sky sees (1 + cos t) / 2 of it, so that no side of an object
-    is dark. The light stays with the object, so that a place has one color in all views. Both are factors of the
-    surface's color as displayed.
-    """
-
-    ambient: float = 0.4
-    """Light from everywhere."""
-    sky: float = 0.6
-    """Light from the whole sky."""
-    direction: tuple[float, float, float] = (0.36, 0.48, 0.8)
-    """Towards the middle of the sky, in the object frame; of any length. Along none of the axes, so that the sides of a
-    box differ."""
-
-
-MATTE = Lighting()
-UNLIT = Lighting(ambient=1.0, sky=0.0)
-"""The surface's own colors (albedo)."""
-
-
-@dataclass(frozen=True, eq=False)
-class RayHits:
-    """What of a mesh lies behind the center of each pixel."""
-
-    faces: Int[Tensor, "height width"]
-    """Row of the mesh's faces; -1 where there is none."""
-    depth: Float[Tensor, "height width"]
-    """Meters along the optical axis; infinite where there is no face."""
-    normals: Float[Tensor, "height width 3"]
-    """Smooth unit normals in the object frame, turned towards the camera; zero where there is no face."""
+DISTANCE = 5.0
+"""Of the cameras of `orbit_cameras` from that middle, object units."""
+AMBIENT = 0.4
+"""Part of the light on a matte surface that comes from everywhere. The rest comes from a sky, a half sphere of even
+brightness: a face that leans by an angle t from the middle of the sky sees (1 + cos t) / 2 of it, so that no side of an
+object is dark. Both are factors of the surface's color as displayed."""
+SKY = np.array([0.36, 0.48, 0.8])
+"""Unit vector towards the middle of the sky, in the object frame: the light stays with the object, so that a place has
+one color in all views. Along none of the axes, so that the sides of a box differ."""
 
 
 class MeshTracer:
@@ -80,20 +56,18 @@ class MeshTracer:
         placed = ((vertices - self.middle) / self.size).astype(np.float32)
         TriangleMesh(self.scene, placed, self.faces.astype(np.int32))
 
-    def cast(self, camera: Camera) -> RayHits:
-        """Return what lies behind the center of each pixel."""
-        faces = torch.full((camera.height, camera.width), -1)
+    def depth(self, camera: Camera) -> Float[Tensor, "height width"]:
+        """Return the depth of the face behind the center of each pixel, meters along the optical axis.
+
+        Float64; infinite where there is no face.
+        """
         depth = torch.full((camera.height, camera.width), torch.inf, dtype=torch.float64)
-        normals = torch.zeros(camera.height, camera.width, 3, dtype=torch.float64)
         for hits in self._cast(camera):
-            rows, columns = torch.from_numpy(hits.rows), torch.from_numpy(hits.columns)
-            faces[rows, columns] = torch.from_numpy(hits.faces)
-            depth[rows, columns] = torch.from_numpy(hits.depth)
-            normals[rows, columns] = torch.from_numpy(self._normals(hits).astype(np.float64))
-        return RayHits(faces, depth, normals)
+            depth[torch.from_numpy(hits.rows), torch.from_numpy(hits.columns)] = torch.from_numpy(hits.depth)
+        return depth
 
     def photograph(
-        self, camera: Camera, *, name: str, lighting: Lighting, background: tuple[float, float, float], supersample: int
+        self, camera: Camera, *, name: str, ambient: float, background: tuple[float, float, float], supersample: int
     ) -> View:
         """Take one picture as `render_views` does."""
         fine = camera.resized(camera.width * supersample, camera.height * supersample)
@@ -101,19 +75,15 @@ class MeshTracer:
         sums, covered = np.zeros((count, 3)), np.zeros(count)
         for hits in self._cast(fine):
             pixel = hits.rows // supersample * camera.width + hits.columns // supersample
-            color = self._colors(hits, fine, lighting)
+            color = self._colors(hits, fine, ambient)
             covered += np.bincount(pixel, minlength=count)
             for channel in range(3):
                 sums[:, channel] += np.bincount(pixel, weights=color[:, channel], minlength=count)
-        samples = supersample * supersample
-        image = sums / samples + (1 - covered / samples)[:, None] * np.asarray(background)
-        shape = (camera.height, camera.width)
-        return View(
-            name,
-            torch.from_numpy(np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8).reshape(*shape, 3)),
-            camera,
-            torch.from_numpy(np.rint(255 * covered / samples).astype(np.uint8).reshape(shape)),
-        )
+        part = covered[:, None] / supersample**2
+        image = np.clip(sums / supersample**2 + (1 - part) * np.asarray(background), 0, 1)
+        shaped = np.rint(255 * np.hstack([image, part])).astype(np.uint8).reshape(camera.height, camera.width, 4)
+        color, mask = np.ascontiguousarray(shaped[..., :3]), np.ascontiguousarray(shaped[..., 3])
+        return View(name, torch.from_numpy(color), camera, torch.from_numpy(mask))
 
     def _cast(self, camera: Camera) -> "list[_Hits]":
         """Cast a ray through each pixel of the rectangle that the mesh fills, a band of rows at a time."""
@@ -172,18 +142,15 @@ class MeshTracer:
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         return normals * -np.where(towards == 0, 1, towards) / np.maximum(length, 1e-30)
 
-    def _colors(self, hits: "_Hits", camera: Camera, lighting: Lighting) -> np.ndarray:
+    def _colors(self, hits: "_Hits", camera: Camera, ambient: float) -> np.ndarray:
         """Return the color of each hit, 0 to 1."""
         places = np.einsum("nca,nc->na", self.coordinates[hits.faces], hits.weights)
         # Size of a ray's neighborhood on a face that looks at the camera; one that leans shows more.
         spans = hits.depth / min(camera.focal) * self.texels[hits.faces]
         colors = self.atlas.look_up(places, self.materials[hits.faces], spans=spans)
         colors *= np.einsum("nca,nc->na", self.colors[hits.faces], hits.weights)
-        if lighting.sky:
-            towards = np.asarray(lighting.direction) / np.linalg.norm(lighting.direction)
-            colors *= (lighting.ambient + lighting.sky * (1 + self._normals(hits) @ towards) / 2)[:, None]
-        else:
-            colors *= lighting.ambient
+        if ambient < 1:
+            colors *= (ambient + (1 - ambient) * (1 + self._normals(hits) @ SKY) / 2)[:, None]
         return colors
 
     def _texels_per_meter(self) -> np.ndarray:
@@ -214,7 +181,7 @@ def render_views(
     mesh: TexturedMesh,
     cameras: Sequence[Camera],
     *,
-    lighting: Lighting = MATTE,
+    ambient: float = AMBIENT,
     background: tuple[float, float, float] = (1.0, 1.0, 1.0),
     supersample: int = 3,
     progress: Callable[[int, int], None] | None = None,
@@ -222,29 +189,23 @@ def render_views(
     """Return one picture of the mesh from each camera, called view_000, view_001, ..., with masks.
 
     Each pixel is the mean of `supersample` x `supersample` rays on an even grid; the mask says how many met the mesh,
-    and `background` (red, green, blue, 0 to 1) fills what they left. Both sides of every face are seen.
-    `progress` is called with the number of pictures done and their total. Raises CaptureError for no camera and for
-    values out of range.
+    and `background` (red, green, blue, 0 to 1) fills what they left. Both sides of every face are seen. `ambient` is
+    the part of the light that comes from everywhere: with 1 the surface has its own colors (albedo). `progress` is
+    called with the number of pictures done and their total. Raises CaptureError for no camera and for values out of
+    range.
     """
     if not cameras:
-        raise CaptureError(
-            "expected cameras to render from, got none: `orbit_cameras` makes some", name="cameras", value=0
-        )
+        raise CaptureError.expected("cameras to render from", 0, name="cameras", advice="`orbit_cameras` makes some")
     if supersample < 1:
-        raise CaptureError(
-            f"expected a supersample of at least 1, got {supersample}", name="supersample", value=supersample
-        )
+        raise CaptureError.expected("a supersample of at least 1", supersample, name="supersample")
     if not all(0 <= value <= 1 for value in background):
-        raise CaptureError(
-            f"expected a background of numbers from 0 to 1, got {background}", name="background", value=background
-        )
+        raise CaptureError.expected("numbers from 0 to 1", background, name="background")
     tracer = MeshTracer(mesh)
     views = []
     for number, camera in enumerate(cameras):
         name = f"view_{number:03d}"
-        views.append(
-            tracer.photograph(camera, name=name, lighting=lighting, background=background, supersample=supersample)
-        )
+        taken = tracer.photograph(camera, name=name, ambient=ambient, background=background, supersample=supersample)
+        views.append(taken)
         if progress is not None:
             progress(number + 1, len(cameras))
     return tuple(views)
@@ -256,28 +217,21 @@ def orbit_cameras(
     size: int = FOCAL_SIZE,
     elevations: Sequence[float] = (0.0, 45.0, -45.0),
     azimuths: int = 24,
-    distance: float = 5.0,
-    unit: float | None = None,
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
 ) -> tuple[Camera, ...]:
     """Return cameras on circles around an object that all look at the middle of its bounding box.
 
     As the defaults stand, the 72 views of ObjectFolder's scans: three elevations, degrees, of 24 azimuths each, square
-    images of `size` pixels that span 60 degrees. `distance` counts object units. A unit is `unit` meters, or, where
-    that is not given, such that the bounding box reaches `RADIUS` units from its middle to its corners: the sphere
-    around the object then spans 87 % of the image. Raises CaptureError for an object without extent, and for an
-    elevation straight along `up`.
+    images of `size` pixels that span 60 degrees. The bounding box reaches `RADIUS` object units from its middle to its
+    corners, and the cameras are `DISTANCE` units away: the sphere around the object spans 87 % of the image. Raises
+    CaptureError for an object without extent, and for an elevation straight along `up`.
     """
     vertices = surface.vertices.double()
     low, high = vertices.amin(0), vertices.amax(0)
-    radius = float((high - low).norm()) / 2
+    middle, radius, focal = (low + high) / 2, float((high - low).norm()) / 2, FOCAL * size / FOCAL_SIZE
     if not (math.isfinite(radius) and radius > 0):
-        raise CaptureError(
-            f"expected a surface with a positive extent, got {radius:g} m; check its points",
-            name="surface",
-            value=radius,
-        )
-    reach = distance * (radius / RADIUS if unit is None else unit)
+        raise CaptureError.expected("a positive extent", radius, name="surface", advice="check its points")
+    reach = DISTANCE * radius / RADIUS
     vertical = torch.tensor(up, dtype=torch.float64)
     vertical = vertical / vertical.norm()
     # The axis least along `up` leads to azimuth zero: x for z-up and for y-up objects.
@@ -290,9 +244,6 @@ def orbit_cameras(
         for number in range(azimuths):
             azimuth = 2 * math.pi * number / azimuths
             outward = math.cos(elevation) * (math.cos(azimuth) * start + math.sin(azimuth) * side)
-            position = (low + high) / 2 + reach * (outward + math.sin(elevation) * vertical)
-            focal = FOCAL * size / FOCAL_SIZE
-            cameras.append(
-                Camera.looking(position, (low + high) / 2, up=vertical, focal=focal, width=size, height=size)
-            )
+            position = middle + reach * (outward + math.sin(elevation) * vertical)
+            cameras.append(Camera.looking(position, middle, up=vertical, focal=focal, width=size, height=size))
     return tuple(cameras)

@@ -58,7 +58,7 @@ def compare_outlines(
         scale = min(1.0, longest / max(view.camera.width, view.camera.height))
         width, height = max(1, round(scale * view.camera.width)), max(1, round(scale * view.camera.height))
         camera = _scaled(view.camera.resized(width, height), 1.0 / factor)
-        outline = (tracer.cast(camera).faces >= 0).numpy()
+        outline = torch.isfinite(tracer.depth(camera)).numpy()
         mask = cv2.resize(view.mask.numpy(), (width, height), interpolation=cv2.INTER_AREA) > 127
         either, differs = outline | mask, outline ^ mask
         far = _distance_to_edge(mask) > 1.0 + MASK_PIXELS * scale

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Bool, Float32
 
 from avmsf.mesh.textured_mesh import TexturedMesh
@@ -87,5 +88,5 @@ def _left_out(outline: Outline, grid: Grid, solid: Bool[np.ndarray, "x y z"]) ->
 def _beyond(view: View, outline: Outline, tracer: MeshTracer) -> float:
     """Return the part of a mask, without its outermost pixel, in which a view does not see a surface."""
     inside = outline.inside > 1
-    seen = (tracer.cast(view.camera).faces >= 0).numpy()
+    seen = torch.isfinite(tracer.depth(view.camera)).numpy()
     return float((inside & ~seen).sum() / max(int(inside.sum()), 1))

@@ -144,7 +144,7 @@ def _bias(hull: Float32[np.ndarray, "x y z"], grid: Grid, depths: Sequence[SeenD
     tracer = MeshTracer(TexturedMesh.plain(closed_surface(hull, grid, 40_000)))
     behind = []
     for each in depths[:: max(1, len(depths) // 24)]:
-        front = tracer.cast(each.camera).depth.numpy()
+        front = tracer.depth(each.camera).numpy()
         both = np.isfinite(front) & (each.depth > 0)
         behind.append((each.depth - front)[both])
     found = np.sort(np.concatenate(behind))
