@@ -51,7 +51,7 @@ def write_figures(record: Path, folder: Path) -> list[Path]:
                 space["materials"],
                 _moves([each for each in scores if (each["source"], each["target"]) == (source, target)], name),
                 target=target,
-                title=f"{source} to {target}, UMAP of {len(space['names'])} objects ({space['features']['name']})",
+                title=f"{source} to {target}, UMAP of {len(space['names'])} objects ({space['features']})",
             )
             for name, space in spaces.items()
             for source, target in dict.fromkeys((each["source"], each["target"]) for each in scores)

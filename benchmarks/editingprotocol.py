@@ -9,7 +9,7 @@ needs no weights.
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean
@@ -23,14 +23,16 @@ from avmsf.errors import AvmsfError, EvaluationError
 from avmsf.evaluation.clap import Clap
 from avmsf.evaluation.editing import (
     GENERATED,
+    PHYSICS,
     RECORDED_TRANSITIONS,
     SEVEN_TRANSITIONS,
+    SIMULATED_TRANSITIONS,
     EditMethod,
     EditScore,
     EditTask,
-    MaterialChange,
-    judge,
+    Transition,
     prompted_tasks,
+    score_edits,
     towards_reference,
     towards_words,
     write_scores,
@@ -42,21 +44,26 @@ from avmsf.evaluation.editing_objects import (
     SHAPES,
     KnownObject,
     PaperFields,
+    SolvedShape,
+    drawn_size,
     recorded_objects,
+    simulated_objects,
 )
+from avmsf.evaluation.mode_embedding import FEATURES, MaterialSpace
 from avmsf.evaluation.objects import ObjectFeatures
 from avmsf.evaluation.protocols import EDITING_UMAP
+from avmsf.fem.material import MATERIALS
 from avmsf.pipeline.config import DINO, PRESETS
 from avmsf.pipeline.features import choose_encoder
-from benchmarks.editing import labelled_objects, other_recording, referred_task, spaces_of, strange_shapes
 from benchmarks.editingfigures import write_figures
 from benchmarks.report import Options, Report, Table, log, show
 
 LEAST = 8
 """Objects that an embedding of materials needs to mean anything."""
-
 PREVIEWS = 20
 """Sounds of each edit of which the CLAP score is taken, about, for its curve over the steps."""
+SEEDS, STEPS = range(3), 100
+"""Of the part `edit`: each seed takes another object, another reference and other chance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +79,13 @@ class Cast:
     known: bool
     """Whether the constants of the objects' materials are: else the laws of elasticity have nothing to go by."""
     remarks: tuple[str, ...] = ()
+
+
+def measure_simulated(options: Options) -> Report:
+    """Return the figures of the part `edit`: towards recordings, on simulated objects."""
+    if options.quick_look:
+        return measure(simulated_cast(SIMULATED_TRANSITIONS, SEEDS[:1], kinds=SHAPES[:2]), steps=5)
+    return measure(simulated_cast(SIMULATED_TRANSITIONS, SEEDS), steps=STEPS)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -107,7 +121,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         clap = None if chosen.clap is None else Clap.load(chosen.clap)
         words = model is not None
         cast = (
-            simulated_cast(words=words, seed=chosen.seed)
+            simulated_cast(SEVEN_TRANSITIONS, range(chosen.seed, chosen.seed + 2), words=words)
             if chosen.simulated
             else recorded_cast(
                 chosen.dataset, words=words, seed=chosen.seed, paper=(chosen.encoder, chosen.cache) if paper else None
@@ -151,10 +165,10 @@ def recorded_cast(folder: Path, *, words: bool, seed: int = 0, paper: tuple[str,
     log(f"editing: extracting modes of {len(REALIMPACT_26) - len(missing)} objects")
     objects = recorded_objects(dataset, paper=None if paper is None else _paper_fields(dataset, *paper, seed=seed))
     present = {each.material for each in objects}
-    transitions = [each for each in RECORDED_TRANSITIONS if {each.source, each.target} <= present]
-    tasks = prompted_tasks(objects, transitions, seed=seed) if words else tuple(referred_tasks(objects, seed=seed))
+    transitions = [each for each in RECORDED_TRANSITIONS if {*each} <= present]
+    tasks = prompted_tasks(objects, transitions, seed=seed) if words else tuple(_referred_tasks(objects, seed=seed))
     if not tasks:
-        pairs = ", ".join(f"{each.source} to {each.target}" for each in RECORDED_TRANSITIONS)
+        pairs = ", ".join(map(" to ".join, RECORDED_TRANSITIONS))
         raise EvaluationError(
             f"{folder}: expected objects of a material to edit, {pairs}, found {', '.join(sorted(present))}",
             file=folder,
@@ -179,22 +193,36 @@ def _paper_fields(dataset: Dataset, encoder: str, cache: Path, *, seed: int) -> 
     return PaperFields(lambda name: inputs(name, "paper"), replace(PUBLISHED, seed=seed), cache / "training")
 
 
-def simulated_cast(*, words: bool, seed: int = 0) -> Cast:
-    """Return the simulated objects: four shapes in seven materials make the clusters, two strangers are edited."""
+def simulated_cast(
+    transitions: Sequence[Transition], seeds: Iterable[int], *, words: bool = False, kinds: Sequence[str] = SHAPES
+) -> Cast:
+    """Return the simulated objects: shapes in seven materials make the clusters, two others are edited.
+
+    Towards recordings each seed edits one of the two, and the other one is the reference.
+    """
     log("editing: solving shapes")
-    labelled, shapes = labelled_objects(), strange_shapes()
-    tasks: tuple[EditTask, ...]
-    if words:
-        edited = [other_recording(shape, each.source, seed=seed) for each in SEVEN_TRANSITIONS for shape in shapes]
-        tasks = prompted_tasks(edited, SEVEN_TRANSITIONS, seed=seed)
-    else:
-        pairs = tuple(zip(shapes, shapes[::-1], strict=True))
-        tasks = tuple(referred_task(own, other, each, seed=seed) for each in SEVEN_TRANSITIONS for own, other in pairs)
+    labelled = simulated_objects(SolvedShape.of(kind, seed=11) for kind in kinds)
+    shapes = [SolvedShape.of(kind, seed=12) for kind in OTHER_SHAPES]
+
+    def one(shape: SolvedShape, material: str, seed: int) -> KnownObject:
+        size = drawn_size(shape.kind, material, seed=100 + seed)
+        return shape.struck(MATERIALS[material], size=size)
+
+    tasks: list[EditTask] = []
+    for source, target in transitions:
+        for seed in seeds:
+            edited = one(shapes[seed % 2], source, seed)
+            if words:
+                tasks += prompted_tasks([edited], [(source, target)], seed=seed)
+            else:
+                reference = _reference_of(one(shapes[1 - seed % 2], target, seed))
+                tasks.append(EditTask(edited, target, reference=reference, seed=seed))
     what = (
-        f"simulated objects: {', '.join(SHAPES)} in seven materials make the clusters, {' and '.join(OTHER_SHAPES)}, "
+        f"simulated objects: {', '.join(kinds)} in seven materials, each in a size of its own, .7 to 1.4 times, make "
+        f"the clusters; {' and '.join(OTHER_SHAPES)}, which are in no cluster, are edited. Modes are the finite "
+        "elements' own, Poisson's ratio .27 throughout; those within 60 dB of the loudest are compared"
     )
-    what += "which are in no cluster, are edited (as python -m benchmarks tasks --parts edit has them)"
-    return Cast("simulated", labelled, tasks, what, known=True)
+    return Cast("simulated", labelled, tuple(tasks), what, known=True)
 
 
 def measure(
@@ -212,7 +240,9 @@ def measure(
 
     Towards the tasks' prompts by a model, else towards their references. Raises AvmsfError as the methods do.
     """
-    spaces = spaces_of(cast.labelled, seed=seed)
+    banks, materials = ([getattr(each, name) for each in cast.labelled] for name in ("bank", "material"))
+    names = [each.name for each in cast.labelled]
+    spaces = {each: MaterialSpace.of(banks, materials, names=names, features=each, seed=seed) for each in FEATURES}
     settings = {} if steps is None else {"steps": steps}
     if clap is not None:
         settings["preview_every"] = max(1, (steps or GuidedEditConfig().steps) // PREVIEWS)
@@ -220,36 +250,31 @@ def measure(
     if model is not None:
         methods = towards_words(model, settings, generated=generated, paper=paper)
     else:
-        methods = tuple(
-            each
-            for each in towards_reference(settings, paper=paper)
-            if cast.known or not isinstance(each, MaterialChange)
-        )
-    scores = judge(cast.tasks, methods, spaces, clap=clap, progress=_tell_score)
+        methods = tuple(each for each in towards_reference(settings, paper=paper) if cast.known or each is not PHYSICS)
+    scores = score_edits(cast.tasks, methods, spaces, clap=clap, progress=_tell_score)
     if record is not None:
         write_scores(scores, spaces, record)
-    return _report(scores, cast, methods, seed=seed, words=model is not None)
+    told_apart = {f"{cast.name}.told_apart_{name}": each.nearest_neighbor_accuracy() for name, each in spaces.items()}
+    return _report(scores, cast, methods, words=model is not None) + Report(figures=told_apart)
 
 
-def referred_tasks(objects: Sequence[KnownObject], *, seed: int = 0) -> Iterator[EditTask]:
+def _referred_tasks(objects: Sequence[KnownObject], *, seed: int) -> Iterator[EditTask]:
     """Return every object of a transition's source, towards recordings of one object of its target.
 
     The objects of the target take turns, in their order.
     """
-    for transition in RECORDED_TRANSITIONS:
-        targets = [each for each in objects if each.material == transition.target]
-        sources = [each for each in objects if each.material == transition.source]
+    for source, target in RECORDED_TRANSITIONS:
+        targets = [each for each in objects if each.material == target]
+        sources = [each for each in objects if each.material == source]
         for number, each in enumerate(sources if targets else []):
-            impacts = targets[number % len(targets)].impacts
-            reference = Reference.of(
-                impacts.sounds, sample_rate=impacts.sample_rate, name=targets[number % len(targets)].name
-            )
-            yield EditTask(each, transition.target, reference=reference, seed=seed)
+            yield EditTask(each, target, reference=_reference_of(targets[number % len(targets)]), seed=seed)
 
 
-def _report(
-    scores: Sequence[EditScore], cast: Cast, methods: Sequence[EditMethod], *, seed: int, words: bool
-) -> Report:
+def _reference_of(known: KnownObject) -> Reference:
+    return Reference.of(known.impacts.sounds, sample_rate=known.impacts.sample_rate, name=known.name)
+
+
+def _report(scores: Sequence[EditScore], cast: Cast, methods: Sequence[EditMethod], *, words: bool) -> Report:
     """Return the means over all edits and over those of each transition."""
     pairs = list(dict.fromkeys((task.object.material, task.target) for task in cast.tasks))
     rows: list[list[str | float]] = []
@@ -269,9 +294,11 @@ def _report(
                 figures |= {f"{cast.name}.{name}_{method.name}": value for name, value in values.items()}
     conventions = (
         f"{cast.what}; led towards {'two prompts' if words else 'recordings of an object'} of the target material; "
-        f"seed {seed}. umap: distance to the center of the target's cluster by frequencies, as in the paper; "
-        "umap_rings: with dampings; clap: mean cosine of sounds and prompt; spectral: relative STFT error from the "
-        "nearest clip of the reference. edits: those with a score; a generated sound may hold no mode.",
+        f"seeds {', '.join(map(str, sorted({task.seed for task in cast.tasks})))}. umap: distance to the center of the "
+        "target's cluster by frequencies, as in the paper; umap_rings: with dampings; clap: mean cosine of sounds and "
+        "prompt; spectral: relative STFT error from the nearest clip of the reference, at equal level. edits: those "
+        "with a score; a generated sound may hold no mode. told_apart: part of the labelled objects whose nearest "
+        "other is of the same material. physics: both materials' constants known, so neither baseline nor rival.",
         *cast.remarks,
         f"umap in the paper: {', '.join(f'{title} {value:g}' for title, value in EDITING_UMAP.items())}; its choice of "
         "objects and prompts is not published, and every set of objects has another UMAP.",

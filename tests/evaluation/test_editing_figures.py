@@ -6,23 +6,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from test_editing import QUICK, Speaker, embedded, flat_space, struck
+from test_editing import QUICK, Generator, embedded, flat_space, struck
 
 from avmsf.editing.config import DistillationConfig
 from avmsf.evaluation.clap import Clap
-from avmsf.evaluation.editing import EditScore, EditTask, judge, towards_words, write_scores
-from avmsf.evaluation.mode_embedding import MaterialSpace, Pitches
+from avmsf.evaluation.editing import EditScore, EditTask, score_edits, towards_words, write_scores
+from avmsf.evaluation.mode_embedding import MaterialSpace, pitches
 from factories.made_clap import save_clap
 
 # The benchmarks are no part of the package.
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from benchmarks import editingfigures, editingprotocol
+from benchmarks import editingfigures
 
 PROMPT = "a glass is struck"
 METHODS = ("audio-sds", "hierarchical")
 
 
-class Answering(Speaker):
+class Answering(Generator):
     """A model that wants every sound half as loud towards its end."""
 
     def denoised(self, latents, level, conditioning, *, guidance):
@@ -33,8 +33,8 @@ class Answering(Speaker):
 
 def space_of_vectors(monkeypatch: pytest.MonkeyPatch) -> MaterialSpace:
     """Return a space whose embedding is two components of the vectors: UMAP would have to be compiled."""
-    monkeypatch.setattr(MaterialSpace, "place", lambda self, bank: self.features.vector(bank)[[0, 31]])
-    space = flat_space(Pitches())
+    monkeypatch.setattr(MaterialSpace, "place", lambda self, bank: pitches(bank)[[0, 31]])
+    space = flat_space("pitches")
     return embedded(space, space.vectors[:, [0, 31]])
 
 
@@ -44,9 +44,9 @@ def judged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[MaterialSpa
     save_clap(tmp_path / "clap")
     clap, space = Clap.load(tmp_path / "clap"), space_of_vectors(monkeypatch)
     settings = {**QUICK, "preview_every": 2}
-    methods = towards_words(Answering(), settings, distillation=DistillationConfig(denoising=1))
+    before, _, *guided = towards_words(Answering(), settings, distillation=DistillationConfig(denoising=1))
     task = EditTask(struck("ceramic"), "glass", prompt=PROMPT)
-    return space, clap, judge([task], methods, {"pitches": space}, clap=clap)
+    return space, clap, score_edits([task], (before, *guided), {"pitches": space}, clap=clap)
 
 
 def test_scores_hold_the_places_and_the_clap_score_of_every_preview(
@@ -106,17 +106,3 @@ def test_another_file_is_no_record(text: str, tmp_path: Path, capsys: pytest.Cap
     (tmp_path / "other.json").write_text(text, encoding="utf-8")
     assert editingfigures.main([str(tmp_path / "other.json"), str(tmp_path / "figures")]) == 2
     assert "other.json" in capsys.readouterr().err
-
-
-def test_the_protocol_draws_what_it_records(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[object] = []
-    cast = editingprotocol.Cast("none", (), (), "", known=False)
-    monkeypatch.setattr(editingprotocol, "recorded_cast", lambda *_, **__: cast)
-    monkeypatch.setattr(editingprotocol, "measure", lambda *_, **__: asked.append("measured"))
-    monkeypatch.setattr(editingprotocol, "write_figures", lambda *given: asked.append(given))
-    monkeypatch.setattr(editingprotocol, "show", lambda *_, **__: None)
-    record, folder = tmp_path / "record.json", tmp_path / "figures"
-    assert editingprotocol.main([str(tmp_path), "--record", str(record), "--figures", str(folder)]) == 0
-    assert asked == ["measured", (record, folder)]
-    with pytest.raises(SystemExit):
-        editingprotocol.main([str(tmp_path), "--figures", str(folder)])

@@ -5,31 +5,28 @@ are the distance of its modes from those of labelled objects (`avmsf.evaluation.
 reference's, and, for prompts, the CLAP score; they are compared with those of the unedited object.
 """
 
-import json
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf._utils.files import write_whole
 from avmsf.capture.audio import Recording
 from avmsf.capture.prepare import prepare
 from avmsf.capture.settings import CaptureSettings
 from avmsf.editing.clips import level, with_length
 from avmsf.editing.config import DistillationConfig, GuidedEditConfig
-from avmsf.editing.distillation import AudioDiffusion, DecoderDistillation
+from avmsf.editing.distillation import DecoderDistillation
 from avmsf.editing.guided import (
     HIERARCHICAL,
     INDEPENDENT,
     PUBLISHED,
-    SEARCHED,
     Guide,
     GuidedEditProgress,
     Parameterization,
@@ -37,17 +34,18 @@ from avmsf.editing.guided import (
 )
 from avmsf.editing.material import change_material
 from avmsf.editing.reference import Reference
-from avmsf.errors import AvmsfWarning, CaptureError, EditError, EvaluationError, ExtractionError
+from avmsf.editing.stable_audio import StableAudio
+from avmsf.errors import AvmsfError, AvmsfWarning, EvaluationError
 from avmsf.evaluation.clap import Clap
 from avmsf.evaluation.editing_objects import KnownObject, amplitudes_of, audible_modes
-from avmsf.evaluation.metrics import default_fft_sizes
+from avmsf.evaluation.metrics import default_fft_sizes, relative_stft_error
 from avmsf.evaluation.mode_embedding import MaterialSpace
-from avmsf.fem.material import MATERIALS
+from avmsf.evaluation.results import write_json
+from avmsf.fem.material import material_named
 from avmsf.field.sound_field import SoundField
 from avmsf.modal.extraction.extract import extract_sounds
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder, ShortTime
 from avmsf.modal.modes import ModalBank
-from avmsf.modal.spectra import magnitude_stft
 
 _MAX_STORED_SOUNDS = 8
 """Contacts at which an edited object is rendered."""
@@ -67,37 +65,22 @@ PROMPTS: Mapping[str, tuple[str, str]] = {
 """Two prompts for each target material. The paper has two a transition and prints none: these are ours."""
 
 
-@dataclass(frozen=True)
-class Transition:
-    """From one material to another."""
-
-    source: str
-    target: str
-
-    @property
-    def prompts(self) -> tuple[str, str]:
-        """Prompts for the target. Raises EvaluationError for a material without prompts."""
-        if self.target not in PROMPTS:
-            raise EvaluationError(
-                f"expected a target with prompts, {', '.join(PROMPTS)}, got {self.target!r}",
-                name="target",
-                value=self.target,
-            )
-        return PROMPTS[self.target]
-
-
-RECORDED_TRANSITIONS = (
-    Transition("ceramic", "wood"),
-    Transition("wood", "ceramic"),
-    Transition("wood", "glass"),
-    Transition("glass", "metal"),
+Transition = tuple[str, str]
+"""From one material to another."""
+RECORDED_TRANSITIONS: tuple[Transition, ...] = (
+    ("ceramic", "wood"),
+    ("wood", "ceramic"),
+    ("wood", "glass"),
+    ("glass", "metal"),
 )
 """Contrasting pairs for the 26 objects. The paper shows the first two and calls the others contrastive: ours."""
-SIMULATED_TRANSITIONS = (Transition("ceramic", "wood"), Transition("glass", "steel"), Transition("wood", "glass"))
+SIMULATED_TRANSITIONS: tuple[Transition, ...] = (("ceramic", "wood"), ("glass", "steel"), ("wood", "glass"))
 """Those that are evaluated with recordings as target and several seeds."""
 _RING = ("ceramic", "wood", "glass", "steel", "plastic", "iron", "polycarbonate")
-SEVEN_TRANSITIONS = tuple(Transition(*pair) for pair in zip(_RING, (*_RING[1:], _RING[0]), strict=True))
+SEVEN_TRANSITIONS: tuple[Transition, ...] = tuple(zip(_RING, (*_RING[1:], _RING[0]), strict=True))
 """Every one of the seven simulated materials is left once and reached once, by a neighbor that it contrasts with."""
+
+_Goal = TypeVar("_Goal")
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,13 +101,13 @@ class EditTask:
         """Contacts of the rendered sounds."""
         return self.object.impacts.contacts[:_MAX_STORED_SOUNDS]
 
-    def words(self) -> str:
-        """Return the prompt. Raises EvaluationError where there is none."""
-        if self.prompt is None:
+    def expect(self, goal: _Goal | None, name: str) -> _Goal:
+        """Return the task's prompt or reference. Raises EvaluationError where it has none."""
+        if goal is None:
             raise EvaluationError.expected(
-                f"one for {self.object.name} to {self.target}", name="prompt", advice="give the task one"
+                f"one for {self.object.name} to {self.target}", name=name, advice="give the task one"
             )
-        return self.prompt
+        return goal
 
 
 def prompted_tasks(
@@ -132,16 +115,12 @@ def prompted_tasks(
 ) -> tuple[EditTask, ...]:
     """Return every object of a transition's source material, with each of the two prompts."""
     return tuple(
-        EditTask(each, transition.target, prompt=prompt, seed=seed)
-        for transition in transitions
+        EditTask(each, target, prompt=prompt, seed=seed)
+        for source, target in transitions
         for each in objects
-        if each.material == transition.source
-        for prompt in transition.prompts
+        if each.material == source
+        for prompt in PROMPTS[target]
     )
-
-
-GENERATED = 3.0
-"""Seconds of a sound that is generated from a prompt only."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,62 +135,46 @@ class Edited:
     previews: tuple[tuple[int, Float[Tensor, " samples"]], ...] = ()
     """Steps of the edit and the sound after each, all at one contact; step 0 is the unedited object."""
 
+    @classmethod
+    def of(cls, field: SoundField, task: EditTask, **more: Any) -> "Edited":
+        """Return a field's modes and sounds at the task's contacts."""
+        bank = audible_modes(field.bank, amplitudes_of(field, task.contacts), sample_rate=field.sample_rate)
+        return cls(bank, field.render(task.contacts), field.sample_rate, **more)
 
-@runtime_checkable
-class EditMethod(Protocol):
+
+@dataclass(frozen=True)
+class EditMethod:
     """A method that changes the material of an object's sound."""
 
-    @property
-    def name(self) -> str:
-        """Name in tables."""
-        ...
-
-    def edit(self, task: EditTask) -> Edited:
-        """Return the edited object. Raises AvmsfError where it cannot."""
-        ...
-
-
-@dataclass(frozen=True)
-class Untouched:
-    """The object as it was: what an edit has to better."""
-
-    name: str = "before"
-
-    def edit(self, task: EditTask) -> Edited:
-        """Return the object's own sounds."""
-        return edited_at(task.object.sound_field, task)
-
-
-@dataclass(frozen=True)
-class MaterialChange:
-    """The laws of elasticity with both materials' constants, which the other methods do not have."""
-
-    name: str = "physics"
-
-    def edit(self, task: EditTask) -> Edited:
-        """Return the object in the new material. Raises EvaluationError for a material without constants."""
-        for material in (task.object.material, task.target):
-            if material not in MATERIALS:
-                raise EvaluationError(
-                    f"expected a material of {', '.join(MATERIALS)}, got {material!r}", name="material", value=material
-                )
-        old, new = MATERIALS[task.object.material], MATERIALS[task.target]
-        return edited_at(change_material(task.object.sound_field, old, new), task)
-
-
-@dataclass(frozen=True, eq=False)
-class Guided:
-    """Guided editing with a parameterization."""
-
     name: str
-    guide: Callable[[EditTask], Guide]
-    parameters: Parameterization
-    config: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of `GuidedEditConfig` other than the seed, which is the task's."""
+    """Name in tables."""
+    edit: Callable[[EditTask], Edited]
+    """Returns the edited object. Raises AvmsfError where it cannot."""
 
-    def edit(self, task: EditTask) -> Edited:
-        """Return the steered object."""
-        config = GuidedEditConfig(**{"preview_every": 0, **self.config, "seed": task.seed})
+
+UNTOUCHED = EditMethod("before", lambda task: Edited.of(task.object.sound_field, task))
+"""The object as it was: what an edit has to better."""
+
+
+def _in_new_material(task: EditTask) -> Edited:
+    old, new = (material_named(name) for name in (task.object.material, task.target))
+    return Edited.of(change_material(task.object.sound_field, old, new), task)
+
+
+PHYSICS = EditMethod("physics", _in_new_material)
+"""The laws of elasticity with both materials' constants, which the other methods do not have."""
+
+
+def guided(
+    name: str,
+    guide: Callable[[EditTask], Guide],
+    parameters: Parameterization,
+    settings: Mapping[str, Any] | None = None,
+) -> EditMethod:
+    """Return guided editing; `settings` are those of `GuidedEditConfig` other than the seed, which is the task's."""
+
+    def edit(task: EditTask) -> Edited:
+        config = GuidedEditConfig(**{"preview_every": 0, **(settings or {}), "seed": task.seed})
         field, previews = task.object.sound_field, list[tuple[int, Tensor]]()
 
         def keep(progress: GuidedEditProgress) -> None:
@@ -220,104 +183,77 @@ class Guided:
                     previews.append((0, field.render(progress.place[None])[0]))
                 previews.append((progress.step, progress.preview))
 
-        edited = edit_towards(field, self.guide(task), config=config, parameters=self.parameters, progress=keep)
-        return replace(edited_at(edited, task), previews=tuple(previews))
+        edited = edit_towards(field, guide(task), config=config, parameters=parameters, progress=keep)
+        return Edited.of(edited, task, previews=tuple(previews))
+
+    return EditMethod(name, edit)
 
 
-@runtime_checkable
-class TextToAudio(Protocol):
-    """A model that makes a sound from words alone."""
-
-    @property
-    def sample_rate(self) -> float:
-        """Hz."""
-        ...
-
-    def generate(self, prompt: str, *, seconds: float, seed: int) -> Float[Tensor, " samples"]:
-        """Return a mono sound."""
-        ...
+GENERATED = 3.0
+"""Seconds of a sound that is generated from a prompt only."""
 
 
-@dataclass(frozen=True, eq=False)
-class Generation:
-    """Direct generation (the paper's baseline): no object at all, and the modes extracted from what is made."""
+def generation(model: StableAudio, seconds: float = GENERATED, finder: ModeFinder | None = None) -> EditMethod:
+    """Return direct generation (the paper's baseline): no object at all, and the modes found in what is made.
 
-    model: TextToAudio
-    seconds: float = GENERATED
-    finder: ModeFinder = field(default_factory=HighResolution)
-    """How modes are found in the sound."""
-    name: str = "generation"
+    Sounds are taken from their onset on. Raises as preparing and extracting do.
+    """
 
-    def edit(self, task: EditTask) -> Edited:
-        """Return the generated sound from its onset on, and its modes. Raises as preparing and extracting do."""
-        rate = self.model.sample_rate
-        made = self.model.generate(task.words(), seconds=self.seconds, seed=task.seed).double().cpu()
-        recording = Recording(f"generated from {task.words()!r}", made[None].numpy(), rate, "FLOAT")
+    def edit(task: EditTask) -> Edited:
+        rate, prompt = model.sample_rate, task.expect(task.prompt, "prompt")
+        made = model.generate(prompt, seconds=seconds, seed=task.seed).double().cpu()
+        recording = Recording(f"generated from {prompt!r}", made[None].numpy(), rate, "FLOAT")
         sound = torch.from_numpy(np.array(prepare(recording, CaptureSettings()).sound))[None]
-        modes = extract_sounds(sound, sample_rate=rate, method=self.finder)
+        modes = extract_sounds(sound, sample_rate=rate, method=finder or HighResolution())
         bank = audible_modes(modes.bank, torch.complex(modes.gains.double(), modes.quadrature.double()))
         return Edited(bank, sound.float(), rate)
 
+    return EditMethod("generation", edit)
 
-def towards_reference(config: Mapping[str, Any] | None = None, *, paper: bool = False) -> tuple[EditMethod, ...]:
+
+def towards_reference(settings: Mapping[str, Any] | None = None, *, paper: bool = False) -> tuple[EditMethod, ...]:
     """Return the methods of the protocol without words.
 
-    As it was; every mode by itself, from there and from where our search ends; ours, or the `paper`'s parameters; and
-    the laws of elasticity.
+    As it was; every mode by itself; ours, or the `paper`'s parameters; and the laws of elasticity.
     """
-    settings, parameters = config or {}, PUBLISHED if paper else HIERARCHICAL
+    parameters = PUBLISHED if paper else HIERARCHICAL
+
+    def guide(task: EditTask) -> Guide:
+        return task.expect(task.reference, "reference")
+
     return (
-        Untouched(),
-        Guided("unconstrained", _reference, INDEPENDENT, settings),
-        Guided("searched", _reference, SEARCHED, settings),
-        Guided(parameters.name, _reference, parameters, settings),
-        MaterialChange(),
+        UNTOUCHED,
+        guided("unconstrained", guide, INDEPENDENT, settings),
+        guided(parameters.name, guide, parameters, settings),
+        PHYSICS,
     )
 
 
 def towards_words(
-    model: AudioDiffusion,
-    config: Mapping[str, Any] | None = None,
+    model: StableAudio,
+    settings: Mapping[str, Any] | None = None,
     *,
     distillation: DistillationConfig | None = None,
     generated: float = GENERATED,
     paper: bool = False,
 ) -> tuple[EditMethod, ...]:
-    """Return the methods of the paper's table: as it was, generation (of a model that can), Audio-SDS, and ours.
+    """Return the methods of the paper's table: as it was, generation, Audio-SDS, and ours.
 
-    `config` are settings of `GuidedEditConfig`; `generated` is how many seconds direct generation makes. The `paper`'s
+    `settings` are those of `GuidedEditConfig`; `generated` is how many seconds direct generation makes. The `paper`'s
     form has its parameters of an edit, and its extraction from generated sounds.
     """
+    parameters = PUBLISHED if paper else HIERARCHICAL
 
     def guide(task: EditTask) -> Guide:
         rate = task.object.sound_field.sample_rate
-        return DecoderDistillation(model, task.words(), sample_rate=rate, config=distillation)
+        return DecoderDistillation(model, task.expect(task.prompt, "prompt"), sample_rate=rate, config=distillation)
 
-    settings = config or {}
-    finder: ModeFinder = ShortTime() if paper else HighResolution()
-    parameters = PUBLISHED if paper else HIERARCHICAL
-    generation = (Generation(model, generated, finder),) if isinstance(model, TextToAudio) else ()
     return (
-        Untouched(),
-        *generation,
-        Guided("audio-sds", guide, INDEPENDENT, settings),
-        Guided(parameters.name, guide, parameters, settings),
+        UNTOUCHED,
+        generation(model, generated, ShortTime() if paper else None),
+        guided("audio-sds", guide, INDEPENDENT, settings),
+        guided(parameters.name, guide, parameters, settings),
     )
-
-
-def edited_at(edited: SoundField, task: EditTask) -> Edited:
-    """Return a field's modes and sounds at the task's contacts."""
-    amplitudes = amplitudes_of(edited, task.contacts)
-    bank = audible_modes(edited.bank, amplitudes, sample_rate=edited.sample_rate)
-    return Edited(bank, edited.render(task.contacts), edited.sample_rate)
-
-
-def _reference(task: EditTask) -> Guide:
-    if task.reference is None:
-        raise EvaluationError.expected(
-            f"one for {task.object.name} to {task.target}", name="reference", advice="give the task one"
-        )
-    return task.reference
 
 
 @dataclass(frozen=True)
@@ -332,21 +268,19 @@ class EditScore:
     seed: int
     umap: Mapping[str, float]
     """Distance to the center of the target's cluster, by the names of the spaces; in UMAP's units."""
-    octaves: Mapping[str, float]
-    """The same without UMAP, in octaves."""
-    spectral: float | None
-    """Mean relative STFT error of the sounds from the nearest clip of the reference, at equal level."""
-    clap: float | None
-    """Mean cosine of the sounds and the prompt."""
-    seconds: float
-    """Time of the edit."""
     places: Mapping[str, tuple[float, float]]
     """Position of the modes in each space, by the names of the spaces; in UMAP's units."""
+    spectral: float | None
+    """Mean relative STFT error of the sounds from the nearest clip of the reference, at equal level."""
+    seconds: float
+    """Time of the edit."""
+    clap: float | None = None
+    """Mean cosine of the sounds and the prompt."""
     clap_curve: tuple[tuple[int, float], ...] = ()
     """Steps of the edit and the CLAP score after each, at one contact; step 0 is the unedited object."""
 
 
-def judge(
+def score_edits(
     tasks: Sequence[EditTask],
     methods: Sequence[EditMethod],
     spaces: Mapping[str, MaterialSpace],
@@ -366,45 +300,37 @@ def judge(
             begun = time.perf_counter()
             try:
                 made = method.edit(task)
-            except (CaptureError, ExtractionError, EditError, EvaluationError) as error:
-                warnings.warn(
-                    AvmsfWarning(
-                        f"{task.object.name} to {task.target}, {method.name}: no score, since {error}",
-                        **{**error.attributes, "name": f"{task.object.name} to {task.target}, {method.name}"},
-                    ),
-                    stacklevel=2,
-                )
+            except AvmsfError as error:
+                name = f"{task.object.name} to {task.target}, {method.name}"
+                attributes = {**error.attributes, "name": name}
+                warnings.warn(AvmsfWarning(f"{name}: no score, since {error}", **attributes), stacklevel=2)
                 continue
-            seconds = time.perf_counter() - begun
-            said: float | None = None
-            curve: tuple[tuple[int, float], ...] = ()
+            scores.append(_score(task, method.name, made, spaces, time.perf_counter() - begun))
             if clap is not None and task.prompt is not None:
-                said = float(clap.score(made.sounds, [task.prompt], sample_rate=made.sample_rate).mean())
-                curve = clap_curve(made, task.prompt, clap)
-            places = {name: space.place(made.bank) for name, space in spaces.items()}
-            scores.append(
-                EditScore(
-                    method.name,
-                    task.object.name,
-                    task.object.material,
-                    task.target,
-                    task.prompt,
-                    task.seed,
-                    {name: space.distance(places[name], task.target) for name, space in spaces.items()},
-                    {name: space.plain_distance(made.bank, task.target) for name, space in spaces.items()},
-                    None if task.reference is None else spectral_distance(made, task.reference),
-                    said,
-                    seconds,
-                    {name: (float(place[0]), float(place[1])) for name, place in places.items()},
-                    curve,
-                )
-            )
+                cosine = float(clap.score(made.sounds, [task.prompt], sample_rate=made.sample_rate).mean())
+                scores[-1] = replace(scores[-1], clap=cosine, clap_curve=_clap_curve(made, task.prompt, clap))
             if progress is not None:
                 progress(scores[-1])
     return tuple(scores)
 
 
-def clap_curve(made: Edited, prompt: str, clap: Clap) -> tuple[tuple[int, float], ...]:
+def _score(task: EditTask, method: str, made: Edited, spaces: Mapping[str, MaterialSpace], seconds: float) -> EditScore:
+    places = {name: space.place(made.bank) for name, space in spaces.items()}
+    return EditScore(
+        method,
+        task.object.name,
+        task.object.material,
+        task.target,
+        task.prompt,
+        task.seed,
+        {name: space.distance(places[name], task.target) for name, space in spaces.items()},
+        {name: (float(place[0]), float(place[1])) for name, place in places.items()},
+        None if task.reference is None else spectral_distance(made, task.reference),
+        seconds,
+    )
+
+
+def _clap_curve(made: Edited, prompt: str, clap: Clap) -> tuple[tuple[int, float], ...]:
     """Return the steps of an edit's previews and their CLAP scores; silent previews have none."""
     previews = [(step, sound) for step, sound in made.previews if bool(sound.any())]
     if not previews:
@@ -415,12 +341,8 @@ def clap_curve(made: Edited, prompt: str, clap: Clap) -> tuple[tuple[int, float]
 
 def write_scores(scores: Sequence[EditScore], spaces: Mapping[str, MaterialSpace], path: Path) -> None:
     """Write scores and the embeddings that they rest on to one JSON file. Raises EvaluationError where it cannot."""
-    record = {
-        "scores": [asdict(score) for score in scores],
-        "spaces": {name: space.record() for name, space in spaces.items()},
-    }
-    text = json.dumps(record, allow_nan=False, indent=1)
-    write_whole(path, lambda place: place.write_text(text, encoding="utf-8"), raising=EvaluationError)
+    found = {"scores": [asdict(score) for score in scores]}
+    write_json(path, {**found, "spaces": {name: space.record() for name, space in spaces.items()}})
 
 
 def spectral_distance(made: Edited, reference: Reference) -> float:
@@ -434,14 +356,10 @@ def spectral_distance(made: Edited, reference: Reference) -> float:
             name="reference",
             value=reference.sample_rate,
         )
-    clips = with_length(reference.clips, made.sounds.shape[1]).double()
-    leveled, wanted = (
-        sounds / level(sounds, sample_rate=made.sample_rate)[:, None] for sounds in (made.sounds.double(), clips)
+    clips = with_length(reference.clips, made.sounds.shape[1])
+    sounds, wanted = (
+        each.double() / level(each.double(), sample_rate=made.sample_rate)[:, None] for each in (made.sounds, clips)
     )
     sizes = default_fft_sizes(made.sample_rate)
-    errors = torch.zeros(len(leveled), len(wanted), dtype=torch.float64)
-    for size in sizes:
-        own, aims = (magnitude_stft(sounds, fft_size=size, hop=max(1, size // 4)) for sounds in (leveled, wanted))
-        sums = torch.stack([(one - aims).abs().sum(dim=(1, 2)) for one in own])
-        errors += sums / aims.sum(dim=(1, 2)) / len(sizes)
-    return float(errors.amin(dim=1).mean())
+    errors = [relative_stft_error(sounds, clip.expand_as(sounds), fft_sizes=sizes) for clip in wanted]
+    return float(torch.stack(errors).amin(dim=0).mean())

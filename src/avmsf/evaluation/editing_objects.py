@@ -8,7 +8,7 @@ fields know the true shapes.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -165,27 +165,18 @@ def recorded_objects(
 ) -> tuple[KnownObject, ...]:
     """Read objects of a dataset by name and material, and extract their modes from all of their recordings.
 
-    Modes and fields are those of the default, fitted without training, or the `paper`'s.
-    Objects that the dataset does not hold are left out, so that a part of it will do. Raises DatasetError and
-    ExtractionError as reading and extracting do, and EvaluationError where the dataset has none of them.
+    Modes and fields are those of the default, fitted without training, or the `paper`'s. Objects that the dataset does
+    not hold are left out, so that a part of it will do. Raises DatasetError and ExtractionError as reading and
+    extracting do.
     """
-    held = [name for name in dataset.objects() if name in materials]
-    if not held:
-        raise EvaluationError.expected(
-            f"objects of known materials such as {', '.join(list(materials)[:3])}",
-            0,
-            got="none",
-            name=dataset.name,
-            advice="choose another dataset",
-        )
     found = []
-    for name in held:
-        impacts = dataset.capture(name).impacts
-        found.append(
-            KnownObject(name, materials[name], impacts, extract_modes(impacts))
-            if paper is None
-            else paper.object(name, materials[name], impacts)
-        )
+    for name in dataset.objects():
+        if name in materials:
+            impacts = dataset.capture(name).impacts
+            if paper is None:
+                found.append(KnownObject(name, materials[name], impacts, extract_modes(impacts)))
+            else:
+                found.append(paper.object(name, materials[name], impacts))
     return tuple(found)
 
 
@@ -233,7 +224,6 @@ class SolvedShape:
         directions = -elastic.normals(places)
         amplitudes = body.gains(places, directions)
         sounds = ring(vibration.poles, amplitudes, sample_rate=sample_rate, samples=round(seconds * sample_rate))
-        name = f"{self.kind}-{material.name}"
         impacts = Impacts(
             contacts=places,
             sounds=sounds.float(),
@@ -248,7 +238,7 @@ class SolvedShape:
         bodies = NominalBodies((NominalBody(None, elastic),), {})
         recipe = MixtureEstimator(bodies=CandidateBodies(bodies))
         features = partial(FeatureField.from_points, elastic.nodes[self._spread])
-        return KnownObject(name, material.name, impacts, modes, recipe, features)
+        return KnownObject(f"{self.kind}-{material.name}", material.name, impacts, modes, recipe, features)
 
     @cached_property
     def _spread(self) -> Int[Tensor, " points"]:
@@ -262,18 +252,13 @@ def drawn_size(kind: str, material: str, *, seed: int) -> float:
     return _SMALLEST * (_LARGEST / _SMALLEST) ** share
 
 
-def simulated_objects(
-    shapes: tuple[SolvedShape, ...], *, seed: int = 0, progress: Callable[[str], None] | None = None
-) -> tuple[KnownObject, ...]:
+def simulated_objects(shapes: Iterable[SolvedShape], *, seed: int = 0) -> tuple[KnownObject, ...]:
     """Return each shape in each material of the table, in sizes of their own."""
-    log = progress or (lambda stage: None)
-    found = []
-    for shape in shapes:
-        for material in MATERIALS.values():
-            log(f"{shape.kind} of {material.name}")
-            size = drawn_size(shape.kind, material.name, seed=seed)
-            found.append(shape.struck(material, size=size))
-    return tuple(found)
+    return tuple(
+        shape.struck(material, size=drawn_size(shape.kind, material.name, seed=seed))
+        for shape in shapes
+        for material in MATERIALS.values()
+    )
 
 
 def amplitudes_of(field: SoundField, contacts: Float64[Tensor, "contacts 3"]) -> Tensor:
