@@ -86,7 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--clouds",
         type=Path,
         metavar="FOLDER",
-        help="baselines, gains, surface: keep the Gaussians fitted to the objects here; without it they are made again",
+        help="gains, surface: keep the Gaussians fitted to the objects here; without it they are made again",
     )
     parser.add_argument(
         "--weights",

@@ -68,7 +68,7 @@ class _Objects:
     """Simulated objects, read or made, and their bodies, each computed once."""
 
     def __init__(self, options: Options, folder: Path) -> None:
-        self.options, self.folder, self._given, self._clouds = options, folder, options.sim20, options.clouds
+        self.options, self.folder, self._given = options, folder, options.sim20
         self.quick, self.most = options.quick_look, 1 if options.quick_look else None
         self.weights = folder / "sonicgauss-small.safetensors" if options.weights is None else options.weights
         self.family = cache(self._family)
@@ -94,8 +94,7 @@ class _Objects:
         return body_family(self.surface(name), count=MODES, log=log)
 
     def training(self) -> Report:
-        cache = None if self._clouds is None else self._clouds / "sonicgauss"
-        return train_small(self.weights, cache=cache, quick=self.quick)
+        return train_small(self.weights, quick=self.quick)
 
 
 @dataclass(frozen=True)

@@ -3,23 +3,23 @@
 import time
 from pathlib import Path
 
-from avmsf.baselines.sonicgauss.pretraining import PretrainingConfig, pretrain, training_objects, training_recipes
+from avmsf.baselines.sonicgauss.pretraining import PRETRAINING, pretrain, training_objects, training_recipes
 from avmsf.baselines.sonicgauss.small import SmallConfig
 from avmsf.baselines.sonicgauss.training import TrainingConfig
 from benchmarks.report import Report, Table, log
 
 OBJECTS = 40
 """Simulated objects, 32 recordings each."""
-_QUICK = PretrainingConfig(SmallConfig(blocks=1, encoder_blocks=1), TrainingConfig(steps=4, batch=8, rate=1e-3))
+_QUICK = SmallConfig(blocks=1, encoder_blocks=1), TrainingConfig(steps=4, batch=8, rate=1e-3)
 
 
-def train_small(weights: Path, *, cache: Path | None, quick: bool) -> Report:
+def train_small(weights: Path, *, quick: bool) -> Report:
     """Make training objects, train on them, write the weights, and return the curve of the loss."""
-    config = _QUICK if quick else PretrainingConfig()
+    sizes, training = _QUICK if quick else (SmallConfig(), PRETRAINING)
     begun = time.process_time()
-    objects = list(training_objects(training_recipes(2 if quick else OBJECTS), cache=cache, log=log))
+    objects = list(training_objects(training_recipes(2 if quick else OBJECTS), log=log))
     made = time.process_time() - begun
-    found = pretrain(objects, config, log=log)
+    found = pretrain(objects, sizes, training, log=log)
     found.write(weights)
     losses = [float(value) for value in found.report["losses"]]
     rows: list[list[str | float]] = [[f"{(place + 1) / len(losses):.0%}", value] for place, value in enumerate(losses)]

@@ -21,19 +21,16 @@ from avmsf.baselines.sonicgauss.patches import (
     sounds_of,
     spectra,
 )
-from avmsf.baselines.sonicgauss.pretraining import PretrainingConfig, TrainingObject, pretrain, training_recipes
-from avmsf.baselines.sonicgauss.small import SmallConfig, SmallSonicGauss, SmallWeights
-from avmsf.baselines.sonicgauss.small_renderer import SmallRenderer, fit_small
-from avmsf.baselines.sonicgauss.training import TrainingConfig, draw_times, flow_loss, integrate, train
+from avmsf.baselines.sonicgauss.pretraining import TrainingObject, pretrain, training_recipes
+from avmsf.baselines.sonicgauss.small import SmallConfig, SmallSonicGauss, SmallWeights, fit_small
+from avmsf.baselines.sonicgauss.training import TrainingConfig, TunedRenderer, draw_times, flow_loss, integrate, train
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.methods import SmallSonicGaussMethod, method_named
 from avmsf.simulate.sim20 import SIM20
 from factories.raising import raises
 from factories.sonicgauss_cases import SECONDS, cloud, impacts
 
-TINY = PretrainingConfig(
-    SmallConfig(width=16, heads=2, blocks=1, encoder_blocks=1, tokens=4), TrainingConfig(4, batch=4, rate=1e-3)
-)
+TINY = SmallConfig(width=16, heads=2, blocks=1, encoder_blocks=1, tokens=4), TrainingConfig(4, batch=4, rate=1e-3)
 
 
 @cache
@@ -42,10 +39,10 @@ def weights(seed: int = 0) -> SmallWeights:
         TrainingObject(cloud(seed=row), (made := impacts(seed=row)).contacts.float(), made.sounds, made.sample_rate)
         for row in range(2)
     ]
-    return pretrain(objects, TINY, seed=seed)
+    return pretrain(objects, *TINY, seed=seed)
 
 
-def tuned(level: float = 1.0, seed: int = 0) -> SmallRenderer:
+def tuned(level: float = 1.0, seed: int = 0) -> TunedRenderer:
     config = TrainingConfig(steps=3, batch=4, rate=1e-3)
     return replace(fit_small(weights(), cloud(), impacts(level=level), config, seed=seed), steps=2)
 
@@ -246,8 +243,9 @@ def test_a_file_of_other_weights_is_refused_by_the_tensors_name(tmp_path, change
         made.network.position = torch.nn.Parameter(torch.zeros(3, 16))
         name = "network.position"
     made.write(path)
-    with raises(EvaluationError, file=path, name=name, value=None if change == "missing" else [3, 16]):
+    with raises(EvaluationError, file=path) as caught:
         SmallWeights.read(path)
+    assert name in str(caught.value)
 
 
 def lively_network() -> SmallSonicGauss:

@@ -16,14 +16,12 @@ from avmsf.baselines.diffsound.material_fit import DiffSoundConfig
 from avmsf.baselines.diffsound.renderer import DiffSound, fit_diffsound
 from avmsf.baselines.sonicgauss.published import (
     EPOCHS,
-    PublishedRenderer,
     PublishedSizes,
     PublishedSonicGauss,
     fit_published,
     folder_digest,
 )
-from avmsf.baselines.sonicgauss.small import COMMAND, SmallWeights
-from avmsf.baselines.sonicgauss.small_renderer import TUNING, SmallRenderer, fit_small
+from avmsf.baselines.sonicgauss.small import COMMAND, TUNING, SmallWeights, fit_small
 from avmsf.baselines.sonicgauss.training import TrainingConfig, TunedRenderer
 from avmsf.capture.audio import read_recording
 from avmsf.errors import CaptureError, EvaluationError
@@ -82,7 +80,7 @@ class SonicGaussMethod:
         # Results of other weights are not mixed.
         return f"SonicGaussMethod(weights {folder_digest(self.folder)}, {self.sizes}, {self.epochs})"
 
-    def fit(self, task: Task) -> PublishedRenderer:
+    def fit(self, task: Task) -> TunedRenderer:
         """Fine-tune. Raises AvmsfError for weights of another model, and for an object without Gaussians."""
         model = PublishedSonicGauss.load(self.folder, self.sizes)
         device = usable_device(task.device, raising=EvaluationError)
@@ -106,7 +104,7 @@ class SmallSonicGaussMethod:
         digest = hashlib.sha256(self.file.read_bytes()).hexdigest()[:16]
         return f"SmallSonicGaussMethod(weights {digest}, {self.config})"
 
-    def fit(self, task: Task) -> SmallRenderer:
+    def fit(self, task: Task) -> TunedRenderer:
         """Fine-tune. Raises AvmsfError for a file of something else, and for an object without Gaussians."""
         return fit_small(SmallWeights.read(self.file), task.gaussians(), task.train, self.config, seed=task.seed)
 

@@ -5,11 +5,10 @@ that few components of a patch keep both. Phases are not kept: they are found by
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Complex, Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from avmsf.editing.clips import resampled, with_length
 
@@ -28,15 +27,18 @@ _ITERATIONS, _MOMENTUM = 32, 0.99 / 1.99
 """Of the fast Griffin-Lim algorithm (Perraudin et al. 2013), as torchaudio has them by default."""
 
 
-@dataclass(frozen=True, eq=False)
-class PatchCodec:
-    """A linear map of log spectrograms to latents and back."""
+class PatchCodec(nn.Module):
+    """A linear map of log spectrograms to latents and back: orthonormal components, and what they are divided by."""
 
-    mean: Float[Tensor, " values"]
-    components: Float[Tensor, "values channels"]
-    """Orthonormal columns."""
-    scale: Float[Tensor, " channels"]
-    """What the coefficients are divided by."""
+    mean: Tensor
+    components: Tensor
+    scale: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(VALUES))
+        self.register_buffer("components", torch.zeros(VALUES, CHANNELS))
+        self.register_buffer("scale", torch.ones(CHANNELS))
 
     @classmethod
     def of(cls, logs: Sequence[Float[Tensor, "contacts bins frames"]], *, seed: int) -> "PatchCodec":
@@ -44,14 +46,16 @@ class PatchCodec:
 
         Coefficients are divided by the root of their deviation: faint ones, mostly noise, stay fainter than the rest.
         """
-        rows = torch.cat([_patches(each).flatten(0, 1) for each in logs])
-        mean = rows.mean(0)
-        rows = rows - mean
+        rows, codec = torch.cat([_patches(each).flatten(0, 1) for each in logs]), cls()
+        codec.mean = rows.mean(0)
+        rows = rows - codec.mean
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             components = torch.pca_lowrank(rows, q=2 * CHANNELS, center=False, niter=3)[2][:, :CHANNELS]
+        codec.components = components.contiguous()
         deviation = (rows @ components).std(0)
-        return cls(mean, components.contiguous(), (deviation * deviation.max()).sqrt())
+        codec.scale = (deviation * deviation.max()).sqrt()
+        return codec
 
     def encode(self, logs: Float[Tensor, "contacts bins frames"]) -> Float[Tensor, "contacts patches channels"]:
         """Return the latents of log spectrograms."""

@@ -9,7 +9,7 @@ import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -32,10 +32,10 @@ from avmsf.baselines.sonicgauss.training import (
     TrainingConfig,
     TunedRenderer,
     expect_sound,
-    expect_tensors,
     flow_loss,
     integrate,
-    train,
+    load_tensors,
+    tune,
 )
 from avmsf.capture.impacts import Impacts
 from avmsf.editing.clips import resampled, with_length
@@ -212,26 +212,14 @@ def folder_digest(folder: Path) -> str:
 
 
 def _load(part: nn.Module, path: Path) -> None:
-    state = part.state_dict()
     try:
         with safe_open(path, framework="pt") as file:
-            names = set(file.keys())
-            tensors = {name: file.get_tensor(name) for name in state if name in names}
+            tensors = {name: file.get_tensor(name) for name in file.keys() if not name.startswith(_UNUSED)}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise EvaluationError(
             f"{path}: expected published weights of SonicGauss, got {error}; {_DOWNLOAD}", file=path
         ) from error
-    expect_tensors(path, tensors, {name: tuple(each.shape) for name, each in state.items()})
-    unknown = sorted(name for name in names - state.keys() if not name.startswith(_UNUSED))
-    if unknown:
-        raise EvaluationError(
-            f"{path}: expected only tensors of the published model, got {unknown[0]} and {len(unknown) - 1} others; "
-            f"{_DOWNLOAD}",
-            file=path,
-            name=unknown[0],
-            value=tuple(unknown),
-        )
-    part.load_state_dict(tensors)
+    load_tensors(part, tensors, path, _DOWNLOAD)
 
 
 def _diffusers() -> tuple[Any, Any]:
@@ -250,50 +238,25 @@ EPOCHS, BATCH = 80, 2
 """Rounds over an object's recordings, and recordings a step, as published."""
 
 
-@dataclass(frozen=True, eq=False)
-class PublishedRenderer(TunedRenderer):
-    """A fine-tuned model, and what places and levels mean for its object; its sounds end after 2.97 s."""
-
-    model: PublishedSonicGauss
-    peak: float
-    """Of the loudest training recording, in the recordings' unit."""
-
-    @cached_property
-    def _tokens(self) -> Float[Tensor, "1 tokens width"]:
-        """The encoded Gaussians, the same for all contacts."""
-        with torch.no_grad():
-            return self.model.gaussians(self.seen)
-
-    def _sound(self, place: Float[Tensor, "3"]) -> Float[Tensor, " samples"]:
-        model, device = self.model, _device_of(self.model)
-        channels = int(model.sizes.transformer["in_channels"])
-        noise = torch.randn(1, FRAMES, channels, generator=torch.Generator().manual_seed(self.seed)).to(device)
-        tokens = model.condition(self._tokens, place[None].to(device))
-        seconds = self.samples / self.sample_rate
-        latents = integrate(lambda z, s: model.velocity(z, s, tokens, seconds=seconds), noise, steps=self.steps)
-        sound = model.autoencoder.decode(latents.mT).sample.mean(1).float().cpu()
-        rate = float(model.autoencoder.config.sampling_rate)
-        return self.peak * with_length(resampled(sound, sample_rate=rate, wanted=self.sample_rate), self.samples)[0]
-
-
 def fit_published(
-    model: PublishedSonicGauss, cloud: GaussianCloud, train_impacts: Impacts, *, epochs: int = EPOCHS, seed: int = 0
-) -> PublishedRenderer:
+    model: PublishedSonicGauss, cloud: GaussianCloud, impacts: Impacts, *, epochs: int = EPOCHS, seed: int = 0
+) -> TunedRenderer:
     """Fine-tune a model in place to an object's recordings, as published, on the device where it is.
 
-    Recordings are divided by the loudest one's peak. Batch norms keep their statistics, and the last weights are taken:
-    there are too few recordings to leave some out. Raises EvaluationError where the recordings are silent, and where
-    nothing can be seen of the object.
+    Recordings are divided by the loudest one's peak; generated sounds end after 2.97 s. Batch norms keep their
+    statistics, and the last weights are taken: there are too few recordings to leave some out. Raises EvaluationError
+    where the recordings are silent, and where nothing can be seen of the object.
     """
     device = _device_of(model)
     seen = normalized(cloud, first_nine(cloud))
-    peak = float(train_impacts.sounds.abs().max())
-    expect_sound(peak, train_impacts)
-    contacts = seen.places(train_impacts.contacts).float().to(device)
-    seconds = min(train_impacts.duration, LONGEST)
-    means, deviations = _encoded(model, train_impacts, peak)
+    peak = float(impacts.sounds.abs().max())
+    expect_sound(peak, impacts)
+    contacts = seen.places(impacts.contacts).float().to(device)
+    means, deviations = _encoded(model, impacts, peak)
+    frames = torch.randn(1, *means.shape[1:], generator=torch.Generator().manual_seed(seed)).to(device)
 
     def loss(rows: Int[Tensor, " batch"], generator: torch.Generator) -> Tensor:
+        seconds = min(impacts.duration, LONGEST)
         noise = torch.randn(means[rows].shape, generator=generator)
         latents = (means[rows] + deviations[rows] * noise).to(device)
         kept = (torch.rand(len(rows), 1, 1, generator=generator) >= DROPPED).to(latents)
@@ -302,15 +265,23 @@ def fit_published(
             lambda z, s: model.velocity(z, s, tokens, seconds=seconds, kept=kept), latents, generator=generator
         )
 
-    config = TrainingConfig(steps=epochs * math.ceil(len(train_impacts) / BATCH), batch=BATCH)
+    # The encoded Gaussians are the same for all contacts.
+    encoded = cache(lambda: model.gaussians(seen))
+
+    def generate(place: Float[Tensor, "1 3"], steps: int) -> Float[Tensor, " samples"]:
+        tokens, seconds = model.condition(encoded(), place.to(device)), impacts.duration
+        latents = integrate(lambda z, s: model.velocity(z, s, tokens, seconds=seconds), frames, steps=steps)
+        sound = model.autoencoder.decode(latents.mT).sample.mean(1).float().cpu()
+        rate = float(model.autoencoder.config.sampling_rate)
+        sound = resampled(sound, sample_rate=rate, wanted=impacts.sample_rate)
+        return peak * with_length(sound, impacts.sounds.shape[1])[0]
+
+    config = TrainingConfig(steps=epochs * math.ceil(len(impacts) / BATCH), batch=BATCH)
     model.train().autoencoder.eval()
     for part in model.gaussians.modules():
         if isinstance(part, torch.nn.BatchNorm1d):
             part.eval()
-    losses = train(model.trained(), loss, len(train_impacts), config, seed=seed)
-    report = {"steps": len(losses), "first_loss": round(losses[0], 4), "last_loss": round(losses[-1], 4)}
-    rate, samples = train_impacts.sample_rate, train_impacts.sounds.shape[1]
-    return PublishedRenderer(model.eval(), peak, seen=seen, sample_rate=rate, samples=samples, report=report, seed=seed)
+    return tune(model, model.trained(), loss, impacts, config, seed=seed, seen=seen, generate=generate)
 
 
 @torch.no_grad()

@@ -4,8 +4,7 @@ At time s from 0 to 1 there is z_s = (1 - s) z + s e of data z and Gaussian nois
 is by AdamW with a warm-up, then a linear decay.
 """
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,25 +53,15 @@ def integrate(
     return latents
 
 
-def expect_tensors(path: Path, tensors: Mapping[str, Tensor], shapes: Mapping[str, Sequence[int]]) -> None:
-    """Raise EvaluationError, which names the first tensor that is missing or has another shape."""
-    missing = [name for name in shapes if name not in tensors]
-    if missing:
+def load_tensors(part: nn.Module, tensors: Mapping[str, Tensor], path: Path, advice: str) -> None:
+    """Fill a network. Raises EvaluationError that names the tensors that are missing, unknown or of another shape."""
+    try:
+        part.load_state_dict(tensors)
+    except RuntimeError as error:
+        reason = " ".join(" ".join(str(error).splitlines()[1:]).split())[:400]
         raise EvaluationError(
-            f"{path}: expected {len(shapes)} tensors, {len(missing)} are missing such as {missing[0]}; copy the file "
-            "again",
-            file=path,
-            name=missing[0],
-        )
-    for name, shape in shapes.items():
-        if tuple(tensors[name].shape) != tuple(shape):
-            raise EvaluationError(
-                f"{path}: expected the tensor {name} of the shape {list(shape)}, got {list(tensors[name].shape)}; copy "
-                "the file of this model",
-                file=path,
-                name=name,
-                value=list(tensors[name].shape),
-            )
+            f"{path}: expected the tensors of this model, got others: {reason}; {advice}", file=path
+        ) from error
 
 
 Loss = Callable[[Int[Tensor, " batch"], torch.Generator], Float[Tensor, ""]]
@@ -92,8 +81,8 @@ class TrainingConfig:
     decay: float = 1e-2
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class TunedRenderer(ABC):
+@dataclass(frozen=True, eq=False)
+class TunedRenderer:
     """A generator fine-tuned to one object."""
 
     seen: Normalized
@@ -101,21 +90,41 @@ class TunedRenderer(ABC):
     sample_rate: float
     """Hz."""
     samples: int
+    generate: Callable[[Float[Tensor, "1 3"], int], Float[Tensor, " samples"]]
+    """Makes the sound of a place in the cube by so many Euler steps, always from the same noise."""
     report: Mapping[str, Any]
-    seed: int = 0
     steps: int = STEPS
 
     @torch.no_grad()
     def render(
         self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
     ) -> Float[Tensor, "contacts samples"]:
-        """Return generated sounds, all from the same noise; directions are not known to the method."""
-        rows = [self._sound(place) for place in self.seen.places(contacts)]
+        """Return generated sounds; directions are not known to the method."""
+        rows = [self.generate(place[None], self.steps) for place in self.seen.places(contacts)]
         return torch.stack(rows) if rows else torch.zeros(0, self.samples)
 
-    @abstractmethod
-    def _sound(self, place: Float[Tensor, "3"]) -> Float[Tensor, " samples"]:
-        """Return the sound of a place in the cube."""
+
+def tune(
+    network: nn.Module,
+    parameters: Iterable[nn.Parameter],
+    loss: Loss,
+    impacts: Impacts,
+    config: TrainingConfig,
+    *,
+    seed: int,
+    seen: Normalized,
+    generate: Callable[[Float[Tensor, "1 3"], int], Float[Tensor, " samples"]],
+) -> TunedRenderer:
+    """Train a network's parameters in place on an object's recordings, and return the renderer of its sounds."""
+    losses = train(parameters, loss, len(impacts), config, seed=seed)
+    network.eval()
+    part = max(1, len(losses) // 10)
+    report = {
+        "first_loss": round(sum(losses[:part]) / part, 4),
+        "last_loss": round(sum(losses[-part:]) / part, 4),
+        "steps": len(losses),
+    }
+    return TunedRenderer(seen, impacts.sample_rate, impacts.sounds.shape[1], generate, report)
 
 
 def expect_sound(loudest: float, impacts: Impacts) -> None:
