@@ -85,3 +85,14 @@ def test_the_notebook_is_stored_without_outputs() -> None:
     cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
     assert cells
     assert all(not cell["outputs"] and cell["execution_count"] is None for cell in cells)
+
+
+def test_every_function_and_test_in_the_table_of_equations_exists() -> None:
+    text = (REPOSITORY / "docs/paper-map.md").read_text()
+    functions = re.findall(r"`(avmsf\.[\w.]+)`", text)
+    tests = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", text)
+    assert min(len(functions), len(tests)) > 10
+    for function in functions:
+        pkgutil.resolve_name(function)
+    for file, name in tests:
+        assert f"def {name}(" in (REPOSITORY / file).read_text(), f"{file} has no {name}"

@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -55,16 +54,13 @@ from avmsf.modal.extraction.extract import extract_sounds
 from avmsf.modal.extraction.finders import ShortTime
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
+from benchmarks import editingprotocol as protocol
 from factories.made_audio import save_audio
 from factories.made_clap import save_clap
 from factories.made_modes import sliding_plate
 from factories.plate_field import plate_impacts
-from oracles.block import block
-
-# The benchmarks are no part of the package, and `python -m benchmarks` finds them from the repository's root alone.
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from benchmarks import editingprotocol as protocol
 from factories.raising import raises, warns
+from oracles.block import block
 
 RATE = 16000.0
 QUICK = {"steps": 3, "contacts_per_step": 2, "fft_sizes": (512, 128)}

@@ -1,6 +1,5 @@
 """From edits to the record of the protocol and its figures, with a tiny CLAP network of random weights."""
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +11,8 @@ from avmsf.editing.config import DistillationConfig
 from avmsf.evaluation.clap import Clap
 from avmsf.evaluation.editing import EditScore, EditTask, score_edits, towards_words, write_scores
 from avmsf.evaluation.mode_embedding import MaterialSpace, pitches
-from factories.made_clap import save_clap
-
-# The benchmarks are no part of the package.
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from benchmarks import editingfigures
+from factories.made_clap import save_clap
 
 PROMPT = "a glass is struck"
 METHODS = ("audio-sds", "hierarchical")

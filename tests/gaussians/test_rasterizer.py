@@ -8,9 +8,6 @@ import numba
 import pytest
 import torch
 
-# The oracle belongs to the benchmarks, which are no part of the package.
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
 from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.rasterizer.cpu import NumbaRasterizer

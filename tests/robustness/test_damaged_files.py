@@ -1,16 +1,11 @@
 """Files with random damage are read, or refused by the package's own error: never a traceback."""
 
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 
 from avmsf.cli import check
-
-# The benchmarks are no part of the package.
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
 from benchmarks.robustness import files
 from benchmarks.robustness.seeds import write_seeds
 

@@ -1,17 +1,12 @@
 """Requests that no page would send: none is answered by 500, none prints a traceback, and no answer is long."""
 
-import sys
 from pathlib import Path
 
 import pytest
 
 from avmsf.studio.opening import open_target
-from served import served
-
-# The benchmarks are no part of the package.
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
 from benchmarks.robustness.studio import Request, fuzz, write_object
+from served import served
 
 
 @pytest.mark.parametrize("count", [14, pytest.param(150, marks=pytest.mark.slow)])
