@@ -14,9 +14,7 @@ from avmsf.gaussians.rasterizer.cpu import NumbaRasterizer
 from avmsf.gaussians.rasterizer.projection import project
 from avmsf.gaussians.rasterizer.protocol import Rendering, choose_rasterizer
 from avmsf.photographs.cameras import Camera
-from benchmarks.rasterizer import measure_rasterizer
-from benchmarks.rasterizers import render_everywhere, render_padded, splats
-from benchmarks.report import Options
+from benchmarks.rasterizers import render_everywhere, splats
 from factories.raising import raises
 
 NAMES = tuple(each.name for each in fields(GaussianCloud))
@@ -111,16 +109,6 @@ def test_colors_turn_with_the_direction_of_view(degree: int) -> None:
     for name in ("centers", "harmonics"):
         gradient, truth = getattr(own, name).grad, getattr(true, name).grad
         assert float((gradient - truth).norm() / truth.norm()) < 1e-5, name
-
-
-def test_the_padded_rasterizer_does_the_same_work() -> None:
-    cloud, camera = cloud_of(), camera_of()
-    for side in (8, 16):
-        padded = render_padded(cloud, camera, background=BACKGROUND, side=side)
-        _, undecided = render_everywhere(cloud, camera, background=BACKGROUND)
-        torch.testing.assert_close(
-            padded.color[~undecided], image_of(cloud, camera).color[~undecided], atol=1e-5, rtol=0
-        )
 
 
 def test_a_round_gaussian_straight_ahead_is_a_bell() -> None:
@@ -377,10 +365,3 @@ def test_gsplat_renders_what_the_cpu_does() -> None:
     for name in NAMES:
         truth = getattr(here, name).grad
         assert float((getattr(other, name).grad.cpu() - truth).norm() / truth.norm()) < 1e-3, name
-
-
-def test_the_benchmark_measures_what_it_says() -> None:
-    figures = measure_rasterizer(Options(("rasterizer",), quick_look=True)).figures
-    assert {"rasterizer.speedup", "rasterizer.step_milliseconds"} < set(figures)
-    assert 0 < figures["rasterizer.image_error"] < 1e-5
-    assert 0 < figures["rasterizer.gradient_error"] < 1e-4
