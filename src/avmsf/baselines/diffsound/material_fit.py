@@ -17,11 +17,12 @@ import numpy as np
 import scipy.optimize
 import torch
 from jaxtyping import Float, Float64
-from scipy.signal import butter, resample_poly, sosfilt
+from scipy.signal import butter, sosfilt
 from torch import Tensor
 
 from avmsf.baselines.diffsound.losses import ClipSpectra
 from avmsf.capture.impacts import Impacts
+from avmsf.editing.clips import resampled, with_length
 from avmsf.errors import EvaluationError
 from avmsf.fem.body_family import BodyFamily
 from avmsf.fem.elastic_modes import ElasticModes
@@ -145,22 +146,19 @@ def clip_spectra(impacts: Impacts) -> ClipSpectra:
 
     Silent recordings are left out, and those after the first `CLIPS`. Raises EvaluationError where all are silent.
     """
-    sounds = impacts.sounds.detach().cpu().double().numpy()
-    rates = int(RATE), round(impacts.sample_rate)
-    common = math.gcd(*rates)
-    kept = resample_poly(sounds, rates[0] // common, rates[1] // common, axis=1)[:, :SAMPLES]
-    kept = sosfilt(butter(2, HIGH_PASS, "highpass", fs=RATE, output="sos"), kept, axis=1)
-    kept = np.pad(kept, ((0, 0), (0, SAMPLES - kept.shape[1])))
-    peaks = np.abs(kept).max(axis=1)
-    if not (peaks > 0.0).any():
+    sounds = resampled(impacts.sounds.detach().cpu().double(), sample_rate=impacts.sample_rate, wanted=RATE)
+    high_pass = butter(2, HIGH_PASS, "highpass", fs=RATE, output="sos")
+    kept = with_length(torch.from_numpy(sosfilt(high_pass, sounds.numpy(), axis=1)), SAMPLES)
+    peaks = kept.abs().amax(dim=1)
+    loud = peaks > 0.0
+    if not bool(loud.any()):
         raise EvaluationError(
             f"expected a recording with a sound, got {len(impacts)} silent ones ({', '.join(impacts.names[:3])}); "
             "record the impacts again",
             name="sounds",
             value=0.0,
         )
-    loud = peaks > 0.0
-    return ClipSpectra(torch.from_numpy((kept[loud] / peaks[loud, None])[:CLIPS]).float(), RATE)
+    return ClipSpectra((kept[loud] / peaks[loud, None])[:CLIPS].float(), RATE)
 
 
 def predicted_sound(
@@ -196,10 +194,18 @@ def fit_material(
     """
     config = DiffSoundConfig() if config is None else config
     starts = [material_named(config.material)] if config.material is not None else list(MATERIALS.values())
-    _expect_audible(family, starts)
     problem = _Problem(spectra, curve, family, _bounds(starts, family))
     tried = [_point(each, problem.bounds[:, 2].mean()) for each in starts]
-    best = problem.transported(min(tried, key=problem.loss), config.transport_steps)
+    best = min(tried, key=problem.loss)
+    if not math.isfinite(problem.loss(best)):
+        lowest = float(family.bodies[0].modes(starts[0]).frequency[0])
+        raise EvaluationError(
+            f"expected an object with modes from {BAND[0]:g} to {BAND[1]:g} Hz, got a lowest mode at {lowest:.3g} Hz; "
+            "give the mesh's unit",
+            name="frequency",
+            value=lowest,
+        )
+    best = problem.transported(best, config.transport_steps)
     best = problem.descended(best, config.difference_steps)
     if config.search:
         best = problem.searched(best, config.search)
@@ -311,20 +317,3 @@ class _Problem:
             with torch.no_grad():
                 point.clamp_(*self.bounds)
         return point.detach(), kept
-
-
-def _expect_audible(family: BodyFamily, materials: Iterable[Material]) -> None:
-    """Raise EvaluationError where no material of the table gives the body a mode in the band."""
-    bodies = family.bodies
-    for material in materials:
-        for body in bodies:
-            frequency = body.modes(material).frequency
-            if bool(((frequency > BAND[0]) & (frequency < BAND[1])).any()):
-                return
-    lowest = float(bodies[0].modes(next(iter(materials))).frequency[0])
-    raise EvaluationError(
-        f"expected an object with modes from {BAND[0]:g} to {BAND[1]:g} Hz, got a lowest mode at {lowest:.3g} Hz; give "
-        "the mesh's unit",
-        name="frequency",
-        value=lowest,
-    )

@@ -11,7 +11,7 @@ publish neither gains by position nor a level; Li et al. compare with "position-
 the object's vibration modes" and add their learned residual noise, as here."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -131,24 +131,13 @@ def leveled(fit: MaterialFit, curve: DampingCurve, train: Impacts, residual: Res
             name="frequency",
             value=0,
         )
-    elastic = _some(elastic, inside)
+    elastic = replace(elastic, frequency=elastic.frequency[inside], shapes=elastic.shapes[:, inside].contiguous())
     bank = ModalBank(audible[inside], damping[inside])
     weight = _weights(_displacements(elastic, bank, train.contacts, train.directions), bank, train, weighted=weighted)
     report = {
         "stiffness": fit.stiffness, "poisson": fit.poisson, "thickness": fit.thickness, "difference": fit.difference,
     }  # fmt: skip
     return DiffSound(fit, elastic, bank, weight, residual, train.sample_rate, train.sounds.shape[1], report)
-
-
-def _some(elastic: ElasticModes, rows: Tensor) -> ElasticModes:
-    return ElasticModes(
-        frequency=elastic.frequency[rows],
-        nodes=elastic.nodes,
-        triangles=elastic.triangles,
-        shapes=elastic.shapes[:, rows].contiguous(),
-        material=elastic.material,
-        mass=elastic.mass,
-    )
 
 
 def _displacements(
