@@ -3,7 +3,6 @@
 from dataclasses import replace
 from functools import cache
 from itertools import product
-from typing import Any
 
 import pytest
 import torch
@@ -19,10 +18,10 @@ from avmsf.baselines.sonicgauss.point_transformer import (
     hilbert,
     z_order,
 )
-from avmsf.baselines.sonicgauss.published import PublishedSizes, PublishedSonicGauss
+from avmsf.baselines.sonicgauss.published import PublishedSizes, PublishedSonicGauss, fit_published
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.methods import SonicGaussMethod, method_named, report_of
-from avmsf.evaluation.task import Task
+from avmsf.evaluation.methods import method_named
+from avmsf.evaluation.task import Task, report_of
 from factories.raising import raises
 from factories.sonicgauss_cases import cloud, impacts
 
@@ -220,47 +219,29 @@ def test_contact_object_duration_and_dropped_conditions_change_the_velocity():
         assert not torch.allclose(changed, base, rtol=0, atol=1e-5)
 
 
-def task(*, seed: int = 0) -> Task:
-    train = impacts(3)
-    return Task(
-        name="box",
-        train=train,
-        contacts=train.contacts,
-        names=train.names,
-        seed=seed,
-        modes=_unknown,
-        features=_unknown,
-        bodies=_unknown,
-        other_recording=_unknown,
-        gaussians=lambda: cloud(60),
+def test_it_fits_and_renders_from_a_folder_by_its_seed(folder):
+    first, again = (
+        replace(fit_published(PublishedSonicGauss.load(folder, TINY), cloud(60), impacts(3), epochs=2), steps=2)
+        for _ in range(2)
     )
-
-
-def _unknown(*arguments: object) -> Any:
-    raise AssertionError("SonicGauss knows Gaussians and recordings alone")
-
-
-def test_the_method_fits_and_renders_from_a_folder_by_its_seed(folder):
-    method = method_named(f"sonicgauss:{folder}")
-    assert isinstance(method, SonicGaussMethod)
-    assert method.name == f"sonicgauss:{folder}"
-    tiny = replace(method, sizes=TINY, epochs=2)
-    first, again = (replace(tiny.fit(task()), steps=2) for _ in range(2))
     contacts = impacts(3).contacts
     sounds = first.render(contacts)
     assert sounds.shape == impacts(3).sounds.shape
     assert torch.equal(again.render(contacts), sounds)
     assert torch.equal(first.render(contacts[1:2])[0], sounds[1])
     assert report_of(first)["steps"] == 4
-    known = repr(method)
+
+
+def test_results_of_other_weights_are_not_mixed(folder):
+    method = method_named(f"sonicgauss:{folder}")
+    assert method.name == f"sonicgauss:{folder}"
     (folder / "model_3.safetensors").write_bytes(b"others")
-    assert repr(method) != known
-    with pytest.raises(EvaluationError):
-        method_named("sonicgauss:/nowhere")
-    with pytest.raises(EvaluationError):
-        method_named("sonicgauss")
+    assert repr(method_named(f"sonicgauss:{folder}")) != repr(method)
+    for name in ("sonicgauss:/nowhere", "sonicgauss"):
+        with pytest.raises(EvaluationError):
+            method_named(name)
 
 
-def test_an_object_without_gaussians_is_refused(folder):
+def test_an_object_without_gaussians_is_refused():
     with raises(EvaluationError, name="gaussians"):
-        SonicGaussMethod(folder, TINY).fit(replace(task(), gaussians=Task.gaussians))
+        Task.gaussians()

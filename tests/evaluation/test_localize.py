@@ -16,7 +16,7 @@ from avmsf.capture import Impacts, read_capture
 from avmsf.cli import main
 from avmsf.errors import LocationError
 from avmsf.evaluation import localization, report
-from avmsf.evaluation.field_methods import FieldMethod, GridField
+from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.localization import MAX_VERTICES, located, random_distance
 from avmsf.evaluation.objects import ObjectFeatures
 from avmsf.evaluation.results import ResultsFolder
@@ -144,7 +144,6 @@ def test_heat_maps_have_the_true_contacts_and_the_papers_methods_their_own_dista
     monkeypatch.setattr(report, "draw_contact", draw)
     words = ["evaluate", "localize", str(data), "--objects", "a", "--methods", "field-auto,paper-grid,paper,nearest"]
     words += ["--lift.encoder", "descriptors", "--output", str(results), "--figures"]
-    monkeypatch.setattr(GridField, "fit", lambda grid, task: grid.method.fit(task))
     assert main(words) == 0
     assert set(asked) == {False, True}
     assert asked[True].shape == (4, 3)

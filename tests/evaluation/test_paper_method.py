@@ -10,7 +10,7 @@ import torch
 from avmsf.cli.evaluate import inputs_of, settled_lifts
 from avmsf.datasets import CaptureCollection
 from avmsf.errors import EvaluationError, SceneError
-from avmsf.evaluation.field_methods import NETWORK, FieldMethod, GridField
+from avmsf.evaluation.field_methods import NETWORK, FieldMethod
 from avmsf.evaluation.methods import METHODS
 from avmsf.evaluation.protocols import PROTOCOLS
 from avmsf.evaluation.results import ResultsFolder
@@ -31,8 +31,7 @@ from factories.raising import raises
     ("name", "damping"), [("paper", "shared"), ("paper-grid", "shared"), ("paper-per-contact", "per-contact")]
 )
 def test_the_method_is_the_preset_with_one_damping(name: str, damping: Any) -> None:
-    method: Any = METHODS[name]
-    field = method.method if isinstance(method, GridField) else method
+    field: Any = METHODS[name]
     preset = PRESETS["paper"]
     assert field.pipeline == replace(preset, fit=replace(preset.fit, damping=damping))
     assert (field.visual_input, field.published) == ("paper", True)

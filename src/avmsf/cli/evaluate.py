@@ -19,7 +19,7 @@ from avmsf.datasets import CaptureCollection, open_dataset
 from avmsf.datasets.dataset import Dataset
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.cases import Predefined, Shots
-from avmsf.evaluation.field_methods import configured
+from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.methods import RecordedMethod, method_named
 from avmsf.evaluation.objects import SUBSETS, ObjectBodies, ObjectFeatures, choose_objects, members
 from avmsf.evaluation.parallel import RunProgress, Workers, run_objects
@@ -178,8 +178,7 @@ def _note_start(methods: Sequence[Method], time_zero: TimeZero | None) -> None:
                 f"note: the files of {method.name} are taken as they are; with --time-zero peak each has to start at "
                 "its largest sample, as the recordings do"
             )
-        settings = configured(method)
-        wanted = None if settings is None else settings.pipeline.time_zero
+        wanted = method.pipeline.time_zero if isinstance(method, FieldMethod) else None
         if wanted not in (None, time_zero):
             say(f"note: {method.name} is published with sounds from their {wanted}s: --time-zero {wanted}")
 

@@ -3,15 +3,14 @@
 import itertools
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Literal
 
 import torch
 
 from avmsf.capture.impacts import Impacts, rows_by_place
 from avmsf.errors import FitError
-from avmsf.evaluation.task import Method, Task, VisualInput
+from avmsf.evaluation.task import Task, VisualInput
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit, held_out
@@ -28,11 +27,52 @@ NETWORK = PipelineConfig(gain_model="network")
 """The attention network with the quick settings of the fit."""
 
 
+_FEWEST_TO_VALIDATE = 6
+"""Training places from which on a part of them is held out to choose settings by, as in `fit` itself."""
+_UNINFORMED_RATE = 0.03
+"""Adam's step for frequencies (in widths of their modes) and for the logarithms of dampings without extracted modes:
+frequencies, dampings and noise have to find where they belong."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Values of the settings that a choice is made of; every combination is a candidate."""
+
+    clusters: tuple[int, ...]
+    learning_rate: tuple[float, ...]
+    steps: tuple[int, ...]
+    """Steps end to end; on a whole object's recordings a step is an epoch."""
+    early_weight: tuple[float, ...]
+    damping: tuple[Literal["shared", "per-contact"], ...] = ("shared", "per-contact")
+
+    def candidates(self, base: FitConfig) -> Iterator[FitConfig]:
+        """Yield `base` with every combination of the values, the last setting changing fastest."""
+        values = asdict(self)
+        for chosen in itertools.product(*values.values()):
+            yield replace(base, **dict(zip(values, chosen, strict=True)))
+
+
+PAPER_GRID = Grid((128, 256, 512), (1e-2, 5e-3, 1e-3), (5000, 10000, 20000), (0.5, 1.0, 2.0))
+"""The paper's lists (supplement, training setup): 162 fits an object, to run where there is time for them."""
+QUICK_GRID = Grid((8, 16, 32), (3e-3, 1e-3), (150,), (1.0,))
+"""What of it matters at the quick recipe's sizes: 12 fits an object."""
+
+
 @dataclass(frozen=True)
 class FieldMethod:
     """A field fitted as a configuration of the pipeline says.
 
     Seed and device are the evaluation's, and the sounds start as in the task's recordings.
+
+    Unless `informed` it has no modal initialization (the paper's row "w/o init"), neither extracted modes nor a
+    warm-up. It starts from `random_modes`, with as many modes and bands of noise as the extraction has, and is trained
+    end to end for as many steps as the configuration takes in all.
+
+    With a `grid`, its settings are chosen on validation contacts, a part of the training contacts alone: the quarter of
+    the training places that farthest-point sampling takes last is held out; every candidate is fitted to the others and
+    scored there by ENV (paper, supplement), the mean over contacts of the root mean square difference of envelopes. The
+    best is fitted to all training contacts; of equals the first. With fewer than six places nothing is held out, and
+    the configuration's own settings are taken. Modes are those of all training contacts.
     """
 
     name: str
@@ -44,19 +84,36 @@ class FieldMethod:
     published: bool = False
     """Whether modes are found as `pipeline` says, in place of those that all methods share, and recordings are located
     by the cosine distance of gains as it is published."""
+    informed: bool = True
+    """Whether it starts from extracted modes."""
+    grid: Grid | None = None
+    """Settings to choose from."""
 
     def fit(self, task: Task) -> SoundField:
-        """Fit the field. Raises AvmsfError where modes, features or field cannot be made."""
-        return self.fitted(task, task.train, task.features(self.visual_input), self.modes(task), self.pipeline.fit)
+        """Fit the field, whose report has what was chosen. Raises AvmsfError where a stage cannot be made."""
+        features, modes, config = task.features(self.visual_input), self._modes(task), self.pipeline.fit
+        report: dict[str, Any] = {}
+        if self.grid is not None:
+            config, report["grid"] = self._choose(self.grid, task, features, modes)
+        if not self.informed:
+            modes = random_modes(
+                task.train,
+                modes=len(modes.bank),
+                bins=len(modes.residual.magnitude),
+                generator=torch.Generator().manual_seed(task.seed),
+            )
+            steps = config.warmup_steps + config.steps
+            config = replace(config, warmup_steps=0, steps=steps, correction_rate=_UNINFORMED_RATE)
+        field = self._fitted(task, task.train, features, modes, config)
+        return replace(field, origin=replace(field.origin, report={**field.origin.report, **report}))
 
-    def modes(self, task: Task) -> Extraction:
-        """Return the modes of a task's training recordings."""
+    def _modes(self, task: Task) -> Extraction:
         if not self.published:
             return task.modes()
         finder = finder_named(self.pipeline.extraction, self.pipeline.modes)
         return extract_sounds(task.train.sounds, sample_rate=task.train.sample_rate, method=finder)
 
-    def fitted(
+    def _fitted(
         self, task: Task, train: Impacts, features: FeatureField, modes: Extraction, config: FitConfig
     ) -> SoundField:
         """Fit the field to some of a task's recordings, in whose modes they are rows."""
@@ -66,56 +123,33 @@ class FieldMethod:
         config = replace(config, clusters=clusters, seed=task.seed)
         return fit(train, features, modes, config, gains=gains, capture=task.name, device=task.device)
 
-
-@dataclass(frozen=True)
-class FieldVariant:
-    """A field that is fitted in another way than its method says, and has the method's name and features."""
-
-    method: FieldMethod
-    """What it differs from."""
-
-    @property
-    def name(self) -> str:
-        """What tables call it."""
-        return self.method.name
-
-    @property
-    def visual_input(self) -> VisualInput:
-        """What is read of the object's points."""
-        return self.method.visual_input
-
-
-@dataclass(frozen=True)
-class UninformedField(FieldVariant):
-    """A field without modal initialization (the paper's row "w/o init"): no extracted modes and no warm-up.
-
-    It starts from `random_modes`, with as many modes and bands of noise as the extraction has, and is trained end to
-    end for as many steps as the method takes in all. Corrections have `correction_rate`, for here they are no
-    corrections: frequencies, dampings and noise have to find where they belong.
-    """
-
-    correction_rate: float = 0.03
-    """Adam's step for frequencies (in widths of their modes) and for the logarithms of dampings."""
-
-    def fit(self, task: Task) -> SoundField:
-        """Fit the field. Raises AvmsfError where features or field cannot be made, or no mode can be counted."""
-        counted = self.method.modes(task)
-        start = random_modes(
-            task.train,
-            modes=len(counted.bank),
-            bins=len(counted.residual.magnitude),
-            generator=torch.Generator().manual_seed(task.seed),
-        )
-        config = self.method.pipeline.fit
-        steps = config.warmup_steps + config.steps
-        config = replace(config, warmup_steps=0, steps=steps, correction_rate=self.correction_rate)
-        return self.method.fitted(task, task.train, task.features(self.visual_input), start, config)
+    def _choose(
+        self, grid: Grid, task: Task, features: FeatureField, modes: Extraction
+    ) -> tuple[FitConfig, dict[str, Any]]:
+        """Return the best settings of a grid, and the report of the choice."""
+        base, train = self.pipeline.fit, task.train
+        held = held_out(train.contacts, base.validation)
+        if len(rows_by_place(train.contacts)) < _FEWEST_TO_VALIDATE or not held:
+            return base, {"validated": False}
+        learnt = [row for row in range(len(train)) if row not in held]
+        taken = replace(modes, gains=modes.gains[learnt], quadrature=modes.quadrature[learnt])
+        candidates = list(grid.candidates(base))
+        errors = [
+            _envelope_error(self._fitted(task, train.take(learnt), features, taken, config), train.take(held))
+            for config in candidates
+        ]
+        chosen = candidates[min(range(len(candidates)), key=errors.__getitem__)]
+        return chosen, {
+            "validated": True,
+            "validation_contacts": [train.names[row] for row in held],
+            "validation_envelope": errors,
+            "chosen": {each.name: getattr(chosen, each.name) for each in fields(grid)},
+        }
 
 
-def configured(method: Method) -> FieldMethod | None:
-    """Return the configuration that a method fits, or starts from; None for methods without one."""
-    found = method.method if isinstance(method, FieldVariant) else method
-    return found if isinstance(found, FieldMethod) else None
+def _envelope_error(field: SoundField, held: Impacts) -> float:
+    difference = envelope(field.render(held.contacts, directions=held.directions)) - envelope(held.sounds.float())
+    return float(difference.square().mean(dim=1).sqrt().mean())
 
 
 _MAX_FREQUENCY = 0.9
@@ -161,85 +195,3 @@ def random_modes(train: Impacts, *, modes: int, bins: int, generator: torch.Gene
         Residual(torch.full((bins,), _NOISE * math.sqrt(power))),
         torch.zeros_like(gains),
     )
-
-
-_FEWEST_TO_VALIDATE = 6
-"""Training places from which on a part of them is held out to choose settings by, as in `fit` itself."""
-
-
-@dataclass(frozen=True)
-class Grid:
-    """Values of the settings that a choice is made of; every combination is a candidate."""
-
-    clusters: tuple[int, ...]
-    learning_rate: tuple[float, ...]
-    steps: tuple[int, ...]
-    """Steps end to end; on a whole object's recordings a step is an epoch."""
-    early_weight: tuple[float, ...]
-    damping: tuple[Literal["shared", "per-contact"], ...] = ("shared", "per-contact")
-
-    def candidates(self, base: FitConfig) -> Iterator[FitConfig]:
-        """Yield `base` with every combination of the values, the last setting changing fastest."""
-        names = ("clusters", "learning_rate", "steps", "early_weight", "damping")
-        for values in itertools.product(*(getattr(self, name) for name in names)):
-            yield replace(base, **dict(zip(names, values, strict=True)))
-
-
-PAPER_GRID = Grid((128, 256, 512), (1e-2, 5e-3, 1e-3), (5000, 10000, 20000), (0.5, 1.0, 2.0))
-"""The paper's lists (supplement, training setup): 162 fits an object, to run where there is time for them."""
-QUICK_GRID = Grid((8, 16, 32), (3e-3, 1e-3), (150,), (1.0,))
-"""What of it matters at the quick recipe's sizes: 12 fits an object."""
-
-
-@dataclass(frozen=True)
-class GridField(FieldVariant):
-    """A field whose settings are chosen from a grid on validation contacts, a part of the training contacts alone.
-
-    The quarter of the training places that farthest-point sampling takes last is held out; every candidate is fitted
-    to the others and scored there by ENV (paper, supplement), the mean over contacts of the root mean square difference
-    of envelopes. The best is fitted to all training contacts; of equals the first. With fewer than six places nothing
-    is held out, and the method's own settings are taken. Modes are those of all training contacts.
-    """
-
-    grid: Grid
-
-    def fit(self, task: Task) -> SoundField:
-        """Choose and fit the field, whose report has what was chosen. Raises as FieldMethod."""
-        features, modes, base = task.features(self.visual_input), self.method.modes(task), self.method.pipeline.fit
-        fitted = partial(self.method.fitted, task)
-        held = held_out(task.train.contacts, base.validation)
-        if len(rows_by_place(task.train.contacts)) < _FEWEST_TO_VALIDATE or not held:
-            return _with_report(fitted(task.train, features, modes, base), {"validated": False})
-        learnt = [row for row in range(len(task.train)) if row not in held]
-        candidates = list(self.grid.candidates(base))
-        errors = [
-            _held_out_error(
-                fitted(task.train.take(learnt), features, _take(modes, learnt), config), task.train.take(held)
-            )
-            for config in candidates
-        ]
-        best = min(range(len(candidates)), key=errors.__getitem__)
-        chosen = candidates[best]
-        report = {
-            "validated": True,
-            "validation_contacts": [task.train.names[row] for row in held],
-            "validation_envelope": errors,
-            "chosen": {
-                name: getattr(chosen, name)
-                for name in ("clusters", "learning_rate", "steps", "early_weight", "damping")
-            },
-        }
-        return _with_report(fitted(task.train, features, modes, chosen), report)
-
-
-def _take(modes: Extraction, rows: list[int]) -> Extraction:
-    return replace(modes, gains=modes.gains[rows], quadrature=modes.quadrature[rows])
-
-
-def _held_out_error(field: SoundField, held: Impacts) -> float:
-    difference = envelope(field.render(held.contacts, directions=held.directions)) - envelope(held.sounds.float())
-    return float(difference.square().mean(dim=1).sqrt().mean())
-
-
-def _with_report(field: SoundField, grid: dict[str, Any]) -> SoundField:
-    return replace(field, origin=replace(field.origin, report={**field.origin.report, "grid": grid}))

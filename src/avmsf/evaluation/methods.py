@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,19 +15,13 @@ from torch import Tensor
 from avmsf._utils.device import usable_device
 from avmsf.baselines.diffsound.material_fit import DiffSoundConfig
 from avmsf.baselines.diffsound.renderer import DiffSound, fit_diffsound
-from avmsf.baselines.sonicgauss.published import (
-    EPOCHS,
-    PublishedSizes,
-    PublishedSonicGauss,
-    fit_published,
-    folder_digest,
-)
-from avmsf.baselines.sonicgauss.small import COMMAND, TUNING, SmallWeights, fit_small
-from avmsf.baselines.sonicgauss.training import TrainingConfig, TunedRenderer
+from avmsf.baselines.sonicgauss.published import PublishedSonicGauss, fit_published, folder_digest
+from avmsf.baselines.sonicgauss.small import COMMAND, SmallWeights, fit_small
+from avmsf.baselines.sonicgauss.training import TunedRenderer
 from avmsf.capture.audio import read_recording
 from avmsf.errors import CaptureError, EvaluationError
-from avmsf.evaluation.field_methods import NETWORK, PAPER_GRID, QUICK_GRID, FieldMethod, GridField, UninformedField
-from avmsf.evaluation.registry import PUBLISHED, RECORDED, SMALL, expect_method
+from avmsf.evaluation.field_methods import NETWORK, PAPER_GRID, QUICK_GRID, FieldMethod
+from avmsf.evaluation.registry import PUBLISHED, RECORDED, SMALL, expect_method, kind_of
 from avmsf.evaluation.simple_methods import (
     MeanGains,
     MeanWaveform,
@@ -38,7 +33,6 @@ from avmsf.evaluation.simple_methods import (
 from avmsf.evaluation.task import Method, Renderer, Task, VisualInput
 from avmsf.fem.material import MATERIALS
 from avmsf.field.config import GainModel
-from avmsf.field.sound_field import SoundField
 from avmsf.pipeline.config import PRESETS, PipelineConfig
 
 
@@ -62,53 +56,6 @@ class DiffSoundMethod:
         return fit_diffsound(task.train, task.family(), task.modes(), config, weighted=self.weighted)
 
 
-@dataclass(frozen=True)
-class SonicGaussMethod:
-    """The published architecture and weights, fine-tuned to each object, on CUDA where there is a GPU."""
-
-    folder: Path
-    """Holds the published files."""
-    sizes: PublishedSizes = field(default_factory=PublishedSizes)
-    epochs: int = EPOCHS
-
-    @property
-    def name(self) -> str:
-        """`sonicgauss:` and the folder."""
-        return f"{PUBLISHED}{self.folder}"
-
-    def __repr__(self) -> str:
-        # Results of other weights are not mixed.
-        return f"SonicGaussMethod(weights {folder_digest(self.folder)}, {self.sizes}, {self.epochs})"
-
-    def fit(self, task: Task) -> TunedRenderer:
-        """Fine-tune. Raises AvmsfError for weights of another model, and for an object without Gaussians."""
-        model = PublishedSonicGauss.load(self.folder, self.sizes)
-        device = usable_device(task.device, raising=EvaluationError)
-        return fit_published(model.to(device), task.gaussians(), task.train, epochs=self.epochs, seed=task.seed)
-
-
-@dataclass(frozen=True)
-class SmallSonicGaussMethod:
-    """The small generator, trained from scratch on simulated objects, fine-tuned to each object."""
-
-    file: Path
-    """Weights that `python -m benchmarks baselines --parts sonicgauss-training` made."""
-    config: TrainingConfig = TUNING
-
-    @property
-    def name(self) -> str:
-        """`sonicgauss-small:` and the file."""
-        return f"{SMALL}{self.file}"
-
-    def __repr__(self) -> str:
-        digest = hashlib.sha256(self.file.read_bytes()).hexdigest()[:16]
-        return f"SmallSonicGaussMethod(weights {digest}, {self.config})"
-
-    def fit(self, task: Task) -> TunedRenderer:
-        """Fine-tune. Raises AvmsfError for a file of something else, and for an object without Gaussians."""
-        return fit_small(SmallWeights.read(self.file), task.gaussians(), task.train, self.config, seed=task.seed)
-
-
 @dataclass(frozen=True, eq=False)
 class Recorded:
     """Wav files, one a recording of the object, that are looked up by the contact of that recording.
@@ -130,10 +77,6 @@ class Recorded:
     """Samples that each file must have."""
 
     def __post_init__(self) -> None:
-        if len(self.contacts) != len(self.names):
-            raise EvaluationError.expected(
-                f"one for each of {len(self.contacts)} contacts", len(self.names), name="names"
-            )
         if not self.folder.is_dir():
             example = self.path(self.names[0]).name if self.names else "RECORDING.wav"
             raise EvaluationError.expected(
@@ -211,12 +154,14 @@ NEIGHBORS = 3
 
 @dataclass(frozen=True)
 class Baseline:
-    """A method without training."""
+    """A method without settings."""
 
     name: str
     """Name in tables."""
     make: Callable[[Task], Renderer] = field(repr=False)
     """Makes the renderer from the task's training recordings."""
+    weights: str = ""
+    """Digest of the weights that it starts from: results of other weights are not mixed."""
 
     def fit(self, task: Task) -> Renderer:
         """Make the renderer. Raises AvmsfError where it cannot."""
@@ -299,18 +244,18 @@ FIELDS = (
     _quick("field-unaligned", "unaligned"),
     # All steps end to end take long enough without two trials of dampings beforehand. The noise is
     # trained, as measuring it needs the modes.
-    UninformedField(_quick("field-no-initialization", damping="shared", noise_rate=0.1)),
+    replace(_quick("field-no-initialization", damping="shared", noise_rate=0.1), informed=False),
     _quick("field-no-residual", residual=False),
     # The warm-up moves no damping, so there is nothing to choose between.
     _quick("field-warmup", steps=0, damping="shared"),
     _paper("paper"),
     _paper("paper-positions", "paper-positions"),
-    UninformedField(_paper("paper-no-initialization")),
+    replace(_paper("paper-no-initialization"), informed=False),
     _paper("paper-unaligned", "paper-unaligned"),
     _paper("paper-no-residual", residual=False),
     _paper("paper-per-contact", damping="per-contact"),
-    GridField(_quick("field-grid"), QUICK_GRID),
-    GridField(_paper("paper-grid"), PAPER_GRID),
+    replace(_quick("field-grid"), grid=QUICK_GRID),
+    replace(_paper("paper-grid"), grid=PAPER_GRID),
 )
 """Configurations of the pipeline by name: the network with quick settings, other gains, ablations, the preset `paper`
 and its ablations, and choices from grids."""
@@ -327,11 +272,27 @@ def method_named(name: str) -> Method:
     if name in METHODS:
         return METHODS[name]
     expect_method(name)
-    if name.partition(":")[0] == PUBLISHED[:-1]:
-        return SonicGaussMethod(_given(name, PUBLISHED, "a folder", "with the published weights"))
-    if name.partition(":")[0] == SMALL[:-1]:
-        return SmallSonicGaussMethod(_given(name, SMALL, "a file", f"which this makes: {COMMAND}"))
+    kind = kind_of(name)
+    if kind == kind_of(PUBLISHED):
+        folder = _given(name, PUBLISHED, "a folder", "with the published weights")
+        return Baseline(f"{PUBLISHED}{folder}", partial(_published_sonicgauss, folder), folder_digest(folder))
+    if kind == kind_of(SMALL):
+        file = _given(name, SMALL, "a file", f"which this makes: {COMMAND}")
+        digest = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+        return Baseline(f"{SMALL}{file}", partial(_small_sonicgauss, file), digest)
     return RecordedMethod(_given(name, RECORDED, "a folder", "with a folder of wav files for every object"))
+
+
+def _published_sonicgauss(folder: Path, task: Task) -> TunedRenderer:
+    """Fine-tune the published architecture and weights, on CUDA where there is a GPU."""
+    model = PublishedSonicGauss.load(folder)
+    device = usable_device(task.device, raising=EvaluationError)
+    return fit_published(model.to(device), task.gaussians(), task.train, seed=task.seed)
+
+
+def _small_sonicgauss(file: Path, task: Task) -> TunedRenderer:
+    """Fine-tune the small generator, trained from scratch on simulated objects."""
+    return fit_small(SmallWeights.read(file), task.gaussians(), task.train, seed=task.seed)
 
 
 def _given(name: str, prefix: str, kind: Literal["a folder", "a file"], use: str) -> Path:
@@ -345,16 +306,3 @@ def _given(name: str, prefix: str, kind: Literal["a folder", "a file"], use: str
             value=name,
         )
     return path
-
-
-def report_of(renderer: Renderer) -> dict[str, Any]:
-    """Return what a method chose on its way to a renderer, as plain values; empty where it had no choice."""
-    if isinstance(renderer, SoundField):
-        return renderer.origin.report
-    if isinstance(renderer, TunedRenderer):
-        return dict(renderer.report)
-    if isinstance(renderer, SplineGains | DiffSound):
-        return renderer.report
-    if isinstance(renderer, MeanGains | MeanWaveform):
-        return {"neighbors": renderer.count}
-    return {}

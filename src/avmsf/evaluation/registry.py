@@ -1,7 +1,7 @@
 """The names and titles of methods and protocols; importing this loads nothing that computes."""
 
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
 from avmsf.errors import EvaluationError
@@ -62,22 +62,21 @@ _PATH_TITLES = {
 def expect_protocol(name: str) -> None:
     """Raise `EvaluationError`, which lists the known ones, for the name of no protocol."""
     if name not in PROTOCOL_NAMES:
-        raise EvaluationError(
-            f"expected a protocol of {', '.join(PROTOCOL_NAMES)}, got {name!r}{_guess(name, PROTOCOL_NAMES)}",
-            name="protocol",
-            value=name,
-        )
+        raise _unknown("protocol", name, PROTOCOL_NAMES)
 
 
 def expect_method(name: str) -> None:
     """Raise `EvaluationError`, which lists the known ones, for the name of no method."""
-    if name not in METHOD_TITLES and name.partition(":")[0] + ":" not in (PUBLISHED, SMALL, RECORDED):
-        raise EvaluationError(
-            f"expected a method of {', '.join(METHOD_TITLES)}, {PUBLISHED}FOLDER, {SMALL}FILE and {RECORDED}FOLDER, "
-            f"got {name!r}{_guess(name, tuple(METHOD_TITLES))}",
-            name="method",
-            value=name,
-        )
+    if name not in METHOD_TITLES and kind_of(name) not in _PATH_TITLES:
+        raise _unknown("method", name, METHOD_TITLES, f", {PUBLISHED}FOLDER, {SMALL}FILE and {RECORDED}FOLDER")
+
+
+def _unknown(kind: str, name: str, known: Iterable[str], others: str = "") -> EvaluationError:
+    near = difflib.get_close_matches(name, known, n=1)
+    advice = f"; did you mean {near[0]}?" if near else ""
+    return EvaluationError(
+        f"expected a {kind} of {', '.join(known)}{others}, got {name!r}{advice}", name=kind, value=name
+    )
 
 
 def expect_suited(method: str, protocol: str) -> None:
@@ -90,11 +89,6 @@ def expect_suited(method: str, protocol: str) -> None:
             name="method",
             value=method,
         )
-
-
-def _guess(name: str, known: Sequence[str]) -> str:
-    near = difflib.get_close_matches(name, known, n=1)
-    return f"; did you mean {near[0]}?" if near else ""
 
 
 def kind_of(method: str) -> str:

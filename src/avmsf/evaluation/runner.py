@@ -20,16 +20,15 @@ from avmsf.capture.impacts import Impacts
 from avmsf.datasets.dataset import Dataset, ObjectFacts
 from avmsf.errors import AvmsfError, EvaluationError
 from avmsf.evaluation.cases import Case, Places
-from avmsf.evaluation.field_methods import configured
+from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.localization import located, write_map
-from avmsf.evaluation.methods import report_of
 from avmsf.evaluation.modal_metrics import truth_at, truth_from_first_sample, truth_of
 from avmsf.evaluation.objects import draw_other_recording
 from avmsf.evaluation.page import keep_sound, listening_gain
 from avmsf.evaluation.protocols import EvaluationProtocol
 from avmsf.evaluation.results import ENCODER, CaseRecord, ObjectRecord, Outcome, ResultsFolder, failure_of
 from avmsf.evaluation.splits import MetricSettings, MetricValues, align_split, spread
-from avmsf.evaluation.task import FromFiles, Method, ReadsFeatures, Renderer, Task, expect_renderer
+from avmsf.evaluation.task import FromFiles, Method, ReadsFeatures, Renderer, Task, expect_renderer, report_of
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.body_family import BodyFamily
 from avmsf.field.gains.elastic import CandidateBodies
@@ -187,8 +186,7 @@ class CaseRun:
     def outcome(self, method: Method) -> Outcome:
         """Return what a method comes to; whatever it raises, but for an interruption, is its failure."""
         begun, shared = time.perf_counter(), self.shared
-        settings = configured(method)
-        recordings = self.scored if settings is None or settings.published else self.own
+        recordings = self.own if isinstance(method, FieldMethod) and not method.published else self.scored
         try:
             for each in (self.scored, recordings):
                 with self._sharing():
@@ -229,8 +227,8 @@ class CaseRun:
             return self.evaluation.metric_settings.values(
                 renderer, sounds, self.scored.test, self.truth, loudest=loudest
             ), {}
-        points, settings = self._shared(self.features)("surface").points, configured(method)
-        published = settings is not None and settings.published
+        points = self._shared(self.features)("surface").points
+        published = isinstance(method, FieldMethod) and method.published
         found = located(
             renderer,
             recordings.train,

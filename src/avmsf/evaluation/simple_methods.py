@@ -32,10 +32,41 @@ from avmsf.modal.synthesis import synthesize
 
 
 @dataclass(frozen=True, eq=False)
-class ModalBaseline(ABC):
-    """Modes of the training impacts, with gains that are made of the training contacts' own."""
+class _Trained:
+    """What is made of the training impacts alone."""
 
     train: Impacts
+
+    @property
+    def sample_rate(self) -> float:
+        """Samples per second, Hz."""
+        return self.train.sample_rate
+
+
+class _Neighbors:
+    """What is averaged over the nearest training impacts."""
+
+    train: Impacts
+    count: int
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.count <= len(self.train):
+            raise EvaluationError(
+                f"expected a count of 1 to {len(self.train)} nearest training impacts, got {self.count}",
+                name="count",
+                value=self.count,
+            )
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """How many are averaged, as plain values."""
+        return {"neighbors": self.count}
+
+
+@dataclass(frozen=True, eq=False)
+class ModalBaseline(_Trained, ABC):
+    """Modes of the training impacts, with gains that are made of the training contacts' own."""
+
     extraction: Extraction
     """Modes of the training impacts, and their gains in each of them, row for row."""
     noise: bool = field(default=False, kw_only=True)
@@ -51,11 +82,6 @@ class ModalBaseline(ABC):
                 name="extraction",
                 value=len(self.extraction.gains),
             )
-
-    @property
-    def sample_rate(self) -> float:
-        """Samples per second, Hz."""
-        return self.train.sample_rate
 
     @property
     def bank(self) -> ModalBank:
@@ -107,20 +133,14 @@ class ModalBaseline(ABC):
 
 
 @dataclass(frozen=True, eq=False)
-class WhiteNoise:
+class WhiteNoise(_Trained):
     """Gaussian white noise at the mean level of the training sounds, different for each contact.
 
     The level is the root mean square over the sound. (The paper says the same of its white noise, but its values are
     those of noise of peak one: see `avmsf.evaluation.metrics`.)
     """
 
-    train: Impacts
     seed: int = 0
-
-    @property
-    def sample_rate(self) -> float:
-        """Samples per second, Hz."""
-        return self.train.sample_rate
 
     def render(
         self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
@@ -140,15 +160,8 @@ class WhiteNoise:
 
 
 @dataclass(frozen=True, eq=False)
-class NearestRecording:
+class NearestRecording(_Trained):
     """The training sound whose contact is nearest."""
-
-    train: Impacts
-
-    @property
-    def sample_rate(self) -> float:
-        """Samples per second, Hz."""
-        return self.train.sample_rate
 
     def render(
         self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
@@ -158,7 +171,7 @@ class NearestRecording:
 
 
 @dataclass(frozen=True, eq=False)
-class MeanWaveform:
+class MeanWaveform(_Neighbors, _Trained):
     """The mean of the nearest training sounds, sample by sample: the paper's KNN. Phases cancel in it.
 
     With `by_direction`, where the directions of both sides are known, an impact's direction is part of where it is, by
@@ -166,19 +179,10 @@ class MeanWaveform:
     known here. Recordings are neighbors, each one, also those of one contact.
     """
 
-    train: Impacts
     count: int = 3
     """How many sounds are averaged."""
     by_direction: bool = False
     """Whether directions count as well as contacts."""
-
-    def __post_init__(self) -> None:
-        _expect_neighbors(self.train, self.count)
-
-    @property
-    def sample_rate(self) -> float:
-        """Samples per second, Hz."""
-        return self.train.sample_rate
 
     def render(
         self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
@@ -195,15 +199,15 @@ class MeanWaveform:
 
 
 @dataclass(frozen=True, eq=False)
-class MeanGains(ModalBaseline):
+class MeanGains(_Neighbors, ModalBaseline):
     """The modes with the mean of the nearest contacts' signed gains, in phase and in quadrature."""
 
     count: int = 3
     """How many contacts' gains are averaged."""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        _expect_neighbors(self.train, self.count)
+        ModalBaseline.__post_init__(self)
+        _Neighbors.__post_init__(self)
 
     def amplitudes_at(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts two_modes"]:
         """Return the mean of the nearest training contacts' gains in phase, then in quadrature."""
@@ -255,13 +259,6 @@ def _render(
         sample_rate=test.sample_rate,
         quadrature=quadrature,
     )
-
-
-def _expect_neighbors(train: Impacts, count: int) -> None:
-    if not 1 <= count <= len(train):
-        raise EvaluationError(
-            f"expected a count of 1 to {len(train)} nearest training impacts, got {count}", name="count", value=count
-        )
 
 
 @dataclass(frozen=True, eq=False)

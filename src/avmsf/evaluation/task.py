@@ -71,6 +71,11 @@ def expect_renderer(given: Any) -> Renderer:
     return renderer
 
 
+def report_of(renderer: Renderer) -> dict[str, Any]:
+    """Return what a method chose on its way to a renderer, as plain values; empty where it had no choice."""
+    return dict(getattr(getattr(renderer, "origin", renderer), "report", {}))
+
+
 VisualInput = Literal["surface", "positions", "visual", "unaligned", "paper", "paper-positions", "paper-unaligned"]
 """Features of an object's points. `surface`: positions of points on its mesh, or as `positions` without one.
 `positions`: only the positions of the points that visual features are of. `visual`: positions with visual features,
