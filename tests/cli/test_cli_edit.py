@@ -17,8 +17,8 @@ from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.edit import Options
 from avmsf.cli.progress import ProgressBar
 from avmsf.editing.material import RATIO_ONLY, change_material, rayleigh_damping
-from avmsf.editing.material_statistics import MaterialStatistics
 from avmsf.editing.modal_edit import EDITS, adjust_modes
+from avmsf.editing.reference import Reference
 from avmsf.errors import AvmsfError, EditError
 from avmsf.fem.material import CERAMIC, GLASS, STEEL, WOOD
 from avmsf.field.gains.family import Sites
@@ -271,8 +271,7 @@ def test_towards_a_materials_sound(field: Path, capsys: Streams) -> None:
     ringing = wood.bank.damping / ceramic().bank.damping
     assert float(ringing.median()) > 3.0
     # What it is of is what it was made before, and what is made of it before is what the sound is led on from.
-    common = MaterialStatistics.transform(change_material(ceramic(), GLASS, WOOD), WOOD, STEEL)
-    heard = common.reference(samples=2400, sample_rate=RATE, seed=3).describe()
+    heard = Reference.of_material(change_material(ceramic(), GLASS, WOOD), WOOD, STEEL, seed=3).describe()
     words = ["--from", "glass", "--to-material", "wood", "--pitch", "1", "--like-material", "steel", "--seed", "3"]
     both = edited(field, *words, *quick, name="both")
     assert [each["edit"] for each in both.origin.report[EDITS]] == ["change_material", "guided"]

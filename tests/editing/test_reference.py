@@ -10,14 +10,11 @@ import soundfile
 import torch
 
 from avmsf.editing.clips import level, levelled, resampled, with_length
-from avmsf.editing.material_statistics import MaterialStatistics
 from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
-from avmsf.editing.reference import Reference
-from avmsf.editing.start_search import band_spectrum
+from avmsf.editing.reference import Reference, _brightness, band_spectrum
 from avmsf.errors import AvmsfWarning, EditError
 from avmsf.fem.material import CERAMIC, WOOD
 from avmsf.field.gain_field import Gains
-from avmsf.modal.modes import ModalBank
 from factories.raising import raises, warns
 from factories.ringing_field import RATE, SameGains, ringing_field, sound_of
 
@@ -176,83 +173,37 @@ def test_a_reference_that_lacks_what_the_field_holds_is_said(tmp_path):
         Reference.read(low, sample_rate=RATE)
 
 
-def law(frequency: torch.Tensor, alpha: float, beta: float) -> torch.Tensor:
-    return 0.5 * (alpha + beta * (2 * math.pi * frequency).square())
-
-
-def made_statistics() -> MaterialStatistics:
-    generator = torch.Generator().manual_seed(0)
-    banks, gains = [], []
-    for size in (1.0, 30.0):
-        frequency = torch.exp(torch.linspace(math.log(200.0), math.log(3200.0), 50, dtype=torch.float64))
-        frequency = frequency * torch.exp(0.01 * torch.randn(50, dtype=torch.float64, generator=generator))
-        banks.append(ModalBank(frequency, law(frequency, 12.0, 4e-7)))
-        gains.append((size * (frequency / 200.0) ** -1.0).float())
-    return MaterialStatistics.of_modes(banks, gains, name="made")
-
-
-def test_statistics_find_the_law_the_slope_and_the_band():
-    found = made_statistics()
-    assert (found.alpha, found.beta) == (pytest.approx(12.0, rel=1e-6), pytest.approx(4e-7, rel=1e-6))
-    # Gains in inverse proportion to frequency fall by 6.02 dB an octave.
-    assert found.brightness == pytest.approx(-20 * math.log10(2), rel=0.01)
-    # With weights 1 / f, evenly spaced in log f from 200 Hz, half the weight lies below 2 / (1 + 1/16) times 200 Hz.
-    assert float(found.frequency[31:33].mean()) == pytest.approx(400 / (1 + 1 / 16), rel=0.05)
-
-
-def test_modes_that_are_muted_say_nothing_of_brightness():
-    whole = made_statistics()
+def test_brightness_is_the_slope_of_audible_gains():
     frequency = torch.exp(torch.linspace(math.log(200.0), math.log(3200.0), 50, dtype=torch.float64))
-    bank = ModalBank(frequency, law(frequency, 12.0, 4e-7))
-    gains = ((frequency / 200.0) ** -1.0).float()
-    for row in (0, 49):
-        muted = gains.clone()
-        muted[row] = 0.0
-        found = MaterialStatistics.of_modes([bank], [muted], name="muted")
-        assert found.brightness == pytest.approx(whole.brightness, rel=0.02)
+    gains = 200.0 / frequency
+    # Gains in inverse proportion to frequency fall by 6.02 dB an octave; muted modes say nothing of it.
+    for muted in (None, 0, 49):
+        heard = gains.clone() if muted is None else gains.index_fill(0, torch.tensor(muted), 0.0)
+        assert _brightness(frequency, heard) == pytest.approx(-20 * math.log10(2), rel=1e-6)
 
 
-def test_made_up_blows_have_the_statistics():
-    found, generator = made_statistics(), torch.Generator().manual_seed(1)
-    sounds = found.sounds(6, samples=4000, sample_rate=RATE, generator=generator)
-    again = found.sounds(6, samples=4000, sample_rate=RATE, generator=torch.Generator().manual_seed(1))
-    assert torch.equal(sounds, again)
-    assert not torch.allclose(sounds[0], sounds[1])
-    power = torch.fft.rfft(sounds.double()).abs().square().sum(0)
-    hertz = torch.fft.rfftfreq(4000, 1 / RATE)
-    # The modes lie from 200 to 3,200 Hz, and are some ten hertz wide.
-    assert float(power[(hertz > 150) & (hertz < 3500)].sum() / power.sum()) > 0.97
-    # All modes at half the rate or above sound nowhere.
-    high = MaterialStatistics("high", found.frequency * 100, 1.0, 0.0, 0.0)
-    with raises(EditError, name="frequency", value=float(high.frequency[0])):
-        high.sounds(1, samples=100, sample_rate=RATE, generator=generator)
-
-
-def test_another_material_of_the_same_object():
+def test_made_up_impacts_are_of_the_object_in_another_material():
     field = ringing_field()
-    found = MaterialStatistics.transform(field, CERAMIC, WOOD)
+    made, again, other = (Reference.of_material(field, CERAMIC, WOOD, count=6, seed=seed) for seed in (1, 1, 2))
+    assert made.name == "wood"
+    assert torch.equal(made.clips, again.clips)
+    assert not torch.allclose(made.clips, other.clips)
+    assert not torch.allclose(made.clips[0], made.clips[1])
+    power = torch.fft.rfft(made.clips.double()).abs().square().sum(0)
+    hertz = torch.fft.rfftfreq(field.samples, 1 / RATE)
     ratio = math.sqrt(WOOD.young / CERAMIC.young * CERAMIC.density / WOOD.density)
-    assert (found.alpha, found.beta, found.name) == (WOOD.alpha, WOOD.beta, "wood")
-    assert set(found.frequency.tolist()) <= set((ratio * field.bank.frequency).tolist())
-    start = found.reference(samples=4000, sample_rate=RATE).start(struck())
-    assert start.damping_factor > 2.0
+    lowest, highest = (ratio * float(each) for each in (field.bank.frequency[0], field.bank.frequency[-1]))
+    # Wood's modes are some ten hertz wide.
+    assert float(power[(hertz > 0.8 * lowest) & (hertz < 1.2 * highest)].sum() / power.sum()) > 0.95
+    assert made.start(struck()).damping_factor > 2.0
 
 
-def test_statistics_of_no_modes_are_refused():
-    with raises(EditError, name="banks", value=0):
-        MaterialStatistics.of_modes([], [], name="nothing")
-
-
-def test_statistics_of_objects_that_do_not_fit():
-    bank, ones = ringing_field().bank, torch.ones(6)
-    for gains, row, value in (
-        ([ones], None, 1),
-        ([ones, torch.ones(5)], 1, 5),
-        ([ones, 0 * ones], 1, 0.0),
-        ([math.inf * ones, ones], 0, math.inf),
-    ):
-        with raises(EditError, name="gains", row=row, value=value):
-            MaterialStatistics.of_modes([bank, bank], gains, name="things")
+def test_an_object_that_makes_no_sound_is_refused():
+    with raises(EditError, name="gains", value=0.0):
+        Reference.of_material(replace(ringing_field(), gain_field=SameGains(torch.zeros(6))), CERAMIC, WOOD)
+    # All modes at half the rate or above sound nowhere.
+    with raises(EditError, name="frequency"):
+        Reference.of_material(ringing_field(pitch=100.0), CERAMIC, WOOD)
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,9 +220,8 @@ def test_a_modes_size_does_not_depend_on_its_phase():
     field, turn = ringing_field(), torch.linspace(0.0, 1.5, 6)
     gains = field.gain_field.gains
     turned = replace(field, gain_field=Ahead(gains * torch.cos(turn), gains * torch.sin(turn)))
-    own, other = (MaterialStatistics.transform(each, CERAMIC, WOOD) for each in (field, turned))
-    torch.testing.assert_close(other.frequency, own.frequency)
-    assert other.brightness == pytest.approx(own.brightness, rel=1e-5)
+    own, other = (Reference.of_material(each, CERAMIC, WOOD, seed=0) for each in (field, turned))
+    torch.testing.assert_close(other.clips, own.clips, rtol=1e-4, atol=1e-4)
 
 
 def test_an_edit_starts_where_nothing_moves_alone():

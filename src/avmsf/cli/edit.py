@@ -34,7 +34,6 @@ from avmsf.cli.writing import Level, write_sound
 from avmsf.editing.distillation import DecoderDistillation
 from avmsf.editing.guided import PARAMETERISATIONS, Guide, GuidedEditProgress, edit_towards
 from avmsf.editing.material import LAWS, change_material, infer_material
-from avmsf.editing.material_statistics import MaterialStatistics
 from avmsf.editing.modal_edit import EDITS, adjust_modes, remarks, silenced
 from avmsf.editing.reference import Reference
 from avmsf.editing.stable_audio import StableAudio
@@ -219,8 +218,7 @@ def _guided(options: GuideOptions, field: SoundField, *, output: Path, old: Mate
 def _guide(options: GuideOptions, field: SoundField, old: Material | None) -> Guide:
     if options.like_material is not None:
         assert old is not None
-        common = MaterialStatistics.transform(field, old, material_named(options.like_material))
-        return common.reference(samples=field.samples, sample_rate=field.sample_rate, seed=options.config.seed)
+        return Reference.of_material(field, old, material_named(options.like_material), seed=options.config.seed)
     if options.prompt is None:
         return Reference.read(options.like, sample_rate=field.sample_rate)
     say(f"loading {options.model}")
