@@ -8,7 +8,7 @@ the model: the decoded result is a target like a recording.
 
 import math
 import warnings
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -17,72 +17,8 @@ from torch import Tensor
 from avmsf.editing.clips import levelled, resampled, with_length
 from avmsf.editing.config import DistillationConfig, check_prompt
 from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
+from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import AvmsfWarning, EditError
-
-
-@runtime_checkable
-class AudioDiffusion(Protocol):
-    """A frozen latent diffusion model from text to audio."""
-
-    @property
-    def name(self) -> str:
-        """Name in reports and checkpoints."""
-        ...
-
-    @property
-    def sample_rate(self) -> float:
-        """Of its waveforms, Hz."""
-        ...
-
-    @property
-    def channels(self) -> int:
-        """Of its waveforms: 2 for stereo."""
-        ...
-
-    @property
-    def device(self) -> torch.device:
-        """Where it computes."""
-        ...
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """Precision of the denoiser."""
-        ...
-
-    def describe(self) -> dict[str, Any]:
-        """Return its weights, window and precision, which identify it, as plain values."""
-        ...
-
-    def encode(self, waveforms: Float[Tensor, "contacts channels samples"]) -> Float[Tensor, "contacts dim frames"]:
-        """Return float32 latents of waveforms, continued by silence to the length that the model works at."""
-        ...
-
-    def decode(
-        self, latents: Float[Tensor, "contacts dim frames"], *, samples: int
-    ) -> Float[Tensor, "contacts channels samples"]:
-        """Return the first `samples` samples of the waveforms of latents, float32."""
-        ...
-
-    def embed(self, prompt: str, negative: str | None, *, seconds: float) -> Any:
-        """Return the conditioning of `denoised`: a prompt for a sound of this duration.
-
-        `negative` is a text to move away from; None is no text.
-        """
-        ...
-
-    def denoised(
-        self,
-        latents: Float[Tensor, "contacts dim frames"],
-        level: Float[Tensor, " contacts"],
-        conditioning: Any,
-        *,
-        guidance: float,
-    ) -> Float[Tensor, "contacts dim frames"]:
-        """Return the clean latents that the model sees in noisy ones, float32 (see the module's text).
-
-        With classifier-free guidance g the estimate is u + g (c - u), c with the prompt and u with the negative one.
-        """
-        ...
 
 
 def noised(
@@ -96,7 +32,7 @@ def noised(
 
 
 def partial_denoising(
-    model: AudioDiffusion,
+    model: StableAudio,
     noisy: Float[Tensor, "contacts dim frames"],
     level: Float[Tensor, " contacts"],
     conditioning: Any,
@@ -119,7 +55,7 @@ class DecoderDistillation:
 
     def __init__(
         self,
-        model: AudioDiffusion,
+        model: StableAudio,
         prompt: str,
         *,
         sample_rate: float,

@@ -48,6 +48,15 @@ class StableAudio:
         the model has.
         """
         self.pipeline, self.name = pipeline, name
+        self.sample_rate = float(pipeline.vae.config.sampling_rate)
+        """Of its waveforms, Hz."""
+        self.channels = int(pipeline.vae.config.audio_channels)
+        """Of its waveforms."""
+        weight = next(pipeline.transformer.parameters())
+        self.device: torch.device = weight.device
+        """Where it computes."""
+        self.dtype: torch.dtype = weight.dtype
+        """Precision of the denoiser."""
         for part in (pipeline.vae, pipeline.text_encoder, pipeline.projection_model, pipeline.transformer):
             part.eval().requires_grad_(False)
         pipeline.set_progress_bar_config(disable=True)
@@ -55,7 +64,6 @@ class StableAudio:
         self._longest = int(pipeline.transformer.config.sample_size)
         self._frames = self._longest if seconds is None else self._frames_of(seconds)
         self._reach = _reach(pipeline.vae.config.downsampling_ratios)
-        self._silence: Float[Tensor, "1 dim 1"] | None = None
 
     @classmethod
     def load(
@@ -79,33 +87,8 @@ class StableAudio:
         try:
             pipeline = pipeline.to(place)
         except torch.OutOfMemoryError as error:
-            raise EditError.expected(
-                f"one with memory for {name}",
-                str(place),
-                name="device",
-                advice="free memory, or choose the device cpu",
-            ) from error
+            raise _no_memory(name, place) from error
         return cls(pipeline, name=name, seconds=seconds)
-
-    @property
-    def sample_rate(self) -> float:
-        """Of its waveforms, Hz."""
-        return float(self.pipeline.vae.config.sampling_rate)
-
-    @property
-    def channels(self) -> int:
-        """Of its waveforms."""
-        return int(self.pipeline.vae.config.audio_channels)
-
-    @property
-    def device(self) -> torch.device:
-        """Where it computes."""
-        return next(self._denoiser.parameters()).device
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """Precision of the denoiser."""
-        return next(self._denoiser.parameters()).dtype
 
     def describe(self) -> dict[str, Any]:
         """Return a digest of its weights and configurations, the frames that it works at, and its precision."""
@@ -113,12 +96,21 @@ class StableAudio:
 
     @cached_property
     def _digest(self) -> str:
-        return _digest_of(self.pipeline)
-
-    @property
-    def _denoiser(self) -> nn.Module:
-        denoiser: nn.Module = self.pipeline.transformer
-        return denoiser
+        """What tells it from others wherever its files are: of its settings and samples of its weights."""
+        found = hashlib.sha256()
+        for part in (*_NETWORKS, "scheduler"):
+            config = getattr(self.pipeline, part).config
+            settings = config if isinstance(config, dict) else config.to_dict()
+            # Those that begin with an underscore name the folder and the libraries' versions.
+            plain = {key: each for key, each in settings.items() if not key.startswith("_") and key not in _ON_SAVING}
+            found.update(f"{part} {json.dumps(plain, sort_keys=True, default=str)}".encode())
+        for part in _NETWORKS:
+            for key, weight in getattr(self.pipeline, part).state_dict().items():
+                rows = torch.linspace(0, weight.numel() - 1, min(weight.numel(), _SAMPLED), dtype=torch.float64).long()
+                sampled = weight.flatten()[rows.to(weight.device)].cpu().double()
+                found.update(f"{part} {key} {weight.dtype} {tuple(weight.shape)}".encode())
+                found.update(sampled.numpy().tobytes())
+        return found.hexdigest()
 
     def encode(self, waveforms: Float[Tensor, "contacts channels samples"]) -> Float[Tensor, "contacts dim frames"]:
         """Return the means of the autoencoder's latents, continued by silence to the frames that are worked at."""
@@ -138,7 +130,7 @@ class StableAudio:
         latents = self._encoded(rows)
         if given == self._frames:
             return latents
-        silence = self._silent_latent().expand(len(latents), -1, self._frames - sounding)
+        silence = self._silence.expand(len(latents), -1, self._frames - sounding)
         return torch.cat([latents[:, :, :sounding], silence], dim=2)
 
     def decode(
@@ -186,7 +178,7 @@ class StableAudio:
             repeat_interleave_real=False,
         )
         with torch.no_grad():
-            predicted = self._denoiser(
+            predicted = self.pipeline.transformer(
                 scheduler.precondition_inputs(noisy, sigma).repeat(len(taken), 1, 1).to(self.dtype),
                 scheduler.precondition_noise(sigma).flatten().repeat(len(taken)),
                 encoder_hidden_states=conditioning.text[rows],
@@ -218,34 +210,22 @@ class StableAudio:
         words = check_prompt(prompt)
         self._frames_of(seconds)
         try:
-            latents = self._sampled(words, seconds, seed, negative=negative, steps=steps, guidance=guidance)
+            with warnings.catch_warnings():
+                # Its schedule ends at 500 in float32, a last digit beyond what the sampler's noise was made for.
+                warnings.filterwarnings("ignore", message="Should have t[ab]")
+                # Latents, for the pipeline would give the autoencoder the denoiser's precision.
+                latents = self.pipeline(
+                    words,
+                    audio_end_in_s=seconds,
+                    negative_prompt=negative,
+                    num_inference_steps=steps,
+                    guidance_scale=guidance,
+                    generator=generator_of(seed),
+                    output_type="latent",
+                ).audios
             return self.decode(latents, samples=round(seconds * self.sample_rate))[0].mean(dim=0).cpu()
         except torch.OutOfMemoryError as error:
-            raise EditError.expected(
-                f"one with memory for a sound of {self.name}",
-                str(self.device),
-                name="device",
-                advice="free memory, or choose the device cpu",
-            ) from error
-
-    def _sampled(
-        self, words: str, seconds: float, seed: Seed, *, negative: str | None, steps: int, guidance: float
-    ) -> Float[Tensor, "1 dim frames"]:
-        """Return the latents that the pipeline makes of words."""
-        with warnings.catch_warnings():
-            # Its schedule ends at 500 in float32, a last digit beyond what the sampler's noise was made for.
-            warnings.filterwarnings("ignore", message="Should have t[ab]")
-            # Latents, for the pipeline would give the autoencoder the denoiser's precision.
-            latents: Tensor = self.pipeline(
-                words,
-                audio_end_in_s=seconds,
-                negative_prompt=negative,
-                num_inference_steps=steps,
-                guidance_scale=guidance,
-                generator=generator_of(seed),
-                output_type="latent",
-            ).audios
-        return latents
+            raise _no_memory(f"a sound of {self.name}", self.device) from error
 
     def _frames_of(self, seconds: float) -> int:
         """Return how many frames hold a length of time. Raises `EditError` for more than the model has."""
@@ -259,11 +239,11 @@ class StableAudio:
             latents: Tensor = self.pipeline.vae.encode(waveforms.to(self.device).float()).latent_dist.mode()
         return latents
 
-    def _silent_latent(self) -> Float[Tensor, "1 dim 1"]:
-        if self._silence is None:
-            silence = torch.zeros(1, self.channels, (2 * self._reach + 1) * self._hop)
-            self._silence = self._encoded(silence)[:, :, self._reach : self._reach + 1]
-        return self._silence
+    @cached_property
+    def _silence(self) -> Float[Tensor, "1 dim 1"]:
+        """The latent of silence."""
+        silence = torch.zeros(1, self.channels, (2 * self._reach + 1) * self._hop)
+        return self._encoded(silence)[:, :, self._reach : self._reach + 1]
 
 
 def _reach(strides: list[int]) -> int:
@@ -294,56 +274,52 @@ def _load_pipeline(source: str | Path, dtype: torch.dtype) -> tuple[Any, str]:
 
     All but its autoencoder is in `dtype`: in bfloat16 a waveform would have eight bits.
     """
-    kind = _pipeline_class()
-    folder = Path(source).expanduser()
-    named = not folder.is_dir()
-    if named and not is_hub_name(source):
+    kind, folder = _pipeline_class(), Path(source).expanduser()
+    here = folder.is_dir()
+    if not here and not is_hub_name(source):
         wanted = f"a folder with a {kind.__name__}, or a name of the hub such as {STABLE_AUDIO}"
         advice = "check the path"
         raise EditError.expected(wanted, str(source), got="no such folder", file=folder, name="source", advice=advice)
-    name = str(source) if named else folder.resolve().name
-    folder = _download(kind, name) if named else folder
+    name = folder.resolve().name if here else str(source)
     try:
+        place = folder if here else _downloaded(kind, name)
         with warnings.catch_warnings():
             # No user of this package can fix it.
             warnings.filterwarnings("ignore", message="`torch.nn.utils.weight_norm` is deprecated")
-            pipeline = kind.from_pretrained(folder, local_files_only=True, use_safetensors=True)
-        preconditions = [hasattr(pipeline.scheduler, each) for each in _PRECONDITIONING]
-        missing = {part: _missing_weights(folder / part, getattr(pipeline, part)) for part in _NETWORKS}
-    except Exception as error:  # whatever is wrong with the files, the libraries have their own errors
-        raise _unusable(folder, kind, " ".join(str(error).split())[:300]) from error
-    if not all(preconditions):
-        raise _unusable(folder, kind, f"the scheduler {type(pipeline.scheduler).__name__}, not of the EDM family")
-    for part, weights in missing.items():
-        if weights:
-            raise _unusable(folder, kind, f"{part} without {weights[0]} and {len(weights) - 1} other weights")
+            pipeline = kind.from_pretrained(place, local_files_only=True, use_safetensors=True)
+        for part in _PRECONDITIONING:
+            if not hasattr(pipeline.scheduler, part):
+                raise ValueError(f"the scheduler {type(pipeline.scheduler).__name__}, not of the EDM family")
+        for part in _NETWORKS:
+            missing = _missing_weights(place / part, getattr(pipeline, part))
+            if missing:
+                raise ValueError(f"{part} without {missing[0]} and {len(missing) - 1} other weights")
+    except Exception as error:  # diffusers, transformers, safetensors and the hub's client have their own errors
+        raise EditError.expected(
+            f"a complete {kind.__name__} of diffusers",
+            str(source),
+            got=f"none ({why_not(error)})",
+            file=folder if here else None,
+            name="source",
+            advice=f"copy it again; {_HOW_TO_GET.format(name=STABLE_AUDIO)}" if here else _HOW_TO_GET.format(name=name),
+        ) from error
     for part in _NETWORKS:
         # By hand, for how a pipeline is told its precision changed between versions of diffusers.
         getattr(pipeline, part).to(torch.float32 if part == "vae" else dtype)
     return pipeline, name
 
 
-def _download(kind: Any, name: str) -> Path:
+def _downloaded(kind: Any, name: str) -> Path:
     """Return the folder of a pipeline in the hub's cache, after downloading it where it is not there."""
     try:
         return Path(kind.download(name, local_files_only=True))
     except Exception:  # not there, or not complete; the client raises whatever it does
-        pass
-    try:
         return Path(kind.download(name))
-    except Exception as error:  # the hub's client raises whatever the network beneath it does
-        raise EditError(
-            f"{name}: expected a model in the cache or one that can be downloaded, got neither ({why_not(error)}); "
-            f"{_HOW_TO_GET.format(name=name)}",
-            name="source",
-            value=name,
-        ) from error
 
 
-def _unusable(folder: Path, kind: Any, found: str) -> EditError:
-    wanted = f"a complete {kind.__name__} of diffusers"
-    advice = f"copy it again; {_HOW_TO_GET.format(name=STABLE_AUDIO)}"
-    return EditError.expected(wanted, got=found, file=folder, name="source", advice=advice)
+def _no_memory(what: str, device: torch.device) -> EditError:
+    advice = "free memory, or choose the device cpu"
+    return EditError.expected(f"one with memory for {what}", str(device), name="device", advice=advice)
 
 
 def _missing_weights(folder: Path, network: nn.Module) -> list[str]:
@@ -358,24 +334,6 @@ def _missing_weights(folder: Path, network: nn.Module) -> list[str]:
     stored = {held[name].data_ptr() for name in there & held.keys()}
     # What shares its memory with a weight that is there is another name of it.
     return sorted(name for name, weight in held.items() if name not in there and weight.data_ptr() not in stored)
-
-
-def _digest_of(pipeline: Any) -> str:
-    """Return what tells a pipeline from others wherever its files are: of its settings and samples of its weights."""
-    found = hashlib.sha256()
-    for part in (*_NETWORKS, "scheduler"):
-        config = getattr(pipeline, part).config
-        settings = config if isinstance(config, dict) else config.to_dict()
-        # Those that begin with an underscore name the folder and the libraries' versions.
-        plain = {name: each for name, each in settings.items() if not name.startswith("_") and name not in _ON_SAVING}
-        found.update(f"{part} {json.dumps(plain, sort_keys=True, default=str)}".encode())
-    for part in _NETWORKS:
-        for name, weight in getattr(pipeline, part).state_dict().items():
-            rows = torch.linspace(0, weight.numel() - 1, min(weight.numel(), _SAMPLED), dtype=torch.float64).long()
-            sampled = weight.flatten()[rows.to(weight.device)].cpu().double()
-            found.update(f"{part} {name} {weight.dtype} {tuple(weight.shape)}".encode())
-            found.update(sampled.numpy().tobytes())
-    return found.hexdigest()
 
 
 def _pipeline_class() -> Any:
