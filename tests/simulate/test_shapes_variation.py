@@ -65,17 +65,6 @@ def test_no_tetrahedron_is_turned_inside_out(kind: str, part: float) -> None:
     assert float((varied.points - solid.points).norm(dim=1).max()) < 1.5 * part * solid.size
 
 
-def test_what_is_inside_goes_along() -> None:
-    solid = make_shape("blob").solid
-    inside = np.setdiff1d(np.arange(len(solid.points)), solid.boundary.numpy())
-    assert len(inside) > 100
-    varied = vary_thickness(solid, 0.1, generator=chance())
-    moved = (varied.points - solid.points).norm(dim=1).numpy()
-    assert moved[inside].mean() > 0.05 * moved.mean()
-    # Harmonic motion is largest on the surface.
-    assert moved[inside].max() <= moved[np.unique(solid.boundary.numpy())].max()
-
-
 def test_chance_decides_and_zero_changes_nothing() -> None:
     solid = make_shape("spoon").solid
     assert vary_thickness(solid, 0.0, generator=chance()) is solid

@@ -5,7 +5,6 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 import trimesh
@@ -25,42 +24,10 @@ from avmsf.simulate.sim20 import sim20_recipe
 from avmsf.simulate.simulation import Simulation, simulate_object
 from avmsf.simulate.simulation_folder import is_written, simulate_set, write_simulation, write_textured
 from avmsf.simulate.strikes import STEEPEST, draw_strikes, nearest_on
+from factories.made_tile import tile
 from factories.raising import raises
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-
-
-def sheet(path: Path, *, bend: float = 1.0) -> Path:
-    """Write a bent tile in four colors, open below; without a bend it is flat."""
-    across, along = np.meshgrid(np.linspace(-0.1, 0.1, 13), np.linspace(-0.07, 0.07, 9), indexing="ij")
-    places = np.stack([across, along, bend * (0.6 * across**2 + 0.3 * across * along)], axis=-1).reshape(-1, 3)
-    rows = np.arange(13 * 9).reshape(13, 9)
-    corners = [rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:]]
-    faces = np.stack([corners[0], corners[1], corners[2], corners[0], corners[2], corners[3]], axis=-1).reshape(-1, 3)
-    colors = np.array([[200, 40, 30], [30, 90, 200], [240, 220, 60], [70, 160, 80]], dtype=np.uint8)
-    painted = colors[(places[:, 0] > 0) + 2 * (places[:, 1] > 0)]
-    path.write_bytes(trimesh.Trimesh(places, faces, vertex_colors=painted, process=False).export(file_type="ply"))
-    return path
-
-
-@pytest.fixture(scope="module")
-def recipe(tmp_path_factory: pytest.TempPathFactory) -> ObjectRecipe:
-    """Return a coarse tile of a few hundred tetrahedra, briefly recorded."""
-    mesh = sheet(tmp_path_factory.mktemp("mesh") / "tile.ply")
-    return ObjectRecipe(
-        mesh=mesh, thickness=0.006, detail=0.15, elastic_modes=12, impacts=12, seconds=0.4, sample_rate=32000, views=3,
-        view_size=48,
-    )  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
-@pytest.fixture(scope="module")
-def simulation(recipe: ObjectRecipe, cache: Path) -> Simulation:
-    return simulate_object(recipe, cache=cache)
 
 
 def rings(simulation: Simulation) -> torch.Tensor:
@@ -248,14 +215,6 @@ def test_a_written_object_is_an_ordinary_capture_with_views_and_truth(simulation
     assert list(tmp_path.iterdir()) == [folder]
 
 
-def test_a_mesh_is_written_where_it_is_asked_for(simulation: Simulation, recipe: ObjectRecipe, tmp_path: Path) -> None:
-    for surface, files in ((True, {"surface.ply"}), (False, set())):
-        made = replace(simulation, recipe=replace(recipe, surface=surface))
-        write_simulation(made, tmp_path / str(surface))
-        assert {each.name for each in (tmp_path / str(surface)).glob("surface.*")} == files
-        assert len(read_views(tmp_path / str(surface))) == 3
-
-
 def test_the_same_recipe_gives_the_same_bytes(recipe: ObjectRecipe, tmp_path: Path) -> None:
     digests = []
     for folder in (tmp_path / "one", tmp_path / "two"):
@@ -344,7 +303,7 @@ def test_recipes_that_describe_nothing_are_refused(recipe: ObjectRecipe, name: s
 
 def test_a_sheet_without_a_wall_is_told_to_have_one(recipe: ObjectRecipe, tmp_path: Path) -> None:
     # Flat: of a bent one the filling sometimes makes a sliver, by chance.
-    flat = sheet(tmp_path / "tile.ply", bend=0.0)
+    flat = tile(tmp_path / "tile.ply", bend=0.0)
     with raises(SimulationError, file=flat, name="volume") as caught:
         simulate_object(replace(recipe, mesh=flat, thickness=None))
     assert "--thickness" in str(caught.value)

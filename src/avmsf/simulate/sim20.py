@@ -5,27 +5,10 @@ from avmsf.simulate.recipe import ObjectRecipe
 
 SET = "sim-20"
 _OBJECTS = (
-    ("mug", "ceramic"),
-    ("bowl", "glass"),
-    ("skillet", "iron"),
-    ("plate", "ceramic"),
-    ("spoon", "steel"),
-    ("goblet", "glass"),
-    ("bracket", "steel"),
-    ("bell", "iron"),
-    ("blob", "polycarbonate"),
-    ("pot", "steel"),
-    ("dish", "ceramic"),
-    ("fluted", "ceramic"),
-    ("jug", "glass"),
-    ("tray", "polycarbonate"),
-    ("mug", "plastic"),
-    ("tube", "steel"),
-    ("spoon", "wood"),
-    ("platter", "wood"),
-    ("jug", "ceramic"),
-    ("bowl", "wood"),
-)
+    "mug-ceramic bowl-glass skillet-iron plate-ceramic spoon-steel goblet-glass bracket-steel bell-iron "
+    "blob-polycarbonate pot-steel dish-ceramic fluted-ceramic jug-glass tray-polycarbonate mug-plastic tube-steel "
+    "spoon-wood platter-wood jug-ceramic bowl-wood"
+).split()
 """Kinds and materials; an object's place here, counted from 1, is its seed."""
 _WALLS = {
     "mug-ceramic": 0.003,
@@ -39,8 +22,8 @@ _SIZES = {"blob-polycarbonate": 0.5, "tube-steel": 0.5}
 """Walls and longest sides that differ from what is drawn, meters: where few modes would be heard, or most too low."""
 SIM20 = {
     name: ObjectRecipe(kind=kind, material=material, seed=seed, size=_SIZES.get(name), thickness=_WALLS.get(name))
-    for seed, (kind, material) in enumerate(_OBJECTS, start=1)
-    for name in (f"{kind}-{material}",)
+    for seed, name in enumerate(_OBJECTS, start=1)
+    for kind, material in (name.split("-"),)
 }
 """Recipes by the objects' names, in the order in which they are made."""
 NON_SYMMETRIC = tuple(

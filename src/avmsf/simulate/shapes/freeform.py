@@ -30,16 +30,9 @@ def dish(random: np.random.Generator, wall: float | None) -> Draft:
         return values[:, 0] * (1.0 + out * along), values[:, 1] + radius * up * along**2
 
     body = Body()
-    profile = Profile(
-        [
-            (0.0, 0.0, 1.2 * wall),
-            (0.55 * radius, 0.0, 1.2 * wall),
-            (0.8 * radius, 0.25 * height, wall),
-            (radius, height, 0.9 * wall),
-        ]
-    )
-    Turned.lay(body, profile, warp=warp)
-    return Draft(body, wall, Symmetry("none"))
+    corners = [(0.0, 0.0, 1.2), (0.55, 0.0, 1.2), (0.8, 0.25, 1.0), (1.0, 1.0, 0.9)]
+    Turned.lay(body, Profile.scaled(radius, height, wall, corners), warp=warp)
+    return Draft(body, wall, Symmetry())
 
 
 def blob(random: np.random.Generator, wall: float | None) -> Draft:
@@ -75,7 +68,7 @@ def blob(random: np.random.Generator, wall: float | None) -> Draft:
     body.fill(placed[cells])
     layers = np.stack([shaped(ball) * scale for ball in balls])
     body.grow(triangles.reshape(-1, 3), np.arange(len(rows)), placed[rows], layers)
-    return Draft(body, flat, Symmetry("none"))
+    return Draft(body, flat, Symmetry())
 
 
 def _boxes(numbers: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:

@@ -107,20 +107,8 @@ def mug(random: np.random.Generator, wall: float | None) -> Draft:
     wall = drawn_wall(random, 0.0035, 0.005, wall)
     height = tall * radius
     body = Body()
-    turned = Turned.lay(
-        body,
-        Profile(
-            [
-                (0.0, 0.0, 1.2 * wall),
-                (0.9 * narrow * radius, 0.0, 1.2 * wall),
-                (narrow * radius, 0.03 * height, wall),
-                (radius, 0.45 * height, wall),
-                (radius, height, 0.9 * wall),
-            ]
-        ),
-        points=800,
-        crowd=_CROWD,
-    )
+    corners = [(0.0, 0.0, 1.2), (0.9 * narrow, 0.0, 1.2), (narrow, 0.03, 1.0), (1.0, 0.45, 1.0), (1.0, 1.0, 0.9)]
+    turned = Turned.lay(body, Profile.scaled(radius, height, wall, corners), points=800, crowd=_CROWD)
     reach, low = random.uniform(0.75, 0.95) * radius, random.uniform(0.2, 0.3)
     _add_handle(body, turned, low * height, random.uniform(0.74, 0.82) * height, reach, random)
     return Draft(body, wall, _mirrored())
@@ -142,24 +130,11 @@ def jug(random: np.random.Generator, wall: float | None) -> Draft:
         return values[:, 0] * (1.0 + lip * part * near) + tilted, values[:, 1] + 0.12 * radius * part * near
 
     body = Body()
-    turned = Turned.lay(
-        body,
-        Profile(
-            [
-                (0.0, 0.0, 1.2 * wall),
-                (0.75 * radius, 0.0, 1.2 * wall),
-                (1.2 * radius, 0.3 * height, wall),
-                (neck * radius, 0.75 * height, wall),
-                (1.1 * neck * radius, height, wall),
-            ]
-        ),
-        points=800,
-        crowd=_CROWD,
-        warp=warp,
-    )
+    corners = [(0.0, 0.0, 1.2), (0.75, 0.0, 1.2), (1.2, 0.3, 1.0), (neck, 0.75, 1.0), (1.1 * neck, 1.0, 1.0)]
+    turned = Turned.lay(body, Profile.scaled(radius, height, wall, corners), points=800, crowd=_CROWD, warp=warp)
     reach = random.uniform(0.9, 1.1) * radius
     _add_handle(body, turned, random.uniform(0.38, 0.45) * height, 0.82 * height, reach, random)
-    return Draft(body, wall, Symmetry("none"))
+    return Draft(body, wall, Symmetry())
 
 
 def skillet(random: np.random.Generator, wall: float | None) -> Draft:
@@ -169,19 +144,8 @@ def skillet(random: np.random.Generator, wall: float | None) -> Draft:
     wall = drawn_wall(random, 0.003, 0.0045, wall)
     height = depth * radius
     body = Body()
-    turned = Turned.lay(
-        body,
-        Profile(
-            [
-                (0.0, 0.0, 1.2 * wall),
-                (0.8 * radius, 0.0, 1.2 * wall),
-                (0.9 * radius, 0.15 * height, wall),
-                (radius, height, wall),
-            ]
-        ),
-        points=760,
-        crowd=_CROWD,
-    )
+    corners = [(0.0, 0.0, 1.2), (0.8, 0.0, 1.2), (0.9, 0.15, 1.0), (1.0, 1.0, 1.0)]
+    turned = Turned.lay(body, Profile.scaled(radius, height, wall, corners), points=760, crowd=_CROWD)
     ring = _ring_at(turned, 0.6 * height, _BANDS)
     patch = turned.side_patch(range(ring, ring + _BANDS + 1), _HALF)
     start = turned.outside(patch)
@@ -245,4 +209,4 @@ def _ring_at(turned: Turned, height: float, bands: int) -> int:
 
 
 def _mirrored() -> Symmetry:
-    return Symmetry("one mirror plane, y = 0", mirrors=torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64))
+    return Symmetry(mirrors=torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64))

@@ -26,8 +26,6 @@ def _no_planes() -> Tensor:
 class Symmetry:
     """Rotations about one axis and mirror planes that are symmetries of a shape; compositions are not listed."""
 
-    words: str
-    """For people, such as "one mirror plane"."""
     axis: Float64[Tensor, " 3"] | None = None
     """Direction of the axis, a unit vector; None where no turn is a symmetry."""
     order: int | None = None
@@ -37,11 +35,6 @@ class Symmetry:
     """Unit normals of mirror planes, apart from those that contain an axis of every angle."""
     point: Float64[Tensor, " 3"] = field(default_factory=_origin)
     """A point of the axis and of all planes, object frame, meters."""
-
-    @property
-    def none(self) -> bool:
-        """Whether the shape has no symmetry but the identity."""
-        return self.axis is None and not len(self.mirrors)
 
 
 @dataclass(frozen=True, eq=False)

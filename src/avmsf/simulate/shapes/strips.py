@@ -65,8 +65,8 @@ def platter(random: np.random.Generator, wall: float | None) -> Draft:
     grid = _even_grid(length, width * length)
     places = grid.parts * (0.5 * length, 0.5 * width * length)
     middle = np.concatenate([places, np.zeros((len(places), 1))], axis=1)
-    words = "half turns about x, y and z and the three mirror planes between them"
-    symmetry = Symmetry(words, _UP, 2, torch.eye(3, dtype=torch.float64))
+    # Half turns about x, y and z.
+    symmetry = Symmetry(_UP, 2, torch.eye(3, dtype=torch.float64))
     return Draft(_body(grid, middle, np.full(len(middle), wall)), wall, symmetry)
 
 
@@ -86,7 +86,7 @@ def tray(random: np.random.Generator, wall: float | None) -> Draft:
         ],
         axis=1,
     )
-    symmetry = Symmetry("half turn about z and two mirror planes that contain it", _UP, 2, torch.eye(3).double()[:2])
+    symmetry = Symmetry(_UP, 2, torch.eye(3).double()[:2])
     return Draft(_body(grid, middle, np.full(len(middle), wall)), wall, symmetry)
 
 
@@ -109,7 +109,7 @@ def bracket(random: np.random.Generator, wall: float | None) -> Draft:
     middle = np.stack([x, flat[:, 1], z], axis=1)
     body = Body()
     body.lay(Sheet.of(middle, np.full(len(middle), wall), grid.triangles[kept], grid.order))
-    return Draft(body, wall, Symmetry("none"))
+    return Draft(body, wall, Symmetry())
 
 
 def spoon(random: np.random.Generator, wall: float | None) -> Draft:
@@ -158,7 +158,7 @@ def spoon(random: np.random.Generator, wall: float | None) -> Draft:
     body = Body()
     body.lay(Sheet.of(middle, walls, triangles, order))
     mirror = torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64)
-    return Draft(body, wall, Symmetry("one mirror plane, y = 0", mirrors=mirror))
+    return Draft(body, wall, Symmetry(mirrors=mirror))
 
 
 def _even_grid(length: float, width: float) -> Grid:

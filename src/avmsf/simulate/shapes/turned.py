@@ -125,6 +125,13 @@ class Profile:
     """Radius, height and thickness, meters; the curve starts at the first, ends at the last and rounds those between.
     At the axis the first two have one height, so that the curve crosses it level."""
 
+    @classmethod
+    def scaled(
+        cls, radius: float, height: float, wall: float, corners: Sequence[tuple[float, float, float]]
+    ) -> "Profile":
+        """Return the profile whose corners are multiples of a radius, a height and a wall."""
+        return cls([(out * radius, up * height, thick * wall) for out, up, thick in corners])
+
     @cached_property
     def _curve(self) -> tuple[Float64[np.ndarray, " fine"], Float64[np.ndarray, "fine 3"]]:
         """Places along the curve, 0 to 1 of its length, and radius, height and thickness there."""

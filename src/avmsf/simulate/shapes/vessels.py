@@ -20,16 +20,8 @@ def bowl(random: np.random.Generator, wall: float | None) -> Draft:
     wall = drawn_wall(random, 0.003, 0.0055, wall)
     height = depth * radius
     body = Body()
-    profile = Profile(
-        [
-            (0.0, 0.0, 1.25 * wall),
-            (bottom * radius, 0.0, 1.25 * wall),
-            (belly * radius, 0.15 * height, wall),
-            (0.97 * radius, 0.7 * height, wall),
-            (radius, height, 0.9 * wall),
-        ]
-    )
-    turned = Turned.lay(body, profile)
+    corners = [(0.0, 0.0, 1.25), (bottom, 0.0, 1.25), (belly, 0.15, 1.0), (0.97, 0.7, 1.0), (1.0, 1.0, 0.9)]
+    turned = Turned.lay(body, Profile.scaled(radius, height, wall, corners))
     _stand(body, turned, 0.42 * radius, random.uniform(0.004, 0.008))
     return Draft(body, wall, _round())
 
@@ -40,16 +32,8 @@ def plate(random: np.random.Generator, wall: float | None) -> Draft:
     flat = random.uniform(0.55, 0.68)
     wall = drawn_wall(random, 0.0035, 0.0055, wall)
     body = Body()
-    profile = Profile(
-        [
-            (0.0, 0.0, wall),
-            (flat * radius, 0.0, wall),
-            ((flat + 0.12) * radius, 0.65 * rise, wall),
-            ((flat + 0.2) * radius, 0.85 * rise, wall),
-            (radius, rise, 0.9 * wall),
-        ]
-    )
-    turned = Turned.lay(body, profile)
+    corners = [(0.0, 0.0, 1.0), (flat, 0.0, 1.0), (flat + 0.12, 0.65, 1.0), (flat + 0.2, 0.85, 1.0), (1.0, 1.0, 0.9)]
+    turned = Turned.lay(body, Profile.scaled(radius, rise, wall, corners))
     _stand(body, turned, 0.8 * flat * radius, random.uniform(0.003, 0.005))
     return Draft(body, wall, _round())
 
@@ -103,19 +87,8 @@ def bell(random: np.random.Generator, wall: float | None) -> Draft:
     wall = drawn_wall(random, 0.003, 0.0045, wall)
     height = tall * radius
     body = Body()
-    turned = Turned.lay(
-        body,
-        Profile(
-            [
-                (0.0, height, 1.2 * wall),
-                (shoulder * radius, height, 1.2 * wall),
-                (waist * radius, 0.75 * height, wall),
-                (waist * 1.15 * radius, 0.3 * height, wall),
-                (radius, 0.0, 1.5 * wall),
-            ]
-        ),
-        points=800,
-    )
+    corners = [(0.0, 1.0, 1.2), (shoulder, 1.0, 1.2), (waist, 0.75, 1.0), (waist * 1.15, 0.3, 1.0), (1.0, 0.0, 1.5)]
+    turned = Turned.lay(body, Profile.scaled(radius, height, wall, corners), points=800)
     distance = np.hypot(*turned.sheet.middle[turned.rings.starts[:-1], :2].T)
     patch = turned.middle_patch(max(1, int(np.argmin(np.abs(distance - grip_radius)))), lower=False)
     start = turned.top(patch)
@@ -134,7 +107,7 @@ def tube(random: np.random.Generator, wall: float | None) -> Draft:
     body = Body()
     # Outwards is upwards here, so that the lower side of the wall is the tube's outside.
     Turned.lay(body, Profile([(radius, height * length, wall) for height in (-0.5, 0.0, 0.5)]))
-    return Draft(body, wall, Symmetry("every turn about z, a mirror plane across it", _UP, None, _UP[None].clone()))
+    return Draft(body, wall, Symmetry(_UP, None, _UP[None].clone()))
 
 
 def pot(random: np.random.Generator, wall: float | None) -> Draft:
@@ -144,20 +117,10 @@ def pot(random: np.random.Generator, wall: float | None) -> Draft:
     wall = drawn_wall(random, 0.004, 0.006, wall)
     height, sides = tall * radius, 6
     body = Body()
-    Turned.lay(
-        body,
-        Profile(
-            [
-                (0.0, 0.0, 1.2 * wall),
-                (0.93 * radius, 0.0, 1.2 * wall),
-                (radius, 0.1 * height, wall),
-                (0.5 * (1 + flare) * radius, 0.6 * height, wall),
-                (flare * radius, height, wall),
-            ]
-        ),
-        fold=sides,
-        warp=_polygon(sides, edged),
-    )
+    half = 0.5 * (1 + flare)
+    corners = [(0.0, 0.0, 1.2), (0.93, 0.0, 1.2), (1.0, 0.1, 1.0), (half, 0.6, 1.0), (flare, 1.0, 1.0)]
+    profile = Profile.scaled(radius, height, wall, corners)
+    Turned.lay(body, profile, fold=sides, warp=_polygon(sides, edged))
     return Draft(body, wall, _turning(sides))
 
 
@@ -174,19 +137,8 @@ def fluted(random: np.random.Generator, wall: float | None) -> Draft:
         return values[:, 0] * (1.0 + deep * wave), values[:, 1] + wavy * radius * wave
 
     body = Body()
-    Turned.lay(
-        body,
-        Profile(
-            [
-                (0.0, 0.0, 1.2 * wall),
-                (0.5 * radius, 0.0, 1.2 * wall),
-                (0.85 * radius, 0.3 * height, wall),
-                (radius, height, wall),
-            ]
-        ),
-        fold=lobes,
-        warp=warp,
-    )
+    corners = [(0.0, 0.0, 1.2), (0.5, 0.0, 1.2), (0.85, 0.3, 1.0), (1.0, 1.0, 1.0)]
+    Turned.lay(body, Profile.scaled(radius, height, wall, corners), fold=lobes, warp=warp)
     return Draft(body, wall, _turning(lobes))
 
 
@@ -214,10 +166,10 @@ def _polygon(sides: int, edged: float) -> Warp:
 
 
 def _round() -> Symmetry:
-    return Symmetry("every turn about z", _UP, None)
+    return Symmetry(_UP, None)
 
 
 def _turning(order: int) -> Symmetry:
     angles = torch.arange(order, dtype=torch.float64) * (math.pi / order) + 0.5 * math.pi
     normals = torch.stack([torch.cos(angles), torch.sin(angles), torch.zeros_like(angles)], dim=1)
-    return Symmetry(f"turns by 1/{order} about z and {order} mirror planes that contain it", _UP, order, normals)
+    return Symmetry(_UP, order, normals)
