@@ -17,7 +17,7 @@ from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
 from avmsf.simulate.hammer import contact_times, pulse_spectrum
 from avmsf.simulate.imperfections import recording_starts, stream
 from avmsf.simulate.recipe import Hammer, Imperfections, ObjectRecipe
-from avmsf.simulate.simulation import Simulation, recorded, ring, simulate_object
+from avmsf.simulate.simulation import Simulation, recorded, simulate_object
 from avmsf.simulate.simulation_folder import write_simulation
 from factories.made_modes import breathing_sphere
 
@@ -52,10 +52,10 @@ def test_starts_have_the_asked_mean_and_spread_and_any_fraction_of_a_sample() ->
 def test_without_these_imperfections_recordings_start_with_their_impacts(recipe: ObjectRecipe, cache: Path) -> None:
     made = simulate_object(replace(recipe, imperfections=Imperfections.none(), noise_db=None), cache=cache)
     truth, rate = made.truth, float(recipe.sample_rate)
-    plain = ring(made.body.vibration.poles, truth.amplitudes, sample_rate=rate, samples=12800)
+    assert truth.starts is not None
+    plain = recorded(made.body.vibration.poles, truth.amplitudes, truth.starts, sample_rate=rate, samples=12800)
     assert torch.equal(made.recordings, plain.float())
     assert torch.equal(made.capture.impacts.sounds, made.recordings)
-    assert truth.starts is not None
     assert truth.starts.tolist() == [0.0] * 12
     assert not made.capture.settings.align
 

@@ -41,7 +41,7 @@ from avmsf.modal.residual_noise import Residual
 from avmsf.simulate.imperfections import stream
 from avmsf.simulate.recipe import Hammer
 from avmsf.simulate.shapes import make_shape
-from avmsf.simulate.simulation import HIGHEST, SoundingBody, ring
+from avmsf.simulate.simulation import HIGHEST, SoundingBody, recorded
 
 _CERAMIC = ("3_CeramicKoiBowl", "4_CeramicBowlFish", "9_BowlCeramic", "61_PlanterCeramic", "63_SmallPlanterCeramic",
             "64_CeramicMug", "65_PitcherCeramic")  # fmt: skip
@@ -223,7 +223,8 @@ class SolvedShape:
         places = elastic.nodes[self._spread[:_CONTACTS]]
         directions = -elastic.normals(places)
         amplitudes = body.gains(places, directions)
-        sounds = ring(vibration.poles, amplitudes, sample_rate=sample_rate, samples=round(seconds * sample_rate))
+        starts, samples = torch.zeros(len(places), dtype=torch.float64), round(seconds * sample_rate)
+        sounds = recorded(vibration.poles, amplitudes, starts, sample_rate=sample_rate, samples=samples)
         impacts = Impacts(
             contacts=places,
             sounds=sounds.float(),

@@ -5,10 +5,10 @@ from avmsf.simulate.recipe import ObjectRecipe
 
 SET = "sim-20"
 _OBJECTS = (
-    "mug-ceramic bowl-glass skillet-iron plate-ceramic spoon-steel goblet-glass bracket-steel bell-iron "
-    "blob-polycarbonate pot-steel dish-ceramic fluted-ceramic jug-glass tray-polycarbonate mug-plastic tube-steel "
-    "spoon-wood platter-wood jug-ceramic bowl-wood"
-).split()
+    "mug-ceramic", "bowl-glass", "skillet-iron", "plate-ceramic", "spoon-steel", "goblet-glass", "bracket-steel",
+    "bell-iron", "blob-polycarbonate", "pot-steel", "dish-ceramic", "fluted-ceramic", "jug-glass", "tray-polycarbonate",
+    "mug-plastic", "tube-steel", "spoon-wood", "platter-wood", "jug-ceramic", "bowl-wood",
+)  # fmt: skip
 """Kinds and materials; an object's place here, counted from 1, is its seed."""
 _WALLS = {
     "mug-ceramic": 0.003,

@@ -21,15 +21,13 @@ from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.radiation import radiated, travel_time
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh
+from avmsf.modal.synthesis import synthesize
 from avmsf.simulate.bodies import Body, make_body, up_of
 from avmsf.simulate.ground_truth import Truth
 from avmsf.simulate.hammer import contact_times, peak_forces, pulse_spectrum
 from avmsf.simulate.imperfections import damping_matrix, recording_starts, stream
 from avmsf.simulate.recipe import Hammer, ObjectRecipe
 from avmsf.simulate.strikes import Strikes, draw_strikes
-
-_BLOCK = 512
-"""Samples between which all phases are computed anew."""
 
 
 def recorded(
@@ -40,7 +38,7 @@ def recorded(
     sample_rate: float,
     samples: int,
 ) -> Float64[Tensor, "contacts samples"]:
-    """Return what `ring` gives for recordings whose sounds start at the samples `starts`, and zero before.
+    """Return the real part of the sum of amplitude times exp(pole t), t = 0 at the samples `starts`, and zero before.
 
     Starts may lie between samples: amplitudes are those at the start, and each sample has the sound's exact value at
     its time after it. Nothing is interpolated. Of a sound that starts before the recording (negative), the rest is
@@ -48,31 +46,19 @@ def recorded(
     """
     first = starts.ceil().clamp(min=0.0)
     late = (first - starts) / sample_rate
-    sounds = ring(poles, amplitudes * torch.exp(poles * late[:, None]), sample_rate=sample_rate, samples=samples)
+    moved = amplitudes * torch.exp(poles * late[:, None])
+    sounds = synthesize(
+        -moved.imag,
+        poles.imag / (2 * math.pi),
+        -poles.real,
+        samples=samples,
+        sample_rate=sample_rate,
+        quadrature=moved.real,
+    )
     whole = torch.zeros_like(sounds)
     for row, begin in enumerate(first.long().tolist()):
         whole[row, begin:] = sounds[row, : samples - begin]
     return whole
-
-
-def ring(
-    poles: Complex128[Tensor, " modes"],
-    amplitudes: Complex128[Tensor, "contacts modes"],
-    *,
-    sample_rate: float,
-    samples: int,
-) -> Float64[Tensor, "contacts samples"]:
-    """Return the real part of the sum over modes of amplitude times exp(pole t), from t = 0.
-
-    Poles are -d + 2 pi i f. exp(s (m K + k) / rate) = exp(s m K / rate) exp(s k / rate): two small tables and one
-    product of matrices.
-    """
-    blocks = math.ceil(samples / _BLOCK)
-    within = torch.exp(poles[:, None] * (torch.arange(_BLOCK, dtype=torch.float64) / sample_rate))
-    starts = torch.exp(poles[None, :] * (_BLOCK * torch.arange(blocks, dtype=torch.float64)[:, None] / sample_rate))
-    weights = (amplitudes[:, None, :] * starts[None]).reshape(-1, len(poles))
-    sounds = torch.cat([weights.real, -weights.imag], dim=1) @ torch.cat([within.real, within.imag])
-    return sounds.reshape(len(amplitudes), -1)[:, :samples].contiguous()
 
 
 PINK, RUMBLE, WHITE = 0.5, 0.4, 0.1
@@ -89,26 +75,20 @@ def room_noise(
     Half of its power is pink, 1/f; four tenths are the rumble of a building, 1/f^3; a tenth is white.
     """
     size = next_fast_len(samples, real=True)
-    level = noise_levels(size, sample_rate=sample_rate)
+    frequency = np.fft.rfftfreq(size, 1.0 / sample_rate)
+    bounded = np.maximum(frequency, LOWEST)
+    power = np.zeros(len(frequency))
+    for part, exponent in ((PINK, -1.0), (RUMBLE, -3.0), (WHITE, 0.0)):
+        each = np.where(frequency > 0.0, bounded**exponent, 0.0)
+        power += part * each / each.sum()
+    # A bin of unit variance in its real and its imaginary part has 4 / size^2 of power, for it counts twice.
+    level = size * np.sqrt(power / 4.0)
     # A row at a time: what is drawn for one does not depend on how many follow.
     rows = []
     for _ in range(count):
         spectrum = generator.standard_normal(len(level)) + 1j * generator.standard_normal(len(level))
         rows.append(irfft(level * spectrum, size)[:samples])
     return np.stack(rows)
-
-
-def noise_levels(size: int, *, sample_rate: float) -> Float64[np.ndarray, " bins"]:
-    """Return what the bins of `rfft` over `size` samples are multiplied by: no offset, unit power in all."""
-    frequency = np.fft.rfftfreq(size, 1.0 / sample_rate)
-    bounded = np.maximum(frequency, LOWEST)
-    power = np.zeros(len(frequency))
-    for part, exponent in ((PINK, -1.0), (RUMBLE, -3.0), (WHITE, 0.0)):
-        shape = bounded**exponent
-        shape[0] = 0.0
-        power += part * shape / shape.sum()
-    # A bin of unit variance in its real and its imaginary part has 4 / size^2 of power, for it counts twice.
-    return size * np.sqrt(power / 4.0)
 
 
 @dataclass(frozen=True, eq=False)
