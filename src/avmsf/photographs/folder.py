@@ -3,7 +3,8 @@
 import json
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -21,9 +22,10 @@ from avmsf.mesh.io import load_parts
 from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.colmap import PLACES, find_model, read_colmap, read_points
 from avmsf.photographs.nerf_json import load_record, read_transforms
-from avmsf.photographs.shots import Findings, Shot, Shots, read_view, without_camera
+from avmsf.photographs.shots import Shot, Shots, read_view, summarize, without_camera
 
 MIN_VIEWS = 3
+_NO_CAMERAS = "neither: photographs without cameras need structure from motion first"
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -47,21 +49,22 @@ def read_views(
     where an image's shape does not fit its camera's, or where fewer than three views remain.
     """
     if longest is not None and longest < 1:
-        raise CaptureError(
-            f"expected the longest side in pixels, at least 1, got {longest}", name="longest", value=longest
-        )
+        raise CaptureError.expected("at least 1 pixel", longest, name="longest")
     if not (math.isfinite(meters) and meters > 0):
-        raise CaptureError(
-            f"expected the length of the cameras' unit in meters, got {meters}", name="meters", value=meters
-        )
+        raise CaptureError.expected("the length of the cameras' unit in meters", meters, name="meters")
     base, found = find_shots(Path(folder))
     shots = sorted(found.shots, key=lambda shot: shot.name)
-    _refuse_repeated(shots, found.origin)
-    findings = Findings(list(found.remarks))
+    repeated = sorted({one.name for one, other in pairwise(shots) if one.name == other.name})
+    if repeated:
+        several, advice = f"several for {listed(repeated)}", "remove all but one"
+        raise CaptureError.expected(
+            "one camera for each image", repeated, got=several, file=found.origin, name=repeated[0], advice=advice
+        )
+    remarks, findings = list(found.remarks), defaultdict[str, list[str]](list)
     unused = without_camera(shots, base)
     if unused:
         message = f"{counted(len(unused), 'image')} not used, without a camera: {listed(unused)}"
-        findings.remarks.append(Remark(message, name="cameras", value=unused))
+        remarks.append(Remark(message, name="cameras", value=unused))
     if max_views is not None:
         shots = shots[:: max(1, -(-len(shots) // max_views))]
     views = []
@@ -70,8 +73,9 @@ def read_views(
         views += [] if view is None else [view]
         if progress is not None:
             progress(done, len(shots))
-    remarks = findings.summary()
-    _refuse_few(views, shots, findings, found.origin)
+    remarks += summarize(findings)
+    if len(views) < MIN_VIEWS:
+        raise _too_few(views, shots, findings, remarks, found.origin)
     for remark in remarks + check_cameras([view.camera for view in views]):
         warnings.warn(remark.about(found.origin), stacklevel=2)
     return tuple(views)
@@ -84,60 +88,36 @@ def find_shots(folder: Path) -> tuple[Path, Shots]:
     """
     if folder.suffix.lower() == ".json" and not folder.is_dir():
         if not folder.is_file():
-            raise CaptureError(f"{folder}: expected a camera file, got none", file=folder)
+            raise CaptureError.expected("a camera file", file=folder)
         return folder.parent, read_transforms(folder)
     if not folder.is_dir():
-        raise CaptureError(f"{folder}: expected a folder, got none", file=folder)
+        raise CaptureError.expected("a folder", file=folder)
     if (folder / "transforms.json").is_file():
         return folder, read_transforms(folder / "transforms.json")
     model = find_model(folder)
     if model is None:
         others = sorted(path.name for path in folder.glob("*.json"))
-        found = (
-            f"{listed(others)}; give the path of one of these"
-            if others
-            else "neither: photographs without cameras need structure from motion first"
-        )
-        raise CaptureError(
-            f"{folder}: expected transforms.json, or COLMAP's cameras and images (.bin or .txt) in "
-            f"{', '.join(PLACES)}, got {found}",
-            file=folder,
-            value=others,
-        )
+        found = f"{listed(others)}; give the path of one of these" if others else _NO_CAMERAS
+        wanted = f"transforms.json, or COLMAP's cameras and images (.bin or .txt) in {', '.join(PLACES)}"
+        raise CaptureError.expected(wanted, others, got=found, file=folder)
     images = folder / "images"
     return folder, read_colmap(model, images if images.is_dir() else folder)
 
 
-def _refuse_repeated(shots: Sequence[Shot], origin: Path) -> None:
-    names = [shot.name for shot in shots]
-    repeated = sorted({one for one, other in pairwise(names) if one == other})
-    if repeated:
-        raise CaptureError(
-            f"{origin}: expected one camera for each image, got several for {listed(repeated)}; remove all but one",
-            file=origin,
-            name=repeated[0],
-            value=repeated,
-        )
-
-
-def _refuse_few(views: Sequence[View], shots: Sequence[Shot], findings: Findings, origin: Path) -> None:
-    if len(views) >= MIN_VIEWS:
-        return
-    if shots and len(findings.empty) == len(shots):
-        raise CaptureError(
-            f"{origin}: expected masks with 255 on the object and 0 elsewhere, got {len(shots)} without an object",
-            file=origin,
-            name="masks",
-            value=0,
-        )
-    reasons = "".join(f"; {remark.message}" for remark in findings.summary())
-    raise CaptureError(
-        f"{origin}: expected at least {MIN_VIEWS} views, got {len(views)} of {len(shots)} that can be used{reasons}"
-        + (f" (expected {shots[0].image} and so on)" if findings.lost else ""),
-        file=origin,
-        name="views",
-        value=len(views),
-    )
+def _too_few(
+    views: Sequence[View],
+    shots: Sequence[Shot],
+    findings: Mapping[str, Sequence[str]],
+    remarks: Sequence[Remark],
+    origin: Path,
+) -> CaptureError:
+    if shots and len(findings.get("empty masks", ())) == len(shots):
+        wanted, got = "masks with 255 on the object and 0 elsewhere", f"{len(shots)} without an object"
+        return CaptureError.expected(wanted, 0, got=got, file=origin, name="masks")
+    reasons = "".join(f"; {remark.message}" for remark in remarks)
+    place = f" (expected {shots[0].image} and so on)" if "missing images" in findings else ""
+    got = f"{len(views)} of {len(shots)} that can be used{reasons}{place}"
+    return CaptureError.expected(f"at least {MIN_VIEWS} views", len(views), got=got, file=origin, name="views")
 
 
 def check_cameras(cameras: Sequence[Camera]) -> list[Remark]:
@@ -202,12 +182,8 @@ def _read_ply(transforms: Path) -> tuple[np.ndarray, np.ndarray] | None:
     path = transforms.parent / named.replace("\\", "/")
     clouds: list[Any] = load_parts(path)
     if len(clouds) != 1:
-        raise CaptureError(
-            f"{path} (ply_file_path of {transforms.name}): expected one point cloud, got {len(clouds)} parts",
-            file=path,
-            name="ply_file_path",
-            value=len(clouds),
-        )
+        got, key = f"{len(clouds)} parts", "ply_file_path"
+        raise CaptureError.expected("one point cloud", len(clouds), got=got, file=path, name=key)
     points = np.asarray(clouds[0].vertices, dtype=np.float64)
     colors = np.full((len(points), 3), 128, dtype=np.uint8)
     painted = np.asarray(getattr(clouds[0].visual, "vertex_colors", colors))

@@ -1,7 +1,8 @@
 """What a camera file says of a photograph, and its image, mask and lens made into the view of one pinhole."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import torch
@@ -78,43 +79,36 @@ def mask_names(name: str, folder: Path) -> list[Path]:
     return [folder / "masks" / path.with_suffix(".png"), folder / "masks" / f"{path}.png"]
 
 
-@dataclass
-class Findings:
-    """Problems of single images, reported together."""
-
-    remarks: list[Remark]
-    lost: list[str] = field(default_factory=list)
-    empty: list[str] = field(default_factory=list)
-    resized: list[str] = field(default_factory=list)
-    turned: list[str] = field(default_factory=list)
-    unmasked: list[str] = field(default_factory=list)
-    stretched: list[str] = field(default_factory=list)
-
-    def summary(self) -> list[Remark]:
-        """Return one remark for each kind of finding; its name is the kind, its value the images."""
-        kinds = (
-            ("missing images", "image", "missing or corrupt, not used", self.lost),
-            ("empty masks", "image", "with an empty mask, not used", self.empty),
-            ("image sizes", "image", "of another size than the camera, whose intrinsics were scaled", self.resized),
-            ("orientations", "image", "rotated by the orientation tag to fit the camera", self.turned),
-            ("missing masks", "mask", "missing or corrupt; the images are used without", self.unmasked),
-            ("mask sizes", "mask", "scaled from another size to that of the image", self.stretched),
-        )
-        return self.remarks + [
-            Remark(f"{counted(len(images), thing)} {message}: {listed(images)}", name=name, value=images)
-            for name, thing, message, images in kinds
-            if images
-        ]
+KINDS = {
+    "missing images": ("image", "missing or corrupt, not used"),
+    "empty masks": ("image", "with an empty mask, not used"),
+    "image sizes": ("image", "of another size than the camera, whose intrinsics were scaled"),
+    "orientations": ("image", "rotated by the orientation tag to fit the camera"),
+    "missing masks": ("mask", "missing or corrupt; the images are used without"),
+    "mask sizes": ("mask", "scaled from another size to that of the image"),
+}
+"""Problems of single images, which are reported together: what they concern, and what became of it."""
 
 
-def read_view(shot: Shot, base: Path, longest: int | None, meters: float, findings: Findings) -> View | None:
+def summarize(findings: Mapping[str, Sequence[str]]) -> list[Remark]:
+    """Return one remark for each kind of finding of `KINDS`; its value is the images."""
+    return [
+        Remark(f"{counted(len(findings[name]), thing)} {message}: {listed(findings[name])}", name, findings[name])
+        for name, (thing, message) in KINDS.items()
+        if name in findings
+    ]
+
+
+def read_view(
+    shot: Shot, base: Path, longest: int | None, meters: float, findings: defaultdict[str, list[str]]
+) -> View | None:
     """Read one shot's image and mask into a pinhole's view; None, and a finding, where there is nothing to see."""
     try:
         picture = read_picture(shot.image)
     except PictureSizeError:
         raise
     except CaptureError:
-        findings.lost.append(shot.name)
+        findings["missing images"].append(shot.name)
         return None
     picture, lens = _fit(shot, picture, findings)
     picture = _with_mask(shot, base, picture, findings)
@@ -123,7 +117,7 @@ def read_view(shot: Shot, base: Path, longest: int | None, meters: float, findin
         width, height = (max(1, round(side * longest / max(picture.size))) for side in picture.size)
         picture, lens = picture.scaled(width, height), lens.resized(width, height)
     if picture.mask is not None and not picture.mask.any():
-        findings.empty.append(shot.name)
+        findings["empty masks"].append(shot.name)
         return None
     pose = shot.world_to_camera.clone()
     pose[:3, 3] *= meters
@@ -131,60 +125,55 @@ def read_view(shot: Shot, base: Path, longest: int | None, meters: float, findin
     return View(shot.name, torch.from_numpy(picture.color), lens.camera(pose), mask)
 
 
-def _fit(shot: Shot, picture: Picture, findings: Findings) -> tuple[Picture, Lens]:
+def _fit(shot: Shot, picture: Picture, findings: defaultdict[str, list[str]]) -> tuple[Picture, Lens]:
     """Return picture and lens of one size; raises CaptureError where their shapes differ."""
     lens = shot.lens_of(*picture.size)
-    if picture.size == (lens.width, lens.height):
-        return picture, lens
-    if picture.mask is None:
+    size = (lens.width, lens.height)
+    if picture.mask is None and picture.size != size:
         upright = read_upright(shot.image)
-        if upright.size != picture.size and _same_shape(upright.size, (lens.width, lens.height)):
+        if upright.size != picture.size and _same_shape(upright.size, size):
             picture = upright
-            findings.turned.append(shot.name)
-    width, height = picture.size
-    if (width, height) == (lens.width, lens.height):
+            findings["orientations"].append(shot.name)
+    if picture.size == size:
         return picture, lens
-    if not _same_shape((width, height), (lens.width, lens.height)):
-        raise CaptureError(
-            f"{shot.image}: expected an image of its camera's shape, {lens.width} x {lens.height} ({lens.origin}), got "
-            f"{width} x {height}; give the images of which the cameras were estimated, not cropped or rotated",
-            file=shot.image,
-            name="image",
-            value=[width, height],
-        )
-    findings.resized.append(f"{shot.name} ({width} x {height} instead of {lens.width} x {lens.height})")
-    return picture, lens.resized(width, height)
+    whose, advice = f"its camera's ({lens.origin})", "give the images of which the cameras were estimated, not cropped"
+    _expect_shape(picture.size, size, shot.image, "image", whose=whose, advice=f"{advice} or rotated")
+    findings["image sizes"].append(f"{shot.name} ({_shown(picture.size)} instead of {_shown(size)})")
+    return picture, lens.resized(*picture.size)
 
 
-def _with_mask(shot: Shot, base: Path, picture: Picture, findings: Findings) -> Picture:
+def _with_mask(shot: Shot, base: Path, picture: Picture, findings: defaultdict[str, list[str]]) -> Picture:
     """Return the picture with the mask that lies in a file, where it has none of its own."""
     if picture.mask is not None:
         return picture
-    path = next((place for place in mask_places(shot, base) if place.is_file()), None)
+    path = next((place for place in mask_places(shot, base) if place.is_file()), shot.mask)
     if path is None:
-        if shot.mask is not None:
-            findings.unmasked.append(shot.name)
         return picture
     try:
         mask = read_mask(path)
     except PictureSizeError:
         raise
     except CaptureError:
-        findings.unmasked.append(shot.name)
+        findings["missing masks"].append(shot.name)
         return picture
-    width, height = picture.size
-    if mask.shape != (height, width):
-        if not _same_shape((mask.shape[1], mask.shape[0]), (width, height)):
-            raise CaptureError(
-                f"{path}: expected a mask of its image's shape, {width} x {height}, got {mask.shape[1]} x "
-                f"{mask.shape[0]}; make the mask of this image",
-                file=path,
-                name="mask",
-                value=[mask.shape[1], mask.shape[0]],
-            )
-        findings.stretched.append(f"{shot.name} ({mask.shape[1]} x {mask.shape[0]} for {width} x {height})")
-        mask = scale(mask, width, height)
+    size = (mask.shape[1], mask.shape[0])
+    if size != picture.size:
+        _expect_shape(size, picture.size, path, "mask", whose="its image's", advice="make the mask of this image")
+        findings["mask sizes"].append(f"{shot.name} ({_shown(size)} for {_shown(picture.size)})")
+        mask = scale(mask, *picture.size)
     return Picture(picture.color, mask)
+
+
+def _expect_shape(
+    found: tuple[int, int], wanted: tuple[int, int], path: Path, name: str, *, whose: str, advice: str
+) -> None:
+    if not _same_shape(found, wanted):
+        shape = f"the shape {_shown(wanted)}, {whose}"
+        raise CaptureError.expected(shape, list(found), got=_shown(found), file=path, name=name, advice=advice)
+
+
+def _shown(size: tuple[int, int]) -> str:
+    return f"{size[0]} x {size[1]}"
 
 
 def _same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
