@@ -15,7 +15,6 @@ from torch import Tensor
 
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.capture.audio import read_recording
-from avmsf.capture.folder import read_strike
 from avmsf.capture.prepare import margin_length, prepare
 from avmsf.capture.table import parse_row, read_rows
 from avmsf.errors import CaptureWarning
@@ -75,8 +74,9 @@ def by_threshold(folder: Path) -> Impacts:
     settings = CaptureSettings()
     rows, _ = read_rows(folder)
     strikes = [parse_row(row, settings) for row in rows]
-    prepared = [read_strike(folder, strike, settings=settings)[0] for strike in strikes]
-    rate = read_recording(folder / strikes[0].file).sample_rate
+    recordings = [read_recording(folder / strike.file, strike.file) for strike in strikes]
+    prepared = [prepare(each, settings, newtons=strike.newtons) for each, strike in zip(recordings, strikes, strict=True)]
+    rate = recordings[0].sample_rate
     length = min(round(settings.kept_seconds(rate) * rate), *(len(each.sound) for each in prepared))
     directions = [strike.direction for strike in strikes]
     return Impacts(

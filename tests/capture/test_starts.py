@@ -142,7 +142,7 @@ def test_measured_recordings_with_something_before_the_impact_are_cut(
 ) -> None:
     recordings = [read_recording(path) for path in sorted((shared / name).glob("*.wav"))]
     prepared = [prepare(each, settings) for each in recordings]
-    assert not start_with_impact(prepared, rate=recordings[0].sample_rate)
+    assert not start_with_impact(prepared)
 
 
 def test_a_displacement_s_and_a_velocity_s_response_start_with_the_impact(tmp_path: Path) -> None:
@@ -181,7 +181,7 @@ def test_a_plate_s_responses_start_with_the_impact_at_any_rate(rate: float, cont
     )
     files = [Recording("plate", each[None], rate, "FLOAT") for each in np.concatenate([noise, sounds], axis=1)]
     prepared = [prepare(each, CaptureSettings()) for each in files]
-    assert start_with_impact(prepared, rate=rate) == (lead == 0)
+    assert start_with_impact(prepared) == (lead == 0)
 
 
 @pytest.mark.parametrize("leads", [(6, 6, 6), (3, 9, 5), (0, 0, 100)])

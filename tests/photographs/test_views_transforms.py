@@ -161,7 +161,7 @@ def test_what_is_not_json_is_named(tmp_path: Path) -> None:
         ({"transform_matrix": None}, "transform_matrix", None),
         ({"transform_matrix": "one"}, "transform_matrix", "one"),
         ({"transform_matrix": [1, 2, 3]}, "transform_matrix", [1, 2, 3]),
-        ({"transform_matrix": [[1, 0], [0, 1]]}, "transform_matrix", [2, 2]),
+        ({"transform_matrix": [[1, 0], [0, 1]]}, "transform_matrix", [[1, 0], [0, 1]]),
         ({"file_path": None}, "file_path", None),
         ({"fl_x": "wide"}, "fl_x", "wide"),
         ({"fl_x": -50.0}, "intrinsics", [-50.0, 52.0, 19.0, 16.0, 0, 0, 0, 0, 0, 40, 30]),

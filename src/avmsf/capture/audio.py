@@ -33,6 +33,7 @@ MIN_CHANNEL_LEVEL = 0.1
 """Level of a channel over the loudest one's below which it is not used: a muted or far microphone's, 20 dB down."""
 OFFSET_SIGNIFICANCE = 1e-6
 """Probability by which noise without an offset would look as if it had one."""
+_CHANNELS = "response_channel or force_channel in capture.toml"
 EIGHT_BIT = frozenset({"PCM_U8", "PCM_S8", "ULAW", "ALAW", "DPCM_8"})
 LOSSLESS = ("PCM_", "FLOAT", "DOUBLE", "ALAC_", "DWVW_", "DPCM_")
 """What libsndfile's names of formats without loss begin with; FLAC's is that of its samples, PCM_16 or PCM_24."""
@@ -64,13 +65,8 @@ class Recording:
     def channel(self, number: int) -> Float64[np.ndarray, " frames"]:
         """Return one channel, counted from 1 as sound editors count them; `CaptureError` where there is none."""
         if not 1 <= number <= len(self.channels):
-            raise CaptureError(
-                f"{self.name}: expected a channel from 1 to {len(self.channels)}, got {number}; correct "
-                "response_channel or force_channel in capture.toml",
-                file=self.name,
-                name="channel",
-                value=number,
-            )
+            wanted, advice = f"a channel from 1 to {len(self.channels)}", f"correct {_CHANNELS}"
+            raise CaptureError.expected(wanted, number, file=self.name, name="channel", advice=advice)
         return self.channels[number - 1]
 
     def response_channel(self, number: int | None = None, *, force_channel: int | None = None) -> int:
@@ -85,24 +81,26 @@ class Recording:
             return number
         left = [index + 1 for index in range(len(self.channels)) if index + 1 != force_channel]
         if not left:
-            raise CaptureError(
-                f"{self.name}: expected a channel with the sound, got only the force channel; record both, or remove "
-                "force_channel from capture.toml",
+            raise CaptureError.expected(
+                "a channel with the sound",
+                0,
+                got="only the force channel",
                 file=self.name,
                 name="response_channel",
-                value=0,
+                advice="record both, or remove force_channel from capture.toml",
             )
         if len(left) == 1:
             return left[0]
         loudest = max(left, key=lambda each: float(np.std(self.channels[each - 1])))
         if not all(self._agree(loudest, each) for each in left):
-            raise CaptureError(
-                f"{self.name}: expected one channel with the sound, got {len(self.channels)} different ones; write "
-                "response_channel, counted from 1, in capture.toml (`avmsf check` proposes one where it can, and the "
-                "hammer's force_channel), or save it as mono",
+            raise CaptureError.expected(
+                "one channel with the sound",
+                len(self.channels),
+                got=f"{len(self.channels)} different ones",
                 file=self.name,
                 name="response_channel",
-                value=len(self.channels),
+                advice="write response_channel, counted from 1, in capture.toml (`avmsf check` proposes one where it "
+                "can, and the hammer's force_channel), or save it as mono",
             )
         levels = {each: float(np.std(self.channels[each - 1])) for each in left}
         return next(each for each in left if levels[each] >= MIN_CHANNEL_LEVEL * levels[loudest])
@@ -160,16 +158,15 @@ def read_recording(path: Path, name: str | None = None, *, advice: str = "check 
     try:
         missing = not path.is_file()
     except OSError as error:
-        reason = repr(error.strerror)
-        raise CaptureError(
-            f"{name[:80]}…: expected the name of a sound file, got {reason}; {advice}", file=path, value=name
-        ) from error
+        got, short = repr(error.strerror), f"{name[:80]}…"
+        message = f"{short}: expected the name of a sound file, got {got}; {advice}"
+        raise CaptureError(message, file=path, value=name) from error
     if path.is_dir():
         raise CaptureError(f"{name}: expected a sound file, got a folder; name a file in it", file=path)
     if missing:
         raise missing_recording(path, name, advice=advice)
     if is_lfs_pointer(path):
-        raise CaptureError(f"{name}: expected a sound file, got a Git LFS pointer; run git lfs pull", file=name)
+        raise CaptureError.expected("a sound file", got="a Git LFS pointer", file=name, advice="run git lfs pull")
     return decode_recording(path, name)
 
 
@@ -194,24 +191,18 @@ def decode_recording(source: Path | SoundBytes, name: str) -> Recording:
     except (soundfile.LibsndfileError, OSError, UnicodeEncodeError) as error:
         reason = getattr(error, "error_string", str(error)).strip().rstrip(".")
         size = source.stat().st_size if isinstance(source, Path) else source.getbuffer().nbytes
-        raise CaptureError(
-            f"{name}: expected a sound file, got {size} bytes that cannot be read ({reason}); export it again as wav",
-            file=name,
-            name="bytes",
-            value=size,
-        ) from error
+        got, advice = f"{size} bytes that cannot be read ({reason})", "export it again as wav"
+        raise CaptureError.expected("a sound file", size, got=got, file=name, name="bytes", advice=advice) from error
     if not samples.size:
-        raise CaptureError(f"{name}: expected samples, got none; record or export it again", file=name, value=0)
-    if not np.isfinite(samples).all():
-        count = int((~np.isfinite(samples)).sum())
-        raise CaptureError(
-            f"{name}: expected finite samples, got {count} that are not; export it again", file=name, value=count
-        )
+        raise CaptureError.expected("samples", 0, got="none", file=name, advice="record or export it again")
+    wrong = int((~np.isfinite(samples)).sum())
+    if wrong:
+        got = f"{wrong} that are not"
+        raise CaptureError.expected("finite samples", wrong, got=got, file=name, advice="export it again")
     peak = float(np.abs(samples).max())
     if peak > MAX_PEAK:
-        raise CaptureError(
-            f"{name}: expected samples of at most {MAX_PEAK:g}, got {peak:.3g}; export it again", file=name, value=peak
-        )
+        got, wanted = f"{peak:.3g}", f"samples of at most {MAX_PEAK:g}"
+        raise CaptureError.expected(wanted, peak, got=got, file=name, advice="export it again")
     return Recording(name, np.ascontiguousarray(samples.T), rate, subtype)
 
 
@@ -238,37 +229,26 @@ def wav_bytes(samples: Shaped[np.ndarray, "frames *channels"], rate: int) -> byt
 def refuse_rate(rate: float, name: str) -> None:
     """Raise `CaptureError` unless the rate lies between 100 Hz and 192 kHz."""
     if not LOWEST_RATE <= rate <= HIGHEST_RATE:
-        raise CaptureError(
-            f"{name}: expected a sample rate of {LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz (the file's rate times "
-            f"playback_speed), got {rate:g} Hz; export it at another rate",
-            file=name,
-            name="sample_rate",
-            value=rate,
-        )
+        wanted = f"a sample rate of {LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz (the file's rate times playback_speed)"
+        advice = "export it at another rate"
+        raise CaptureError.expected(wanted, rate, got=f"{rate:g} Hz", file=name, name="sample_rate", advice=advice)
 
 
 def refuse_peak(sound: Float64[np.ndarray, " frames"], name: str) -> None:
     """Raise `CaptureError` for a sound whose samples are too large or too small to be computed with in float32."""
     peak = float(np.abs(sound).max())
     if not MIN_PEAK <= peak <= MAX_PEAK:
-        raise CaptureError(
-            f"{name}: expected a peak of {MIN_PEAK:g} to {MAX_PEAK:g}, got {peak:.3g}; export it again, or check the "
-            "force that it is divided by",
-            file=name,
-            name="peak",
-            value=peak,
-        )
+        wanted, got = f"a peak of {MIN_PEAK:g} to {MAX_PEAK:g}", f"{peak:.3g}"
+        advice = "export it again, or check the force that it is divided by"
+        raise CaptureError.expected(wanted, peak, got=got, file=name, name="peak", advice=advice)
 
 
 def refuse_silence(sound: Float64[np.ndarray, " frames"], name: str) -> None:
     """Raise `CaptureError` where every sample is the same."""
     if np.ptp(sound) == 0:
-        raise CaptureError(
-            f"{name}: expected a sound, got silence (all {len(sound)} samples are {sound[0]:g}); "
-            "record it again, or choose another response_channel",
-            file=name,
-            value=float(sound[0]),
-        )
+        got = f"silence (all {len(sound)} samples are {sound[0]:g})"
+        advice = "record it again, or choose another response_channel"
+        raise CaptureError.expected("a sound", float(sound[0]), got=got, file=name, advice=advice)
 
 
 def clipped_samples(samples: Shaped[np.ndarray, " frames"]) -> int:
@@ -295,10 +275,7 @@ def _refuse_long(file: soundfile.SoundFile, name: str) -> None:
     """Raise `RecordingLengthError` for a file of too many samples, by its header."""
     samples = file.frames * file.channels
     if samples > MAX_SAMPLES:
-        raise RecordingLengthError(
-            f"{name}: expected at most {MAX_SAMPLES:,} samples in all channels, got {samples:,} "
-            f"({file.frames / file.samplerate / 60:.3g} minutes of {file.channels}); cut it to the seconds around the "
-            "impact",
-            file=name,
-            value=samples,
-        )
+        minutes = file.frames / file.samplerate / 60
+        got = f"{samples:,} ({minutes:.3g} minutes of {file.channels})"
+        wanted, advice = f"at most {MAX_SAMPLES:,} samples in all channels", "cut it to the seconds around the impact"
+        raise RecordingLengthError.expected(wanted, samples, got=got, file=name, advice=advice)

@@ -1,31 +1,16 @@
 """Everything that is wrong with a capture folder, found without stopping at the first thing."""
 
 import hashlib
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from avmsf._utils.text import counted, listed
 from avmsf.capture.filenames import number_key
-from avmsf.capture.folder import read_strike
 from avmsf.capture.measure import RecordingReport
-from avmsf.capture.prepare import Prepared, margin_length
+from avmsf.capture.preprocess import Issues, Preprocessed, preprocess
 from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.starts import are_uncut
-from avmsf.capture.table import (
-    FARTHEST,
-    TABLE,
-    Row,
-    Strike,
-    fitting_units,
-    is_missing,
-    parse_row,
-    read_rows,
-    refuse_missing,
-    refuse_repeated_files,
-)
-from avmsf.capture.together import check_contacts, check_levels, check_surface, common_length, common_rate, find_surface
+from avmsf.capture.table import FARTHEST, TABLE, Row, fitting_units
 from avmsf.errors import CaptureError
 
 UNCUT = "all recordings start with the impact, as impulse responses do, and are not cut"
@@ -49,98 +34,55 @@ class CaptureReport:
     """Notes on the recordings together that are no problems."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Sound:
-    """What the recordings are compared by."""
-
-    file: str
-    samples: int
-    """From the onset to the end."""
-    rate: float
-    peak: float
-    digest: bytes
-    start: Prepared
-    """With no more than the first `margin_length` samples of the sound."""
-
-
 def check(folder: str | Path, settings: CaptureSettings | None = None) -> CaptureReport:
     """Check a capture folder as `read_capture` would and report on every recording; raises nothing for bad input."""
-    folder = Path(folder)
+    folder, issues = Path(folder), Issues(collect=True)
     try:
         settings = settings or settings_of(folder)
-        rows, warned = read_rows(folder)
+        found = preprocess(folder, settings, issues)
     except CaptureError as error:
         return CaptureReport(False, (), (str(error),))
-    problems = [str(each) for each in warned]
-    reports, strikes, sounds = list[RecordingReport](), list[Strike](), list[_Sound]()
-    far = dict[int, float]()
-    for row in rows:
-        strike, prepared, report = _check_row(folder, row, settings=settings, far=far)
-        reports.append(report)
-        if strike is not None:
-            strikes.append(strike)
-        if prepared is not None:
-            rate = report.sample_rate or 0.0
-            start = replace(prepared, sound=prepared.sound[: margin_length(rate)].copy())
-            digest = hashlib.sha256(prepared.sound.tobytes()).digest()
-            sounds.append(_Sound(report.file, len(prepared.sound), rate, prepared.peak, digest, start))
+    reports = [found.reports.get(row.line) or _unreadable(row, found, issues) for row in found.rows]
+    far = [error for error in issues.rows.values() if error.name == "unit"]
     if len(far) > 1:
         # One message for all, with which they are listed together.
-        largest = max(far.values())
+        largest = max(abs(value) for error in far for value in error.value)
         words = (
             f"expected a contact within {FARTHEST:g} m of the origin, got coordinates of up to {largest:g} "
             f"(unit = {settings.unit!r}): {fitting_units(largest)}"
         )
-        reports = [replace(each, problems=(words,)) if each.line in far else each for each in reports]
-    refused: list[str] = []
-    problems += map(str, check_contacts(strikes, settings) if strikes else ())
-    with _collected(refused):
-        refuse_repeated_files(strikes)
-    with _collected(refused):
-        refuse_missing(folder, strikes)
-    with _collected(refused):
-        surface = find_surface(folder, settings)
-        if surface is not None and strikes:
-            problems += map(str, check_surface(strikes, surface, settings=settings))
+        lines = [line for line, error in issues.rows.items() if error in far]
+        reports = [replace(each, problems=(words,)) if each.line in lines else each for each in reports]
+    sounds = list(found.sounds.values())
     comparable = len(sounds) > 1 and len({each.rate for each in sounds}) == 1
-    uncut = comparable and are_uncut([each.start for each in sounds], rate=sounds[0].rate, settings=settings)
-    if uncut:
+    remarks = []
+    if comparable and are_uncut(sounds, settings):
         reports = [each if each.onset_seconds is None else replace(each, onset_seconds=0.0) for each in reports]
-        sounds = [replace(each, samples=each.samples + each.start.onset) for each in sounds]
-    if sounds:
-        names = [each.file for each in sounds]
-        with _collected(refused):
-            rate = common_rate([each.rate for each in sounds], names)
-            lengths = [each.samples for each in sounds]
-            problems += map(str, common_length(lengths, names, rate=rate, settings=settings)[1])
-        with _collected(refused):
-            problems += map(str, check_levels([each.peak for each in sounds], names))
-    problems += _copies(sounds) + _unlisted(folder, {report.file for report in reports})
-    readable = not refused and all(report.readable for report in reports)
-    remarks = [UNCUT] if uncut else []
+        remarks.append(UNCUT)
     names = [report.file for report in reports]
     if names == sorted(names) != sorted(names, key=number_key):
         remarks.append(TEXT_ORDER)
-    return CaptureReport(readable, tuple(reports), tuple(refused + problems), tuple(remarks))
+    readable = not issues.errors and all(report.readable for report in reports)
+    problems = [*map(str, issues.errors), *map(str, issues.warnings), *_copies(found), *_unlisted(folder, set(names))]
+    return CaptureReport(readable, tuple(reports), tuple(problems), tuple(remarks))
 
 
-@contextmanager
-def _collected(refused: list[str]) -> Iterator[None]:
-    """Add a CaptureError's message to what makes the folder unreadable, and go on."""
-    try:
-        yield
-    except CaptureError as error:
-        refused.append(str(error))
+def _unreadable(row: Row, found: Preprocessed, issues: Issues) -> RecordingReport:
+    strike = found.strikes.get(row.line)
+    file = row.cells["file"] if strike is None else strike.file
+    return RecordingReport(file=file, line=row.line, readable=False, problems=(str(issues.rows[row.line]),))
 
 
-def _copies(sounds: Sequence[_Sound]) -> list[str]:
+def _copies(found: Preprocessed) -> list[str]:
     """Return a sentence for each sound that is another one's copy."""
-    first = {each.digest: each.file for each in reversed(sounds)}
-    return [
-        f"{each.file}: the same sound as {first[each.digest]}, to the last bit: copy the right file, or remove its row"
-        for each in sounds
-        if each.file != first[each.digest]
-    ]
+    first, sentences = dict[bytes, str](), []
+    for line, sound in found.sounds.items():
+        file = found.strikes[line].file
+        original = first.setdefault(hashlib.sha256(sound.sound.tobytes()).digest(), file)
+        if original != file:
+            advice = "copy the right file, or remove its row"
+            sentences.append(f"{file}: the same sound as {original}, to the last bit: {advice}")
+    return sentences
 
 
 def _unlisted(folder: Path, named: set[str]) -> list[str]:
@@ -152,24 +94,3 @@ def _unlisted(folder: Path, named: set[str]) -> list[str]:
         return []
     lack = f"{counted(len(unlisted), 'wav file')} {'has' if len(unlisted) == 1 else 'have'} no row in {TABLE}"
     return [f"{lack}: {listed(unlisted)}"]
-
-
-def _check_row(
-    folder: Path, row: Row, *, settings: CaptureSettings, far: dict[int, float]
-) -> tuple[Strike | None, Prepared | None, RecordingReport]:
-    """Return one row parsed as far as possible, its sound, and its report.
-
-    The largest coordinate of a contact too far away is added, by its line, to `far`.
-    """
-    strike = None
-    try:
-        strike = parse_row(row, settings)
-        if is_missing(folder / strike.file):
-            raise CaptureError(f"{strike.file}: expected a sound file, got none", file=strike.file)
-        prepared, report = read_strike(folder, strike, settings=settings)
-    except CaptureError as error:
-        if error.name == "unit":
-            far[row.line] = max(map(abs, error.value))
-        file = strike.file if strike is not None else row.cells["file"]
-        return strike, None, RecordingReport(file=file, line=row.line, readable=False, problems=(str(error),))
-    return strike, prepared, report

@@ -8,16 +8,14 @@ from pathlib import Path, PurePosixPath
 import torch
 
 from avmsf._utils.files import new_folder
-from avmsf.capture.audio import read_recording, wav_bytes
+from avmsf.capture.audio import wav_bytes
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.measure import RecordingReport, measure, shared_problems
-from avmsf.capture.prepare import Prepared, prepare
+from avmsf.capture.measure import RecordingReport, shared_problems
+from avmsf.capture.preprocess import Issues, preprocess
 from avmsf.capture.settings import SETTINGS, CaptureSettings, settings_of
-from avmsf.capture.starts import build_impacts, shorten
-from avmsf.capture.table import DIRECTION, FORCE, REQUIRED, TABLE, Strike, in_folder, read_strikes
-from avmsf.capture.together import check_contacts, check_levels, check_surface, common_rate, find_surface
+from avmsf.capture.table import DIRECTION, FORCE, REQUIRED, TABLE, in_folder
 from avmsf.errors import CaptureError, CaptureWarning
-from avmsf.mesh.surface import Surface, contacted_part, write_surface
+from avmsf.mesh.surface import Surface, write_surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,41 +55,12 @@ def read_capture(folder: str | Path, settings: CaptureSettings | None = None) ->
 
 
 def _read_capture(folder: Path, settings: CaptureSettings) -> Capture:
-    strikes, remarks = read_strikes(folder, settings)
-    remarks += check_contacts(strikes, settings)
-    surface = find_surface(folder, settings)
-    if surface is not None:
-        remarks += check_surface(strikes, surface, settings=settings)
-        surface, _ = contacted_part(surface, torch.tensor([strike.contact for strike in strikes]))
-    recordings, reports, peaks = [], [], []
-    for strike in strikes:
-        prepared, report = read_strike(folder, strike, settings=settings)
-        recordings.append(shorten(prepared, rate=report.sample_rate or 0.0, settings=settings))
-        peaks.append(prepared.peak)
-        reports.append(report)
-    names = [strike.file for strike in strikes]
-    remarks += check_levels(peaks, names)
-    rate = common_rate([report.sample_rate or 0.0 for report in reports], names)
-    directions = [strike.direction for strike in strikes]
-    impacts, warned = build_impacts(
-        recordings,
-        torch.tensor([strike.contact for strike in strikes], dtype=torch.float64),
-        names=names,
-        rate=rate,
-        settings=settings,
-        directions=None if None in directions else torch.tensor(directions, dtype=torch.float32),
-    )
-    for remark in remarks + warned + _summary(reports, folder):
+    issues = Issues()
+    found = preprocess(folder, settings, issues)
+    assert found.impacts is not None
+    for remark in issues.warnings + _summary(list(found.reports.values()), folder):
         warnings.warn(remark, stacklevel=3)
-    return Capture(settings.name or folder.resolve().name, impacts, surface, settings, folder)
-
-
-def read_strike(folder: Path, strike: Strike, *, settings: CaptureSettings) -> tuple[Prepared, RecordingReport]:
-    """Read, prepare and measure the recording of one row; `CaptureError` where it cannot be used."""
-    advice = f"copy it there, or remove its row from {TABLE}"
-    recording = read_recording(folder / strike.file, strike.file, advice=advice)
-    prepared = prepare(recording, settings, newtons=strike.newtons)
-    return prepared, measure(recording, prepared, settings=settings, line=strike.line)
+    return Capture(settings.name or folder.resolve().name, found.impacts, found.surface, settings, folder)
 
 
 def write_capture(capture: Capture, folder: str | Path, *, onsets_within: float | None = None) -> None:

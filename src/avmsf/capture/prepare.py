@@ -32,6 +32,8 @@ class Prepared:
     """The hammer's push, where there is a force channel."""
     newtons: float | None
     """Peak force that the sound is divided by."""
+    rate: float
+    """The file's own sample rate, Hz."""
 
     @property
     def peak(self) -> float:
@@ -55,7 +57,13 @@ def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float |
     pulse, onset = None, 0
     if settings.force_channel is not None:
         force = recording.channel(settings.force_channel)
-        pulse = _find_pulse(force, recording.name, settings)
+        if np.ptp(force) == 0:
+            wanted, advice = "a force in its channel", "choose another force_channel or remove the recording"
+            value, key = settings.force_channel, "force_channel"
+            raise CaptureError.expected(
+                wanted, value, got=f"silence in {value}", file=recording.name, name=key, advice=advice
+            )
+        pulse = find_pulse(force)
         onset = pulse.start
         if newtons is None:
             newtons = abs(pulse.height * settings.force_scale)
@@ -65,12 +73,9 @@ def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float |
     if manner == "auto":
         manner = "none" if newtons is None else "peak"
     if manner == "peak" and newtons is None:
-        raise CaptureError(
-            f'{recording.name}: expected a force for normalize = "peak", got none: give force_newtons in impacts.csv, '
-            "or a force_channel",
-            file=recording.name,
-            name="normalize",
-            value="peak",
+        advice = "give force_newtons in impacts.csv, or a force_channel"
+        raise CaptureError.expected(
+            'a force for normalize = "peak"', "peak", got="none", file=recording.name, name="normalize", advice=advice
         )
     if manner == "deconvolve" and pulse is not None:
         before, kept = deconvolve(sound, force, pulse=pulse, regularization=settings.regularization)
@@ -86,7 +91,7 @@ def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float |
         before, kept = before / newtons, kept / newtons
     refuse_peak(kept, recording.name)
     before = before[max(0, len(before) - margin_length(recording.sample_rate)) :].copy()
-    return Prepared(kept, before, onset, pulse, None if manner == "none" else newtons)
+    return Prepared(kept, before, onset, pulse, None if manner == "none" else newtons, recording.sample_rate)
 
 
 def remove_rumble(
@@ -100,23 +105,13 @@ def remove_rumble(
     """
     if highpass == 0.0:
         return sound
-    lowest = recording.sample_rate / len(sound)
-    if highpass < lowest:
-        raise CaptureError(
-            f"{recording.name}: expected a highpass of 0, or of at least {lowest:.3g} Hz, one period in the recording, "
-            f"got {highpass:g} Hz; change it in capture.toml",
-            file=recording.name,
-            name="highpass",
-            value=highpass,
-        )
-    if highpass >= recording.sample_rate / 2:
-        raise CaptureError(
-            f"{recording.name}: expected a highpass below {recording.sample_rate / 2:g} Hz, half the sample rate, got "
-            f"{highpass:g} Hz; change it in capture.toml",
-            file=recording.name,
-            name="highpass",
-            value=highpass,
-        )
+    lowest, half = recording.sample_rate / len(sound), recording.sample_rate / 2
+    if not lowest <= highpass < half:
+        below = f"below {half:g} Hz, half the sample rate"
+        above = f"of 0, or of at least {lowest:.3g} Hz, one period in the recording"
+        wanted, got = f"a highpass {above if highpass < lowest else below}", f"{highpass:g} Hz"
+        advice = "change it in capture.toml"
+        raise CaptureError.expected(wanted, highpass, got=got, file=recording.name, name="highpass", advice=advice)
     sections = scipy.signal.butter(4, highpass, "highpass", fs=recording.sample_rate, output="sos")
     filtered: Float64[np.ndarray, " frames"] = scipy.signal.sosfiltfilt(sections, sound)
     return filtered
@@ -139,25 +134,9 @@ def refuse_short(kept: Float64[np.ndarray, " samples"], recording: Recording) ->
     """Raise `CaptureError` where less than `shortest_allowed` follows the onset."""
     least = shortest_allowed(recording.sample_rate)
     if len(kept) < least:
-        raise CaptureError(
-            f"{recording.name}: expected at least {least} samples after the onset, got {len(kept)} "
-            f"({len(kept) / recording.sample_rate * 1e3:.3g} ms); record it again, or remove its row",
-            file=recording.name,
-            name="samples",
-            value=len(kept),
-        )
-
-
-def _find_pulse(force: Float64[np.ndarray, " frames"], name: str, settings: CaptureSettings) -> Pulse:
-    if np.ptp(force) == 0:
-        raise CaptureError(
-            f"{name}: expected a force in channel {settings.force_channel}, got silence; choose another force_channel "
-            "or remove the recording",
-            file=name,
-            name="force_channel",
-            value=settings.force_channel,
-        )
-    return find_pulse(force)
+        got = f"{len(kept)} ({len(kept) / recording.sample_rate * 1e3:.3g} ms)"
+        wanted, advice = f"at least {least} samples after the onset", "record it again, or remove its row"
+        raise CaptureError.expected(wanted, len(kept), got=got, file=recording.name, name="samples", advice=advice)
 
 
 def deconvolve(

@@ -11,7 +11,7 @@ from torch import Tensor
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.prepare import MIN_MARGIN, Prepared, margin_length
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.together import common_length
+from avmsf.capture.together import common_length, common_rate
 from avmsf.errors import CaptureWarning
 
 START_LEVEL = 10**-2.0
@@ -28,7 +28,7 @@ def latest_start(rate: float) -> int:
     return max(MIN_MARGIN, round(MAX_START_SECONDS * rate))
 
 
-def start_with_impact(recordings: Sequence[Prepared], *, rate: float) -> bool:
+def start_with_impact(recordings: Sequence[Prepared]) -> bool:
     """Return whether all recordings start with the impact, without anything before it, as impulse responses do.
 
     A single recording does not show this: the first samples of an impulse response are small where its modes happen to
@@ -38,6 +38,7 @@ def start_with_impact(recordings: Sequence[Prepared], *, rate: float) -> bool:
     root mean square frequency. Every single onset has to come within `MAX_START_SECONDS` or `MIN_MARGIN` samples as
     well.
     """
+    rate = recordings[0].rate
     latest = latest_start(rate)
     if any(each.onset >= latest or len(each.before) < each.onset for each in recordings):
         return False
@@ -53,32 +54,19 @@ def start_with_impact(recordings: Sequence[Prepared], *, rate: float) -> bool:
     return bool(mean[:first].max() >= START_LEVEL * mean.max())
 
 
-def are_uncut(recordings: Sequence[Prepared], *, rate: float, settings: CaptureSettings) -> bool:
+def are_uncut(recordings: Sequence[Prepared], settings: CaptureSettings) -> bool:
     """Return whether the recordings of a capture are taken from their files' first sample on, though `align` is set.
 
     A force channel, `align = false` and `time_zero = "peak"` say where the sounds start.
     """
     return (
-        settings.align
-        and not settings.from_peaks
-        and settings.force_channel is None
-        and start_with_impact(recordings, rate=rate)
+        settings.align and not settings.from_peaks and settings.force_channel is None and start_with_impact(recordings)
     )
 
 
-def align_starts(recordings: Sequence[Prepared], *, rate: float, settings: CaptureSettings) -> list[Prepared]:
-    """Return the recordings uncut where all of them start with the impact (`are_uncut`), else as they are."""
-    if not are_uncut(recordings, rate=rate, settings=settings):
-        return list(recordings)
-    return [
-        replace(each, sound=np.concatenate([each.before, each.sound]), before=each.before[:0], onset=0)
-        for each in recordings
-    ]
-
-
-def shorten(prepared: Prepared, *, rate: float, settings: CaptureSettings) -> Prepared:
+def shorten(prepared: Prepared, settings: CaptureSettings) -> Prepared:
     """Return a recording in float32 with no more of it than `build_impacts` can use, so that many fit in memory."""
-    most = round(settings.kept_seconds(rate) * rate) + margin_length(rate)
+    most = round(settings.kept_seconds(prepared.rate) * prepared.rate) + margin_length(prepared.rate)
     sound, before = (part.astype(np.float32) for part in (prepared.sound[:most], prepared.before))
     return replace(prepared, sound=sound, before=before)
 
@@ -88,30 +76,35 @@ def build_impacts(
     contacts: Float64[Tensor, "contacts 3"],
     *,
     names: Sequence[str],
-    rate: float,
     settings: CaptureSettings,
     directions: Float[Tensor, "contacts 3"] | None = None,
 ) -> tuple[Impacts, list[CaptureWarning]]:
     """Return the impacts, their sounds from their starts on cut to one length, and warnings of what shortens them.
 
-    Without `align`, or from the peaks on, nothing will be moved later, so that `before` and `after` are None. `rate` is
-    the files' in Hz. Raises `CaptureError` as `common_length`.
+    Recordings that all start with the impact (`are_uncut`) are used whole. Without `align`, or from the peaks on,
+    nothing will be moved later, so that `before` and `after` are None. Raises `CaptureError` where sample rates differ,
+    and as `common_length`.
     """
-    settled = align_starts(recordings, rate=rate, settings=settings)
-    length, remarks = common_length([len(each.sound) for each in settled], names, rate=rate, settings=settings)
+    rate = common_rate([each.rate for each in recordings], names)
+    if are_uncut(recordings, settings):
+        recordings = [
+            replace(each, sound=np.concatenate([each.before, each.sound]), before=each.before[:0])
+            for each in recordings
+        ]
+    length, remarks = common_length([len(each.sound) for each in recordings], names, rate=rate, settings=settings)
     before = after = None
     if settings.align and not settings.from_peaks:
         size = margin_length(rate)
-        before = torch.full((len(settled), size), torch.nan)
+        before = torch.full((len(recordings), size), torch.nan)
         after = before.clone()
-        for row, each in enumerate(settled):
+        for row, each in enumerate(recordings):
             rest = each.sound[length : length + size].astype(np.float32)
             before[row, size - len(each.before) :] = torch.from_numpy(each.before.astype(np.float32))
             after[row, : len(rest)] = torch.from_numpy(rest)
     forces = [each.newtons for each in recordings]
     impacts = Impacts(
         contacts=contacts,
-        sounds=torch.from_numpy(np.stack([each.sound[:length] for each in settled]).astype(np.float32)),
+        sounds=torch.from_numpy(np.stack([each.sound[:length] for each in recordings]).astype(np.float32)),
         sample_rate=rate * settings.playback_speed,
         names=tuple(names),
         directions=directions,

@@ -1,5 +1,6 @@
 """What the recordings and contacts of one capture must have in common, and what looks wrong when compared."""
 
+import itertools
 import math
 from collections import Counter, defaultdict
 from collections.abc import Sequence
@@ -15,7 +16,7 @@ from avmsf.capture.placement import Placement, check_placement
 from avmsf.capture.prepare import shortest_allowed
 from avmsf.capture.settings import METRES, CaptureSettings
 from avmsf.capture.table import TABLE, Strike, fitting_units, parse_row, read_rows
-from avmsf.errors import CaptureError, CaptureWarning, Location
+from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.mesh.surface import Surface, contacted_part, read_surface, surface_points
 
 WIDEST = 10.0
@@ -45,12 +46,9 @@ def common_rate(rates: Sequence[float], names: Sequence[str]) -> float:
             f"{rate:g} Hz ({counted(count, 'file')}, {names[list(rates).index(rate)]} the first)"
             for rate, count in counts.most_common()
         ]
-        raise CaptureError(
-            f"expected recordings of one sample rate, got {', '.join(found)}; nothing is resampled, so convert them to "
-            "one rate",
-            name="sample_rate",
-            value=[rate for rate, _ in counts.most_common()],
-        )
+        wanted, values = "recordings of one sample rate", [rate for rate, _ in counts.most_common()]
+        advice = "nothing is resampled, so convert them to one rate"
+        raise CaptureError.expected(wanted, values, got=", ".join(found), name="sample_rate", advice=advice)
     return rates[0]
 
 
@@ -62,37 +60,34 @@ def check_levels(peaks: Sequence[float], names: Sequence[str]) -> list[CaptureWa
     levels = 20 * np.log10(np.asarray(peaks))
     away = levels - np.median(levels)
     worst = int(np.abs(away).argmax())
-    found = (
-        f"{names[worst]}: its peak, {peaks[worst]:.3g}, is {away[worst]:+.0f} dB from that of most recordings "
-        f"({np.median(peaks):.3g})"
-    )
+    found = f"peak, {peaks[worst]:.3g}, is {away[worst]:+.0f} dB from that of most recordings ({np.median(peaks):.3g})"
     if np.ptp(levels) > MAX_RANGE_DB:
         raise CaptureError(
-            f"{found}; expected at most {MAX_RANGE_DB:g} dB between the loudest and the faintest, got "
-            f"{np.ptp(levels):.0f}; export it at the scale of the others, or remove its row",
+            f"{names[worst]}: its {found}; expected at most {MAX_RANGE_DB:g} dB between the loudest and the faintest, "
+            f"got {np.ptp(levels):.0f}; export it at the scale of the others, or remove its row",
             file=names[worst],
             name="peak",
             value=peaks[worst],
         )
+    ascending, row = np.sort(levels), worst
+    above = ascending[-1] - ascending[-2] if len(levels) >= 6 else 0.0
     if len(levels) >= MIN_EQUAL_PEAKS and np.ptp(levels) < SAME_PEAK_DB:
+        row = 0
         message = (
             f"all {len(levels)} recordings have the same peak, {peaks[0]:.3g}: expected the levels as recorded, got "
             "each scaled to one peak, which loses how strong the modes are at each contact; export them unscaled"
         )
-        return [CaptureWarning(message, file=names[0], name="peak", value=peaks[0])]
-    ascending = np.sort(levels)
-    if len(levels) >= 6 and ascending[-1] - ascending[-2] > USUAL_GAP_DB:
-        loudest = int(levels.argmax())
-        above = ascending[-1] - ascending[-2]
+    elif above > USUAL_GAP_DB:
+        row = int(levels.argmax())
         message = (
-            f"{names[loudest]}: its peak, {peaks[loudest]:.3g}, is {above:.0f} dB above that of the next loudest "
-            f"recording; expected at most {USUAL_GAP_DB:g} dB; check its gain, its scale and its force"
+            f"{names[row]}: its peak, {peaks[row]:.3g}, is {above:.0f} dB above that of the next loudest recording; "
+            f"expected at most {USUAL_GAP_DB:g} dB; check its gain, its scale and its force"
         )
-        return [CaptureWarning(message, file=names[loudest], name="peak", value=peaks[loudest])]
-    if abs(away[worst]) > USUAL_RANGE_DB:
-        message = f"{found}; expected at most {USUAL_RANGE_DB:g} dB; check its scale and its force"
-        return [CaptureWarning(message, file=names[worst], name="peak", value=peaks[worst])]
-    return []
+    elif abs(away[worst]) > USUAL_RANGE_DB:
+        message = f"{names[worst]}: its {found}; expected at most {USUAL_RANGE_DB:g} dB; check its scale and its force"
+    else:
+        return []
+    return [CaptureWarning(message, file=names[row], name="peak", value=peaks[row])]
 
 
 def common_length(
@@ -107,26 +102,18 @@ def common_length(
     asked = round(seconds * rate)
     least = shortest_allowed(rate)
     if asked < least:
-        raise CaptureError(
-            f"seconds: expected at least {least} samples at {rate:g} Hz, got {asked} ({seconds:g} s); increase it in "
-            "capture.toml",
-            name="seconds",
-            value=seconds,
-        )
+        wanted, got = f"at least {least} samples at {rate:g} Hz", f"{asked} ({seconds:g} s)"
+        raise CaptureError.expected(wanted, seconds, got=got, name="seconds", advice="increase it in capture.toml")
     shortest = min(lengths)
     usual = min(asked, int(np.median(lengths)))
-    remarks = []
-    if shortest < 0.9 * usual:
-        name = names[list(lengths).index(shortest)]
-        remarks.append(
-            CaptureWarning(
-                f"{name}: {shortest / rate:.3g} s after its onset, most recordings have {usual / rate:.3g} s; all "
-                "sounds are cut to this length; record it again or remove its row",
-                file=name,
-                value=shortest / rate,
-            )
-        )
-    return min(asked, shortest), remarks
+    if shortest >= 0.9 * usual:
+        return min(asked, shortest), []
+    name = names[list(lengths).index(shortest)]
+    message = (
+        f"{name}: {shortest / rate:.3g} s after its onset, most recordings have {usual / rate:.3g} s; all sounds are "
+        "cut to this length; record it again or remove its row"
+    )
+    return min(asked, shortest), [CaptureWarning(message, file=name, value=shortest / rate)]
 
 
 def check_contacts(strikes: Sequence[Strike], settings: CaptureSettings) -> list[CaptureWarning]:
@@ -173,17 +160,13 @@ def check_surface(strikes: Sequence[Strike], surface: Surface, *, settings: Capt
     found = placement.describe([f"row {strike.line}" for strike in strikes]) + _advice(placement, settings)
     farthest = float(placement.distances.max())
     if placement.other_unit:
-        raise CaptureError(
-            f"{TABLE}: expected contacts and surface in one unit; {found}", file=TABLE, name="unit", value=farthest
-        )
+        message = f"{TABLE}: expected contacts and surface in one unit; {found}"
+        raise CaptureError(message, file=TABLE, name="unit", value=farthest)
     worst = strikes[int(placement.distances.argmax())].line
     if farthest > placement.diagonal:
-        raise Location(TABLE, worst, f"row {worst}").error(
-            f"expected a contact on the surface, got one {farthest:.3g} m off it, more than its extent of "
-            f"{placement.diagonal:.3g} m: {found}",
-            name="surface",
-            value=farthest,
-        )
+        got = f"one {farthest:.3g} m off it, more than its extent of {placement.diagonal:.3g} m: {found}"
+        wanted = "a contact on the surface"
+        raise CaptureError.expected(wanted, farthest, got=got, file=TABLE, row=worst, name="surface")
     return [CaptureWarning(f"{TABLE}: {found}", file=TABLE, row=worst, name="surface", value=farthest)]
 
 
@@ -215,23 +198,15 @@ def fitting_units_of(placement: Placement, settings: CaptureSettings) -> dict[st
     if placement.mostly_off if mistake is None else not mistake.unit_only:
         return {}
     ratio = settings.meters * (1.0 if mistake is None else mistake.factor) / settings.surface_meters
-    pairs = [
-        (unit, surface_unit)
-        for unit, meters in METRES.items()
-        for surface_unit, surface_meters in METRES.items()
-        if math.isclose(meters / surface_meters, ratio, rel_tol=1e-6)
-    ]
-
-    def changes(pair: tuple[str, str]) -> dict[str, str]:
-        unit, surface_unit = pair
-        changed = {} if unit == settings.unit else {"unit": unit}
-        return changed | ({} if surface_unit == (settings.surface_unit or unit) else {"surface_unit": surface_unit})
-
-    def price(pair: tuple[str, str]) -> tuple[bool, bool, float]:
-        size = placement.diagonal * METRES[pair[1]] / settings.surface_meters
-        return not NARROWEST <= size <= WIDEST, bool(changes(pair)), abs(math.log(size / USUAL_SIZE))
-
-    return changes(min(pairs, key=price)) if pairs else {}
+    prices = list[tuple[tuple[bool, bool, float], dict[str, str]]]()
+    for (unit, meters), (surface_unit, surface_meters) in itertools.product(METRES.items(), repeat=2):
+        if math.isclose(meters / surface_meters, ratio, rel_tol=1e-6):
+            changes = {} if unit == settings.unit else {"unit": unit}
+            changes |= {} if surface_unit == (settings.surface_unit or unit) else {"surface_unit": surface_unit}
+            size = placement.diagonal * surface_meters / settings.surface_meters
+            unusual = not NARROWEST <= size <= WIDEST
+            prices.append(((unusual, bool(changes), abs(math.log(size / USUAL_SIZE))), changes))
+    return min(prices, key=lambda each: each[0])[1] if prices else {}
 
 
 def _advice(placement: Placement, settings: CaptureSettings) -> str:

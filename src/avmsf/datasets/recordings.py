@@ -18,7 +18,6 @@ from avmsf.capture.placement import check_placement
 from avmsf.capture.prepare import Prepared, prepare
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.starts import build_impacts, shorten
-from avmsf.capture.together import common_rate
 from avmsf.errors import CaptureError, CaptureWarning, DatasetError
 from avmsf.mesh.surface import Surface, surface_points
 
@@ -59,7 +58,7 @@ def build_capture(
     noise and second impacts. Raises DatasetError, which names the `origin`, where fewer than two recordings
     remain or they do not fit together, and where contacts and surface count different units.
     """
-    kept: list[tuple[str, float, np.ndarray, Prepared]] = []
+    kept: list[tuple[str, np.ndarray, Prepared]] = []
     reports, remarks = [], list(remarks)
     try:
         for each in recordings:
@@ -68,21 +67,19 @@ def build_capture(
             except CaptureError as error:
                 remarks.append(f"left out: {error}")
                 continue
-            rate = each.recording.sample_rate
             if recorded:
                 # Clipping shows only before the amplifier's gain is divided out.
                 reports.append(measure(each.recording, prepared, settings=settings, line=len(kept) + 1))
             gain = 10 ** (-each.gain_db / 20)
             prepared = replace(prepared, sound=prepared.sound * gain, before=prepared.before * gain)
-            kept.append((each.name, rate, each.contact, shorten(prepared, rate=rate, settings=settings)))
+            kept.append((each.name, each.contact, shorten(prepared, settings)))
         remarks += shared_problems(reports)
         refuse_few(len(kept), origin=origin, reasons=remarks)
-        names, rates, contacts, parts = zip(*kept, strict=True)
+        names, contacts, parts = zip(*kept, strict=True)
         impacts, warned = build_impacts(
             parts,
             torch.from_numpy(np.stack(contacts).astype(np.float64)),
             names=names,
-            rate=common_rate(rates, names),
             settings=settings,
         )
     except CaptureError as error:

@@ -33,12 +33,12 @@ class Camera:
     def __post_init__(self) -> None:
         numbers = [*self.focal, *self.principal, *self.world_to_camera.flatten().tolist()]
         if not all(map(math.isfinite, numbers)) or min(self.focal) <= 0 or min(self.width, self.height) < 1:
-            raise CaptureError(
-                f"expected a camera with finite numbers, positive focal lengths and a size in pixels, got focal "
-                f"lengths {self.focal}, principal point {self.principal}, size {self.width} x {self.height}; check "
-                "the file that holds the cameras",
+            raise CaptureError.expected(
+                "finite numbers, positive focal lengths and a size in pixels",
+                [*self.focal, *self.principal, self.width, self.height],
+                got=f"focal lengths {self.focal}, principal point {self.principal}, size {self.width} x {self.height}",
                 name="camera",
-                value=[*self.focal, *self.principal, self.width, self.height],
+                advice="check the file that holds the cameras",
             )
 
     @classmethod
@@ -60,12 +60,9 @@ class Camera:
         forward = target - position
         right = torch.linalg.cross(forward, up)
         if float(right.norm()) < 1e-9 * max(float(forward.norm()) * float(up.norm()), 1e-300):
-            raise CaptureError(
-                f"expected an up direction across the line of sight {forward.tolist()}, got {up.tolist()}; choose "
-                "another up, or another target than the camera's position",
-                name="up",
-                value=up.tolist(),
-            )
+            wanted = f"an up direction across the line of sight {forward.tolist()}"
+            advice = "choose another up, or another target than the camera's position"
+            raise CaptureError.expected(wanted, up.tolist(), name="up", advice=advice)
         forward, right = forward / forward.norm(), right / right.norm()
         rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
         pose = torch.eye(4, dtype=torch.float64)

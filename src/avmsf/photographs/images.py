@@ -15,6 +15,7 @@ from avmsf.errors import CaptureError
 MAX_PIXELS = 200_000_000
 """Pixels of a picture: as many as the largest sensors of cameras and telephones have (16,320 x 12,240). Reading one
 takes 0.6 GB in 8 bits, 3 GB with 16 bits and alpha; a PNG file of 110 kB may claim 900 million."""
+_SIZE = f"at most {MAX_PIXELS:,} pixels"
 _HEADERS: tuple[tuple[bytes, type[ImageFile.ImageFile]], ...] = (
     (b"\x89PNG", PngImagePlugin.PngImageFile),
     (b"\xff\xd8", JpegImagePlugin.JpegImageFile),
@@ -101,18 +102,12 @@ def _is_small(content: bytes, path: Path) -> bool:
             return False
         width, height = read_header(io.BytesIO(content)).size
     except Image.DecompressionBombError as error:
-        raise PictureSizeError(
-            f"{path}: expected at most {MAX_PIXELS:,} pixels ({error}); scale it down", file=path
-        ) from error
+        raise PictureSizeError.expected(_SIZE, got=f"more ({error})", file=path, advice="scale it down") from error
     except Exception:  # Pillow raises whatever the parsing of a damaged header raises
         return False
     if width * height > MAX_PIXELS:
-        raise PictureSizeError(
-            f"{path}: expected at most {MAX_PIXELS:,} pixels, got {width:,} x {height:,}; scale the picture down",
-            file=path,
-            name="pixels",
-            value=width * height,
-        )
+        got, advice = f"{width:,} x {height:,}", "scale the picture down"
+        raise PictureSizeError.expected(_SIZE, width * height, got=got, file=path, name="pixels", advice=advice)
     return True
 
 
@@ -121,26 +116,18 @@ def _decode(path: Path, flags: int) -> np.ndarray:
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise CaptureError(f"{path}: expected an image file ({error.strerror})", file=path) from error
+        raise CaptureError.expected("an image file", got=error.strerror, file=path) from error
     pixels = None
     if _is_small(content, path):
         with contextlib.suppress(cv2.error):
             pixels = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
     if pixels is None:
-        raise CaptureError(
-            f"{path}: expected a complete PNG, JPEG or WebP image, got {len(content)} bytes that cannot be read; copy "
-            "or export it again",
-            file=path,
-            name="bytes",
-            value=len(content),
-        )
+        wanted, got = "a complete PNG, JPEG or WebP image", f"{len(content)} bytes that cannot be read"
+        advice = "copy or export it again"
+        raise CaptureError.expected(wanted, len(content), got=got, file=path, name="bytes", advice=advice)
     if pixels.dtype == np.uint16:
         return ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
     if pixels.dtype != np.uint8:
-        raise CaptureError(
-            f"{path}: expected 8 or 16 bits per channel, got {pixels.dtype}; export it as PNG",
-            file=path,
-            name="bits",
-            value=str(pixels.dtype),
-        )
+        wanted, kind = "8 or 16 bits per channel", str(pixels.dtype)
+        raise CaptureError.expected(wanted, kind, got=kind, file=path, name="bits", advice="export it as PNG")
     return pixels

@@ -17,8 +17,6 @@ from avmsf.photographs.images import Picture
 _GRID = 33
 # A straightened picture takes in at most this many times the width and height that the lens has in its middle.
 _WIDEST = 2.0
-
-
 _ANY_CAMERA = Location(None, item="the camera")
 
 
@@ -101,12 +99,9 @@ def _widest_pinhole(lens: Lens) -> Lens:
     """Return the pinhole of smallest focal length, by bisection, whose every pixel lies in the lens's image."""
     narrow, wide = 4.0, 1 / _WIDEST
     if not _covers(lens, narrow):
-        raise lens.origin.error(
-            f"expected an invertible distortion, got {lens.distortion}; check the camera model (fisheye: "
-            f"{lens.fisheye}) and the order of its coefficients",
-            name="distortion",
-            value=lens.distortion,
-        )
+        message = f"expected an invertible distortion, got {lens.distortion}; check the camera model (fisheye: "
+        message += f"{lens.fisheye}) and the order of its coefficients"
+        raise lens.origin.error(message, name="distortion", value=lens.distortion)
     if _covers(lens, wide):
         narrow = wide
     while narrow / wide > 1 + 1e-5:

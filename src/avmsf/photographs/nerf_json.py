@@ -36,19 +36,15 @@ def read_transforms(path: Path) -> Shots:
     record = load_record(path)
     frames = record.get("frames")
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-        raise CaptureError(
-            f"{path}: expected a list 'frames', each with file_path and transform_matrix, got {type(frames).__name__}",
-            file=path,
-            name="frames",
-            value=type(frames).__name__,
-        )
+        wanted, kind = "a list 'frames', each with file_path and transform_matrix", type(frames).__name__
+        raise CaptureError.expected(wanted, kind, got=kind, file=path, name="frames")
     refuse_many(len(frames), path)
     common = {key: value for key, value in record.items() if key != "frames"}
     shots, scaled = [], []
     for row, frame in enumerate(frames):
         file = _text(frame, "file_path", Location(path, row, f"frame {row}"))
         where = Location(path, row, f"frame {row} ({file})")
-        pose, scale = rigid(_matrix(frame, where), where)
+        pose, scale = _rigid(_matrix(frame, where), where)
         image = _with_suffix(path.parent / file)
         name = _name(file, image)
         if abs(scale - 1) > MAX_SCALE_DEVIATION:
@@ -56,7 +52,7 @@ def read_transforms(path: Path) -> Shots:
         settings = ChainMap(frame, common)
         mask = path.parent / _text(frame, "mask_path", where) if frame.get("mask_path") else None
         _camera_model(settings, where)
-        shots.append(Shot(name, image, opencv_from_opengl(pose), partial(_lens, settings, where), mask))
+        shots.append(Shot(name, image, _opencv_from_opengl(pose), partial(_lens, settings, where), mask))
     message = f"poses have a scaled rotation; the scale was removed: {listed(scaled)}"
     return Shots(path, tuple(shots), (Remark(message, name="transform_matrix", value=scaled),) if scaled else ())
 
@@ -96,9 +92,8 @@ def load_record(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise CaptureError(f"{path}: expected a JSON file, got one that cannot be read ({error})", file=path) from error
     if not isinstance(record, dict):
-        raise CaptureError.expected(
-            "a JSON object with 'frames'", type(record).__name__, got=type(record).__name__, file=path
-        )
+        kind = type(record).__name__
+        raise CaptureError.expected("a JSON object with 'frames'", kind, got=kind, file=path)
     return record
 
 
@@ -117,9 +112,8 @@ def _lens(settings: Mapping[str, Any], where: Location, image_width: int, image_
     principal = (_number(settings, "cx", where, width / 2), _number(settings, "cy", where, height / 2))
     k1, k2, k3, k4, p1, p2 = (_number(settings, key, where, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     if not fisheye and k4:
-        raise where.error(
-            f"expected k1 k2 p1 p2 k3 of a perspective lens, got k4 = {k4}; calibrate again", name="k4", value=k4
-        )
+        message = f"expected k1 k2 p1 p2 k3 of a perspective lens, got k4 = {k4}; calibrate again"
+        raise where.error(message, name="k4", value=k4)
     distortion = (k1, k2, k3, k4) if fisheye else (k1, k2, p1, p2, k3)
     return Lens(focal, principal, width, height, distortion, fisheye, where)
 
@@ -127,15 +121,12 @@ def _lens(settings: Mapping[str, Any], where: Location, image_width: int, image_
 def _focal(settings: Mapping[str, Any], axis: str, pixels: int, where: Location) -> float | None:
     if f"fl_{axis}" in settings:
         return _number(settings, f"fl_{axis}", where)
-    if f"camera_angle_{axis}" not in settings:
+    key = f"camera_angle_{axis}"
+    if key not in settings:
         return None
-    angle = _number(settings, f"camera_angle_{axis}", where)
+    angle = _number(settings, key, where)
     if not 0 < angle < math.pi:
-        raise where.error(
-            f"expected camera_angle_{axis} in radians between 0 and pi, got {angle}",
-            name=f"camera_angle_{axis}",
-            value=angle,
-        )
+        raise where.error(f"expected {key} in radians between 0 and pi, got {angle}", name=key, value=angle)
     return pixels / 2 / math.tan(angle / 2)
 
 
@@ -144,27 +135,23 @@ def _camera_model(settings: Mapping[str, Any], where: Location) -> str:
     fallback = "OPENCV_FISHEYE" if settings.get("is_fisheye") else "OPENCV"
     name = str(settings.get("camera_model") or fallback).upper()
     if name not in PERSPECTIVE + FISHEYE:
-        raise where.error(
-            f"expected a camera model among {', '.join(PERSPECTIVE + FISHEYE)}, got {name}; undistort the images first",
-            name="camera_model",
-            value=name,
-        )
+        known = ", ".join(PERSPECTIVE + FISHEYE)
+        message = f"expected a camera model among {known}, got {name}; undistort the images first"
+        raise where.error(message, name="camera_model", value=name)
     return name
 
 
 def _matrix(frame: dict[str, Any], where: Location) -> np.ndarray:
     key = "transform_matrix"
     written = frame.get(key)
-    if written is None:
-        raise where.error(f"expected {key}, the camera-to-world pose, got none", name=key)
     try:
         matrix = np.array(written, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise where.error(f"expected {key} as 4 rows of 4 numbers ({error})", name=key, value=written) from error
-    if matrix.ndim != 2:
-        raise where.error(
-            f"expected {key} as 4 rows of 4 numbers, got {matrix.ndim} dimensions", name=key, value=written
-        )
+    if written is None or matrix.shape not in ((4, 4), (3, 4)):
+        got = "none" if written is None else f"the shape {matrix.shape}"
+        message = f"expected {key}, the camera-to-world pose, as 4 rows of 4 numbers, got {got}"
+        raise where.error(message, name=key, value=written)
     return matrix
 
 
@@ -203,53 +190,45 @@ def _name(file: str, image: Path) -> str:
     return "/".join([*parts, image.name])
 
 
-def rigid(matrix: Float[np.ndarray, "rows columns"], where: Location) -> tuple[Float[np.ndarray, "4 4"], float]:
+def _rigid(matrix: Float[np.ndarray, "rows 4"], where: Location) -> tuple[Float[np.ndarray, "4 4"], float]:
     """Return a camera-to-world matrix made exactly rigid, and the scale that its rotation had.
 
     `matrix` is 4 x 4, or 3 x 4 without the last row. A scale that is the same along all axes does not move the camera
     and is removed; the caller warns of it. Raises CaptureError, at `where`, for anything else that is not a rotation
     with a position.
     """
-    key = "transform_matrix"
-    if matrix.shape not in ((4, 4), (3, 4)):
-        raise where.error(
-            f"expected a pose of 4 x 4 numbers, got {matrix.shape[0]} x {matrix.shape[1]}",
-            name=key,
-            value=list(matrix.shape),
-        )
+
+    def refused(message: str, value: Any) -> CaptureError:
+        return where.error(message, name="transform_matrix", value=value)
+
     if not np.isfinite(matrix).all():
         value = float(matrix[~np.isfinite(matrix)][0])
-        raise where.error(f"expected a finite pose, got {value}; estimate this camera again", name=key, value=value)
-    if matrix.shape[0] == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
-        raise where.error(
-            f"expected 0 0 0 1 as the pose's last row, got {matrix[3].tolist()}; perhaps the matrix is transposed",
-            name=key,
-            value=matrix[3].tolist(),
-        )
+        raise refused(f"expected a finite pose, got {value}; estimate this camera again", value)
+    if len(matrix) == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
+        row = matrix[3].tolist()
+        raise refused(f"expected 0 0 0 1 as the pose's last row, got {row}; perhaps the matrix is transposed", row)
     determinant = float(np.linalg.det(matrix[:3, :3]))
     if determinant < -1e-12:
-        raise where.error(
+        raise refused(
             f"expected a pose with right-handed axes, got determinant {determinant:.3g}. transforms.json has OpenGL's "
             "axes: x right, y up, z backward. With y up and z forward (Unity, DirectX), negate the third column; with "
             "x right, y down and z forward (OpenCV), negate the second and the third",
-            name=key,
-            value=determinant,
+            determinant,
         )
     left, stretches, right = np.linalg.svd(matrix[:3, :3])
     scale = float(stretches.mean())
     if scale < 1e-9 or np.abs(stretches / scale - 1).max() > MAX_SCALE_DEVIATION:
-        raise where.error(
-            f"expected a rotation in the pose, got a matrix with the scales "
-            f"{', '.join(f'{stretch:.4g}' for stretch in stretches)} along its axes; remove the scales",
-            name=key,
-            value=stretches.tolist(),
+        scales = ", ".join(f"{stretch:.4g}" for stretch in stretches)
+        raise refused(
+            f"expected a rotation in the pose, got a matrix with the scales {scales} along its axes; remove the scales",
+            stretches.tolist(),
         )
-    rigid_pose = np.eye(4)
-    rigid_pose[:3, :3], rigid_pose[:3, 3] = left @ right, matrix[:3, 3]
-    return rigid_pose, scale
+    rigid = np.eye(4)
+    rigid[:3, :3], rigid[:3, 3] = left @ right, matrix[:3, 3]
+    return rigid, scale
 
 
-def opencv_from_opengl(camera_to_world: Float[np.ndarray, "4 4"]) -> Float[Tensor, "4 4"]:
+def _opencv_from_opengl(camera_to_world: Float[np.ndarray, "4 4"]) -> Float[Tensor, "4 4"]:
     """Return world to camera with OpenCV's axes from a rigid camera-to-world matrix with OpenGL's."""
     turned = camera_to_world * np.array([1.0, -1.0, -1.0, 1.0])
     inverse = np.eye(4)

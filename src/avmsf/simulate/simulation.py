@@ -260,12 +260,11 @@ def _captured(
     prepared = []
     for file, force, sound in zip(truth.names, forces.tolist(), recordings, strict=True):
         recording = Recording(file, sound.double().numpy()[None], rate, "FLOAT")
-        prepared.append(shorten(prepare(recording, settings, newtons=force), rate=rate, settings=settings))
+        prepared.append(shorten(prepare(recording, settings, newtons=force), settings))
     impacts, _ = build_impacts(
         prepared,
         strikes.written_places,
         names=truth.names,
-        rate=rate,
         settings=settings,
         directions=strikes.written_directions.float(),
     )
