@@ -42,9 +42,8 @@ def find_surface_file(folder: Path, settings: CaptureSettings) -> Path | None:
     if settings.surface is not None:
         named = Path(settings.surface)
         if named.is_absolute() or ".." in named.parts:
-            raise CaptureError.expected(
-                "a file in the capture folder", settings.surface, file=folder, name="surface", advice="copy it there"
-            )
+            wanted, advice = "a file in the capture folder", "copy it there"
+            raise CaptureError.expected(wanted, settings.surface, file=folder, name="surface", advice=advice)
         return folder / named
     return next((folder / name for name in SURFACE_FILES if (folder / name).is_file()), None)
 
@@ -98,28 +97,18 @@ def missing_recording(path: Path, name: str, *, advice: str, used: Collection[Pa
 
     `advice` says what to do where there is none of a similar name.
     """
-    near = _nearest_name(path, used)
+    near = None
     if not path.parent.is_dir():
         advice = f"the folder {path.parent} does not exist either; {advice}"
-    elif near is not None:
-        advice = f"did you mean {near}?"
+    else:
+        # A file with another number is another recording, not another spelling: 5.wav is similar to 005.wav, 040.wav
+        # is not. Sorted by name: the order of a folder differs from disk to disk.
+        numbers = _numbers(path.name)
+        unused = sorted(other.name for other in path.parent.iterdir() if other not in used)
+        names = {each.lower(): each for each in unused if not numbers or _numbers(each) in (numbers, [])}
+        near = next((names[each] for each in get_close_matches(path.name.lower(), names, n=1, cutoff=0.7)), None)
+        advice = advice if near is None else f"did you mean {near}?"
     return CaptureError(f"{name}: expected a sound file, got none; {advice}", file=path, value=near)
-
-
-def _nearest_name(path: Path, used: Collection[Path]) -> str | None:
-    """Return the unused file with the most similar name to a path that does not exist, if any.
-
-    A file with another number is another recording, not another spelling: 040.wav is not similar to 005.wav, 5.wav is.
-    """
-    if not path.parent.is_dir():
-        return None
-    # The first by name: the order of a folder differs from disk to disk.
-    wanted = _numbers(path.name)
-    unused = (other.name for other in path.parent.iterdir() if other not in used)
-    others = (name for name in unused if not wanted or _numbers(name) in (wanted, []))
-    names = {name.lower(): name for name in sorted(others)}
-    found = get_close_matches(path.name.lower(), names, n=1, cutoff=0.7)
-    return names[found[0]] if found else None
 
 
 def _numbers(name: str) -> list[int]:

@@ -129,12 +129,8 @@ class Impacts:
         """
         if not bool(torch.isfinite(delays).all()):
             row = int((~torch.isfinite(delays)).nonzero()[0])
-            raise ArrayError(
-                f"delays: expected finite numbers of samples, got {float(delays[row])} (row {row})",
-                row=row,
-                name="delays",
-                value=float(delays[row]),
-            )
+            wanted = "finite numbers of samples"
+            raise ArrayError.expected(wanted, float(delays[row]), row=row, name="delays")
         margins = [self.sounds.new_zeros(len(self), 0) if each is None else each for each in (self.before, self.after)]
         whole = torch.cat([margins[0], self.sounds, margins[1]], dim=1).nan_to_num_(nan=0.0)
         sounds = _cut(whole, margins[0].shape[1] + delays, self.sounds.shape[1])

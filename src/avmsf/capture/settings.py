@@ -130,7 +130,7 @@ class CaptureSettings:
         try:
             table = read_toml(path)
         except FileNotFoundError as error:
-            raise CaptureError(f"{path}: expected a file of capture settings, got none", file=path) from error
+            raise CaptureError.expected("a file of capture settings", file=path) from error
         except (OSError, ValueError) as error:
             raise CaptureError.expected("a TOML file", got=f"one that cannot be read: {error}", file=path) from error
         return cls.of(table, name=str(path), file=path)
@@ -164,11 +164,9 @@ def _typed(key: str, value: Any, kinds: tuple[object, ...]) -> Any:
 
 def _unknown_key(key: str, known: list[str]) -> CaptureError:
     """Return the error of a key; its `value` is the most similar known one, if any."""
-    similar = get_close_matches(key, known, n=1, cutoff=0.6)
-    advice = f" (did you mean {similar[0]}?)" if similar else ""
-    return CaptureError(
-        f"expected keys among {', '.join(known)}, got {key!r}{advice}", name=key, value=similar[0] if similar else None
-    )
+    similar = next(iter(get_close_matches(key, known, n=1, cutoff=0.6)), None)
+    advice = "" if similar is None else f" (did you mean {similar}?)"
+    return CaptureError(f"expected keys among {', '.join(known)}, got {key!r}{advice}", name=key, value=similar)
 
 
 def settings_of(folder: Path) -> CaptureSettings:

@@ -82,15 +82,13 @@ def read_cells(path: Path) -> tuple[list[tuple[int, list[str]]], str]:
         reader = csv.reader(io.StringIO(text), delimiter=separator)
         lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in islice(reader, MAX_ROWS + 2)]
     except UnicodeDecodeError as error:
-        raise CaptureError(
-            f"{path}: expected UTF-8 text; save it from the spreadsheet as 'CSV UTF-8'", file=path
-        ) from error
+        advice = "save it from the spreadsheet as 'CSV UTF-8'"
+        raise CaptureError.expected("UTF-8 text", got="other bytes", file=path, advice=advice) from error
     except (OSError, ValueError, csv.Error) as error:
-        raise CaptureError(f"{path}: expected a table, got a file that cannot be read: {error}", file=path) from error
+        raise CaptureError.expected("a table", got=f"a file that cannot be read: {error}", file=path) from error
     if len(lines) > MAX_ROWS + 1:
-        raise CaptureError(
-            f"{path}: expected at most {MAX_ROWS:,} rows, got more; divide the table", file=path, row=lines[-1][0]
-        )
+        message = f"{path}: expected at most {MAX_ROWS:,} rows, got more; divide the table"
+        raise CaptureError(message, file=path, row=lines[-1][0])
     return [(line, cells) for line, cells in lines if any(cells)], separator
 
 
@@ -115,10 +113,8 @@ def read_rows(folder: Path) -> tuple[list[Row], list[CaptureWarning]]:
     rows = []
     for line, cells in lines[1:]:
         if len(cells) != len(header):
-            raise Location(path, line, f"row {line}").error(
-                f"expected {len(header)} cells as in the header, got {len(cells)}: {separator.join(cells)}",
-                value=len(cells),
-            )
+            wanted, got = f"{len(header)} cells as in the header", f"{len(cells)}: {separator.join(cells)}"
+            raise CaptureError.expected(wanted, len(cells), got=got, file=path, row=line)
         named = dict(zip(header, cells, strict=True))
         named["file"] = _as_on_disk(folder, named["file"])
         rows.append(Row(line, named, separator != ","))
@@ -146,9 +142,9 @@ def parse_row(row: Row, settings: CaptureSettings) -> Strike:
     contact = [value * settings.meters for value in written]
     farthest = max(written, key=abs)
     if abs(farthest) * settings.meters > FARTHEST:
+        shown = ", ".join(row.cells[name] for name in ("x", "y", "z"))
         raise where.error(
-            f"expected a contact within {FARTHEST:g} m of the origin, got "
-            f"({', '.join(row.cells[name] for name in ('x', 'y', 'z'))}), {math.hypot(*contact):.4g} m away "
+            f"expected a contact within {FARTHEST:g} m of the origin, got ({shown}), {math.hypot(*contact):.4g} m away "
             f"(unit = {settings.unit!r}): {fitting_units(abs(farthest))}",
             name="unit",
             value=written,
@@ -160,11 +156,9 @@ def parse_row(row: Row, settings: CaptureSettings) -> Strike:
     if FORCE in row.cells:
         newtons = _number(row, FORCE)
         if not MIN_FORCE_NEWTONS <= newtons <= MAX_FORCE_NEWTONS:
-            raise where.error(
-                f"expected {FORCE}, a peak force of {MIN_FORCE_NEWTONS:g} to {MAX_FORCE_NEWTONS:g} N, got {newtons:g}",
-                name=FORCE,
-                value=newtons,
-            )
+            limits = f"{MIN_FORCE_NEWTONS:g} to {MAX_FORCE_NEWTONS:g} N"
+            message = f"expected {FORCE}, a peak force of {limits}, got {newtons:g}"
+            raise where.error(message, name=FORCE, value=newtons)
     return Strike(_inside(row.cells["file"], where), row.line, (contact[0], contact[1], contact[2]), direction, newtons)
 
 
@@ -200,11 +194,8 @@ def refuse_repeated_files(strikes: Sequence[Strike]) -> None:
     lines: dict[str, int] = {}
     for strike in strikes:
         if strike.file in lines:
-            raise Location(TABLE, strike.line, f"row {strike.line}").error(
-                f"expected a different recording for each row, got {strike.file} as in row {lines[strike.file]}",
-                name="file",
-                value=strike.file,
-            )
+            wanted, got = "a different recording for each row", f"{strike.file} as in row {lines[strike.file]}"
+            raise CaptureError.expected(wanted, strike.file, got=got, file=TABLE, row=strike.line, name="file")
         lines[strike.file] = strike.line
 
 
@@ -223,13 +214,8 @@ def refuse_missing(folder: Path, strikes: Sequence[Strike]) -> None:
         advice, used = f"copy it there, or remove its row from {TABLE}", {folder / each for each in files}
         raise missing_recording(folder / file, file, advice=advice, used=used)
     advice = "copy them there, or correct their names" if below is None else f"write {below} in place of {file}"
-    raise CaptureError(
-        f"{folder / TABLE}: expected a file for each row, got none for {len(missing)} of {len(strikes)} "
-        f"({listed(missing)}); {advice}",
-        file=folder / TABLE,
-        name="file",
-        value=missing,
-    )
+    got, table = f"none for {len(missing)} of {len(strikes)} ({listed(missing)})", folder / TABLE
+    raise CaptureError.expected("a file for each row", missing, got=got, file=table, name="file", advice=advice)
 
 
 def is_missing(path: Path) -> bool:
@@ -259,32 +245,23 @@ def fitting_units(written: float) -> str:
 
 
 def _check_header(header: Sequence[str], path: Path) -> list[CaptureWarning]:
+    def refused(wanted: str, got: Sequence[str], name: str, value: Sequence[str], advice: str = "") -> CaptureError:
+        shown = f"only {', '.join(got)}"
+        return CaptureError.expected(wanted, list(value), got=shown, file=path, name=name, advice=advice)
+
     missing = [name for name in REQUIRED if name not in header]
     if missing:
         numbers = "vertex numbers have to become positions: " if any("vert" in name for name in header) else ""
-        raise CaptureError(
-            f"{path}: expected the columns {', '.join(missing)}, got only {', '.join(header)}; {numbers}{HOW_TO_WRITE}",
-            file=path,
-            name=missing[0],
-            value=list(header),
-        )
+        raise refused(f"the columns {', '.join(missing)}", header, missing[0], header, numbers + HOW_TO_WRITE)
     directions = [name for name in DIRECTION if name in header]
     if 0 < len(directions) < 3:
-        raise CaptureError(
-            f"{path}: expected all of nx, ny, nz or none, got only {', '.join(directions)}",
-            file=path,
-            name=next(name for name in DIRECTION if name not in header),
-            value=directions,
-        )
+        absent = next(name for name in DIRECTION if name not in header)
+        raise refused("all of nx, ny, nz or none", directions, absent, directions)
     known = (*REQUIRED, *DIRECTION, FORCE)
     double = sorted({name for name in header if name in known and header.count(name) > 1})
     if double:
-        raise CaptureError(
-            f"{path}: expected different names of columns, got more than one {', '.join(double)}",
-            file=path,
-            name=double[0],
-            value=list(header),
-        )
+        got = f"more than one {', '.join(double)}"
+        raise CaptureError.expected("different names of columns", list(header), got=got, file=path, name=double[0])
     extra = [name or "(no name)" for name in header if name not in known]
     if not extra:
         return []
@@ -308,11 +285,8 @@ def _number(row: Row, name: str) -> float:
 def _unit_vector(values: Sequence[float], where: Location) -> tuple[float, float, float]:
     length = math.hypot(*values)
     if length == 0:
-        raise where.error(
-            "expected a direction as nx,ny,nz, got the zero vector; give a direction or remove the columns",
-            name=DIRECTION[0],
-            value=list(values),
-        )
+        message = "expected a direction as nx,ny,nz, got the zero vector; give a direction or remove the columns"
+        raise where.error(message, name=DIRECTION[0], value=list(values))
     # What has unit length already stays as it is, so that writing and reading again changes no digit.
     scale = 1.0 if abs(length - 1) < 1e-6 else 1 / length
     return (values[0] * scale, values[1] * scale, values[2] * scale)
@@ -327,7 +301,6 @@ def _inside(text: str, where: Location) -> str:
     if not text:
         raise where.error("expected a wav file's path as file, got nothing", name="file", value=text)
     if path.is_absolute() or ".." in path.parts or ":" in path.parts[0]:
-        raise where.error(
-            f"expected a path inside the capture folder as file, got {text}; copy it there", name="file", value=text
-        )
+        message = f"expected a path inside the capture folder as file, got {text}; copy it there"
+        raise where.error(message, name="file", value=text)
     return str(path)
