@@ -38,12 +38,11 @@ def detect_dataset(path: str | Path) -> Kind:
     kind = _kind(folder)
     if kind is None:
         found, value = _explain(folder)
-        raise DatasetError(
-            f"{folder}: expected a capture folder or a folder of them ({TABLE}), ObjectFolder Real "
-            f"(OBJECT/audio/CONTACT/mic.wav), or RealImpact (NUMBER_NAME/preprocessed/deconvolved_0db.npy), {found}",
-            file=folder,
-            value=value,
+        wanted = (
+            f"a capture folder or a folder of them ({TABLE}), ObjectFolder Real (OBJECT/audio/CONTACT/mic.wav), or "
+            "RealImpact (NUMBER_NAME/preprocessed/deconvolved_0db.npy)"
         )
+        raise DatasetError(f"{folder}: expected {wanted}, {found}", file=folder, value=value)
     return kind
 
 

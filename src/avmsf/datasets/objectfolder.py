@@ -164,9 +164,8 @@ class ObjectFolderRaw:
     def _examine(self, identifier: str) -> tuple[list[_Entry], list[str]]:
         """Return the usable recordings, and a message for each problem or assumption."""
         entries, problems, unknown_gains = [], [], []
-        for folder in sorted(
-            self._folders[identifier].iterdir(), key=lambda path: (number_of(path.name) or 0, path.name)
-        ):
+        folders = self._folders[identifier]
+        for folder in (folders / name for name in in_order(path.name for path in folders.iterdir())):
             contact = folder.name
             if not folder.is_dir() or contact.startswith(".") or contact.endswith("_deprecated"):
                 continue
@@ -275,9 +274,8 @@ def find_contacts(folder: Path, given: Path | None = None) -> tuple[Path, ...]:
             return found
     if given is not None:
         got = "a folder without them" if given.is_dir() else "no file or folder"
-        raise DatasetError.expected(
-            f"{' and '.join(CONTACT_LISTS)}, or one of these lists", got=got, file=given, name="contacts"
-        )
+        wanted = f"{' and '.join(CONTACT_LISTS)}, or one of these lists"
+        raise DatasetError.expected(wanted, got=got, file=given, name="contacts")
     return ()
 
 
@@ -292,13 +290,9 @@ def read_contacts(files: Sequence[Path]) -> dict[tuple[str, str], Point]:
         for row, record in _records(path):
             key, place = _parse_record(record, path, row)
             if places.setdefault(key, place) != place:
-                raise DatasetError(
-                    f"{path}, row {row}: expected one position of contact {key[1]} of object {key[0]}, got {place} "
-                    f"and {places[key]}; delete one",
-                    file=path,
-                    row=row,
-                    name=key[1],
-                    value=place,
+                wanted, got = f"one position of contact {key[1]} of object {key[0]}", f"{place} and {places[key]}"
+                raise DatasetError.expected(
+                    wanted, place, got=got, file=path, row=row, name=key[1], advice="delete one"
                 )
     return places
 
@@ -318,9 +312,8 @@ def _parse_record(record: Any, path: Path, row: int) -> tuple[tuple[str, str], P
     location = record.get("location") if isinstance(record, dict) else None
     found = _LISTED.search(location) if isinstance(location, str) else None
     if found is None:
-        raise DatasetError.expected(
-            "a location that ends in OBJECT_CONTACT_3sec_48000hz.wav", location, file=path, row=row, name="location"
-        )
+        wanted = "a location that ends in OBJECT_CONTACT_3sec_48000hz.wav"
+        raise DatasetError.expected(wanted, location, file=path, row=row, name="location")
     contact = record.get("contact")
     numbers = isinstance(contact, list) and all(type(value) in (int, float) for value in contact)
     if not numbers or len(contact) != 3 or not np.isfinite(contact).all():
@@ -338,9 +331,8 @@ def read_gain_db(path: Path) -> float:
     text = _read_note(path)
     gain, pad = _pair(text, "gain", path), _pair(text, "pad", path)
     if not set(pad) <= {0.0, 1.0}:
-        raise DatasetError.expected(
-            "pad 0 or 1 for each channel", pad, got=f"{pad[0]:g} and {pad[1]:g}", file=path, name="pad"
-        )
+        wanted, got = "pad 0 or 1 for each channel", f"{pad[0]:g} and {pad[1]:g}"
+        raise DatasetError.expected(wanted, pad, got=got, file=path, name="pad")
     return gain[1] - PAD_DB * pad[1]
 
 
@@ -348,12 +340,9 @@ def read_newtons(path: Path) -> float:
     """Read the peak force of a `striking_force.yaml`, newtons. Raises DatasetError where it holds no force above 0."""
     found = re.findall(rf"\bstriking_force_newtons['\"]?\s*:\s*({_NUMBER})[\s,}}\]]", _read_note(path) + "\n")
     if len(found) != 1 or not 0 < float(found[0]) < math.inf:
-        raise DatasetError(
-            f"{path}: expected one striking_force_newtons above 0, got {', '.join(found) if found else 'none'}",
-            file=path,
-            name="striking_force_newtons",
-            value=tuple(map(float, found)),
-        )
+        value, got = tuple(map(float, found)), ", ".join(found) or "none"
+        key = "striking_force_newtons"
+        raise DatasetError.expected(f"one {key} above 0", value, got=got, file=path, name=key)
     return float(found[0])
 
 

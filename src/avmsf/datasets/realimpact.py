@@ -93,13 +93,14 @@ class RealImpact:
         rows, common = closest_rows(vertices, microphones, corners)
         contacts = torch.from_numpy(positions[rows])
         off = torch.cdist(contacts, surface.vertices.double()).amin(dim=1)
-        if float(off.max()) > MAX_MESH_DISTANCE_M:
+        farthest = float(off.max())
+        if farthest > MAX_MESH_DISTANCE_M:
+            wanted = f"vertexXYZ.npy within {MAX_MESH_DISTANCE_M:g} m of the vertices of {MESH}"
             raise DatasetError(
-                f"{origin}: expected vertexXYZ.npy within {MAX_MESH_DISTANCE_M:g} m of the vertices of {MESH}, got "
-                f"{float(off.max()):.3g} m; unpack the archive again",
+                f"{origin}: expected {wanted}, got {farthest:.3g} m; unpack the archive again",
                 file=self.folder / identifier / FOLDER / "vertexXYZ.npy",
                 row=rows[int(off.argmax())],
-                value=float(off.max()),
+                value=farthest,
             )
         remarks = [] if common else ["no microphone position is common to all impacts: each has its closest one"]
         capture = build_capture(
@@ -147,13 +148,11 @@ class RealImpact:
         return open_array(self.folder / identifier / FOLDER / name)
 
     def _mesh(self, identifier: str) -> Surface:
-        shown = f"{identifier}/{FOLDER}/{MESH}"
-        if not (self.folder / shown).is_file():
-            raise DatasetError(
-                f"{shown}: expected a file, got none; unpack {identifier}.zip again", file=self.folder / shown
-            )
+        path = self.folder / identifier / FOLDER / MESH
+        if not path.is_file():
+            raise DatasetError.expected("a file", file=path, advice=f"unpack {identifier}.zip again")
         try:
-            return read_surface(self.folder / shown)
+            return read_surface(path)
         except CaptureError as error:
             raise DatasetError(str(error), **error.attributes) from error
 
@@ -165,11 +164,9 @@ class RealImpact:
             name = f"{identifier}/{FOLDER}/{SOUNDS}, row {row}"
             sound = np.array(sounds[row], dtype=np.float64)
             if not np.isfinite(sound).all():
-                raise DatasetError(
-                    f"{name}: expected finite samples, got NaN or inf; unpack {identifier}.zip again",
-                    file=self.folder / identifier / FOLDER / SOUNDS,
-                    row=row,
-                )
+                got, file = "NaN or inf", self.folder / identifier / FOLDER / SOUNDS
+                advice = f"unpack {identifier}.zip again"
+                raise DatasetError.expected("finite samples", got=got, file=file, row=row, advice=advice)
             recording = Recording(name, sound[None], SAMPLE_RATE_HZ, "FLOAT")
             yield DatasetRecording(f"vertex_{vertices[row]}.wav", recording, positions[row])
 
@@ -183,9 +180,8 @@ class RealImpact:
                 problems.append(str(error))
                 unusable.add(name)
         if not (folder / MESH).is_file():
-            problems.append(
-                f"{FOLDER}/{MESH}: expected a file to find the closest microphone, got none; unpack it again"
-            )
+            wanted = "a file to find the closest microphone"
+            problems.append(f"{FOLDER}/{MESH}: expected {wanted}, got none; unpack it again")
             unusable.add(NEEDED[0])
         count = 0 if unusable & set(NEEDED) else len(np.unique(self._array(identifier, "vertexID.npy")))
         return ObjectReport(self.facts(identifier), count, tuple(problems))
@@ -197,38 +193,25 @@ def open_array(path: Path) -> np.ndarray:
     Raises DatasetError unless it is whole and of its form.
     """
     dtype, shape = FORMS[path.name]
-    shown, advice = "/".join(path.parts[-3:]), "download or unpack it again"
     if not path.is_file():
-        raise DatasetError(f"{shown}: expected a file, got none; {advice}", file=path)
+        raise DatasetError.expected("a file", file=path, advice="download or unpack it again")
     try:
         array = np.lib.format.open_memmap(path, mode="r")
     except (OSError, ValueError) as error:
         size = path.stat().st_size
-        raise DatasetError(
-            f"{shown}: expected a whole NumPy array, got {size} bytes ({error}); {advice}",
-            file=path,
-            name="size",
-            value=size,
+        got, advice = f"{size} bytes ({error})", "download or unpack it again"
+        raise DatasetError.expected(
+            "a whole NumPy array", size, got=got, file=path, name="size", advice=advice
         ) from error
-    if (
-        array.dtype != dtype
-        or len(shape) != array.ndim
-        or any(map(lambda a, b: a not in (None, b), shape, array.shape))
-    ):
-        wanted = ", ".join("any" if length is None else str(length) for length in shape)
-        raise DatasetError(
-            f"{shown}: expected {dtype} ({wanted}), got {array.dtype} {array.shape}; take the published file",
-            file=path,
-            name="shape",
-            value=(str(array.dtype), *array.shape),
-        )
+    advice = "take the published file"
+    fits = len(shape) == array.ndim and all(a in (None, b) for a, b in zip(shape, array.shape, strict=True))
+    if array.dtype != dtype or not fits:
+        lengths = ", ".join("any" if length is None else str(length) for length in shape)
+        wanted, value = f"{dtype} ({lengths})", (str(array.dtype), *array.shape)
+        got = f"{array.dtype} {array.shape}"
+        raise DatasetError.expected(wanted, value, got=got, file=path, name="shape", advice=advice)
     if not array.flags.c_contiguous:
-        raise DatasetError(
-            f"{shown}: expected row-major order, got column-major; take the published file",
-            file=path,
-            name="order",
-            value="F",
-        )
+        raise DatasetError.expected("row-major order", "F", got="column-major", file=path, name="order", advice=advice)
     return array
 
 

@@ -103,31 +103,22 @@ def check_wav(path: Path, *, shown: str, rate: float, frames: int) -> DatasetErr
 
     Expected is one channel of at least so many frames at the rate, Hz.
     """
+    advice = "unpack or download it again"
     if not path.is_file():
-        return DatasetError(f"{shown}: expected a sound file, got none; unpack or download it again", file=path)
+        return DatasetError(f"{shown}: expected a sound file, got none; {advice}", file=path)
     try:
         header = soundfile.info(str(path))
     except (soundfile.LibsndfileError, OSError) as error:
         reason = getattr(error, "error_string", str(error)).strip().rstrip(".")
-        return DatasetError(f"{shown}: expected a sound file, got {reason!r}; unpack or download it again", file=path)
+        return DatasetError(f"{shown}: expected a sound file, got {reason!r}; {advice}", file=path)
     for name, found, expected in (
         ("sample rate", header.samplerate, int(rate)),
         ("number of channels", header.channels, 1),
+        ("length in frames", header.frames, max(frames, header.frames)),
     ):
         if found != expected:
-            return DatasetError(
-                f"{shown}: expected a {name} of {expected}, got {found}; take the published file",
-                file=path,
-                name=name,
-                value=found,
-            )
-    if header.frames < frames:
-        return DatasetError(
-            f"{shown}: expected {frames} frames, got {header.frames}; unpack or download it again",
-            file=path,
-            name="frames",
-            value=header.frames,
-        )
+            message = f"{shown}: expected a {name} of {expected}, got {found}; take the published file"
+            return DatasetError(message, file=path, name=name, value=found)
     return None
 
 
