@@ -74,9 +74,11 @@ def by_threshold(folder: Path) -> Impacts:
     settings = CaptureSettings()
     rows, _ = read_rows(folder)
     strikes = [parse_row(row, settings) for row in rows]
-    recordings = [read_recording(folder / strike.file, strike.file) for strike in strikes]
-    prepared = [prepare(each, settings, newtons=strike.newtons) for each, strike in zip(recordings, strikes, strict=True)]
-    rate = recordings[0].sample_rate
+    prepared = [
+        prepare(read_recording(folder / strike.file, strike.file), settings, newtons=strike.newtons)
+        for strike in strikes
+    ]
+    rate = prepared[0].rate
     length = min(round(settings.kept_seconds(rate) * rate), *(len(each.sound) for each in prepared))
     directions = [strike.direction for strike in strikes]
     return Impacts(
