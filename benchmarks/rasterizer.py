@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.rasterizer.cpu import NumbaRasterizer
+from avmsf.gaussians.rasterizer.devices import NumbaRasterizer
 from avmsf.gaussians.rasterizer.protocol import Rendering
 from avmsf.photographs.cameras import Camera
 from benchmarks.rasterizers import render_everywhere, render_padded

@@ -19,7 +19,7 @@ from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.fit import splat
 from avmsf.gaussians.ply import read_splats, write_splats
-from avmsf.gaussians.rasterizer.protocol import choose_rasterizer
+from avmsf.gaussians.rasterizer.devices import choose_rasterizer
 from avmsf.gaussians.visibility import depth_of_cloud
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.surface import Surface, read_surface

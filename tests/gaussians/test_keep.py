@@ -7,7 +7,7 @@ from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.prune import blended_weight, keep_object, masks_agree
-from avmsf.gaussians.rasterizer.cpu import NumbaRasterizer
+from avmsf.gaussians.rasterizer.devices import NumbaRasterizer
 from factories.ball_views import MIDDLE, RADIUS, ball_color, ball_views
 from factories.raising import raises
 

@@ -10,9 +10,9 @@ import torch
 
 from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.rasterizer.cpu import NumbaRasterizer
+from avmsf.gaussians.rasterizer.devices import NumbaRasterizer, choose_rasterizer
 from avmsf.gaussians.rasterizer.projection import project
-from avmsf.gaussians.rasterizer.protocol import Rendering, choose_rasterizer
+from avmsf.gaussians.rasterizer.protocol import Rendering
 from avmsf.photographs.cameras import Camera
 from benchmarks.rasterizers import render_everywhere, splats
 from factories.raising import raises
@@ -321,7 +321,7 @@ def test_gsplat_is_given_what_it_expects(monkeypatch: pytest.MonkeyPatch) -> Non
     with raises(SceneError, name="cloud", value="cpu"):
         own(single((0.0, 0.0, 0.5)), AHEAD, background=BACKGROUND)
     # There is no card here: only the question where a tensor lies is answered otherwise.
-    monkeypatch.setattr("avmsf.gaussians.rasterizer.cuda._lies_on_card", lambda tensor: True)
+    monkeypatch.setattr("avmsf.gaussians.rasterizer.devices._lies_on_card", lambda tensor: True)
     cloud = leaves(single((0.1, 0.2, 0.5), scale=0.02, logit=0.0))
     found = own(cloud, AHEAD, background=BACKGROUND)
     shapes = {name: tuple(value.shape) for name, value in given.items() if isinstance(value, torch.Tensor)}

@@ -13,7 +13,7 @@ from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.densify import rotation_matrices
 from avmsf.gaussians.fit import SplatProgress, splat
 from avmsf.gaussians.initialize import StartPoints, photographed_colors, starting_cloud
-from avmsf.gaussians.rasterizer.cpu import NumbaRasterizer
+from avmsf.gaussians.rasterizer.devices import NumbaRasterizer
 from avmsf.gaussians.ssim import psnr
 from avmsf.gaussians.targets import choose_background, prepare_photographs
 from avmsf.photographs.cameras import View
@@ -63,12 +63,10 @@ def test_held_out_views_of_a_ball_are_foretold_and_its_gaussians_lie_on_it() -> 
 @pytest.mark.parametrize("background", ["found", "random"])
 def test_an_interrupted_run_goes_on_to_the_same_bits(tmp_path: Path, background: str) -> None:
     views, place = ball_views(12), tmp_path / "kept" / "splat.ckpt"
-    config = SplatConfig(
-        steps=60, start_points=400, gaussians=600, densify_every=15, background=background, reset_every=15
-    )
+    config = SplatConfig(steps=60, start_points=400, gaussians=600, densify_every=15, background=background)
 
     def interrupt(progress: SplatProgress) -> None:
-        # After a split and an opacity reset, and amid the next epoch of views.
+        # After a split, and amid the next epoch of views.
         if progress.step == 40:
             raise KeyboardInterrupt
 

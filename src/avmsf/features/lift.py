@@ -13,7 +13,8 @@ from avmsf.features.encoder import Encoder, continue_outside
 from avmsf.features.feature_field import FeatureField
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.points import nearest_points
-from avmsf.gaussians.rasterizer.protocol import Rasterizer, choose_rasterizer
+from avmsf.gaussians.rasterizer.devices import choose_rasterizer
+from avmsf.gaussians.rasterizer.protocol import Rasterizer
 from avmsf.gaussians.visibility import DepthMap, Visibility, depth_of_cloud, depth_reach, depth_test
 from avmsf.photographs.cameras import Camera, View
 

@@ -1,7 +1,7 @@
 """An object as 3D Gaussians: soft ellipsoids with an opacity and a color that depends on the direction of view."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -54,19 +54,8 @@ class GaussianCloud:
 
     def join(self, other: "GaussianCloud") -> "GaussianCloud":
         """Return these Gaussians and then those of another cloud with harmonics of the same degree."""
-        return GaussianCloud(
-            torch.cat([self.centers, other.centers]),
-            torch.cat([self.rotations, other.rotations]),
-            torch.cat([self.log_scales, other.log_scales]),
-            torch.cat([self.logit_opacities, other.logit_opacities]),
-            torch.cat([self.harmonics, other.harmonics]),
-        )
+        names = [each.name for each in fields(self)]
+        return GaussianCloud(*(torch.cat([getattr(self, name), getattr(other, name)]) for name in names))
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> "GaussianCloud":
-        return GaussianCloud(
-            change(self.centers),
-            change(self.rotations),
-            change(self.log_scales),
-            change(self.logit_opacities),
-            change(self.harmonics),
-        )
+        return GaussianCloud(*(change(getattr(self, each.name)) for each in fields(self)))

@@ -1,38 +1,17 @@
 """Settings of the fit of Gaussians to views: one flat record, which is also the command line's options."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Literal
 
 from avmsf._utils.text import changes_repr
 from avmsf.errors import SceneError
 
-_LEAST = {
-    "steps": 1,
-    "start_points": 100,
-    "gaussians": 100,
-    "halvings": 0,
-    "densify_every": 1,
-    "reset_every": 0,
-    "dissimilarity_weight": 0,
-    "mask_weight": 0,
-    "flat_weight": 0,
-    "growth": 0,
-    "large": 0,
-    "seed": 0,
-}
-_RATES = (
-    "center_rate",
-    "rotation_rate",
-    "scale_rate",
-    "opacity_rate",
-    "color_rate",
-    "shade_rate",
-    "final_center_rate",
-    "final_rate",
-    "start_scale",
-    "start_flatness",
-)
+_LEAST = {"steps": 1, "start_points": 100, "gaussians": 100, "densify_every": 1}
+_POSITIVE = ("start_scale", "start_flatness")
+"""Settings above zero, as all learning rates are."""
+_NOT_NEGATIVE = ("halvings", "growth", "large", "seed")
+"""Settings from zero on, as all weights are."""
 _PARTS = ("coarse_until", "degree_every", "densify_from", "densify_until", "least_opacity", "wrong_masks")
 
 
@@ -102,25 +81,21 @@ class SplatConfig:
     """Largest scale, in half diagonals, up to which a doubled Gaussian is copied; above, it is split."""
     least_opacity: float = 0.1
     """Opacity below which a Gaussian is removed."""
-    reset_every: int = 0
-    """Steps between resets of all opacities to twice `least_opacity`; 0 never resets them."""
     wrong_masks: float = 0.05
     """Fraction of the views whose masks may be wrong."""
     seed: int = 0
     """Seed of the order of the views, backgrounds and splits."""
 
     def __post_init__(self) -> None:
-        for name, least in _LEAST.items():
-            value = getattr(self, name)
-            if not least <= value < math.inf:
-                raise _unexpected(name, value, f"{least} or more")
-        for name in _RATES:
-            value = getattr(self, name)
-            if not 0 < value < math.inf:
-                raise _unexpected(name, value, "more than 0")
-        for name in _PARTS:
-            value = getattr(self, name)
-            if not 0 <= value <= 1:
+        for name in (each.name for each in fields(self)):
+            value, least = getattr(self, name), _LEAST.get(name, 0)
+            if name in _LEAST or name in _NOT_NEGATIVE or name.endswith("_weight"):
+                if not least <= value < math.inf:
+                    raise _unexpected(name, value, f"{least} or more")
+            elif name in _POSITIVE or name.endswith("_rate"):
+                if not 0 < value < math.inf:
+                    raise _unexpected(name, value, "more than 0")
+            elif name in _PARTS and not 0 <= value <= 1:
                 raise _unexpected(name, value, "0 to 1")
         if self.degree not in (0, 1, 2, 3):
             raise _unexpected("degree", self.degree, "0, 1, 2 or 3")

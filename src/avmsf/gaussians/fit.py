@@ -22,7 +22,8 @@ from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.densify import Density
 from avmsf.gaussians.initialize import StartPoints, photographed_colors, starting_cloud
 from avmsf.gaussians.prune import keep_object
-from avmsf.gaussians.rasterizer.protocol import Rasterizer, Rendering, choose_rasterizer
+from avmsf.gaussians.rasterizer.devices import choose_rasterizer
+from avmsf.gaussians.rasterizer.protocol import Rasterizer, Rendering
 from avmsf.gaussians.ssim import psnr, ssim
 from avmsf.gaussians.targets import Photograph, choose_background, prepare_photographs
 from avmsf.gaussians.visual_hull import visual_hull
@@ -344,8 +345,6 @@ class _Run:
         if first <= step <= last and step % config.densify_every == 0:
             rows, fresh = self.density.densify(self.cloud, config, self.half_diagonal, generator=self.generator)
             self._rebuild(rows, fresh)
-            if config.reset_every and step % config.reset_every == 0 and step < last:
-                self._reset_opacities()
         elif step > last and step % config.densify_every == 0:
             transparent = self.cloud.opacities < config.least_opacity
             if bool(transparent.any()):
@@ -365,12 +364,6 @@ class _Run:
             advice = "check cameras and that the initial points are on the object, or lower least_opacity"
             raise SceneError.expected("at least 4", count, row=self.step, name="gaussians", advice=advice)
         self.density = Density.zeros(self.cloud)
-
-    def _reset_opacities(self) -> None:
-        highest = 2.0 * self.config.least_opacity
-        self.parameters["logit_opacities"].clamp_(max=math.log(highest / (1.0 - highest)))
-        for moment in self.moments["logit_opacities"]:
-            moment.zero_()
 
 
 def _named(cloud: GaussianCloud) -> dict[str, Tensor]:

@@ -3,11 +3,9 @@
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.photographs.cameras import Camera
 
@@ -40,26 +38,3 @@ class Rasterizer(Protocol):
     def __call__(self, cloud: GaussianCloud, camera: Camera, *, background: Float[Tensor, " 3"]) -> Rendering:
         """Return what `camera` sees before a `background` color."""
         ...
-
-
-def choose_rasterizer(device: torch.device | str) -> Rasterizer:
-    """Return what renders clouds whose tensors lie on `device`: numba kernels on the CPU, gsplat on CUDA.
-
-    Raises SceneError for any other device, and for CUDA where gsplat or the device is missing.
-    """
-    kind = torch.device(device).type
-    # Imported when they are chosen: both build on this module, and who renders nothing waits for no compiler.
-    if kind == "cpu":
-        from avmsf.gaussians.rasterizer.cpu import NumbaRasterizer
-
-        return NumbaRasterizer()
-    if kind != "cuda":
-        raise SceneError.expected("cpu or cuda", str(device), name="device", advice="move the Gaussians to one")
-    if not torch.cuda.is_available():
-        advice = "choose cpu, or install the PyTorch build for your GPU"
-        raise SceneError.expected(
-            "a CUDA device that PyTorch can use", str(device), got="none", name="device", advice=advice
-        )
-    from avmsf.gaussians.rasterizer.cuda import GsplatRasterizer
-
-    return GsplatRasterizer()
