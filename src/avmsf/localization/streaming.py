@@ -3,13 +3,14 @@
 The modes are known, so the free decay after an impact is predicted: its modal amplitudes are fitted once, propagated
 from sample to sample, and updated regularly from the stream. A new impact is detected where the energy of the residual,
 in hops of 2.5 ms, jumps above all of the last 60 ms. The first `window` seconds from its onset on go to the locator,
-without the predicted decay of earlier impacts. The state has a fixed size (`StreamState`). The result does not depend
+without the predicted decay of earlier impacts. The state has a fixed size. The result does not depend
 on the lengths of the blocks: samples are processed hop by hop.
 """
 
 import time
 from dataclasses import dataclass, replace
 
+import numpy as np
 import scipy
 import torch
 from jaxtyping import Complex128, Float, Float64
@@ -65,8 +66,8 @@ class LocatedImpact:
     """False for a first estimate after which a better one comes."""
 
 
-@dataclass(frozen=True, eq=False)
-class PendingImpact:
+@dataclass(eq=False)
+class _PendingImpact:
     """An impact that was detected and whose last estimate was not returned yet."""
 
     onset: int
@@ -75,32 +76,8 @@ class PendingImpact:
     """Modal amplitudes of earlier impacts at `since`."""
     since: int
     """Sample that `earlier` is of."""
-    answered: bool
+    answered: bool = False
     """Whether the first estimate was returned, and the impact's own modal amplitudes are known."""
-
-
-@dataclass(frozen=True, eq=False)
-class StreamState:
-    """The state from one block to the next. Its size does not grow."""
-
-    clock: int
-    """Samples processed."""
-    waiting: Float64[Tensor, " waiting"]
-    """Filtered samples that wait for a complete hop."""
-    recent: Float64[Tensor, " recent"]
-    """The last samples processed."""
-    residual: Float64[Tensor, " recent"]
-    """These without the predicted decay of known impacts."""
-    ringing: Complex128[Tensor, " modes"]
-    """Modal amplitudes C of the decay: sample n from `clock` on is the imaginary part of the sum of C z^n."""
-    pending: PendingImpact | None
-    """The latest impact, until its last estimate is returned."""
-    highpass: Float64[Tensor, "sections 2"]
-    """State of the high-pass filter."""
-    rejected: int
-    """Number of detected sounds that were rejected: another object's, or noise."""
-    refusal: str
-    """Why the last one of them was."""
 
 
 class StreamingLocalizer:
@@ -154,11 +131,20 @@ class StreamingLocalizer:
         self.filter = scipy.signal.butter(2, cut, "highpass", fs=rate, output="sos") if cut > 0.0 else None
         strength = locator.gains[:, audible].abs().square().mean(0).sqrt()
         bank = field.bank.take(audible)
-        self._modes = Ringing.of(bank, strength, sample_rate=rate, hop=self.hop, window=self.window)
+        self._modes = Ringing.of(bank, strength, sample_rate=rate, window=self.window)
         memory = self.hop * (_MEMORY_HOPS + 2 * _SKIPPED_HOPS) + round(_ONSET_SEARCH_SECONDS * rate)
         self._history_samples = (self.later or self.window) + memory
-        self.state = self._silence()
         locator.prepare(*(each for each in (self.window, self.later) if each is not None))
+        self.clock = 0
+        """Samples processed."""
+        self.waiting = self.recent = self.residual = torch.zeros(0, dtype=torch.float64)
+        """Filtered samples that wait for a complete hop; the last ones processed; these without the predicted decay."""
+        self.ringing = torch.zeros(len(bank), dtype=torch.complex128)
+        """Modal amplitudes C of the decay: sample n from `clock` on is the imaginary part of the sum of C z^n."""
+        self.rejected, self.refusal = 0, ""
+        """Number of detected sounds that were rejected, another object's or noise, and why the last one was."""
+        self._pending: _PendingImpact | None = None
+        self._highpass = np.zeros((0 if self.filter is None else len(self.filter), 2))
 
     def process(self, block: Float[Tensor, " samples"]) -> list[LocatedImpact]:
         """Return the estimates that the next samples of the stream complete, in the order of time.
@@ -169,126 +155,103 @@ class StreamingLocalizer:
         if not bool(torch.isfinite(block).all()):
             advice = "leave them out or send zeros"
             raise LocationError.expected("finite samples", got="NaN or infinity", name="block", advice=advice)
-        clear, highpass = self._filtered(block.detach().double().cpu(), self.state.highpass)
-        state = replace(self.state, waiting=torch.cat([self.state.waiting, clear]), highpass=highpass)
-        came = state.clock + len(state.waiting)
+        samples = block.detach().double().cpu()
+        if self.filter is not None and len(samples):
+            passed, self._highpass = scipy.signal.sosfilt(self.filter, samples.numpy(), zi=self._highpass)
+            samples = torch.from_numpy(passed)
+        self.waiting = torch.cat([self.waiting, samples])
+        came = self.clock + len(self.waiting)
         answers: list[LocatedImpact] = []
-        while len(state.waiting) >= self.hop:
-            state, answer = self._process_hop(state)
+        while len(self.waiting) >= self.hop:
+            answer = self._process_hop()
             if answer is not None:
                 waited = (came - round(answer.seconds * self.rate)) / self.rate
                 answers.append(replace(answer, latency=waited + time.perf_counter() - begun))
-        self.state = state
         return answers
 
-    def _silence(self) -> StreamState:
-        nothing = torch.zeros(0, dtype=torch.float64)
-        sections = 0 if self.filter is None else len(self.filter)
-        still = torch.zeros(len(self._modes.poles), dtype=torch.complex128)
-        highpass = torch.zeros(sections, 2, dtype=torch.float64)
-        return StreamState(0, nothing, nothing, nothing, still, None, highpass, 0, "")
-
-    def _process_hop(self, state: StreamState) -> tuple[StreamState, LocatedImpact | None]:
+    def _process_hop(self) -> LocatedImpact | None:
         """Process one hop, and return the estimate that it completes."""
-        new, predicted = state.waiting[: self.hop], self._modes.render(state.ringing, self.hop)
-        recent = torch.cat([state.recent, new])[-self._history_samples :]
-        residual = torch.cat([state.residual, new - predicted])[-self._history_samples :]
-        state = replace(
-            state,
-            clock=state.clock + self.hop,
-            waiting=state.waiting[self.hop :],
-            recent=recent,
-            residual=residual,
-            ringing=state.ringing * self._modes.hop,
-        )
-        if state.pending is None or state.pending.answered:
-            return self._detect(state, float(predicted.square().mean()))
-        return self._answer(state, state.pending)
+        new, predicted = self.waiting[: self.hop], self._modes.render(self.ringing, self.hop)
+        self.recent = torch.cat([self.recent, new])[-self._history_samples :]
+        self.residual = torch.cat([self.residual, new - predicted])[-self._history_samples :]
+        self.clock, self.waiting = self.clock + self.hop, self.waiting[self.hop :]
+        self.ringing = self._modes.after(self.ringing, self.hop)
+        if self._pending is None or self._pending.answered:
+            return self._detect(self._pending, float(predicted.square().mean()))
+        return self._answer(self._pending)
 
-    def _detect(self, state: StreamState, ringing: float) -> tuple[StreamState, LocatedImpact | None]:
+    def _detect(self, pending: _PendingImpact | None, ringing: float) -> LocatedImpact | None:
         """Detect an impact in the last hop; without one, update the decay or return a later estimate."""
-        pending, answer = state.pending, None
-        detected = self._has_energy_jump(state.residual, ringing)
-        if pending is not None and (detected or state.clock - pending.onset >= (self.later or 0)):
+        answer, detected = None, self._has_energy_jump(ringing)
+        if pending is not None and (detected or self.clock - pending.onset >= (self.later or 0)):
             # The hop in which the next impact began is left out.
-            end = state.clock - self.hop * (_SKIPPED_HOPS if detected else 0)
+            end = self.clock - self.hop * (_SKIPPED_HOPS if detected else 0)
             length = min(end - pending.onset, self.later or 0)
-            state = replace(state, pending=None)
+            self._pending = None
             if length > self.window:
-                state, answer = self._located(state, pending, length, final=True)
+                answer = self._located(pending, length, final=True)
         if detected:
-            start = state.clock - self.hop
-            before = self._modes.after(state.ringing, -self.hop)
-            return replace(state, pending=PendingImpact(start, before, start, answered=False)), answer
-        if state.clock // self.hop % _UPDATE_HOPS == 0 and self._is_settled(state):
-            state = self._corrected(state, state.clock - self.window)
-        return state, answer
+            start = self.clock - self.hop
+            self._pending = _PendingImpact(start, self._modes.after(self.ringing, -self.hop), start)
+        elif self.clock // self.hop % _UPDATE_HOPS == 0 and self._is_settled():
+            self._correct(self.clock - self.window)
+        return answer
 
-    def _answer(self, state: StreamState, pending: PendingImpact) -> tuple[StreamState, LocatedImpact | None]:
+    def _answer(self, pending: _PendingImpact) -> LocatedImpact | None:
         """Return the first estimate as soon as the window is complete."""
-        if state.clock < pending.onset + self.hop + self.window:
-            return state, None
-        onset = self._onset(state, pending)
-        if state.clock < onset + self.window:
-            return replace(state, pending=replace(pending, onset=onset)), None
-        begun = replace(pending, onset=onset, answered=True)
-        state, answer = self._located(state, begun, self.window, final=self.later is None)
-        more = answer is not None and self.later is not None
-        return replace(self._corrected(state, onset), pending=begun if more else None), answer
+        if self.clock < pending.onset + self.hop + self.window:
+            return None
+        # As in recordings.
+        behind = min(len(self.residual), self.clock - pending.onset + round(_ONSET_SEARCH_SECONDS * self.rate))
+        there = self.residual[len(self.residual) - behind :]
+        pending.onset = self.clock - behind + find_onset(there.numpy(), sample_rate=self.rate)
+        if self.clock < pending.onset + self.window:
+            return None
+        pending.answered = True
+        answer = self._located(pending, self.window, final=self.later is None)
+        self._correct(pending.onset)
+        if answer is None or self.later is None:
+            self._pending = None
+        return answer
 
-    def _located(
-        self, state: StreamState, pending: PendingImpact, length: int, *, final: bool
-    ) -> tuple[StreamState, LocatedImpact | None]:
+    def _located(self, pending: _PendingImpact, length: int, *, final: bool) -> LocatedImpact | None:
         """Locate an impact by so many samples without the decay of earlier ones; None where it is rejected."""
         earlier = self._modes.after(pending.earlier, pending.onset - pending.since)
-        start = len(state.recent) - (state.clock - pending.onset)
-        sound = state.recent[start : start + length] - self._modes.render(earlier, length)
+        start = len(self.recent) - (self.clock - pending.onset)
+        sound = self.recent[start : start + length] - self._modes.render(earlier, length)
+        seconds = pending.onset / self.rate
         try:
             found = assess_match(self.locator.locate(sound.float()))
             if found.refusal is not None:
-                raise LocationError(f"the impact: {found.refusal}", name="impact", value=pending.onset / self.rate)
+                raise LocationError(f"the impact: {found.refusal}", name="impact", value=seconds)
         except LocationError as error:
-            return replace(state, rejected=state.rejected + 1, refusal=str(error)), None
-        return state, LocatedImpact(pending.onset / self.rate, found, length / self.rate, 0.0, final)
+            self.rejected, self.refusal = self.rejected + 1, str(error)
+            return None
+        return LocatedImpact(seconds, found, length / self.rate, 0.0, final)
 
-    def _has_energy_jump(self, residual: Float64[Tensor, " recent"], ringing: float) -> bool:
+    def _has_energy_jump(self, ringing: float) -> bool:
         """Return whether the residual's energy in the last hop exceeds that before it by `_ONSET_ENERGY_RATIO`."""
-        count = min(_MEMORY_HOPS + _SKIPPED_HOPS + 1, len(residual) // self.hop)
-        hops = residual[len(residual) - count * self.hop :].reshape(count, self.hop).square().mean(1)
+        count = min(_MEMORY_HOPS + _SKIPPED_HOPS + 1, len(self.residual) // self.hop)
+        hops = self.residual[len(self.residual) - count * self.hop :].reshape(count, self.hop).square().mean(1)
         known = hops[: -_SKIPPED_HOPS - 1]
         return len(known) >= _MIN_MEMORY_HOPS and float(hops[-1]) > _ONSET_ENERGY_RATIO * (
             float(known.max()) + _MAX_UNEXPLAINED * ringing
         )
 
-    def _is_settled(self, state: StreamState) -> bool:
+    def _is_settled(self) -> bool:
         """Return whether the last window holds no beginning of an impact that the decay was not fitted to."""
-        since = 0 if state.pending is None else state.pending.onset
-        return state.clock - self.window >= since and len(state.recent) >= self.window
+        since = 0 if self._pending is None else self._pending.onset
+        return self.clock - self.window >= since and len(self.recent) >= self.window
 
-    def _onset(self, state: StreamState, pending: PendingImpact) -> int:
-        """Return an impact's first sample, found as in recordings."""
-        behind = min(len(state.residual), state.clock - pending.onset + round(_ONSET_SEARCH_SECONDS * self.rate))
-        there = state.residual[len(state.residual) - behind :]
-        return state.clock - behind + find_onset(there.numpy(), sample_rate=self.rate)
-
-    def _corrected(self, state: StreamState, start: int) -> StreamState:
+    def _correct(self, start: int) -> None:
         """Add the modal amplitudes of the residual in the window from sample `start` on."""
-        first = len(state.residual) - (state.clock - start)
-        last = first + self.window
-        before = state.residual[max(0, first - self.window) : first]
+        first, behind = len(self.residual) - (self.clock - start), self.clock - start
+        before = self.residual[max(0, first - self.window) : first]
         noise = float(before.square().mean()) if len(before) else 0.0
-        found = self._modes.fit(state.residual[first:last], noise)
-        explained = self._modes.render(found, state.clock - start)
-        residual = torch.cat([state.residual[:first], state.residual[first:] - explained])
-        return replace(state, residual=residual, ringing=state.ringing + self._modes.after(found, state.clock - start))
-
-    def _filtered(
-        self, block: Float64[Tensor, " samples"], state: Float64[Tensor, "sections 2"]
-    ) -> tuple[Float64[Tensor, " samples"], Float64[Tensor, "sections 2"]]:
-        if self.filter is None or not len(block):
-            return block, state
-        passed, after = scipy.signal.sosfilt(self.filter, block.numpy(), zi=state.numpy())
-        return torch.from_numpy(passed), torch.from_numpy(after)
+        found = self._modes.fit(self.residual[first : first + self.window], noise)
+        explained = self._modes.render(found, behind)
+        self.residual = torch.cat([self.residual[:first], self.residual[first:] - explained])
+        self.ringing = self.ringing + self._modes.after(found, behind)
 
 
 _MIN_NOISE_RATIO = 1e-12
@@ -304,8 +267,6 @@ class Ringing:
     poles: Complex128[Tensor, " modes"]
     window: Complex128[Tensor, "window modes"]
     """Powers of the poles."""
-    hop: Complex128[Tensor, " modes"]
-    """The poles' powers by a hop."""
     scale: Float64[Tensor, " two_modes"]
     """Standard deviation of the sines' and cosines' amplitudes over the object's surface."""
     vectors: Float64[Tensor, "two_modes two_modes"]
@@ -314,16 +275,14 @@ class Ringing:
     with any amount of noise is two small products."""
 
     @classmethod
-    def of(
-        cls, bank: ModalBank, size: Float[Tensor, " modes"], *, sample_rate: float, hop: int, window: int
-    ) -> "Ringing":
+    def of(cls, bank: ModalBank, size: Float[Tensor, " modes"], *, sample_rate: float, window: int) -> "Ringing":
         """Return the ringing of modes that are as strong as `size` on average over the object, in any unit."""
         poles = poles_of(bank, sample_rate)
         relative = size.double() / size.double().max().clamp_min(torch.finfo(torch.float64).tiny)
         scale = relative.clamp_min(_FAINTEST).repeat(2)
         values, vectors = torch.linalg.eigh(gram(poles, window, power=0) * scale[:, None] * scale)
         powers = poles ** torch.arange(window)[:, None]
-        return cls(poles, powers, poles**hop, scale, vectors, values.clamp_min(0.0))
+        return cls(poles, powers, scale, vectors, values.clamp_min(0.0))
 
     def render(self, amplitudes: Complex128[Tensor, " modes"], length: int) -> Float64[Tensor, " samples"]:
         """Return so many samples of what rings with amplitudes."""
