@@ -17,7 +17,7 @@ from avmsf.cli import main
 from avmsf.errors import LocationError
 from avmsf.evaluation import localization, report
 from avmsf.evaluation.field_methods import FieldMethod
-from avmsf.evaluation.localization import MAX_VERTICES, located, random_distance
+from avmsf.evaluation.localization import MAX_VERTICES, PublishedLocator, located, random_distance
 from avmsf.evaluation.objects import ObjectFeatures
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.simple_methods import NearestRecording, WhiteNoise
@@ -27,7 +27,6 @@ from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.sound_field import SoundField
 from avmsf.localization.contact_map import ContactMap
-from avmsf.localization.cosine_distance import PublishedLocator
 from avmsf.modal.extraction.finders import ShortTime
 from factories.plate_field import QUICK, plate_extraction, plate_features, plate_impacts
 from factories.plate_set import PlateLooks, fill_plates

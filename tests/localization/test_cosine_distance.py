@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from avmsf.localization.cosine_distance import LARGEST_DELAY, MOST_DELAYS, STEP, cosine_distance, delays_of
+from avmsf.localization.likelihood import DELAY_STEP, LARGEST_DELAY, MOST_DELAYS, cosine_distance, delays_of
 
 FREQUENCY = torch.tensor([310.0, 870.0, 1900.0, 3400.0, 5200.0, 8100.0], dtype=torch.float64)
 GAINS = torch.randn(40, 6, 2, generator=torch.Generator().manual_seed(0))
@@ -40,7 +40,7 @@ def test_it_is_the_least_of_a_fine_search_over_delays() -> None:
 @pytest.mark.parametrize(("hertz", "missed"), [(2000.0, 0.005), (20_000.0, 0.05)])
 def test_a_delay_between_two_that_are_tried_costs_no_more_than_stated(hertz: float, missed: float) -> None:
     frequency, own = torch.full((1,), hertz, dtype=torch.float64), torch.ones(1, 1, dtype=torch.complex64)
-    delays = delays_of(torch.ones(1, dtype=torch.float64), frequency, step=STEP)
+    delays = delays_of(torch.ones(1, dtype=torch.float64), frequency, step=DELAY_STEP)
     assert (len(delays) == MOST_DELAYS) == (hertz > 6400.0)
     assert abs(float(delays[len(delays) // 2])) < 1e-15
     between = float(delays[:2].mean())

@@ -12,7 +12,7 @@ from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.scaled_gains import ScaledGains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.localization.locator import Locator
-from avmsf.localization.tempering import calibrate_tempering
+from avmsf.localization.prediction import calibrate_tempering
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from oracles.plate import Plate, plate_modes, plate_surface_points, sample_contacts

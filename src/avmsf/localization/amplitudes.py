@@ -10,9 +10,13 @@ them into mixtures whose errors have nothing to do with one another.
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from jaxtyping import Complex128, Float, Float64, Int64
+from jaxtyping import Complex128, Float, Float64
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from avmsf.modal.inner_products import gram, poles_of, project
 from avmsf.modal.modes import ModalBank
@@ -43,13 +47,8 @@ class Amplitudes:
     """Sum of the sound's squares, without what is noise."""
 
     @property
-    def explained(self) -> float:
-        """Part of the sound's energy that the modes explain, free to sound as strongly as they like."""
-        return self.part(self.fitted)
-
-    @property
     def fitted(self) -> float:
-        """The energy that they explain, in the unit of `energy`."""
+        """The energy that the modes explain, free to sound as strongly as they like, in the unit of `energy`."""
         return float(torch.cat([self.values.real, self.values.imag]) @ self.products)
 
     def part(self, energy: float) -> float:
@@ -106,6 +105,11 @@ class Extractor:
         noise = torch.lerp(power[left], power[left + 1], place - left)
         return Amplitudes(values, noise, products[0], max(energy - self.samples * floor, 0.0))
 
+    def explained(self, sound: Float[Tensor, " samples"]) -> float:
+        """Return the energy of a sound that the modes explain, noise included."""
+        products = project(sound[None], poles_of(self.bank, self.sample_rate))[0][0]
+        return float(products @ self.inverse @ products)
+
     def _noise(
         self, sound: Float[Tensor, " samples"], values: Complex128[Tensor, " modes"], color: Residual
     ) -> tuple[Float64[Tensor, " bands"], float]:
@@ -122,7 +126,8 @@ class Extractor:
         free = self.samples / max(self.samples - 2 * len(self.bank), 0.5 * self.samples)
         cells = free * _cell_power(sound.double() - modelled)
         own = cells.mean(0)
-        shape = _at(color.magnitude.double(), len(own)).square()
+        shape = interpolate(color.magnitude.double()[None, None], len(own), mode="linear", align_corners=True)[0, 0]
+        shape = shape.square()
         if not bool(shape.any()):
             shape = torch.ones_like(own)
         shape = shape.clamp_min(1e-6 * float(shape.mean()))
@@ -148,25 +153,13 @@ def _separate(
     spread = torch.diagonal(covariance).real.clone()
     coherence = covariance.abs() / (spread.sqrt()[:, None] * spread.sqrt())
     mixing = torch.eye(modes, dtype=torch.complex128)
-    for group in _groups(coherence > _COHERENT):
+    _, groups = connected_components(csr_array((coherence > _COHERENT).numpy()), directed=False)
+    for label in np.flatnonzero(np.bincount(groups) > 1):
+        group = torch.from_numpy(np.flatnonzero(groups == label))
         values, vectors = torch.linalg.eigh(covariance[group][:, group])
         spread[group] = values.clamp_min(torch.finfo(torch.float64).tiny)
         mixing[group[:, None], group[None]] = vectors
     return mixing, spread
-
-
-def _groups(linked: Tensor) -> list[Int64[Tensor, " group"]]:
-    """Return the rows of each set of two or more that hang together."""
-    left, groups = set(range(len(linked))), []
-    while left:
-        found, new = set[int](), {min(left)}
-        while new:
-            found |= new
-            new = set(torch.nonzero(linked[sorted(new)].any(0)).flatten().tolist()) - found
-        left -= found
-        if len(found) > 1:
-            groups.append(torch.tensor(sorted(found)))
-    return groups
 
 
 def _cell_power(sound: Float64[Tensor, " samples"]) -> Float64[Tensor, "frames bands"]:
@@ -187,43 +180,20 @@ def _steady(cells: Float64[Tensor, "frames bands"]) -> float:
     return float(floor) / -math.log1p(-_NOISE_QUANTILE)
 
 
-def _at(values: Float64[Tensor, " bins"], count: int) -> Float64[Tensor, " bands"]:
-    """Return values spread evenly over a band, at `count` evenly spread places of it."""
-    return torch.nn.functional.interpolate(values[None, None], size=count, mode="linear", align_corners=True)[0, 0]
-
-
 DETUNINGS = (0.9, 0.95, 1.05, 1.1)
 """Factors on all frequencies: 5 % is a half-power bandwidth of a mode that turns six times while it falls to 1/e."""
 
 
-@dataclass(frozen=True, eq=False)
-class DetunedModes:
-    """A bank's modes at each of `DETUNINGS`, for sounds of one length."""
+def detuned_extractors(bank: ModalBank, *, sample_rate: float, samples: int, highest: float) -> tuple[Extractor, ...]:
+    """Return the extractors of a bank's modes at each of `DETUNINGS`, of those modes that stay below `highest` Hz.
 
-    poles: tuple[Complex128[Tensor, " _modes"], ...]
-    """Of each detuning, apart: their products with a sound are faster one after the other than all at once."""
-    inverses: tuple[Float64[Tensor, "_two_modes _two_modes"], ...]
-    """As `Extractor.inverse`."""
-
-    @classmethod
-    def of(cls, bank: ModalBank, *, sample_rate: float, samples: int, highest: float) -> "DetunedModes":
-        """Return it for sounds at `sample_rate` Hz, of the modes that stay below `highest` Hz.
-
-        A detuning that leaves no mode below is left out; those downwards leave all that are below in tune.
-        """
-        poles, inverses = [], []
-        for factor in DETUNINGS:
-            kept = torch.nonzero(factor * bank.frequency < highest).flatten()
-            if len(kept):
-                moved = ModalBank(factor * bank.frequency[kept], bank.damping[kept])
-                poles.append(poles_of(moved, sample_rate))
-                inverses.append(Extractor.of(moved, sample_rate=sample_rate, samples=samples).inverse)
-        return cls(tuple(poles), tuple(inverses))
-
-    def fitted(self, sound: Float[Tensor, " samples"]) -> Float64[Tensor, " detunings"]:
-        """Return the energy of a sound that the modes explain at each detuning, noise included."""
-        energies = []
-        for poles, inverse in zip(self.poles, self.inverses, strict=True):
-            products = project(sound[None], poles)[0][0]
-            energies.append(products @ inverse @ products)
-        return torch.stack(energies)
+    A detuning that leaves no mode below is left out; those downwards leave all that are below in tune.
+    """
+    below = [(factor, factor * bank.frequency < highest) for factor in DETUNINGS]
+    return tuple(
+        Extractor.of(
+            ModalBank(factor * bank.frequency[kept], bank.damping[kept]), sample_rate=sample_rate, samples=samples
+        )
+        for factor, kept in below
+        if bool(kept.any())
+    )

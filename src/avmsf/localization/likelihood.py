@@ -23,7 +23,6 @@ from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_floats
 from avmsf.errors import ArrayError, LocationError
-from avmsf.localization.cosine_distance import delays_of
 
 RELATIVE_ERRORS = (0.8, 0.15, 0.03)
 """Relative errors r of the gains for which the likelihood of every point is computed."""
@@ -32,7 +31,7 @@ MORE_RELATIVE_ERRORS = (1.6, 0.35, 0.07, 0.015)
 INDEPENDENT = (0.25, 0.4)
 """Exponent of the tempered likelihood where a field's errors dominate: of a field that explains nothing of a sound even
 at its best point, and of one that explains all of it. Chosen on plates, where the 90 % region then held nine impacts in
-ten; elsewhere it held as few as four. So a field's own contacts calibrate it (`avmsf.localization.tempering`)."""
+ten; elsewhere it held as few as four. So a field's own contacts calibrate it (`calibrate_tempering`)."""
 SHIFT_DEVIATION = 2e-4
 """Standard deviation of that, seconds."""
 _COARSE, _FINE = 0.9, 0.3
@@ -46,6 +45,13 @@ _LEVEL_STEP, _LEVEL_LIMIT = 0.1, 28.0
 """Logarithms of the levels that noise is tried at: step, and limit either way. Amplitudes are in units of the largest;
 their errors' variances are at least 1e-10, those expected of modes at least 1e-8 of the largest."""
 _TINY = torch.finfo(torch.float32).tiny
+LARGEST_DELAY = 5e-4
+"""Bound of the onset's error, seconds, either way."""
+DELAY_STEP = 0.2
+"""Radians that the typical frequency turns by between two delays, of which one is within half of that: a point with the
+recorded gains has a distance of .1^2 / 2 = .005 at most. It grows with the square of the frequency where `MOST_DELAYS`
+limits them, from 6.4 kHz on, to .05 at 20 kHz."""
+MOST_DELAYS = 201
 _BATCH = 512
 """Points computed at once: few enough that their arrays stay in a processor's cache."""
 
@@ -63,6 +69,19 @@ class PredictedGains:
     """Mean of the gains' squares over the surface, nowhere zero."""
     frequency: Float64[Tensor, " modes"]
     """Hz."""
+
+    @classmethod
+    def of(
+        cls,
+        gains: Complex64[Tensor, "points modes"],
+        variance: Float32[Tensor, "points modes"],
+        frequency: Float64[Tensor, " modes"],
+    ) -> "PredictedGains":
+        """Return gains with their powers."""
+        power = gains.abs().square()
+        mean_power = power.mean(0)
+        least = max(1e-8 * float(mean_power.max()), _TINY)
+        return cls(gains, power, variance, mean_power.clamp_min(least), frequency)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +142,7 @@ class LikelihoodResult:
     def tempering(self, explained: float, *, factor: float = 1.0) -> float:
         """Return the exponent of the tempered likelihood, where the likeliest point explains that part of the sound.
 
-        `factor` on `INDEPENDENT` is that of one field, as `avmsf.localization.tempering` measures it.
+        `factor` on `INDEPENDENT` is that of one field, as `calibrate_tempering` measures it.
         """
         least, most = INDEPENDENT
         together = min(1.0, factor * (least + (most - least) * explained))
@@ -161,33 +180,6 @@ def evaluate_likelihood(
 
 
 @dataclass(frozen=True, eq=False)
-class _Strengths:
-    """Weighted sums over modes of the sound's energy, and of that of an impact of force one."""
-
-    sound: Float32[Tensor, ""]
-    power: Float32[Tensor, " points"]
-    variance: Float32[Tensor, " points"]
-    mean_power: Float32[Tensor, ""]
-
-    @classmethod
-    def of(
-        cls, predicted: PredictedGains, values: Complex128[Tensor, " modes"], noise: Float32[Tensor, " modes"]
-    ) -> "_Strengths":
-        surplus = (values.abs().square().float() - noise).clamp_min(0.0)
-        level = (surplus.sum() / predicted.mean_power.sum()).clamp_min(1e-12)
-        weights = 1.0 / (noise + level * predicted.mean_power)
-        return cls(
-            weights @ surplus, predicted.power @ weights, predicted.variance @ weights, weights @ predicted.mean_power
-        )
-
-    def forces(self, rows: Int64[Tensor, " rows"], relative_error: float) -> Float32[Tensor, " rows"]:
-        """Return the squares of the forces at which impacts, with their errors, have the sound's energy."""
-        part = 0.5 * relative_error**2
-        own = (1.0 + part) * self.power[rows] + self.variance[rows] + part * self.mean_power
-        return (self.sound / own.clamp_min(_TINY)).clamp(1e-24, 1e24)
-
-
-@dataclass(frozen=True, eq=False)
 class _Trial:
     """One sound's amplitudes, in units in which the strongest is one, and the predicted gains."""
 
@@ -196,7 +188,10 @@ class _Trial:
     noise: Float32[Tensor, " modes"]
     weights: Float32[Tensor, " modes"]
     """One over the errors' variance, roughly: with these the shift is found."""
-    strengths: _Strengths
+    surplus: Float32[Tensor, " modes"]
+    """The sound's energy beyond the noise."""
+    force_weights: Float32[Tensor, " modes"]
+    """By which energies are summed that give the force at which an impact's errors are taken."""
     force: Force | None
     noise_fraction: float
     """Fraction of the errors' variance that is noise."""
@@ -211,11 +206,12 @@ class _Trial:
     ) -> "_Trial":
         """Return the trial of amplitudes of which the greatest has magnitude one."""
         mean_power, unknown = predicted.mean_power, predicted.variance.mean(0)
-        level = (values.abs().square().float() - noise).clamp_min(0.0).sum() / (mean_power + unknown).sum()
-        error = level.clamp_min(1e-12) * (unknown + RELATIVE_ERRORS[1] ** 2 * mean_power)
-        weights = 1.0 / (noise + error)
+        surplus = (values.abs().square().float() - noise).clamp_min(0.0)
+        level = (surplus.sum() / (mean_power + unknown).sum()).clamp_min(1e-12)
+        weights = 1.0 / (noise + level * (unknown + RELATIVE_ERRORS[1] ** 2 * mean_power))
+        force_weights = 1.0 / (noise + (surplus.sum() / mean_power.sum()).clamp_min(1e-12) * mean_power)
         noise_fraction = float((weights * noise).mean())
-        return cls(predicted, values, noise, weights, _Strengths.of(predicted, values, noise), force, noise_fraction)
+        return cls(predicted, values, noise, weights, surplus, force_weights, force, noise_fraction)
 
     def noise_log_likelihood(self) -> float:
         """Return the log likelihood of noise, of any level, with the constant of `evaluate_likelihood`.
@@ -258,7 +254,8 @@ class _Trial:
         """Return the log likelihood, summed over relative errors, and the force and shift of the likeliest one."""
         steps, rotated = self._rotated(_FINE)
         prior = -0.5 * (steps / SHIFT_DEVIATION).square()
-        weighted, energy = self._weighted(rotated), rotated[0].abs().square()
+        weighted, energy, mean_power = self._weighted(rotated), rotated[0].abs().square(), self.predicted.mean_power
+        sound, mean = self.force_weights @ self.surplus, self.force_weights @ mean_power
         evidence, forces, shifts = [], [], []
         for part in torch.split(rows, _BATCH):
             gains, power = self.predicted.gains[part], self.predicted.power[part]
@@ -267,12 +264,13 @@ class _Trial:
             chosen = torch.argmax(gained + prior.float(), dim=1)
             both = torch.view_as_real(gains) * torch.view_as_real(rotated[chosen])
             cross, variance = both[..., 0] + both[..., 1], self.predicted.variance[part]
+            own, spread = power @ self.force_weights, variance @ self.force_weights
             tried = []
-            for relative_error in relative_errors:
-                error = torch.add(variance, power + self.predicted.mean_power, alpha=0.5 * relative_error**2)
-                tried.append(
-                    self._marginalize_force(cross, energy, power, error, self.strengths.forces(part, relative_error))
-                )
+            for half in (0.5 * relative_error**2 for relative_error in relative_errors):
+                error = torch.add(variance, power + mean_power, alpha=half)
+                # At this force an impact, with its errors, has the sound's energy.
+                squares = (sound / ((1.0 + half) * own + spread + half * mean).clamp_min(_TINY)).clamp(1e-24, 1e24)
+                tried.append(self._marginalize_force(cross, energy, power, error, squares))
             found, strength = (torch.stack(each) for each in zip(*tried, strict=True))
             evidence.append(torch.logsumexp(found, 0) + prior[chosen].float())
             forces.append(strength.gather(0, found.argmax(0)[None])[0])
@@ -301,3 +299,43 @@ class _Trial:
         size = strength.abs().clamp_min(_TINY)
         spread = self.force.spread_db * math.log(10.0) / 20.0
         return found - size.log() - 0.5 * ((size / self.force.expected).log() / spread).square(), strength
+
+
+def delays_of(
+    power: Float64[Tensor, " modes"], frequency: Float64[Tensor, " modes"], *, step: float
+) -> Float64[Tensor, " delays"]:
+    """Return evenly spaced delays (seconds) up to `LARGEST_DELAY` either way, zero among them.
+
+    From one to the next the typical frequency, the root mean square of frequencies (Hz) weighted by `power`, turns by
+    `step` radians, or by more where that would take more than `MOST_DELAYS`.
+    """
+    typical = 2.0 * math.pi * float(((power @ frequency.square()) / power.sum()).sqrt())
+    count = min(MOST_DELAYS, 1 + 2 * math.ceil(LARGEST_DELAY * typical / step))
+    return torch.linspace(-LARGEST_DELAY, LARGEST_DELAY, count, dtype=torch.float64)
+
+
+def cosine_distance(
+    gains: Complex64[Tensor, "points modes"],
+    recorded: Complex128[Tensor, " modes"],
+    frequency: Float64[Tensor, " modes"],
+) -> Float64[Tensor, " points"]:
+    """Return the cosine distance of each point's gains from recorded ones, 0 to 1, whichever sign the recording has.
+
+    Gains are the amplitudes of sines, and of cosines as imaginary part; frequencies are in Hz. Each point has the delay
+    of the recording, up to `LARGEST_DELAY`, that makes its distance least: one sample turns high modes by more than
+    gains differ between points. A point or a recording without gains has the distance 1.
+    """
+    if not bool(recorded.any()):
+        return torch.ones(len(gains), dtype=torch.float64)
+    recorded = recorded / recorded.norm()
+    turns = 2.0 * math.pi * frequency
+    delays = delays_of(recorded.abs().square(), frequency, step=DELAY_STEP)
+    rotated = (recorded * torch.polar(torch.ones((), dtype=torch.float64), -delays[:, None] * turns)).to(
+        torch.complex64
+    )
+    parts = torch.view_as_real(rotated).flatten(1).T.contiguous()
+    found = [
+        (torch.view_as_real(part).flatten(1) @ parts).abs().amax(1) / part.norm(dim=1).clamp_min(1e-30)
+        for part in torch.split(gains, _BATCH)
+    ]
+    return (1.0 - torch.cat(found).double()).clamp(0.0, 1.0)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
 from functools import cached_property
+from statistics import fmean
 from threading import RLock
 
 import torch
@@ -13,11 +14,17 @@ from torch import Tensor
 from avmsf._utils.arrays import ArrayLike, as_floats, short_repr
 from avmsf.errors import LocationError
 from avmsf.field.sound_field import SoundField
-from avmsf.localization.amplitudes import Amplitudes, DetunedModes, Extractor
+from avmsf.localization.amplitudes import Amplitudes, Extractor, detuned_extractors
 from avmsf.localization.contact_map import ContactMap
-from avmsf.localization.cosine_distance import cosine_distance
-from avmsf.localization.likelihood import Force, LikelihoodResult, PredictedGains, evaluate_likelihood
+from avmsf.localization.likelihood import (
+    Force,
+    LikelihoodResult,
+    PredictedGains,
+    cosine_distance,
+    evaluate_likelihood,
+)
 from avmsf.localization.prediction import (
+    calibrate_tempering,
     calibration_factor,
     distinct_contacts,
     local_variance,
@@ -25,7 +32,6 @@ from avmsf.localization.prediction import (
     smoothing_matrix,
 )
 from avmsf.localization.preprocess import check_sound
-from avmsf.localization.tempering import calibrate_tempering
 from avmsf.modal.modes import ModalBank
 
 _UNIT = 1e-3
@@ -124,9 +130,9 @@ class Locator:
         check_sound(used.numpy()[None], self.field.sample_rate)
         length = self._length(len(used), float("inf") if highest is None else highest)
         amplitudes = length.extractor.extract(used, color=self.field.residual if self.use_noise_model else None)
-        detuned = length.detuned.fitted(used)
+        detuned = [each.explained(used) for each in length.detuned]
         # The energy without loud noise is uncertain, but no less than what modes explain, detuned or not.
-        amplitudes = replace(amplitudes, energy=max(amplitudes.energy, amplitudes.fitted, float(detuned.max())))
+        amplitudes = replace(amplitudes, energy=max(amplitudes.energy, amplitudes.fitted, *detuned))
         values, noise = length.separate(amplitudes)
         _check_above_noise(values, noise)
         scaled = length.scaled(known)
@@ -144,8 +150,8 @@ class Locator:
             length.distance(values, noise),
             probability,
             explained,
-            amplitudes.explained,
-            amplitudes.part(float(detuned.mean())),
+            amplitudes.part(amplitudes.fitted),
+            amplitudes.part(fmean(detuned)),
             float(found.force[row]) / length.unit,
             evidence=free.evidence(self.areas),
             notes=()
@@ -192,7 +198,8 @@ class _Length:
     gains: Complex64[Tensor, "points modes"]
     """Gains of the modes themselves, in units of `unit`."""
     unit: float
-    detuned: DetunedModes
+    detuned: tuple[Extractor, ...]
+    """For the null model."""
 
     @classmethod
     def of(cls, locator: Locator, samples: int, highest: float) -> "_Length":
@@ -216,7 +223,7 @@ class _Length:
             )
         gains = gains / unit
         predicted = _decorrelated(gains, locator.variance[:, modes] / unit**2, extractor)
-        detuned = DetunedModes.of(bank, sample_rate=rate, samples=samples, highest=highest)
+        detuned = detuned_extractors(bank, sample_rate=rate, samples=samples, highest=highest)
         return cls(extractor, predicted, gains, unit, detuned)
 
     def separate(self, amplitudes: Amplitudes) -> tuple[Complex128[Tensor, " modes"], Float64[Tensor, " modes"]]:
@@ -273,10 +280,7 @@ def _decorrelated(
         gains, variance = gains.clone(), variance.clone()
         gains[:, correlated] = gains[:, correlated] @ inner.conj().to(torch.complex64)
         variance[:, correlated] = variance[:, correlated] @ inner.abs().square().float()
-    power = gains.abs().square()
-    mean_power = power.mean(0)
-    mean_power = mean_power.clamp_min(1e-8 * float(mean_power.max()))
-    return PredictedGains(gains, power, variance, mean_power, shares.T @ extractor.bank.frequency)
+    return PredictedGains.of(gains, variance, shares.T @ extractor.bank.frequency)
 
 
 def _force_notes(

@@ -245,7 +245,8 @@ class StreamingLocalizer:
 
     def _correct(self, start: int) -> None:
         """Add the modal amplitudes of the residual in the window from sample `start` on."""
-        first, behind = len(self.residual) - (self.clock - start), self.clock - start
+        behind = self.clock - start
+        first = len(self.residual) - behind
         before = self.residual[max(0, first - self.window) : first]
         noise = float(before.square().mean()) if len(before) else 0.0
         found = self._modes.fit(self.residual[first : first + self.window], noise)

@@ -33,7 +33,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, LocationError
 from avmsf.fem.body_family import BodyFamily
 from avmsf.fem.elastic_modes import ElasticModes
-from avmsf.localization.cosine_distance import cosine_distance
+from avmsf.localization.likelihood import cosine_distance
 from avmsf.modal.config import scaled_fft_size
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_gains
