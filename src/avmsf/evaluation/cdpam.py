@@ -11,13 +11,10 @@ one and the same sound are in use, whose values differ by orders of magnitude:
 
 import hashlib
 import importlib.util
-import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
-from typing import IO, Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Float64
@@ -34,8 +31,8 @@ _FULL_SCALE = 32768.0
 _LAYERS = 16
 """Convolutions of the encoder; every fourth keeps every second sample and has twice as many channels."""
 _TAPS = 15
-_HEAD_SIZES = (512, 256, 64, 16, 4)
-"""Features before and after each layer of the distance."""
+_HEAD_LAYERS = 4
+"""Layers of the distance."""
 _NORM_EPSILON = 1e-5
 """What batch normalization adds to a variance."""
 _SLOPE, _HEAD_SLOPE = 0.1, 0.01
@@ -43,34 +40,8 @@ _SLOPE, _HEAD_SLOPE = 0.1, 0.01
 _SILENCE = 1024
 """Samples of silence in whose middle, after all layers, the ends are not felt: they reach 27 of 64."""
 _FILE = Path("CDPAM_trained", "scratchJNDdefault_best_model.pth")
-_INSTALL = "install them again: pip install --force-reinstall 'cdpam==0.0.6'"
-_ALLOWED = {
-    ("torch._utils", "_rebuild_tensor_v2"),
-    ("torch", "FloatStorage"),
-    ("torch", "LongStorage"),
-    ("collections", "OrderedDict"),
-}
-"""All that the weights' file consists of besides numbers and strings."""
-
-
-@dataclass(frozen=True, eq=False)
-class CdpamWeights:
-    """The authors' trained weights, by their names in their code."""
-
-    tensors: Mapping[str, Tensor]
-
-    def take(self, name: str, *shape: int) -> Tensor:
-        """Return a tensor in float64. Raises EvaluationError where there is none of this name and shape."""
-        tensor = self.tensors.get(name)
-        if not isinstance(tensor, Tensor) or tuple(tensor.shape) != shape:
-            found = list(tensor.shape) if isinstance(tensor, Tensor) else None
-            raise EvaluationError(
-                f"weights of the package cdpam: expected a tensor {name} of the shape {list(shape)}, got {found}; "
-                f"{_INSTALL}",
-                name=name,
-                value=found,
-            )
-        return tensor.double()
+_DIGEST = "453c8b6edee1a94f0120236156436ff28fe4d8d884485e4a67695c8e8570bdfe"
+"""SHA-256 of the weights of cdpam 0.0.6: a pickle of Python 2, which torch opens in no way that runs no code."""
 
 
 def find_weights() -> Path:
@@ -84,45 +55,31 @@ def find_weights() -> Path:
     return Path(found.submodule_search_locations[0]) / _FILE
 
 
-def read_weights(path: Path) -> CdpamWeights:
-    """Read a weights file. Raises EvaluationError where it is missing, damaged, or holds anything but tensors."""
-    # The file is pickled the way of Python 2, with an opcode that torch's own `weights_only` does not know. So what may
-    # be made while it is read is listed here, by the same principle.
-    pickles = SimpleNamespace(__name__=__name__, Unpickler=_TensorUnpickler, load=_load)
-    unreadable = OSError, EOFError, RuntimeError, ValueError, LookupError, TypeError, pickle.UnpicklingError
+def read_weights(path: Path) -> Mapping[str, Tensor]:
+    """Return the authors' trained weights, by their names in their code. Raises EvaluationError for any other file."""
     try:
-        stored = torch.load(path, map_location="cpu", weights_only=False, pickle_module=pickles)
-    except unreadable as error:
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise EvaluationError(
-            f"{path}: expected the trained weights of CDPAM, got {reason}; {_INSTALL}", file=path
-        ) from error
-    tensors = stored.get("state") if isinstance(stored, Mapping) else None
-    if not isinstance(tensors, Mapping):
+        found = "other content" if hashlib.sha256(path.read_bytes()).hexdigest() != _DIGEST else ""
+    except OSError as error:
+        found = str(error)
+    if found:
         raise EvaluationError.expected(
-            "the trained weights of CDPAM under 'state'", file=path, name="state", advice=_INSTALL
+            "the trained weights of CDPAM",
+            got=found,
+            file=path,
+            advice="install them again: pip install --force-reinstall 'cdpam==0.0.6'",
         )
-    return CdpamWeights(tensors)
-
-
-class _TensorUnpickler(pickle.Unpickler):
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) not in _ALLOWED:
-            raise pickle.UnpicklingError(f"{module}.{name} in place of tensors")
-        return super().find_class(module, name)
-
-
-def _load(file: IO[bytes], **options: Any) -> Any:
-    return _TensorUnpickler(file, **options).load()
+    weights: Mapping[str, Tensor] = torch.load(path, map_location="cpu", weights_only=False)["state"]
+    return weights
 
 
 @dataclass(frozen=True, eq=False)
-class CdpamNetwork:
-    """The encoder with its batch normalization folded in, and the layers of the distance.
+class Cdpam:
+    """The encoder with its batch normalization folded in, and the layers of the distance; `Cdpam.load()` makes one.
 
     Sixteen convolutions, each followed by a leaky rectifier. Of the mean over time the first half, the authors'
     acoustic part, is scaled to length one. The distance sums weighted absolute differences after each of four layers,
-    so that of features that are weighted beforehand it is the L1 distance.
+    so that of features that are weighted beforehand it is the L1 distance: each sound is embedded once, however many
+    others it is compared with.
 
     What passes through the encoder is the difference from its response to silence. Sounds as fractions of full scale
     change that response by so little that the rounding of 32-bit sums would be a part of the distance.
@@ -133,97 +90,6 @@ class CdpamNetwork:
     head_layers: tuple[tuple[Float64[Tensor, "_ _"], Float64[Tensor, " _"], Float64[Tensor, " _"]], ...]
     """Of each layer of the distance: weights, bias, and what its differences are multiplied by."""
     _silences: dict[int, tuple[Float[Tensor, "_ _"], ...]] = field(default_factory=dict, repr=False)
-
-    @classmethod
-    def of(cls, weights: CdpamWeights) -> "CdpamNetwork":
-        """Fold trained weights. Raises EvaluationError where they are not those of this network."""
-        head_layers = tuple(
-            (
-                weights.take(f"model_dist.convs.{layer}.0.weight", after, before),
-                weights.take(f"model_dist.convs.{layer}.0.bias", after),
-                weights.take(f"model_dist.chan_w.{layer}", after).abs(),
-            )
-            for layer, (before, after) in enumerate(pairwise(_HEAD_SIZES))
-        )
-        return cls(tuple(_folded(weights, layer) for layer in range(_LAYERS)), head_layers)
-
-    def features(self, sound: Float[Tensor, " samples"]) -> Float64[Tensor, " features"]:
-        """Return the weighted features of a sound of any length at 22,050 Hz, float32."""
-        difference, mean = sound[None], torch.zeros(1)
-        silences = self._silence(len(sound))
-        for layer, silence in enumerate(silences):
-            difference = conv1d(difference, self.convolutions[layer][0], stride=_stride(layer), padding=_TAPS // 2)
-            level = _lengthened(silence, difference.shape[1])
-            # While the sum keeps the level's sign, its slope is the level's; beyond zero it is the other one.
-            sign = torch.where(level > 0.0, 1.0, -1.0)
-            beyond = torch.addcmul(-level.abs(), -sign, difference).relu_()
-            difference = difference * torch.where(level > 0.0, 1.0, _SLOPE) + (1 - _SLOPE) * beyond
-            mean = leaky_relu(level.double(), _SLOPE).mean(dim=1) if layer == _LAYERS - 1 else mean
-        return self.head(mean + difference.mean(dim=1, dtype=torch.float64))
-
-    def head(self, mean: Float64[Tensor, " dim"]) -> Float64[Tensor, " features"]:
-        """Return the weighted features of an encoder's mean over time."""
-        values = normalize(mean, dim=0)
-        features = []
-        for number, (matrix, offset, importance) in enumerate(self.head_layers, start=1):
-            values = matrix @ values + offset
-            # The last layer has no rectifier.
-            if number < len(self.head_layers):
-                values = leaky_relu(values, _HEAD_SLOPE)
-            features.append(importance * values)
-        return torch.cat(features)
-
-    def _silence(self, samples: int) -> tuple[Float[Tensor, "outputs samples"], ...]:
-        """Return every convolution's response to a silence, which is shorter where its middle is constant."""
-        # The strides halve the length four times; the ends look alike for lengths with the same remainder.
-        length = samples if samples < _SILENCE else _SILENCE + (samples - _SILENCE) % 16
-        if length not in self._silences:
-            signal, responses = torch.zeros(1, length), []
-            for layer, (weights, bias) in enumerate(self.convolutions):
-                responses.append(conv1d(signal, weights, stride=_stride(layer), padding=_TAPS // 2) + bias)
-                signal = leaky_relu(responses[-1], _SLOPE)
-            self._silences[length] = tuple(responses)
-        return self._silences[length]
-
-
-def _stride(layer: int) -> int:
-    return 2 if layer % 4 == 3 else 1
-
-
-def _lengthened(response: Float[Tensor, "outputs short"], samples: int) -> Float[Tensor, "outputs samples"]:
-    """Return a short silence's response as that of a longer one: its middle is repeated."""
-    half, added = response.shape[1] // 2, samples - response.shape[1]
-    middle = response[:, half : half + 1].expand(-1, added)
-    return torch.cat([response[:, :half], middle, response[:, half:]], dim=1)
-
-
-def _folded(
-    weights: CdpamWeights, layer: int
-) -> tuple[Float[Tensor, "outputs inputs taps"], Float[Tensor, "outputs 1"]]:
-    """Return a convolution's weights and bias, batch normalization included."""
-    outputs, inputs = 64 * 2 ** ((layer + 1) // 4), 1 if layer == 0 else 64 * 2 ** (layer // 4)
-    kernel = weights.take(f"base_encoder.encoder.{layer}.weight", outputs, inputs, _TAPS)
-    bias = weights.take(f"base_encoder.encoder.{layer}.bias", outputs)
-    scale, shift, mean, variance = (
-        weights.take(f"base_encoder.ebatch.{layer}.{name}", outputs)
-        for name in ("weight", "bias", "running_mean", "running_var")
-    )
-    factor = scale / (variance + _NORM_EPSILON).sqrt()
-    kernel, bias = kernel * factor[:, None, None], (bias - mean) * factor + shift
-    # The second half of the last layer is the content part, which the distance does not use.
-    used = outputs // 2 if layer == _LAYERS - 1 else outputs
-    return kernel[:used].float(), bias[:used, None].float()
-
-
-@dataclass(frozen=True, eq=False)
-class Cdpam:
-    """The network, and the embeddings of all sounds so far; `Cdpam.load()` makes one.
-
-    Two sounds' distance is the sum of the absolute differences of their embeddings, so that each sound is embedded
-    once, however many others it is compared with.
-    """
-
-    network: CdpamNetwork
     _embeddings: dict[str, Float64[Tensor, " features"]] = field(default_factory=dict, repr=False)
 
     @classmethod
@@ -232,7 +98,16 @@ class Cdpam:
 
         Raises EvaluationError where the package is missing or its weights are not those known here.
         """
-        return cls(CdpamNetwork.of(read_weights(find_weights())))
+        weights = read_weights(find_weights())
+        head_layers = tuple(
+            (
+                weights[f"model_dist.convs.{layer}.0.weight"].double(),
+                weights[f"model_dist.convs.{layer}.0.bias"].double(),
+                weights[f"model_dist.chan_w.{layer}"].double().abs(),
+            )
+            for layer in range(_HEAD_LAYERS)
+        )
+        return cls(tuple(_folded(weights, layer) for layer in range(_LAYERS)), head_layers)
 
     def distance(
         self,
@@ -271,7 +146,7 @@ class Cdpam:
         if scaling == "authors":
             scaled = torch.round(scaled * _FULL_SCALE)
         with torch.no_grad():
-            features = self.network.features(scaled.float())
+            features = self._features(scaled.float())
         if not bool(torch.isfinite(features).all()):
             raise EvaluationError(
                 f"expected sounds as fractions of full scale, 1, got a peak of {float(sound.abs().max()):g}",
@@ -279,3 +154,68 @@ class Cdpam:
                 value=float(sound.abs().max()),
             )
         return features
+
+    def _features(self, sound: Float[Tensor, " samples"]) -> Float64[Tensor, " features"]:
+        """Return the weighted features of a sound of any length at 22,050 Hz, float32."""
+        difference, mean = sound[None], torch.zeros(1)
+        silences = self._silence(len(sound))
+        for layer, silence in enumerate(silences):
+            difference = conv1d(difference, self.convolutions[layer][0], stride=_stride(layer), padding=_TAPS // 2)
+            level = _lengthened(silence, difference.shape[1])
+            # While the sum keeps the level's sign, its slope is the level's; beyond zero it is the other one.
+            sign = torch.where(level > 0.0, 1.0, -1.0)
+            beyond = torch.addcmul(-level.abs(), -sign, difference).relu_()
+            difference = difference * torch.where(level > 0.0, 1.0, _SLOPE) + (1 - _SLOPE) * beyond
+            mean = leaky_relu(level.double(), _SLOPE).mean(dim=1) if layer == _LAYERS - 1 else mean
+        return self._head(mean + difference.mean(dim=1, dtype=torch.float64))
+
+    def _head(self, mean: Float64[Tensor, " dim"]) -> Float64[Tensor, " features"]:
+        """Return the weighted features of an encoder's mean over time."""
+        values = normalize(mean, dim=0)
+        features = []
+        for number, (matrix, offset, importance) in enumerate(self.head_layers, start=1):
+            values = matrix @ values + offset
+            # The last layer has no rectifier.
+            if number < len(self.head_layers):
+                values = leaky_relu(values, _HEAD_SLOPE)
+            features.append(importance * values)
+        return torch.cat(features)
+
+    def _silence(self, samples: int) -> tuple[Float[Tensor, "outputs samples"], ...]:
+        """Return every convolution's response to a silence, which is shorter where its middle is constant."""
+        # The strides halve the length four times; the ends look alike for lengths with the same remainder.
+        length = samples if samples < _SILENCE else _SILENCE + (samples - _SILENCE) % 16
+        if length not in self._silences:
+            signal, responses = torch.zeros(1, length), []
+            for layer, (weights, bias) in enumerate(self.convolutions):
+                responses.append(conv1d(signal, weights, stride=_stride(layer), padding=_TAPS // 2) + bias)
+                signal = leaky_relu(responses[-1], _SLOPE)
+            self._silences[length] = tuple(responses)
+        return self._silences[length]
+
+
+def _stride(layer: int) -> int:
+    return 2 if layer % 4 == 3 else 1
+
+
+def _lengthened(response: Float[Tensor, "outputs short"], samples: int) -> Float[Tensor, "outputs samples"]:
+    """Return a short silence's response as that of a longer one: its middle is repeated."""
+    half, added = response.shape[1] // 2, samples - response.shape[1]
+    middle = response[:, half : half + 1].expand(-1, added)
+    return torch.cat([response[:, :half], middle, response[:, half:]], dim=1)
+
+
+def _folded(
+    weights: Mapping[str, Tensor], layer: int
+) -> tuple[Float[Tensor, "outputs inputs taps"], Float[Tensor, "outputs 1"]]:
+    """Return a convolution's weights and bias, batch normalization included."""
+    kernel, bias = (weights[f"base_encoder.encoder.{layer}.{name}"].double() for name in ("weight", "bias"))
+    scale, shift, mean, variance = (
+        weights[f"base_encoder.ebatch.{layer}.{name}"].double()
+        for name in ("weight", "bias", "running_mean", "running_var")
+    )
+    factor = scale / (variance + _NORM_EPSILON).sqrt()
+    kernel, bias = kernel * factor[:, None, None], (bias - mean) * factor + shift
+    # The second half of the last layer is the content part, which the distance does not use.
+    used = len(bias) // 2 if layer == _LAYERS - 1 else len(bias)
+    return kernel[:used].float(), bias[:used, None].float()
