@@ -11,7 +11,6 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf.capture import Impacts
-from avmsf.evaluation.metrics import PAPER
 from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor, sine_floor
 from avmsf.evaluation.splits import Scores, evaluate, score, split
 from avmsf.evaluation.task import Renderer
@@ -55,7 +54,7 @@ CONVENTIONS = (
     "error: relative STFT error at held-out contacts, that is sums over bins and frames of absolute differences of "
     "magnitudes over the truth's sums; mean over FFT 2048/1024/512/256 at 44.1 kHz, 512/256/128/64 at 400 Hz; hop a "
     "quarter.",
-    f"l1, l1_log, envelope: convention '{PAPER.name}' of avmsf.evaluation.metrics, mean over held-out contacts.",
+    "l1, l1_log, envelope: the paper's, as avmsf.evaluation.metrics has them, mean over held-out contacts.",
     "knn3: of the 3 nearest contacts. warmup: the network after its warm-up alone. field: the network after training, "
     "quick recipe; auto: the same with the Gaussian process over all kernel families, no_body: without elastic mode "
     "shapes.",

@@ -197,7 +197,6 @@ def test_who_knows_the_answer_scores_zero_and_the_rest_in_order():
     scores = evaluate(NearestRecording(train), test)
     assert scores.names == test.names
     assert set(scores.values) == {"relative_stft", "l1", "l1_log", "envelope"}
-    assert scores.convention == "paper"
     noise = evaluate(WhiteNoise(train), test).mean()
     assert all(noise[metric] > value for metric, value in scores.mean().items())
     sizes = (256, 64)
@@ -258,11 +257,11 @@ def test_training_recordings_are_for_what_makes_a_renderer():
 
 def test_scores_have_means_and_standard_errors():
     values = {"l1": torch.tensor([1.0, 2.0, 3.0, 6.0], dtype=torch.float64)}
-    scores = Scores(convention="paper", names=("a", "b", "c", "d"), values=values)
+    scores = Scores(names=("a", "b", "c", "d"), values=values)
     assert scores.mean() == {"l1": 3.0}
     # Sum of squares 14 over 3, over 4.
     assert scores.standard_error()["l1"] == pytest.approx(math.sqrt(14 / 12), rel=1e-12)
-    single = Scores(convention="paper", names=("a",), values={"l1": values["l1"][:1]})
+    single = Scores(names=("a",), values={"l1": values["l1"][:1]})
     assert math.isnan(single.standard_error()["l1"])
 
 

@@ -12,10 +12,10 @@ from corpus import make as corpus
 from avmsf.errors import ArrayError, EvaluationError
 from avmsf.evaluation.cdpam import Cdpam
 from avmsf.evaluation.metrics import (
-    PAPER,
     default_fft_sizes,
     envelope_distance,
     log_mel_distance,
+    paper_distances,
     relative_stft_error,
     resampled,
     spectrogram_distance,
@@ -134,7 +134,7 @@ def test_the_papers_white_noise_is_where_the_paper_has_it():
     """Noise of peak one scores L1 3.774 and ENV .305 there, and 3.789 and .308 on its other data set."""
     noise = torch.randn(20, 144_000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     noise /= noise.abs().amax(dim=1, keepdim=True)
-    scores = PAPER.scores(noise, 0 * noise, sample_rate=48000.0)
+    scores = paper_distances(noise, 0 * noise, sample_rate=48000.0)
     # The largest of 144,000 samples, which sets a clip's level, scatters by 5 %, the mean of 20 clips by 1.2 %.
     assert float(scores["l1"].mean()) == pytest.approx(3.774, rel=0.03)
     assert float(scores["envelope"].mean()) == pytest.approx(0.305, rel=0.03)
@@ -164,7 +164,7 @@ def test_fft_sizes_go_with_the_sample_rate(sample_rate, sizes):
 @pytest.mark.parametrize("sample_rate", [100.0, 400.0, 5512.5, 16000.0, 31000.0, 44100.0, 62000.0, 63000.0, 192000.0])
 def test_the_papers_convention_holds_at_any_rate(sample_rate):
     a, b = clips(2, seed=1), clips(2, seed=2).flip(0)
-    scores = PAPER.scores(a, b, sample_rate=sample_rate)
+    scores = paper_distances(a, b, sample_rate=sample_rate)
     assert set(scores) == {"l1", "l1_log", "envelope"}
     assert all(bool((values > 0).all()) for values in scores.values())
 
@@ -197,12 +197,6 @@ def test_a_bad_row_is_called_by_its_name():
     with raises(EvaluationError, name="predicted", row=2, value=math.inf) as caught:
         validate(broken, clips(), names=("a", "b", "taps/c.wav"))
     assert "taps/c.wav" in str(caught.value)
-
-
-def test_different_sample_rates_are_refused():
-    with raises(EvaluationError, name="sample_rates", value=(48000.0, 44100.0)):
-        validate(clips(), clips(), sample_rates=(48000.0, 44100.0))
-    validate(clips(), clips(), sample_rates=(RATE, RATE))
 
 
 def test_resampling_keeps_a_tone_and_its_length():

@@ -10,12 +10,11 @@ error. Every metric calls `validate` first, which raises EvaluationError with th
 - `spectrogram_distance` (L1), `log_mel_distance` (L1-log) and `envelope_distance` (ENV): the paper's three.
 
 CDPAM is in `avmsf.evaluation.cdpam`; modes are compared with true ones in `avmsf.evaluation.modal_metrics`.
-`PAPER` names the parameters of the paper's three.
+`paper_distances` are the paper's three.
 """
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Float64
@@ -34,25 +33,11 @@ _BLOCK = 16
 """Sounds compared at a time: bounds the memory that their spectrograms take."""
 
 
-def validate(
-    predicted: Sounds,
-    truth: Sounds,
-    *,
-    names: Sequence[str] | None = None,
-    sample_rates: tuple[float, float] | None = None,
-) -> None:
+def validate(predicted: Sounds, truth: Sounds, *, names: Sequence[str] | None = None) -> None:
     """Raise EvaluationError unless both are [contacts, samples] of one shape, not empty, and finite throughout.
 
-    The message names a row by `names`, or else by its index. Where both sample rates are given (Hz, predicted and
-    true) they have to be equal.
+    The message names a row by `names`, or else by its index.
     """
-    if sample_rates is not None and sample_rates[0] != sample_rates[1]:
-        raise EvaluationError(
-            f"expected predicted sounds at the true ones' {sample_rates[1]:g} Hz, got {sample_rates[0]:g} Hz; resample "
-            "one of them",
-            name="sample_rates",
-            value=sample_rates,
-        )
     for what, sounds in (("predicted", predicted), ("truth", truth)):
         _expect_rows(sounds, what)
     if len(predicted) != len(truth):
@@ -162,56 +147,34 @@ def envelope_distance(predicted: Sounds, truth: Sounds) -> PerContact:
     return _blockwise(lambda a, b: (envelope(a) - envelope(b)).square().mean(dim=1).sqrt(), predicted, truth)
 
 
-@dataclass(frozen=True)
-class PaperConvention:
-    """The paper's L1, L1-log and ENV at the capture's own sample rate: keys `l1`, `l1_log` and `envelope`.
+PAPER_FFT_SIZE, PAPER_HOP, PAPER_MELS, PAPER_FLOOR = 1024, 256, 80, 1e-5
+"""Samples of the window and from frame to frame, and mel bands, at 44.1 and 48 kHz; the smallest mel magnitude, in the
+sounds' unit.
 
-    FFT size, hop and number of mel bands are for 44.1 and 48 kHz; at other rates all three go as `scaled_fft_size`.
+The paper describes its metrics in words. This is the reading that its own values support. Sixty clips of Gaussian
+white noise, 3 s at 48 kHz with peak one, against silence score L1 3.74 and ENV .305 in it, a ratio of 12.27 at any
+level; the paper's rows for white noise have 3.774 and .305 (12.37), and 3.789 and .308 (12.30), where FFT sizes of
+512 and 2048 would give 8.67 and 17.33. For L1-log the paper's 6.859 lies between what such noise scores against
+eight ObjectFolder Real clips as recorded, 8.8, and scaled to peak one, 6.1, with triangles of height one on
+magnitudes; on squared magnitudes it would be 12 to 15. It remains an inference: compare ratios with the paper's,
+not absolute values."""
 
-    The paper describes its metrics in words. This is the reading that its own values support. Sixty clips of Gaussian
-    white noise, 3 s at 48 kHz with peak one, against silence score L1 3.74 and ENV .305 in it, a ratio of 12.27 at any
-    level; the paper's rows for white noise have 3.774 and .305 (12.37), and 3.789 and .308 (12.30), where FFT sizes of
-    512 and 2048 would give 8.67 and 17.33. For L1-log the paper's 6.859 lies between what such noise scores against
-    eight ObjectFolder Real clips as recorded, 8.8, and scaled to peak one, 6.1, with triangles of height one on
-    magnitudes; on squared magnitudes it would be 12 to 15. It remains an inference: compare ratios with the paper's,
-    not absolute values.
+
+def paper_distances(predicted: Sounds, truth: Sounds, *, sample_rate: float) -> dict[str, PerContact]:
+    """Return the paper's `l1`, `l1_log` and `envelope` of every contact, at the sounds' own sample rate (Hz).
+
+    At rates other than 44.1 and 48 kHz all three sizes go as `scaled_fft_size`, with 80 mel bands at most. Raises
+    EvaluationError as the metrics do.
     """
-
-    fft_size: int = 1024
-    """Samples of the Hann window."""
-    hop: int = 256
-    """Samples from frame to frame."""
-    mel_count: int = 80
-    """Mel bands from 0 Hz to half the rate; never more than this."""
-    floor: float = 1e-5
-    """Smallest mel magnitude, in the sounds' unit."""
-
-    @property
-    def name(self) -> str:
-        """What a report calls the convention."""
-        return "paper"
-
-    def scores(self, predicted: Sounds, truth: Sounds, *, sample_rate: float) -> dict[str, PerContact]:
-        """Return `l1`, `l1_log` and `envelope` of every contact; raises EvaluationError as the metrics do."""
-        fft_size, hop, mel_count = (
-            scaled_fft_size(size, sample_rate=sample_rate) for size in (self.fft_size, self.hop, self.mel_count)
-        )
-        return {
-            "l1": spectrogram_distance(predicted, truth, fft_size=fft_size, hop=hop),
-            "l1_log": log_mel_distance(
-                predicted,
-                truth,
-                sample_rate=sample_rate,
-                fft_size=fft_size,
-                hop=hop,
-                mel_count=min(self.mel_count, mel_count),
-                floor=self.floor,
-            ),
-            "envelope": envelope_distance(predicted, truth),
-        }
-
-
-PAPER = PaperConvention()
+    fft_size, hop, mels = (
+        scaled_fft_size(size, sample_rate=sample_rate) for size in (PAPER_FFT_SIZE, PAPER_HOP, PAPER_MELS)
+    )
+    sizes = {"fft_size": fft_size, "hop": hop, "mel_count": min(PAPER_MELS, mels)}
+    return {
+        "l1": spectrogram_distance(predicted, truth, fft_size=fft_size, hop=hop),
+        "l1_log": log_mel_distance(predicted, truth, sample_rate=sample_rate, floor=PAPER_FLOOR, **sizes),
+        "envelope": envelope_distance(predicted, truth),
+    }
 
 
 def _expect_rows(sounds: Sounds, what: str) -> None:

@@ -125,6 +125,8 @@ def _path(dataset: Dataset, identifier: str) -> Path | None:
 
 
 Amplitudes = Complex128[Tensor, "contacts modes"]
+_SAME_FREQUENCY = 0.002
+"""Difference of two frequencies of one mode, over the frequency, however narrow the mode is."""
 _TURNS = 100
 """Most rounds in which phases and polarities are chosen in turn; a few suffice."""
 
@@ -196,14 +198,11 @@ def compare_modes(
     truth: Truth,
     *,
     directions: Float[Tensor, "contacts 3"] | None = None,
-    widths: float = 1.0,
-    relative: float = 0.002,
 ) -> ModalScores:
     """Compare a method's modes and its gains at the contacts with the true ones, row for row.
 
-    `directions` are the unit vectors of the impacts, which the true gains belong to; `widths` and `relative` as
-    `match_modes` has them. Raises EvaluationError where rows differ in number, for values that are not finite, and
-    where the truth is silence at all contacts.
+    `directions` are the unit vectors of the impacts, which the true gains belong to. Raises EvaluationError where rows
+    differ in number, for values that are not finite, and where the truth is silence at all contacts.
     """
     bank, true = renderer.bank, truth.amplitudes
     predicted = renderer.complex_gains(contacts, directions=directions).detach().cpu().to(torch.complex128)
@@ -219,7 +218,7 @@ def compare_modes(
     energy = true.abs().square().sum(dim=0) / (4 * truth.damping)
     if not float(energy.sum()) > 0.0:
         raise EvaluationError.expected("modes with energy", 0.0, got="zero gains at all contacts", name="truth")
-    match = match_modes(bank, ModalBank(truth.frequency, truth.damping), widths=widths, relative=relative)
+    match = match_modes(bank, ModalBank(truth.frequency, truth.damping))
     found = match >= 0
     partner = match[found]
     frequency_error, damping_error = torch.full((2, len(match)), math.nan, dtype=torch.float64)
@@ -247,23 +246,14 @@ def compare_modes(
     )
 
 
-def match_modes(
-    found: ModalBank, true: ModalBank, *, widths: float = 1.0, relative: float = 0.002
-) -> Int[Tensor, " modes"]:
+def match_modes(found: ModalBank, true: ModalBank) -> Int[Tensor, " modes"]:
     """Return for each true mode the row of the found mode that is taken for it, or -1: one to one, by frequency alone.
 
-    Two modes can be one where their frequencies differ by at most `widths` half-power widths of the true mode (damping
-    / pi, Hz) or, if that is more, `relative` of its frequency. Of all ways to pair them that is taken in which the sum
-    over pairs of 1 - (difference / allowed)^2 is largest: many pairs, and close ones rather than a chain of bad ones.
-    Raises EvaluationError for widths that allow nothing.
+    Two modes can be one where their frequencies differ by at most the half-power width of the true mode (damping / pi,
+    Hz) or, if that is more, .2 % of its frequency. Of all ways to pair them that is taken in which the sum over pairs
+    of 1 - (difference / allowed)^2 is largest: many pairs, and close ones rather than a chain of bad ones.
     """
-    if not (widths >= 0.0 and relative >= 0.0 and math.isfinite(widths + relative) and widths + relative > 0.0):
-        raise EvaluationError(
-            f"expected widths and relative of 0 or more, not both 0, got {widths:g} and {relative:g}",
-            name="widths",
-            value=(widths, relative),
-        )
-    allowed = torch.maximum(widths * true.damping / math.pi, relative * true.frequency)
+    allowed = torch.maximum(true.damping / math.pi, _SAME_FREQUENCY * true.frequency)
     distance = (found.frequency.detach()[None] - true.frequency[:, None]).abs() / allowed[:, None]
     possible = (distance <= 1.0).numpy()
     worth = np.where(possible, 1.0 - distance.square().numpy(), 0.0)

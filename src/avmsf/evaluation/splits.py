@@ -18,14 +18,7 @@ from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, ExtractionError, FitError, PositionWarning
 from avmsf.evaluation.cases import Places
-from avmsf.evaluation.metrics import (
-    PAPER,
-    PaperConvention,
-    PerContact,
-    default_fft_sizes,
-    relative_stft_error,
-    validate,
-)
+from avmsf.evaluation.metrics import PerContact, default_fft_sizes, paper_distances, relative_stft_error, validate
 from avmsf.evaluation.modal_metrics import ModalRenderer, compare_modes
 from avmsf.evaluation.task import Renderer, expect_renderer
 from avmsf.field.sound_field import SoundField
@@ -48,8 +41,6 @@ class Scores:
         means = ", ".join(f"{metric} {value:.3g}" for metric, value in self.mean().items())
         return f"Scores({counted(len(self.names), 'recording')}: {means})"
 
-    convention: str
-    """Name of the convention that the metrics follow, except for `relative_stft`."""
     names: tuple[str, ...]
     """Name of each scored recording."""
     values: Mapping[str, PerContact]
@@ -117,7 +108,6 @@ def evaluate(
     test: Capture | Impacts,
     *,
     train: Capture | Impacts | None = None,
-    convention: PaperConvention = PAPER,
     fft_sizes: Sequence[int] | None = None,
 ) -> Scores:
     """Score the sounds that `renderer` renders at the contacts of recordings against these recordings.
@@ -162,7 +152,7 @@ def evaluate(
             sounds = made.render(impacts.contacts, impacts.directions, samples=samples)
         else:
             sounds = made.render(impacts.contacts, directions=impacts.directions)
-    return score(sounds, impacts, convention=convention, fft_sizes=fft_sizes)
+    return score(sounds, impacts, fft_sizes=fft_sizes)
 
 
 def _impacts_of(recordings: Capture | Impacts, name: str) -> Impacts:
@@ -193,12 +183,11 @@ def score(
     sounds: ArrayLike,
     impacts: Impacts,
     *,
-    convention: PaperConvention = PAPER,
     fft_sizes: Sequence[int] | None = None,
 ) -> Scores:
     """Score sounds that were made otherwise than by a renderer, row for row of the impacts.
 
-    `relative_stft` with `fft_sizes` in samples, or else with `default_fft_sizes`, and the convention's metrics. Raises
+    `relative_stft` with `fft_sizes` in samples, or else with `default_fft_sizes`, and the paper's metrics. Raises
     EvaluationError for sounds that do not fit the impacts or are not finite, with the name of the impact, and
     ArrayError for what are no numbers.
     """
@@ -206,8 +195,8 @@ def score(
     validate(sounds, impacts.sounds, names=impacts.names)
     sizes = default_fft_sizes(impacts.sample_rate) if fft_sizes is None else tuple(fft_sizes)
     values = {"relative_stft": relative_stft_error(sounds, impacts.sounds, fft_sizes=sizes)}
-    values |= convention.scores(sounds, impacts.sounds, sample_rate=impacts.sample_rate)
-    return Scores(convention=convention.name, names=impacts.names, values=values)
+    values |= paper_distances(sounds, impacts.sounds, sample_rate=impacts.sample_rate)
+    return Scores(names=impacts.names, values=values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,7 +213,6 @@ class MetricValues:
 class MetricSettings:
     """Which metrics are computed."""
 
-    convention: PaperConvention = PAPER
     level: Literal["full-scale", "raw"] = "full-scale"
     """full-scale: all sounds of an object times one factor, so that its loudest recording has a peak of one and L1, ENV
     and CDPAM of different objects can be averaged; methods do not depend on it. raw: in the unit of the recordings,
@@ -270,7 +258,7 @@ class MetricSettings:
             )
         if self.level == "full-scale" and loudest > 0:
             sounds, test = sounds / loudest, replace(test, sounds=test.sounds / loudest)
-        scores = score(sounds, test, convention=self.convention)
+        scores = score(sounds, test)
         values: dict[str, tuple[float | None, ...]] = {
             metric: tuple(figures.tolist()) for metric, figures in scores.values.items()
         }
