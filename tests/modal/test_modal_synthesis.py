@@ -79,15 +79,6 @@ def test_gradients_are_those_of_finite_differences():
     assert torch.autograd.gradcheck(sounds, [inputs[0], inputs[1], own, inputs[3]], atol=1e-7)
 
 
-def test_equal_dampings_given_a_contact_each_change_nothing():
-    gains, frequency, damping, quadrature = draw()
-    shared, own = (
-        synthesize(gains, frequency, rates, samples=2000, sample_rate=RATE, quadrature=quadrature)
-        for rates in (damping, damping.expand(3, -1))
-    )
-    torch.testing.assert_close(own, shared, rtol=0, atol=1e-13)
-
-
 def test_each_contact_decays_at_its_own_damping():
     gains, frequency, damping, quadrature = draw()
     own = damping * torch.tensor([[1.0], [2.0], [5.0]], dtype=torch.float64)
@@ -95,24 +86,3 @@ def test_each_contact_decays_at_its_own_damping():
     for row in range(3):
         alone = plain_sum(gains[row : row + 1], frequency, own[row], quadrature[row : row + 1], 2000)
         torch.testing.assert_close(together[row : row + 1], alone, rtol=0, atol=1e-11)
-
-
-def test_quadrature_turns_the_phase():
-    gains, frequency, damping, _ = draw()
-    turn = 0.7
-    turned = synthesize(
-        gains * math.cos(turn),
-        frequency,
-        damping,
-        samples=3000,
-        sample_rate=RATE,
-        quadrature=gains * math.sin(turn),
-    )
-    times = torch.arange(3000, dtype=torch.float64) / RATE
-    atoms = torch.exp(-damping[:, None] * times) * torch.sin(2 * math.pi * frequency[:, None] * times + turn)
-    torch.testing.assert_close(turned, gains @ atoms, rtol=0, atol=1e-11)
-
-
-def test_no_mode_is_silence():
-    empty = torch.zeros(0, dtype=torch.float64)
-    assert torch.equal(synthesize(torch.zeros(2, 0), empty, empty, samples=600, sample_rate=RATE), torch.zeros(2, 600))

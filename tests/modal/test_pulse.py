@@ -40,13 +40,6 @@ def test_each_sample_holds_the_force_of_its_time(shape, power):
         assert float(pulse[row]) == pytest.approx(part / whole, abs=1e-9)
 
 
-def test_nothing_jumps_as_the_contact_grows_beyond_a_sample():
-    one, more = ForcePulse(1 / RATE).samples(RATE), ForcePulse(1.001 / RATE).samples(RATE)
-    assert len(one) == 1
-    assert len(more) == 2
-    assert float(more[1]) < 1e-5
-
-
 @pytest.mark.parametrize("shape", SHAPES)
 def test_softening_is_a_causal_convolution(shape):
     sounds = torch.randn(2, 300, dtype=torch.float64, generator=torch.Generator().manual_seed(0))

@@ -41,14 +41,6 @@ def test_a_steady_sine_reads_a_quarter_of_its_amplitude_times_the_fft_size():
     assert float(inner[bin_ + 2 :].max()) < 1e-9
 
 
-def test_white_noise_reads_what_the_text_says():
-    fft_size = 256
-    magnitudes = magnitude_stft(2.0 * noise(4, 100_000), fft_size=fft_size, hop=fft_size)
-    mean = float(magnitudes[:, 1:-1, 2:-2].mean())
-    # 197,000 independent Rayleigh variables scatter by 52 % each: three standard errors are .4 %.
-    assert mean == pytest.approx(2.0 * math.sqrt(3 * math.pi * fft_size / 32), rel=0.004)
-
-
 def test_gradients_are_finite_at_silence_and_right_elsewhere():
     silent = torch.zeros(2, 100, requires_grad=True)
     filters = htk_filters(8, fft_size=32, sample_rate=8000.0, lowest=0.0, highest=4000.0).float()
@@ -66,16 +58,6 @@ def test_envelope_is_scipys(samples):
     sound = noise(3, samples)
     expected = np.abs(scipy.signal.hilbert(sound.numpy(), axis=1))
     np.testing.assert_allclose(envelope(sound).numpy(), expected, rtol=0, atol=1e-13)
-
-
-def test_envelope_of_a_decaying_sine_is_its_decay():
-    rate, damping = 48000.0, 30.0
-    times = torch.arange(round(rate), dtype=torch.float64) / rate
-    decay = torch.exp(-damping * times)
-    found = envelope((decay * torch.sin(2 * math.pi * 2000.0 * times))[None])[0]
-    # From 10 to 50 ms: the onset's own trace in the analytic signal falls only as 1 / t, slower than the sound.
-    inner = slice(480, 2400)
-    assert float(((found - decay).abs() / decay)[inner].max()) < 0.02
 
 
 def test_htk_filters_peak_at_even_mels_and_sum_to_one():

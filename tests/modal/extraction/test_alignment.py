@@ -12,11 +12,9 @@ from torch import Tensor
 from avmsf.capture.audio import read_recording
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.onset import find_onset
-from avmsf.modal.extraction import alignment
-from avmsf.modal.extraction.alignment import align, coherence, strongest_modes
+from avmsf.modal.extraction.alignment import align, coherence
 from avmsf.modal.extraction.extract import extract_modes, extract_once
 from avmsf.modal.extraction.finders import HighResolution
-from avmsf.modal.extraction.phase_likelihood import DelayPrior, MeasuredPhases, background_power
 
 RATE, SAMPLES, LEAD = 16000.0, 6000, 320
 FREQUENCY = torch.tensor([431.0, 902.5, 1370.0, 2204.0, 3317.0, 4750.0], dtype=torch.float64)
@@ -60,8 +58,8 @@ def error(found: Tensor, starts: Tensor) -> float:
     return float((away - away.median()).square().mean().sqrt())
 
 
-@pytest.mark.parametrize("noise_db", [-60.0, -40.0, -20.0])
-@pytest.mark.parametrize(("deviation", "modes"), [(1.0, 3), (1.0, 6), (3.0, 3), (3.0, 6)])
+@pytest.mark.parametrize("noise_db", [-60.0, -20.0])
+@pytest.mark.parametrize(("deviation", "modes"), [(1.0, 6), (3.0, 3)])
 def test_delays_are_recovered(deviation: float, modes: int, noise_db: float) -> None:
     starts = jitter(12, deviation)
     found = align(damped(gains(12, modes), starts, noise_db=noise_db))
@@ -120,14 +118,6 @@ def test_a_recording_with_phases_of_its_own_is_named_and_moved_as_most_are() -> 
     assert error(found.delays[kept], starts[kept]) < 0.05
 
 
-def test_what_the_phases_leave_open_moves_a_delay_gradually() -> None:
-    prior, delays = DelayPrior(torch.tensor([1.0], dtype=torch.float64), 0.5), torch.full((4,), 9.0).double()
-    # A quarter of certainty leaves three quarters of a Cauchy distribution, whose
-    # upper third begins at its scale over the root of 3.
-    found = prior.median(delays, torch.tensor([0.0, 0.25, 0.499, 0.6], dtype=torch.float64))
-    assert torch.allclose(found, torch.tensor([1.0, 1.0 + 0.5 / 3**0.5, 9.0, 9.0], dtype=torch.float64))
-
-
 def test_phases_without_anything_in_common_hardly_move_starts() -> None:
     phase = 2 * math.pi * torch.rand(8, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
     impacts = damped(1 + gains(8, 6).abs(), torch.zeros(8, dtype=torch.float64), phase=phase, noise_db=-50.0)
@@ -136,17 +126,6 @@ def test_phases_without_anything_in_common_hardly_move_starts() -> None:
     assert found.agreement.mean() < 0.6
     assert found.delays.std() < 1.0
     assert max(found.coherence_before, found.coherence_after) < 0.7
-
-
-def test_a_recording_agrees_the_less_the_farther_its_phases_are_off() -> None:
-    agreement, starts = [], jitter(10, 1.0)
-    for size in (0.05, 0.2, 0.4):
-        phase = PHASE.repeat(10, 1)
-        phase[4] += size * torch.tensor([1.0, -0.8, 1.0, -1.0, 0.8, -0.9])
-        found = align(damped(gains(10, 6), starts, phase=phase, noise_db=-50.0))
-        assert found is not None
-        agreement.append(float(found.agreement[4]))
-    assert agreement[0] > 0.95 > agreement[1] > 0.05 > agreement[2]
 
 
 def test_the_common_start_does_not_depend_on_where_between_samples_impacts_fall() -> None:
@@ -191,34 +170,6 @@ def test_extraction_aligns_first_and_its_file_keeps_the_alignment(tmp_path: Path
     assert torch.equal(once.aligned(impacts.take([3])).sounds, again.aligned(impacts).sounds[3:4])
     amplitude = torch.complex(found.quadrature.double(), -found.gains.double())
     assert coherence(amplitude, found.bank.damping) > 0.99
-
-
-def test_many_recordings_are_aligned_by_the_modes_of_some(monkeypatch: pytest.MonkeyPatch) -> None:
-    starts, amplitudes = jitter(40, 2.0), gains(40, 6)
-    # Recordings are often ordered by place: these lie on nodal lines of the highest modes.
-    amplitudes[:32, 4:] = 0
-    impacts = damped(amplitudes, starts, noise_db=-40.0)
-    every = align(impacts)
-    monkeypatch.setattr(alignment, "_SEARCHED_SAMPLES", 0)
-    some = align(impacts)
-    assert every is not None
-    assert some is not None
-    assert not torch.equal(every.phases.bank.frequency, some.phases.bank.frequency)
-    assert torch.allclose(some.phases.bank.frequency, FREQUENCY, rtol=1e-3)
-    assert error(some.delays, starts) < 0.02
-    assert torch.allclose(some.delays, every.delays, rtol=0, atol=0.02)
-
-
-def test_amplitudes_at_a_later_start_are_those_of_the_sounds_cut_there() -> None:
-    delays = torch.tensor([3.0, -2.0, 0.5, 7.25, 0.0, -5.0], dtype=torch.float64)
-    impacts = damped(gains(6, 6), torch.full((6,), -8.0, dtype=torch.float64))
-    bank = strongest_modes(impacts)
-    noise = background_power(impacts, bank)
-    read, cut = (
-        MeasuredPhases.of(each, bank, reach=1.0, background=noise) for each in (impacts, impacts.delayed(delays))
-    )
-    assert len(bank) == 6
-    assert torch.allclose(read.turned(delays), cut.amplitude, rtol=0, atol=1e-3 * float(read.amplitude.abs().max()))
 
 
 @pytest.mark.skipif(not (SHARED / "tree43").is_dir(), reason="needs the measured data: set AVMSF_SHARED")

@@ -5,17 +5,13 @@ from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
-from scipy.signal import resample_poly
 from torch import Tensor
 
-from avmsf.capture.audio import read_sound
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.onset import find_onset
 from avmsf.errors import ExtractionError
 from avmsf.modal.extraction.extract import extract_modes, extract_once, extract_sounds
 from avmsf.modal.extraction.finders import HighResolution, ShortTime, lowest_frequency
@@ -143,30 +139,12 @@ def test_played_faster_all_rates_rise_alike(stretch: float):
     torch.testing.assert_close(fast.residual.magnitude, slow.residual.magnitude, rtol=0.035, atol=0)
 
 
-def test_the_order_of_recordings_does_not_matter():
-    impacts, _ = recorded(-40.0, seconds=0.25)
-    order = [3, 5, 0, 2, 1, 4]
-    one, two = extract_modes(impacts), extract_modes(impacts.take(order))
-    torch.testing.assert_close(two.bank.frequency, one.bank.frequency, rtol=1e-6, atol=0)
-    torch.testing.assert_close(two.bank.damping, one.bank.damping, rtol=1e-3, atol=0)
-    torch.testing.assert_close(two.gains, one.gains[order], rtol=0, atol=1e-2 * float(one.gains.abs().max()))
-
-
 def test_an_offset_is_no_mode():
     impacts, _ = recorded(-40.0, seconds=0.25)
     offset = 10 * impacts.sounds.abs().max()
     plain, raised = (HighResolution().find(sounds, RATE) for sounds in (impacts.sounds, impacts.sounds + offset))
     # The mean of a sound is not only its offset, so that the two differ a little.
     torch.testing.assert_close(raised.frequency, plain.frequency, rtol=1e-4, atol=0)
-
-
-def test_a_silent_recording_changes_nothing():
-    impacts, _ = recorded(-40.0, seconds=0.25)
-    more = torch.cat([impacts.sounds, torch.zeros(1, impacts.sounds.shape[1])])
-    found = extract_sounds(more, sample_rate=RATE)
-    expected = HighResolution().find(impacts.sounds, RATE).frequency
-    torch.testing.assert_close(found.bank.frequency, expected, rtol=1e-6, atol=0)
-    assert float(found.gains[-1].abs().max()) == 0.0
 
 
 def test_hum_is_no_mode():
@@ -220,13 +198,6 @@ def test_the_papers_method_finds_the_plates_strong_modes():
     assert float((found.bank.frequency[:, None] - strongest).abs().amin(0).max()) < 4.0
 
 
-def test_one_recording_has_the_modes_of_its_sound():
-    impacts, truth = recorded(-40.0, contacts=1)
-    found = extract_modes(impacts)
-    assert torch.equal(found.bank.frequency, extract_sounds(impacts.sounds, sample_rate=RATE).bank.frequency)
-    assert float((found.bank.frequency[:, None] / truth.frequency - 1).abs().amin(1).median()) < 1e-4
-
-
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("contacts", [2, 8])
 def test_noise_is_blamed(seed: int, contacts: int):
@@ -264,25 +235,6 @@ def low_tone() -> Tensor:
 def test_sounds_without_modes_are_refused_with_the_cause(sounds: Callable[[], Tensor], fault: dict[str, object]):
     with raises(ExtractionError, **fault):
         extract_modes(impacts_of(sounds()))
-
-
-@pytest.mark.slow
-def test_the_bowls_doublet_is_resolved(shared: Path):
-    clips = []
-    for row in range(8):
-        sound, rate = read_sound(shared / "bowl_clips" / f"mic{row}.wav")
-        begin = find_onset(sound.double().numpy(), sample_rate=rate)
-        # To a sixth of the rate, below the doublet's octave, to be quick.
-        slower = resample_poly(sound[begin : begin + round(1.5 * rate)].numpy(), 1, 6)
-        clips.append(torch.from_numpy(slower.astype(np.float32)))
-    found = extract_sounds(torch.stack(clips), sample_rate=rate / 6)
-    for pitch in (1681.2, 1684.24):
-        nearest = int((found.bank.frequency - pitch).abs().argmin())
-        # As measured on all of 3 s at the full rate, whichever seven of the eight clips are taken.
-        assert float(found.bank.frequency[nearest]) == pytest.approx(pitch, abs=0.05)
-        assert float(found.bank.damping[nearest]) == pytest.approx(3.1, abs=0.3)
-    loudest = torch.hypot(found.gains, found.quadrature).amax(1) / torch.stack(clips).abs().amax(1)
-    assert float(loudest.max()) < 5.0
 
 
 @pytest.mark.parametrize("method", [HighResolution, ShortTime])

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from avmsf.modal.extraction.least_squares import NormalEquations, fit_gains, fit_sine_gains, refine
-from avmsf.modal.inner_products import gram, own_gram, poles_of, project
+from avmsf.modal.inner_products import gram, poles_of, project
 from avmsf.modal.modes import ModalBank, common_phase
 from avmsf.modal.synthesis import synthesize
 
@@ -49,20 +49,6 @@ def test_gram_is_the_sum_over_time(power: int, samples: int):
     torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-10 * max(1.0, float(expected.abs().max())))
 
 
-def test_what_does_not_decay_is_summed_too():
-    bank = bank_of([500.0, 500.0, 1e-9], [0.0, 1e-12, 0.0])
-    atoms = basis(bank, 8000)
-    torch.testing.assert_close(gram(poles_of(bank, RATE), 8000, power=0), atoms @ atoms.T, rtol=1e-9, atol=1e-7)
-    sounds = torch.randn(2, 8000, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    torch.testing.assert_close(project(sounds, poles_of(bank, RATE))[0], sounds @ atoms.T, rtol=1e-9, atol=1e-7)
-
-
-def test_own_gram_is_the_gram_of_one_mode():
-    poles = poles_of(BANK, RATE)
-    for row, own in enumerate(own_gram(poles, 900)):
-        torch.testing.assert_close(own, gram(poles[row : row + 1], 900, power=0), rtol=1e-11, atol=1e-9)
-
-
 @pytest.mark.parametrize("samples", [100, 512, 6000])
 def test_projections_are_the_sums_over_time(samples: int):
     sounds = torch.randn(2, samples, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
@@ -98,15 +84,6 @@ def test_gains_of_sines_that_start_late_come_back_with_their_phases():
     torch.testing.assert_close(common_phase(*fit_gains(sounds, BANK, sample_rate=RATE)), phase, rtol=0, atol=1e-6)
 
 
-def test_a_common_phase_does_not_heed_signs_and_follows_the_strong():
-    strong = torch.tensor([[3.0], [-2.0], [4.0]], dtype=torch.float64)
-    weak = torch.tensor([[0.1]], dtype=torch.float64)
-    gains = torch.cat([strong * math.cos(0.7), weak * math.cos(2.0)])
-    quadrature = torch.cat([strong * math.sin(0.7), weak * math.sin(2.0)])
-    # A hundredth of a square's 29 can turn the sum's argument, which is twice the phase, by no more than 1 / 2900.
-    assert float(common_phase(gains, quadrature)[0]) == pytest.approx(0.7, abs=1 / 2900)
-
-
 def test_sine_gains_leave_the_least_residual():
     _, _, sounds = draw(BANK)
     atoms = basis(BANK, 6000)[: len(BANK)]
@@ -120,19 +97,6 @@ def test_gains_have_the_dtype_of_the_sounds_and_render_them():
     assert gains.dtype == quadrature.dtype == torch.float32
     rendered = synthesize(gains, BANK.frequency, BANK.damping, samples=6000, sample_rate=RATE, quadrature=quadrature)
     assert float((rendered - sounds).abs().max()) < 3e-6 * float(sounds.abs().max())
-
-
-def test_no_sounds_have_no_gains():
-    assert fit_gains(torch.zeros(0, 1000), BANK, sample_rate=RATE)[0].shape == (0, len(BANK))
-
-
-def test_an_empty_bank_has_no_gains():
-    empty = bank_of([], [])
-    gains, quadrature = fit_gains(torch.ones(3, 600), empty, sample_rate=RATE)
-    assert (
-        gains.shape == quadrature.shape == fit_sine_gains(torch.ones(3, 600), empty, sample_rate=RATE).shape == (3, 0)
-    )
-    assert len(refine(torch.ones(3, 600), empty, sample_rate=RATE)) == 0
 
 
 def test_two_modes_of_one_frequency_share_the_gain():

@@ -143,30 +143,6 @@ def test_coherence_is_one_for_one_phase_modulo_pi_and_low_for_random_phases() ->
     assert float(quality_of(sounds, bank).coherence) < 0.35
 
 
-def test_shares_are_those_of_the_integrals_of_the_squares() -> None:
-    gains = shapes(5, 3)
-    quality = quality_of(record(TRUTH, gains, noise=0.0), TRUTH)
-    energy = (gains.square() / TRUTH.damping).sum(0)
-    torch.testing.assert_close(quality.energy_share, energy / energy.sum(), rtol=1e-4, atol=0)
-    assert float(quality.energy_share.sum()) == pytest.approx(1.0)
-
-
-def test_a_silent_recording_changes_nothing() -> None:
-    sounds = record(TRUTH, shapes(6, 3))
-    alone = quality_of(sounds, TRUTH)
-    padded = quality_of(torch.cat([sounds, torch.zeros(1, SAMPLES, dtype=torch.float64)]), TRUTH)
-    torch.testing.assert_close(padded.frequency_spread, alone.frequency_spread)
-    torch.testing.assert_close(padded.explained_left_out, alone.explained_left_out)
-    assert padded.is_mode.tolist() == alone.is_mode.tolist()
-
-
-def test_of_a_single_recording_every_figure_is_finite() -> None:
-    quality = quality_of(record(TRUTH, shapes(1, 3)), TRUTH)
-    for figure in (quality.frequency_spread, quality.damping_spread, quality.coherence, quality.explained_left_out):
-        assert torch.isfinite(figure).all()
-    assert quality.is_mode.all()
-
-
 def test_a_pole_that_is_not_there_is_stable_at_no_order() -> None:
     sounds = record(TRUTH, shapes(4, 3))
     stable = stable_orders(sounds, bank_of((400.0, 8.0), (550.0, 10.0)), sample_rate=RATE)

@@ -54,19 +54,6 @@ def test_chance_is_the_tail_of_chi_squared(contacts: int):
     assert scipy.stats.chi2.sf(threshold * 2 * contacts, 2 * contacts) == pytest.approx(1e-5, rel=1e-6)
 
 
-def test_noise_explains_what_chance_says():
-    sounds = torch.randn(3, SAMPLES, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    everywhere = bank_of(torch.linspace(50, 3950, 800).tolist(), [5.0] * 800)
-    energy, ratio = Candidates.of(sounds, everywhere, flat(1.0, everywhere, 3), sample_rate=RATE).score(
-        samples=SAMPLES, sample_rate=RATE
-    )
-    # The mean of 800 chi-squared variables with 6 degrees of freedom scatters by 2 %.
-    assert float(ratio.mean()) == pytest.approx(1.0, abs=0.08)
-    assert float(ratio.max()) < chance_ratio(3, trials=800)
-    assert float(ratio.max()) > 0.5 * chance_ratio(3, trials=800)
-    torch.testing.assert_close(energy, ratio * 6, rtol=1e-9, atol=0)
-
-
 @pytest.mark.parametrize("noise", [1e-5, 1e-2])
 def test_every_mode_is_among_the_candidates(noise: float):
     sounds = record(TRUTH, noise=noise).float()
@@ -80,27 +67,6 @@ def test_every_mode_is_among_the_candidates(noise: float):
     assert (frequency >= 20.0).all()
     assert (frequency < RATE / 2).all()
     assert (damping > 0).all()
-
-
-def test_bands_of_noise_yield_hardly_a_candidate():
-    noise = torch.randn(4, SAMPLES, generator=torch.Generator().manual_seed(2))
-    frequency, _ = candidates(
-        noise, torch.ones(4, 33), sample_rate=RATE, lowest=20.0, significance=chance_ratio(4, trials=SAMPLES)
-    )
-    assert len(frequency) == 0
-
-
-@pytest.mark.parametrize("significance", [3.0, -1.0])
-def test_silence_yields_no_candidate(significance: float):
-    # With a negative limit no band is passed over.
-    frequency, damping = candidates(
-        torch.zeros(2, SAMPLES),
-        torch.full((2, 33), 1e-12),
-        sample_rate=RATE,
-        lowest=20.0,
-        significance=significance,
-    )
-    assert len(frequency) == len(damping) == 0
 
 
 def test_doubles_are_merged_and_neighbors_kept():
@@ -134,27 +100,6 @@ def test_selection_refuses_what_only_leaks_from_a_neighbor():
     assert sift(sounds, leaked, noise=0.03).frequency.tolist() == TRUTH.frequency.tolist()
 
 
-def test_selection_refuses_what_is_faint_beside_a_neighbor():
-    bank = bank_of([300.0, 303.0], [10.0, 10.0])
-    gains = torch.tensor([[1.0, 10 ** (-75 / 20)]], dtype=torch.float64)
-    sounds = synthesize(gains, bank.frequency, bank.damping, samples=SAMPLES, sample_rate=RATE)
-    assert select_one(sounds, bank).frequency.tolist() == [300.0]
-
-
-def test_selection_keeps_what_is_known_and_no_more_than_asked():
-    sounds = record(TRUTH, noise=1e-3)
-    known = bank_of([1234.0], [10.0])
-    chosen = sift(sounds, TRUTH, known=known, count=2)
-    assert len(chosen) == 3
-    assert contains(chosen, 1234.0)
-    assert (chosen.frequency.diff() > 0).all()
-
-
-def test_selection_does_not_judge_twice_what_is_known():
-    sounds = record(TRUTH, noise=1e-3)
-    assert sift(sounds, TRUTH, known=TRUTH).frequency.tolist() == TRUTH.frequency.tolist()
-
-
 def test_selection_among_hundreds_spans_its_chunks():
     sounds = record(TRUTH, noise=1e-3)
     decoys = torch.linspace(100, 3900, 400, dtype=torch.float64) + 0.5
@@ -166,23 +111,6 @@ def test_selection_among_hundreds_spans_its_chunks():
     chosen = sift(sounds, mixed)
     for pitch in TRUTH.frequency.tolist():
         assert contains(chosen, pitch)
-
-
-def test_selection_from_nothing_is_what_is_known():
-    sounds = record(TRUTH)
-    assert sift(sounds, bank_of([], []), known=TRUTH).frequency.tolist() == TRUTH.frequency.tolist()
-    assert len(sift(sounds, bank_of([], []))) == 0
-
-
-def test_pruning_leaves_true_modes_and_takes_decoys():
-    sounds = record(TRUTH, noise=1e-3)
-    bank = merge(
-        torch.cat([TRUTH.frequency, torch.tensor([500.0, 2000.0], dtype=torch.float64)]),
-        torch.cat([TRUTH.damping, torch.tensor([8.0, 9.0], dtype=torch.float64)]),
-        duration=0.75,
-    )
-    kept = prune(sounds, bank, flat(1e-3, bank), count=50, **SIFTING)
-    assert kept.frequency.tolist() == TRUTH.frequency.tolist()
 
 
 def test_pruning_takes_one_of_two_that_are_equal():
@@ -206,13 +134,6 @@ def test_pruning_leaves_no_cancelling_modes():
     _, apart = NormalEquations.of(sounds, poles_of(kept, RATE)).lost_without()
     assert float(apart.min()) >= 0.01
     assert contains(kept, 700.0)
-
-
-def test_pruning_keeps_the_most_needed():
-    gains = torch.tensor([[1.0, 0.1, 0.5]], dtype=torch.float64)
-    bank = bank_of([300.0, 900.0, 2000.0], [10.0, 10.0, 10.0])
-    sounds = synthesize(gains, bank.frequency, bank.damping, samples=SAMPLES, sample_rate=RATE)
-    assert prune(sounds, bank, flat(1e-5, bank, 1), count=2, **SIFTING).frequency.tolist() == [300.0, 2000.0]
 
 
 def test_range_leaves_faint_modes_out():
@@ -265,22 +186,3 @@ def test_what_the_chosen_explain_one_after_another_is_what_they_explain_together
     ]
     assert float(energy.max()) == pytest.approx(max(gained), rel=1e-7)
     assert int(energy[~given].argmax()) == gained.index(max(gained))
-
-
-def energies(sounds: Tensor, bank: ModalBank, given: list[int]) -> Tensor:
-    both = Candidates.of(sounds, bank, flat(1e-3, bank), sample_rate=RATE)
-    known = torch.zeros(len(bank), dtype=torch.bool)
-    known[given] = True
-    inner = gram(poles_of(bank, RATE), SAMPLES, power=0)
-    return choose(inner, both.products, both.noise, known, significance=6.0, reach=1e-12)
-
-
-def test_what_is_chosen_twice_explains_nothing_the_second_time():
-    sounds = record(TRUTH, noise=1e-3)
-    twice = bank_of([300.0, 300.0, 700.0], [5.0, 5.0, 6.0])
-    assert sorted((energies(sounds, twice, []) > 0).tolist()) == [False, True, True]
-    close = bank_of([300.0 + 1e-7 * step for step in range(20)], [5.0] * 20)
-    assert int((energies(sounds, close, []) > 0).sum()) == 1
-    # What is left of a twin is rounding, which must not be divided by: the others explain what they do beside one.
-    beside_one = energies(sounds, bank_of([300.0, 700.0], [5.0, 6.0]), [0])
-    torch.testing.assert_close(energies(sounds, twice, [0, 1])[[0, 2]], beside_one, rtol=1e-9, atol=0)
