@@ -164,7 +164,7 @@ def _scores(views: Sequence[View], cloud: GaussianCloud, truth: _Truth) -> _Scor
     mean, p95, mesh = min(found, key=lambda each: each[0])
     thickness = abs(_thickness(mesh) / _thickness(true) - 1)
     hollow = _mesh(shape.solid()).volume - true.volume
-    cavity = abs(mesh.volume - true.volume) / hollow if shape.cavities and not shape.supposed else float("nan")
+    cavity = abs(mesh.volume - true.volume) / hollow if shape.hollow.any() and not shape.supposed else float("nan")
     return _Scores(mean, p95, float(thickness), float(cavity), seconds)
 
 

@@ -7,7 +7,7 @@ import pytest
 import soundfile
 import torch
 
-from avmsf.capture import CaptureSettings, check, read_capture, read_sound
+from avmsf.capture import CaptureSettings, check, read_capture, read_recording
 from avmsf.capture.audio import clipped_samples, constant_offset
 from avmsf.errors import CaptureError, CaptureWarning
 from factories.capture_folder import RATE, fill, ring
@@ -178,22 +178,19 @@ def test_flat_tops_count_and_smooth_ones_do_not() -> None:
     assert clipped_samples(slow) == 0
 
 
-def test_read_sound_gives_samples_and_rate(tmp_path: Path) -> None:
+def test_the_response_is_one_channel_of_several(tmp_path: Path) -> None:
     both = stereo()
     soundfile.write(tmp_path / "clip.wav", both, 44_100, subtype="FLOAT")
-    sound, rate = read_sound(tmp_path / "clip.wav", channel=2)
-    assert rate == 44_100
-    assert torch.equal(sound, torch.from_numpy(both[:, 1].astype(np.float32)))
+    recording = read_recording(tmp_path / "clip.wav")
+    assert recording.sample_rate == 44_100
+    assert np.array_equal(recording.response(2), both[:, 1].astype(np.float32))
     with raises(CaptureError, file="clip.wav", name="response_channel", value=2):
-        read_sound(tmp_path / "clip.wav")
+        recording.response()
     for channel in (0, 3):
         with raises(CaptureError, file="clip.wav", name="channel", value=channel):
-            read_sound(tmp_path / "clip.wav", channel=channel)
-    soundfile.write(tmp_path / "silence.wav", np.zeros(100), 44_100)
-    with raises(CaptureError, file="silence.wav", value=0.0):
-        read_sound(tmp_path / "silence.wav")
+            recording.response(channel)
 
 
 def test_integer_samples_become_fractions_of_full_scale(tmp_path: Path) -> None:
     soundfile.write(tmp_path / "half.wav", np.array([0, 16384, -32768], dtype=np.int16), 48_000)
-    assert read_sound(tmp_path / "half.wav")[0].tolist() == [0, 0.5, -1]
+    assert read_recording(tmp_path / "half.wav").channel(1).tolist() == [0, 0.5, -1]

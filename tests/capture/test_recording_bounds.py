@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from avmsf.capture import check, read_capture, read_sound
+from avmsf.capture import check, read_capture, read_recording
 from avmsf.capture.audio import MAX_PEAK, MAX_SAMPLES, MIN_PEAK
 from avmsf.capture.table import MAX_ROWS
 from avmsf.errors import CaptureError
@@ -64,7 +64,7 @@ def test_a_compressed_file_is_measured_by_its_header(tmp_path: Path) -> None:
             file.write(np.zeros((MAX_SAMPLES // channels // 16, channels), dtype=np.int16))
     assert name.stat().st_size < 1e6
     with raises(CaptureError, file=name, value=17 * MAX_SAMPLES // 16):
-        read_sound(name)
+        read_recording(name)
 
 
 def test_many_missing_files_are_counted_once(tmp_path: Path) -> None:

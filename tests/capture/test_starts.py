@@ -12,7 +12,7 @@ from scipy.signal import fftconvolve
 from avmsf.capture import CaptureSettings, check, read_capture
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.prepare import margin_length, prepare
-from avmsf.capture.starts import start_with_impact
+from avmsf.capture.preprocess import start_with_impact
 from avmsf.datasets.recordings import DatasetRecording, build_capture
 from factories.capture_folder import RATE, fill, ring
 from oracles.plate import Plate, sample_contacts, strike

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from avmsf.errors import CaptureError, CaptureWarning
+from avmsf.errors import CaptureError
 from avmsf.photographs import read_sparse_points, read_views
 from avmsf.photographs.nerf_json import read_transforms
-from factories.raising import raises, warns
+from factories.raising import raises
 from factories.views_folder import HEIGHT, WIDTH, frames, ring, write_image, write_transforms
 
 
@@ -211,15 +211,6 @@ def test_numbers_that_the_caller_gives_are_checked(tmp_path: Path) -> None:
         read_views(tmp_path, longest=0)
     with raises(CaptureError, name="meters", value=-1.0):
         read_views(tmp_path, meters=-1.0)
-
-
-def test_progress_counts_every_image(tmp_path: Path) -> None:
-    write_transforms(tmp_path, frames(ring(4)))
-    (tmp_path / "images" / "b.png").unlink()
-    seen: list[tuple[int, int]] = []
-    with warns(CaptureWarning, name="missing images", value=["b.png"]):
-        read_views(tmp_path, progress=lambda done, count: seen.append((done, count)))
-    assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
 def test_paths_outside_the_folder_are_read(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 
 from avmsf.capture import read_capture
-from avmsf.capture.audio import read_sound
+from avmsf.capture.audio import read_recording
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.modal.extraction.least_squares import fit_gains
@@ -30,7 +30,7 @@ def test_the_example_sounds_as_its_truth_says() -> None:
     assert truth.names == read_capture(EXAMPLE_FOLDER).impacts.names
     # Each recording from its first sample after the impact on, and the truth as much later.
     firsts = truth.starts.ceil().long().tolist()
-    recordings = [read_sound(EXAMPLE_FOLDER / name)[0] for name in truth.names]
+    recordings = [torch.from_numpy(read_recording(EXAMPLE_FOLDER / name).response()).float() for name in truth.names]
     sounds = torch.stack([row[first:][:44000] for row, first in zip(recordings, firsts, strict=True)])
     late = [(first - float(start)) / rate for first, start in zip(firsts, truth.starts, strict=True)]
     expected = torch.stack([truth.after(seconds).amplitudes[row] for row, seconds in enumerate(late)])

@@ -9,7 +9,7 @@ import pytest
 import scipy.stats
 import torch
 
-from avmsf.capture.audio import read_sound
+from avmsf.capture.audio import read_recording
 from avmsf.capture.onset import find_onset
 from avmsf.fem.material import CERAMIC
 from avmsf.fem.radiation import SOUND_SPEED, travel_time
@@ -82,7 +82,9 @@ def test_the_truth_names_the_impact_in_every_file(simulation: Simulation, tmp_pa
     assert truth.starts is not None
     assert simulation.truth.starts is not None
     assert torch.equal(truth.starts, simulation.truth.starts)
-    recordings = [read_sound(tmp_path / "plate" / name)[0] for name in truth.names]
+    recordings = [
+        torch.from_numpy(read_recording(tmp_path / "plate" / name).channel(1)).float() for name in truth.names
+    ]
     assert torch.equal(torch.stack(recordings), simulation.recordings)
     onsets = [find_onset(row.double().numpy(), sample_rate=32000.0) for row in recordings]
     late = torch.tensor(onsets) - truth.starts

@@ -1,6 +1,5 @@
 from .audio import Recording as Recording
 from .audio import read_recording as read_recording
-from .audio import read_sound as read_sound
 from .check import CaptureReport as CaptureReport
 from .check import check as check
 from .folder import Capture as Capture

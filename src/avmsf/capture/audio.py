@@ -7,11 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import soundfile
-import torch
-from jaxtyping import Float, Float64, Shaped
+from jaxtyping import Float64, Shaped
 from scipy.ndimage import uniform_filter1d
 from scipy.special import stdtrit
-from torch import Tensor
 
 from avmsf._utils.files import is_lfs_pointer
 from avmsf.capture.filenames import missing_recording
@@ -204,19 +202,6 @@ def decode_recording(source: Path | SoundBytes, name: str) -> Recording:
         got, wanted = f"{peak:.3g}", f"samples of at most {MAX_PEAK:g}"
         raise CaptureError.expected(wanted, peak, got=got, file=name, advice="export it again")
     return Recording(name, np.ascontiguousarray(samples.T), rate, subtype)
-
-
-def read_sound(path: str | Path, *, channel: int | None = None) -> tuple[Float[Tensor, " samples"], float]:
-    """Read one clip for which no contact is known: the whole of it as float32, and its sample rate in Hz.
-
-    `channel` counts from 1 and is needed only where a file holds several different ones. Raises `CaptureError` for
-    what `read_recording` rejects, for a rate outside 100 Hz to 192 kHz, and for silence.
-    """
-    recording = read_recording(Path(path))
-    sound = recording.response(channel)
-    refuse_rate(recording.sample_rate, recording.name)
-    refuse_silence(sound, recording.name)
-    return torch.from_numpy(sound.astype(np.float32)), recording.sample_rate
 
 
 def wav_bytes(samples: Shaped[np.ndarray, "frames *channels"], rate: int) -> bytes:

@@ -7,9 +7,8 @@ from pathlib import Path
 from avmsf._utils.text import counted, listed
 from avmsf.capture.filenames import number_key
 from avmsf.capture.measure import RecordingReport
-from avmsf.capture.preprocess import Issues, Preprocessed, preprocess
+from avmsf.capture.preprocess import Issues, Preprocessed, are_uncut, preprocess
 from avmsf.capture.settings import CaptureSettings, settings_of
-from avmsf.capture.starts import are_uncut
 from avmsf.capture.table import FARTHEST, TABLE, Row, fitting_units
 from avmsf.errors import CaptureError
 

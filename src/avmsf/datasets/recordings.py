@@ -16,8 +16,8 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.measure import measure, shared_problems
 from avmsf.capture.placement import check_placement
 from avmsf.capture.prepare import Prepared, prepare
+from avmsf.capture.preprocess import build_impacts, shorten
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.starts import build_impacts, shorten
 from avmsf.errors import CaptureError, CaptureWarning, DatasetError
 from avmsf.mesh.surface import Surface, surface_points
 

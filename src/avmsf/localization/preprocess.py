@@ -17,8 +17,8 @@ from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.measure import check_impulsive, find_clipping
 from avmsf.capture.onset import Pulse, find_second_impact, find_second_push
 from avmsf.capture.prepare import prepare, shortest_allowed
+from avmsf.capture.preprocess import latest_start
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.starts import latest_start
 from avmsf.errors import ArrayError, AvmsfError, CaptureError, LocationError
 from avmsf.field.sound_field import SoundField
 

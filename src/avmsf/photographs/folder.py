@@ -4,7 +4,7 @@ import json
 import math
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -35,7 +35,6 @@ def read_views(
     longest: int | None = None,
     max_views: int | None = None,
     meters: float = 1.0,
-    progress: Callable[[int, int], None] | None = None,
 ) -> tuple[View, ...]:
     """Read a folder of photographs with cameras, sorted by name, as undistorted views.
 
@@ -43,7 +42,7 @@ def read_views(
     the path of a JSON file of that kind; the JSON goes first where both are there. Masks come from the images' alpha
     channel, from the files that the JSON names, or from `masks/`. `longest` is the most pixels of a side; larger images
     are scaled down with their cameras. Of more than `max_views` images, only every second one or fewer are read.
-    `meters` is the length of the file's unit. `progress` is called with the number of images done and of all.
+    `meters` is the length of the file's unit.
 
     Warns with CaptureWarning of what was not used or was corrected. Raises CaptureError where cameras cannot be read,
     where an image's shape does not fit its camera's, or where fewer than three views remain.
@@ -67,12 +66,8 @@ def read_views(
         remarks.append(Remark(message, name="cameras", value=unused))
     if max_views is not None:
         shots = shots[:: max(1, -(-len(shots) // max_views))]
-    views = []
-    for done, shot in enumerate(shots, start=1):
-        view = read_view(shot, base, longest, meters, findings)
-        views += [] if view is None else [view]
-        if progress is not None:
-            progress(done, len(shots))
+    found_views = (read_view(shot, base, longest, meters, findings) for shot in shots)
+    views = [view for view in found_views if view is not None]
     remarks += summarize(findings)
     if len(views) < MIN_VIEWS:
         raise _too_few(views, shots, findings, remarks, found.origin)

@@ -34,35 +34,15 @@ _BLUR = 0.6
 
 
 @dataclass(frozen=True)
-class Cavity:
-    """A hollow that opens to the outside."""
-
-    volume: float
-    """Cubic meters, as far as views saw it empty."""
-    depth: float
-    """Largest distance from the openings, meters, as far as views saw it empty."""
-    openings: int
-    """Separate openings; 2 for a tube."""
-    opening_area: float
-    """Of all openings, square meters."""
-
-
-@dataclass(frozen=True)
 class ShapeReport:
     """What is known of how good a shape is."""
 
-    views: int
-    """Views whose masks were used."""
     rejected: tuple[str, ...]
     """Names of the views whose masks contradict the others'."""
     mask_offset: float
     """How far inside the masks' outlines the photographs' edges lay, pixels; outlines were moved there."""
-    depth_bias: float
-    """How far depth lay behind the surface, meters; it was taken off."""
     unseen: float
     """Part of the surface, 0 to 1, that no view saw; it was closed by the convex hull of what was seen."""
-    unseen_direction: tuple[float, float, float] | None
-    """Mean outward normal of the part that no view saw, of length 1; None where all was seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,22 +61,6 @@ class ObjectShape:
     diagonal: float
     """Of the box around the object, meters."""
     report: ShapeReport
-
-    @cached_property
-    def cavities(self) -> tuple[Cavity, ...]:
-        """All cavities, the largest first."""
-        found = []
-        for number in range(1, int(self.hollow.max()) + 1):
-            here = self.hollow == number
-            lids, count = ndimage.label(self._lids & ndimage.binary_dilation(here, iterations=2), np.ones((3, 3, 3)))
-            sizes = np.bincount(lids.ravel())[1:]
-            big = sizes >= 0.05 * sizes.max(initial=0)
-            depth = ndimage.distance_transform_edt(~(lids > 0))[here].max() if count else 0.0
-            cell = self.grid.spacing
-            found.append(
-                Cavity(int(here.sum()) * cell**3, float(depth) * cell, int(big.sum()), float(sizes.sum()) * cell**2)
-            )
-        return tuple(found)
 
     @property
     def thickness_range(self) -> tuple[float, float] | None:

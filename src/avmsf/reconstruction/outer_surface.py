@@ -13,11 +13,17 @@ from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.extent import masked_views, no_common_point, object_extent
 from avmsf.photographs.mesh_views import MeshTracer
-from avmsf.reconstruction.depth_fusion import SeenDepth, fused_depth
 from avmsf.reconstruction.fairing import fair_hull
 from avmsf.reconstruction.mask_consistency import WRONG_FRACTION, consistent_masks, edge_offset
 from avmsf.reconstruction.object_shape import ObjectShape, ShapeReport, closed_surface
-from avmsf.reconstruction.visual_hull import Grid, Outline, depth_in_convex_hull, hull_distance
+from avmsf.reconstruction.visual_hull import (
+    Grid,
+    Outline,
+    SeenDepth,
+    depth_in_convex_hull,
+    fused_depth,
+    hull_distance,
+)
 
 DepthMap = Callable[[Camera], Float[Tensor, "height width"]]
 """What gives the depth of the first surface that each pixel of a camera sees, meters along the axis; 0 where none."""
@@ -82,7 +88,7 @@ def object_surface(views: Sequence[View], depth_map: DepthMap, *, cells: int = 1
     bias = _bias(hull, grid, depths, diagonal)
     free, view_counts = _free(hull, grid, depths, bias, diagonal)
     seen = np.minimum(hull, _DEPTH_TOLERANCE * diagonal - free)
-    seen, bound, unseen, direction = _closed(hull, seen, view_counts, grid)
+    seen, bound, unseen = _closed(hull, seen, view_counts, grid)
     hollow = _hollows(bound, seen, grid, diagonal)
     supposed = not hollow.any()
     if supposed:
@@ -91,8 +97,7 @@ def object_surface(views: Sequence[View], depth_map: DepthMap, *, cells: int = 1
     if not supposed:
         outer = np.where(_covered(hollow > 0, (bound > 0) & (seen <= 0)), np.maximum(seen, bound), seen)
     rejected = tuple(view.name for view, each in zip(masked, right, strict=True) if not each)
-    report = ShapeReport(len(kept), rejected, offset, bias, unseen, direction)
-    return ObjectShape(grid, outer, seen, hollow, supposed, diagonal, report)
+    return ObjectShape(grid, outer, seen, hollow, supposed, diagonal, ShapeReport(rejected, offset, unseen))
 
 
 def _rough(
@@ -192,11 +197,10 @@ def _closed(
     seen: Float32[np.ndarray, "x y z"],
     view_counts: Float32[np.ndarray, "x y z"],
     grid: Grid,
-) -> tuple[Float32[np.ndarray, "x y z"], Float32[np.ndarray, "x y z"], float, tuple[float, float, float] | None]:
+) -> tuple[Float32[np.ndarray, "x y z"], Float32[np.ndarray, "x y z"], float]:
     """Cut what no view sees by the convex hull of what views see.
 
-    Return the cut solid, the hull cut likewise, which lids cavities, the part of the surface that no view saw, and the
-    direction in which it lies.
+    Return the cut solid, the hull cut likewise, which lids cavities, and the part of the surface that no view saw.
     """
     surface = closed_surface(seen, grid, _CLOSING_FACES)
     places = surface.vertices.double().numpy()
@@ -210,15 +214,9 @@ def _closed(
     inside = depth_in_convex_hull(places[known], grid, np.argwhere(near))
     bound[near] = np.minimum(hull[near], inside)
     corners = surface.vertices.double()[surface.faces]
-    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).numpy()
+    areas = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=1).numpy()
     hidden = ~known[surface.faces.numpy()].any(axis=1)
-    areas = np.linalg.norm(normals, axis=1)
-    total = normals[hidden].sum(axis=0)
-    length = float(np.linalg.norm(total))
-    direction = None if length == 0.0 else (float(total[0]), float(total[1]), float(total[2]))
-    if direction is not None:
-        direction = (direction[0] / length, direction[1] / length, direction[2] / length)
-    return np.minimum(seen, bound), bound, float(areas[hidden].sum() / areas.sum()), direction
+    return np.minimum(seen, bound), bound, float(areas[hidden].sum() / areas.sum())
 
 
 def _covered(hollow: Bool[np.ndarray, "x y z"], free: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:

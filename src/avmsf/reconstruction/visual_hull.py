@@ -1,4 +1,8 @@
-"""Signed distances on a grid of cells: how far inside the outlines of all masks, or a convex hull, each place lies."""
+"""Signed distances on a grid of cells.
+
+How far inside the outlines of all masks, or a convex hull, each place lies, and how far before the surface that most
+views see.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,10 +15,13 @@ from scipy.spatial import ConvexHull, QhullError
 
 from avmsf._utils.compiled import compiled, lane_count, run_lanes
 from avmsf.errors import SceneError
-from avmsf.photographs.cameras import View
+from avmsf.photographs.cameras import Camera, View
 
 _SUBPIXELS = 3
 """Times as many pixels across in which the distance to an outline is measured. It must be odd."""
+
+_BINS = 32
+"""Of distances before the depth that views see."""
 
 _OUTSIDE_M = np.float32(1e6)
 """Meters outside, of what is not known to be inside."""
@@ -123,6 +130,17 @@ def hull_distance(
     return distance
 
 
+@compiled(error_model="numpy", inline="always")
+@no_type_check
+def _pixel(projection, lowest, spacing, place):
+    """Return the depth, row and column of the middle of a cell in a view."""
+    x, y, z = lowest[0] + spacing * place[0], lowest[1] + spacing * place[1], lowest[2] + spacing * place[2]
+    depth = projection[2, 0] * x + projection[2, 1] * y + projection[2, 2] * z + projection[2, 3]
+    column = (projection[0, 0] * x + projection[0, 1] * y + projection[0, 2] * z + projection[0, 3]) / depth
+    row = (projection[1, 0] * x + projection[1, 1] * y + projection[1, 2] * z + projection[1, 3]) / depth
+    return depth, row, column
+
+
 @compiled(error_model="numpy")
 @no_type_check
 def _measure(lane, lanes, projection, inside, focal, lowest, spacing, rows, least, seen):
@@ -130,15 +148,8 @@ def _measure(lane, lanes, projection, inside, focal, lowest, spacing, rows, leas
     height, width = inside.shape
     count, kept = least.shape
     for cell in range(lane * count // lanes, (lane + 1) * count // lanes):
-        x = lowest[0] + spacing * rows[cell, 0]
-        y = lowest[1] + spacing * rows[cell, 1]
-        z = lowest[2] + spacing * rows[cell, 2]
-        depth = projection[2, 0] * x + projection[2, 1] * y + projection[2, 2] * z + projection[2, 3]
-        if depth <= 0.0:
-            continue
-        column = (projection[0, 0] * x + projection[0, 1] * y + projection[0, 2] * z + projection[0, 3]) / depth
-        row = (projection[1, 0] * x + projection[1, 1] * y + projection[1, 2] * z + projection[1, 3]) / depth
-        if not (0.0 <= column < width and 0.0 <= row < height):
+        depth, row, column = _pixel(projection, lowest, spacing, rows[cell])
+        if not (depth > 0.0 and 0.0 <= column < width and 0.0 <= row < height):
             continue
         seen[cell] += 1
         across, down = min(max(column - 0.5, 0.0), width - 1.001), min(max(row - 0.5, 0.0), height - 1.001)
@@ -184,3 +195,76 @@ def _depth_below_planes(lane, lanes, planes, lowest, spacing, rows, result):
         for plane in range(planes.shape[0]):
             least = min(least, -(planes[plane, 0] * x + planes[plane, 1] * y + planes[plane, 2] * z + planes[plane, 3]))
         result[cell] = least
+
+
+@dataclass(frozen=True, eq=False)
+class SeenDepth:
+    """The depth of the first surface that one view sees."""
+
+    camera: Camera
+    depth: Float32[np.ndarray, "height width"]
+    """Meters along the optical axis; 0 where nothing is known."""
+
+    @classmethod
+    def of(cls, view: View, depth: Float32[np.ndarray, "height width"]) -> "SeenDepth":
+        """Return the depth inside a view's mask: at the outline a pixel's depth is the background's in part."""
+        assert view.mask is not None
+        return cls(view.camera, np.where(view.mask.numpy() > 127, depth, np.float32(0.0)).astype(np.float32))
+
+    def moved(self, meters: float) -> "SeenDepth":
+        """Return the depth that lies so much farther away, where it is known."""
+        return replace(self, depth=np.where(self.depth > 0, self.depth + np.float32(meters), np.float32(0.0)))
+
+
+def fused_depth(
+    views: Sequence[SeenDepth],
+    grid: Grid,
+    where: Bool[np.ndarray, "x y z"],
+    *,
+    band: float,
+    quantile: float,
+    least: float,
+) -> tuple[Float32[np.ndarray, "x y z"], Float32[np.ndarray, "x y z"]]:
+    """Return how far each cell lies before the surface, meters within `band`, and how many views see the cell.
+
+    A view sees a cell that lies before its depth or at most `band` behind. The distance is the `quantile` of theirs.
+    """
+    rows = np.argwhere(where)
+    counts = np.zeros((len(rows), _BINS), dtype=np.uint8)
+    for each in views:
+        projection = (each.camera.intrinsics @ each.camera.world_to_camera[:3]).numpy()
+        run_lanes(_count, lane_count(), projection, each.depth, grid.lowest, grid.spacing, rows, band, counts)
+    total = np.cumsum(counts, axis=1, dtype=np.float32)
+    view_counts = total[:, -1]
+    wanted = quantile * view_counts
+    first = np.minimum((total < wanted[:, None]).sum(axis=1), _BINS - 1)
+    at = np.arange(len(rows))
+    before = np.where(first > 0, total[at, np.maximum(first - 1, 0)], 0.0)
+    within = (wanted - before) / np.maximum(counts[at, first], 1)
+    value = ((first + np.clip(within, 0.0, 1.0)) / _BINS * 2.0 - 1.0) * band
+    values = np.full(grid.shape, -band, dtype=np.float32)
+    seen = np.zeros(grid.shape, dtype=np.float32)
+    values[tuple(rows.T)] = np.where(view_counts >= least, value, -band)
+    seen[tuple(rows.T)] = view_counts
+    return values, seen
+
+
+@compiled(error_model="numpy")
+@no_type_check
+def _count(lane, lanes, projection, reached, lowest, spacing, rows, band, counts):
+    """Count one view's distance before its depth in the bin of each cell."""
+    height, width = reached.shape
+    count, bins = counts.shape
+    for cell in range(lane * count // lanes, (lane + 1) * count // lanes):
+        depth, row, column = _pixel(projection, lowest, spacing, rows[cell])
+        if not (depth > 0.0 and 0.0 <= column < width and 0.0 <= row < height):
+            continue
+        there = reached[int(row), int(column)]
+        if there <= 0.0:
+            continue
+        before = (there - depth) / band
+        if before < -1.0:
+            continue
+        place = min(int((before + 1.0) * 0.5 * bins), bins - 1)
+        if counts[cell, place] < 255:
+            counts[cell, place] += 1

@@ -14,8 +14,8 @@ from torch import Tensor
 from avmsf.capture.audio import Recording
 from avmsf.capture.folder import Capture
 from avmsf.capture.prepare import prepare
+from avmsf.capture.preprocess import build_impacts, shorten
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.starts import build_impacts, shorten
 from avmsf.fem.damping import Vibration, damped
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.radiation import radiated, travel_time
