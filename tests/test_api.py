@@ -6,7 +6,6 @@ import sys
 import warnings
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ import torch
 import trimesh
 
 import avmsf
-from avmsf._utils.arrays import as_directions
 from avmsf.capture import Impacts
 from avmsf.cli import main
 from avmsf.editing import adjust_modes, change_material
@@ -32,10 +30,9 @@ from avmsf.errors import (
     PositionWarning,
 )
 from avmsf.evaluation import score
-from avmsf.fem.material import CERAMIC, WOOD
 from avmsf.field import FitConfig, SoundField
 from avmsf.photographs.cameras import Camera, View
-from avmsf.pipeline import PRESETS, PipelineConfig
+from avmsf.pipeline import PipelineConfig
 from factories.plate_capture import fill_plate
 from factories.plate_field import RATE, plate_impacts
 from factories.raising import raises, warns
@@ -124,12 +121,6 @@ def test_fit_says_what_it_does_unless_that_is_turned_off(capfd):
     assert "modes" in err
 
 
-def test_a_seed_takes_the_place_of_the_configurations():
-    made = avmsf.fit(capture(), seed=7, config=PipelineConfig(modes=2, fit=FitConfig(steps=0)), progress=False)
-    assert made.origin.config.seed == 7
-    assert made.origin.report["pipeline"]["gain_model"] == "auto"
-
-
 @pytest.mark.parametrize("kind", [list, np.array, np.float32, torch.tensor])
 def test_lists_and_arrays_sound_like_tensors(kind):
     contacts = [CONTACT, [0.1, 0.02, 0.0]]
@@ -214,15 +205,6 @@ def test_a_recording_is_located_by_its_path_or_its_samples(tmp_path):
     assert all(float((place - expected).norm()) < 0.03 for place in places)  # meters
 
 
-@pytest.mark.parametrize("progress", [True, False])
-def test_long_work_says_what_it_does_in_a_pipe_too(monkeypatch, capsys, progress):
-    monkeypatch.setattr("avmsf._utils.progress.REPEAT_SECONDS", 1e-3)
-    avmsf.locate(field(), capture().impacts.sounds[3], points=field().gain_field.points, progress=progress)
-    assert ("locating" in capsys.readouterr().err) == progress
-    avmsf.fit(capture(), config=PipelineConfig(modes=2, fit=FitConfig(steps=2)), progress=progress)
-    assert (" ... 0 s" in capsys.readouterr().err) == progress
-
-
 def test_evaluation_aligns_recordings_as_the_fit_did(tmp_path):
     late = 40
     sounds = torch.nn.functional.pad(plate_impacts().sounds, (late, late))
@@ -245,18 +227,6 @@ def test_evaluation_aligns_recordings_as_the_fit_did(tmp_path):
     assert scores[0] == avmsf.evaluate(made, made.aligned(test.impacts)).mean()["relative_stft"]
     unaligned = avmsf.evaluate(made, replace(test.impacts, before=None, after=None)).mean()["relative_stft"]
     assert scores[0] < unaligned
-
-
-def test_a_field_is_evaluated_over_the_length_of_the_recordings():
-    whole = capture().impacts
-    shorter = replace(whole, sounds=whole.sounds[:, :-73])
-    sounds = field().render(shorter.contacts, shorter.directions, samples=shorter.sounds.shape[1])
-    assert avmsf.evaluate(field(), shorter).mean() == score(sounds, shorter).mean()
-
-
-def test_modes_are_extracted_from_a_capture_or_its_impacts():
-    one, other = (avmsf.extract_modes(each).bank for each in (capture(), capture().impacts))
-    torch.testing.assert_close(one.frequency, other.frequency)
 
 
 @pytest.mark.parametrize(
@@ -340,11 +310,6 @@ def test_contacts_between_the_vertices_of_a_coarse_mesh_are_on_the_object():
     assert fitted.origin.trained_on == capture().impacts.names
 
 
-def test_paths_may_be_strings(tmp_path):
-    field().save(str(tmp_path / "a.safetensors"))
-    assert Path(tmp_path / "a.safetensors").is_file()
-
-
 def test_values_of_another_type_are_refused_by_name():
     made, alone = field(), avmsf.Capture("plate", Impacts.of([[0, 0, 0]], [[0.0, 1.0]], 8000.0))
     refusals = [
@@ -374,13 +339,6 @@ def test_lists_are_taken_wherever_tensors_are():
     assert str(len(impacts)) in repr(scores)
 
 
-def test_directions_count_as_unit_vectors():
-    along, straight = [[0.0, 0.6, -0.8]], [[0.0, 0.0, 0.0]]
-    torch.testing.assert_close(as_directions(np.array(along) * 5, "directions", count=1).tolist(), along)
-    assert torch.equal(as_directions(straight, "directions", count=1), torch.zeros(1, 3).double())
-    assert torch.equal(field().render([CONTACT], straight), field().render([CONTACT]))
-
-
 def test_a_position_near_the_object_gives_a_warning():
     points = field().gain_field.points
     size = float((points.amax(0) - points.amin(0)).norm())
@@ -388,17 +346,6 @@ def test_a_position_near_the_object_gives_a_warning():
     with warns(PositionWarning, name="positions", row=1, value=pytest.approx(0.3 * size, rel=0.05)):
         field().render(beside)
     field().render(points)
-
-
-def test_materials_are_given_by_name():
-    by_name, given = (change_material(field(), *pair) for pair in (("ceramic", "Wood"), (CERAMIC, WOOD)))
-    assert torch.equal(by_name.bank.frequency, given.bank.frequency)
-
-
-def test_configurations_print_what_differs_from_the_defaults():
-    config = PipelineConfig(gain_model="smooth", fit=FitConfig(seed=3))
-    assert repr(config) == "PipelineConfig(gain_model='smooth', fit=FitConfig(seed=3))"
-    assert len(repr(PRESETS["paper"])) < 500
 
 
 def test_an_edit_is_the_material_first_and_then_the_modes():

@@ -89,14 +89,6 @@ def test_longest_sets_the_resolution_and_keeps_the_proportions(folder):
         load(folder, longest=0)
 
 
-def test_a_model_saved_in_half_precision_computes_in_float32(folder, tmp_path):
-    half = load(folder).model.to(torch.bfloat16)
-    half.save_pretrained(tmp_path / "half")
-    encoder, picture = load(tmp_path / "half"), image(28, 28)
-    assert {each.dtype for each in encoder.model.parameters()} == {torch.float32}
-    assert encoder.describe(picture).dtype == torch.float32
-
-
 def test_without_constants_of_its_own_a_model_gets_imagenets(folder, tmp_path):
     bare = tmp_path / "bare"
     bare.mkdir()

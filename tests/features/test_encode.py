@@ -43,23 +43,3 @@ def test_one_color_is_carried_on_unchanged():
     color = torch.where(coverage[..., None] > 0, torch.tensor([0.2, 0.5, 0.7]), torch.tensor([0.9, 0.0, 0.1]))
     # Weighted means in float32.
     torch.testing.assert_close(continue_outside(color, coverage), torch.tensor([0.2, 0.5, 0.7]).expand(64, 64, 3))
-
-
-def test_the_silhouette_leaves_no_edge():
-    # A shaded disc before white: a gradient of 1/64 a pixel inside, and one of .5 at the rim.
-    coverage = disc()
-    shade = (torch.arange(64) / 64)[None, :, None].expand(64, 64, 3)
-    color = torch.where(coverage[..., None] > 0, shade, 1.0)
-    filled = continue_outside(color, coverage)
-    rim = (disc(radius=24.0) - disc(radius=16.0)) > 0
-    steps = (filled[:, 1:] - filled[:, :-1]).abs()[rim[:, 1:]]
-    # What is carried on comes in blocks of a few pixels, each a mean of those beside it.
-    assert float(steps.max()) < 6 / 64
-
-
-def test_a_mask_without_an_inside_is_used_as_far_as_it_goes():
-    color = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0))
-    thin = torch.zeros(16, 16)
-    thin[:, 8] = 1.0
-    assert torch.equal(continue_outside(color, thin)[:, 8], color[:, 8])
-    assert torch.equal(continue_outside(color, torch.zeros(16, 16)), color)

@@ -26,14 +26,6 @@ def test_the_nearest_point_is_the_one_at_least_distance():
     assert torch.equal(field.at(contacts), field.features[brute])
 
 
-def test_contacts_are_compared_in_float64():
-    field = FeatureField.from_points(torch.tensor([[1.0, 0.0, 0.0], [1.0 + 2**-22, 0.0, 0.0]]))
-    # Nearer to the second point by less than float32 can say of a coordinate near one.
-    contact = torch.tensor([[1.0 + 2**-23 + 2**-40, 0.0, 0.0]], dtype=torch.float64)
-    assert field.nearest(contact).tolist() == [1]
-    assert field.nearest(contact.float()).tolist() == [0]
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_region_is_described_by_the_mean_of_its_points_features(dtype):
     points = box()

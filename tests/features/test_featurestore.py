@@ -31,13 +31,6 @@ def test_what_was_saved_comes_back(tmp_path):
     assert [each.name for each in path.parent.iterdir()] == [path.name]
 
 
-def test_points_that_are_features_too_can_be_saved(tmp_path):
-    points = torch.rand(6, 3)
-    save_features(FeatureField(points, points, "geometry"), tmp_path / "f")
-    assert torch.equal(load_features(tmp_path / "f").features, points)
-    assert read_report(tmp_path / "f") == {}
-
-
 def test_a_failed_save_leaves_the_old_file(tmp_path):
     path = tmp_path / "features.safetensors"
     save_features(field(), path)
@@ -64,10 +57,6 @@ def rewritten(path, *, tensors=None, **changes):
 
 TENSORS = {"points": torch.zeros(20, 3), "features": torch.zeros(20, 5)}
 SHAPES = {"points": [20, 3], "features": [20, 5]}
-
-
-def test_a_file_as_the_record_says_is_read(tmp_path):
-    assert load_features(rewritten(tmp_path / "f")).encoder == "x"
 
 
 @pytest.mark.parametrize(

@@ -267,19 +267,6 @@ def test_a_surfaces_depth_is_along_the_axis():
     assert int((partly > 0).sum()) == pytest.approx(18 * 18, abs=2 * 18)
 
 
-def test_views_are_described_one_at_a_time():
-    encoder, told = painted_sphere(AROUND), []
-    views = [view_of(camera, name=f"v{row}") for row, camera in enumerate(AROUND)]
-    lift_points(
-        sphere_points(50),
-        views,
-        encoder,
-        depth_map=sphere_depth,
-        progress=lambda p: told.append((p.view, p.done, p.total, len(encoder.images))),
-    )
-    assert told == [(f"v{row}", row + 1, 6, row + 1) for row in range(6)]
-
-
 def test_the_encoder_never_sees_the_background():
     mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.uint8)
     mask[50:150, 60:180] = 255
@@ -308,16 +295,6 @@ def test_points_that_the_views_agree_to_be_hidden_are_left_out() -> None:
     assert len(kept.features.points) > 450
     assert kept.dropped == 1000 - len(kept.features.points)
     assert bool((kept.seen > 0).all())
-
-
-def test_a_point_that_one_of_many_views_sees_is_left_out() -> None:
-    points = sphere_points()
-    views = [view_of(camera) for camera in 10 * AROUND]
-    lifted = lift_points(points, views, painted_sphere(10 * AROUND), depth_map=sphere_depth)
-    once = replace(lifted, seen=torch.where(torch.arange(500) == 7, 1, lifted.seen))
-    kept = supported(once, views)
-    assert kept.dropped == int((lifted.seen == 0).sum()) + 1
-    assert not bool((kept.features.points == points[7].float()).all(1).any())
 
 
 def test_points_afloat_before_a_surface_that_the_views_see_are_left_out() -> None:

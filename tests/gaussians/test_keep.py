@@ -6,7 +6,7 @@ import torch
 from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
-from avmsf.gaussians.prune import blended_weight, keep_object, masks_agree
+from avmsf.gaussians.prune import blended_weight, keep_object
 from avmsf.gaussians.rasterizer.devices import NumbaRasterizer
 from factories.ball_views import MIDDLE, RADIUS, ball_color, ball_views
 from factories.raising import raises
@@ -45,12 +45,6 @@ def test_wrong_masks_of_a_few_views_take_nothing_away() -> None:
     views[5] = replace(views[5], mask=torch.zeros(64, 64, dtype=torch.uint8))
     views[6] = replace(views[6], mask=None)
     assert len(keep_object(ball, views)) == COUNT
-
-
-def test_a_point_that_no_view_sees_is_not_on_the_object() -> None:
-    points = torch.tensor([MIDDLE, (5.0, 5.0, 5.0)])
-    assert masks_agree(points, ball_views(6)).tolist() == [True, False]
-    assert masks_agree(points, ball_views(6, masked=False)).tolist() == [True, True]
 
 
 def test_without_masks_what_floats_alone_goes() -> None:

@@ -10,7 +10,6 @@ import trimesh
 
 from avmsf.errors import CaptureError, EvaluationError, FitError
 from avmsf.gaussians.points import (
-    _centers,
     closest_points,
     cluster,
     farthest_points,
@@ -62,10 +61,6 @@ def test_closest_points_are_a_ball_around_the_start():
     assert bool((distance[rows].diff() >= 0).all())
 
 
-def test_closest_points_begin_with_the_start_among_its_doubles():
-    assert closest_points(torch.zeros(4, 3), 3, start=2).tolist() == [2, 0, 1]
-
-
 @pytest.mark.parametrize("count", [1, 4, 40])
 def test_nearest_points_are_those_of_a_full_search(count):
     points, queries = cloud(40), cloud(25, seed=1)
@@ -90,20 +85,6 @@ def test_clusters_are_a_minimum_of_lloyds():
     for label in range(12):
         assert torch.allclose(groups.centers[label], points[groups.labels == label].mean(dim=0), atol=1e-12)
     assert torch.equal(groups.labels, torch.cdist(points, groups.centers).argmin(dim=1))
-
-
-def test_clusters_come_in_the_points_dtype_and_leave_none_empty():
-    points = cloud(20).float().repeat(5, 1)
-    groups = cluster(points, 20)
-    assert groups.centers.dtype == torch.float32
-    assert sorted(torch.bincount(groups.labels, minlength=20).tolist()) == [5] * 20
-
-
-def test_an_empty_cluster_starts_anew_at_the_farthest_point():
-    places = torch.tensor([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]], dtype=torch.float64)
-    before = torch.tensor([[0.0, 0, 0], [9, 9, 9], [8, 8, 8]], dtype=torch.float64)
-    centers = _centers(places, torch.tensor([0, 0, 0]), before)
-    assert centers.tolist() == [[2, 0, 0], [5, 0, 0], [8, 8, 8]]
 
 
 def test_more_clusters_than_positions_are_refused():
@@ -147,13 +128,6 @@ def test_a_lattice_fills_the_box_to_its_corners_with_one_spacing():
     assert math.prod(len(points[:, axis].unique()) for axis in range(3)) == len(points)
 
 
-def test_a_lattice_takes_the_nearest_whole_number_of_steps():
-    contacts = torch.tensor([[0.0, 0, 0], [1.0, 0.7, 0.0]], dtype=torch.float64)
-    # Four steps along x are .25 m; 2.8 of them along y, so three, of .233 m: 5 by 4 points.
-    points = lattice(contacts, 22)
-    assert (len(points[:, 0].unique()), len(points[:, 1].unique())) == (5, 4)
-
-
 def test_a_lattice_of_flat_contacts_is_flat():
     contacts = cloud(30)
     contacts[:, 2] = 0.25
@@ -164,12 +138,6 @@ def test_a_lattice_of_flat_contacts_is_flat():
     assert len(lattice(contacts, 100)) == 100
     contacts[:, 1] = 2.0
     assert lattice(contacts, 100).tolist() == [[1.0, 2.0, 0.25]]
-
-
-def test_a_thickness_that_is_measuring_error_counts_as_flat():
-    contacts = cloud(30)
-    contacts[:, 2] *= 5e-4
-    assert len(lattice(contacts, 100)[:, 2].unique()) == 1
 
 
 def test_what_the_points_do_not_have_is_refused():

@@ -3,7 +3,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
@@ -243,12 +242,3 @@ def test_a_run_that_diverges_says_which_rates_to_lower() -> None:
     with raises(SceneError) as caught:
         splat(ball_views(5), replace(QUICK, center_rate=1e20, color_rate=1e30))
     assert caught.value.name in ("loss", "gaussians")
-
-
-def test_clouds_move_join_and_part() -> None:
-    cloud = starting_cloud(StartPoints(_ball_points(20), torch.rand(20, 3)), degree=1, scale=1.0, opacity=0.5)
-    both = cloud.join(cloud.take(torch.arange(5)))
-    assert len(both) == 25
-    assert _same(both.take(torch.arange(20, 25)), cloud.take(torch.arange(5)))
-    assert _same(cloud.to("cpu").detach(), cloud)
-    np.testing.assert_allclose(cloud.opacities.numpy(), 0.5)

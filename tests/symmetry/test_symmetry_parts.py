@@ -5,9 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from avmsf.gaussians.neighborhoods import read_neighborhoods
-from avmsf.symmetry.alignment import Halves, Motion, fit_motion
-from avmsf.symmetry.candidates import CoarseCloud, matching_pairs, mirrors_of_pairs, turns_of_pairs
+from avmsf.symmetry.alignment import Halves, Motion
 from avmsf.symmetry.group import Group, ScoredMotion, SymmetryTest
 
 X, Y, Z = np.eye(3)
@@ -63,68 +61,6 @@ def test_a_part_on_one_side_is_wrong():
     handled = halves(np.concatenate([points, rod])).error(Motion(X, MIDDLE, None))
     # Points of the rod have no counterpart and count 3 spacings each.
     assert handled == pytest.approx(3 * math.sqrt(500 / 6500), rel=0.35)
-
-
-def test_a_fit_finds_the_plane_and_the_axis():
-    cloud = halves(egg())
-    tilted = Motion(np.array([math.cos(0.15), math.sin(0.15), 0.0]), np.array([0.02, 0.0, 0.0]), None)
-    degrees, gap = fit_motion(tilted, cloud, queries=1500).separation(Motion(X, MIDDLE, None))
-    # 9 degrees and a fiftieth of the diagonal off before; a tenth of a spacing after.
-    assert degrees < 0.5
-    assert gap < 0.002
-    axis = Motion(np.array([0.0, math.sin(0.12), math.cos(0.12)]), np.array([0.02, 0.01, 0.0]), math.pi)
-    degrees, gap = fit_motion(axis, cloud, queries=1500).separation(Motion(Z, MIDDLE, math.pi))
-    assert degrees < 0.5
-    assert gap < 0.002
-
-
-def test_matching_pairs_propose_planes_and_axes_that_no_inertia_shows():
-    # Four balls of different sizes at the corners of a kite, and their mirror images far to the side: the mean and the
-    # principal axes are not the plane's.
-    random = np.random.default_rng(0)
-    balls = [((0.2, 0.1, 0.0), 0.12), ((0.35, -0.1, 0.1), 0.08), ((0.15, -0.2, -0.1), 0.05)]
-    points = [
-        np.array([sign * place[0], place[1], place[2]]) + radius * direction / np.linalg.norm(direction)
-        for place, radius in balls
-        for sign in (1, -1)
-        for direction in random.normal(size=(int(60000 * radius**2), 3))
-    ]
-    surface = read_neighborhoods(np.array(points))
-    coarse = CoarseCloud.of(surface, surface.points[random.choice(len(points), 150, replace=False)])
-    pairs = matching_pairs(surface, generator=random)
-    planes = mirrors_of_pairs(surface, pairs, coarse=coarse, most=5)
-    # The coarse picture is good to a fiftieth of the object, some degrees.
-    assert min(sum(plane.separation(Motion(X, MIDDLE, None))) for plane in planes) < 6.0
-    cloud = read_neighborhoods(egg())
-    pairs = matching_pairs(cloud, generator=random)
-    axes = turns_of_pairs(cloud, pairs, coarse=CoarseCloud.of(cloud, cloud.points[:150]), most=10)
-    for true in (X, Y, Z):
-        assert min(axis.separation(Motion(true, MIDDLE, math.pi))[0] for axis in axes) < 9.0
-
-
-def test_two_symmetries_imply_the_third():
-    group = Group(SymmetryTest(halves(egg()), 0.35))
-    group.consider(Motion(X, MIDDLE, None))
-    group.consider(Motion(Y, MIDDLE, None))
-    assert (len(group.mirrors), len(group.turns)) == (2, 0)
-    group.complete()
-    (turn,) = group.turns
-    assert turn.order == 2
-    assert turn.motion.separation(Motion(Z, MIDDLE, None))[0] < 1.0
-
-
-def test_the_order_of_a_turn_is_the_largest_that_holds():
-    random = np.random.default_rng(0)
-    # A gear's outline of five waves, drawn up to a tube.
-    angle, height = 2 * math.pi * random.random(6000), 0.5 * random.random(6000)
-    radius = 0.3 + 0.04 * np.cos(5 * angle)
-    tube = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
-    test = SymmetryTest(halves(tube), 0.35)
-    turn = test.find_order(test.score(Motion(Z, MIDDLE, 2 * math.pi / 5)), tolerance=0.35)
-    assert turn.order == 5
-    smooth = np.stack([0.3 * np.cos(angle), 0.3 * np.sin(angle), height], axis=1)
-    test = SymmetryTest(halves(smooth), 0.35)
-    assert test.find_order(test.score(Motion(Z, MIDDLE, 2 * math.pi / 5)), tolerance=0.35).continuous
 
 
 def test_a_tube_of_twelve_sides_is_nearly_round_and_yet_has_an_order():

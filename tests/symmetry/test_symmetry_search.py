@@ -32,12 +32,12 @@ def degrees(found: torch.Tensor, true: tuple[float, float, float]) -> float:
     return math.degrees(math.acos(min(1.0, abs(float(found.numpy() @ direction)))))
 
 
-def cup(handle: bool) -> np.ndarray:
+def cup() -> np.ndarray:
     """An open can, 1 wide and 1.2 high, with a ring-shaped handle."""
     wall = draw(trimesh.creation.cylinder(0.5, 1.2, sections=200), count=5000)
     wall = wall[wall[:, 2] < 0.599]
     ring = draw(trimesh.creation.torus(0.3, 0.07), seed=1, count=900)[:, [0, 2, 1]] + np.array([0.55, 0.0, 0.0])
-    return np.concatenate([wall, ring[np.hypot(ring[:, 0], ring[:, 1]) > 0.5]]) if handle else wall
+    return np.concatenate([wall, ring[np.hypot(ring[:, 0], ring[:, 1]) > 0.5]])
 
 
 def test_a_box_has_three_half_turns_and_three_planes_in_any_pose_and_size():
@@ -71,26 +71,11 @@ def test_a_prism_of_six_is_no_round_column_though_its_inertia_is():
 
 
 @pytest.mark.slow
-def test_a_cone_is_round_and_its_planes_are_not_listed():
-    found = find(draw(trimesh.creation.cone(1.0, 2.0, sections=256)))
-    assert [each.order for each in found.rotations] == [None]
-    assert found.mirrors == ()
-    assert degrees(found.rotations[0].axis, (0, 0, 1)) < 1.0
-
-
-@pytest.mark.slow
 def test_a_handle_leaves_a_cup_one_plane_only():
-    found = find(cup(handle=True))
+    found = find(cup())
     assert found.rotations == ()
     assert len(found.mirrors) == 1
     assert degrees(found.mirrors[0].normal, (0, 1, 0)) < 2.0
-
-
-@pytest.mark.slow
-def test_an_open_can_is_not_half_of_a_closed_one():
-    found = find(cup(handle=False))
-    assert [each.order for each in found.rotations] == [None]
-    assert found.mirrors == ()
 
 
 @pytest.mark.slow
@@ -116,12 +101,6 @@ def test_a_blob_has_none():
     found = find(draw(trimesh.Trimesh(ball.vertices * radius[:, None], ball.faces)))
     assert not found
     assert found.rejected > found.tolerance
-
-
-@pytest.mark.slow
-def test_the_same_seed_finds_the_same_to_the_last_bit():
-    points = draw(trimesh.creation.box((1.0, 0.7, 0.4)), count=300)
-    assert find(points, seed=3).to_dict() == find(points, seed=3).to_dict()
 
 
 @pytest.mark.slow
