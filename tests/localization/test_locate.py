@@ -342,19 +342,24 @@ def test_a_locator_is_of_its_own_field_and_points():
         locate(true_field(100), sound, locator=locator_of())
 
 
-def test_points_without_sense_are_refused():
-    for points in (torch.zeros(0, 3), torch.zeros(3, 2), torch.full((3, 3), torch.nan)):
-        with raises(LocationError, name="points", value=list(points.shape)):
-            Locator.of(true_field(), points=points)
-    with raises(LocationError, name="directions", value=[2, 3]):
-        Locator.of(true_field(), points=torch.zeros(3, 3), directions=torch.zeros(2, 3))
-    for value, length in ((torch.nan, torch.nan), (0.0, 0.0), (2.0, 12**0.5)):
-        directions = torch.eye(3)
-        directions[1] = value
-        with raises(LocationError, name="directions", row=1, value=pytest.approx(length, nan_ok=True)):
-            Locator.of(true_field(), points=torch.zeros(3, 3), directions=directions)
-    with raises(LocationError, name="areas"):
-        Locator.of(true_field(), points=torch.zeros(3, 3), areas=torch.zeros(3))
+@pytest.mark.parametrize(
+    ("name", "given"),
+    [
+        ("points", {"points": torch.zeros(0, 3)}),
+        ("points", {"points": torch.zeros(3, 2)}),
+        ("points", {"points": torch.full((3, 3), torch.nan)}),
+        ("directions", {"points": torch.zeros(3, 3), "directions": torch.zeros(2, 3)}),
+        ("directions", {"points": torch.zeros(3, 3), "directions": torch.full((3, 3), torch.nan)}),
+        ("areas", {"points": torch.zeros(3, 3), "areas": torch.zeros(3)}),
+        ("areas", {"points": torch.zeros(3, 3), "areas": torch.ones(2)}),
+    ],
+)
+def test_points_without_sense_are_refused(name, given):
+    with raises(LocationError, name=name):
+        Locator.of(true_field(), **given)
+
+
+def test_a_recording_below_all_modes_is_refused():
     with raises(LocationError, name="modes", value=50.0):
         locator_of().locate(struck(1, seed=0).sounds[0], highest=50.0)
 

@@ -58,7 +58,7 @@ def spot(blow: LocatedImpact) -> int:
 def test_nothing_is_left_to_compute_for_the_first_blow() -> None:
     fresh = Locator.of(locator().field)
     listener = StreamingLocalizer(fresh, later=0.2)
-    assert "_tempering_factor" in vars(fresh)
+    assert "tempering_factor" in vars(fresh)
     assert {length for length, _ in fresh.lengths} == {listener.window, listener.later}
 
 

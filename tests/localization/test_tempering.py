@@ -78,6 +78,6 @@ def test_regions_are_the_wider_the_less_a_mode_counts() -> None:
     sound, sizes = field.render(field.gain_field.points[200:201])[0], []
     for factor in (1.0, 0.1, 0.01):
         locator = Locator.of(field)
-        vars(locator)["_tempering_factor"] = factor
+        vars(locator)["tempering_factor"] = factor
         sizes.append(int(locator.locate(sound).region().sum()))
     assert sizes[0] < sizes[1] < sizes[2]

@@ -19,23 +19,13 @@ from avmsf.capture.audio import Recording, refuse_silence
 from avmsf.capture.onset import find_onset, find_pulse
 from avmsf.capture.prepare import remove_rumble, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
-from avmsf.errors import CaptureError, LocationError
+from avmsf.errors import LocationError
 from avmsf.field.sound_field import SoundField
 from avmsf.localization.amplitudes import Extractor
 from avmsf.localization.contact_map import ContactMap
 from avmsf.localization.likelihood import Force
 from avmsf.localization.locator import Locator
-from avmsf.localization.preprocess import (
-    Sound,
-    as_recording,
-    at_field_rate,
-    describe,
-    location_error,
-    own_settings,
-    preprocess_recording,
-    read_if_path,
-    settings_for,
-)
+from avmsf.localization.preprocess import Sound, at_field_rate, location_errors, open_recording, preprocess_recording
 from avmsf.modal.synthesis import synthesize
 
 REJECT_ABOVE = 0.5
@@ -171,14 +161,14 @@ def locate_impacts(
     located, and for settings with `normalize = "deconvolve"` where the recording has a force channel.
     """
     known = None if force is None else Force.of(force)
-    recording = read_if_path(recording)
-    whole = as_recording(recording, field, sample_rate=sample_rate)
-    chosen = settings_for(whole, own_settings(recording, field) if settings is None else settings)
+    whole, chosen, notes = open_recording(recording, field, sample_rate=sample_rate, settings=settings)
     if chosen.normalize == "deconvolve":
         wanted, advice = "a recording of one impact", "cut it into one recording for each impact"
         raise LocationError.expected(wanted, "deconvolve", file=whole.name, name="normalize", advice=advice)
-    notes = describe(whole, chosen)
-    sound = _without_rumble(whole, chosen)
+    with location_errors():
+        response = whole.response(chosen.response_channel, force_channel=chosen.force_channel)
+        refuse_silence(response, whole.name)
+        sound = remove_rumble(response, chosen.highpass, whole)
     onsets = detect_onsets(sound, sample_rate=whole.sample_rate)
     forces = _peak_forces(whole, onsets, chosen)
     resampled, highest, remark = at_field_rate(sound, whole, field, speed=chosen.playback_speed)
@@ -194,7 +184,10 @@ def locate_impacts(
             own = own - predict_ringing(field, resampled, starts[number - 1], start, len(own), highest=highest)
         seconds = onset / whole.sample_rate
         try:
-            located = _accepted(finder.locate(own.float(), highest=highest, force=known), whole.name, seconds)
+            located = assess_match(finder.locate(own.float(), highest=highest, force=known))
+            if located.refusal is not None:
+                message = f"{whole.name}, impact at {seconds:.3f} s: {located.refusal}"
+                raise LocationError(message, file=whole.name, name="impact", value=seconds)
         except LocationError as error:
             rejected.append((seconds, error))
             continue
@@ -207,26 +200,6 @@ def locate_impacts(
     times = ", ".join(f"{seconds:.3f}" for seconds, _ in rejected)
     left_out = f"{whole.name}: {counted(len(rejected), 'impact')}, at {times} s, could not be located: {rejected[0][1]}"
     return [(seconds, replace(each, notes=(*each.notes, left_out))) for seconds, each in found]
-
-
-def _accepted(found: ContactMap, recording: str, seconds: float) -> ContactMap:
-    """Return the map of the impact at `seconds`, see `assess_match`; raises LocationError for one on another object."""
-    located = assess_match(found)
-    if located.refusal is not None:
-        raise LocationError(
-            f"{recording}, impact at {seconds:.3f} s: {located.refusal}", file=recording, name="impact", value=seconds
-        )
-    return located
-
-
-def _without_rumble(recording: Recording, settings: CaptureSettings) -> Float64[np.ndarray, " frames"]:
-    """Return the channel of the sound, high-pass filtered; raises LocationError where it cannot be used."""
-    try:
-        response = recording.response(settings.response_channel, force_channel=settings.force_channel)
-        refuse_silence(response, recording.name)
-        return remove_rumble(response, settings.highpass, recording)
-    except CaptureError as error:
-        raise location_error(error) from error
 
 
 def _peak_forces(recording: Recording, onsets: list[int], settings: CaptureSettings) -> list[float | None]:

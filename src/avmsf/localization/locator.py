@@ -11,7 +11,7 @@ from jaxtyping import Complex64, Complex128, Float, Float32, Float64
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from avmsf._utils.arrays import ArrayLike, as_floats, short_repr
+from avmsf._utils.arrays import ArrayLike, as_directions, as_numbers, as_vectors, short_repr
 from avmsf.errors import LocationError
 from avmsf.field.sound_field import SoundField
 from avmsf.localization.amplitudes import Amplitudes, Extractor, detuned_extractors
@@ -31,11 +31,9 @@ from avmsf.localization.prediction import (
     predict,
     smoothing_matrix,
 )
-from avmsf.localization.preprocess import check_sound
+from avmsf.localization.preprocess import check_sound, location_errors
 from avmsf.modal.modes import ModalBank
 
-_UNIT = 1e-3
-"""How far a direction's length may be from one."""
 _MAX_CACHED_LENGTHS = 8
 """Lengths of sounds whose equations are kept."""
 _LIKELY = -3.0
@@ -83,15 +81,18 @@ class Locator:
     ) -> "Locator":
         """Return the locator of a field, over the points (meters) of its gains unless others are given.
 
-        `directions`, unit vectors, are those of impacts at the points; without them they go straight into the surface.
-        `areas` are the area of surface that each point represents, in any unit; without them all are equal. Without
-        `use_residual` the recording counts as free of noise (the paper's ablation). Raises LocationError for points,
-        directions or areas of another shape or with values that cannot be.
+        `directions` are those of impacts at the points, as in `SoundField.render`. `areas` are the area of surface that
+        each point represents, in any unit; without them all are equal. Without `use_residual` the recording counts as
+        free of noise (the paper's ablation). Raises LocationError for points, directions or areas of another shape or
+        with values that cannot be.
         """
-        positions = as_floats(field.gain_field.points if points is None else points, "points")
-        ways = None if directions is None else as_floats(directions, "directions")
-        parts = None if areas is None else as_floats(areas, "areas")
-        _check_points(positions, ways, parts)
+        with location_errors():
+            positions = as_vectors(field.gain_field.points if points is None else points, "points")
+            ways = None if directions is None else as_directions(directions, "directions", count=len(positions))
+            parts = torch.ones(len(positions)) if areas is None else as_numbers(areas, "areas", count=len(positions))
+        if not len(positions) or not bool((parts > 0.0).all()):
+            name = "areas" if len(positions) else "points"
+            raise LocationError.expected("one above 0 for each of one or more points", got="others", name=name)
         gains, variance, dampings = predict(field, positions, ways, factor=calibration_factor(field))
         return cls(
             field,
@@ -99,7 +100,7 @@ class Locator:
             gains,
             variance + local_variance(positions, gains.__getitem__),
             dampings,
-            torch.ones(len(positions), dtype=torch.float64) if parts is None else parts.double(),
+            parts.double(),
             smoothing_matrix(positions, contacts=distinct_contacts(field)),
             use_residual,
         )
@@ -161,23 +162,18 @@ class Locator:
 
     def prepare(self, *samples: int) -> None:
         """Compute now what the first sound of each of these lengths, in samples, needs."""
-        _ = self.tempering_factor
         for length in samples:
             self._length(min(length, self.field.samples), float("inf"))
 
-    @property
+    @cached_property
     def tempering_factor(self) -> float:
         """Factor on the exponent of the tempered likelihood, by leave-one-out over the field's own contacts."""
-        with self._lock:
-            return self._tempering_factor
-
-    @cached_property
-    def _tempering_factor(self) -> float:
         return calibrate_tempering(self.field)
 
     def _length(self, samples: int, highest: float) -> "_Length":
         key = (samples, highest)
         with self._lock:
+            _ = self.tempering_factor
             # The entry that is used moves to the end, so that one that a stream uses again and again is never dropped.
             found = self.lengths.pop(key, None)
             if found is None:
@@ -314,36 +310,3 @@ def _check_above_noise(values: Complex128[Tensor, " modes"], noise: Float64[Tens
             name="noise",
             advice="record the impact louder, or with less noise",
         )
-
-
-def _check_points(
-    points: Float[Tensor, "..."],
-    directions: Float[Tensor, "..."] | None,
-    areas: Float[Tensor, "..."] | None,
-) -> None:
-    if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not bool(torch.isfinite(points).all()):
-        wrong, shape = int((~torch.isfinite(points)).sum()), list(points.shape)
-        got = f"the shape {shape} with {wrong} values that are not finite"
-        raise LocationError.expected("finite positions [points, 3]", shape, got=got, name="points")
-    if directions is not None and directions.shape != points.shape:
-        raise LocationError.expected(
-            f"the shape of the points, {list(points.shape)}", list(directions.shape), name="directions"
-        )
-    if directions is not None:
-        length = directions.double().norm(dim=1)
-        # Not "> _UNIT": NaN is no unit vector either.
-        bad = torch.nonzero(~((length - 1.0).abs() <= _UNIT)).flatten()
-        if len(bad):
-            row = int(bad[0])
-            raise LocationError.expected(
-                "unit vectors",
-                float(length[row]),
-                got=f"a length of {float(length[row]):g}",
-                row=row,
-                name="directions",
-                advice="divide each by its length",
-            )
-    fit = areas is None or (areas.shape == points.shape[:1] and bool((areas > 0).all() & torch.isfinite(areas).all()))
-    if not fit:
-        wanted = f"a number above 0 for each of {len(points)} points"
-        raise LocationError.expected(wanted, got="others", name="areas", advice="leave areas out")

@@ -1,6 +1,7 @@
 """A recorded impact, read like the recordings that a field was fitted to: its channel, its onset, its rate."""
 
-import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
@@ -19,7 +20,7 @@ from avmsf.capture.onset import Pulse, find_second_impact, find_second_push
 from avmsf.capture.prepare import prepare, shortest_allowed
 from avmsf.capture.preprocess import latest_start
 from avmsf.capture.settings import CaptureSettings
-from avmsf.errors import ArrayError, AvmsfError, CaptureError, LocationError
+from avmsf.errors import ArrayError, CaptureError, LocationError
 from avmsf.field.sound_field import SoundField
 
 Sound = str | Path | Recording | ArrayLike
@@ -62,11 +63,8 @@ def preprocess_recording(
     recording lacks are ignored. Raises LocationError for recordings that are silent, too short, not finite, or without
     a sudden rise.
     """
-    recording = read_if_path(recording)
-    whole = as_recording(recording, field, sample_rate=sample_rate)
-    chosen = settings_for(whole, own_settings(recording, field) if settings is None else settings)
-    notes = describe(whole, chosen)
-    try:
+    whole, chosen, notes = open_recording(recording, field, sample_rate=sample_rate, settings=settings)
+    with location_errors():
         prepared = prepare(whole, chosen)
         if settings is None and not field.origin.settings.align and prepared.onset < latest_start(whole.sample_rate):
             # It starts with its impact as those did that the field was fitted to, which were not cut.
@@ -74,8 +72,6 @@ def preprocess_recording(
         # Of one channel all is used, the silence before the impact too.
         samples = whole.response() if len(whole.channels) == 1 else prepared.sound
         check_impulsive(samples, sample_rate=whole.sample_rate, name=whole.name)
-    except CaptureError as error:
-        raise location_error(error) from error
     # A pulse that was divided out took the force of the impact with it.
     sound = prepared.sound if prepared.newtons is None else prepared.sound * prepared.newtons
     begin = prepared.onset if chosen.align else 0
@@ -92,42 +88,45 @@ def preprocess_recording(
     return PreparedImpact(at_rate, prepared.onset, highest, (*notes, *remark), newtons)
 
 
-def read_if_path(recording: Sound) -> Recording | ArrayLike:
-    """Return a recording as it is, or read it from its path. Raises CaptureError as `read_recording`."""
-    return read_recording(Path(recording)) if isinstance(recording, str | Path) else recording
+@contextmanager
+def location_errors() -> Iterator[None]:
+    """Raise errors of a recording or an array, with their attributes, as a LocationError."""
+    try:
+        yield
+    except (ArrayError, CaptureError) as error:
+        raise LocationError(str(error), **error.attributes) from error
 
 
-def as_recording(
-    recording: Recording | ArrayLike, field: SoundField, *, sample_rate: float | int | None = None
-) -> Recording:
-    """Return a recording that can be located.
+def open_recording(
+    recording: Sound, field: SoundField, *, sample_rate: float | int | None, settings: CaptureSettings | None
+) -> tuple[Recording, CaptureSettings, list[str]]:
+    """Return a recording that can be located, the settings to read it by, and messages on its faults.
 
-    Raises LocationError for samples of more than one channel, rates that are not above 0, silence and samples that are
-    not finite.
+    Without `settings` these are those of the field's capture, and none for bare samples. Raises CaptureError as
+    `read_recording`, and LocationError for samples of more than one channel, rates that are not above 0, silence,
+    samples that are not finite, and for a response channel that is not there.
     """
+    if isinstance(recording, str | Path):
+        recording = read_recording(Path(recording))
+    own = replace(field.origin.settings, align=True)
     if not isinstance(recording, Recording):
-        samples = as_floats(recording, "recording").double().numpy()
+        samples, own = as_floats(recording, "recording").double().numpy(), CaptureSettings()
         if samples.ndim != 1:
             shape, advice = list(samples.shape), "give one channel, or a Recording"
             raise LocationError.expected("samples of one channel, in shape", shape, name="recording", advice=advice)
-        try:
-            rate = field.sample_rate if sample_rate is None else as_rate(sample_rate)
-        except ArrayError as error:
-            raise LocationError(str(error), **error.attributes) from error
+        rate = field.sample_rate if sample_rate is None else sample_rate
         recording = Recording("the recording", samples[None], rate, "FLOAT")
     elif sample_rate is not None and sample_rate != recording.sample_rate:
         wanted, advice = f"its own sample rate, {recording.sample_rate:g} Hz", "leave sample_rate out"
         raise LocationError.expected(wanted, sample_rate, file=recording.name, name="sample_rate", advice=advice)
-    if not (math.isfinite(recording.sample_rate) and recording.sample_rate > 0.0):
-        rate = recording.sample_rate
-        raise LocationError.expected("a sample rate above 0", rate, file=recording.name, name="sample_rate")
+    with location_errors():
+        recording = replace(recording, sample_rate=as_rate(recording.sample_rate))
     check_sound(recording.channels, recording.sample_rate, file=recording.name)
-    return recording
-
-
-def location_error(error: AvmsfError) -> LocationError:
-    """Return an error of a recording, with its attributes, as a LocationError."""
-    return LocationError(str(error), **error.attributes)
+    chosen = _settings_for(recording, own if settings is None else settings)
+    with location_errors():
+        response = recording.response(chosen.response_channel, force_channel=chosen.force_channel)
+    clipped = find_clipping(response, name=recording.name)
+    return recording, chosen, [] if clipped is None else [clipped]
 
 
 def check_sound(
@@ -145,16 +144,6 @@ def check_sound(
         raise LocationError.expected("finite", wrong, got=got, file=file, name="finite", advice="export it again")
     if not np.ptp(channels, axis=1).any():
         raise LocationError.expected("a sound", "silence", file=file, name="sound", advice="record the impact again")
-
-
-def describe(recording: Recording, settings: CaptureSettings) -> list[str]:
-    """Return messages on faults of a recording that can be located nevertheless."""
-    try:
-        response = recording.response(settings.response_channel, force_channel=settings.force_channel)
-    except CaptureError as error:
-        raise location_error(error) from error
-    clipped = find_clipping(response, name=recording.name)
-    return [] if clipped is None else [clipped]
 
 
 def at_field_rate(
@@ -187,12 +176,7 @@ def at_field_rate(
     return torch.from_numpy(resampled.astype(np.float32)), highest, [note]
 
 
-def own_settings(recording: Recording | ArrayLike, field: SoundField) -> CaptureSettings:
-    """Return the settings by which a field's own capture was read; bare samples have none."""
-    return replace(field.origin.settings, align=True) if isinstance(recording, Recording) else CaptureSettings()
-
-
-def settings_for(recording: Recording, settings: CaptureSettings) -> CaptureSettings:
+def _settings_for(recording: Recording, settings: CaptureSettings) -> CaptureSettings:
     """Return settings without those that a recording of a single impact may lack."""
     count = len(recording.channels)
     force, response = settings.force_channel, settings.response_channel
