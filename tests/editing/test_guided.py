@@ -31,7 +31,7 @@ class Towards:
         return {"towards": float(self.sound.square().sum()), "noise": self.noise}
 
     def start(self, struck):
-        return ModalEdit.none(struck.bank)
+        return ModalEdit.none(struck.field.bank)
 
     def targets(self, sounds, step, generator):
         found = self.sound[:, : sounds.shape[1]].expand(len(sounds), -1).clone()
@@ -138,7 +138,7 @@ def test_the_published_form_has_one_factor_on_frequencies_and_gains_that_follow_
 def test_what_does_not_move_stays_where_it_begins(parameters, pitch):
     class Proposing(Towards):
         def start(self, struck):
-            return ModalEdit.none(struck.bank, pitch=math.log(0.5), damping=math.log(2.0))
+            return ModalEdit.none(struck.field.bank, pitch=math.log(0.5), damping=math.log(2.0))
 
     guide = Proposing(sound_of(ringing_field(pitch=0.5)))
     made, seen = trace(ringing_field(), guide, config=replace(QUICK, steps=2, preview_every=0), parameters=parameters)

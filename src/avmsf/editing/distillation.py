@@ -86,7 +86,7 @@ class DecoderDistillation:
 
     def start(self, rendered: FieldAtContacts) -> ModalEdit:
         """Return the field as it is: Audio-SDS starts from the object's own sound."""
-        return ModalEdit.none(rendered.bank)
+        return ModalEdit.none(rendered.field.bank)
 
     def targets(
         self, sounds: Float[Tensor, "contacts samples"], step: int, generator: torch.Generator

@@ -264,7 +264,7 @@ class _Optimization:
             else read_checkpoint(checkpoint, self.identity, what="an edit", raising=EditError)
         )
         searching = state is None and parameters.searches
-        start = guide.start(self.probes) if searching else ModalEdit.none(self.probes.bank)
+        start = guide.start(self.probes) if searching else ModalEdit.none(self.field.bank)
         self.variables = EditVariables(start, self.probes.loudest(config.free_modes), parameters)
         if state is not None:
             self.variables.resume(state["variables"])
@@ -297,9 +297,9 @@ class _Optimization:
         generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
         rows = torch.randperm(len(self.points), generator=generator)[: self.config.contacts_per_step]
         rendered = self._at(self.points[rows])
-        before = level(rendered.sounds(ModalEdit.none(rendered.bank)), sample_rate=rendered.sample_rate)
+        before = level(rendered.sounds(), sample_rate=self.field.sample_rate)
         sounds = rendered.sounds(self.variables.edit())
-        after = level(sounds, sample_rate=rendered.sample_rate)
+        after = level(sounds, sample_rate=self.field.sample_rate)
         sounds = sounds * (before.square().sum() / after.square().sum()).sqrt()
         with torch.no_grad():
             targets = self.guide.targets(sounds.detach(), self.step, generator).to(sounds)
@@ -341,7 +341,7 @@ class _Optimization:
         with torch.no_grad():
             edit = self.variables.edit()
             if self.parameters.gains_follow:
-                edit = edit.following(self.probes.bank)
+                edit = edit.following(self.probes.field.bank)
             after = level(self.probes.sounds(edit), sample_rate=self.field.sample_rate)
             factor = (self.loudness.square().sum() / after.square().sum()).sqrt()
             return edit.louder(factor).to("cpu")
@@ -352,7 +352,7 @@ class _Optimization:
         return FieldAtContacts.at(self.field, contacts, samples=max(1, samples), device=self.device)
 
     def _check_audible(self) -> Float[Tensor, " contacts"]:
-        sounds = self.probes.sounds(ModalEdit.none(self.probes.bank))
+        sounds = self.probes.sounds()
         if not bool(torch.isfinite(sounds).all()) or float(sounds.abs().max()) == 0.0:
             got = "silence at all contacts"
             raise EditError.expected("audible modes", 0.0, got=got, name="field", advice="fit it again")

@@ -1,7 +1,7 @@
 """An edit of an object's modes: common factors and one set of factors a mode, the same at all contacts."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -16,7 +16,6 @@ from avmsf.field.scaled_gains import ScaledGains, fitted_gains
 from avmsf.field.sound_field import SoundField
 from avmsf.field.uncertainty import scale_of
 from avmsf.modal.modes import ModalBank
-from avmsf.modal.synthesis import synthesize_phased
 
 EDITS = "edits"
 """Key of a field's report that lists its edits, in order."""
@@ -202,14 +201,9 @@ class ModalEdit:
         return float(self.pitch.detach().exp())
 
     @property
-    def damping_factor(self) -> float:
-        """Common factor on all dampings, without their own shifts: kappa."""
-        return float(self.damping.detach().exp())
-
-    @property
     def decay_factor(self) -> float:
-        """Common factor on all decay times, as `adjust_modes`'s `decay`: 1 / kappa."""
-        return 1.0 / self.damping_factor
+        """Common factor on all decay times, without their own shifts: 1 / kappa, as `decay` of `adjust_modes`."""
+        return 1.0 / float(self.damping.detach().exp())
 
     def to(self, device: torch.device | str) -> "ModalEdit":
         """Return the edit on a device."""
@@ -252,14 +246,10 @@ class ModalEdit:
 class FieldAtContacts:
     """A field at some contacts, whose modes can be edited."""
 
-    bank: ModalBank
-    """The field's own modes."""
-    phase: Float64[Tensor, " modes"]
-    """Radians."""
+    field: SoundField
+    """Its modes are on the device that computes."""
     known: Gains
     """Of the field itself at the contacts."""
-    sample_rate: float
-    """Hz."""
     samples: int
     """Length of the sounds."""
 
@@ -270,51 +260,34 @@ class FieldAtContacts:
         contacts: Float[Tensor, "contacts 3"],
         *,
         samples: int,
-        device: torch.device | None = None,
+        device: torch.device | str = "cpu",
     ) -> "FieldAtContacts":
         """Evaluate a field at contacts (object frame, meters) for impacts along the inward normals."""
-        known = field.known(contacts)
-        place = torch.device("cpu") if device is None else device
-        parts = (known.mean, known.quadrature, known.damping)
-        return cls(
-            ModalBank(field.bank.frequency.to(place), field.bank.damping.to(place)),
-            field.phase.to(place),
-            Gains(*(None if part is None else part.to(place) for part in parts)),  # type: ignore[arg-type]
-            field.sample_rate,
-            samples,
-        )
+        bank = ModalBank(field.bank.frequency.to(device), field.bank.damping.to(device))
+        known = _each_part(field.known(contacts), lambda part: part.to(device))
+        return cls(replace(field, bank=bank, phase=field.phase.to(device)), known, samples)
 
     def first(self, count: int) -> "FieldAtContacts":
         """Return the field at the first `count` of the contacts."""
-        parts = (self.known.mean, self.known.quadrature, self.known.damping)
-        return replace(self, known=Gains(*(None if part is None else part[:count] for part in parts)))  # type: ignore[arg-type]
+        return replace(self, known=_each_part(self.known, lambda part: part[:count]))
 
-    def sounds(self, edit: ModalEdit) -> Float[Tensor, "contacts samples"]:
-        """Return the sounds of the edited modes, without the residual; differentiable in the edit."""
-        bank = edit.bank(self.bank)
-        audible = self.audible(bank)
-        scale = torch.where(audible, edit.scale.exp(), 0.0).to(self.known.mean)
-        quadrature = self.known.quadrature
-        # A silent mode's phase must not run beyond what float64 resolves.
-        frequency = torch.where(audible, bank.frequency, self.bank.frequency)
-        return synthesize_phased(
-            self.known.mean * scale,
-            frequency,
-            bank.damping if self.known.damping is None else bank.damping * self.known.damping,
-            self.phase,
-            samples=self.samples,
-            sample_rate=self.sample_rate,
-            quadrature=None if quadrature is None else quadrature * scale,
+    def sounds(self, edit: ModalEdit | None = None) -> Float[Tensor, "contacts samples"]:
+        """Return the sounds of the modes, edited if an edit is given, without the residual; differentiable in it."""
+        if edit is None:
+            return self.field.modal_sounds(self.known, self.samples)
+        scale, quadrature = edit.scale.exp().to(self.known.mean), self.known.quadrature
+        scaled = replace(
+            self.known, mean=self.known.mean * scale, quadrature=None if quadrature is None else quadrature * scale
         )
-
-    def audible(self, bank: ModalBank) -> Bool[Tensor, " modes"]:
-        """Return which modes lie below half the sample rate: the others would alias, and are silent."""
-        return bank.frequency.detach() < self.sample_rate / 2
-
-    def energy(self) -> Float64[Tensor, " modes"]:
-        """Return each unedited mode's energy over time (`Gains.energy`); zero for silent ones."""
-        return torch.where(self.audible(self.bank), self.known.energy(self.bank.damping), 0.0)
+        return replace(self.field, bank=edit.bank(self.field.bank)).modal_sounds(scaled, self.samples)
 
     def loudest(self, count: int) -> Int[Tensor, " edited"]:
-        """Return the indices of the strongest modes, at most `count` of them, ascending."""
-        return torch.argsort(self.energy(), descending=True)[:count].sort().values
+        """Return the indices of the modes of most energy over time, at most `count` of them, ascending."""
+        energy = torch.where(self.field.audible, self.known.energy(self.field.bank.damping), 0.0)
+        return torch.argsort(energy, descending=True)[:count].sort().values
+
+
+def _each_part(gains: Gains, change: Callable[[Tensor], Tensor]) -> Gains:
+    """Return gains with a change to what they have of mean, quadrature and factors on dampings."""
+    parts = {name: change(part) for name, part in vars(gains).items() if part is not None}
+    return replace(gains, **parts)

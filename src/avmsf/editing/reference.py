@@ -303,12 +303,12 @@ def _search_start(rendered: FieldAtContacts, targets_of: _TargetFunction) -> Mod
             damping, step = min(tried, key=lambda each: tried[each]), step / 2
             around = [max(-_MAX_LOG_DAMPING, damping - step), min(_MAX_LOG_DAMPING, damping + step)]
         best = min(best, (tried[damping], pitch, damping))
-    return ModalEdit.none(rendered.bank, pitch=best[1], damping=best[2])
+    return ModalEdit.none(rendered.field.bank, pitch=best[1], damping=best[2])
 
 
 def _pitches(rendered: FieldAtContacts, targets_of: _TargetFunction) -> list[float]:
     """Return proposals of log alpha: that of no change, and those by quantiles and overlap."""
-    sounds = rendered.sounds(ModalEdit.none(rendered.bank))
+    sounds = rendered.sounds()
     targets, weight = targets_of(sounds)
     own, aim = (band_spectrum(weight * each).mean(dim=0) for each in (sounds, targets))
     differences = (_quantiles(aim) - _quantiles(own)).clamp(-_MAX_LOG_PITCH, _MAX_LOG_PITCH)
@@ -330,10 +330,10 @@ def _quantiles(spectrum: Float[Tensor, " bands"]) -> Float[Tensor, " quantiles"]
 
 
 def _error(rendered: FieldAtContacts, targets_of: _TargetFunction, pitch: float, damping: float) -> float:
-    sounds = rendered.sounds(ModalEdit.none(rendered.bank, pitch=pitch, damping=damping))
+    sounds = rendered.sounds(ModalEdit.none(rendered.field.bank, pitch=pitch, damping=damping))
     if float(sounds.abs().max()) == 0.0:
         return math.inf
-    sizes = [scaled_fft_size(size, sample_rate=rendered.sample_rate) for size in _FFT_SIZES]
+    sizes = [scaled_fft_size(size, sample_rate=rendered.field.sample_rate) for size in _FFT_SIZES]
     targets, weight = targets_of(sounds)
     target = spectral_target(weight * targets, fft_sizes=sizes, hops=[size // 4 for size in sizes])
     return float(spectral_loss(weight * sounds, target)) / len(sizes)

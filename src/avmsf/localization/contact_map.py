@@ -1,7 +1,6 @@
 """The posterior of the contact of one impact: a distance and a probability for every point of the surface."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -93,8 +92,14 @@ class EquivalentPoint:
         Images farther than `tolerance` from `other` do not count, nor do symmetries that leave `first` about where it
         is.
         """
+        images: list[tuple[RotationalSymmetry | MirrorSymmetry, float | None, Tensor]] = []
+        if symmetries is not None:
+            row = first.double()[None]
+            images += [(each, None, each.reflect(row)[0]) for each in symmetries.mirrors]
+            turns = [(each, angle) for each in symmetries.rotations for angle in each.angles(_ANGLES)[1:]]
+            images += [(each, angle, each.turn(row, angle)[0]) for each, angle in turns]
         nearest, found, rotated = tolerance, None, None
-        for symmetry, angle, image in _images(first, symmetries):
+        for symmetry, angle, image in images:
             distance = float((image - other.double()).norm())
             if distance < nearest and float((image - first.double()).norm()) > distance:
                 nearest, found, rotated = distance, symmetry, angle
@@ -114,7 +119,7 @@ class ContactMap:
         if self.refusal is not None:
             return f"ContactMap({len(self.points)} points, no position: {self.refusal}){notes}"
         where = ", ".join(f"{value + 0.0:.3f}" for value in self.position.tolist())
-        others = len(self._other_peaks(LEVEL))
+        others = len(self.peaks()) - 1
         more = f", {counted(others, 'other possible position')}" if others else ""
         radius = f"{LEVEL:.0%} within {1e3 * self.credible_radius():.2g} mm"
         return f"ContactMap({len(self.points)} points, most probable ({where}) m, {radius}{more}){notes}"
@@ -241,10 +246,6 @@ class ContactMap:
         found.sort(key=lambda peak: (-peak.probability, peak.row))
         return tuple(peak for peak in found if peak.probability >= least or peak.points[self.most_probable])
 
-    def _other_peaks(self, level: float) -> tuple[Peak, ...]:
-        """Return the peaks that do not contain the most probable point."""
-        return tuple(peak for peak in self.peaks(level) if not peak.points[self.most_probable])
-
     @property
     def multimodal(self) -> bool:
         """Whether the contact may be at several positions apart: more than one of the `peaks` of the 90 % region."""
@@ -258,12 +259,11 @@ class ContactMap:
         Each has the symmetry that maps `position` nearest to it, if nearer than twice `linking_length`. Empty for a
         posterior of one peak.
         """
-        tolerance = 2.0 * self.linking_length
+        here, tolerance = self.position, 2.0 * self.linking_length
         return tuple(
-            EquivalentPoint.of(
-                self.position, each.position, symmetries, probability=each.probability, tolerance=tolerance
-            )
-            for each in self._other_peaks(level)
+            EquivalentPoint.of(here, each.position, symmetries, probability=each.probability, tolerance=tolerance)
+            for each in self.peaks(level)
+            if not each.points[self.most_probable]
         )
 
     def describe(self, symmetries: Symmetries | None = None, level: float = LEVEL) -> dict[str, Any]:
@@ -327,19 +327,6 @@ def enlarged(symmetries: Symmetries, factor: float) -> Symmetries:
         mirrors=tuple(replace(each, point=each.point * factor) for each in symmetries.mirrors),
         spacing=symmetries.spacing * factor,
     )
-
-
-def _images(
-    position: Float[Tensor, " 3"], symmetries: Symmetries | None
-) -> Iterator[tuple[RotationalSymmetry | MirrorSymmetry, float | None, Float[Tensor, " 3"]]]:
-    if symmetries is None:
-        return
-    row = position.double()[None]
-    for mirror in symmetries.mirrors:
-        yield mirror, None, mirror.reflect(row)[0]
-    for rotation in symmetries.rotations:
-        for angle in rotation.angles(_ANGLES)[1:]:
-            yield rotation, angle, rotation.turn(row, angle)[0]
 
 
 def _check_probability(level: float) -> None:
