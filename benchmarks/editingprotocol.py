@@ -50,7 +50,7 @@ from avmsf.evaluation.editing_objects import (
     simulated_objects,
 )
 from avmsf.evaluation.mode_embedding import FEATURES, MaterialSpace
-from avmsf.evaluation.objects import ObjectFeatures
+from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.protocols import EDITING_UMAP
 from avmsf.fem.material import MATERIALS
 from avmsf.pipeline.config import DINO, PRESETS
@@ -189,8 +189,8 @@ def _paper_fields(dataset: Dataset, encoder: str, cache: Path, *, seed: int) -> 
     # Before the modes of all objects: without the encoder nothing else is worth its time.
     choose_encoder(lift, log=log)
     scene = replace(scene, splat=replace(scene.splat, seed=seed), lift=lift)
-    inputs = ObjectFeatures(dataset, cache, scene, lift)
-    return PaperFields(lambda name: inputs(name, "paper"), replace(PUBLISHED, seed=seed), cache / "training")
+    inputs = ObjectInputs(dataset, cache, scene, lift)
+    return PaperFields(lambda name: inputs.features(name, "paper"), replace(PUBLISHED, seed=seed), cache / "training")
 
 
 def simulated_cast(

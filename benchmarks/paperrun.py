@@ -11,7 +11,7 @@ from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
 from avmsf.datasets import CaptureCollection
-from avmsf.evaluation.objects import ObjectFeatures
+from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.simple_methods import MeanWaveform
 from avmsf.evaluation.splits import evaluate, split
 from avmsf.features.feature_field import FeatureField
@@ -71,7 +71,7 @@ def paper_runs(options: Options, folder: Path) -> Report:
         nearest = evaluate(MeanWaveform(train, count=3), test).mean()["relative_stft"]
         log(f"{name}: mean of 3: {nearest:.3f}")
         paper = replace(PRESETS["paper"].scene.lift, encoder=DESCRIPTORS)
-        features = ObjectFeatures(dataset, folder / "features", paper=paper)(name, "paper")
+        features = ObjectInputs(dataset, folder / "features", paper=paper).features(name, "paper")
         begun = time.perf_counter()
         curves[name] = dict(_curve(name, train, test, features, config))
         seconds = time.perf_counter() - begun

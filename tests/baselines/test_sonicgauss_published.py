@@ -21,7 +21,7 @@ from avmsf.baselines.sonicgauss.point_transformer import (
 from avmsf.baselines.sonicgauss.published import PublishedSizes, PublishedSonicGauss, fit_published
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.methods import method_named
-from avmsf.evaluation.task import Task, report_of
+from avmsf.evaluation.task import report_of
 from factories.raising import raises
 from factories.sonicgauss_cases import cloud, impacts
 
@@ -240,8 +240,3 @@ def test_results_of_other_weights_are_not_mixed(folder):
     for name in ("sonicgauss:/nowhere", "sonicgauss"):
         with pytest.raises(EvaluationError):
             method_named(name)
-
-
-def test_an_object_without_gaussians_is_refused():
-    with raises(EvaluationError, name="gaussians"):
-        Task.gaussians()

@@ -10,7 +10,6 @@ from avmsf.cli.evaluate import run
 from avmsf.cli.options.evaluate import Options
 from avmsf.errors import AvmsfError, EvaluationError, FitError
 from avmsf.evaluation.field_methods import FieldMethod
-from avmsf.evaluation.objects import ObjectBodies
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.runner import Evaluation
 from avmsf.evaluation.task import Task
@@ -240,8 +239,7 @@ def test_a_known_wall_is_handed_on(plates: Path, tmp_path: Path, monkeypatch: py
     monkeypatch.setattr("avmsf.cli.evaluate.run_objects", stop)
     words = ["farthest", str(plates), *CHEAP, "--output", str(tmp_path / "results"), "--body.wall", "0"]
     assert run(Options.parse([*words, "--geometry", "noisy"])) == 130
-    bodies = asked[0].bodies
-    assert isinstance(bodies, ObjectBodies)
-    assert (bodies.config.wall, bodies.geometry) == (0.0, "noisy")
+    inputs = asked[0].inputs
+    assert (inputs.body.wall, inputs.geometry) == (0.0, "noisy")
     # Figures of another wall are not these.
     assert asked[0].settings["body"]["wall"] == 0.0

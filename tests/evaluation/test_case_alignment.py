@@ -1,14 +1,14 @@
 """Methods learn from, and are compared with, recordings that all start at one time after their impacts."""
 
-from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
+from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
-from avmsf.datasets import CaptureCollection
+from avmsf.datasets.dataset import ObjectFacts
 from avmsf.evaluation import align_split, evaluate
 from avmsf.evaluation.cases import Case
 from avmsf.evaluation.field_methods import FieldMethod
@@ -19,29 +19,42 @@ from avmsf.evaluation.simple_methods import NearestRecording
 from avmsf.evaluation.splits import MetricSettings
 from avmsf.evaluation.task import Task
 from factories.delayed_plate import ALIGNED, delays, distance, strikes, without_delays
-from factories.plate_set import NoBodies, PlateLooks
+from factories.plate_set import PlateInputs
 
 COUNT, TRAIN = 16, 12
 METHODS = ("nearest", "knn3", "knn-gains")
 
 
+class Plate:
+    """A dataset of one object."""
+
+    name = "plates"
+
+    def __init__(self, impacts: Impacts) -> None:
+        self.impacts = impacts
+
+    def capture(self, identifier: str) -> Capture:
+        return Capture(identifier, self.impacts, None)
+
+    def facts(self, identifier: str) -> ObjectFacts:
+        return ObjectFacts(identifier, identifier)
+
+    def visual_source(self, identifier: str) -> None:
+        return None
+
+
 def run_of(impacts: Impacts, folder: Path, own_starts: Impacts | None = None) -> CaseRun:
-    methods = tuple(map(method_named, METHODS))
-    metric_settings = MetricSettings(level="raw", cdpam=False)
-    inputs, bodies = PlateLooks(), NoBodies()
-    protocol, dataset = PROTOCOLS["farthest"], CaptureCollection(folder)
-    data = ObjectData(
-        "a",
-        impacts,
-        features=inputs,
-        bodies=partial(bodies, "a"),
-        family=partial(bodies.family, "a"),
-        other_recording=lambda: torch.zeros(impacts.sounds.shape[1]),
-        own_starts=own_starts,
+    evaluation = Evaluation(
+        Plate(impacts),
+        "plates",
+        PROTOCOLS["farthest"],
+        tuple(map(method_named, METHODS)),
+        PlateInputs(),
+        metric_settings=MetricSettings(level="raw", cdpam=False),
+        own_starts=None if own_starts is None else Plate(own_starts),
     )
-    evaluation = Evaluation(dataset, "plates", protocol, methods, inputs, bodies, metric_settings=metric_settings)
     case = Case("all", tuple(range(TRAIN)), tuple(range(TRAIN, COUNT)))
-    return CaseRun(evaluation, data, case, folder=folder, number=1, stores_sounds=False)
+    return CaseRun(evaluation, ObjectData(evaluation, "a"), case, folder=folder, number=1, stores_sounds=False)
 
 
 def test_errors_of_baselines_do_not_depend_on_delays(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from avmsf.datasets import CaptureCollection
 from avmsf.errors import AvmsfError, EvaluationError, FitError
 from avmsf.evaluation.methods import method_named
 from avmsf.evaluation.modal_metrics import ModalRenderer, compare_modes, truth_at
-from avmsf.evaluation.objects import ObjectBodies, ObjectFeatures, draw_other_recording
+from avmsf.evaluation.objects import ObjectInputs, draw_other_recording
 from avmsf.evaluation.parallel import RunProgress, Workers, run_objects
 from avmsf.evaluation.protocols import PROTOCOLS
 from avmsf.evaluation.report import write_summary
@@ -28,7 +28,7 @@ from avmsf.evaluation.simple_methods import NearestRecording
 from avmsf.evaluation.splits import MetricSettings, evaluate, split, spread
 from avmsf.evaluation.task import Method, Renderer, Task
 from avmsf.simulate.ground_truth import read_truth
-from factories.plate_set import NoBodies, PlateLooks, fill_plates
+from factories.plate_set import PlateInputs, fill_plates
 from factories.raising import raises
 
 CHEAP = ("white-noise", "nearest", "knn3", "random-impact")
@@ -47,8 +47,7 @@ def planned(folder: Path, *methods: str | Method, protocol: str = "farthest", se
         "plates",
         PROTOCOLS[protocol],
         chosen,
-        PlateLooks(),
-        NoBodies(),
+        PlateInputs(),
         seed=seed,
         metric_settings=MetricSettings(cdpam=False),
     )
@@ -199,13 +198,13 @@ def test_one_shot_has_modes_too(plates: Path, tmp_path: Path) -> None:
 
 
 def test_shared_time_is_no_methods_time(plates: Path, tmp_path: Path) -> None:
-    class SlowLooks(PlateLooks):
-        def __call__(self, *arguments: object, **named: object):  # type: ignore[no-untyped-def]
+    class SlowInputs(PlateInputs):
+        def features(self, *arguments: object, **named: object):  # type: ignore[no-untyped-def]
             time.sleep(0.2)
-            return super().__call__(*arguments, **named)
+            return super().features(*arguments, **named)
 
     asking = Asking(lambda task: task.features("positions"))
-    run_objects(replace(planned(plates, asking), features=SlowLooks()), ("a",), ResultsFolder(tmp_path))
+    run_objects(replace(planned(plates, asking), inputs=SlowInputs()), ("a",), ResultsFolder(tmp_path))
     (record,) = ResultsFolder(tmp_path).records()
     assert record.outcomes[0].fit_seconds < record.cases[0].shared_seconds
     assert record.cases[0].shared_seconds >= 0.2
@@ -415,7 +414,7 @@ def test_many_at_a_time_come_to_the_same_figures(plates: Path, tmp_path: Path) -
     evaluation = planned(plates, *CHEAP, "spline-gains")
     # Workers find what the package holds, and not what lies beside the tests.
     dataset, kept = evaluation.dataset, tmp_path / "features"
-    evaluation = replace(evaluation, features=ObjectFeatures(dataset, kept), bodies=ObjectBodies(dataset, kept))
+    evaluation = replace(evaluation, inputs=ObjectInputs(dataset, kept))
     objects = evaluation.dataset.objects()
     run_objects(evaluation, objects, ResultsFolder(tmp_path / "one"))
     many = ResultsFolder(tmp_path / "many")

@@ -18,7 +18,7 @@ from avmsf.errors import LocationError
 from avmsf.evaluation import localization, report
 from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.localization import MAX_VERTICES, PublishedLocator, located, random_distance
-from avmsf.evaluation.objects import ObjectFeatures
+from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.simple_methods import NearestRecording, WhiteNoise
 from avmsf.evaluation.task import Task
@@ -29,7 +29,7 @@ from avmsf.field.sound_field import SoundField
 from avmsf.localization.contact_map import ContactMap
 from avmsf.modal.extraction.finders import ShortTime
 from factories.plate_field import QUICK, plate_extraction, plate_features, plate_impacts
-from factories.plate_set import PlateLooks, fill_plates
+from factories.plate_set import PlateInputs, fill_plates
 from factories.raising import raises
 
 
@@ -137,7 +137,9 @@ def test_heat_maps_have_the_true_contacts_and_the_papers_methods_their_own_dista
         drawn[title] = (found, truth)
         return Figure()
 
-    monkeypatch.setattr(ObjectFeatures, "__call__", lambda inputs, *given, **named: PlateLooks()(*given, **named))
+    monkeypatch.setattr(
+        ObjectInputs, "features", lambda inputs, *given, **named: PlateInputs().features(*given, **named)
+    )
     monkeypatch.setattr(FieldMethod, "fit", quick)
     monkeypatch.setattr("avmsf.evaluation.runner.located", watched)
     monkeypatch.setattr(report, "draw_contact", draw)

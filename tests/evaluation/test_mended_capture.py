@@ -11,7 +11,7 @@ from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.runner import Evaluation
 from avmsf.evaluation.splits import MetricSettings
 from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
-from factories.plate_set import NoBodies, PlateLooks, fill_plates
+from factories.plate_set import PlateInputs, fill_plates
 
 
 def test_a_truth_of_other_recordings_costs_neither_the_other_objects_nor_the_folder(tmp_path: Path) -> None:
@@ -27,8 +27,7 @@ def test_a_truth_of_other_recordings_costs_neither_the_other_objects_nor_the_fol
             "plates",
             PROTOCOLS["farthest"],
             methods,
-            PlateLooks(),
-            NoBodies(),
+            PlateInputs(),
             metric_settings=MetricSettings(cdpam=False),
         )
         run_objects(evaluation, ("a", "b"), results)

@@ -35,6 +35,7 @@ from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.synthesis import synthesize
 from factories.plate_field import PLATE, QUICK, RATE, plate_extraction, plate_features, plate_impacts
 from factories.raising import raises
+from factories.sonicgauss_cases import cloud
 from oracles.block import block
 
 TINY = replace(QUICK, hidden=16, layers=1, warmup_steps=6, steps=4, fft_sizes=(256,), early=256)
@@ -95,6 +96,7 @@ def plate_task(train: Impacts, *, impacts: Impacts | None = None, seed: int = 0)
         bodies=plate_bodies,
         other_recording=lambda: torch.linspace(-1, 1, SAMPLES),
         family=plate_family,
+        gaussians=lambda: cloud(60),
     )
 
 

@@ -11,7 +11,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.datasets.dataset import DatasetReport, ObjectFacts, VisualSource
 from avmsf.errors import SceneError
-from avmsf.evaluation.objects import ObjectFeatures
+from avmsf.evaluation.objects import ObjectInputs
 from avmsf.features.feature_field import FeatureField
 from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.ply import read_splats
@@ -61,8 +61,10 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_looks_and_positions_are_of_the_same_points_and_made_once(seen: Path, tmp_path: Path) -> None:
-    inputs = ObjectFeatures(OneObject(seen), tmp_path, CONFIG)
-    aligned, bare, unaligned = (inputs("slab", visual_input) for visual_input in ("visual", "positions", "unaligned"))
+    inputs = ObjectInputs(OneObject(seen), tmp_path, CONFIG)
+    aligned, bare, unaligned = (
+        inputs.features("slab", visual_input) for visual_input in ("visual", "positions", "unaligned")
+    )
     assert torch.equal(aligned.points, bare.points)
     assert torch.equal(aligned.points, unaligned.points)
     assert bare.features.shape == (400, 3)
@@ -71,7 +73,7 @@ def test_looks_and_positions_are_of_the_same_points_and_made_once(seen: Path, tm
     assert not torch.allclose(aligned.features, unaligned.features)
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")}
     assert len(before) == 2
-    inputs("slab", "visual")
+    inputs.features("slab", "visual")
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")} == before
 
 
@@ -79,15 +81,15 @@ def test_looks_and_positions_are_of_the_same_points_and_made_once(seen: Path, tm
 def test_the_papers_features_are_of_gaussians_even_where_a_mesh_is_there(seen: Path, tmp_path: Path) -> None:
     scene = replace(CONFIG, splat=SplatConfig(steps=30, start_points=400))
     paper = replace(PRESETS["paper"].scene.lift, encoder="descriptors")
-    inputs = ObjectFeatures(OneObject(seen), tmp_path, scene, paper)
-    features = inputs("slab", "paper")
+    inputs = ObjectInputs(OneObject(seen), tmp_path, scene, paper)
+    features = inputs.features("slab", "paper")
     (cloud,) = tmp_path.rglob("cloud.ply")
     assert {*map(tuple, features.points.tolist())} <= {*map(tuple, read_splats(cloud).centers.tolist())}
     # All that the encoder says, and no positions.
     assert features.features.shape[1] > 4 + 3
     assert "components" not in features.encoder
     # The paper's ablations differ from it in nothing else.
-    bare, unaligned = inputs("slab", "paper-positions"), inputs("slab", "paper-unaligned")
+    bare, unaligned = inputs.features("slab", "paper-positions"), inputs.features("slab", "paper-unaligned")
     assert torch.equal(bare.points, features.points)
     assert torch.equal(bare.features, FeatureField.from_points(features.points).features)
     assert unaligned.features.shape == features.features.shape
@@ -96,20 +98,20 @@ def test_the_papers_features_are_of_gaussians_even_where_a_mesh_is_there(seen: P
 
 @pytest.mark.slow
 def test_fewer_views_are_kept_apart_from_all(seen: Path, tmp_path: Path) -> None:
-    inputs = ObjectFeatures(OneObject(seen), tmp_path, CONFIG)
-    few, every = inputs("slab", "unaligned", 6), inputs("slab", "unaligned")
+    inputs = ObjectInputs(OneObject(seen), tmp_path, CONFIG)
+    few, every = inputs.features("slab", "unaligned", 6), inputs.features("slab", "unaligned")
     assert not torch.allclose(few.features, every.features)
     images = {place.name: len(list(place.rglob("images/*.png"))) for place in (tmp_path / "slab").iterdir()}
     assert images == {"6 views": 6, "all views": 72}
 
 
 def test_an_object_that_nothing_shows_has_positions_alone(tmp_path: Path) -> None:
-    inputs = ObjectFeatures(OneObject(None), tmp_path, CONFIG)
-    points = inputs("slab", "positions").points
+    inputs = ObjectInputs(OneObject(None), tmp_path, CONFIG)
+    points = inputs.features("slab", "positions").points
     assert points.amin(0).tolist() == pytest.approx([0.0, 0.0, 0.0], abs=0.02)
     assert points.amax(0).tolist() == pytest.approx([0.1, 0.2, 0.1], abs=0.02)
     with raises(SceneError, name="slab"):
-        inputs("slab", "visual")
+        inputs.features("slab", "visual")
 
 
 def test_a_mesh_may_be_preferred_to_the_photographs_beside_it(tmp_path: Path) -> None:
@@ -127,12 +129,12 @@ def test_a_negative_number_of_views_is_refused() -> None:
 
 
 def test_the_surface_of_a_mesh_needs_no_views_and_is_that_of_a_fit(tmp_path: Path) -> None:
-    found = ObjectFeatures(OneObject(None, slab()), tmp_path / "cache", CONFIG, seed=3)("slab", "surface")
+    found = ObjectInputs(OneObject(None, slab()), tmp_path / "cache", CONFIG, seed=3).features("slab", "surface")
     assert torch.equal(found.points, FeatureField.from_mesh(slab(), seed=3).points)
     assert not (tmp_path / "cache").exists()
 
 
 @pytest.mark.slow
 def test_the_surface_is_that_of_the_views_where_a_mesh_does_not_count(seen: Path, tmp_path: Path) -> None:
-    inputs = ObjectFeatures(OneObject(seen, slab()), tmp_path, CONFIG, meshes=False)
-    assert torch.equal(inputs("slab", "surface").points, inputs("slab", "positions").points)
+    inputs = ObjectInputs(OneObject(seen, slab()), tmp_path, CONFIG, geometry="gaussians")
+    assert torch.equal(inputs.features("slab", "surface").points, inputs.features("slab", "positions").points)

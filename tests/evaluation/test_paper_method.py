@@ -23,7 +23,7 @@ from avmsf.modal.extraction.finders import ShortTime
 from avmsf.pipeline.config import DESCRIPTORS, DINO, PRESETS, LiftConfig
 from avmsf.pipeline.features import DinoEncoder
 from factories.plate_field import QUICK, plate_features, plate_impacts
-from factories.plate_set import NoBodies, PlateLooks
+from factories.plate_set import PlateInputs
 from factories.raising import raises
 
 
@@ -53,6 +53,8 @@ def test_a_method_may_find_modes_in_its_own_way() -> None:
         features=lambda look: plate_features(),
         bodies=shared,
         other_recording=shared,
+        family=shared,
+        gaussians=shared,
     )
     pipeline = replace(NETWORK, extraction="short-time", fit=replace(QUICK, steps=1, correction_rate=0.0))
     field = FieldMethod("quick", pipeline, "paper", published=True).fit(task)
@@ -105,7 +107,7 @@ def test_encoders_are_loaded_once_on_the_device_and_only_for_who_reads_them(monk
 def test_methods_without_features_share_results_with_any_encoder(tmp_path: Path) -> None:
     def begin(name: str, encoder: str | None) -> None:
         evaluation = Evaluation(
-            CaptureCollection(tmp_path), "plates", PROTOCOLS["farthest"], (METHODS[name],), PlateLooks(), NoBodies(),
+            CaptureCollection(tmp_path), "plates", PROTOCOLS["farthest"], (METHODS[name],), PlateInputs(),
             metric_settings=MetricSettings(cdpam=False), encoder=encoder,
         )  # fmt: skip
         evaluation.begin(ResultsFolder(tmp_path / "results"))

@@ -11,6 +11,7 @@ from avmsf.evaluation.task import VisualInput
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.body_family import BodyFamily
 from avmsf.field.gains.elastic import CandidateBodies
+from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.mesh import Surface
 from avmsf.simulate.ground_truth import TRUTH, Truth, write_truth
 from oracles.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
@@ -63,23 +64,19 @@ def _surface(plate: Plate) -> Surface:
 
 
 @dataclass(frozen=True)
-class PlateLooks:
-    """Positions of a plate, and no looks."""
+class PlateInputs:
+    """Positions of a plate, and no looks and no shape."""
 
-    def __call__(self, identifier: str, visual_input: VisualInput, views: int | None = None) -> FeatureField:
+    def features(self, identifier: str, visual_input: VisualInput, views: int | None = None) -> FeatureField:
         if visual_input not in ("surface", "positions"):
             raise SceneError(f"{identifier}: nothing shows its look")
         return FeatureField.from_points(plate_surface_points(plate_named(identifier), 200))
 
-
-@dataclass(frozen=True)
-class NoBodies:
-    """Knows no object's shape."""
-
-    def __call__(self, identifier: str) -> CandidateBodies:
-        """Raise SimulationError."""
+    def bodies(self, identifier: str) -> CandidateBodies:
         raise SimulationError(f"{identifier} has no shape here")
 
     def family(self, identifier: str) -> BodyFamily:
-        """Raise SimulationError."""
         raise SimulationError(f"{identifier} has no shape here")
+
+    def cloud(self, identifier: str, views: int | None = None) -> GaussianCloud:
+        raise SceneError(f"{identifier}: nothing shows its look")

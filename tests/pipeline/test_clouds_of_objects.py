@@ -7,7 +7,7 @@ import torch
 
 from avmsf.datasets import CaptureCollection
 from avmsf.errors import SceneError
-from avmsf.evaluation.objects import ObjectFeatures
+from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.protocols import PROTOCOLS
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.runner import Evaluation, run_object
@@ -17,7 +17,7 @@ from avmsf.evaluation.task import Task
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import write_splats
 from factories.plate_capture import fill_plate
-from factories.plate_set import NoBodies, PlateLooks, fill_plates
+from factories.plate_set import PlateInputs, fill_plates
 from factories.sonicgauss_cases import cloud
 
 
@@ -26,7 +26,7 @@ def test_given_gaussians_are_read_and_an_object_that_nothing_shows_is_refused(tm
         fill_plate(tmp_path / "set" / name, surface=False)
     given = cloud(200)
     write_splats(given, tmp_path / "set" / "shown" / "splats.ply")
-    looks = ObjectFeatures(CaptureCollection(tmp_path / "set"), tmp_path / "cache")
+    looks = ObjectInputs(CaptureCollection(tmp_path / "set"), tmp_path / "cache")
     assert torch.equal(looks.cloud("shown").centers, given.centers)
     assert torch.equal(looks.cloud("shown", views=12).centers, given.centers)
     with pytest.raises(SceneError):
@@ -34,12 +34,12 @@ def test_given_gaussians_are_read_and_an_object_that_nothing_shows_is_refused(tm
 
 
 def test_methods_get_the_gaussians_of_their_object_and_views(tmp_path: Path) -> None:
-    folder = fill_plates(tmp_path / "plates")
     asked = []
 
-    def clouds(identifier: str, views: int | None = None) -> GaussianCloud:
-        asked.append((identifier, views))
-        return cloud(7)
+    class Inputs(PlateInputs):
+        def cloud(self, identifier: str, views: int | None = None) -> GaussianCloud:
+            asked.append((identifier, views))
+            return cloud(7)
 
     class Asking:
         name = "asking"
@@ -48,20 +48,11 @@ def test_methods_get_the_gaussians_of_their_object_and_views(tmp_path: Path) -> 
             assert len(task.gaussians()) == 7
             return NearestRecording(task.train)
 
-    for number, given in enumerate((clouds, None)):
-        results = ResultsFolder(tmp_path / f"results {number}")
-        evaluation = Evaluation(
-            CaptureCollection(folder),
-            "plates",
-            PROTOCOLS["farthest"],
-            (Asking(),),
-            PlateLooks(),
-            NoBodies(),
-            metric_settings=MetricSettings(cdpam=False),
-            clouds=given,
-        )
-        run_object(evaluation, "a", results)
-        record = results.read("a")
-        assert record is not None
-        assert (record.outcomes[0].failure is None) == (given is not None)
+    dataset, results = CaptureCollection(fill_plates(tmp_path / "plates")), ResultsFolder(tmp_path / "results")
+    settings = MetricSettings(cdpam=False)
+    protocol = PROTOCOLS["farthest"]
+    run_object(Evaluation(dataset, "plates", protocol, (Asking(),), Inputs(), metric_settings=settings), "a", results)
+    record = results.read("a")
+    assert record is not None
+    assert record.outcomes[0].failure is None
     assert asked == [("a", None)]

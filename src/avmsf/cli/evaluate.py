@@ -21,7 +21,7 @@ from avmsf.errors import EvaluationError
 from avmsf.evaluation.cases import Predefined, Shots
 from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.methods import RecordedMethod, method_named
-from avmsf.evaluation.objects import SUBSETS, ObjectBodies, ObjectFeatures, choose_objects, members
+from avmsf.evaluation.objects import SUBSETS, ObjectInputs, choose_objects, members
 from avmsf.evaluation.parallel import RunProgress, Workers, run_objects
 from avmsf.evaluation.protocols import PREDEFINED, PUBLISHED, SHOTS, EvaluationProtocol, protocol_named
 from avmsf.evaluation.report import PAGE, SUMMARY, TABLES, write_figures, write_page, write_summary
@@ -136,10 +136,8 @@ def evaluation_of(
     kept = (options.cache or folder / "features").resolve()
     lift, paper = settled_lifts(options.lift, inputs_of(methods, protocol), device=device)
     given = SceneConfig(ViewsConfig(source=options.visual_source), options.splat, options.lift)
-    scene = replace(given, lift=lift)
-    # With the shape from photographs, no method may read the mesh.
-    inputs = ObjectFeatures(
-        dataset, kept, scene, paper, device, meshes=options.geometry != "gaussians", seed=options.seed
+    inputs = ObjectInputs(
+        dataset, kept, replace(given, lift=lift), paper, options.geometry, body, device, seed=options.seed
     )
     cdpam = not options.no_cdpam and "cdpam" in protocol.metrics
     return Evaluation(
@@ -148,12 +146,10 @@ def evaluation_of(
         protocol,
         methods,
         inputs,
-        ObjectBodies(dataset, kept, options.geometry, body, scene, device=device),
         options.seed,
         MetricSettings(level=options.amplitude_scale, cdpam=cdpam, cdpam_contacts=options.cdpam_contacts),
         finder_named(options.extraction, options.modes),
         {"scene": asdict(given), "paper": asdict(paper), "geometry": options.geometry, "body": asdict(body)},
-        inputs.cloud,
         device,
         None if lift == options.lift else lift.encoder,
         options.time_zero,

@@ -1,7 +1,8 @@
 """What methods read of the objects of a dataset, made once an object and cached; and groups of objects."""
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -43,23 +44,29 @@ NAMES: Mapping[VisualInput, str] = {
 """What the files of features are called, where they are not those of the fields without ablation."""
 
 
+NOISE = 0.02
+"""Displacement of a noisy mesh's vertices over the object's size."""
+
+
 @dataclass(frozen=True)
-class ObjectFeatures:
-    """Makes the features of a dataset's objects, each in a folder of its own beneath `cache`."""
+class ObjectInputs:
+    """Makes what methods read of a dataset's objects, each object's in a folder of its own beneath `cache`."""
 
     dataset: Dataset
     cache: Path
-    config: SceneConfig = field(default_factory=SceneConfig)
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    """How Gaussians and features are made."""
     paper: LiftConfig = PRESETS["paper"].scene.lift
     """How features are made in the paper's form."""
+    geometry: Geometry = "mesh"
+    """What bodies are made of. With `gaussians`, nothing reads the object's mesh, where the dataset has one."""
+    body: BodyConfig = field(default_factory=BodyConfig)
     device: str | None = None
     """Device of Gaussians and DINOv2; None for a GPU where there is one."""
-    meshes: bool = True
-    """Whether `surface` is an object's mesh where the dataset has one; else it is as `positions`."""
     seed: int = 0
     """Seed of the points on a mesh."""
 
-    def __call__(self, identifier: str, visual_input: VisualInput, views: int | None = None) -> FeatureField:
+    def features(self, identifier: str, visual_input: VisualInput, views: int | None = None) -> FeatureField:
         """Return what `visual_input` means for an object, from at most `views` views, or from all for None.
 
         `positions` are those of the same points that features are lifted onto, so that the two differ in nothing else;
@@ -67,21 +74,23 @@ class ObjectFeatures:
         `avmsf fit`, and needs no views of an object with a mesh. Raises SceneError for the features of an object
         that nothing shows, and DatasetError for an unknown one.
         """
-        surface = self.dataset.capture(identifier).surface if visual_input == "surface" and self.meshes else None
-        if surface is not None:
-            return FeatureField.from_mesh(surface, seed=self.seed)
+        if visual_input == "surface" and self.geometry != "gaussians":
+            surface = self.dataset.capture(identifier).surface
+            if surface is not None:
+                return FeatureField.from_mesh(surface, seed=self.seed)
         bare = visual_input == "surface" or visual_input.endswith("positions")
         if bare and self.dataset.visual_source(identifier) is None:
-            return self._bare(identifier)
-        lift = self.paper if visual_input.startswith("paper") else self.config.lift
+            capture = self.dataset.capture(identifier)
+            if capture.surface is None:
+                return FeatureField.from_contacts(capture.impacts.contacts)
+            return FeatureField.from_points(capture.surface.vertices)
+        lift = self.paper if visual_input.startswith("paper") else self.scene.lift
         if visual_input == "surface" and lift.encoder == AUTO:
             # Positions do not depend on the encoder.
             lift = replace(lift, encoder=DESCRIPTORS)
         lift = replace(lift, symmetry=not visual_input.endswith("unaligned"))
-        stages = self._stages(
-            identifier, replace(self.config, lift=lift), views, name=NAMES.get(visual_input, FEATURES)
-        )
-        with stages.stages.lock("avmsf evaluate", wait=NO_LIMIT):
+        name = NAMES.get(visual_input, FEATURES)
+        with self._stages(identifier, replace(self.scene, lift=lift), views, name) as stages:
             features = load_features(stages.features.path)
         return FeatureField.from_points(features.points) if bare else features
 
@@ -90,52 +99,12 @@ class ObjectFeatures:
 
         Raises SceneError where nothing shows the object.
         """
-        # Other methods may look at the mesh alone; those that ask for Gaussians have the best that shows the object.
-        config = replace(self.config, views=replace(self.config.views, source=ViewsConfig().source))
-        stages = self._stages(identifier, config, views)
-        with stages.stages.lock("avmsf evaluate", wait=NO_LIMIT):
+        with self._stages(identifier, self._best_views, views) as stages:
             return read_splats(stages.cloud.path)
 
-    def _stages(self, identifier: str, config: SceneConfig, views: int | None, name: str = FEATURES) -> SceneStages:
-        """Return the stages from what shows an object. Raises SceneError where nothing does."""
-        seen = self.dataset.visual_source(identifier)
-        if seen is None:
-            raise SceneError(f"{identifier}: expected a mesh or photographs in the dataset, got none", name=identifier)
-        config = replace(config, views=replace(config.views, count=views or 0))
-        place = self.cache / identifier / ("all views" if views is None else f"{views} views")
-        return SceneStages(
-            seen.folder, StageFolder(place), config, settings=seen.settings, name=name, device=self.device
-        )
-
-    def _bare(self, identifier: str) -> FeatureField:
-        capture = self.dataset.capture(identifier)
-        if capture.surface is None:
-            return FeatureField.from_contacts(capture.impacts.contacts)
-        return FeatureField.from_points(capture.surface.vertices)
-
-
-NOISE = 0.02
-"""Displacement of a noisy mesh's vertices over the object's size."""
-
-
-@dataclass(frozen=True)
-class ObjectBodies:
-    """Computes the bodies of a dataset's objects, each in a folder of its own beneath `cache`."""
-
-    dataset: Dataset
-    cache: Path
-    geometry: Geometry = "mesh"
-    config: BodyConfig = field(default_factory=BodyConfig)
-    scene: SceneConfig = field(default_factory=SceneConfig)
-    """How Gaussians are made, where the geometry asks for them."""
-    seed: int = 0
-    """Start of the chance in the noise."""
-    device: str | None = None
-    """Device of Gaussians; None for a GPU where there is one."""
-
-    def __call__(self, identifier: str) -> CandidateBodies:
+    def bodies(self, identifier: str) -> CandidateBodies:
         """Return an object's bodies. Raises SceneError where its shape is unknown, SimulationError for an unfit one."""
-        return candidate_bodies(self._surface(identifier), self.config, cache=self.cache / identifier / "bodies")
+        return candidate_bodies(self._surface(identifier), self.body, cache=self.cache / identifier / "bodies")
 
     def family(self, identifier: str) -> BodyFamily:
         """Return an object's bodies for DiffSound. Raises SceneError and SimulationError likewise."""
@@ -143,26 +112,33 @@ class ObjectBodies:
 
     def _surface(self, identifier: str) -> Surface | ObjectShape:
         if self.geometry == "gaussians":
-            return self._shape(identifier)
+            with self._stages(identifier, self._best_views, None) as stages:
+                return stages.shape()
         surface = self.dataset.capture(identifier).surface
         if surface is None or not len(surface.faces):
             raise SceneError.expected("a mesh in the dataset", name=identifier, advice="take geometry from Gaussians")
-        return surface if self.geometry == "mesh" else roughened(surface, NOISE, seed=self.seed)
+        return surface if self.geometry == "mesh" else roughened(surface, NOISE, seed=0)
 
-    def _shape(self, identifier: str) -> ObjectShape:
+    @property
+    def _best_views(self) -> SceneConfig:
+        """Settings with the best that shows the object: other methods may look at the mesh alone."""
+        return replace(self.scene, views=replace(self.scene.views, source=ViewsConfig().source))
+
+    @contextmanager
+    def _stages(
+        self, identifier: str, config: SceneConfig, views: int | None, name: str = FEATURES
+    ) -> Iterator[SceneStages]:
+        """Yield the stages from what shows an object, locked. Raises SceneError where nothing does."""
         seen = self.dataset.visual_source(identifier)
         if seen is None:
             raise SceneError(f"{identifier}: expected a mesh or photographs in the dataset, got none", name=identifier)
-        scene = replace(self.scene, views=replace(self.scene.views, source=ViewsConfig().source))
+        config = replace(config, views=replace(config.views, count=views or 0))
+        place = self.cache / identifier / ("all views" if views is None else f"{views} views")
         stages = SceneStages(
-            seen.folder,
-            StageFolder(self.cache / identifier / "all views"),
-            scene,
-            settings=seen.settings,
-            device=self.device,
+            seen.folder, StageFolder(place), config, settings=seen.settings, name=name, device=self.device
         )
         with stages.stages.lock("avmsf evaluate", wait=NO_LIMIT):
-            return stages.shape()
+            yield stages
 
 
 def draw_other_recording(dataset: Dataset, identifier: str, train: Impacts, *, seed: int) -> Float[Tensor, " samples"]:

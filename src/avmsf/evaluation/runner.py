@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -17,38 +17,21 @@ from torch import Tensor
 from avmsf._utils.caching import Given, Result, once, source_digest
 from avmsf._utils.device import one_thread
 from avmsf.capture.impacts import Impacts
-from avmsf.datasets.dataset import Dataset, ObjectFacts
+from avmsf.datasets.dataset import Dataset
 from avmsf.errors import AvmsfError, EvaluationError
 from avmsf.evaluation.cases import Case, Places
 from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.localization import located, write_map
 from avmsf.evaluation.modal_metrics import truth_at, truth_from_first_sample, truth_of
-from avmsf.evaluation.objects import draw_other_recording
+from avmsf.evaluation.objects import ObjectInputs, draw_other_recording
 from avmsf.evaluation.page import keep_sound, listening_gain
 from avmsf.evaluation.protocols import EvaluationProtocol
 from avmsf.evaluation.results import ENCODER, CaseRecord, ObjectRecord, Outcome, ResultsFolder, failure_of
 from avmsf.evaluation.splits import MetricSettings, MetricValues, align_split, spread
 from avmsf.evaluation.task import FromFiles, Method, ReadsFeatures, Renderer, Task, expect_renderer, report_of
-from avmsf.features.feature_field import FeatureField
-from avmsf.fem.body_family import BodyFamily
-from avmsf.field.gains.elastic import CandidateBodies
-from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder
 from avmsf.simulate.ground_truth import Truth
-
-
-@runtime_checkable
-class BodyMaker(Protocol):
-    """Computes an object's FE models."""
-
-    def __call__(self, identifier: str) -> CandidateBodies:
-        """Return an object's bodies. Raises AvmsfError where its shape is unknown or unfit."""
-        ...
-
-    def family(self, identifier: str) -> BodyFamily:
-        """Return its bodies of any material and thickness, for simulations. Raises AvmsfError likewise."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +43,7 @@ class Evaluation:
     """Name of the dataset in reports; one folder of results has one."""
     protocol: EvaluationProtocol
     methods: tuple[Method, ...]
-    features: Callable[..., FeatureField]
-    """Of an object's identifier, a `VisualInput` and the maximum of `views`, as `ObjectFeatures`."""
-    bodies: BodyMaker
+    inputs: ObjectInputs
     seed: int = 0
     """Random seed of the methods."""
     metric_settings: MetricSettings = field(default_factory=MetricSettings)
@@ -70,8 +51,6 @@ class Evaluation:
     """Extraction of modes, once per case."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the features, as plain values."""
-    clouds: Callable[[str, int | None], GaussianCloud] | None = None
-    """Of an object's identifier and the maximum of views; None where no method reads Gaussians."""
     device: str | None = None
     """Device that methods train on, with the same result up to rounding; None for a GPU where there is one."""
     encoder: str | None = None
@@ -141,26 +120,34 @@ class _Recordings:
         self.train, self.test = align_split(self.train, self.test, modes=self.modes)
 
 
-@dataclass(frozen=True, eq=False)
 class ObjectData:
-    """What all cases of an object share; functions compute their results once."""
+    """What all cases of an object share, each made once; so is the error of what cannot be made."""
 
-    identifier: str
-    impacts: Impacts
-    """Recordings on which all methods are scored."""
-    features: Callable[..., FeatureField]
-    bodies: Callable[[], CandidateBodies]
-    family: Callable[[], BodyFamily]
-    other_recording: Callable[[], Float[Tensor, " samples"]]
-    """Draws a recording of another object."""
-    truth: Truth | None = None
-    material: str | None = None
-    vertices: Float[Tensor, "vertices 3"] | None = None
-    """Of the object's mesh, meters."""
-    own_starts: Impacts | None = None
-    """Where `impacts` start at their peaks, the same recordings with the dataset's own starts, for fields that are not
-    of the paper's configuration: from its peak a recording's modes have phases of its own, which hide the signs of the
-    gains."""
+    def __init__(self, evaluation: Evaluation, identifier: str) -> None:
+        """Read an object. Raises AvmsfError, OSError or ValueError where it is damaged."""
+        dataset, inputs = evaluation.dataset, evaluation.inputs
+        capture = dataset.capture(identifier)
+        surface = capture.surface
+        self.identifier = identifier
+        self.impacts = capture.impacts
+        """Recordings on which all methods are scored."""
+        self.own_starts = None if evaluation.own_starts is None else evaluation.own_starts.capture(identifier).impacts
+        """Where `impacts` start at their peaks, the same recordings with the dataset's own starts, for fields that are
+        not of the paper's configuration: from its peak a recording's modes have phases of its own, which hide the
+        signs of the gains, and which the truth of all does not have."""
+        truth = None if evaluation.time_zero == "peak" else truth_of(dataset, identifier)
+        self.digest = digest_of(self.impacts, truth)
+        if truth is not None:
+            truth = truth_from_first_sample(truth_at(truth, self.impacts.names), self.impacts)
+        self.truth, self.facts = truth, dataset.facts(identifier)
+        self.vertices = None if surface is None or not len(surface.faces) else surface.vertices
+        self.features = once(partial(inputs.features, identifier))
+        self.bodies = once(partial(inputs.bodies, identifier))
+        self.family = once(partial(inputs.family, identifier))
+        self.gaussians = once(partial(inputs.cloud, identifier))
+        self.other_recording = once(
+            partial(draw_other_recording, dataset, identifier, self.impacts, seed=evaluation.seed)
+        )
 
 
 class CaseRun:
@@ -179,7 +166,7 @@ class CaseRun:
                 data.own_starts, case, finder, path.with_name(f"{number:02d} own starts.safetensors")
             )
         self.truth = None if data.truth is None else truth_at(data.truth, self.scored.test.names)
-        self.features = partial(data.features, data.identifier, views=case.views)
+        self.features = partial(data.features, views=case.views)
         self.stored_rows = spread(len(case.test), MAX_STORED_SOUNDS) if stores_sounds else []
         self.shared = 0.0
 
@@ -246,9 +233,6 @@ class CaseRun:
         return MetricValues(dict(found.errors), {}), maps
 
     def _task(self, recordings: _Recordings) -> Task:
-        make = self.evaluation.clouds
-        known = None if make is None else self._shared(partial(make, self.data.identifier, self.case.views))
-        clouds = {} if known is None else {"gaussians": known}
         return Task(
             name=self.data.identifier,
             train=recordings.train,
@@ -260,9 +244,9 @@ class CaseRun:
             bodies=self._shared(self.data.bodies),
             other_recording=self._shared(self.data.other_recording),
             family=self._shared(self.data.family),
-            material=self.data.material,
+            gaussians=self._shared(partial(self.data.gaussians, self.case.views)),
+            material=self.data.facts.material,
             device=self.evaluation.device,
-            **clouds,
         )
 
     def _shared(self, make: Callable[Given, Result]) -> Callable[Given, Result]:
@@ -311,35 +295,13 @@ def run_object(
     with one_thread():
         record = results.read(identifier) or ObjectRecord(identifier)
         try:
-            capture = evaluation.dataset.capture(identifier)
-            impacts, surface = capture.impacts, capture.surface
-            own = None if evaluation.own_starts is None else evaluation.own_starts.capture(identifier).impacts
-            # From its peak, a recording's modes have phases of its own, which the truth of all does not have.
-            truth = None if evaluation.time_zero == "peak" else truth_of(evaluation.dataset, identifier)
-            digest = digest_of(impacts, truth)
-            if truth is not None:
-                truth = truth_from_first_sample(truth_at(truth, impacts.names), impacts)
-            facts, cases = evaluation.dataset.facts(identifier), evaluation.protocol.choosing.cases(impacts)
+            data = ObjectData(evaluation, identifier)
+            cases = evaluation.protocol.choosing.cases(data.impacts)
         except (AvmsfError, OSError, ValueError) as error:  # A damaged object must not cost the others their hours.
             results.write(replace(record, failure=failure_of(error)))
             return
-        record = _described(_of_same_recordings(record, digest, evaluation, results), impacts, facts, cases)
+        record = _described(_of_same_recordings(record, data.digest, evaluation, results), data, cases)
         results.write(record)
-        # Each made once for all cases; so is the error of what cannot be made.
-        data = ObjectData(
-            identifier,
-            impacts,
-            features=once(evaluation.features),
-            bodies=once(partial(evaluation.bodies, identifier)),
-            family=once(partial(evaluation.bodies.family, identifier)),
-            other_recording=once(
-                partial(draw_other_recording, evaluation.dataset, identifier, impacts, seed=evaluation.seed)
-            ),
-            truth=truth,
-            material=facts.material,
-            vertices=None if surface is None or not len(surface.faces) else surface.vertices,
-            own_starts=own,
-        )
         firsts = {case.label: case.key for case in reversed(cases)}
         for number, case in enumerate(cases, 1):
             stores_sounds = firsts[case.label] == case.key
@@ -364,14 +326,14 @@ def _of_same_recordings(
     return replace(record, digest=digest)
 
 
-def _described(record: ObjectRecord, impacts: Impacts, facts: ObjectFacts, cases: Sequence[Case]) -> ObjectRecord:
+def _described(record: ObjectRecord, data: ObjectData, cases: Sequence[Case]) -> ObjectRecord:
     """Return an object's record with what is known of it now, and with its cases."""
-    known = {case.key: case for case in record.cases}
+    known, impacts = {case.key: case for case in record.cases}, data.impacts
     return replace(
         record,
-        name=facts.name,
-        material=facts.material,
-        inferred=facts.inferred,
+        name=data.facts.name,
+        material=data.facts.material,
+        inferred=data.facts.inferred,
         contacts=len(Places.of(impacts).rows),
         sample_rate=impacts.sample_rate,
         duration=impacts.duration,

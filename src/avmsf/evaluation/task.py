@@ -83,17 +83,6 @@ pooled over the object's symmetries; `unaligned`: without pooling. `paper`: the 
 `paper-positions`: only their positions; `paper-unaligned`: without pooling."""
 
 
-_OMIT = "give one, or omit the methods that need it"
-
-
-def _no_family() -> BodyFamily:
-    raise EvaluationError.expected("a mesh or views of the object", name="mesh", advice=_OMIT)
-
-
-def _no_gaussians() -> GaussianCloud:
-    raise EvaluationError.expected("views, a mesh or a .ply of the object", name="gaussians", advice=_OMIT)
-
-
 @dataclass(frozen=True, eq=False)
 class Task:
     """One object and one choice of training contacts.
@@ -120,12 +109,12 @@ class Task:
     other_recording: Callable[[], Float[Tensor, " samples"]]
     """Draws, by `seed`, the recording of another object, at the sample rate and of the length of `train`. Raises
     EvaluationError where there is no other object."""
-    family: Callable[[], BodyFamily] = _no_family
+    family: Callable[[], BodyFamily]
     """Computes the FE models of the object's surface, of any material. Raises AvmsfError likewise."""
+    gaussians: Callable[[], GaussianCloud]
+    """Fits Gaussians to the object's views. Raises AvmsfError without views."""
     material: str | None = None
     """Material of the object in the dataset, in lower case; None where it is unknown."""
-    gaussians: Callable[[], GaussianCloud] = _no_gaussians
-    """Fits Gaussians to the object's views. Raises AvmsfError without views."""
     device: str | None = None
     """Device to train on; None for a GPU where there is one."""
 
