@@ -1,7 +1,6 @@
 """Guided editing: a field's modes are optimized towards a guide's target sounds, with one edit for all contacts."""
 
 import hashlib
-import json
 import math
 import time
 import warnings
@@ -13,9 +12,10 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Float64, Int
+from safetensors.torch import save
 from torch import Tensor
 
-from avmsf._utils.caching import source_digest
+from avmsf._utils.caching import key_of, source_digest
 from avmsf._utils.state import read_checkpoint, write_checkpoint
 from avmsf.editing.clips import level
 from avmsf.editing.config import GuidedEditConfig
@@ -26,7 +26,9 @@ from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.points import farthest_points
 from avmsf.modal.config import scaled_fft_size
 
-_QUANTITIES = ("pitch", "shift", "damping", "damping_shift", "scale")
+_DEVIATIONS = {"shift": 0.05, "damping_shift": 0.3, "scale": 1.0}
+"""Standard deviations of what single modes have of their own, logarithms: of frequencies, almost a semitone; of
+dampings; and of gain factors, without the common level."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class Parameterization:
     """Rates are those of Adam, in logarithms a step, falling to a twentieth; 0 fixes a quantity at its initial value.
 
     The penalty on a quantity of single modes is half the mean square over modes of its value over its standard
-    deviation, times `stiffness`, in the unit of the loss, which is a relative error.
+    deviation (`_DEVIATIONS`), times `stiffness`, in the unit of the loss, which is a relative error.
     """
 
     name: str
@@ -51,12 +53,6 @@ class Parameterization:
     """Of each gain factor."""
     stiffness: float
     """Weight of the penalty on single modes."""
-    shift_deviation: float = 0.05
-    """Standard deviation of single frequencies, logarithm: .05 is almost a semitone."""
-    damping_shift_deviation: float = 0.3
-    """Standard deviation of single dampings, logarithm."""
-    scale_deviation: float = 1.0
-    """Standard deviation of gain factors, logarithm, without the common level."""
     searches: bool = True
     """Whether the guide proposes the initial edit; otherwise the unedited object."""
     gains_follow: bool = False
@@ -93,11 +89,10 @@ class EditVariables:
         self.parameters, self.modes, self.edited = parameters, len(start.shift), edited
         self.values: dict[str, Float64[Tensor, "*edited"]] = {}
         groups = []
-        for name in _QUANTITIES:
-            value: Tensor = getattr(start, name).detach().to(edited.device)
+        for name, value in vars(start.to(edited.device)).items():
             rate = getattr(parameters, f"{name}_rate")
             chosen = value if value.ndim == 0 else value[edited]
-            self.values[name] = chosen.clone().requires_grad_(rate > 0)
+            self.values[name] = chosen.detach().clone().requires_grad_(rate > 0)
             if rate > 0:
                 groups.append({"params": [self.values[name]], "lr": rate, "rate": rate})
         # Targets change from step to step: a long memory of the gradient's square would brake what chance once pushed.
@@ -113,20 +108,17 @@ class EditVariables:
 
     def penalty(self) -> Float64[Tensor, ""]:
         """Return the penalty on single modes, in the unit of the loss."""
-        parameters, scale = self.parameters, self.values["scale"]
-        parts = (
-            self.values["shift"] / parameters.shift_deviation,
-            self.values["damping_shift"] / parameters.damping_shift_deviation,
-            (scale - scale.mean()) / parameters.scale_deviation,
-        )
-        return 0.5 * parameters.stiffness * torch.stack([part.square().mean() for part in parts]).sum()
+        scale = self.values["scale"]
+        own = {**self.values, "scale": scale - scale.mean()}
+        parts = [(own[name] / deviation).square().mean() for name, deviation in _DEVIATIONS.items()]
+        return 0.5 * self.parameters.stiffness * torch.stack(parts).sum()
 
     def differentiate(self, loss: Float[Tensor, ""]) -> bool:
-        """Take the gradient of a loss and the penalty; return whether it is finite."""
+        """Take the gradient of a loss and the penalty; return whether both are finite."""
         self.optimizer.zero_grad()
         torch.autograd.backward(loss + self.penalty())
-        moving = [value.grad for value in self.values.values() if value.grad is not None]
-        return all(bool(torch.isfinite(gradient).all()) for gradient in moving)
+        found = [loss, *(value.grad for value in self.values.values() if value.grad is not None)]
+        return all(bool(torch.isfinite(each).all()) for each in found)
 
     def move(self, *, done: float) -> None:
         """Take a step of the optimizer; `done` is the fraction of finished steps."""
@@ -258,11 +250,9 @@ class _Optimization:
         # The interval of previews does not change the result.
         del settings["preview_every"]
         self.identity = checkpoint_identity(field, probes, guide.describe(), settings)
-        state = (
-            None
-            if checkpoint is None
-            else read_checkpoint(checkpoint, self.identity, what="an edit", raising=EditError)
-        )
+        state = None
+        if checkpoint is not None:
+            state = read_checkpoint(checkpoint, self.identity, what="an edit", raising=EditError)
         searching = state is None and parameters.searches
         start = guide.start(self.probes) if searching else ModalEdit.none(self.field.bank)
         self.variables = EditVariables(start, self.probes.loudest(config.free_modes), parameters)
@@ -325,7 +315,7 @@ class _Optimization:
     def _update(self, sounds: Float[Tensor, "usable samples"], targets: Float[Tensor, "usable samples"]) -> float:
         target = spectral_target(targets, fft_sizes=self.sizes, hops=[size // 4 for size in self.sizes])
         error = spectral_loss(sounds, target) / len(self.sizes)
-        if not (self.variables.differentiate(error) and bool(torch.isfinite(error))):
+        if not self.variables.differentiate(error):
             wanted, advice = "a finite value and gradient", "lower the learning rates"
             raise EditError.expected(wanted, float(error), row=self.step, name="loss", advice=advice)
         self.consistent = False
@@ -379,16 +369,12 @@ def checkpoint_identity(
 
     `contacts` are places at which the field's gains are looked at; `guide` and `settings` plain values.
     """
-    known = field.known(contacts)
-    tensors = [field.bank.frequency, field.bank.damping, field.phase, known.mean, field.gain_field.points]
-    digest = hashlib.sha256(json.dumps([field.sample_rate, field.samples]).encode())
-    for tensor in (*tensors, *(each for each in (known.quadrature, known.damping) if each is not None)):
-        digest.update(f"{tensor.dtype} {tuple(tensor.shape)}".encode())
-        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-    words = {
-        "guide": guide,
-        "settings": settings,
-        "version of avmsf": [version("avmsf"), source_digest("avmsf.editing.guided")],
-    }
-    plain = {name: json.dumps(each, sort_keys=True).encode() for name, each in words.items()}
-    return {"field": digest.hexdigest(), **{name: hashlib.sha256(each).hexdigest() for name, each in plain.items()}}
+    tensors = {**vars(field.bank), **vars(field.known(contacts)), "phase": field.phase}
+    tensors["points"] = field.gain_field.points
+    content = save(
+        {name: each.detach().cpu().clone().contiguous() for name, each in tensors.items() if each is not None}
+    )
+    field_values = [field.sample_rate, field.samples, hashlib.sha256(content).hexdigest()]
+    made_by = [version("avmsf"), source_digest("avmsf.editing.guided")]
+    values = {"field": field_values, "guide": guide, "settings": settings, "version of avmsf": made_by}
+    return {name: key_of({name: each}) for name, each in values.items()}

@@ -74,7 +74,9 @@ def change_material(
     before, mute = field.bank, muted(field)
     omega = torch.hypot(2.0 * math.pi * before.frequency, before.damping)
     moved = omega * (math.sqrt(new.young / old.young) * math.sqrt(old.density / new.density) / size)
-    damping = before.damping * _rayleigh_ratio(omega, moved, old, new)
+    # Where the old material does not damp, neither does the new one.
+    ratio = rayleigh_damping(moved, new) / rayleigh_damping(omega, old) if _damps(old) else torch.ones_like(omega)
+    damping = before.damping * ratio
     dead = (damping >= moved) & torch.isfinite(damping) & ~mute
     # Without a tone a mode has no frequency that a bank could hold, and what is mute no place where it would be heard.
     left = dead | mute
@@ -109,14 +111,6 @@ def _name(origin: Origin, old: Material, new: Material) -> str:
 def rayleigh_damping(omega: Float64[Tensor, " modes"], material: Material) -> Float64[Tensor, " modes"]:
     """Return a material's own dampings, 1/s, at undamped angular frequencies: (alpha + beta w^2) / 2."""
     return 0.5 * (material.alpha + material.beta * omega.square())
-
-
-def _rayleigh_ratio(
-    omega: Float64[Tensor, " modes"], moved: Float64[Tensor, " modes"], old: Material, new: Material
-) -> Float64[Tensor, " modes"]:
-    if not _damps(old):
-        return torch.ones_like(omega)
-    return rayleigh_damping(moved, new) / rayleigh_damping(omega, old)
 
 
 def _damps(material: Material) -> bool:
@@ -182,7 +176,7 @@ def guess_materials(
     omega = torch.hypot(2.0 * math.pi * bank.frequency, bank.damping)
     guesses = []
     for material in materials:
-        if material.alpha > 0 or material.beta > 0:
+        if _damps(material):
             misses, order = (bank.damping / rayleigh_damping(omega, material)).log().abs().sort()
             below = (torch.ones_like(misses) if weight is None else weight[order]).cumsum(0)
             middle = int(torch.searchsorted(below, 0.5 * below[-1]))
@@ -223,24 +217,20 @@ def infer_material(field: SoundField, *, option: str, new: Material | None = Non
     body = ProbableBody.of(report)
     stiff = "" if body is None else f", and the most probable body has {body.specific_stiffness}"
     guesses = guess_materials(bank, _weight(field), materials=MATERIALS.values() if body is None else body.materials)
-    best, second = guesses[0] if guesses else None, guesses[1] if len(guesses) > 1 else None
-    if best is None or not best.fits:
-        nearest = (
-            "" if best is None else f": the nearest, {best.material.name}, differs by a factor of {best.ratio:.3g}"
-        )
-        raise EditError.expected(
-            f"the present material, as none has the dampings of the modes{nearest}{stiff}",
-            None if best is None else best.material.name,
-            got="none",
-            name=option,
-            advice=f"give {option}",
-        )
+    fitting = [each for each in guesses if each.fits]
+    if not fitting:
+        near = [f": the nearest, {each.material.name}, differs by a factor of {each.ratio:.3g}" for each in guesses[:1]]
+        wanted = f"the present material, as none has the dampings of the modes{''.join(near)}{stiff}"
+        found = guesses[0].material.name if guesses else None
+        raise EditError.expected(wanted, found, got="none", name=option, advice=f"give {option}")
+    best = fitting[0]
     words = (
         f"old material: {best.material.name} assumed, whose dampings differ by a median factor of {best.ratio:.3g} "
         f"from those of the modes{stiff}"
     )
-    if second is not None and second.ratio < _AMBIGUOUS_RATIO * best.ratio:
-        words += f"; {second.material.name} fits equally well ({second.ratio:.3g}) and would give another level"
+    for second in guesses[1:2]:
+        if second.ratio < _AMBIGUOUS_RATIO * best.ratio:
+            words += f"; {second.material.name} fits equally well ({second.ratio:.3g}) and would give another level"
     if best.material == new:
         words += "; it is the new material too, which changes nothing"
     return KnownMaterial(best.material, f"{words}; give {option} if known")

@@ -104,8 +104,13 @@ class Reference:
         `EditError` for a file that is missing, no sound, silent, shorter than 20 ms after the onset, or without an
         onset. Warns of a second impact, of clipping, and of a rate below the field's.
         """
-        found = wav_files(paths)
-        clips = [read_clip(path, sample_rate=sample_rate) for path in found]
+        given = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
+        inside = [sorted(path.glob("*.[wW][aA][vV]")) if path.is_dir() else [path] for path in given]
+        found = [path for each in inside for path in each]
+        if not found:
+            folder, advice = given[0] if given else None, "give a sound file, or a folder with some"
+            raise EditError.expected("one or more wav files", file=folder, name="reference", advice=advice)
+        clips = [_read_clip(path, sample_rate=sample_rate) for path in found]
         longest = max(len(clip) for clip in clips)
         name = found[0].name if len(found) == 1 else f"{found[0].name} and {len(found) - 1} more"
         padded = torch.cat([with_length(clip[None], longest) for clip in clips])
@@ -142,23 +147,7 @@ class Reference:
         return targets, torch.where(ends >= samples, torch.ones_like(share), share)
 
 
-def wav_files(paths: str | Path | Sequence[str | Path]) -> list[Path]:
-    """Return sound files, those of folders in the order of their names. Raises `EditError` where there are none."""
-    given = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
-    found: list[Path] = []
-    for path in given:
-        found += sorted(each for each in path.iterdir() if each.suffix.lower() == ".wav") if path.is_dir() else [path]
-    if not found:
-        raise EditError.expected(
-            "one or more wav files",
-            file=given[0] if given else None,
-            name="reference",
-            advice="give a sound file, or a folder with some",
-        )
-    return found
-
-
-def read_clip(path: Path, *, sample_rate: float) -> Float[Tensor, " samples"]:
+def _read_clip(path: Path, *, sample_rate: float) -> Float[Tensor, " samples"]:
     """Return a recorded impact from its onset to the next, float32 at `sample_rate` Hz, of its strongest channel.
 
     Warns and raises `EditError` as `Reference.read`.
@@ -172,32 +161,22 @@ def read_clip(path: Path, *, sample_rate: float) -> Float[Tensor, " samples"]:
     except CaptureError as error:
         raise EditError(f"reference {error}", **{**error.attributes, "file": path}) from error
     sound, rate = prepared.sound, mono.sample_rate
+
+    def note(message: str, name: str, value: float | tuple[float, float] | None = None) -> None:
+        warnings.warn(AvmsfWarning(message, file=path, name=name, value=value), stacklevel=3)
+
     clipped = find_clipping(mono.response(), name=mono.name)
-    notes = [] if clipped is None else [AvmsfWarning(clipped, file=path, name="clipping")]
+    if clipped is not None:
+        note(clipped, "clipping")
     second = find_second_impact(sound, 0, sample_rate=rate, seconds=len(sound) / rate)
     if second is not None:
         at = (prepared.onset / rate, (prepared.onset + second) / rate)
-        notes.append(
-            AvmsfWarning(
-                f"{mono.name}: expected one impact, got two at {at[0]:.3f} s and {at[1]:.3f} s; only the first is used",
-                file=path,
-                name="impacts",
-                value=at,
-            )
-        )
+        found = f"expected one impact, got two at {at[0]:.3f} s and {at[1]:.3f} s; only the first is used"
+        note(f"{mono.name}: {found}", "impacts", at)
         sound = sound[: max(second, shortest_allowed(rate))]
     if rate < sample_rate:
-        notes.append(
-            AvmsfWarning(
-                f"{mono.name}: expected {sample_rate:g} Hz or more, got {rate:g} Hz; modes above "
-                f"{_HELD * 0.5 * rate:.4g} Hz are edited towards silence",
-                file=path,
-                name="sample_rate",
-                value=rate,
-            )
-        )
-    for note in notes:
-        warnings.warn(note, stacklevel=2)
+        lost = f"modes above {_HELD * 0.5 * rate:.4g} Hz are edited towards silence"
+        note(f"{mono.name}: expected {sample_rate:g} Hz or more, got {rate:g} Hz; {lost}", "sample_rate", rate)
     clip = torch.from_numpy(np.ascontiguousarray(sound - sound.mean()))[None]
     return resampled(clip, sample_rate=rate, wanted=sample_rate)[0].float()
 
