@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf.capture import Impacts
-from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor, sine_floor
+from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor
 from avmsf.evaluation.splits import Scores, evaluate, score, split
 from avmsf.evaluation.task import Renderer
 from avmsf.features.feature_field import FeatureField
@@ -278,7 +278,7 @@ def _judge(
     }
     scores = {method: evaluate(renderer, test) for method, renderer in renderers.items()}
     scores["floor"] = score(floor(test, modes.bank), test)
-    scores["sine_floor"] = score(sine_floor(test, modes.bank), test)
+    scores["sine_floor"] = score(floor(test, modes.bank, sines=True), test)
     figures = {"modes": float(len(modes.bank))}
     for method in METHODS:
         figures |= _of_method(method, scores[method])

@@ -3,6 +3,7 @@
 import csv
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import torch
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, FitError
 from avmsf.evaluation.metrics import relative_stft_error
-from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor, sine_floor
+from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor
 from avmsf.evaluation.splits import Scores, evaluate, score, split
 from avmsf.evaluation.task import Renderer, expect_renderer
 from avmsf.gaussians.points import farthest_points
@@ -123,7 +124,7 @@ def test_the_floor_is_the_noise_alone():
     bank = true_extraction(impacts).bank
     clean = plate_impacts()
     assert torch.equal(clean.contacts, impacts.contacts)
-    for make in (floor, sine_floor):
+    for make in (floor, partial(floor, sines=True)):
         left = (make(impacts, bank) - impacts.sounds).square().mean() / impacts.sounds.square().mean()
         # Least squares takes away the noise in as many directions of 4410 as there are gains, so 2 % at most.
         assert 10 * math.log10(float(left)) == pytest.approx(-40.0, abs=0.15)
@@ -136,13 +137,13 @@ def test_only_the_floor_with_cosines_follows_a_turned_phase():
     bank = true_extraction(impacts).bank
     # Two samples late: up to a third of a period at 4 kHz.
     late = replace(impacts, sounds=torch.roll(impacts.sounds, -2, dims=1))
-    both, sines = (float(evaluate_sounds(make(late, bank), late)) for make in (floor, sine_floor))
+    both, sines = (float(evaluate_sounds(make(late, bank), late)) for make in (floor, partial(floor, sines=True)))
     assert both < 0.02
     assert sines > 5 * both
     # The best sines are not what is left of the best sines and cosines without the cosines.
     gains, _ = fit_gains(late.sounds, bank, sample_rate=late.sample_rate)
     without = synthesize(gains, bank.frequency, bank.damping, samples=4410, sample_rate=22050.0)
-    best = float((sine_floor(late, bank) - late.sounds).square().sum())
+    best = float((floor(late, bank, sines=True) - late.sounds).square().sum())
     assert best < 0.999 * float((without - late.sounds).square().sum())
 
 

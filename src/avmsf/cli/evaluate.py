@@ -29,7 +29,7 @@ from avmsf.evaluation.report_tables import Section
 from avmsf.evaluation.results import IDENTITY, ResultsFolder
 from avmsf.evaluation.runner import Evaluation
 from avmsf.evaluation.splits import MetricSettings
-from avmsf.evaluation.task import Method, ReadsFeatures, VisualInput
+from avmsf.evaluation.task import Method, VisualInput
 from avmsf.modal.extraction.finders import finder_named
 from avmsf.pipeline.config import AUTO, PRESETS, LiftConfig, SceneConfig, TimeZero, ViewsConfig
 from avmsf.pipeline.features import choose_encoder, settled
@@ -217,7 +217,7 @@ def settled_lifts(
 
 def inputs_of(methods: Sequence[Method], protocol: EvaluationProtocol) -> frozenset[VisualInput]:
     """Return the features that an evaluation reads: those of its methods, and the points that locate recordings."""
-    read = {method.visual_input for method in methods if isinstance(method, ReadsFeatures)}
+    read = {method.visual_input for method in methods if isinstance(method, FieldMethod)}
     return frozenset(read | {"surface"} if protocol.locating else read)
 
 
@@ -226,7 +226,7 @@ def title_of(dataset: Dataset, folder: Path) -> str:
     if not isinstance(dataset, CaptureCollection):
         return dataset.name
     name = folder.resolve().name
-    return f"{name} (captures)" if any(name == each.dataset for each in PUBLISHED) else name
+    return f"{name} (captures)" if name in {dataset for dataset, _ in PUBLISHED} else name
 
 
 def _print(part: Section, screen: Console) -> None:

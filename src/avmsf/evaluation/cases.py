@@ -57,8 +57,7 @@ class Farthest:
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
         """Return the one case, the same as that of `avmsf.evaluation.splits.split`."""
         places = Places.of(impacts)
-        wanted = places.expect_part(self.fraction)
-        return (places.case("farthest", farthest_points(places.contacts, wanted)),)
+        return (places.case("farthest", farthest_points(places.contacts, places.expect_part(self.fraction))),)
 
 
 @dataclass(frozen=True)
@@ -71,8 +70,7 @@ class Closest:
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
         """Return the one case."""
         places = Places.of(impacts)
-        wanted = places.expect_part(self.fraction)
-        return (places.case("closest", closest_points(places.contacts, wanted)),)
+        return (places.case("closest", closest_points(places.contacts, places.expect_part(self.fraction))),)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ import numpy as np
 import soundfile
 import torch
 from jaxtyping import Float, Float64, UInt8
-from jinja2 import Environment, PackageLoader
 from matplotlib import colormaps
 from PIL import Image
 from scipy.signal import resample_poly
@@ -18,7 +17,7 @@ from torch import Tensor
 
 from avmsf._utils.files import write_whole
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.report_tables import Section, figure
+from avmsf.evaluation.report_tables import Section, figure, render
 from avmsf.evaluation.results import CaseRecord, ObjectRecord, Outcome
 from avmsf.evaluation.splits import spread
 from avmsf.export.web import report_directives, with_policy
@@ -131,10 +130,9 @@ OBJECTS = 4
 def page(parts: Sequence[Section], records: Sequence[ObjectRecord], folder: Path) -> str:
     """Return the complete page; sounds are read from the results' folder. Raises EvaluationError for a missing one."""
     opening, *others = parts
-    environment = Environment(loader=PackageLoader("avmsf.evaluation", ""), autoescape=True, trim_blocks=True)
-    whole = environment.get_template("report.html.jinja").render(
-        opening=opening, parts=others, listening=_listening(records, folder), range_db=f"{RANGE_DB:g}", is_text=_is_text
-    )
+    listening = _listening(records, folder)
+    values = {"opening": opening, "parts": others, "listening": listening, "range_db": f"{RANGE_DB:g}"}
+    whole = render("report.html.jinja", **values, is_text=_is_text)
     return with_policy(whole, report_directives(whole))
 
 

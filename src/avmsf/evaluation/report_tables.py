@@ -3,10 +3,13 @@
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 from typing import Any
 
+from jinja2 import Environment, PackageLoader, select_autoescape
+
 from avmsf._utils.text import counted
-from avmsf.evaluation.protocols import BASELINE, COMPUTATION, PROTOCOLS, published, published_ratios
+from avmsf.evaluation.protocols import BASELINE, COMPUTATION, PROTOCOLS, PUBLISHED, published_ratios
 from avmsf.evaluation.registry import kind_of, title_of
 from avmsf.evaluation.results import ObjectRecord
 from avmsf.evaluation.summary import (
@@ -154,20 +157,18 @@ def _main_table(main: Table, shown: Sequence[str], protocol: str, dataset: str, 
         (method, *(_mean(figures.get(metric)) for metric in shown), _count(figures))
         for method, figures in found.items()
     ]
-    best = _best(main, shown)
-    paper = published(protocol, dataset)
-    if paper is not None:
-        rows += [
-            (f"paper: {row.title}", *(figure(row.figures.get(metric)) for metric in shown), _DASH)
-            for row in paper.rows
-            if row.label in (None, labels[0])
-        ]
+    paper = PUBLISHED.get((dataset, protocol), ())
+    rows += [
+        (f"paper: {row.title}", *(figure(row.figures.get(metric)) for metric in shown), _DASH)
+        for row in paper
+        if row.label in (None, labels[0])
+    ]
     remark = (
-        f"Rows that begin with “paper:” are the paper's values on {paper.dataset}. {WARNING}"
-        if paper is not None
+        f"Rows that begin with “paper:” are the paper's values on {dataset}. {WARNING}"
+        if paper
         else f"The paper has no values of this experiment on {dataset}."
     )
-    grid = Grid(("method", *_headings(shown), "objects"), tuple(rows), best)
+    grid = Grid(("method", *_headings(shown), "objects"), tuple(rows), _best(main, found, shown))
     titles = "; ".join(f"{method}: {title}" for method in found if (title := title_of(method)) is not None)
     remarks = (*_of_fewer(main), remark, *([f"{titles}."] if titles else []))
     return Section("All methods" + (f": {labels[0]}" if len(labels) > 1 else ""), (), grid, remarks)
@@ -178,7 +179,7 @@ def _ratio_table(main: Table, shown: Sequence[str], protocol: str, dataset: str)
     falling = [metric for metric in shown if any(metric in figures for figures in found.values())]
     rows = [(method, *(figure(found[method].get(metric)) for metric in falling)) for method in found]
     for source, methods in published_ratios(protocol).items():
-        if published(protocol, dataset) is not None and not dataset.startswith(source):
+        if (dataset, protocol) in PUBLISHED and not dataset.startswith(source):
             continue
         rows += [
             (f"paper, {source}: {method}", *(figure(figures.get(metric)) for metric in falling))
@@ -200,43 +201,28 @@ def _case_table(metric: str, tables: Mapping[str, Table], protocol: str, dataset
     found = {label: means(table) for label, table in tables.items()}
     methods = list(dict.fromkeys(method for each in found.values() for method in each))
     rows = [(method, *(_mean(found[label].get(method, {}).get(metric)) for label in tables)) for method in methods]
-    paper = published(protocol, dataset)
-    for title in dict.fromkeys(row.title for row in paper.rows) if paper is not None else ():
-        own = {row.label: row.figures.get(metric) for row in paper.rows if row.title == title} if paper else {}
+    paper = PUBLISHED.get((dataset, protocol), ())
+    for title in dict.fromkeys(row.title for row in paper):
+        own = {row.label: row.figures.get(metric) for row in paper if row.title == title}
         if any(own.get(label) is not None for label in tables):
             rows.append((f"paper: {title}", *(figure(own.get(label)) for label in tables)))
     return Section(f"{HEADINGS.get(metric, metric)} by case", (), Grid(("method", *tables), tuple(rows)))
 
 
 def _times(records: Sequence[ObjectRecord], order: Sequence[str], protocol: str, dataset: str) -> Section:
-    times = times_of(records)
-    fits = {
-        method: [times[each]["methods"][method] for each in times if method in times[each]["methods"]]
-        for method in order
-    }
-    rows = [
-        (
-            method,
-            figure(sum(each["fit"] for each in found) / len(found)),
-            figure(sum(each["render"] for each in found) / len(found)),
-        )
-        for method, found in fits.items()
-        if found
-    ]
-    shared = [each["shared"] for each in times.values()]
-    if shared:
-        rows.append(("shared: modes and features", figure(sum(shared) / len(shared)), _DASH))
+    times = times_of(records).values()
+    rows = []
+    for method in order:
+        found = [each["methods"][method] for each in times if method in each["methods"]]
+        if found:
+            rows.append((method, *(figure(fmean(each[name] for each in found)) for name in ("fit", "render"))))
+    if times:
+        rows.append(("shared: modes and features", figure(fmean(each["shared"] for each in times)), _DASH))
     words = "Seconds on one thread, mean over objects, sum over a protocol's cases, without the computation of metrics."
-    if published(protocol, dataset) is not None:
-        rows += [
-            (f"paper: {each.title}", figure(each.train_seconds), figure(each.render_seconds)) for each in COMPUTATION
-        ]
+    if (dataset, protocol) in PUBLISHED:
+        rows += [(f"paper: {title}", *map(figure, seconds)) for title, seconds in COMPUTATION.items()]
         words += " Rows that begin with “paper:” are the paper's: one training and one sound on an A5000 GPU."
-    return Section(
-        "Time per object",
-        (words,),
-        Grid(("method", "fit", "render the test contacts"), tuple(rows)),
-    )
+    return Section("Time per object", (words,), Grid(("method", "fit", "render the test contacts"), tuple(rows)))
 
 
 def _failures(records: Sequence[ObjectRecord]) -> Section:
@@ -260,11 +246,8 @@ def _ordered(table: Table, order: Sequence[str]) -> Table:
 def _metrics(table: Table, protocol: str) -> tuple[str, ...]:
     """Return the protocol's columns that have values."""
     columns = PROTOCOLS[protocol].metrics if protocol in PROTOCOLS else tuple(HEADINGS)
-    return tuple(metric for metric in columns if metric in _found(table))
-
-
-def _found(table: Table) -> dict[str, None]:
-    return dict.fromkeys(metric for figures in table.values() for values in figures.values() for metric in values)
+    known = {metric for figures in table.values() for values in figures.values() for metric in values}
+    return tuple(metric for metric in columns if metric in known)
 
 
 def _headings(metrics: Sequence[str]) -> tuple[str, ...]:
@@ -282,19 +265,15 @@ def _count(figures: Mapping[str, Mean]) -> str:
     return str(max((each.objects for each in figures.values()), default=0))
 
 
-def _best(table: Table, shown: Sequence[str]) -> frozenset[tuple[int, int]]:
+def _best(table: Table, found: Mapping[str, Mapping[str, Mean]], shown: Sequence[str]) -> frozenset[tuple[int, int]]:
     """Return the best cells of each metric's column, among the methods that have it of all objects that have it."""
-    found, best = means(table), set()
+    best = set()
     for column, metric in enumerate(shown, 1):
         total = sum(any(metric in values for values in figures.values()) for figures in table.values())
-        complete = {
-            row: figures[metric].mean
-            for row, figures in enumerate(found.values())
-            if metric in figures and figures[metric].objects == total
-        }
+        means_of = {row: each[metric] for row, each in enumerate(found.values()) if metric in each}
+        complete = [(mean.mean, row) for row, mean in means_of.items() if mean.objects == total]
         if complete:
-            pick = max if metric in RISING else min
-            best.add((pick(complete, key=lambda row: complete[row]), column))
+            best.add((max(complete, key=lambda pair: pair[0])[1] if metric in RISING else min(complete)[1], column))
     return frozenset(best)
 
 
@@ -310,32 +289,17 @@ def _of_fewer(table: Table) -> tuple[str, ...]:
     )
 
 
+def render(template: str, **values: Any) -> str:
+    """Return a filled template of the package."""
+    loader, escape = PackageLoader("avmsf.evaluation", ""), select_autoescape(("html.jinja",))
+    environment = Environment(loader=loader, autoescape=escape, trim_blocks=True)
+    environment.filters["markdown"] = _escaped
+    return environment.get_template(template).render(**values)
+
+
 def markdown(parts: Sequence[Section]) -> str:
     """Return the parts as one text: the first one's title above all, each table in pipes."""
-    lines: list[str] = []
-    for place, part in enumerate(parts):
-        lines += [f"{'#' if place == 0 else '##'} {_escaped(part.title)}", ""]
-        for words in part.words:
-            lines += [_escaped(words), ""]
-        if part.grid is not None:
-            lines += [*_table(part.grid), ""]
-        for words in part.remarks:
-            lines += [_escaped(words), ""]
-    return "\n".join(lines).rstrip() + "\n"
-
-
-def _table(grid: Grid) -> list[str]:
-    figures = len(grid.columns) - 1
-    lines = [_row(grid.columns), f"|---|{'---:|' * figures}"]
-    for number, row in enumerate(grid.rows):
-        words = map(_escaped, row)
-        cells = [f"**{cell}**" if (number, place) in grid.best else cell for place, cell in enumerate(words)]
-        lines.append(f"| {' | '.join(cells)} |")
-    return lines
-
-
-def _row(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(_escaped(cell) for cell in cells)} |"
+    return render("report.md.jinja", parts=parts).rstrip() + "\n"
 
 
 def _escaped(words: str) -> str:

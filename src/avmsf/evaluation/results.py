@@ -45,7 +45,7 @@ class Outcome:
     failure: str | None = None
     """Reason for missing values, in the first line (`failure_of`)."""
     digest: str = ""
-    """Of the files that a method's sounds are read from (`FromFiles`); empty for all other methods."""
+    """Of the files that a method's sounds are read from (`RecordedMethod`); empty for all other methods."""
 
 
 @dataclass(frozen=True)

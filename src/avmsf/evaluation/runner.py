@@ -22,13 +22,14 @@ from avmsf.errors import AvmsfError, EvaluationError
 from avmsf.evaluation.cases import Case, Places
 from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.localization import located, write_map
+from avmsf.evaluation.methods import RecordedMethod
 from avmsf.evaluation.modal_metrics import truth_at, truth_from_first_sample, truth_of
 from avmsf.evaluation.objects import ObjectInputs, draw_other_recording
 from avmsf.evaluation.page import keep_sound, listening_gain
 from avmsf.evaluation.protocols import EvaluationProtocol
 from avmsf.evaluation.results import ENCODER, CaseRecord, ObjectRecord, Outcome, ResultsFolder, failure_of
 from avmsf.evaluation.splits import MetricSettings, MetricValues, align_split, spread
-from avmsf.evaluation.task import FromFiles, Method, ReadsFeatures, Renderer, Task, expect_renderer, report_of
+from avmsf.evaluation.task import Method, Renderer, Task, expect_renderer, report_of
 from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder
 from avmsf.simulate.ground_truth import Truth
@@ -84,7 +85,7 @@ class Evaluation:
 
     def _described(self, method: Method) -> str:
         """Return what tells a method apart from another of its name. Methods that read no features share any folder."""
-        read = self.encoder is not None and isinstance(method, ReadsFeatures) and method.visual_input != "surface"
+        read = self.encoder is not None and isinstance(method, FieldMethod) and method.visual_input != "surface"
         return f"{method!r}{ENCODER}{self.encoder}" if read else repr(method)
 
 
@@ -356,7 +357,7 @@ def _run_case(
     """Run the methods that have no figures in a case, and return the object's record with them."""
     key = run.case.key
     for method in run.evaluation.methods:
-        digest = method.digest(run.data.identifier) if isinstance(method, FromFiles) else ""
+        digest = method.digest(run.data.identifier) if isinstance(method, RecordedMethod) else ""
         if record.done(key, method.name, digest):
             continue
         if log is not None:

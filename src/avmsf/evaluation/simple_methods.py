@@ -230,27 +230,17 @@ class RandomImpact:
         return self.sound.expand(len(contacts), -1)
 
 
-def floor(test: Impacts, bank: ModalBank) -> Float[Tensor, "contacts samples"]:
+def floor(test: Impacts, bank: ModalBank, *, sines: bool = False) -> Float[Tensor, "contacts samples"]:
     """Return the test sounds as `bank` expresses them best: their own gains, in phase and in quadrature.
 
-    No gains that are predicted for the same modes come nearer in the squared error of the waveform.
+    No gains that are predicted for the same modes come nearer in the squared error of the waveform. With `sines` they
+    are damped sines without cosines: all that the paper's equation 3 has.
     """
-    gains, quadrature = fit_gains(test.sounds, bank, sample_rate=test.sample_rate)
-    return _render(test, bank, gains, quadrature)
-
-
-def sine_floor(test: Impacts, bank: ModalBank) -> Float[Tensor, "contacts samples"]:
-    """Return the test sounds as damped sines without cosines express them best: all that the paper's equation 3 has."""
-    gains = fit_sine_gains(test.sounds, bank, sample_rate=test.sample_rate)
-    return _render(test, bank, gains, None)
-
-
-def _render(
-    test: Impacts,
-    bank: ModalBank,
-    gains: Float[Tensor, "contacts modes"],
-    quadrature: Float[Tensor, "contacts modes"] | None,
-) -> Float[Tensor, "contacts samples"]:
+    gains, quadrature = (
+        (fit_sine_gains(test.sounds, bank, sample_rate=test.sample_rate), None)
+        if sines
+        else fit_gains(test.sounds, bank, sample_rate=test.sample_rate)
+    )
     return synthesize(
         gains,
         bank.frequency,

@@ -1,14 +1,15 @@
-"""Statistics of stored values: means over contacts, then over objects; differences between methods.
+"""Statistics of stored values: means over contacts, then over objects; ratios to the baseline.
 
-Every object has the same weight. A method's mean is over the objects that it has values of; differences and ratios are
-over those that the baseline has values of too, paired by object. The ratio is the geometric mean of the objects'
-ratios, so that it does not depend on level and swapping the methods inverts it; the ratio of the means, the only one
-that the paper's tables allow, is given too.
+Every object has the same weight. A method's mean is over the objects that it has values of; ratios are over those that
+the baseline has values above 0 of too, paired by object. The ratio is the geometric mean of the objects' ratios, so
+that it does not depend on level and swapping the methods inverts it; the ratio of the means, the only one that the
+paper's tables allow, is given too.
 """
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from statistics import fmean, geometric_mean, stdev
 from typing import Any
 
 from avmsf.evaluation.protocols import BASELINE
@@ -32,12 +33,8 @@ class Mean:
     @classmethod
     def of(cls, values: Sequence[float]) -> "Mean":
         """Return the mean of at least one value."""
-        count = len(values)
-        mean = math.fsum(values) / count
-        if count == 1:
-            return cls(mean, None, 1)
-        variance = math.fsum((value - mean) ** 2 for value in values) / (count - 1)
-        return cls(mean, math.sqrt(variance / count), count)
+        error = stdev(values) / math.sqrt(len(values)) if len(values) > 1 else None
+        return cls(fmean(values), error, len(values))
 
 
 def labels_of(records: Iterable[ObjectRecord]) -> tuple[str, ...]:
@@ -75,37 +72,35 @@ def figures_of(records: Iterable[ObjectRecord], label: str) -> dict[str, dict[st
 
 def means(table: Table) -> dict[str, dict[str, Mean]]:
     """Return the means over objects by method and metric."""
-    return _over_objects(table, lambda own, other: own, paired=False)
+    found: dict[str, dict[str, list[float]]] = {}
+    for figures in table.values():
+        for method, values in figures.items():
+            for metric, value in values.items():
+                found.setdefault(method, {}).setdefault(metric, []).append(value)
+    return {method: {metric: Mean.of(each) for metric, each in values.items()} for method, values in found.items()}
 
 
-def differences(table: Table) -> dict[str, dict[str, Mean]]:
-    """Return the mean differences to the baseline, object by object."""
-    return _over_objects(table, lambda own, other: own - other, paired=True)
-
-
-def ratios(table: Table) -> dict[str, dict[str, float]]:
-    """Return the geometric means of the ratios to the baseline, object by object."""
-
-    def logarithm(own: float, other: float) -> float:
-        return math.log(own / other) if own > 0 else -math.inf
-
-    found = _over_objects(table, logarithm, paired=True, positive=True)
+def ratios(table: Table, *, of_means: bool = False) -> dict[str, dict[str, float]]:
+    """Return the geometric means of the ratios to the baseline, object by object, or the ratios `of_means`."""
+    found: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    for figures in table.values():
+        for method, values in figures.items():
+            for metric, own in values.items():
+                other = figures.get(BASELINE, {}).get(metric, 0.0)
+                if other > 0:
+                    pairs = found.setdefault(method, {})
+                    if metric not in RISING:
+                        pairs.setdefault(metric, []).append((own, other))
     return {
-        method: {metric: math.exp(each.mean) for metric, each in figures.items() if metric not in RISING}
-        for method, figures in found.items()
+        method: {metric: _ratio(*zip(*each, strict=True), of_means=of_means) for metric, each in values.items()}
+        for method, values in found.items()
     }
 
 
-def ratios_of_means(table: Table) -> dict[str, dict[str, float]]:
-    """Return the methods' means over the baseline's, both over the objects that have both."""
-    own = _over_objects(table, lambda own, other: own, paired=True, positive=True)
-    other = _over_objects(table, lambda own, other: other, paired=True, positive=True)
-    return {
-        method: {
-            metric: each.mean / other[method][metric].mean for metric, each in figures.items() if metric not in RISING
-        }
-        for method, figures in own.items()
-    }
+def _ratio(own: Sequence[float], other: Sequence[float], *, of_means: bool) -> float:
+    if of_means:
+        return math.fsum(own) / math.fsum(other)
+    return geometric_mean([one / base for one, base in zip(own, other, strict=True)]) if min(own) > 0 else 0.0
 
 
 def summarize(
@@ -137,11 +132,8 @@ def summarize(
         "methods": _plain(found, lambda each: each.mean),
         "standard_errors": _plain(found, lambda each: each.standard_error),
         "counts": {method: max(each.objects for each in figures.values()) for method, figures in found.items()},
-        f"difference_to_{BASELINE}": _plain(
-            differences(main), lambda each: {"mean": each.mean, "standard_error": each.standard_error}
-        ),
         f"ratio_to_{BASELINE}": ratios(main),
-        f"ratio_of_means_to_{BASELINE}": ratios_of_means(main),
+        f"ratio_of_means_to_{BASELINE}": ratios(main, of_means=True),
         "cases": {label: _plain(means(table), lambda each: each.mean) for label, table in tables.items()},
         "subsets": {
             name: {"objects": len(table), "methods": _plain(means(table), lambda each: each.mean)}
@@ -203,27 +195,6 @@ def times_of(records: Iterable[ObjectRecord]) -> dict[str, dict[str, Any]]:
             },
         }
         for record in records
-    }
-
-
-def _over_objects(
-    table: Table, combine: Callable[[float, float], float], *, paired: bool, positive: bool = False
-) -> dict[str, dict[str, Mean]]:
-    """Return means of what `combine` makes of a method's figure and the baseline's, over the objects that have both.
-
-    Unless `paired`, an object needs no baseline; with `positive`, the baseline's figure must be more than 0.
-    """
-    found: dict[str, dict[str, list[float]]] = {}
-    for figures in table.values():
-        for method, values in figures.items():
-            for metric, own in values.items():
-                other = figures.get(BASELINE, {}).get(metric)
-                if paired and (other is None or (positive and not other > 0)):
-                    continue
-                value = combine(own, math.nan if other is None else other)
-                found.setdefault(method, {}).setdefault(metric, []).append(value)
-    return {
-        method: {metric: Mean.of(values) for metric, values in figures.items()} for method, figures in found.items()
     }
 
 

@@ -131,22 +131,3 @@ class Method(Protocol):
     def fit(self, task: Task) -> Renderer:
         """Fit a renderer to the task's training recordings. Raises AvmsfError where it cannot."""
         ...
-
-
-@runtime_checkable
-class ReadsFeatures(Protocol):
-    """A method that reads features of the object's points."""
-
-    @property
-    def visual_input(self) -> VisualInput:
-        """Which ones it reads."""
-        ...
-
-
-@runtime_checkable
-class FromFiles(Protocol):
-    """A method whose sounds were made elsewhere and may change from one run to the next."""
-
-    def digest(self, name: str) -> str:
-        """Return what tells an object's files apart from others: its results count only for these."""
-        ...
