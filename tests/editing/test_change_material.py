@@ -21,12 +21,11 @@ from avmsf.errors import EditError, SimulationError
 from avmsf.fem.damping import rayleigh
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import CERAMIC, GLASS, NOMINAL, PLASTIC, STEEL, WOOD, Material
-from avmsf.field.gains.family import Sites
-from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.positional import Smooth
 from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
+from factories.located_plate import mixture_of
 from factories.raising import raises
 from oracles.block import block
 from oracles.plate import Plate, plate_modes, sample_contacts
@@ -56,17 +55,13 @@ def plate_of(material: Material, *, size: float = 1.0) -> Plate:
 def field_of(frequency: torch.Tensor, damping: torch.Tensor, gains: torch.Tensor, contacts: torch.Tensor) -> SoundField:
     """Return a field that has these gains at these contacts, and smooth ones between them."""
     values = torch.complex(gains, 0.5 * gains.roll(1, dims=1))
-    sites = Sites(contacts, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(contacts))
-    size = float((contacts.amax(0) - contacts.amin(0)).norm())
-    measured = MeasuredGains(values, torch.zeros_like(frequency), frequency, damping)
-    model = fit_mixture([Smooth(sites, size)], measured, contacts.float(), directional=False)
+    size, bank = float((contacts.amax(0) - contacts.amin(0)).norm()), ModalBank(frequency, damping)
+    model = mixture_of(contacts, values, bank, contacts, families=[Smooth], size=size)
     # The mean at the contacts is linear in the gains measured there: these have it pass through the given ones.
     passed = torch.linalg.solve(model.smoother(), torch.view_as_real(values).permute(1, 2, 0))
     model = model.with_values(torch.view_as_complex(passed.permute(2, 0, 1).contiguous()))
-    phase = torch.zeros_like(frequency)
-    return SoundField(
-        ModalBank(frequency, damping), model, phase, Residual(torch.full((9,), 1e-9)), RATE, 2000, Origin("plate")
-    )
+    phase, noise = torch.zeros_like(frequency), Residual(torch.full((9,), 1e-9))
+    return SoundField(bank, model, phase, noise, RATE, 2000, Origin("plate"))
 
 
 RATIO = {each: each.young / each.density for each in (STEEL, NOMINAL)}
@@ -158,17 +153,6 @@ def test_the_name_says_the_last_material():
     names = [each.origin.capture for each in (change_material(field, STEEL, STEEL), glass, wood, larger)]
     assert names == ["mug", "mug, glass", "mug, wood", "mug, wood"]
     assert change_material(larger, WOOD, GLASS).origin.capture == "mug, glass"
-
-
-def test_a_modes_own_damping_stays_in_proportion_to_the_law():
-    field = plate_field(GLASS)
-    own = torch.linspace(0.3, 5.0, len(field.bank), dtype=torch.float64)
-    strange = change_material(
-        replace(field, bank=ModalBank(field.bank.frequency, field.bank.damping * own)), GLASS, WOOD
-    )
-    plain = change_material(field, GLASS, WOOD)
-    # Its undamped frequency, which the law is taken at, has its own damping in it: 5e-6 of the frequency here.
-    torch.testing.assert_close(strange.bank.damping / plain.bank.damping, own, rtol=1e-4, atol=0)
 
 
 def test_ratios_of_gains_between_places_stay():

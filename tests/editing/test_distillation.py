@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 import pytest
 import torch
 
-from avmsf.editing.clips import level, levelled
-from avmsf.editing.config import DistillationConfig, GuidedEditConfig
+from avmsf.editing.clips import levelled
+from avmsf.editing.config import DistillationConfig
 from avmsf.editing.distillation import DecoderDistillation, noised, partial_denoising
-from avmsf.editing.guided import edit_towards
 from avmsf.errors import AvmsfWarning, EditError
 from factories.raising import raises, warns
 from factories.ringing_field import RATE, ringing_field, sound_of
@@ -107,12 +106,6 @@ def test_partial_denoising_follows_the_flow_of_a_gaussian():
     assert errors[1] / errors[2] == pytest.approx(2.0, rel=0.1)
 
 
-def test_one_step_is_the_models_own_estimate():
-    model, latents, level = Gaussian(), torch.randn(3, 8, 5, generator=seeded()), torch.tensor([0.2, 0.5, 0.9])
-    found = partial_denoising(model, latents, level, None, steps=1, guidance=1.0)
-    assert torch.equal(found, model.denoised(latents, level, None, guidance=1.0))
-
-
 def test_a_model_that_knows_what_it_wants_is_obeyed():
     wanted = sound_of(ringing_field(pitch=0.7))
     sounds = torch.cat([sound_of(ringing_field(level=each)) for each in (1.0, 1e-3)])
@@ -188,26 +181,6 @@ def test_memory_is_freed_before_it_is_asked_for_again(monkeypatch):
 
 def test_what_tells_models_apart_tells_guides_apart():
     assert guide(Known(room=3)).describe() == guide(Known(room=3)).describe() != guide(Known(room=4)).describe()
-
-
-def test_a_field_is_edited_to_what_the_model_wants():
-    wanted = sound_of(ringing_field(pitch=1.02, damping=2.0))
-    before, seen = ringing_field(), []
-    made = edit_towards(
-        before,
-        guide(Known(wanted), guidance=0.9),
-        config=GuidedEditConfig(steps=40, contacts_per_step=2, preview_every=0, fft_sizes=(2048, 512)),
-        progress=seen.append,
-    )
-    assert seen[-1].pitch == pytest.approx(1.02, abs=0.01)
-    # Single modes' own dampings bring the rest.
-    assert 1.3 < 1 / seen[-1].decay < 2.2
-    assert seen[-1].loss < 0.6 * seen[0].loss
-    entry = made.origin.report["edits"][-1]
-    assert (entry["prompt"], entry["model"], entry["guidance"]) == ("wood", "known", 0.9)
-    torch.testing.assert_close(
-        level(sound_of(made), sample_rate=RATE), level(sound_of(before), sample_rate=RATE), rtol=1e-4, atol=0
-    )
 
 
 @pytest.mark.parametrize(

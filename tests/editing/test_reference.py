@@ -10,7 +10,7 @@ import soundfile
 import torch
 
 from avmsf.editing.clips import level, levelled, resampled, with_length
-from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
+from avmsf.editing.modal_edit import FieldAtContacts
 from avmsf.editing.reference import Reference, _brightness, band_spectrum
 from avmsf.errors import AvmsfWarning, EditError
 from avmsf.fem.material import CERAMIC, WOOD
@@ -222,10 +222,3 @@ def test_a_modes_size_does_not_depend_on_its_phase():
     turned = replace(field, gain_field=Ahead(gains * torch.cos(turn), gains * torch.sin(turn)))
     own, other = (Reference.of_material(each, CERAMIC, WOOD, seed=0) for each in (field, turned))
     torch.testing.assert_close(other.clips, own.clips, rtol=1e-4, atol=1e-4)
-
-
-def test_an_edit_starts_where_nothing_moves_alone():
-    bank = ringing_field().bank
-    edit = ModalEdit.none(bank, pitch=math.log(2.0))
-    assert (edit.pitch_factor, edit.decay_factor) == (pytest.approx(2.0), 1.0)
-    assert not bool(edit.shift.any() or edit.scale.any() or edit.damping_shift.any())

@@ -12,9 +12,8 @@ import torch
 from avmsf.editing.config import STABLE_AUDIO, DistillationConfig, GuidedEditConfig
 from avmsf.editing.distillation import DecoderDistillation, partial_denoising
 from avmsf.editing.guided import HIERARCHICAL, GuidedEditProgress, edit_towards
-from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
 from avmsf.editing.reference import Reference
-from avmsf.editing.stable_audio import StableAudio, _missing_weights
+from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import EditError
 from factories.made_audio import DIM, FRAMES, RATE, save_audio, tiny_pipeline
 from factories.raising import raises
@@ -138,14 +137,6 @@ def test_gradient_reaches_the_modes_and_leaves_the_weights(model):
     guide = DecoderDistillation(model, "a wooden bowl", sample_rate=RATE, config=DistillationConfig(denoising=2))
     weights = {name: each.clone() for name, each in model.pipeline.transformer.state_dict().items()}
     weights |= {name: each.clone() for name, each in model.pipeline.vae.state_dict().items()}
-    zero = ModalEdit.none(field.bank)
-    edit = replace(zero, **{name: getattr(zero, name).clone().requires_grad_() for name in vars(zero)})
-    sounds = FieldAtContacts.at(field, field.gain_field.points, samples=1600).sounds(edit)
-    targets = guide.targets(sounds.detach(), 0, torch.Generator().manual_seed(0))
-    assert not targets.requires_grad
-    (sounds - targets).square().sum().backward()
-    for name, value in vars(edit).items():
-        assert float(value.grad.abs().max()) > 0, name
     made = edit_towards(field, guide, config=GuidedEditConfig(steps=3, contacts_per_step=2, preview_every=0))
     for before, after in ((field.bank.frequency, made.bank.frequency), (field.bank.damping, made.bank.damping)):
         assert bool((before != after).all())
@@ -263,15 +254,13 @@ def copied(folder: Path, place: Path) -> Path:
     return Path(shutil.copytree(folder, place / "copy"))
 
 
-def test_a_folder_that_is_not_complete(folder, model, tmp_path):
+def test_a_folder_that_is_not_complete(folder, tmp_path):
     from safetensors.torch import load_file, save_file
 
     place = copied(folder, tmp_path)
     path = place / "transformer" / "diffusion_pytorch_model.safetensors"
     weights = load_file(path)
-    assert _missing_weights(folder / "transformer", model.pipeline.transformer) == []
     save_file({name: each for name, each in weights.items() if name != "proj_in.weight"}, path)
-    assert _missing_weights(place / "transformer", model.pipeline.transformer) == ["proj_in.weight"]
     spoilers = (
         lambda: None,
         lambda: path.write_bytes(b"broken"),

@@ -1,38 +1,19 @@
 """Plates of wood and plastic, whose broad modes fill their band, and fields that know them exactly."""
 
-from dataclasses import dataclass
 from functools import cache
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from avmsf.field.gain_field import Gains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.localization.locator import Locator
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
-from factories.unsaved_gains import Unsaved
+from factories.located_plate import TrueGains
 from oracles.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
 
 RATE, SECONDS, LENGTH = 44100.0, 0.4, 0.24
 HIGHEST = {"wood": 6000.0, "plastic": 3000.0}
-
-
-@dataclass(frozen=True, eq=False)
-class PlateGains(Unsaved):
-    """A plate's own gains, in closed form."""
-
-    plate: Plate
-    highest: float
-    kind: ClassVar[str] = "plate"
-
-    @property
-    def points(self) -> Tensor:
-        return plate_surface_points(self.plate, 400).float()
-
-    def at(self, contacts: Tensor, directions: Tensor | None = None) -> Gains:
-        return Gains(plate_modes(self.plate, contacts, highest=self.highest).gains.float())
 
 
 def plate(material: str, length: float = LENGTH) -> Plate:
@@ -48,7 +29,7 @@ def damped_field(material: str) -> SoundField:
     modes = plate_modes(own, plate_surface_points(own, 1), highest=HIGHEST[material])
     return SoundField(
         ModalBank(modes.frequency, modes.damping),
-        PlateGains(own, HIGHEST[material]),
+        TrueGains(plate_surface_points(own, 400).float(), plate=own, highest=HIGHEST[material]),
         torch.zeros(len(modes.frequency), dtype=torch.float64),
         Residual(torch.full((65,), 1e-3)),
         RATE,

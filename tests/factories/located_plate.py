@@ -10,6 +10,7 @@ import torch
 from avmsf.field.gain_field import Gains
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.model import MixtureGains
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.localization.contact_map import ContactMap
@@ -33,10 +34,11 @@ class TrueGains(Unsaved):
     turned: bool = False
     factor: float | None = None
     plate: Plate = PLATE
+    highest: float = HIGHEST
     kind: ClassVar[str] = "true"
 
     def at(self, contacts: torch.Tensor, directions: torch.Tensor | None = None) -> Gains:
-        gains = plate_modes(self.plate, contacts, highest=HIGHEST).gains.float()
+        gains = plate_modes(self.plate, contacts, highest=self.highest).gains.float()
         shape = gains.shape
         damping = None if self.factor is None else 1.0 + self.factor * torch.linspace(0, 1, shape[1]).expand(shape)
         return Gains(gains, 0.4 * gains.roll(1, 1) if self.turned else None, damping)
@@ -77,11 +79,22 @@ def struck(count: int, *, seed: int, noise_db: float = -40.0, plate: Plate = PLA
 def fitted_field(taps: int) -> SoundField:
     impacts = struck(taps, seed=5)
     values = torch.complex(*(each.double() for each in fit_gains(impacts.sounds, bank(), sample_rate=RATE)))
-    sites = Sites(impacts.contacts, torch.tensor([0.0, 0.0, 1.0]).double().expand_as(impacts.contacts))
-    families = [each(sites, DIAGONAL) for each in (Unstructured, Smooth, ThinPlate)]
-    measured = MeasuredGains(values, torch.zeros_like(bank().damping), bank().frequency, bank().damping)
-    points = plate_surface_points(PLATE, 1500).float()
-    return field_of(fit_mixture(families, measured, points, directional=False))
+    return field_of(mixture_of(impacts.contacts, values, bank(), plate_surface_points(PLATE, 1500)))
+
+
+def mixture_of(
+    contacts: torch.Tensor,
+    values: torch.Tensor,
+    modes: ModalBank,
+    points: torch.Tensor,
+    *,
+    families=(Unstructured, Smooth, ThinPlate),
+    size: float = DIAGONAL,
+) -> MixtureGains:
+    """Return gains fitted to those measured at contacts of a plate, or of another object of that size."""
+    sites = Sites(contacts, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(contacts))
+    measured = MeasuredGains(values, torch.zeros_like(modes.damping), modes.frequency, modes.damping)
+    return fit_mixture([each(sites, size) for each in families], measured, points.float(), directional=False)
 
 
 def mirrored(contact: torch.Tensor) -> torch.Tensor:

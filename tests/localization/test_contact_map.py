@@ -103,12 +103,6 @@ def test_other_positions_include_a_broader_peak_and_not_the_answer():
     assert positions == [pytest.approx(0.0, abs=0.08), pytest.approx(0.2)]
 
 
-def test_a_map_that_is_printed_shows_its_notes():
-    found = replace(made([0.1, 0.8, 0.1]), notes=("explains 4 %",))
-    assert "explains 4 %" in repr(found)
-    assert "explains 4 %" in repr(replace(found, refusal="another object"))
-
-
 def test_a_symmetric_plate_is_ambiguous_and_each_counterpart_is_named():
     # Heard from its middle, where all modes that are odd about it are silent.
     plate = replace(PLATE, pickup=(0.5, 0.5))

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from avmsf.localization.likelihood import DELAY_STEP, LARGEST_DELAY, MOST_DELAYS, cosine_distance, delays_of
+from avmsf.localization.likelihood import LARGEST_DELAY, cosine_distance
 
 FREQUENCY = torch.tensor([310.0, 870.0, 1900.0, 3400.0, 5200.0, 8100.0], dtype=torch.float64)
 GAINS = torch.randn(40, 6, 2, generator=torch.Generator().manual_seed(0))
@@ -35,18 +35,6 @@ def test_it_is_the_least_of_a_fine_search_over_delays() -> None:
     own = gains().to(torch.complex128)
     match = (own.conj() @ turned.T).real.abs().amax(1) / own.norm(dim=1) / recorded.norm()
     torch.testing.assert_close(cosine_distance(gains(), recorded, FREQUENCY), 1.0 - match, atol=0.01, rtol=0.0)
-
-
-@pytest.mark.parametrize(("hertz", "missed"), [(2000.0, 0.005), (20_000.0, 0.05)])
-def test_a_delay_between_two_that_are_tried_costs_no_more_than_stated(hertz: float, missed: float) -> None:
-    frequency, own = torch.full((1,), hertz, dtype=torch.float64), torch.ones(1, 1, dtype=torch.complex64)
-    delays = delays_of(torch.ones(1, dtype=torch.float64), frequency, step=DELAY_STEP)
-    assert (len(delays) == MOST_DELAYS) == (hertz > 6400.0)
-    assert abs(float(delays[len(delays) // 2])) < 1e-15
-    between = float(delays[:2].mean())
-    recorded = torch.polar(torch.ones(1, dtype=torch.float64), 2.0 * math.pi * between * frequency)
-    # Half a step away from every delay, as half a period is a whole number of steps: the largest distance there is.
-    assert 0.5 * missed < float(cosine_distance(own, recorded, frequency)) < missed
 
 
 def test_nothing_is_at_the_greatest_distance() -> None:

@@ -10,14 +10,12 @@ from avmsf.errors import LocationError
 from avmsf.field.gain_field import Gains
 from avmsf.field.sound_field import Origin
 from avmsf.localization.likelihood import Force
-from avmsf.localization.locate import MIN_EXPLAINED, REJECT_ABOVE, WARN_ABOVE, assess_match, locate
+from avmsf.localization.locate import MIN_EXPLAINED, REJECT_ABOVE, assess_match, locate
 from avmsf.localization.locator import Locator
 from avmsf.localization.prediction import distinct_contacts
-from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.synthesis import synthesize_phased
 from factories.believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
 from factories.located_plate import (
-    DIAGONAL,
     PLATE,
     RATE,
     TrueGains,
@@ -64,20 +62,6 @@ def test_force_polarity_and_onset_do_not_matter():
     assert missed(late, late.most_probable, impacts.contacts[0]) < 0.02
     assert late.explained_energy > 0.9
     assert float(late.distance.min()) < 0.1
-
-
-def test_distance_is_one_minus_the_cosine_of_gains():
-    field, impacts = fitted_field(25), struck(1, seed=9, noise_db=-60.0)
-    found = Locator.of(field, use_residual=False).locate(impacts.sounds[0])
-    sine, cosine = fit_gains(impacts.sounds, bank(), sample_rate=RATE)
-    heard = torch.cat([sine, cosine], 1)[0].double()
-    known = field.gain_field.at(found.points)
-    own = torch.cat([known.mean, known.quadrature], 1).double()
-    undelayed = 1 - (own @ heard).abs() / own.norm(dim=1) / heard.norm()
-    # The delay that each point is free to choose hardly matters to the nearest ones.
-    assert bool((found.distance <= undelayed + 1e-4).all())
-    near = undelayed < 1.1 * undelayed.min()
-    torch.testing.assert_close(found.distance[near], undelayed[near], atol=0.02, rtol=0)
 
 
 def test_phase_and_quadrature_are_what_the_field_renders():
@@ -184,17 +168,6 @@ def test_modes_beneath_noise_count_for_little():
     assert bool((errors[0] < 0.8 * errors[1]).all()), errors
 
 
-@pytest.mark.parametrize("samples", [1, 3])
-def test_a_delayed_recording_has_the_same_least_distance(samples):
-    """The last samples are left out of the undelayed one as well."""
-    impacts, locator = struck(8, seed=6), locator_of()
-    for sound in impacts.sounds:
-        early, late = locator.locate(sound[:-samples]), locator.locate(sound[samples:])
-        apart = float((early.points[early.best] - late.points[late.best]).norm()) / DIAGONAL
-        assert apart < 0.02
-        assert float(late.distance.min()) == pytest.approx(float(early.distance.min()), abs=0.02)
-
-
 def test_short_sounds_suffice_although_modes_cannot_be_told_apart():
     impacts, locator = struck(15, seed=8), locator_of()
     for sound, contact in zip(impacts.sounds, impacts.contacts, strict=True):
@@ -226,15 +199,6 @@ def test_another_plate_is_refused_with_the_number(length):
                 getattr(found, name)
         assert bool(found.probability.isnan().all())
         assert bool(found.distance.isfinite().all())
-
-
-@pytest.mark.parametrize("noise_db", [-40.0, 0.0])
-def test_its_own_sounds_are_not_taken_for_another_plates(noise_db):
-    # Noise, were it as loud as the sound, counts neither for the modes nor against them.
-    for sound in struck(8, seed=6, noise_db=noise_db).sounds:
-        found = locator_of().locate(sound)
-        assert found.mismatch_ratio < WARN_ABOVE
-        assert found.modal_energy > 0.85
 
 
 def test_what_falls_between_is_doubted_in_words():

@@ -8,7 +8,7 @@ import torch
 from avmsf.capture.audio import Recording
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
-from avmsf.localization.locate import detect_onsets, locate_impacts, predict_ringing
+from avmsf.localization.locate import detect_onsets, locate_impacts
 from avmsf.localization.locator import Locator
 from factories.located_plate import PLATE, RATE, locator_of, missed, struck, true_field
 from factories.raising import raises
@@ -39,15 +39,6 @@ def test_every_impact_is_found_where_and_when_it_fell(strengths, locator):
     for (_, each), contact in zip(found, contacts, strict=True):
         assert missed(each, each.most_probable, contact) < 0.05
         assert each.explained_energy > 0.85
-
-
-def test_what_rings_on_is_carried_over_a_impact():
-    sound, _ = overlapping([0.05, 0.2], [1.0, 1.0], seed=32)
-    alone, _ = overlapping([0.05, 0.2], [1.0, 0.0], seed=32)
-    start = round(0.2 * RATE)
-    carried = predict_ringing(true_field(), sound, round(0.05 * RATE), start, 3000, highest=None)
-    true = alone[start : start + 3000].double()
-    assert float((carried - true).norm() / true.norm()) < 0.1
 
 
 def test_one_impact_is_one(locator):

@@ -80,18 +80,6 @@ def test_how_hard_a_blow_was_is_x_its_push_was_recorded():
     assert (soft.newtons, hard.newtons) == (pytest.approx(0.02, rel=0.05), pytest.approx(0.4, rel=0.05))
 
 
-def test_a_force_that_the_force_channel_contradicts_is_noted(locator):
-    sound = recorded(struck(1, seed=25).sounds[0]).channels[0]
-    push = np.zeros_like(sound)
-    push[1796:1805] = 8.0 * np.sin(np.pi * np.arange(1, 10) / 10)
-    both = Recording("hit.wav", np.stack([push, sound]), RATE, "FLOAT")
-    field = replace(true_field(), origin=replace(true_field().origin, per_newton=True))
-    settings, finder = CaptureSettings(force_channel=1, response_channel=2), replace(locator, field=field)
-    for force, noted in ((8.0, False), (12.0, True)):
-        notes = locate(field, both, settings=settings, force=force, locator=finder).notes
-        assert any("force channel" in note for note in notes) == noted
-
-
 def test_a_rate_that_holds_no_mode_is_refused():
     sound = torch.from_numpy(recorded(struck(1, seed=1).sounds[0]).channels[0][::40].copy())
     with raises(LocationError, name="sample_rate", value=450.0):
@@ -112,19 +100,6 @@ def test_a_second_impact_is_noted_and_not_used(locator):
     found = locate(true_field(), recorded(both), locator=locator)
     assert [float(each) for each in re.findall(r"([\d.]+) s\b", found.notes[0])] == pytest.approx([0.1, 0.4], abs=0.01)
     assert missed(found, found.most_probable, impacts.contacts[0]) < 0.03
-
-
-@pytest.mark.parametrize(
-    ("samples", "name", "value"),
-    [
-        (torch.zeros(9000), "sound", "silence"),
-        (torch.full((9000,), torch.inf), "finite", 9000),
-        (torch.ones(100), "samples", 100),
-    ],
-)
-def test_samples_without_a_sound_are_refused(samples, name, value):
-    with raises(LocationError, name=name, value=value):
-        preprocess_recording(samples, true_field())
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,10 @@
 """Impacts in a stream: located at their times, whatever still sounds, and whatever blocks the stream comes in."""
 
-import math
 from dataclasses import replace
 from functools import cache
 
-import numpy as np
 import pytest
 import torch
-from scipy.signal import sosfreqz
 from torch import Tensor
 
 from avmsf.editing.modal_edit import adjust_modes
@@ -70,10 +67,6 @@ def test_every_blow_is_found_while_earlier_ones_ring() -> None:
     # What rings of earlier blows is a tenth and more of a faint one's energy: left in it, less would be explained.
     assert min(blow.map.explained_energy for blow in blows) > 0.98
     assert {blow.final for blow in blows} == {True}
-
-
-def test_forces_come_out_with_their_signs() -> None:
-    blows = heard(StreamingLocalizer(locator()), stream())
     assert [blow.map.force for blow in blows] == pytest.approx(FORCES, rel=0.05)
 
 
@@ -128,14 +121,6 @@ def test_an_offset_and_rumble_are_not_heard() -> None:
     # The filter starts with the stream, and its own start is a jump; it is over before the first blow.
     found = [spot(blow) for blow in blows if blow.seconds > 0.1]
     assert found == list(STRUCK)
-
-
-def test_the_rumble_filter_hardly_changes_the_lowest_mode() -> None:
-    listener = StreamingLocalizer(locator())
-    _, response = sosfreqz(listener.filter, worN=BANK.frequency.min().item(), fs=RATE)
-    # A second-order Butterworth filter at frequency f turns by sqrt(2) c / f and loses (c / f)^4 / 2, c its cut-off.
-    assert np.angle(response) == pytest.approx(math.sqrt(2) * 0.05, rel=0.01)
-    assert 1 - abs(response) == pytest.approx(0.05**4 / 2, rel=0.05)
 
 
 def test_noise_alone_is_no_blow() -> None:

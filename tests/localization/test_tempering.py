@@ -1,23 +1,19 @@
 """How far a field's modes are independent evidence: by how well its own impacts, left out, are found."""
 
-import math
 from dataclasses import replace
 
 import pytest
 import torch
 
-from avmsf.field.gains.family import Sites
-from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
-from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.scaled_gains import ScaledGains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.localization.locator import Locator
 from avmsf.localization.prediction import calibrate_tempering
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
-from oracles.plate import Plate, plate_modes, plate_surface_points, sample_contacts
+from factories.located_plate import PLATE, mixture_of
+from oracles.plate import plate_modes, plate_surface_points, sample_contacts
 
-PLATE = Plate()
 HIGHEST = 2500.0
 
 
@@ -30,11 +26,8 @@ def plate_field(taps: int, *, copies: int = 1, again: int = 1) -> SoundField:
     modes = plate_modes(PLATE, contacts, highest=HIGHEST)
     higher = torch.linspace(1.0, 1.5, copies, dtype=torch.float64).repeat_interleave(len(modes.frequency))
     bank = ModalBank(modes.frequency.repeat(copies) * higher, modes.damping.repeat(copies))
-    sites = Sites(contacts, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(contacts))
-    families = [each(sites, math.hypot(PLATE.length, PLATE.width)) for each in (Unstructured, Smooth, ThinPlate)]
     values = torch.complex(modes.gains, torch.zeros_like(modes.gains)).repeat(1, copies)
-    measured = MeasuredGains(values, torch.zeros_like(bank.damping), bank.frequency, bank.damping)
-    gains = fit_mixture(families, measured, plate_surface_points(PLATE, 600).float(), directional=False)
+    gains = mixture_of(contacts, values, bank, plate_surface_points(PLATE, 600))
     zero = torch.zeros(len(bank), dtype=torch.float64)
     return SoundField(bank, gains, zero, Residual(torch.full((9,), 1e-3)), 8000.0, 4000, Origin("plate"))
 
