@@ -17,33 +17,29 @@ def masked_views(views: Sequence[View]) -> list[View]:
     known = [view for view in views if view.mask is not None]
     empty = [view.name for view in known if view.mask is not None and not bool((view.mask > 127).any())]
     if known and len(empty) == len(known):
-        raise SceneError(
-            f"expected the object in the masks, got only background in all {len(known)}; check that white is the "
-            "object, or remove the masks so that the foreground is found",
-            name="masks",
-            value=empty,
-        )
+        wanted, got = "the object in the masks", f"only background in all {len(known)}"
+        advice = "check that white is the object, or remove the masks so that the foreground is found"
+        raise SceneError.expected(wanted, empty, got=got, name="masks", advice=advice)
     if empty:
         message = f"views whose masks are empty are not used: {', '.join(empty)}"
         warnings.warn(CaptureWarning(message, name="masks", value=empty), stacklevel=3)
     kept = [view for view in known if view.name not in empty]
     if len(kept) < 3:
-        raise SceneError(
-            f"expected 3 or more views with a mask, got {len(kept)} of {len(views)}; give masks, images with alpha or "
-            "a plain background, or initial points",
-            name="views",
-            value=len(kept),
-        )
+        wanted, got = "3 or more views with a mask", f"{len(kept)} of {len(views)}"
+        advice = "give masks, images with alpha or a plain background, or initial points"
+        raise SceneError.expected(wanted, len(kept), got=got, name="views", advice=advice)
     return kept
 
 
 def no_common_point(views: int) -> SceneError:
     """Return the error of masks of this many views that no point of the object frame lies in."""
-    return SceneError(
-        f"expected masks with a common volume, got none from {views} views; check that cameras and masks belong "
-        "together and that the poses have the convention of their file (shifted or small masks miss thin objects)",
+    return SceneError.expected(
+        "masks with a common volume",
+        views,
+        got=f"none from {views} views",
         name="masks",
-        value=views,
+        advice="check that cameras and masks belong together and that the poses have the convention of their file "
+        "(shifted or small masks miss thin objects)",
     )
 
 

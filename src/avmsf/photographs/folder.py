@@ -19,7 +19,7 @@ from avmsf._utils.files import new_folder
 from avmsf._utils.text import counted, listed
 from avmsf.errors import CaptureError, Remark
 from avmsf.mesh.io import load_parts
-from avmsf.photographs.cameras import Camera, View
+from avmsf.photographs.cameras import Camera, View, nearest_to_lines
 from avmsf.photographs.colmap import PLACES, find_model, read_colmap, read_points
 from avmsf.photographs.nerf_json import load_record, read_transforms
 from avmsf.photographs.shots import Shot, Shots, read_view, summarize, without_camera
@@ -124,7 +124,7 @@ def check_cameras(cameras: Sequence[Camera]) -> list[Remark]:
         position = np.round(positions[0], 6).tolist()
         message = f"expected cameras at several positions, got all {len(cameras)} at {position}; check the camera file"
         return [Remark(message, name="positions", value=position)]
-    center = _common_point(positions, axes)
+    center = nearest_to_lines(positions, axes)
     if center is None:
         return []
     behind = int((np.einsum("ij,ij->i", axes, center - positions) < 0).sum())
@@ -136,17 +136,6 @@ def check_cameras(cameras: Sequence[Camera]) -> list[Remark]:
         "round, or the poses are inverted"
     )
     return [Remark(message, name="axes", value=behind)]
-
-
-def _common_point(
-    positions: Float[np.ndarray, "cameras 3"], axes: Float[np.ndarray, "cameras 3"]
-) -> Float[np.ndarray, " 3"] | None:
-    """Return the point nearest to all lines of sight by least squares; None where these are parallel."""
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    total = across.sum(axis=0)
-    if np.linalg.eigvalsh(total)[0] < 1e-4 * len(axes):
-        return None
-    return np.linalg.solve(total, np.einsum("ijk,ik->j", across, positions))
 
 
 def read_sparse_points(

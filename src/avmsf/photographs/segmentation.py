@@ -12,10 +12,11 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
+from scipy import ndimage
 
 from avmsf._utils.text import counted, listed
 from avmsf.errors import CaptureError, CaptureWarning
-from avmsf.photographs.cameras import Camera, View
+from avmsf.photographs.cameras import Camera, View, nearest_to_lines
 
 MIN_VIEWS = 3
 # Parts of a first mask smaller than this against its largest are taken for spots in the background.
@@ -61,7 +62,9 @@ def find_foreground(views: Sequence[View]) -> tuple[View, ...]:
     bare = [index for index, view in enumerate(views) if view.mask is None]
     if not bare:
         return tuple(views)
-    distances = dict(zip(bare, _background_distances([views[index] for index in bare]), strict=True))
+    # All images' common color stands in where an object covers a whole border.
+    common = np.median(np.concatenate([_border(views[index].image.numpy()) for index in bare]), axis=0)
+    distances = {index: _background_distance(views[index].image.numpy(), common) for index in bare}
     cut = _background_threshold(list(distances.values()))
     different = [distances[index] > min(cut, MAX_BACKGROUND_DIFFERENCE) for index in bare]
     _check_plain(different, [views[index].name for index in bare])
@@ -69,7 +72,7 @@ def find_foreground(views: Sequence[View]) -> tuple[View, ...]:
         _large_parts(distances[index] > cut) if view.mask is None else view.mask.numpy() > 127
         for index, view in enumerate(views)
     ]
-    _refuse_few([view.name for view, mask in zip(views, masks, strict=True) if mask.any()], len(views))
+    _refuse_few(masks)
     cameras = [view.camera for view in views]
     for _ in range(ROUNDS):
         outlines = _outlines(masks, cameras)
@@ -84,7 +87,16 @@ def find_foreground(views: Sequence[View]) -> tuple[View, ...]:
             masks[index] = _agreed(distances[index], cut, outlines[index])
     for index in bare:
         masks[index] = _trimmed(masks[index], distances[index])
-    return _masked(views, masks)
+    _refuse_few(masks)
+    empty = [view.name for view, mask in zip(views, masks, strict=True) if view.mask is None and not mask.any()]
+    if empty:
+        message = f"{counted(len(empty), 'view')} not used, without an object: {listed(empty)}"
+        warnings.warn(CaptureWarning(message, name="object", value=empty), stacklevel=2)
+    return tuple(
+        view if view.mask is not None else replace(view, mask=torch.from_numpy(mask.astype(np.uint8) * np.uint8(255)))
+        for view, mask in zip(views, masks, strict=True)
+        if view.name not in empty
+    )
 
 
 def _large_parts(mask: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
@@ -134,7 +146,7 @@ def _agreed(
     mask = (distance > 2 * cut) & outline.possible
     mask |= (distance > cut) & outline.near
     mask |= (distance > cut / 2) & outline.likely
-    holes = _enclosed(mask)
+    holes = ndimage.binary_fill_holes(mask) & ~mask
     count, labels = cv2.connectedComponents(holes.astype(np.uint8), connectivity=4)
     if count > 1:
         total = np.bincount(labels.ravel(), minlength=count)
@@ -160,14 +172,6 @@ def _grown(mask: Bool[np.ndarray, "height width"], pixels: float) -> Bool[np.nda
     return cv2.dilate(mask.astype(np.uint8), _disc(max(1, round(pixels)))) > 0
 
 
-def _enclosed(mask: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
-    """Return the pixels off the mask from which no way leads to the image's border."""
-    outside = np.zeros((mask.shape[0] + 2, mask.shape[1] + 2), dtype=np.uint8)
-    outside[1:-1, 1:-1] = mask
-    cv2.floodFill(outside, None, (0, 0), 2)
-    return outside[1:-1, 1:-1] == 0
-
-
 def _disc(radius: int) -> np.ndarray:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
 
@@ -177,48 +181,21 @@ def _check_plain(different: Sequence[Bool[np.ndarray, "height width"]], names: S
     borders = [np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]) for mask in different]
     share = float(np.concatenate(borders).mean())
     if share > MAX_BORDER_DIFFERENCE:
-        raise CaptureError(
-            f"expected a plain background, got {share:.0%} of the images' borders in other colors ({listed(names)}); "
-            "give masks, or photograph the object in front of one color with a margin around it",
+        raise CaptureError.expected(
+            "a plain background",
+            share,
+            got=f"{share:.0%} of the images' borders in other colors ({listed(names)})",
             name="background",
-            value=share,
+            advice="give masks, or photograph the object in front of one color with a margin around it",
         )
 
 
-def _refuse_few(found: Sequence[str], count: int) -> None:
-    if len(found) < MIN_VIEWS:
-        raise CaptureError(
-            f"expected an object in front of a plain background in at least {MIN_VIEWS} views, got {len(found)} of "
-            f"{count}; give masks",
-            name="object",
-            value=len(found),
-        )
-
-
-def _masked(views: Sequence[View], masks: Sequence[np.ndarray]) -> tuple[View, ...]:
-    found, empty = [], []
-    for view, mask in zip(views, masks, strict=True):
-        if view.mask is not None:
-            found.append(view)
-        elif mask.any():
-            found.append(replace(view, mask=torch.from_numpy(mask.astype(np.uint8) * np.uint8(255))))
-        else:
-            empty.append(view.name)
-    _refuse_few([view.name for view in found], len(views))
-    if empty:
-        message = f"{counted(len(empty), 'view')} not used, without an object: {listed(empty)}"
-        warnings.warn(CaptureWarning(message, name="object", value=empty), stacklevel=3)
-    return tuple(found)
-
-
-def _background_distances(views: Sequence[View]) -> list[UInt8[np.ndarray, "height width"]]:
-    """Return for each pixel how far its color is from the background's: the largest channel's difference, of 255.
-
-    Each image's background is a quadratic in the pixel's place, fitted to its border and to that of all images: so
-    that light falling off to the corners is no object, and an object that covers a whole border no background.
-    """
-    common = np.median(np.concatenate([_border(view.image.numpy()) for view in views]), axis=0)
-    return [_distance(view.image.numpy(), common) for view in views]
+def _refuse_few(masks: Sequence[Bool[np.ndarray, "height width"]]) -> None:
+    found = sum(bool(mask.any()) for mask in masks)
+    if found < MIN_VIEWS:
+        wanted = f"an object in front of a plain background in at least {MIN_VIEWS} views"
+        got = f"{found} of {len(masks)}"
+        raise CaptureError.expected(wanted, found, got=got, name="object", advice="give masks")
 
 
 def _background_threshold(distances: Sequence[UInt8[np.ndarray, "height width"]]) -> int:
@@ -244,7 +221,13 @@ def _border(image: np.ndarray) -> np.ndarray:
     return np.concatenate([strip.reshape(-1, image.shape[2]) for strip in strips])
 
 
-def _distance(image: np.ndarray, common: Float[np.ndarray, " 3"]) -> UInt8[np.ndarray, "height width"]:
+def _background_distance(image: np.ndarray, common: Float[np.ndarray, " 3"]) -> UInt8[np.ndarray, "height width"]:
+    """Return for each pixel how far its color is from the background's: the largest channel's difference, of 255.
+
+    The background is a quadratic in the pixel's place, fitted to the image's border as far as that has about the color
+    `common` to all images: so that light falling off to the corners is no object, and an object that covers a whole
+    border no background.
+    """
     terms = _terms(*image.shape[:2])
     at, colors = _border(terms), _border(image).astype(np.float64)
     background = np.broadcast_to(common, image.shape)
@@ -295,13 +278,13 @@ def carve(masks: Sequence[Bool[np.ndarray, "height width"]], cameras: Sequence[C
     bounds = _bounds(masks, cameras)
     if bounds is None:
         return None
-    coarse = _vote(*_cubes(*bounds, COARSE_CELLS), masks, cameras)
+    coarse = _vote(*bounds, COARSE_CELLS, masks, cameras)
     inside = coarse.occupied(missing=len(masks) // 6)
     if not inside.any():
         return None
     low = coarse.centers[inside].min(axis=0) - 1.5 * coarse.edge
     high = coarse.centers[inside].max(axis=0) + 1.5 * coarse.edge
-    return _vote(*_cubes(low, high, FINE_CELLS), masks, cameras)
+    return _vote(low, high, FINE_CELLS, masks, cameras)
 
 
 def silhouette(
@@ -346,32 +329,27 @@ def _bounds(
         angles.append(float(np.hypot(across - across.mean(), down - down.mean()).max()))
     if len(directions) < 2:
         return None
-    lines, places = np.array(directions), np.array(positions)
-    across = np.eye(3) - lines[:, :, None] * lines[:, None, :]
-    if np.linalg.eigvalsh(across.sum(axis=0))[0] < 1e-6 * len(lines):
+    places = np.array(positions)
+    center = nearest_to_lines(places, np.array(directions))
+    if center is None:
         return None
-    center = np.linalg.solve(across.sum(axis=0), np.einsum("ijk,ik->j", across, places))
     # The median, for a mask that leaked into the background is far too large.
     radius = 1.25 * float(np.median(np.array(angles) * np.linalg.norm(places - center, axis=1)))
     return center - radius, center + radius
 
 
-def _cubes(
-    low: Float[np.ndarray, " 3"], high: Float[np.ndarray, " 3"], count: int
-) -> tuple[Float[np.ndarray, "places 3"], float]:
-    """Return the centers of about `count` cubes that fill a box, and their edge."""
-    edge = float(np.prod(high - low) / count) ** (1 / 3)
-    steps = np.maximum(1, np.ceil((high - low) / edge)).astype(int)
-    axes = [low[axis] + (np.arange(steps[axis]) + 0.5) * edge for axis in range(3)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3), edge
-
-
 def _vote(
-    centers: Float[np.ndarray, "places 3"],
-    edge: float,
+    low: Float[np.ndarray, " 3"],
+    high: Float[np.ndarray, " 3"],
+    count: int,
     masks: Sequence[Bool[np.ndarray, "height width"]],
     cameras: Sequence[Camera],
 ) -> Hull:
+    """Return the votes on about `count` cubes that fill a box."""
+    edge = float(np.prod(high - low) / count) ** (1 / 3)
+    steps = np.maximum(1, np.ceil((high - low) / edge)).astype(int)
+    axes = [low[axis] + (np.arange(steps[axis]) + 0.5) * edge for axis in range(3)]
+    centers = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     seeing, agreeing = np.zeros(len(centers), dtype=np.int64), np.zeros(len(centers), dtype=np.int64)
     for mask, camera in zip(masks, cameras, strict=True):
         across, down, depth = _pixels(centers, camera)
