@@ -38,6 +38,7 @@ ODDS = 3.0
 MOST_CONTACTS = 200
 """As many, and as many points as `MOST_POINTS`, are compared, evenly taken from all, in search for the similarity."""
 UNITS = {1e-3: "mm", 1e-2: "cm", 0.0254: "inches", 0.3048: "feet"}
+_IDENTITY = torch.eye(3, dtype=torch.float64)
 FACTORS = (1.0, *(power for size in (1000.0, 100.0, 10.0, 25.4, 0.0254, 0.3048) for power in (size, 1 / size)))
 
 
@@ -60,14 +61,14 @@ class Mistake:
         return self.factor * contacts.double() @ self.axes.T + self.shift
 
     @property
-    def unit_only(self) -> bool:
-        """Whether the unit alone is wrong."""
-        return bool(torch.equal(self.axes, torch.eye(3, dtype=torch.float64)) and not self.shift.any())
-
-    @property
     def turned(self) -> bool:
         """Whether the axes are others, or mirrored."""
-        return not torch.equal(self.axes, torch.eye(3, dtype=torch.float64))
+        return not torch.equal(self.axes, _IDENTITY)
+
+    @property
+    def unit_only(self) -> bool:
+        """Whether the unit alone is wrong."""
+        return not self.turned and not bool(self.shift.any())
 
     @property
     def unit(self) -> str | None:
@@ -79,24 +80,21 @@ class Mistake:
         within = f"they lie within {_length(self.distance)} of it"
         if self.stated:
             return f"{within} once moved as {self.stated} says that the object was: give both in one frame"
-        steps, questions = [], []
+        steps, questions, unit, moved = [], [], self.unit, bool(self.shift.any())
         if self.factor != 1:
             ratio = self.factor if self.factor > 1 else 1 / self.factor
             steps.append(f"{'multiplied' if self.factor > 1 else 'divided'} by {ratio:.4g}")
             whose = "their unit" if self.factor < 1 else "the surface's unit"
-            questions.append(f"is {whose} {self.unit}?" if self.unit else "are they and the surface of one scale?")
+            questions.append(f"is {whose} {unit}?" if unit else "are they and the surface of one scale?")
         if self.turned:
             steps.append(f"with (x, y, z) taken as {_written(self.axes)}")
-            mirrored = float(torch.linalg.det(self.axes)) < 0
-            upright = float(self.axes[2, 2]) < -0.9
-            questions.append(
-                "are the axes mirrored?" if mirrored else "upside down?" if upright else "does another axis point up?"
-            )
-        if self.shift.any():
+            upright = "upside down?" if float(self.axes[2, 2]) < -0.9 else "does another axis point up?"
+            questions.append("are the axes mirrored?" if float(torch.linalg.det(self.axes)) < 0 else upright)
+        if moved:
             steps.append(f"moved by ({', '.join(f'{value:.3g}' for value in self.shift.tolist())}) m")
             questions.append("do the origins differ?")
         undone = ", ".join(steps) + "," * (len(steps) > 1)
-        if self.factor != 1 and self.unit is None and self.shift.any():
+        if self.factor != 1 and unit is None and moved:
             questions = ["are they in another frame?"]
         return f"{undone} {within}: {' '.join(questions)}"
 
@@ -193,17 +191,13 @@ def check_placement(
     what is fitted from eight. Raises CaptureError where there are no contacts, or points without an extent.
     """
     places, cloud = contacts.double().numpy(), points.double().numpy()
-    if not len(places) or not len(cloud) or not (np.isfinite(places).all() and np.isfinite(cloud).all()):
-        name = "contacts" if not len(places) or not np.isfinite(places).all() else "points"
-        count = len(places) if name == "contacts" else len(cloud)
-        raise CaptureError(f"expected {name} with finite coordinates, got {count}", name=name, value=count)
+    for name, values in (("contacts", places), ("points", cloud)):
+        if not len(values) or not np.isfinite(values).all():
+            raise CaptureError.expected(f"{name} with finite coordinates", len(values), name=name)
     diagonal = _diagonal(cloud)
     if not diagonal > 0:
-        raise CaptureError(
-            f"expected points of an object with an extent, got {len(cloud)} at one position",
-            name="points",
-            value=diagonal,
-        )
+        got = f"{len(cloud)} at one position"
+        raise CaptureError.expected("points of an object with an extent", diagonal, got=got, name="points")
     tree = cKDTree(cloud)
     some = _some(cloud, MOST_POINTS)
     # Between points that lie far apart, a contact on the surface is far from all of them.
@@ -230,14 +224,11 @@ def expect_placed(
     placement = check_placement(contacts, points)
     if not placement.misplaced:
         return
-    if placement.mistake is None:
-        advice = "; bring both into one frame, or use a gain model without elastic mode shapes"
-    elif placement.mistake.unit_only and placement.other_unit:
-        advice = " State both units, as unit and surface_unit in capture.toml do, or give both in meters"
-    else:
-        advice = " Bring both into one frame, or use a gain model without elastic mode shapes"
+    advice = "Bring both into one frame, or use a gain model without elastic mode shapes"
+    if placement.mistake is not None and placement.mistake.unit_only and placement.other_unit:
+        advice = "State both units, as unit and surface_unit in capture.toml do, or give both in meters"
     raise FitError(
-        f"expected contacts on the surface for elastic mode shapes, but {placement.describe(names)}{advice}",
+        f"expected contacts on the surface for elastic mode shapes, but {placement.describe(names)}. {advice}",
         name="contacts",
         value=float(placement.distances.max()),
     )
@@ -268,8 +259,7 @@ class _Search:
         What is `stated` goes first where it leaves most contacts near: what is fitted to few contacts and coarse points
         describes these better by chance.
         """
-        identity = Mistake(1.0, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
-        present, least = self._nats(identity), len(self.contacts) * (math.log(self.floor) + 0.5)
+        present, least = self._nats(_UNCHANGED), len(self.contacts) * (math.log(self.floor) + 0.5)
         if present - least < 1:
             return None
         for each in stated:
@@ -280,10 +270,8 @@ class _Search:
         if len(self.contacts) >= 8:
             found += self._fitted()
         for nats, each in sorted(found, key=lambda pair: pair[0]):
-            far, spread = (
-                float(np.quantile(self._distances(each), 0.9)),
-                each.factor * self.placement.spread or math.inf,
-            )
+            far = float(np.quantile(self._distances(each), 0.9))
+            spread = each.factor * self.placement.spread or math.inf
             # Beside the size that the contacts have by then: what is shrunk comes nearer to anything.
             if nats < present and far <= min(max(self.floor, 0.5 * self.placement.tolerance), TOLERANCE * spread):
                 return replace(each, distance=far)
@@ -313,14 +301,12 @@ class _Search:
         for factor in FACTORS:
             if spread and factor != 1 and not LEAST_SPREAD * diagonal <= factor * spread <= 1.2 * diagonal:
                 continue
+            unit = 0.0 if factor == 1 else math.log(len(FACTORS))
+            # Nothing in meters takes two mistakes.
+            if factor != 1 and not any(math.isclose(min(factor, 1 / factor), each) for each in UNITS):
+                unit *= 2
             for code, axes in _ways() if turning else _ways()[:1]:
-                unit = 0.0 if factor == 1 else math.log(len(FACTORS))
-                # Nothing in meters takes two mistakes.
-                both = factor != 1 and not any(math.isclose(min(factor, 1 / factor), each) for each in UNITS)
-                yield (
-                    unit + both * math.log(len(FACTORS)) + code,
-                    Mistake(factor, axes, torch.zeros(3, dtype=torch.float64)),
-                )
+                yield unit + code, replace(_UNCHANGED, factor=factor, axes=axes)
 
     def _fitted(self) -> list[tuple[float, Mistake]]:
         """Return what iterated closest points make of the likeliest, with a shift, a scale, and a turn."""
@@ -359,19 +345,20 @@ class _Search:
         return found
 
 
+_UNCHANGED = Mistake(1.0, _IDENTITY, torch.zeros(3, dtype=torch.float64))
+
+
 def _ways() -> list[tuple[float, Tensor]]:
     """Return the 48 signed permutations, with the nats of its rarity: none, y-up for z-up, turns, mirrors."""
     ways = []
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
-            axes = torch.diag(torch.tensor(signs, dtype=torch.float64)) @ torch.eye(3, dtype=torch.float64)[list(order)]
-            rarity = 24 if float(torch.linalg.det(axes)) > 0 else 48
+            axes = torch.diag(torch.tensor(signs, dtype=torch.float64)) @ _IDENTITY[list(order)]
+            rarity = 48 if float(torch.linalg.det(axes)) < 0 else 6 if order == (0, 1, 2) else 24
             if (order, signs) == ((0, 1, 2), (1, 1, 1)):
                 rarity = 1
             elif (order, signs) in (((0, 2, 1), (1, -1, 1)), ((0, 2, 1), (1, 1, -1))):
                 rarity = 4
-            elif rarity == 24 and order == (0, 1, 2):
-                rarity = 6
             ways.append((math.log(rarity), axes))
     return sorted(ways, key=lambda way: way[0])
 
