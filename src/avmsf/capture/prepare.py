@@ -140,11 +140,7 @@ def refuse_short(kept: Float64[np.ndarray, " samples"], recording: Recording) ->
 
 
 def deconvolve(
-    sound: Float64[np.ndarray, " frames"],
-    force: Float64[np.ndarray, " frames"],
-    *,
-    pulse: Pulse,
-    regularization: float,
+    sound: Float64[np.ndarray, " frames"], force: Float64[np.ndarray, " frames"], *, pulse: Pulse, regularization: float
 ) -> tuple[Float64[np.ndarray, " lead"], Float64[np.ndarray, " samples"]]:
     """Return the response to a force of one sample's length and of the recorded pulse's height, before and from it on.
 

@@ -28,14 +28,7 @@ from avmsf.capture.table import (
     refuse_missing,
     refuse_repeated_files,
 )
-from avmsf.capture.together import (
-    check_contacts,
-    check_levels,
-    check_surface,
-    common_length,
-    common_rate,
-    find_surface,
-)
+from avmsf.capture.together import check_contacts, check_levels, check_surface, common_length, common_rate, find_surface
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.mesh.surface import Surface, contacted_part
 

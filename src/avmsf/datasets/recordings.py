@@ -77,10 +77,7 @@ def build_capture(
         refuse_few(len(kept), origin=origin, reasons=remarks)
         names, contacts, parts = zip(*kept, strict=True)
         impacts, warned = build_impacts(
-            parts,
-            torch.from_numpy(np.stack(contacts).astype(np.float64)),
-            names=names,
-            settings=settings,
+            parts, torch.from_numpy(np.stack(contacts).astype(np.float64)), names=names, settings=settings
         )
     except CaptureError as error:
         raise DatasetError(f"{origin}: {error}", **error.attributes) from error

@@ -30,11 +30,7 @@ _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def read_views(
-    folder: str | Path,
-    *,
-    longest: int | None = None,
-    max_views: int | None = None,
-    meters: float = 1.0,
+    folder: str | Path, *, longest: int | None = None, max_views: int | None = None, meters: float = 1.0
 ) -> tuple[View, ...]:
     """Read a folder of photographs with cameras, sorted by name, as undistorted views.
 

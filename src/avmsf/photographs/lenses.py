@@ -126,12 +126,7 @@ def _covers(lens: Lens, zoom: float) -> bool:
 
 
 def _sources(
-    lens: Lens,
-    pinhole: Lens,
-    size: tuple[int, int],
-    *,
-    steps: tuple[float, float] = (1.0, 1.0),
-    margin: int = 0,
+    lens: Lens, pinhole: Lens, size: tuple[int, int], *, steps: tuple[float, float] = (1.0, 1.0), margin: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return where in the lens's image the pinhole's pixels come from.
 

@@ -16,14 +16,7 @@ from avmsf.photographs.mesh_views import MeshTracer
 from avmsf.reconstruction.fairing import fair_hull
 from avmsf.reconstruction.mask_consistency import WRONG_FRACTION, consistent_masks, edge_offset
 from avmsf.reconstruction.object_shape import ObjectShape, ShapeReport, closed_surface
-from avmsf.reconstruction.visual_hull import (
-    Grid,
-    Outline,
-    SeenDepth,
-    depth_in_convex_hull,
-    fused_depth,
-    hull_distance,
-)
+from avmsf.reconstruction.visual_hull import Grid, Outline, SeenDepth, depth_in_convex_hull, fused_depth, hull_distance
 
 DepthMap = Callable[[Camera], Float[Tensor, "height width"]]
 """What gives the depth of the first surface that each pixel of a camera sees, meters along the axis; 0 where none."""
