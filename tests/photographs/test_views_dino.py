@@ -9,7 +9,7 @@ import torch
 
 from avmsf.photographs import find_foreground, read_views
 from avmsf.photographs.cameras import View
-from avmsf.photographs.segmentation import carve
+from avmsf.photographs.hull import carve
 from factories.views_folder import quaternion
 
 LOW, HIGH = (-0.0419, 0.0011, -0.0378), (0.0309, 0.0882, 0.0355)
@@ -50,7 +50,7 @@ def test_what_is_bright_in_all_views_fills_the_bounding_box(dino: tuple[View, ..
     masks = [view.image.numpy().max(axis=2) > 40 for view in dino]
     hull = carve(masks, [view.camera for view in dino])
     assert hull is not None
-    inside = hull.centers[hull.occupied(missing=2)]
+    inside = hull.grid.places(np.argwhere(hull.occupied(missing=2)))
     # Millimetres: shadows cost some, a cube is 1 mm, and a pixel 0.4 mm.
     assert np.abs(inside.min(axis=0) - LOW).max() < 4e-3
     assert np.abs(inside.max(axis=0) - HIGH).max() < 4e-3

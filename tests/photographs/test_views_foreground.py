@@ -13,7 +13,7 @@ import trimesh
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.photographs import find_foreground
 from avmsf.photographs.cameras import Camera, View
-from avmsf.photographs.segmentation import carve
+from avmsf.photographs.hull import carve
 from factories.raising import raises, warns
 
 WIDTH, HEIGHT = 120, 90
@@ -208,10 +208,11 @@ def test_few_views_and_masks_without_background_are_refused() -> None:
 def test_the_hull_of_true_outlines_holds_the_ring_and_not_its_hole() -> None:
     hull = carve([seen(row)[0] for row in range(len(cameras()))], cameras())
     assert hull is not None
-    inside = hull.centers[hull.occupied(missing=0)]
-    assert np.abs(inside.max(axis=0)[:2] - (RING + TUBE)).max() < 2 * hull.edge
+    occupied, centers = hull.occupied(missing=0), hull.grid.places(np.indices(hull.grid.shape).transpose(1, 2, 3, 0))
+    inside = centers[occupied]
+    assert np.abs(inside.max(axis=0)[:2] - (RING + TUBE)).max() < 2 * hull.grid.spacing
     # The middle is seen through from above and below.
     assert np.hypot(inside[:, 0], inside[:, 1]).min() > (RING - TUBE) / 2
     # A pixel at half a meter's distance is 3 mm: places that deep in the tube are inside for certain.
-    deep = np.hypot(np.hypot(hull.centers[:, 0], hull.centers[:, 1]) - RING, hull.centers[:, 2]) < TUBE - 0.005
-    assert hull.occupied(missing=0)[deep].mean() > 0.99
+    deep = np.hypot(np.hypot(centers[..., 0], centers[..., 1]) - RING, centers[..., 2]) < TUBE - 0.005
+    assert occupied[deep].mean() > 0.99

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from avmsf.reconstruction.visual_hull import Grid, Outline, hull_distance
+from avmsf.photographs.hull import Grid
+from avmsf.reconstruction.visual_hull import Outline, hull_distance
 from factories.looked_at import ball, views_of
 
 RADIUS = 0.05

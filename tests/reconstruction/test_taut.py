@@ -3,8 +3,9 @@ import pytest
 import trimesh
 
 from avmsf.mesh.level_set import enclose
+from avmsf.photographs.hull import Grid
 from avmsf.reconstruction.fairing import fair_hull
-from avmsf.reconstruction.visual_hull import Grid, Outline, hull_distance
+from avmsf.reconstruction.visual_hull import Outline, hull_distance
 from factories.looked_at import ball, mesh_of, views_of
 
 

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import no_type_check
 
 import cv2
 import numpy as np
@@ -12,9 +11,8 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from torch import Tensor
 
-from avmsf._utils.compiled import compiled, lane_count, run_lanes
 from avmsf.photographs.cameras import View
-from avmsf.photographs.extent import masked_views, no_common_point, object_extent
+from avmsf.photographs.hull import Grid, count_votes, masked_views, no_common_point, object_extent, touches_edge
 
 _ROUGH = 48
 """Voxels along the longest side of the first carving, which finds where the object is."""
@@ -45,89 +43,54 @@ def visual_hull(views: Sequence[View], *, points: int, wrong_fraction: float = 0
     """
     masked = masked_views(views)
     middle, reach = object_extent(masked)
-    lowest, spacing = middle - reach, 2 * reach / _ROUGH
-    shape = (_ROUGH,) * 3
     # The rough box is a guess: where the object touches its edge, it grows.
     for _ in range(4):
-        solid = _carve(masked, lowest, spacing, shape, wrong_fraction)
-        if not solid.any() or not _touches_edge(solid):
+        spacing = 2 * reach / _ROUGH
+        grid = Grid(middle - reach + 0.5 * spacing, spacing, (_ROUGH,) * 3)
+        solid = _carve(masked, grid, wrong_fraction)
+        if not solid.any() or not touches_edge(solid):
             break
         reach *= 1.5
-        lowest, spacing = middle - reach, 2 * reach / _ROUGH
-    _expect_something(solid, masked)
     for _ in range(2):
+        if not solid.any():
+            raise no_common_point(len(masked))
         # The surface's voxels grow with the square of the fineness.
-        finer = spacing * math.sqrt(max(int(_surface(solid).sum()), 1) / points)
-        lowest, extent = _box(solid, lowest, spacing)
+        finer = grid.spacing * math.sqrt(max(int(_surface(solid).sum()), 1) / points)
+        # From the edge of a voxel beyond the solid ones on either side.
+        low, high = grid.box(solid)
+        low, extent = low - 1.5 * grid.spacing, high - low + 3 * grid.spacing
         spacing = max(finer, float(extent.max()) / _FINEST)
-        shape = (*(np.ceil(extent / spacing).astype(int) + 4).tolist(),)
-        lowest = lowest - 2 * spacing
-        solid = _carve(masked, lowest, spacing, shape, wrong_fraction)
-        _expect_something(solid, masked)
+        x, y, z = (np.ceil(extent / spacing).astype(int) + 4).tolist()
+        grid = Grid(low - 1.5 * spacing, spacing, (x, y, z))
+        solid = _carve(masked, grid, wrong_fraction)
+    if not solid.any():
+        raise no_common_point(len(masked))
     rows = np.argwhere(_surface(solid))
-    normals = _normals(solid, rows)
-    places = lowest + (rows + 0.5) * spacing
-    return Hull(torch.from_numpy(places).float(), torch.from_numpy(normals).float(), spacing)
+    normals = torch.from_numpy(_normals(solid, rows)).float()
+    return Hull(torch.from_numpy(grid.places(rows)).float(), normals, grid.spacing)
 
 
-def _carve(
-    views: Sequence[View], lowest: np.ndarray, spacing: float, shape: tuple[int, ...], wrong_fraction: float
-) -> np.ndarray:
+def _carve(views: Sequence[View], grid: Grid, wrong_fraction: float) -> Bool[np.ndarray, "x y z"]:
     """Return which voxels of a grid the views leave."""
-    seen, against = np.zeros(shape, dtype=np.uint16), np.zeros(shape, dtype=np.uint16)
-    middle = lowest + 0.5 * spacing * np.array(shape)
+    masks, middle = [], grid.places((np.array(grid.shape) - 1) / 2)
     for view in views:
         assert view.mask is not None
         pose, mask = view.camera.world_to_camera.numpy(), view.mask.numpy() > 127
         # A voxel is in the mask when some of it is: the mask grows by half a voxel, as far away as the middle is.
         depth = float(pose[2, :3] @ middle + pose[2, 3])
-        grown = 0.5 * spacing * view.camera.focal[0] / max(depth, 1e-9)
+        grown = 0.5 * grid.spacing * view.camera.focal[0] / max(depth, 1e-9)
         if grown >= 1.0:
             mask = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5) <= grown
-        projection = view.camera.intrinsics.numpy() @ pose[:3]
-        run_lanes(_vote, lane_count(), projection, mask, lowest + 0.5 * spacing, spacing, seen, against)
-    agreed = against <= wrong_fraction * seen
+        masks.append(mask)
+    seen, inside = count_votes(masks, [view.camera for view in views], grid)
+    agreed = seen - inside <= wrong_fraction * seen
     counts = seen[agreed & (seen > 0)]
     enough = 0.5 * float(np.quantile(counts, 0.9)) if len(counts) else 1.0
     return agreed & (seen >= max(1.0, enough))
 
 
-@compiled(error_model="numpy")
-@no_type_check
-def _vote(lane, lanes, projection, mask, first, spacing, seen, against):
-    """Count, for each voxel whose middle is in the image, that it was seen and whether the mask speaks against it."""
-    height, width = mask.shape
-    cells = seen.shape[0]
-    for i in range(lane * cells // lanes, (lane + 1) * cells // lanes):
-        x = first[0] + i * spacing
-        for j in range(seen.shape[1]):
-            y = first[1] + j * spacing
-            for k in range(seen.shape[2]):
-                z = first[2] + k * spacing
-                depth = projection[2, 0] * x + projection[2, 1] * y + projection[2, 2] * z + projection[2, 3]
-                if depth <= 0.0:
-                    continue
-                column = (projection[0, 0] * x + projection[0, 1] * y + projection[0, 2] * z + projection[0, 3]) / depth
-                row = (projection[1, 0] * x + projection[1, 1] * y + projection[1, 2] * z + projection[1, 3]) / depth
-                if 0.0 <= column < width and 0.0 <= row < height:
-                    seen[i, j, k] += 1
-                    if not mask[int(row), int(column)]:
-                        against[i, j, k] += 1
-
-
-def _touches_edge(solid: np.ndarray) -> bool:
-    return any(solid.take(end, axis=axis).any() for axis in range(3) for end in (0, -1))
-
-
 def _surface(solid: np.ndarray) -> Bool[np.ndarray, "x y z"]:
     return solid & ~ndimage.binary_erosion(solid)
-
-
-def _box(solid: np.ndarray, lowest: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest corner and the extent of the box around the solid voxels, and one more on each side."""
-    rows = np.argwhere(solid)
-    first, last = rows.min(0) - 1, rows.max(0) + 2
-    return lowest + first * spacing, (last - first) * spacing
 
 
 def _normals(solid: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -136,8 +99,3 @@ def _normals(solid: np.ndarray, rows: np.ndarray) -> np.ndarray:
     lengths = np.linalg.norm(slopes, axis=1, keepdims=True)
     # A voxel alone has no side that is out; any direction will do.
     return np.where(lengths > 1e-6, slopes / np.maximum(lengths, 1e-6), np.array([0.0, 0.0, 1.0]))
-
-
-def _expect_something(solid: np.ndarray, views: Sequence[View]) -> None:
-    if not solid.any():
-        raise no_common_point(len(views))

@@ -11,12 +11,13 @@ from functools import lru_cache
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from avmsf._utils.text import counted, listed
 from avmsf.errors import CaptureError, CaptureWarning
-from avmsf.photographs.cameras import Camera, View, nearest_to_lines
+from avmsf.photographs.cameras import Camera, View
+from avmsf.photographs.hull import carve, silhouette
 
 MIN_VIEWS = 3
 # Parts of a first mask smaller than this against its largest are taken for spots in the background.
@@ -36,10 +37,6 @@ BLUR_PIXELS = 2
 MIN_NOISE = 4.0
 # The share of an image's shorter side that counts as its border.
 BORDER = 0.02
-# Cubes of the hull on its first and its second grid.
-COARSE_CELLS, FINE_CELLS = 40**3, 80**3
-# Of the views that could see a place, so many at least must be there to say anything of it.
-MIN_SEEING = 1 / 3
 
 
 def find_foreground(views: Sequence[View]) -> tuple[View, ...]:
@@ -127,10 +124,11 @@ def _outlines(masks: Sequence[Bool[np.ndarray, "height width"]], cameras: Sequen
     # With few views a single one that sees the background weighs: each carves.
     few = hull.occupied(missing=max(int(MAX_MISSING_LIKELY * hull.views), 1) if hull.views >= 8 else 0)
     many = hull.occupied(missing=max(int(MAX_MISSING_POSSIBLE * hull.views), 1))
+    few, many = (hull.grid.places(np.argwhere(each)) for each in (few, many))
     outlines, explained = [], 0
     for mask, camera in zip(masks, cameras, strict=True):
-        likely, cube = silhouette(hull, few, camera)
-        possible, _ = silhouette(hull, many, camera)
+        likely, cube = silhouette(few, hull.grid.spacing, camera)
+        possible, _ = silhouette(many, hull.grid.spacing, camera)
         near, possible = _grown(likely, cube), _grown(possible, cube)
         explained += int((mask & possible).sum())
         outlines.append(_Outline(likely, possible, near))
@@ -249,124 +247,3 @@ def _terms(height: int, width: int) -> Float[np.ndarray, "height width terms"]:
     """Return 1, x, y, x², xy, y² at each pixel, x and y from -1 to 1."""
     y, x = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1).astype(np.float32)
-
-
-@dataclass(frozen=True, eq=False)
-class Hull:
-    """Cubes around an object with the votes of the views on each."""
-
-    centers: Float[np.ndarray, "places 3"]
-    """Object frame, meters."""
-    edge: float
-    """Of a cube, meters."""
-    seeing: Int[np.ndarray, " places"]
-    """How many views have the place inside their image."""
-    agreeing: Int[np.ndarray, " places"]
-    """How many of these show object there."""
-    views: int
-    """How many views voted."""
-
-    def occupied(self, *, missing: int) -> Bool[np.ndarray, " places"]:
-        """Return which places are object, where up to `missing` views, of as many as voted, may say otherwise."""
-        allowed = np.floor(missing * self.seeing / self.views)
-        enough = self.seeing >= max(2.0, MIN_SEEING * self.views)
-        return enough & (self.agreeing >= self.seeing - allowed)
-
-
-def carve(masks: Sequence[Bool[np.ndarray, "height width"]], cameras: Sequence[Camera]) -> Hull | None:
-    """Return the hull of the masks; None where they and their cameras agree on no place at all."""
-    bounds = _bounds(masks, cameras)
-    if bounds is None:
-        return None
-    coarse = _vote(*bounds, COARSE_CELLS, masks, cameras)
-    inside = coarse.occupied(missing=len(masks) // 6)
-    if not inside.any():
-        return None
-    low = coarse.centers[inside].min(axis=0) - 1.5 * coarse.edge
-    high = coarse.centers[inside].max(axis=0) + 1.5 * coarse.edge
-    return _vote(low, high, FINE_CELLS, masks, cameras)
-
-
-def silhouette(
-    hull: Hull, places: Bool[np.ndarray, " places"], camera: Camera
-) -> tuple[Bool[np.ndarray, "height width"], float]:
-    """Return where the given places lie in the camera's image, and how large a cube is there, pixels.
-
-    The outline is as coarse as the cubes.
-    """
-    across, down, depth = _pixels(hull.centers[places], camera)
-    ahead = depth > 0
-    if not ahead.any():
-        return np.zeros((camera.height, camera.width), dtype=bool), 1.0
-    footprint = max(camera.focal) * hull.edge / float(np.median(depth[ahead]))
-    # A cube covers at most one pixel of an image this small, so that neighbors leave no gap that closing leaves open.
-    shrink = max(1.0, footprint)
-    width, height = int(np.ceil(camera.width / shrink)), int(np.ceil(camera.height / shrink))
-    columns, rows = np.floor(across / shrink), np.floor(down / shrink)
-    seen = ahead & (columns >= 0) & (rows >= 0) & (columns < width) & (rows < height)
-    small = np.zeros((height, width), dtype=np.uint8)
-    small[rows[seen].astype(int), columns[seen].astype(int)] = 1
-    closed = cv2.morphologyEx(small, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-    column = np.minimum((np.arange(camera.width) + 0.5) / shrink, width - 1).astype(int)
-    row = np.minimum((np.arange(camera.height) + 0.5) / shrink, height - 1).astype(int)
-    return closed[row[:, None], column[None, :]] > 0, footprint
-
-
-def _bounds(
-    masks: Sequence[Bool[np.ndarray, "height width"]], cameras: Sequence[Camera]
-) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]] | None:
-    """Return the corners of a box that holds the object: the middles of the masks looked at from all sides."""
-    directions, positions, angles = [], [], []
-    for mask, camera in zip(masks, cameras, strict=True):
-        rows, columns = np.nonzero(mask)
-        if not len(rows):
-            continue
-        across = (columns + 0.5 - camera.principal[0]) / camera.focal[0]
-        down = (rows + 0.5 - camera.principal[1]) / camera.focal[1]
-        ray = camera.world_to_camera[:3, :3].numpy().T @ (across.mean(), down.mean(), 1.0)
-        directions.append(ray / np.linalg.norm(ray))
-        positions.append(camera.position.numpy())
-        angles.append(float(np.hypot(across - across.mean(), down - down.mean()).max()))
-    if len(directions) < 2:
-        return None
-    places = np.array(positions)
-    center = nearest_to_lines(places, np.array(directions))
-    if center is None:
-        return None
-    # The median, for a mask that leaked into the background is far too large.
-    radius = 1.25 * float(np.median(np.array(angles) * np.linalg.norm(places - center, axis=1)))
-    return center - radius, center + radius
-
-
-def _vote(
-    low: Float[np.ndarray, " 3"],
-    high: Float[np.ndarray, " 3"],
-    count: int,
-    masks: Sequence[Bool[np.ndarray, "height width"]],
-    cameras: Sequence[Camera],
-) -> Hull:
-    """Return the votes on about `count` cubes that fill a box."""
-    edge = float(np.prod(high - low) / count) ** (1 / 3)
-    steps = np.maximum(1, np.ceil((high - low) / edge)).astype(int)
-    axes = [low[axis] + (np.arange(steps[axis]) + 0.5) * edge for axis in range(3)]
-    centers = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    seeing, agreeing = np.zeros(len(centers), dtype=np.int64), np.zeros(len(centers), dtype=np.int64)
-    for mask, camera in zip(masks, cameras, strict=True):
-        across, down, depth = _pixels(centers, camera)
-        seen = (depth > 0) & (across >= 0) & (down >= 0) & (across < camera.width) & (down < camera.height)
-        rows, columns = down[seen].astype(np.int32), across[seen].astype(np.int32)
-        seeing += seen
-        agreeing[seen] += mask[rows, columns]
-    return Hull(centers, edge, seeing, agreeing, len(masks))
-
-
-def _pixels(
-    points: Float[np.ndarray, "points 3"], camera: Camera
-) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
-    """Return columns, rows and depths of points; single precision, which is a thousandth of a pixel here."""
-    pose = camera.world_to_camera.numpy().astype(np.float32)
-    inside = points.astype(np.float32) @ pose[:3, :3].T + pose[:3, 3]
-    depth = np.where(inside[:, 2] > 0, inside[:, 2], np.float32(1.0))
-    across = inside[:, 0] / depth * np.float32(camera.focal[0]) + np.float32(camera.principal[0])
-    down = inside[:, 1] / depth * np.float32(camera.focal[1]) + np.float32(camera.principal[1])
-    return across, down, inside[:, 2]

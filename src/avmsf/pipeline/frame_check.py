@@ -20,8 +20,8 @@ from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.folder import check_cameras
+from avmsf.photographs.hull import Hull, carve
 from avmsf.photographs.mesh_views import MeshTracer
-from avmsf.photographs.segmentation import Hull, carve
 
 MAX_VIEWS = 12
 """Views that are compared, as far apart as they stand."""
@@ -203,12 +203,9 @@ def _conventions(views: Sequence[View]) -> Iterator[tuple[str, list[View]]]:
 
 def _surface_of(hull: Hull) -> Float[Tensor, "places 3"]:
     """Return the middles of the outermost cubes that are object, float64."""
-    rows = np.round((hull.centers - hull.centers.min(axis=0)) / hull.edge).astype(int)
-    occupied = hull.occupied(missing=hull.views // 6)
-    grid = np.zeros(rows.max(axis=0) + 3, dtype=bool)
-    grid[tuple(rows[occupied].T + 1)] = True
-    edge = grid & ~ndimage.binary_erosion(grid)
-    return torch.from_numpy(hull.centers[occupied & edge[tuple(rows.T + 1)]])
+    occupied = np.pad(hull.occupied(missing=hull.views // 6), 1)
+    edge = occupied & ~ndimage.binary_erosion(occupied)
+    return torch.from_numpy(hull.grid.places(np.argwhere(edge) - 1))
 
 
 def _masked(views: Sequence[View]) -> list[View]:

@@ -14,8 +14,9 @@ import scipy.sparse.linalg
 from jaxtyping import Bool, Float32, Float64, Int
 from scipy import ndimage
 
+from avmsf.photographs.hull import Grid
 from avmsf.reconstruction.object_shape import closed_surface
-from avmsf.reconstruction.visual_hull import Grid, Outline
+from avmsf.reconstruction.visual_hull import Outline
 
 _ROUND = 0.015
 """Standard deviation of the Gaussian blur of the hull that measures how bent its surface is, over the diagonal."""

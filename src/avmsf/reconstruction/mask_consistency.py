@@ -9,9 +9,10 @@ from jaxtyping import Bool, Float32
 
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import View
+from avmsf.photographs.hull import Grid
 from avmsf.photographs.mesh_views import MeshTracer
 from avmsf.reconstruction.object_shape import closed_surface
-from avmsf.reconstruction.visual_hull import Grid, Outline, hull_distance
+from avmsf.reconstruction.visual_hull import Outline, hull_distance
 
 WRONG_FRACTION = 0.05
 """Part of the masks that may be wrong."""

@@ -11,8 +11,8 @@ from scipy import ndimage
 from avmsf.errors import CaptureError, SceneError
 from avmsf.mesh.level_set import difference, enclose
 from avmsf.mesh.surface import Surface
+from avmsf.photographs.hull import Grid
 from avmsf.reconstruction.distance import distance_from
-from avmsf.reconstruction.visual_hull import Grid
 
 FACES = 6000
 """Triangles at most of a body's surface: tetrahedra of 12,000 to 40,000 degrees of freedom have no more outside."""

@@ -11,12 +11,12 @@ from torch import Tensor
 from avmsf.errors import SceneError
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import Camera, View
-from avmsf.photographs.extent import masked_views, no_common_point, object_extent
+from avmsf.photographs.hull import Grid, masked_views, no_common_point, object_extent, touches_edge
 from avmsf.photographs.mesh_views import MeshTracer
 from avmsf.reconstruction.fairing import fair_hull
 from avmsf.reconstruction.mask_consistency import WRONG_FRACTION, consistent_masks, edge_offset
 from avmsf.reconstruction.object_shape import ObjectShape, ShapeReport, closed_surface
-from avmsf.reconstruction.visual_hull import Grid, Outline, SeenDepth, depth_in_convex_hull, fused_depth, hull_distance
+from avmsf.reconstruction.visual_hull import Outline, SeenDepth, depth_in_convex_hull, fused_depth, hull_distance
 
 DepthMap = Callable[[Camera], Float[Tensor, "height width"]]
 """What gives the depth of the first surface that each pixel of a camera sees, meters along the axis; 0 where none."""
@@ -101,7 +101,7 @@ def _rough(
     for _ in range(5):
         grid = Grid(middle - reach, 2 * reach / (_COARSE_CELLS - 1), (_COARSE_CELLS,) * 3)
         solid = hull_distance(outlines, grid, rank=round(WRONG_FRACTION * len(outlines))) > -grid.spacing
-        if not any(solid.take(end, axis=axis).any() for axis in range(3) for end in (0, -1)):
+        if not touches_edge(solid):
             return _box(solid, grid, len(views))
         reach *= 1.5
     raise SceneError.expected(
@@ -128,10 +128,9 @@ def _box(
     inside: Bool[np.ndarray, "x y z"], grid: Grid, views: int
 ) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
     """Return the lowest and highest corner of the box around what is inside, meters."""
-    rows = np.argwhere(inside)
-    if not len(rows):
+    if not inside.any():
         raise no_common_point(views)
-    return grid.places(rows.min(axis=0)), grid.places(rows.max(axis=0))
+    return grid.box(inside)
 
 
 def _bias(hull: Float32[np.ndarray, "x y z"], grid: Grid, depths: Sequence[SeenDepth], diagonal: float) -> float:

@@ -1,0 +1,268 @@
+"""The visual hull: what no mask speaks against, by the votes of views on cells; and where their object is."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import no_type_check
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int
+
+from avmsf._utils.compiled import compiled, lane_count, run_lanes
+from avmsf.errors import CaptureWarning, SceneError
+from avmsf.photographs.cameras import Camera, View, nearest_to_lines
+
+# Cells of the hull on its first and its second grid.
+COARSE_CELLS, FINE_CELLS = 40**3, 80**3
+# Of the views that could see a place, so many at least must be there to say anything of it.
+MIN_SEEING = 1 / 3
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Cells of equal edges; values belong to the middles of cells."""
+
+    lowest: Float64[np.ndarray, " 3"]
+    """Middle of the first cell, object frame, meters."""
+    spacing: float
+    """Edge of a cell, meters."""
+    shape: tuple[int, int, int]
+    """Cells along x, y and z."""
+
+    @classmethod
+    def around(
+        cls, low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"], *, cells: int, finest: float, margin: int
+    ) -> "Grid":
+        """Return a grid of `cells` along the longest side of a box, and `margin` cells more on each side.
+
+        A box that fills less than half of its cube has finer cells, at most `finest` times as fine, as many as half
+        the cube would have: slender objects are thin.
+        """
+        extent = high - low
+        filled = float(np.prod(extent / extent.max()))
+        spacing = float(extent.max()) / cells * min(max((2.0 * filled) ** (1 / 3), 1 / finest), 1.0)
+        counts = np.ceil(extent / spacing).astype(int) + 2 * margin + 1
+        middle = (low + high) / 2
+        return cls(middle - spacing * (counts - 1) / 2, spacing, (int(counts[0]), int(counts[1]), int(counts[2])))
+
+    @property
+    def diagonal(self) -> float:
+        """Diagonal of the box of all cells, meters."""
+        return self.spacing * float(np.linalg.norm(self.shape))
+
+    def places(self, rows: Int[np.ndarray, "*cells 3"]) -> Float64[np.ndarray, "*cells 3"]:
+        """Return the middles of cells given by their indices, meters."""
+        return self.lowest + self.spacing * rows
+
+    def box(self, inside: Bool[np.ndarray, "x y z"]) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
+        """Return the middles of the lowest and highest of the cells that are inside, of which there must be one."""
+        rows = np.argwhere(inside)
+        return self.places(rows.min(axis=0)), self.places(rows.max(axis=0))
+
+    def coarser(self, factor: int) -> "Grid":
+        """Return a grid that covers this one with cells `factor` times as wide; both have the same first middle."""
+        counts = [-(-(count - 1) // factor) + 1 for count in self.shape]
+        return Grid(self.lowest, self.spacing * factor, (counts[0], counts[1], counts[2]))
+
+
+def touches_edge(solid: Bool[np.ndarray, "x y z"]) -> bool:
+    """Whether anything is solid in the outermost cells of a grid."""
+    return any(solid.take(end, axis=axis).any() for axis in range(3) for end in (0, -1))
+
+
+def count_votes(
+    masks: Sequence[Bool[np.ndarray, "height width"]], cameras: Sequence[Camera], grid: Grid
+) -> tuple[Int[np.ndarray, "x y z"], Int[np.ndarray, "x y z"]]:
+    """Return how many views have the middle of each cell in their image, and how many of these show object there."""
+    seen, inside = np.zeros(grid.shape, dtype=np.uint16), np.zeros(grid.shape, dtype=np.uint16)
+    for mask, camera in zip(masks, cameras, strict=True):
+        projection = (camera.intrinsics @ camera.world_to_camera[:3]).numpy()
+        run_lanes(_vote, lane_count(), projection, mask, grid.lowest, grid.spacing, seen, inside)
+    return seen, inside
+
+
+@compiled(error_model="numpy")
+@no_type_check
+def _vote(lane, lanes, projection, mask, first, spacing, seen, inside):
+    height, width = mask.shape
+    cells = seen.shape[0]
+    for i in range(lane * cells // lanes, (lane + 1) * cells // lanes):
+        x = first[0] + i * spacing
+        for j in range(seen.shape[1]):
+            y = first[1] + j * spacing
+            for k in range(seen.shape[2]):
+                z = first[2] + k * spacing
+                depth = projection[2, 0] * x + projection[2, 1] * y + projection[2, 2] * z + projection[2, 3]
+                if depth <= 0.0:
+                    continue
+                column = (projection[0, 0] * x + projection[0, 1] * y + projection[0, 2] * z + projection[0, 3]) / depth
+                row = (projection[1, 0] * x + projection[1, 1] * y + projection[1, 2] * z + projection[1, 3]) / depth
+                if 0.0 <= column < width and 0.0 <= row < height:
+                    seen[i, j, k] += 1
+                    if mask[int(row), int(column)]:
+                        inside[i, j, k] += 1
+
+
+@dataclass(frozen=True, eq=False)
+class Hull:
+    """Cells around an object with the votes of the views on each."""
+
+    grid: Grid
+    seeing: Int[np.ndarray, "x y z"]
+    """How many views have the cell inside their image."""
+    agreeing: Int[np.ndarray, "x y z"]
+    """How many of these show object there."""
+    views: int
+    """How many views voted."""
+
+    def occupied(self, *, missing: int) -> Bool[np.ndarray, "x y z"]:
+        """Return which cells are object, where up to `missing` views, of as many as voted, may say otherwise."""
+        allowed = np.floor(missing * self.seeing.astype(np.float64) / self.views)
+        enough = self.seeing >= max(2.0, MIN_SEEING * self.views)
+        return enough & (self.agreeing >= self.seeing - allowed)
+
+
+def carve(masks: Sequence[Bool[np.ndarray, "height width"]], cameras: Sequence[Camera]) -> Hull | None:
+    """Return the hull of the masks; None where they and their cameras agree on no place at all."""
+    bounds = _bounds(masks, cameras)
+    if bounds is None:
+        return None
+    coarse = _hull(*bounds, COARSE_CELLS, masks, cameras)
+    inside = coarse.occupied(missing=len(masks) // 6)
+    if not inside.any():
+        return None
+    low, high = coarse.grid.box(inside)
+    margin = 1.5 * coarse.grid.spacing
+    return _hull(low - margin, high + margin, FINE_CELLS, masks, cameras)
+
+
+def _hull(
+    low: Float[np.ndarray, " 3"],
+    high: Float[np.ndarray, " 3"],
+    count: int,
+    masks: Sequence[Bool[np.ndarray, "height width"]],
+    cameras: Sequence[Camera],
+) -> Hull:
+    """Return the votes on about `count` cells that fill a box."""
+    edge = float(np.prod(high - low) / count) ** (1 / 3)
+    x, y, z = np.maximum(1, np.ceil((high - low) / edge)).astype(int).tolist()
+    grid = Grid(low + edge / 2, edge, (x, y, z))
+    return Hull(grid, *count_votes(masks, cameras, grid), len(masks))
+
+
+def silhouette(
+    places: Float64[np.ndarray, "places 3"], edge: float, camera: Camera
+) -> tuple[Bool[np.ndarray, "height width"], float]:
+    """Return where cells of this edge at these places lie in the camera's image, and how large one is there, pixels.
+
+    The outline is as coarse as the cells.
+    """
+    pixels, depth = (values.numpy() for values in camera.project(torch.from_numpy(places)))
+    ahead = depth > 0
+    if not ahead.any():
+        return np.zeros((camera.height, camera.width), dtype=bool), 1.0
+    footprint = max(camera.focal) * edge / float(np.median(depth[ahead]))
+    # A cell covers at most one pixel of an image this small, so that neighbors leave no gap that closing leaves open.
+    shrink = max(1.0, footprint)
+    size = np.ceil(np.array([camera.width, camera.height]) / shrink).astype(int)
+    cells = np.floor(pixels[ahead] / shrink).astype(int)
+    columns, rows = cells[((cells >= 0) & (cells < size)).all(axis=1)].T
+    small = np.zeros((size[1], size[0]), dtype=np.uint8)
+    small[rows, columns] = 1
+    closed = cv2.morphologyEx(small, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    column = np.minimum((np.arange(camera.width) + 0.5) / shrink, size[0] - 1).astype(int)
+    row = np.minimum((np.arange(camera.height) + 0.5) / shrink, size[1] - 1).astype(int)
+    return closed[row[:, None], column[None, :]] > 0, footprint
+
+
+def _bounds(
+    masks: Sequence[Bool[np.ndarray, "height width"]], cameras: Sequence[Camera]
+) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]] | None:
+    """Return the corners of a box that holds the object: the middles of the masks looked at from all sides."""
+    directions, positions, angles = [], [], []
+    for mask, camera in zip(masks, cameras, strict=True):
+        rows, columns = np.nonzero(mask)
+        if not len(rows):
+            continue
+        across = (columns + 0.5 - camera.principal[0]) / camera.focal[0]
+        down = (rows + 0.5 - camera.principal[1]) / camera.focal[1]
+        ray = camera.world_to_camera[:3, :3].numpy().T @ (across.mean(), down.mean(), 1.0)
+        directions.append(ray / np.linalg.norm(ray))
+        positions.append(camera.position.numpy())
+        angles.append(float(np.hypot(across - across.mean(), down - down.mean()).max()))
+    if len(directions) < 2:
+        return None
+    places = np.array(positions)
+    center = nearest_to_lines(places, np.array(directions))
+    if center is None:
+        return None
+    # The median, for a mask that leaked into the background is far too large.
+    radius = 1.25 * float(np.median(np.array(angles) * np.linalg.norm(places - center, axis=1)))
+    return center - radius, center + radius
+
+
+def masked_views(views: Sequence[View]) -> list[View]:
+    """Return the views whose masks show something; a CaptureWarning names those whose masks are empty.
+
+    Raises SceneError for fewer than 3.
+    """
+    known = [view for view in views if view.mask is not None]
+    empty = [view.name for view in known if view.mask is not None and not bool((view.mask > 127).any())]
+    if known and len(empty) == len(known):
+        wanted, got = "the object in the masks", f"only background in all {len(known)}"
+        advice = "check that white is the object, or remove the masks so that the foreground is found"
+        raise SceneError.expected(wanted, empty, got=got, name="masks", advice=advice)
+    if empty:
+        message = f"views whose masks are empty are not used: {', '.join(empty)}"
+        warnings.warn(CaptureWarning(message, name="masks", value=empty), stacklevel=3)
+    kept = [view for view in known if view.name not in empty]
+    if len(kept) < 3:
+        wanted, got = "3 or more views with a mask", f"{len(kept)} of {len(views)}"
+        advice = "give masks, images with alpha or a plain background, or initial points"
+        raise SceneError.expected(wanted, len(kept), got=got, name="views", advice=advice)
+    return kept
+
+
+def no_common_point(views: int) -> SceneError:
+    """Return the error of masks of this many views that no point of the object frame lies in."""
+    return SceneError.expected(
+        "masks with a common volume",
+        views,
+        got=f"none from {views} views",
+        name="masks",
+        advice="check that cameras and masks belong together and that the poses have the convention of their file "
+        "(shifted or small masks miss thin objects)",
+    )
+
+
+def object_extent(views: Sequence[View]) -> tuple[np.ndarray, float]:
+    """Return about where the object's middle is, [3] in the object frame, and how far it reaches from there, meters.
+
+    The middle is the point nearest to the lines of sight through the masks' middles; those that miss it by far have
+    little weight (iteratively reweighted least squares).
+    """
+    positions, directions, sizes = [], [], []
+    for view in views:
+        assert view.mask is not None
+        rows, columns = np.nonzero(view.mask.numpy() > 127)
+        camera = view.camera
+        pixel = np.array([np.median(columns) + 0.5, np.median(rows) + 0.5])
+        ray = np.append((pixel - camera.principal) / camera.focal, 1.0)
+        rotation = camera.world_to_camera[:3, :3].numpy()
+        directions.append(ray / np.linalg.norm(ray) @ rotation)
+        positions.append(camera.position.numpy())
+        sizes.append(max(np.ptp(columns) / camera.focal[0], np.ptp(rows) / camera.focal[1]))
+    starts, rays = np.stack(positions), np.stack(directions)
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    weight = np.ones(len(views))
+    for _ in range(10):
+        weighted = across * weight[:, None, None]
+        # Parallel lines of sight leave one direction open, which the minimum norm solution sets to 0.
+        middle = np.linalg.lstsq(weighted.sum(0), np.einsum("vij,vj->i", weighted, starts), rcond=1e-9)[0]
+        missed = np.linalg.norm(np.einsum("vij,vj->vi", across, middle - starts), axis=1)
+        weight = 1.0 / (missed + 1e-3 * np.median(np.linalg.norm(middle - starts, axis=1)))
+    distance = np.abs(np.einsum("vi,vi->v", middle - starts, rays))
+    # Half the largest extent, and as much again as the middle of a mask may lie off the object's.
+    return middle, float(0.8 * np.quantile(np.array(sizes) * distance, 0.9))
