@@ -155,8 +155,7 @@ class MixtureEstimator(GainRecipe):
         weights = _body_weights(model, families, fit.measured)
         report = _report(bodies, families, weights, missing) | _outlier_report(judgment, case, used)
         report["thickness"] = None if thickness is None else asdict(thickness)
-        advice = _two_levels(fit, bodies)
-        report["advice"] = advice if advice or judgment.informative else _better_order(fit, bodies)
+        report["advice"] = None if judgment.informative else _two_levels(fit) or _better_order(fit, bodies)
         return replace(model, report=report), used
 
     def _expect_inputs(self, case: GainCase, groups: Sequence[Group]) -> None:
@@ -363,11 +362,12 @@ def _assessed(fit: _Fit, model: MixtureGains, body: NominalBody | None) -> Judgm
     return assess_contacts(fitted([]), elastic, fit.sites, model.sites(points), fit.measured)
 
 
-def _two_levels(fit: _Fit, bodies: Sequence[NominalBody]) -> str | None:
+def _two_levels(fit: _Fit) -> str | None:
     """Return from which recording on the level is another, and what to do; None where levels agree."""
     names, rows = fit.case.train.names, fit.compared
-    families, points = fit.families(rows, bodies), fit.case.features.points
-    found = two_levels(families, fit.at(rows), points, directional=fit.directional)
+    sites, size = fit.sites.take(rows), 2.0 * fit.case.features.half_diagonal
+    families = [Unstructured(sites, size), *(kind(sites, size) for kind in POSITIONAL.values())]
+    found = two_levels(families, fit.at(rows))
     if found is None:
         return None
     first, level = found

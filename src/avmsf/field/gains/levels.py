@@ -1,83 +1,54 @@
 """Recordings of two levels: those from one on were made with another gain, microphone place or force scale.
 
-Where the recordings from the k-th on are g times too loud, they and the others are predicted from each other once they
-are divided by g. Those k and g are tried that most raise the log predictive density of all gains over that without
-places (`outliers`): for n contacts, the gains y of one series so divided and P the inverse of their covariance,
+Where the recordings from the k-th on are g times too loud, the gains y of a series of n contacts are D z, D being
+diagonal with 1 before the k-th contact and g from it on, and z gains as the kernels describe them. So
 
-    n/2 log(y' y) - n/2 log(y' P y) + constant of y
+    log p(y | k, g) = log p_z(D^-1 y) - (n - k) log g
 
-(Student t, the scale integrated out). Sums of blocks of P y y' give it for all g.
+with the evidence of kernel families for p_z. Smooth families without a body are enough: a step of the level is seen in
+contacts near each other. All series have k and g in common. It explains only what nothing else does: contacts in the
+order of their places, as a roving hammer's, may be weaker from one on since the object is stiffer there.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-import torch
-from jaxtyping import Float32, Float64
-from torch import Tensor
-
 from avmsf.field.gains.family import KernelFamily
-from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
-from avmsf.field.gains.outliers import INFORMATIVE, WIDE_NOISE_SHARES, PredictiveRatios, surely_positive
+from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, total_evidence
+from avmsf.field.gains.mixture import NOISE_SHARES
 
 _FEWEST = 3
 """Recordings of a group: of fewer, each is judged by itself."""
-_LEVELS = torch.arange(-40, 41, dtype=torch.float64)
-"""dB."""
-_LEAST = 3.0
-"""dB: less is not told from how hard somebody taps."""
-_ROUNDS = 2
-"""Of fit and search: gains of two levels look like noise at first."""
+_COARSE = (-30, -24, -18, -12, -6, 6, 12, 18, 24, 30)
+_FINE = (-3, -2, -1, 0, 1, 2, 3)
+"""Levels tried, dB, and those about the best of them."""
+_SURE = 0.5
+"""Nats for each series by which the evidence has to rise, beside the logarithm of how many steps are tried."""
 
 
-def two_levels(
-    families: Sequence[KernelFamily],
-    measured: MeasuredGains,
-    points: Float32[Tensor, "points 3"],
-    *,
-    directional: bool,
-) -> tuple[int, float] | None:
-    """Return the first of the last contacts that are surely of another level, and by how many dB they are louder.
+def two_levels(families: Sequence[KernelFamily], measured: MeasuredGains) -> tuple[int, float] | None:
+    """Return the first of the last contacts that are of another level, and by how many dB they are louder.
 
-    Student's test of the rise of the log predictive ratios over contacts, with Bonferroni's correction for the places
-    where a group may begin; and places then have to say enough of the gains. None where levels agree. `families` are of
-    the measured contacts, in the order in which they were recorded; `points` are the object's.
+    None where one level explains the gains about as well. `families` are those of the measured contacts, in the order
+    in which they were recorded.
     """
+    count, series = len(measured.values), float(measured.informative.sum())
 
-    def ratios(values: MeasuredGains) -> PredictiveRatios:
-        model = fit_mixture(families, values, points, directional=directional, noise_shares=WIDE_NOISE_SHARES)
-        return PredictiveRatios(model, families[0].reference, values)
-
-    count = len(families[0].reference)
-    if count < 2 * _FEWEST:
-        return None
-    given = found = ratios(measured)
-    for _ in range(_ROUNDS):
-        first, level = _likeliest(found, given.values)
-        if abs(level) < _LEAST:
-            return None
+    def evidence(first: int, level: float) -> float:
         values = measured.values.clone()
         values[first:] *= 10 ** (-level / 20)
-        found = ratios(replace(measured, values=values))
-    explained = found.without(frozenset())[0]
-    surely = surely_positive(explained - given.without(frozenset())[0], candidates=count - 2 * _FEWEST + 1)
-    return (first, level) if surely and float(explained.mean()) >= INFORMATIVE else None
+        moved = replace(measured, values=values)
+        jacobian = series * (count - first) * level / 20 * math.log(10)
+        return total_evidence([WeighedFamily.of(each, moved, NOISE_SHARES) for each in families], moved) - jacobian
 
-
-def _likeliest(hypotheses: PredictiveRatios, values: Float64[Tensor, "contacts series"]) -> tuple[int, float]:
-    """Return where the second group most probably begins and its level, dB, by the kernels of some hypotheses."""
-    count = len(values)
-    factor = 10 ** (-_LEVELS / 20)
-
-    def log_quadratic(precision: Tensor) -> Float64[Tensor, "levels begins series"]:
-        products = precision * values.T[:, :, None] * values.T[:, None]
-        before = torch.stack([products[:, :row, :row].sum((1, 2)) for row in begins])
-        after = torch.stack([products[:, row:, row:].sum((1, 2)) for row in begins])
-        across = products.sum((1, 2)) - before - after
-        scale = factor[:, None, None]
-        return (before + scale * across + scale.square() * after).clamp_min(torch.finfo(torch.float64).tiny).log()
-
-    begins = range(_FEWEST, count - _FEWEST + 1)
-    rise = log_quadratic(torch.eye(count, dtype=torch.float64)) - log_quadratic(torch.linalg.inv(hypotheses.covariance))
-    level, begin = divmod(int((rise @ hypotheses.weight).argmax()), len(begins))
-    return begins[begin], float(_LEVELS[level])
+    tried = {
+        (first, level): evidence(first, level) for first in range(_FEWEST, count - _FEWEST + 1) for level in _COARSE
+    }
+    if not tried:
+        return None
+    first, level = max(tried, key=tried.__getitem__)
+    near = {(first, float(level + more)): evidence(first, level + more) for more in _FINE}
+    best = max(near, key=near.__getitem__)
+    rise = near[best] - evidence(0, 0.0)
+    return best if rise > _SURE * series + math.log(len(tried)) else None

@@ -50,7 +50,7 @@ from avmsf.field.gains.model import MixtureGains, series_of
 
 WIDE_NOISE_SHARES = (*NOISE_SHARES, 0.1, 0.3, 1.0, 3.0)
 """A wrong label may look like noise: the hypotheses that contacts are judged by have to allow for it."""
-INFORMATIVE = 0.7
+_INFORMATIVE = 0.7
 """Mean ratio, nats per mode, from which on places say enough to accuse a contact, or to name a body."""
 _BODY_GAIN = 0.3
 """Nats per mode that a body has to add. An aircraft's and a ruler's add .7 to 1.7, with shuffled shapes .16 at most."""
@@ -208,7 +208,7 @@ class Credibility:
     @property
     def credible(self) -> bool:
         """Whether a body may be named: its mode shapes predict what the distances between contacts do not."""
-        return self.with_body >= INFORMATIVE and self.with_body - self.without_body >= _BODY_GAIN
+        return self.with_body >= _INFORMATIVE and self.with_body - self.without_body >= _BODY_GAIN
 
 
 @dataclass(frozen=True)
@@ -298,12 +298,12 @@ def assess_contacts(plain: Fit, elastic: Fit | None, sites: Sites, places: Sites
     """
     if elastic is None:
         used = _search(plain, sites, measured)
-        return Judgment(_outliers(used, places), None, used.mean() >= INFORMATIVE)
+        return Judgment(_outliers(used, places), None, used.mean() >= _INFORMATIVE)
     found = _search(elastic, sites, measured)
     without = PredictiveRatios(plain(_others(sites, found.aside), WIDE_NOISE_SHARES), sites, measured)
     credibility = Credibility(found.mean(), _Search(without, found.aside).mean())
     used = found if credibility.credible else _search(plain, sites, measured)
-    return Judgment(_outliers(used, places), credibility, used.mean() >= INFORMATIVE)
+    return Judgment(_outliers(used, places), credibility, used.mean() >= _INFORMATIVE)
 
 
 def set_aside(ratios: PredictiveRatios, start: frozenset[int] = frozenset()) -> frozenset[int]:
@@ -375,13 +375,9 @@ def better_order(
     if best is None:
         return None
     more = ratios(orders[best]) - ratios(torch.arange(len(names)))
-    return (best, orders[best]) if surely_positive(more, candidates=len(orders)) else None
-
-
-def surely_positive(values: Float64[Tensor, " contacts"], *, candidates: int = 1) -> bool:
-    """Return whether the mean of values is above zero by more than chance (Student's test, Bonferroni's correction)."""
-    mean, error = float(values.mean()), float(values.std()) / math.sqrt(len(values))
-    return float(scipy.special.stdtr(len(values) - 1, -mean / max(error, _TINY))) < _CHANCE / candidates
+    mean, error = float(more.mean()), float(more.std()) / math.sqrt(len(more))
+    chance = float(scipy.special.stdtr(len(more) - 1, -mean / max(error, _TINY)))
+    return (best, orders[best]) if chance < _CHANCE / len(orders) else None
 
 
 def predicts_better(
@@ -423,7 +419,7 @@ def _search(fit: Fit, sites: Sites, measured: MeasuredGains) -> _Search:
 def _outliers(search: _Search, places: Sites) -> tuple[Outlier, ...]:
     """Return the contacts set aside that are contradicted and that another site explains, the lowest ratio first."""
     mean = search.mean()
-    if mean < INFORMATIVE:
+    if mean < _INFORMATIVE:
         return ()
     found = [_located(search, row, places, mean) for row in sorted(search.aside)]
     return tuple(sorted((each for each in found if each is not None), key=lambda each: each.ratio))
