@@ -10,7 +10,7 @@ from torch import Tensor
 
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
-from avmsf.field.gains.levels import two_levels
+from avmsf.field.gains.labels import better_order, two_levels
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.gains.outliers import (
@@ -20,7 +20,6 @@ from avmsf.field.gains.outliers import (
     Outlier,
     PredictiveRatios,
     assess_contacts,
-    better_order,
     predicts_better,
     set_aside,
 )

@@ -26,10 +26,10 @@ from avmsf.field.config import AUTO, NETWORK, GainModel
 from avmsf.field.gains.elastic import CandidateBodies, Elastic
 from avmsf.field.gains.family import KernelFamily, Sites, sites_along
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, matched, total_evidence
-from avmsf.field.gains.levels import two_levels
+from avmsf.field.gains.labels import better_order, two_levels
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.model import MixtureGains
-from avmsf.field.gains.outliers import Fit, Judgment, assess_contacts, better_order, predicts_better
+from avmsf.field.gains.outliers import Fit, Judgment, assess_contacts, predicts_better
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.gains.symmetry import Symmetric

@@ -25,26 +25,23 @@ The contacts S that are set aside maximize
 
 found by adding, removing or exchanging one contact; the kernels are weighed again without S. A contact of S is an
 outlier if its own label is refuted, L_i < -1.5, and if another site or the opposite direction explains it. Where places
-say little of the gains nothing is an outlier, but all labels may be in another order: of the `candidate_orders` the one
-of the highest evidence is named if it makes the sum of all L_i surely higher.
+say little of the gains nothing is an outlier, but all labels may be in another order (`labels`).
 """
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
 import scipy
 import torch
-from jaxtyping import Complex128, Float, Float32, Float64, Int
+from jaxtyping import Complex128, Float, Float64, Int
 from torch import Tensor
 
-from avmsf._utils.text import counted
-from avmsf.capture.filenames import number_key
 from avmsf.capture.impacts import places_of
 from avmsf.field.gains.family import KernelFamily, Sites
-from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, total_evidence
+from avmsf.field.gains.fitting import MeasuredGains
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.model import MixtureGains, series_of
 
@@ -70,9 +67,7 @@ _EXPLAINED = 0.4
 """Part of the others' mean ratio that a contact has to reach at another place."""
 _GAINS = tuple(10 ** (db / 20) for db in range(-60, 61))
 """Factors by which one recording may be off: of an amplifier, a scale or a force."""
-_SHIFTS = 5
-"""Rows by which recordings may be off: takes left out or repeated before the first."""
-_CHANCE = 0.0228
+CHANCE = 0.0228
 """Probability that errors fall as much by chance: that of two standard errors of a normal distribution."""
 _TINY = torch.finfo(torch.float64).tiny
 
@@ -324,62 +319,6 @@ def set_aside(ratios: PredictiveRatios, start: frozenset[int] = frozenset()) -> 
         score, current = best, found
 
 
-def candidate_orders(names: Sequence[str]) -> dict[str, Int[Tensor, " rows"]]:
-    """Return orders in which the recordings of these names may belong to the rows of a table, and what they are.
-
-    Sorted by the numbers in their names or as text, all reversed, or all moved by some rows; only such as differ from
-    the present one and from each other. Row r has the recording `order[r]`.
-    """
-    rows = list(range(len(names)))
-    found = {
-        "the files sorted by number (1, 2, 10)": sorted(rows, key=lambda row: number_key(names[row])),
-        "the files sorted as text (1, 10, 2)": sorted(rows, key=names.__getitem__),
-        "the files in reverse order": rows[::-1],
-    }
-    for by in rows[1 : _SHIFTS + 1]:
-        found[f"each file {counted(by, 'row')} earlier"] = rows[by:] + rows[:by]
-        found[f"each file {counted(by, 'row')} later"] = rows[-by:] + rows[:-by]
-    distinct = {tuple(order): words for words, order in reversed(found.items()) if order != rows}
-    return {words: torch.tensor(order) for order, words in reversed(distinct.items())}
-
-
-def better_order(
-    names: Sequence[str],
-    families: Sequence[KernelFamily],
-    rows: Int[Tensor, " rows"],
-    measured: MeasuredGains,
-    points: Float32[Tensor, "points 3"],
-    *,
-    directional: bool,
-) -> tuple[str, Int[Tensor, " contacts"]] | None:
-    """Return the candidate order of highest evidence if it surely predicts contacts better, and what it is.
-
-    Student's test of the log predictive ratios' differences over contacts, with Bonferroni's correction. `families` are
-    of the contacts `rows`; `names` and `measured` are all recordings', `points` the object's.
-    """
-
-    def at(order: Int[Tensor, " contacts"]) -> MeasuredGains:
-        return replace(measured, values=measured.values[order[rows]])
-
-    def evidence(words: str) -> float:
-        moved = at(orders[words])
-        return total_evidence([WeighedFamily.of(each, moved, NOISE_SHARES) for each in families], moved)
-
-    def ratios(order: Int[Tensor, " contacts"]) -> Float64[Tensor, " rows"]:
-        moved = at(order)
-        model = fit_mixture(families, moved, points, directional=directional, noise_shares=WIDE_NOISE_SHARES)
-        return PredictiveRatios(model, families[0].reference, moved).without(frozenset())[0]
-
-    orders = candidate_orders(names)
-    best = max(orders, key=evidence, default=None)
-    if best is None:
-        return None
-    more = ratios(orders[best]) - ratios(torch.arange(len(names)))
-    mean, error = float(more.mean()), float(more.std()) / math.sqrt(len(more))
-    chance = float(scipy.special.stdtr(len(more) - 1, -mean / max(error, _TINY)))
-    return (best, orders[best]) if chance < _CHANCE / len(orders) else None
-
-
 def predicts_better(
     new: Complex128[Tensor, "contacts modes"],
     old: Complex128[Tensor, "contacts modes"],
@@ -401,7 +340,7 @@ def predicts_better(
     power = energy(measured.values)
     less, more = ((energy(each - measured.values) / (power + energy(each))).sqrt() for each in (new, old))
     fall = (more - less)[power > 0].numpy()
-    return bool(fall.any()) and float(scipy.stats.wilcoxon(fall, alternative="greater").pvalue) < _CHANCE / candidates
+    return bool(fall.any()) and float(scipy.stats.wilcoxon(fall, alternative="greater").pvalue) < CHANCE / candidates
 
 
 def _search(fit: Fit, sites: Sites, measured: MeasuredGains) -> _Search:

@@ -1,0 +1,124 @@
+"""Labels of all recordings at once: another order, or two levels, where places say nothing of the gains.
+
+Of the `candidate_orders` the one of the highest evidence is named if it makes the sum of all log predictive ratios
+(`outliers`) surely higher.
+
+Recordings from one on may have been made with another gain, microphone place or force scale. Where those from the k-th
+on are g times too loud, the gains y of a series of n contacts are D z, D being diagonal with 1 before the k-th contact
+and g from it on, and z gains as the kernels describe them. So
+
+    log p(y | k, g) = log p_z(D^-1 y) - (n - k) log g
+
+with the evidence of kernel families for p_z. Smooth families without a body are enough: a step of the level is seen in
+contacts near each other. All series have k and g in common. It explains only what nothing else does: contacts in the
+order of their places, as a roving hammer's, may be weaker from one on since the object is stiffer there.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import scipy
+import torch
+from jaxtyping import Float32, Float64, Int
+from torch import Tensor
+
+from avmsf._utils.text import counted
+from avmsf.capture.filenames import number_key
+from avmsf.field.gains.family import KernelFamily
+from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, total_evidence
+from avmsf.field.gains.mixture import NOISE_SHARES
+from avmsf.field.gains.outliers import CHANCE, WIDE_NOISE_SHARES, PredictiveRatios
+
+_FEWEST = 3
+"""Recordings of a group: of fewer, each is judged by itself."""
+_COARSE = (-30, -24, -18, -12, -6, 6, 12, 18, 24, 30)
+_FINE = (-3, -2, -1, 0, 1, 2, 3)
+"""Levels tried, dB, and those about the best of them."""
+_SURE = 0.5
+"""Nats for each series by which the evidence has to rise, beside the logarithm of how many steps are tried."""
+_SHIFTS = 5
+"""Rows by which recordings may be off: takes left out or repeated before the first."""
+
+
+def candidate_orders(names: Sequence[str]) -> dict[str, Int[Tensor, " rows"]]:
+    """Return orders in which the recordings of these names may belong to the rows of a table, and what they are.
+
+    Sorted by the numbers in their names or as text, all reversed, or all moved by some rows; only such as differ from
+    the present one and from each other. Row r has the recording `order[r]`.
+    """
+    rows = list(range(len(names)))
+    found = {
+        "the files sorted by number (1, 2, 10)": sorted(rows, key=lambda row: number_key(names[row])),
+        "the files sorted as text (1, 10, 2)": sorted(rows, key=names.__getitem__),
+        "the files in reverse order": rows[::-1],
+    }
+    for by in rows[1 : _SHIFTS + 1]:
+        found[f"each file {counted(by, 'row')} earlier"] = rows[by:] + rows[:by]
+        found[f"each file {counted(by, 'row')} later"] = rows[-by:] + rows[:-by]
+    distinct = {tuple(order): words for words, order in reversed(found.items()) if order != rows}
+    return {words: torch.tensor(order) for order, words in reversed(distinct.items())}
+
+
+def better_order(
+    names: Sequence[str],
+    families: Sequence[KernelFamily],
+    rows: Int[Tensor, " rows"],
+    measured: MeasuredGains,
+    points: Float32[Tensor, "points 3"],
+    *,
+    directional: bool,
+) -> tuple[str, Int[Tensor, " contacts"]] | None:
+    """Return the candidate order of highest evidence if it surely predicts contacts better, and what it is.
+
+    Student's test of the log predictive ratios' differences over contacts, with Bonferroni's correction. `families` are
+    of the contacts `rows`; `names` and `measured` are all recordings', `points` the object's.
+    """
+
+    def at(order: Int[Tensor, " contacts"]) -> MeasuredGains:
+        return replace(measured, values=measured.values[order[rows]])
+
+    def evidence(words: str) -> float:
+        moved = at(orders[words])
+        return total_evidence([WeighedFamily.of(each, moved, NOISE_SHARES) for each in families], moved)
+
+    def ratios(order: Int[Tensor, " contacts"]) -> Float64[Tensor, " rows"]:
+        moved = at(order)
+        model = fit_mixture(families, moved, points, directional=directional, noise_shares=WIDE_NOISE_SHARES)
+        return PredictiveRatios(model, families[0].reference, moved).without(frozenset())[0]
+
+    orders = candidate_orders(names)
+    best = max(orders, key=evidence, default=None)
+    if best is None:
+        return None
+    more = ratios(orders[best]) - ratios(torch.arange(len(names)))
+    mean, error = float(more.mean()), float(more.std()) / math.sqrt(len(more))
+    chance = float(scipy.special.stdtr(len(more) - 1, -mean / max(error, torch.finfo(torch.float64).tiny)))
+    return (best, orders[best]) if chance < CHANCE / len(orders) else None
+
+
+def two_levels(families: Sequence[KernelFamily], measured: MeasuredGains) -> tuple[int, float] | None:
+    """Return the first of the last contacts that are of another level, and by how many dB they are louder.
+
+    None where one level explains the gains about as well. `families` are those of the measured contacts, in the order
+    in which they were recorded.
+    """
+    count, series = len(measured.values), float(measured.informative.sum())
+
+    def evidence(first: int, level: float) -> float:
+        values = measured.values.clone()
+        values[first:] *= 10 ** (-level / 20)
+        moved = replace(measured, values=values)
+        jacobian = series * (count - first) * level / 20 * math.log(10)
+        return total_evidence([WeighedFamily.of(each, moved, NOISE_SHARES) for each in families], moved) - jacobian
+
+    tried = {
+        (first, level): evidence(first, level) for first in range(_FEWEST, count - _FEWEST + 1) for level in _COARSE
+    }
+    if not tried:
+        return None
+    first, level = max(tried, key=tried.__getitem__)
+    near = {(first, float(level + more)): evidence(first, level + more) for more in _FINE}
+    best = max(near, key=near.__getitem__)
+    rise = near[best] - evidence(0, 0.0)
+    return best if rise > _SURE * series + math.log(len(tried)) else None
