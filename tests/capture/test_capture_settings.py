@@ -57,8 +57,13 @@ def test_units_are_the_international_ones(unit: str, meters: float) -> None:
         ("force_channel = 2\nresponse_channel = 2", "force_channel", 2),
         ('normalize = "rms"', "normalize", "rms"),
         ('normalize = "deconvolve"', "force_channel", None),
+        ('time_zero = "middle"', "time_zero", "middle"),
+        ("highpass = -1.0", "highpass", -1.0),
         ("seconds = ", None, None),
+        (f"seconds = {10**400}", "seconds", 10**400),
+        ("a = " + "[" * 3000 + "]" * 3000, None, None),
     ],
+    ids=lambda each: str(each)[:30],
 )
 def test_a_mistake_names_file_and_key(tmp_path: Path, text: str, name: str | None, value: Any) -> None:
     with raises(CaptureError, file="capture.toml", name=name, value=value):

@@ -78,12 +78,22 @@ def test_a_name_is_found_composed_or_decomposed(tmp_path: Path) -> None:
     assert read_capture(folder).impacts.names[0] == "a\u0308.wav"
 
 
-def test_what_git_lfs_leaves_in_place_of_a_table_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("content", "cause", "advice"),
+    [
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", type(None), "git lfs pull"),
+        ("file,x,y,z\n\u00e4.wav,1,2,3\n".encode("utf-16"), UnicodeDecodeError, "UTF-8"),
+        (b"file,x,y,z\n" + b"a" * 200_000 + b".wav,0,0,0\n", csv.Error, "cannot be read"),
+    ],
+    ids=["Git LFS", "UTF-16", "a cell without end"],
+)
+def test_what_is_no_table_says_so(tmp_path: Path, content: bytes, cause: type, advice: str) -> None:
     folder = fill(tmp_path)
-    (folder / "impacts.csv").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
+    (folder / "impacts.csv").write_bytes(content)
     with raises(CaptureError, file="impacts.csv") as caught:
         read_capture(folder)
-    assert "git lfs pull" in str(caught.value)
+    assert isinstance(caught.value.__cause__, cause)
+    assert advice in str(caught.value)
 
 
 def test_units_scale_contacts_and_surface_alike(tmp_path: Path) -> None:
@@ -148,17 +158,11 @@ def test_units_that_fit_an_object_are_suggested(written: float, fitting: list[st
     assert [unit for unit in METRES if f'"{unit}"' in advice] == fitting
 
 
-def test_missing_folder_table_and_encoding_are_distinguished(tmp_path: Path) -> None:
+def test_a_missing_folder_and_a_missing_table_are_distinguished(tmp_path: Path) -> None:
     with raises(CaptureError, file="nowhere"):
         read_capture(tmp_path / "nowhere")
-    folder = fill(tmp_path / "bowl")
-    (folder / "impacts.csv").write_bytes("file,x,y,z\nä.wav,1,2,3\n".encode("utf-16"))
-    with raises(CaptureError, file="bowl/impacts.csv") as caught:
-        read_capture(folder)
-    assert isinstance(caught.value.__cause__, UnicodeDecodeError)
-    (folder / "impacts.csv").unlink()
-    with raises(CaptureError, file="bowl/impacts.csv") as caught:
-        read_capture(folder)
+    with raises(CaptureError, file=tmp_path / "impacts.csv") as caught:
+        read_capture(tmp_path)
     assert HOW_TO_WRITE in str(caught.value)
 
 
@@ -179,19 +183,18 @@ def test_what_can_be_used_warns_and_is_read(
     assert len(capture.impacts) == len(rows)
 
 
-def test_two_blows_at_one_place_are_not_confused_with_two_close_ones(tmp_path: Path) -> None:
-    folder = fill(tmp_path, rows=(*ROWS[:2], "c.wav,0,0.201,0"))
+@pytest.mark.parametrize(
+    ("header", "rows"),
+    [
+        (HEADER, (*ROWS[:2], "c.wav,0,0.201,0")),
+        (f"{HEADER},nx,ny,nz", ("a.wav,0.1,0,0,0,0,-1", "b.wav,0,0.2,0,0,0,-1", "c.wav,0,0.2,0,1,0,0")),
+    ],
+    ids=["close", "another direction"],
+)
+def test_what_is_no_repetition_is_read_in_silence(tmp_path: Path, header: str, rows: tuple[str, ...]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert len(read_capture(folder).impacts) == 3
-
-
-def test_impacts_at_one_place_along_different_directions_are_no_repetitions(tmp_path: Path) -> None:
-    rows = ("a.wav,0.1,0,0,0,0,-1", "b.wav,0,0.2,0,0,0,-1", "c.wav,0,0.2,0,1,0,0")
-    folder = fill(tmp_path, header=f"{HEADER},nx,ny,nz", rows=rows)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert len(read_capture(folder).impacts) == 3
+        assert len(read_capture(fill(tmp_path, header=header, rows=rows)).impacts) == 3
 
 
 def test_contacts_far_outside_the_surface_are_refused(tmp_path: Path) -> None:
@@ -211,14 +214,6 @@ def test_a_surface_in_millimeters_beside_contacts_in_meters_is_refused_with_its_
     surface = read_capture(folder).surface
     assert surface is not None
     assert surface.vertices.amax().item() == pytest.approx(0.3, rel=1e-6)
-
-
-def test_what_is_no_table_says_so(tmp_path: Path) -> None:
-    folder = fill(tmp_path)
-    (folder / "impacts.csv").write_text("file,x,y,z\n" + "a" * 200_000 + ".wav,0,0,0\n")
-    with raises(CaptureError, file="impacts.csv") as caught:
-        read_capture(folder)
-    assert isinstance(caught.value.__cause__, csv.Error)
 
 
 def test_a_name_that_no_file_can_have_is_reported(tmp_path: Path) -> None:

@@ -8,9 +8,7 @@ import torch
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.capture.audio import Recording
 from avmsf.capture.prepare import prepare
-from avmsf.errors import CaptureError
 from factories.plate_capture import fill_plate
-from factories.raising import raises
 
 RATE = 8000.0
 
@@ -47,8 +45,3 @@ def test_settings_start_where_they_are_asked_to() -> None:
     assert own.starting(None) == own.starting("onset") == own
     assert own.starting("peak").from_peaks
     assert not own.starting("peak").starting("onset").from_peaks
-
-
-def test_another_start_is_refused() -> None:
-    with raises(CaptureError, name="time_zero", value="middle"):
-        CaptureSettings(time_zero="middle")

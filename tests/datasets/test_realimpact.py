@@ -92,11 +92,6 @@ def test_the_mesh_is_surface_and_look(whole: Path) -> None:
     assert len(surface.faces) == 1280
 
 
-def test_facts_come_from_the_name(whole: Path) -> None:
-    facts = RealImpact(whole).facts(NAME)
-    assert (facts.name, facts.material, facts.inferred) == ("iron mortar", "iron", True)
-
-
 def test_check_counts_blows_and_names_what_is_not_here(whole: Path) -> None:
     report = RealImpact(whole).check()
     assert (report.objects[0].recordings, report.objects[0].problems) == (5, ())
@@ -160,9 +155,3 @@ def test_samples_that_are_no_numbers_are_refused(folder: Path) -> None:
     with raises(DatasetError, file="deconvolved_0db.npy", name=None) as caught:
         RealImpact(folder).capture(NAME)
     assert caught.value.row is not None
-
-
-def test_a_number_alone_is_told_whose_it_is(whole: Path) -> None:
-    with raises(DatasetError, name="object", value="43") as caught:
-        RealImpact(whole).visual_source("43")
-    assert "43_IronMortar?" in str(caught.value)

@@ -1,7 +1,9 @@
 """Meshes read and rendered, against closed forms and against the files' own colors."""
 
+import io
 import math
 import warnings
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -224,15 +226,6 @@ def test_orbits_are_the_72_views() -> None:
     assert small[0].position.tolist() == pytest.approx([0, 5 * unit, 0], abs=1e-3)
 
 
-def test_progress_counts_views() -> None:
-    seen: list[tuple[int, int]] = []
-    views = render_views(
-        sphere(1), orbit_cameras(sphere(1).surface, size=8)[:3], progress=lambda done, total: seen.append((done, total))
-    )
-    assert seen == [(1, 3), (2, 3), (3, 3)]
-    assert [view.name for view in views] == ["view_000", "view_001", "view_002"]
-
-
 @pytest.mark.parametrize("kind", ["obj", "glb"])
 def test_textured_files_look_as_what_they_were_written_from(tmp_path: Path, kind: str) -> None:
     texture = noise(64)
@@ -295,31 +288,34 @@ def test_without_colors_a_mesh_is_gray_and_says_so(tmp_path: Path, kind: str) ->
     assert (len(read.vertices), len(read.faces)) == (8, 12)
 
 
-def write_card(folder: Path, *, image: bytes | None, library: str = "map_Kd skin.png") -> Path:
-    (folder / "card.obj").write_text(
+def cut_short(size: int) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(noise(64)).save(file, "png")
+    return file.getvalue()[:size]
+
+
+@pytest.mark.parametrize(
+    ("image", "library", "value", "color"),
+    [
+        (None, "map_Kd skin.png", "skin.png", [255 * GRAY] * 3),
+        (cut_short(3000), "map_Kd skin.png", None, [255 * GRAY] * 3),
+        (None, "", "no warning", [127, 63, 255]),
+    ],
+    ids=["missing", "corrupt", "no image"],
+)
+def test_a_texture_that_cannot_be_read_is_named_and_a_material_without_one_has_its_color(
+    tmp_path: Path, image: bytes | None, library: str, value: str | None, color: list[float]
+) -> None:
+    (tmp_path / "card.obj").write_text(
         "mtllib card.mtl\nusemtl skin\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n"
     )
-    (folder / "card.mtl").write_text(f"newmtl skin\nKd 0.5 0.25 1\n{library}\n")
+    (tmp_path / "card.mtl").write_text(f"newmtl skin\nKd 0.5 0.25 1\n{library}\n")
     if image is not None:
-        (folder / "skin.png").write_bytes(image)
-    return folder / "card.obj"
-
-
-def test_a_missing_texture_file_is_named(tmp_path: Path) -> None:
-    with warns(CaptureWarning, file="card.obj", name="texture", value="skin.png"):
-        assert bool((read_textured_mesh(write_card(tmp_path, image=None)).colors == GRAY).all())
-
-
-def test_a_corrupt_texture_file_is_warned_of(tmp_path: Path) -> None:
-    Image.fromarray(noise(64)).save(tmp_path / "whole.png")
-    cut = (tmp_path / "whole.png").read_bytes()[:3000]
-    with warns(CaptureWarning, file="card.obj", name="texture", value=None):
-        assert bool((read_textured_mesh(write_card(tmp_path, image=cut)).colors == GRAY).all())
-
-
-def test_a_material_without_image_has_its_color(tmp_path: Path) -> None:
-    colors = read_textured_mesh(write_card(tmp_path, image=None, library="")).colors
-    assert np.allclose(colors.numpy() * 255, [127, 63, 255], atol=1)
+        (tmp_path / "skin.png").write_bytes(image)
+    warned = warns(CaptureWarning, file="card.obj", name="texture", value=value) if library else nullcontext()
+    with warned:
+        read = read_textured_mesh(tmp_path / "card.obj")
+    assert np.allclose(read.colors.numpy() * 255, color, atol=1)
 
 
 def test_bad_meshes_are_refused(tmp_path: Path) -> None:
@@ -379,13 +375,3 @@ def test_scanned_objects_fill_the_places_of_their_vertices(shared: Path, name: s
         rows, columns = view.mask.nonzero().T
         low, high = pixels.amin(0), pixels.amax(0)
         assert bool(((columns + 1 >= low[0]) & (columns <= high[0]) & (rows + 1 >= low[1]) & (rows <= high[1])).all())
-
-
-def test_the_blue_cup_is_blue_and_the_spoons_handle_red(shared: Path) -> None:
-    for name, channel in (("blue_cup", 2), ("spoon", 0)):
-        mesh = read_textured_mesh(shared / "meshes" / name / "textured.obj")
-        (view,) = render_views(mesh, orbit_cameras(mesh.surface, size=96)[6:7], ambient=1.0)
-        assert view.coverage is not None
-        colors = view.color[view.coverage == 1]
-        assert bool((colors[:, channel] >= colors.amax(dim=1)).float().mean() > 0.4)
-        assert int(colors.mean(0).argmax()) == channel

@@ -44,14 +44,6 @@ def test_the_largest_sensors_pictures_are_not_refused(tmp_path: Path, monkeypatc
     assert read_picture(path).size == (4, 3)
 
 
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
-@pytest.mark.parametrize("shape", [(5, 7), (5, 7, 3), (5, 7, 4)])
-def test_small_pictures_of_every_kind_are_read(tmp_path: Path, suffix: str, shape: tuple[int, ...]) -> None:
-    path = tmp_path / f"small{suffix}"
-    path.write_bytes(cv2.imencode(suffix, np.full(shape, 90, np.uint8))[1].tobytes())
-    assert read_picture(path).size == (7, 5)
-
-
 def test_a_bomb_among_views_is_named(tmp_path: Path) -> None:
     pose = np.eye(4).tolist()
     frames = [{"file_path": f"{number}.png", "transform_matrix": pose} for number in range(3)]
@@ -67,21 +59,4 @@ def test_too_many_frames_are_refused_before_their_poses(tmp_path: Path) -> None:
     frames = [{"file_path": "0.png", "transform_matrix": "not looked at"}] * (MAX_SHOTS + 1)
     (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 5.0, "frames": frames}))
     with raises(CaptureError, file="transforms.json", name="photographs", value=MAX_SHOTS + 1):
-        read_views(tmp_path)
-
-
-@pytest.mark.parametrize(
-    "changes", [{"fl_x": 10**400}, {"transform_matrix": [[10**400] * 4] * 4}], ids=["focal", "pose"]
-)
-def test_whole_numbers_beyond_every_float_are_refused(tmp_path: Path, changes: dict) -> None:
-    frame = {"file_path": "0.png", "transform_matrix": np.eye(4).tolist(), "fl_x": 5.0}
-    (tmp_path / "0.png").write_bytes(cv2.imencode(".png", np.zeros((8, 8, 3), np.uint8))[1].tobytes())
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame | changes]}))
-    with raises(CaptureError, file="transforms.json", row=0, name=next(iter(changes))):
-        read_views(tmp_path)
-
-
-def test_json_nested_beyond_reason_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "transforms.json").write_text("[" * 100_000)
-    with raises(CaptureError, file="transforms.json"):
         read_views(tmp_path)

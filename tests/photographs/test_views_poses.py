@@ -10,7 +10,7 @@ import torch
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.photographs import read_views
 from factories.raising import raises, warns
-from factories.views_folder import WIDTH, frames, opengl_pose, ring, write_transforms
+from factories.views_folder import frames, opengl_pose, ring, write_transforms
 
 
 def with_poses(folder: Path, change) -> Path:
@@ -120,13 +120,3 @@ def test_cameras_side_by_side_are_right(tmp_path: Path) -> None:
         pose[:3, 3] += step * pose[:3, 0]
         row["transform_matrix"] = pose.tolist()
     assert len(read_views(write_transforms(tmp_path, rows))) == 4
-
-
-def test_one_warning_for_all_poses(tmp_path: Path) -> None:
-    def scale(pose: np.ndarray) -> np.ndarray:
-        return pose * [2, 2, 2, 1]
-
-    folder = with_poses(tmp_path, scale)
-    with pytest.warns(CaptureWarning) as caught:
-        assert read_views(folder)[0].camera.width == WIDTH
-    assert len(caught) == 1

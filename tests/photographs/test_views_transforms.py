@@ -16,6 +16,9 @@ from avmsf.photographs.nerf_json import read_transforms
 from factories.raising import raises
 from factories.views_folder import HEIGHT, WIDTH, frames, ring, write_image, write_transforms
 
+LARGE = 10**400
+"""Beyond every float."""
+
 
 def facing_down_z(folder: Path) -> Path:
     """Three cameras on the z axis's side, their matrices written by hand: the first at z = 5 with no rotation."""
@@ -143,15 +146,19 @@ def test_a_model_beside_the_file_is_in_another_frame_and_left_alone(tmp_path: Pa
     assert read_sparse_points(tmp_path) is None
 
 
-def test_what_is_not_json_is_named(tmp_path: Path) -> None:
-    (tmp_path / "transforms.json").write_text('{"frames": [')
-    with raises(CaptureError, file="transforms.json", value=None):
-        read_views(tmp_path)
-    (tmp_path / "transforms.json").write_text("[1, 2]")
-    with raises(CaptureError, file="transforms.json", value="list"):
-        read_views(tmp_path)
-    (tmp_path / "transforms.json").write_text('{"frames": 3}')
-    with raises(CaptureError, file="transforms.json", name="frames", value="int"):
+@pytest.mark.parametrize(
+    ("text", "name", "value"),
+    [
+        ('{"frames": [', None, None),
+        ("[1, 2]", None, "list"),
+        ('{"frames": 3}', "frames", "int"),
+        ("[" * 100_000, None, None),
+    ],
+    ids=["cut", "list", "number", "deep"],
+)
+def test_what_is_no_json_object_with_frames_is_named(tmp_path: Path, text: str, name: str | None, value: Any) -> None:
+    (tmp_path / "transforms.json").write_text(text)
+    with raises(CaptureError, file="transforms.json", name=name, value=value):
         read_views(tmp_path)
 
 
@@ -167,6 +174,8 @@ def test_what_is_not_json_is_named(tmp_path: Path) -> None:
         ({"fl_x": -50.0}, "intrinsics", [-50.0, 52.0, 19.0, 16.0, 0, 0, 0, 0, 0, 40, 30]),
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model", "EQUIRECTANGULAR"),
         ({"k4": 0.1}, "k4", 0.1),
+        ({"fl_x": LARGE}, "fl_x", LARGE),
+        ({"transform_matrix": [[LARGE] * 4] * 4}, "transform_matrix", [[LARGE] * 4] * 4),
     ],
 )
 def test_what_a_frame_lacks_is_named(tmp_path: Path, change: dict, name: str, value: Any) -> None:
@@ -178,12 +187,10 @@ def test_what_a_frame_lacks_is_named(tmp_path: Path, change: dict, name: str, va
         read_views(tmp_path)
 
 
-def test_without_any_focal_length_it_is_asked_for(tmp_path: Path) -> None:
-    write_transforms(tmp_path, frames(ring(3)), fl_x=None, fl_y=None)
-    with raises(CaptureError, file="transforms.json", row=0, name="fl_x"):
-        read_views(tmp_path)
-    write_transforms(tmp_path, frames(ring(3)), fl_x=None, fl_y=None, camera_angle_x=50.0)
-    with raises(CaptureError, file="transforms.json", row=0, name="camera_angle_x", value=50.0):
+@pytest.mark.parametrize(("angle", "name"), [(None, "fl_x"), (50.0, "camera_angle_x")])
+def test_without_any_focal_length_it_is_asked_for(tmp_path: Path, angle: float | None, name: str) -> None:
+    write_transforms(tmp_path, frames(ring(3)), fl_x=None, fl_y=None, camera_angle_x=angle)
+    with raises(CaptureError, file="transforms.json", row=0, name=name, value=angle):
         read_views(tmp_path)
 
 
@@ -205,12 +212,11 @@ def test_folders_without_cameras_say_what_is_missing(tmp_path: Path) -> None:
         read_views(tmp_path)
 
 
-def test_numbers_that_the_caller_gives_are_checked(tmp_path: Path) -> None:
-    write_transforms(tmp_path, frames(ring(3)))
-    with raises(CaptureError, name="longest", value=0):
-        read_views(tmp_path, longest=0)
-    with raises(CaptureError, name="meters", value=-1.0):
-        read_views(tmp_path, meters=-1.0)
+@pytest.mark.parametrize("given", [{"longest": 0}, {"meters": -1.0}])
+def test_numbers_that_the_caller_gives_are_checked(tmp_path: Path, given: dict) -> None:
+    ((name, value),) = given.items()
+    with raises(CaptureError, name=name, value=value):
+        read_views(write_transforms(tmp_path, frames(ring(3))), **given)
 
 
 def test_paths_outside_the_folder_are_read(tmp_path: Path) -> None:
