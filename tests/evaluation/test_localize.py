@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,9 +14,9 @@ from avmsf.baselines.diffsound.renderer import DiffSound
 from avmsf.capture import Impacts, read_capture
 from avmsf.cli import main
 from avmsf.errors import LocationError
-from avmsf.evaluation import localization, report
+from avmsf.evaluation import report
 from avmsf.evaluation.field_methods import FieldMethod
-from avmsf.evaluation.localization import MAX_VERTICES, PublishedLocator, located, random_distance
+from avmsf.evaluation.localization import MAX_VERTICES, located, published_distance, random_distance
 from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.simple_methods import NearestRecording, WhiteNoise
@@ -37,7 +36,7 @@ def test_the_nearest_recording_finds_itself_and_noise_counts_as_a_random_point()
     train, points = plate_impacts(), plate_features().points
     size = float((points.amax(0) - points.amin(0)).norm())
     assert located(NearestRecording(train), train, train, points).errors == {"rmed": (0.0,) * len(train)}
-    expected = [random_distance(points.double(), place[None]) / size for place in train.contacts]
+    expected = [random_distance(points, place) / size for place in train.contacts]
     assert located(WhiteNoise(train), train, train, points).errors["rmed"] == pytest.approx(expected)
     silent = replace(train, sounds=0 * train.sounds)
     assert located(NearestRecording(train), train, silent, points).errors["rmed"] == pytest.approx(expected)
@@ -68,16 +67,16 @@ def test_a_field_finds_where_its_own_sounds_come_from() -> None:
 def test_the_published_distance_is_one_minus_the_cosine_with_the_gains_of_the_regression() -> None:
     points = plate_features().points[::10]
     field = smooth_field(plate_impacts(), plate_features())
-    locator = PublishedLocator.of(field, points)
     sound = struck(field, plate_features().points).sounds[3]
     recorded = ShortTime().gains(sound[None], field.bank, field.sample_rate)[0].numpy()
-    own = field.gains(points).double().numpy()
+    gains = field.gains(points).double()
+    own = gains.numpy()
     expected = 1.0 - own @ recorded / np.linalg.norm(own, axis=1) / np.linalg.norm(recorded)
-    assert locator.distance(sound).numpy() == pytest.approx(expected, abs=1e-6)
+    assert published_distance(field, gains, sound).numpy() == pytest.approx(expected, abs=1e-6)
     # Neither force nor polarity changes it.
-    assert locator.distance(-250.0 * sound).numpy() == pytest.approx(expected, abs=1e-4)
+    assert published_distance(field, gains, -250.0 * sound).numpy() == pytest.approx(expected, abs=1e-4)
     with raises(LocationError, name="sound"):
-        locator.distance(0.0 * sound)
+        published_distance(field, gains, 0.0 * sound)
 
 
 def test_the_published_form_takes_the_least_cosine_distance_and_refuses_no_noise() -> None:
@@ -88,24 +87,25 @@ def test_the_published_form_takes_the_least_cosine_distance_and_refuses_no_noise
     noise = torch.randn(test.sounds[0].shape, generator=torch.Generator().manual_seed(1))
     test = replace(test, sounds=torch.cat([test.sounds[:-1], noise[None]]))
     found = located(field, train, test, points, published=True, map_rows=(0, len(test) - 1))
-    locator = PublishedLocator.of(field, points)
+    gains = field.gains(points).double()
     for row, rmed in enumerate(found.errors["rmed"]):
-        place = points[int(locator.distance(test.sounds[row]).argmin())]
+        place = points[int(published_distance(field, gains, test.sounds[row]).argmin())]
         assert rmed == pytest.approx(float((place - test.contacts[row]).norm()) / size, rel=1e-5)
     # Noise has a least distance too, and no map.
     assert set(found.maps) == {0}
     order = torch.cdist(found.maps[0].points, points).argmin(1)
-    torch.testing.assert_close(found.maps[0].distance, locator.distance(test.sounds[0])[order])
+    torch.testing.assert_close(found.maps[0].distance, published_distance(field, gains, test.sounds[0])[order])
 
 
 def test_diffsound_searches_the_vertices_of_the_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
     searched = []
 
-    def simulated(renderer: DiffSound, points: torch.Tensor) -> SimpleNamespace:
+    def simulated(renderer: DiffSound, points: torch.Tensor) -> torch.Tensor:
         searched.append(points)
-        return SimpleNamespace(place=lambda sound: points[0])
+        return points
 
-    monkeypatch.setattr(localization.DiffSoundLocator, "of", simulated)
+    monkeypatch.setattr(DiffSound, "gains", simulated)
+    monkeypatch.setattr(DiffSound, "distance", lambda renderer, gains, sound: torch.zeros(len(gains)))
     train, points = plate_impacts(), plate_features().points
     vertices = torch.rand(MAX_VERTICES + 5000, 3, generator=torch.Generator().manual_seed(0))
     renderer = object.__new__(DiffSound)

@@ -27,13 +27,9 @@ RATE, SAMPLES = 8000.0, 3000
 STRUCK = (68, 60, 102, 8)
 
 
-def test_chance_is_the_mean_distance_from_the_nearest_right_place() -> None:
+def test_chance_is_the_mean_distance_from_the_right_place() -> None:
     points = torch.tensor([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [10.0, 0.0, 0.0]])
-    right = torch.tensor([[0.0, 3.0, 0.0], [10.0, 0.0, 0.0]])
-    assert random_distance(points, right[:1]) == pytest.approx((3 + 5 + math.sqrt(109)) / 3)
-    assert random_distance(points, right) == pytest.approx((3 + 5 + 0) / 3)
-    # More points than are looked at at once.
-    assert random_distance(points.repeat(1000, 1), right) == pytest.approx(8 / 3)
+    assert random_distance(points, torch.tensor([0.0, 3.0, 0.0])) == pytest.approx((3 + 5 + math.sqrt(109)) / 3)
 
 
 @cache
@@ -61,7 +57,6 @@ def test_the_most_alike_spectrum_is_a_sounds_own_however_loud() -> None:
         level = 1e-3 * float(sound.abs().max())
         other = -300.0 * (sound + level * torch.randn(SAMPLES, generator=generator))
         assert alike.row(other) == row
-        assert torch.equal(alike.place(other), strikes().contacts[row])
     with raises(EvaluationError, name="sound", value=0.0):
         alike.row(torch.zeros(SAMPLES))
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from avmsf._utils.files import write_whole
 from avmsf._utils.state import read_tensors
-from avmsf.baselines.diffsound.renderer import DiffSound, DiffSoundLocator
+from avmsf.baselines.diffsound.renderer import DiffSound
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, LocationError
 from avmsf.evaluation.simple_methods import NearestRecording
@@ -68,7 +68,7 @@ def located(
     """Locate each recording of `test` by a method, among `CANDIDATES` of the object's points.
 
     DiffSound searches the `vertices` of the object's mesh where they are given, as in the paper. With `published`,
-    `rmed` of a field is that of `PublishedLocator`; otherwise its gains are compared at the best delay and without
+    `rmed` of a field is that of `published_distance`; otherwise its gains are compared at the best delay and without
     their expected noise. Maps are returned of the recordings `map_rows`.
     """
     points = points[farthest_points(points, min(CANDIDATES, len(points)))].double()
@@ -84,7 +84,7 @@ def located(
             places, found = find(sound)
         except (LocationError, EvaluationError):
             places, found = {}, None
-        chance = random_distance(points, truth[None])
+        chance = random_distance(points, truth)
         distances = [float((truth - places[name]).norm()) if name in places else chance for name in names]
         rows.append([distance / diagonal for distance in distances])
         if found is not None and row in map_rows:
@@ -97,10 +97,10 @@ def _by_field(
 ) -> Callable[[Float[Tensor, " samples"]], _Places]:
     """Return what locates a sound by a field."""
     locator = Locator.of(field, points=points)
-    plain = PublishedLocator.of(field, points) if published else None
+    gains = field.gains(points).double() if published else None
 
     def find(sound: Float[Tensor, " samples"]) -> _Places:
-        distance = None if plain is None else plain.distance(sound)
+        distance = None if gains is None else published_distance(field, gains, sound)
         try:
             found = locator.locate(sound)
         except LocationError:
@@ -118,11 +118,11 @@ def _finder(
 ) -> Callable[[Float[Tensor, " samples"]], _Places]:
     """Return what locates a sound by another method; nothing for methods that cannot."""
     if isinstance(renderer, DiffSound):
-        simulated = DiffSoundLocator.of(renderer, points)
-        return lambda sound: ({"rmed": simulated.place(sound)}, None)
+        gains = renderer.gains(points)
+        return lambda sound: ({"rmed": points[int(renderer.distance(gains, sound).argmin())]}, None)
     if isinstance(renderer, NearestRecording):
         similar = NearestSpectrum(train)
-        return lambda sound: ({"rmed": similar.place(sound)}, None)
+        return lambda sound: ({"rmed": train.contacts[similar.row(sound)].double()}, None)
     return lambda sound: ({}, None)
 
 
@@ -131,42 +131,27 @@ def _fewer(vertices: Float64[Tensor, "vertices 3"]) -> Float64[Tensor, "points 3
     return vertices[torch.linspace(0, len(vertices) - 1, count, dtype=torch.float64).round().long()]
 
 
-@dataclass(frozen=True, eq=False)
-class PublishedLocator:
-    """A field's gains at candidate points, against those of the paper's regression (eq. 5) in a recording.
+def published_distance(
+    field: SoundField, gains: Float64[Tensor, "points modes"], sound: Float[Tensor, " samples"]
+) -> Float64[Tensor, " points"]:
+    """Return the cosine distance, 0 to 2, of a field's gains at points from a sound's (eq. 15); 1 without gains.
 
-    The regression is that of the warm-up, at the bins of the field's own frequencies. Its gains have no sign, so that
-    neither has a recording.
+    A sound's gains are those of the paper's regression (eq. 5), that of the warm-up, at the bins of the field's own
+    frequencies; they have no sign, so that neither has a recording. The sound starts where the field's training sounds
+    do and has their sample rate. Raises LocationError where no mode of the field is found in it.
     """
-
-    field: SoundField
-    points: Float64[Tensor, "points 3"]
-    """Object frame, meters."""
-    gains: Float64[Tensor, "points modes"]
-
-    @classmethod
-    def of(cls, field: SoundField, points: Float[Tensor, "points 3"]) -> "PublishedLocator":
-        """Return the locator over points."""
-        return cls(field, points.double(), field.gains(points).double())
-
-    def distance(self, sound: Float[Tensor, " samples"]) -> Float64[Tensor, " points"]:
-        """Return the cosine distance, 0 to 2, of each point's gains from a sound's; 1 at points without gains.
-
-        The sound starts where the field's training sounds do and has their sample rate. Raises LocationError where no
-        mode of the field is found in it.
-        """
-        given = sound.detach().cpu()[None, : self.field.samples]
-        recorded = ShortTime().gains(given, self.field.bank, self.field.sample_rate)[0]
-        if not bool(recorded.any()):
-            raise LocationError.expected(
-                "one of the field's modes", name="sound", advice="record the impact louder, or with less noise"
-            )
-        return 1.0 - torch.nn.functional.cosine_similarity(self.gains, recorded[None], dim=1)
+    given = sound.detach().cpu()[None, : field.samples]
+    recorded = ShortTime().gains(given, field.bank, field.sample_rate)[0]
+    if not bool(recorded.any()):
+        raise LocationError.expected(
+            "one of the field's modes", name="sound", advice="record the impact louder, or with less noise"
+        )
+    return 1.0 - torch.nn.functional.cosine_similarity(gains, recorded[None], dim=1)
 
 
 @dataclass(frozen=True, eq=False)
 class NearestSpectrum:
-    """The contact of the training recording with the most similar spectrum, independent of level."""
+    """The training recording with the most similar spectrum, independent of level."""
 
     train: Impacts
 
@@ -179,10 +164,6 @@ class NearestSpectrum:
             raise EvaluationError("expected a recording, got silence; omit it", name="sound", value=0.0)
         similarity = self._signatures @ self._signature(sound)
         return int(torch.where(self.train.sounds.any(dim=1), similarity, -torch.inf).argmax())
-
-    def place(self, sound: Float[Tensor, " samples"]) -> Float64[Tensor, " 3"]:
-        """Return the contact of that recording, meters."""
-        return self.train.contacts[self.row(sound)].double()
 
     @cached_property
     def _signatures(self) -> Float64[Tensor, "contacts bins"]:
@@ -206,10 +187,9 @@ class NearestSpectrum:
         return centered / centered.norm().clamp_min(torch.finfo(torch.float64).tiny)
 
 
-def random_distance(points: Float[Tensor, "points 3"], right: Float[Tensor, "images 3"]) -> float:
-    """Return how far a point drawn evenly from an object's points is expected to be from the nearest right place."""
-    nearest = [torch.cdist(part.double(), right.double()).amin(dim=1) for part in torch.split(points, 1024)]
-    return float(torch.cat(nearest).mean())
+def random_distance(points: Float[Tensor, "points 3"], right: Float[Tensor, " 3"]) -> float:
+    """Return how far a point drawn evenly from an object's points is expected to be from the right place."""
+    return float((points.double() - right.double()).norm(dim=1).mean())
 
 
 def write_map(path: Path, found: ContactMap, *, truth: Float[Tensor, " 3"]) -> None:

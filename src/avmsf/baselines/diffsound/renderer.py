@@ -91,6 +91,22 @@ class DiffSound:
         )
         return sounds + low_fluctuation_noise(self.residual.magnitude, samples=self.samples).to(sounds)
 
+    def distance(
+        self, gains: Float64[Tensor, "points modes"], sound: Float[Tensor, " samples"]
+    ) -> Float64[Tensor, " points"]:
+        """Return the cosine distance of points' `gains` from those in a sound, 0 to 1 (see `cosine_distance`).
+
+        The sound starts about at its onset and has the renderer's sample rate. Raises LocationError where it is silent
+        or not finite.
+        """
+        audible = sound.detach().cpu()[: self.samples].double()
+        if not bool(torch.isfinite(audible).all()) or not bool(audible.any()):
+            raise LocationError(
+                "sound: expected finite samples that are not all 0, got others; record the impact again", name="sound"
+            )
+        sine, cosine = fit_gains(audible[None], self.bank, sample_rate=self.sample_rate)
+        return cosine_distance(gains.to(torch.complex64), torch.complex(sine[0], cosine[0]), self.bank.frequency)
+
 
 def fit_diffsound(
     train: Impacts,
@@ -188,46 +204,3 @@ def _weights(
     root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
     target = np.linalg.lstsq(root.T, (products / scale).numpy(), rcond=None)[0]
     return torch.from_numpy(scipy.optimize.nnls(root, target)[0]) / scale
-
-
-@dataclass(frozen=True, eq=False)
-class DiffSoundLocator:
-    """Simulated gains at candidate points."""
-
-    renderer: DiffSound
-    points: Float64[Tensor, "points 3"]
-    """Object frame, meters."""
-    gains: Float64[Tensor, "points modes"]
-
-    @classmethod
-    def of(
-        cls,
-        renderer: DiffSound,
-        points: Float[Tensor, "points 3"],
-        *,
-        directions: Float[Tensor, "points 3"] | None = None,
-    ) -> "DiffSoundLocator":
-        """Return the locator over points, struck along `directions` (unit vectors) or straight into the surface."""
-        places = points.detach().cpu().double()
-        gains = renderer.gains(places, directions=directions)
-        return cls(renderer, places, gains)
-
-    def distance(self, sound: Float[Tensor, " samples"]) -> Float64[Tensor, " points"]:
-        """Return the cosine distance of each point's gains from a sound's, 0 to 1 (see `cosine_distance`).
-
-        The sound starts about at its onset and has the renderer's sample rate. Raises LocationError where it is silent
-        or not finite.
-        """
-        audible = sound.detach().cpu()[: self.renderer.samples].double()
-        if not bool(torch.isfinite(audible).all()) or not bool(audible.any()):
-            raise LocationError(
-                "sound: expected finite samples that are not all 0, got others; record the impact again", name="sound"
-            )
-        sine, cosine = fit_gains(audible[None], self.renderer.bank, sample_rate=self.renderer.sample_rate)
-        return cosine_distance(
-            self.gains.to(torch.complex64), torch.complex(sine[0], cosine[0]), self.renderer.bank.frequency
-        )
-
-    def place(self, sound: Float[Tensor, " samples"]) -> Float64[Tensor, " 3"]:
-        """Return the point of the least distance, meters."""
-        return self.points[int(self.distance(sound).argmin())]
