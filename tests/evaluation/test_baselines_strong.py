@@ -6,12 +6,10 @@ import pytest
 import torch
 
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import EvaluationError
 from avmsf.evaluation.simple_methods import MeanGains, SplineGains
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
-from factories.raising import raises
 from oracles.plate import Plate, plate_modes, sample_contacts
 
 
@@ -134,21 +132,3 @@ def test_blows_from_the_other_side_do_not_cancel(baseline):
     # Without directions nothing tells them apart.
     blind = baseline(replace(impacts, directions=None), both_sides).complex_gains(asked)
     assert float((blind - expected).abs().max()) > 0.3 * float(expected.abs().max())
-
-
-def test_spline_gains_have_both_phases():
-    impacts, _, modes = two_sided()
-    turned_modes = replace(modes, gains=torch.zeros_like(modes.gains), quadrature=modes.gains)
-    renderer = SplineGains(replace(impacts, directions=None), turned_modes)
-    straight = SplineGains(replace(impacts, directions=None), modes)
-    assert float(renderer.complex_gains(impacts.contacts).imag.abs().max()) == 0.0
-    assert torch.equal(renderer.complex_gains(impacts.contacts).real, -straight.complex_gains(impacts.contacts).imag)
-    first = renderer.render(impacts.contacts)[:, 0]
-    # A cosine starts at its gain, and the spline passes through the gains.
-    assert torch.allclose(first, modes.gains.sum(1), rtol=0, atol=1e-4 * float(modes.gains.abs().max()))
-
-
-def test_modes_of_other_recordings_are_refused():
-    impacts, modes, _ = two_sided()
-    with raises(EvaluationError, name="extraction", value=14):
-        SplineGains(impacts.take(range(4)), modes)

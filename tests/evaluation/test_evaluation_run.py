@@ -27,7 +27,7 @@ from avmsf.evaluation.runner import Evaluation
 from avmsf.evaluation.simple_methods import NearestRecording
 from avmsf.evaluation.splits import MetricSettings, evaluate, split, spread
 from avmsf.evaluation.task import Method, Renderer, Task
-from avmsf.simulate.ground_truth import read_truth
+from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
 from factories.plate_set import PlateInputs, fill_plates
 from factories.raising import raises
 
@@ -176,6 +176,18 @@ def test_an_object_that_cannot_be_read_or_shows_nothing_is_a_failure(plates: Pat
     assert [(each["object"], each["method"]) for each in failures] == [("a", "field"), ("b", None)]
     assert "nothing shows its look" in failures[0]["failure"]
     assert "03.wav" in failures[1]["failure"]
+
+
+def test_a_truth_of_other_recordings_costs_its_object_alone_until_it_is_mended(tmp_path: Path) -> None:
+    folder = fill_plates(tmp_path / "plates", ("a", "b"), count=6, truth=True)
+    truth = read_truth(folder / "a")
+    write_truth(replace(truth, names=tuple(f"x{name}" for name in truth.names)), folder / "a" / TRUTH)
+    results = ResultsFolder(tmp_path / "results")
+    run_objects(planned(folder, "nearest"), ("a", "b"), results)
+    assert [len(each.outcomes) for each in results.records()] == [0, 1]
+    (folder / "a" / TRUTH).unlink()
+    run_objects(planned(folder, "nearest"), ("a", "b"), results)
+    assert [(len(each.outcomes), each.failure) for each in results.records()] == [(1, None), (1, None)]
 
 
 def test_methods_share_modes_that_are_found_once_and_kept(plates: Path, tmp_path: Path) -> None:

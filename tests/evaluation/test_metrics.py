@@ -9,7 +9,7 @@ import pytest
 import torch
 from corpus import make as corpus
 
-from avmsf.errors import ArrayError, EvaluationError
+from avmsf.errors import EvaluationError
 from avmsf.evaluation.cdpam import Cdpam
 from avmsf.evaluation.metrics import (
     default_fft_sizes,
@@ -21,7 +21,6 @@ from avmsf.evaluation.metrics import (
     spectrogram_distance,
     validate,
 )
-from avmsf.modal.config import scaled_fft_size
 from avmsf.modal.spectra import magnitude_stft
 from factories.raising import raises
 
@@ -235,8 +234,3 @@ def test_every_metric_of_the_corpus_says_what_it_said():
 def test_nothing_is_relative_to_silence():
     with raises(EvaluationError, name="truth", value=0.0):
         relative_stft_error(clips(), 0 * clips(), fft_sizes=(256,))
-
-
-def test_rates_without_sense_are_refused():
-    with raises(ArrayError, name="sample_rate", value=-1.0):
-        scaled_fft_size(1024, sample_rate=-1.0)

@@ -123,11 +123,6 @@ def test_a_mesh_may_be_preferred_to_the_photographs_beside_it(tmp_path: Path) ->
     assert (best.kind, mesh.kind) == ("cameras", "mesh")
 
 
-def test_a_negative_number_of_views_is_refused() -> None:
-    with raises(SceneError, name="count", value=-1):
-        ViewsConfig(count=-1)
-
-
 def test_the_surface_of_a_mesh_needs_no_views_and_is_that_of_a_fit(tmp_path: Path) -> None:
     found = ObjectInputs(OneObject(None, slab()), tmp_path / "cache", CONFIG, seed=3).features("slab", "surface")
     assert torch.equal(found.points, FeatureField.from_mesh(slab(), seed=3).points)

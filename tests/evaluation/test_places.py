@@ -1,16 +1,11 @@
 """Places are counted, chosen and left out with all their recordings, however often and however exactly."""
 
-import warnings
-from dataclasses import replace
-from pathlib import Path
-
 import pytest
 import torch
 
-from avmsf.capture import CaptureSettings, read_capture
 from avmsf.capture.impacts import Impacts
 from avmsf.cli.scores import parts_words
-from avmsf.errors import CaptureWarning, EvaluationError
+from avmsf.errors import EvaluationError
 from avmsf.evaluation.cases import Choosing, Closest, Farthest, LeaveOneOut, Places, Shots
 from avmsf.evaluation.splits import split
 from factories.raising import raises
@@ -72,25 +67,7 @@ def test_a_choice_may_start_from_any_recording_of_a_place() -> None:
     assert "60 recordings at 20 contacts" in str(caught.value)
 
 
-def test_no_impacts_have_no_places() -> None:
-    with raises(EvaluationError, name="count") as caught:
-        split(repeated().take([]), 0.2)
-    assert "0 recordings at 0 contacts" in str(caught.value)
-
-
 def test_places_and_recordings_are_told_apart() -> None:
     assert parts_words(*split(repeated(times=1), 5)) == "15 positions not trained on, 5 trained on"
     words = parts_words(*split(repeated(apart=0.002), 5))
     assert words == "15 positions not trained on, 5 trained on (45 and 15 recordings)"
-
-
-@pytest.mark.parametrize(("fraction", "places"), [(0.5, 22), (0.3, 13)])
-def test_fractions_of_a_tree_struck_twice_a_place(shared: Path, fraction: float, places: int) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CaptureWarning)
-        tree = read_capture(shared / "tree43", CaptureSettings()).impacts
-    train, test = split(tree, fraction)
-    assert (len(train), len(test)) == (2 * places, 2 * (43 - places))
-    moved = tree.contacts + 2e-4 * torch.randn(tree.contacts.shape, generator=torch.Generator().manual_seed(0))
-    again, others = split(replace(tree, contacts=moved), fraction)
-    assert (len(again), len(others)) == (len(train), len(test))

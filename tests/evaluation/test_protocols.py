@@ -9,7 +9,7 @@ import torch
 
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.cases import Case, Closest, Farthest, FewerViews, LeaveOneOut, Predefined, Shots
+from avmsf.evaluation.cases import Closest, Farthest, FewerViews, LeaveOneOut, Predefined, Shots
 from avmsf.evaluation.methods import METHODS
 from avmsf.evaluation.protocols import BASELINE, PROTOCOLS, protocol_named
 from avmsf.evaluation.splits import split
@@ -130,11 +130,6 @@ def test_too_few_contacts_are_refused() -> None:
         with raises(EvaluationError, name="count") as caught:
             choosing.cases(lonely)
         assert "3 recordings at 1 contact" in str(caught.value)
-
-
-def test_a_case_of_several_parts_is_told_by_its_part() -> None:
-    assert Case("a", (0,), (1,)).key == "a"
-    assert Case("a", (0,), (1,), fold="x.wav").key == "a: x.wav"
 
 
 def test_all_methods_of_all_protocols_are_known_and_the_baseline_takes_part() -> None:

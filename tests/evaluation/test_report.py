@@ -24,7 +24,7 @@ from avmsf.evaluation.registry import title_of
 from avmsf.evaluation.report import write_page, write_summary
 from avmsf.evaluation.report_tables import WARNING, Grid, Section, figure, markdown, sections
 from avmsf.evaluation.results import CaseRecord, ObjectRecord, Outcome, ResultsFolder, natural
-from avmsf.evaluation.summary import Mean, missing_of, object_figures, summarize
+from avmsf.evaluation.summary import missing_of, object_figures, summarize
 from factories.plate_set import fill_plates
 from factories.raising import raises
 
@@ -136,10 +136,6 @@ def test_figures_of_which_more_is_better_have_no_ratio() -> None:
 def test_groups_of_objects_have_their_own_means() -> None:
     summary = summarize(THREE, IDENTITY, subsets={"odd": frozenset({"1"}), "none": frozenset({"7"})})
     assert summary["subsets"] == {"odd": {"objects": 1, "methods": {"knn3": {"l1": 2.0}, "paper": {"l1": 1.0}}}}
-
-
-def test_the_mean_of_one_has_no_standard_error() -> None:
-    assert Mean.of([3.0]) == Mean(3.0, None, 1)
 
 
 def test_tables_have_the_papers_rows_for_its_datasets_alone() -> None:
