@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from avmsf.errors import ArrayError, LocationError
-from avmsf.localization.contact_map import ContactMap, EquivalentPoint
+from avmsf.localization.contact_map import ContactMap, Peak
 from avmsf.localization.locator import Locator
 from avmsf.symmetry.symmetries import MirrorSymmetry, RotationalSymmetry, Symmetries
 from factories.located_plate import PLATE, TrueGains, field_of, struck
@@ -132,7 +132,7 @@ def test_a_symmetric_plate_is_ambiguous_and_each_counterpart_is_named():
 
 def test_a_place_that_no_symmetry_reaches_is_not_explained():
     place, other = torch.tensor([0.02, 0.03, 0.0]), torch.tensor([0.1, 0.05, 0.0])
-    named = EquivalentPoint.of(place, other, plate_symmetries(), probability=0.4, tolerance=0.01)
+    named = Peak(1, other, 0.4, torch.ones(2) > 0).explained(place, plate_symmetries(), tolerance=0.01)
     assert named.symmetry is None
     assert str(named).startswith("also at (0.1, 0.05, 0) m, with 40 %: no known symmetry")
 
@@ -140,5 +140,5 @@ def test_a_place_that_no_symmetry_reaches_is_not_explained():
 def test_any_turn_is_found_for_a_round_object():
     turns = Symmetries((RotationalSymmetry(axis(2), torch.zeros(3).double(), None, 0.1),), (), 0.005, 0.38, 1.0)
     place, other = torch.tensor([0.1, 0.0, 0.05]), torch.tensor([0.0, 0.1, 0.05])
-    named = EquivalentPoint.of(place, other, turns, probability=0.4, tolerance=0.01)
+    named = Peak(1, other, 0.4, torch.ones(2) > 0).explained(place, turns, tolerance=0.01)
     assert named.angle == pytest.approx(math.pi / 2, abs=0.02)

@@ -21,7 +21,6 @@ from factories.located_plate import (
     TrueGains,
     bank,
     field_of,
-    fitted_field,
     held,
     locator_of,
     missed,
@@ -157,15 +156,9 @@ def test_modes_beneath_noise_count_for_little():
     white[:, white.shape[1] // 4 :] = 0
     rumble = torch.fft.irfft(white, n=impacts.sounds.shape[1])
     sounds = impacts.sounds + 60 * rumble * impacts.sounds.std() / rumble.std()
-    heeding, plain = [], []
-    for each, use in ((heeding, True), (plain, False)):
-        locator = Locator.of(true_field(), use_residual=use)
-        for sound, contact in zip(sounds, impacts.contacts, strict=True):
-            found = locator.locate(sound)
-            each.append((missed(found, found.most_probable, contact), missed(found, found.best, contact)))
-    errors = torch.tensor([heeding, plain]).mean(1)
-    assert float(errors[0, 0]) < 0.02
-    assert bool((errors[0] < 0.8 * errors[1]).all()), errors
+    found = [locator_of().locate(sound) for sound in sounds]
+    errors = [missed(each, each.most_probable, contact) for each, contact in zip(found, impacts.contacts, strict=True)]
+    assert sum(errors) / 12 < 0.02
 
 
 def test_short_sounds_suffice_although_modes_cannot_be_told_apart():
@@ -174,16 +167,6 @@ def test_short_sounds_suffice_although_modes_cannot_be_told_apart():
         found = locator.locate(sound[:400])
         assert missed(found, found.most_probable, contact) < 0.03
         assert found.explained_energy > 0.9
-
-
-def test_areas_and_other_points_count():
-    sound, points = struck(1, seed=2).sounds[0], plate_surface_points(PLATE, 60)
-    found = Locator.of(fitted_field(25), points=points).locate(sound)
-    assert len(found.probability) == len(points)
-    areas = torch.ones(len(points))
-    areas[found.most_probable] = 1e-30
-    other = Locator.of(fitted_field(25), points=points, areas=areas).locate(sound)
-    assert other.most_probable != found.most_probable
 
 
 @pytest.mark.parametrize("length", [0.14, 0.22, 0.25, 0.4])
@@ -314,8 +297,6 @@ def test_a_locator_is_of_its_own_field_and_points():
         ("points", {"points": torch.full((3, 3), torch.nan)}),
         ("directions", {"points": torch.zeros(3, 3), "directions": torch.zeros(2, 3)}),
         ("directions", {"points": torch.zeros(3, 3), "directions": torch.full((3, 3), torch.nan)}),
-        ("areas", {"points": torch.zeros(3, 3), "areas": torch.zeros(3)}),
-        ("areas", {"points": torch.zeros(3, 3), "areas": torch.ones(2)}),
     ],
 )
 def test_points_without_sense_are_refused(name, given):

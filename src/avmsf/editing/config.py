@@ -32,26 +32,23 @@ class GuidedEditConfig:
 
     def __post_init__(self) -> None:
         """Raise `EditError` for values out of range."""
-        for name, least in (
-            ("steps", 1),
-            ("contacts_per_step", 1),
-            ("free_modes", 1),
-            ("preview_every", 0),
-            ("seed", 0),
-        ):
-            if getattr(self, name) < least:
-                raise _unfit(self, name, f"{least} or more")
-        if self.seed > _LARGEST_SEED:
-            raise _unfit(self, "seed", f"at most {_LARGEST_SEED}")
-        if self.seconds is not None and not 0 < self.seconds < math.inf:
-            raise _unfit(self, "seconds", "more than 0")
-        if not self.fft_sizes or any(size < 4 or size % 4 for size in self.fft_sizes):
-            raise _unfit(self, "fft_sizes", "multiples of 4, such as 2048, 1024, 512, 256")
-        longest = max(self.fft_sizes) / 44100
-        if self.seconds is not None and self.seconds < longest:
-            raise _unfit(
-                self, "seconds", f"at least {longest:.2g}, the largest of fft_sizes at 44.1 kHz, or smaller fft_sizes"
-            )
+        longest = max(self.fft_sizes, default=0) / 44100
+        _check(
+            self,
+            steps=(self.steps >= 1, "1 or more"),
+            contacts_per_step=(self.contacts_per_step >= 1, "1 or more"),
+            free_modes=(self.free_modes >= 1, "1 or more"),
+            preview_every=(self.preview_every >= 0, "0 or more"),
+            seed=(0 <= self.seed <= _LARGEST_SEED, f"0 to {_LARGEST_SEED}"),
+            fft_sizes=(
+                bool(self.fft_sizes) and not any(size < 4 or size % 4 for size in self.fft_sizes),
+                "multiples of 4, such as 2048, 1024, 512, 256",
+            ),
+            seconds=(
+                self.seconds is None or longest <= self.seconds < math.inf,
+                f"at least {longest:.2g}, the largest of fft_sizes at 44.1 kHz, or smaller fft_sizes",
+            ),
+        )
 
 
 @dataclass(frozen=True)
@@ -71,18 +68,21 @@ class DistillationConfig:
 
     def __post_init__(self) -> None:
         """Raise `EditError` for values out of range."""
-        if not 0 < self.lowest <= self.highest < 1:
-            raise _unfit(self, "lowest" if not 0 < self.lowest < 1 else "highest", "0 < lowest <= highest < 1")
-        for name in ("denoising", "batch"):
-            if getattr(self, name) < 1:
-                raise _unfit(self, name, "1 or more")
-        if not (self.guidance >= 0 and math.isfinite(self.guidance)):
-            raise _unfit(self, "guidance", "0 or more, such as 15")
+        _check(
+            self,
+            lowest=(0 < self.lowest < 1, "above 0 and below 1"),
+            highest=(self.lowest <= self.highest < 1, "lowest or more, and below 1"),
+            denoising=(self.denoising >= 1, "1 or more"),
+            batch=(self.batch >= 1, "1 or more"),
+            guidance=(self.guidance >= 0 and math.isfinite(self.guidance), "0 or more, such as 15"),
+        )
 
 
-def _unfit(settings: GuidedEditConfig | DistillationConfig, name: str, expected: str) -> EditError:
-    value = getattr(settings, name)
-    return EditError(f"{name}: expected {expected}, got {value}", name=name, value=value)
+def _check(settings: object, **rules: tuple[bool, str]) -> None:
+    """Raise `EditError` for the first setting whose rule, and what it expects, does not hold."""
+    for name, (holds, expected) in rules.items():
+        if not holds:
+            raise EditError.expected(expected, getattr(settings, name), name=name)
 
 
 def check_prompt(prompt: str) -> str:

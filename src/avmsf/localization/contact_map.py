@@ -50,19 +50,9 @@ class Peak:
     """That the contact is one of its points."""
     points: Bool[Tensor, " points"]
     """Which points it contains."""
-
-
-@dataclass(frozen=True, eq=False)
-class EquivalentPoint:
-    """Another possible position, and the symmetry that maps the most probable one to it."""
-
-    position: Float32[Tensor, " 3"]
-    """Object frame, meters."""
-    probability: float
-    """That the contact is there."""
-    symmetry: RotationalSymmetry | MirrorSymmetry | None
-    """The symmetry that maps the most probable position to this one; None if no known one does."""
-    angle: float | None
+    symmetry: RotationalSymmetry | MirrorSymmetry | None = None
+    """The symmetry that maps the most probable position of all to this one; None if no known one does."""
+    angle: float | None = None
     """Its angle in radians, for a rotation."""
 
     def __str__(self) -> str:
@@ -77,33 +67,24 @@ class EquivalentPoint:
             why = f"its rotation by {math.degrees(self.angle):.0f} degrees about {axis}"
         return f"also at ({where}) m, with {100 * self.probability:.0f} %: {why}"
 
-    @classmethod
-    def of(
-        cls,
-        first: Float[Tensor, " 3"],
-        other: Float[Tensor, " 3"],
-        symmetries: Symmetries | None,
-        *,
-        probability: float,
-        tolerance: float,
-    ) -> "EquivalentPoint":
-        """Return `other` with the symmetry that maps `first` nearest to it; positions and tolerance in meters.
+    def explained(self, first: Float[Tensor, " 3"], symmetries: Symmetries | None, *, tolerance: float) -> "Peak":
+        """Return it with the symmetry that maps `first` nearest to its position; positions and tolerance in meters.
 
-        Images farther than `tolerance` from `other` do not count, nor do symmetries that leave `first` about where it
-        is.
+        Images farther off than `tolerance` do not count, nor do symmetries that leave `first` about where it is.
         """
-        images: list[tuple[RotationalSymmetry | MirrorSymmetry, float | None, Tensor]] = []
-        if symmetries is not None:
-            row = first.double()[None]
-            images += [(each, None, each.reflect(row)[0]) for each in symmetries.mirrors]
-            turns = [(each, angle) for each in symmetries.rotations for angle in each.angles(_ANGLES)[1:]]
-            images += [(each, angle, each.turn(row, angle)[0]) for each, angle in turns]
-        nearest, found, rotated = tolerance, None, None
+        if symmetries is None:
+            return self
+        row, found, nearest = first.double()[None], self, tolerance
+        turns = [(each, angle) for each in symmetries.rotations for angle in each.angles(_ANGLES)[1:]]
+        images: list[tuple[RotationalSymmetry | MirrorSymmetry, float | None, Tensor]] = [
+            *((each, None, each.reflect(row)[0]) for each in symmetries.mirrors),
+            *((each, angle, each.turn(row, angle)[0]) for each, angle in turns),
+        ]
         for symmetry, angle, image in images:
-            distance = float((image - other.double()).norm())
+            distance = float((image - self.position.double()).norm())
             if distance < nearest and float((image - first.double()).norm()) > distance:
-                nearest, found, rotated = distance, symmetry, angle
-        return cls(other, probability, found, rotated)
+                nearest, found = distance, replace(self, symmetry=symmetry, angle=angle)
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,9 +232,7 @@ class ContactMap:
         """Whether the contact may be at several positions apart: more than one of the `peaks` of the 90 % region."""
         return len(self.peaks()) > 1
 
-    def equivalent_points(
-        self, symmetries: Symmetries | None = None, level: float = LEVEL
-    ) -> tuple[EquivalentPoint, ...]:
+    def equivalent_points(self, symmetries: Symmetries | None = None, level: float = LEVEL) -> tuple[Peak, ...]:
         """Return the other possible positions, those of all `peaks` without `position`, the largest peak first.
 
         Each has the symmetry that maps `position` nearest to it, if nearer than twice `linking_length`. Empty for a
@@ -261,7 +240,7 @@ class ContactMap:
         """
         here, tolerance = self.position, 2.0 * self.linking_length
         return tuple(
-            EquivalentPoint.of(here, each.position, symmetries, probability=each.probability, tolerance=tolerance)
+            each.explained(here, symmetries, tolerance=tolerance)
             for each in self.peaks(level)
             if not each.points[self.most_probable]
         )

@@ -134,10 +134,9 @@ class LikelihoodResult:
     noise_log_likelihood: float
     """Log likelihood, with the same constant, of noise in place of an impact; see `_Trial.noise_log_likelihood`."""
 
-    def evidence(self, areas: Float64[Tensor, " points"]) -> float:
-        """Return the log Bayes factor of an impact at some point, with a prior by area, against noise."""
-        prior = areas.log() - areas.sum().log()
-        return float(torch.logsumexp(self.log_likelihood + prior, 0)) - self.noise_log_likelihood
+    def evidence(self) -> float:
+        """Return the log Bayes factor of an impact at some point, all equally probable before, against noise."""
+        return float(self.log_likelihood.logsumexp(0)) - math.log(len(self.log_likelihood)) - self.noise_log_likelihood
 
     def tempering(self, explained: float, *, factor: float = 1.0) -> float:
         """Return the exponent of the tempered likelihood, where the likeliest point explains that part of the sound.

@@ -11,7 +11,7 @@ from jaxtyping import Complex64, Complex128, Float, Float32, Float64
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from avmsf._utils.arrays import ArrayLike, as_directions, as_numbers, as_vectors, short_repr
+from avmsf._utils.arrays import ArrayLike, as_directions, as_vectors, short_repr
 from avmsf.errors import LocationError
 from avmsf.field.sound_field import SoundField
 from avmsf.localization.amplitudes import Amplitudes, Extractor, detuned_extractors
@@ -57,13 +57,9 @@ class Locator:
     """Variance of the prediction: the field's posterior variance, and the variation of the gains around the point."""
     dampings: Float32[Tensor, "points modes"] | None
     """Factors on the modes' dampings; None where these do not vary over the object."""
-    areas: Float64[Tensor, " points"]
-    """Area of surface that each point represents, relative."""
     smoothing: csr_array | None
     """Kernel that smooths the posterior over neighboring points, by the position error of fields of few contacts; None
     for no smoothing."""
-    use_noise_model: bool
-    """Whether the field's residual noise gives the gains' errors."""
     lengths: dict[tuple[int, float], "_Length"] = dataclass_field(default_factory=dict, repr=False)
     """Cache: what depends on a sound's length, for the lengths used last."""
     _lock: RLock = dataclass_field(default_factory=RLock, repr=False)
@@ -76,23 +72,18 @@ class Locator:
         *,
         points: ArrayLike | None = None,
         directions: ArrayLike | None = None,
-        areas: ArrayLike | None = None,
-        use_residual: bool = True,
     ) -> "Locator":
         """Return the locator of a field, over the points (meters) of its gains unless others are given.
 
-        `directions` are those of impacts at the points, as in `SoundField.render`. `areas` are the area of surface that
-        each point represents, in any unit; without them all are equal. Without `use_residual` the recording counts as
-        free of noise (the paper's ablation). Raises LocationError for points, directions or areas of another shape or
-        with values that cannot be.
+        All points represent equal areas of surface. `directions` are those of impacts at them, as in
+        `SoundField.render`. Raises LocationError for points or directions of another shape or with values that cannot
+        be.
         """
         with location_errors():
             positions = as_vectors(field.gain_field.points if points is None else points, "points")
             ways = None if directions is None else as_directions(directions, "directions", count=len(positions))
-            parts = torch.ones(len(positions)) if areas is None else as_numbers(areas, "areas", count=len(positions))
-        if not len(positions) or not bool((parts > 0.0).all()):
-            name = "areas" if len(positions) else "points"
-            raise LocationError.expected("one above 0 for each of one or more points", got="others", name=name)
+        if not len(positions):
+            raise LocationError.expected("one or more", 0, name="points")
         gains, variance, dampings = predict(field, positions, ways, factor=calibration_factor(field))
         return cls(
             field,
@@ -100,9 +91,7 @@ class Locator:
             gains,
             variance + local_variance(positions, gains.__getitem__),
             dampings,
-            parts.double(),
             smoothing_matrix(positions, contacts=distinct_contacts(field)),
-            use_residual,
         )
 
     def locate(
@@ -130,7 +119,7 @@ class Locator:
         used = sound.detach().cpu()[: self.field.samples]
         check_sound(used.numpy()[None], self.field.sample_rate)
         length = self._length(len(used), float("inf") if highest is None else highest)
-        amplitudes = length.extractor.extract(used, color=self.field.residual if self.use_noise_model else None)
+        amplitudes = length.extractor.extract(used, color=self.field.residual)
         detuned = [each.explained(used) for each in length.detuned]
         # The energy without loud noise is uncertain, but no less than what modes explain, detuned or not.
         amplitudes = replace(amplitudes, energy=max(amplitudes.energy, amplitudes.fitted, *detuned))
@@ -143,7 +132,7 @@ class Locator:
         row = int(torch.argmax(found.log_likelihood))
         explained = length.explained(amplitudes, found, row)
         exponent = found.tempering(explained, factor=self.tempering_factor)
-        probability = torch.softmax(exponent * found.log_likelihood + self.areas.log(), 0)
+        probability = torch.softmax(exponent * found.log_likelihood, 0)
         if self.smoothing is not None:
             probability = torch.from_numpy(self.smoothing @ probability.numpy())
         return ContactMap(
@@ -154,7 +143,7 @@ class Locator:
             amplitudes.part(amplitudes.fitted),
             amplitudes.part(fmean(detuned)),
             float(found.force[row]) / length.unit,
-            evidence=free.evidence(self.areas),
+            evidence=free.evidence(),
             notes=()
             if scaled is None
             else _force_notes(scaled, free, exponent, length.unit, per_newton=self.field.origin.per_newton),
