@@ -50,7 +50,7 @@ def test_edits_of_earlier_versions_have_the_present_names(tmp_path):
     kinds = [entry["edit"] for entry in read.origin.report[EDITS]]
     assert kinds == ["change_material", "adjust_modes", "guided", "change_material"]
     assert read.origin.report[EDITS][:2] == entries
-    assert infer_material(read, option="--from").material == WOOD
+    assert infer_material(read, option="--from")[0] == WOOD
 
 
 @pytest.mark.parametrize(

@@ -142,7 +142,7 @@ def test_a_guess_is_kept_whole_and_says_what_it_is(tmp_path: Path):
     assert read.origin.trained_on == ()
     with raises(FitError, name="field", value="body"):
         suggest(read)
-    assert infer_material(read, option="--from").material == STEEL
+    assert infer_material(read, option="--from")[0] == STEEL
     assert SampledField.of(read, limit=20).sine.shape == (20, 12)
 
 

@@ -174,9 +174,9 @@ def _target(change: MaterialOptions, old: Material) -> Material:
 
 def old_material(field: SoundField, *, new: Material | None = None) -> Material:
     """Return a field's material, and print its source. Raises `EditError` where no material fits."""
-    known = infer_material(field, option="--from", new=new)
-    say(known.words)
-    return known.material
+    material, words = infer_material(field, option="--from", new=new)
+    say(words)
+    return material
 
 
 def _guided(options: GuideOptions, field: SoundField, *, output: Path, old: Material | None) -> SoundField:

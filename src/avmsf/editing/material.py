@@ -147,31 +147,18 @@ MAX_MISFIT_RATIO = 1.5
 """By which factor, up or down, the middle one of a field's dampings may miss a law that is said to fit."""
 
 
-@dataclass(frozen=True)
-class Guess:
-    """A material, and how well its damping fits."""
-
-    material: Material
-    ratio: float
-    """Factor, up or down, by which modes of half the weight miss the law, or by more; 1 is a perfect fit."""
-
-    @property
-    def fits(self) -> bool:
-        """Whether it is near enough to be taken for the field's material."""
-        return self.ratio <= MAX_MISFIT_RATIO
-
-
 def guess_materials(
     bank: ModalBank,
     weight: Float64[Tensor, " modes"] | None = None,
     *,
     materials: Iterable[Material] = tuple(MATERIALS.values()),
-) -> tuple[Guess, ...]:
-    """Return a guess for each material that damps at all, the best one first.
+) -> list[tuple[Material, float]]:
+    """Return each material that damps at all, and the factor by which it misses the dampings, the best one first.
 
-    By each mode's damping over that of the material's Rayleigh law at its frequency, of which the middle one counts, by
-    weight (equal without one): a few modes that lose their energy elsewhere are no matter. Dampings alone tell some
-    materials badly apart, as ceramic and iron, so that the second guess matters too.
+    By each mode's damping over that of the material's Rayleigh law at its frequency. Modes of half the weight (equal
+    without one) miss the law by this factor, up or down, or by more; 1 is a perfect fit: a few modes that lose their
+    energy elsewhere are no matter. Dampings alone tell some materials badly apart, as ceramic and iron, so that the
+    second guess matters too.
     """
     omega = torch.hypot(2.0 * math.pi * bank.frequency, bank.damping)
     guesses = []
@@ -180,8 +167,8 @@ def guess_materials(
             misses, order = (bank.damping / rayleigh_damping(omega, material)).log().abs().sort()
             below = (torch.ones_like(misses) if weight is None else weight[order]).cumsum(0)
             middle = int(torch.searchsorted(below, 0.5 * below[-1]))
-            guesses.append(Guess(material, math.exp(float(misses[middle]))))
-    return tuple(sorted(guesses, key=lambda guess: guess.ratio))
+            guesses.append((material, math.exp(float(misses[middle]))))
+    return sorted(guesses, key=lambda guess: guess[1])
 
 
 _AMBIGUOUS_RATIO = 1.2
@@ -190,50 +177,41 @@ _MAX_POINTS = 256
 """Points of the object that energies are taken over, about."""
 
 
-@dataclass(frozen=True)
-class KnownMaterial:
-    """A material, and how it is known."""
+def infer_material(field: SoundField, *, option: str, new: Material | None = None) -> tuple[Material, str]:
+    """Return a field's material, and a message on how it is known.
 
-    material: Material
-    words: str
-    """The message."""
-
-
-def infer_material(field: SoundField, *, option: str, new: Material | None = None) -> KnownMaterial:
-    """Return a field's material: that of its last material edit or of its guess, or the one nearest to its dampings.
-
-    The nearest among those that may be as stiff as the field's body, if it has one, by the modes weighted by energy.
-    `option` is the option for the material, named in messages, which also say where what is assumed is `new`. Raises
-    `EditError` where no material fits.
+    That of the field's last material edit or of its guess, or the one nearest to its dampings: among those that may be
+    as stiff as the field's body, if it has one, by the modes weighted by energy. `option` is the option for the
+    material, named in messages, which also say where what is assumed is `new`. Raises `EditError` where no material
+    fits.
     """
     report = field.origin.report
     bank, last = _before_adjustments(field.bank, report.get(EDITS, []))
     if last is not None and last["edit"] == "change_material":
         known = Material(**last["to"])
-        return KnownMaterial(known, f"old material: {known.name}, from the last material edit")
+        return known, f"old material: {known.name}, from the last material edit"
     if "guess" in report and last is None:
         guessed = Material(**report["material"])
-        return KnownMaterial(guessed, f"old material: {guessed.name}, for which the field was guessed")
+        return guessed, f"old material: {guessed.name}, for which the field was guessed"
     body = ProbableBody.of(report)
     stiff = "" if body is None else f", and the most probable body has {body.specific_stiffness}"
     guesses = guess_materials(bank, _weight(field), materials=MATERIALS.values() if body is None else body.materials)
-    fitting = [each for each in guesses if each.fits]
-    if not fitting:
-        near = [f": the nearest, {each.material.name}, differs by a factor of {each.ratio:.3g}" for each in guesses[:1]]
+    if not guesses or guesses[0][1] > MAX_MISFIT_RATIO:
+        near = [f": the nearest, {each.name}, differs by a factor of {ratio:.3g}" for each, ratio in guesses[:1]]
         wanted = f"the present material, as none has the dampings of the modes{''.join(near)}{stiff}"
-        found = guesses[0].material.name if guesses else None
+        found = guesses[0][0].name if guesses else None
         raise EditError.expected(wanted, found, got="none", name=option, advice=f"give {option}")
-    best = fitting[0]
+    best, best_ratio = guesses[0]
     words = (
-        f"old material: {best.material.name} assumed, whose dampings differ by a median factor of {best.ratio:.3g} "
+        f"old material: {best.name} assumed, whose dampings differ by a median factor of {best_ratio:.3g} "
         f"from those of the modes{stiff}"
     )
-    for second in guesses[1:2]:
-        if second.ratio < _AMBIGUOUS_RATIO * best.ratio:
-            words += f"; {second.material.name} fits equally well ({second.ratio:.3g}) and would give another level"
-    if best.material == new:
+    for second, ratio in guesses[1:2]:
+        if ratio < _AMBIGUOUS_RATIO * best_ratio:
+            words += f"; {second.name} fits equally well ({ratio:.3g}) and would give another level"
+    if best == new:
         words += "; it is the new material too, which changes nothing"
-    return KnownMaterial(best.material, f"{words}; give {option} if known")
+    return best, f"{words}; give {option} if known"
 
 
 def _weight(field: SoundField) -> Float64[Tensor, " modes"]:
@@ -283,7 +261,7 @@ def edit(
         raise EditError("expected an edit, got none: give material, size, pitch, decay, brightness_db or gains_db")
     if material is not None or size != 1.0:
         new = material_named(material) if isinstance(material, str) else material
-        old = infer_material(field, option="old_material", new=new).material if old_material is None else old_material
+        old = infer_material(field, option="old_material", new=new)[0] if old_material is None else old_material
         field = change_material(field, old, old if new is None else new, size=size, law=law)
     if modes:
         field = adjust_modes(field, pitch=pitch, decay=decay, brightness_db=brightness_db, gains_db=gains_db)

@@ -125,7 +125,7 @@ class Locator:
         amplitudes = replace(amplitudes, energy=max(amplitudes.energy, amplitudes.fitted, *detuned))
         values, noise = length.separate(amplitudes)
         _check_above_noise(values, noise)
-        scaled = length.scaled(known)
+        scaled = None if known is None else replace(known, expected=known.expected * length.unit)
         found = evaluate_likelihood(length.predicted, values, noise, force=scaled)
         # The force does not say whether the impact was on this object.
         free = found if scaled is None else evaluate_likelihood(length.predicted, values, noise)
@@ -218,10 +218,6 @@ class _Length:
         # Above zero, for rounding in float32.
         least = 1e-10 * float(amplitudes.values.abs().max()) ** 2
         return mixing.mH @ amplitudes.values, noise * self.extractor.spread + least
-
-    def scaled(self, force: Force | None) -> Force | None:
-        """Return a known force in the unit of the gains here."""
-        return None if force is None else replace(force, expected=force.expected * self.unit)
 
     def distance(
         self, values: Complex128[Tensor, " modes"], noise: Float64[Tensor, " modes"]

@@ -16,7 +16,7 @@ from avmsf._utils.arrays import ArrayLike, as_floats, as_rate
 from avmsf._utils.text import counted
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.measure import check_impulsive, find_clipping
-from avmsf.capture.onset import Pulse, find_second_impact, find_second_push
+from avmsf.capture.onset import find_second_impact, find_second_push
 from avmsf.capture.prepare import prepare, shortest_allowed
 from avmsf.capture.preprocess import latest_start
 from avmsf.capture.settings import CaptureSettings
@@ -75,9 +75,14 @@ def preprocess_recording(
     # A pulse that was divided out took the force of the impact with it.
     sound = prepared.sound if prepared.newtons is None else prepared.sound * prepared.newtons
     begin = prepared.onset if chosen.align else 0
-    second = _second(whole, sound, begin, prepared.pulse, chosen)
+    rate, seconds = whole.sample_rate, len(sound) / whole.sample_rate
+    if prepared.pulse is not None and chosen.force_channel is not None:
+        force = whole.channel(chosen.force_channel)
+        second = find_second_push(force, prepared.pulse, sample_rate=rate, seconds=seconds)
+    else:
+        after = find_second_impact(sound, 0, sample_rate=rate, seconds=seconds)
+        second = None if after is None else begin + after
     if second is not None:
-        rate = whole.sample_rate
         notes.append(
             f"{whole.name}: expected one impact, got more, at {prepared.onset / rate:.3f} s and at {second / rate:.3f} "
             "s: only the first was located; --several (in Python locate_impacts) locates all"
@@ -160,13 +165,9 @@ def at_field_rate(
     frequency = field.bank.frequency
     held = int((frequency < highest).sum())
     if not held:
-        raise LocationError(
-            f"{recording.name}: expected sound at {float(frequency.min()):.4g} Hz, the lowest of the object's "
-            f"{len(frequency)} modes, got {own:g} Hz samples with sound up to {highest:.4g} Hz; record at {rate:g} Hz",
-            file=recording.name,
-            name="sample_rate",
-            value=own,
-        )
+        lowest = f"sound at {float(frequency.min()):.4g} Hz, the lowest of the object's {len(frequency)} modes"
+        got, advice = f"{own:g} Hz samples with sound up to {highest:.4g} Hz", f"record at {rate:g} Hz"
+        raise LocationError.expected(lowest, own, got=got, file=recording.name, name="sample_rate", advice=advice)
     ratio = Fraction(rate / own).limit_denominator(_MAX_RATIO_TERMS)
     resampled = scipy.signal.resample_poly(sound, ratio.numerator, ratio.denominator, padtype="line")
     note = f"{recording.name} was resampled from {own:g} Hz to the field's {rate:g} Hz"
@@ -190,19 +191,3 @@ def _settings_for(recording: Recording, settings: CaptureSettings) -> CaptureSet
     if settings.normalize == "deconvolve" and kept.force_channel is not None:
         return replace(kept, normalize="deconvolve")
     return kept
-
-
-def _second(
-    recording: Recording,
-    sound: Float64[np.ndarray, " samples"],
-    begin: int,
-    pulse: Pulse | None,
-    settings: CaptureSettings,
-) -> int | None:
-    """Return the sample of the recording at which a second impact begins, if there is one."""
-    rate, seconds = recording.sample_rate, len(sound) / recording.sample_rate
-    if pulse is not None and settings.force_channel is not None:
-        force = recording.channel(settings.force_channel)
-        return find_second_push(force, pulse, sample_rate=rate, seconds=seconds)
-    second = find_second_impact(sound, 0, sample_rate=rate, seconds=seconds)
-    return None if second is None else begin + second

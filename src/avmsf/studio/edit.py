@@ -121,9 +121,8 @@ class Sliders:
         if self.material is not None or self.size != 1.0:
             if self.old is None:
                 wanted = None if self.material is None else material_named(self.material)
-                known = infer_material(ground, option=_OLD_CONTROL, new=wanted)
-                old = known.material
-                words.append(known.words)
+                old, known = infer_material(ground, option=_OLD_CONTROL, new=wanted)
+                words.append(known)
             else:
                 old = material_named(self.old)
             new = old if self.material is None else material_named(self.material)
