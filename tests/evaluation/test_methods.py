@@ -291,13 +291,9 @@ def bank_of(extraction: Extraction) -> tuple[torch.Tensor, torch.Tensor]:
 
 def test_nothing_can_be_started_from_nothing():
     train, _ = parts()
-    generator = torch.Generator()
-    with raises(FitError, name="modes", value=0):
-        random_modes(train, modes=0, bins=17, generator=generator)
-    with raises(FitError, name="bins", value=1):
-        random_modes(train, modes=3, bins=1, generator=generator)
+    short = replace(train, sounds=train.sounds[:, :100])
     with raises(FitError, name="train", value=100):
-        random_modes(replace(train, sounds=train.sounds[:, :100]), modes=3, bins=17, generator=generator)
+        random_modes(short, modes=3, bins=17, generator=torch.Generator())
 
 
 def test_the_papers_grid_has_all_its_combinations():

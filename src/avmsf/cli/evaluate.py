@@ -22,7 +22,7 @@ from avmsf.evaluation.cases import Predefined, Shots
 from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.methods import RecordedMethod, method_named
 from avmsf.evaluation.objects import SUBSETS, ObjectInputs, choose_objects, members
-from avmsf.evaluation.parallel import RunProgress, Workers, run_objects
+from avmsf.evaluation.parallel import RunProgress, run_objects
 from avmsf.evaluation.protocols import PREDEFINED, PUBLISHED, SHOTS, EvaluationProtocol, protocol_named
 from avmsf.evaluation.report import PAGE, SUMMARY, TABLES, write_figures, write_page, write_summary
 from avmsf.evaluation.report_tables import Section
@@ -44,7 +44,6 @@ def run(options: Options) -> int:
     """Evaluate, and print the results; return 130 where Ctrl-C stopped it."""
     protocol = _protocol_of(options)
     methods = tuple(method_named(name) for name in words_of(options.methods) or protocol.methods)
-    workers = Workers(options.workers, options.ray)
     # All paths are made absolute: workers may run in folders of their own.
     contacts = None if options.contact_data is None else options.contact_data.resolve()
     opened = partial(open_dataset, options.data.resolve(), contacts=contacts)
@@ -64,7 +63,7 @@ def run(options: Options) -> int:
     names = tuple(method.name for method in methods)
     write = partial(write_summary, results, subsets=groups, wanted=dict.fromkeys(objects, names))
     try:
-        run_shown(evaluation, objects, results, workers, after_each=write)
+        run_shown(evaluation, objects, results, options.workers, options.ray, after_each=write)
         summary = write()
         parts = write_page(results)
         figures = write_figures(results) if options.figures else []
@@ -183,7 +182,8 @@ def run_shown(
     evaluation: Evaluation,
     objects: Sequence[str],
     results: ResultsFolder,
-    workers: Workers,
+    workers: int,
+    address: str | None,
     *,
     after_each: Callable[[], object] = lambda: None,
 ) -> None:
@@ -195,7 +195,7 @@ def run_shown(
                 after_each()
             bar.objects(progress.words, progress.done, progress.total)
 
-        run_objects(evaluation, objects, results, workers=workers, progress=show)
+        run_objects(evaluation, objects, results, workers=workers, address=address, progress=show)
 
 
 def settled_lifts(

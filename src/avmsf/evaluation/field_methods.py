@@ -166,12 +166,8 @@ def random_modes(train: Impacts, *, modes: int, bins: int, generator: torch.Gene
     Frequencies are spread evenly over their logarithm, from the lowest that the sounds' length allows (17 Hz in 3 s) to
     nine tenths of half the sample rate; dampings likewise, from a fall by one neper over the whole sound to a quality
     factor of 10. All gains are equal, and so large that the modes have the energy of the mean sound. Nothing but this
-    energy, the rate and the length are taken from `train`. Raises FitError for fewer than one mode or two bands.
+    energy, the rate and the length are taken from `train`. Raises FitError for too short recordings.
     """
-    if modes < 1:
-        raise FitError(f"modes: expected 1 or more, got {modes}", name="modes", value=modes)
-    if bins < 2:
-        raise FitError(f"bins: expected 2 bands of noise or more, got {bins}", name="bins", value=bins)
     rate, samples = train.sample_rate, train.sounds.shape[1]
     lowest, highest = lowest_frequency(samples, rate), _MAX_FREQUENCY * rate / 2
     if lowest >= highest:

@@ -19,7 +19,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -64,14 +64,9 @@ def truth_at(truth: Truth, names: tuple[str, ...]) -> Truth:
             advice="simulate the object again",
         )
     taken = [rows[name] for name in names]
-    return replace(
-        truth,
-        gains=truth.gains[taken],
-        quadrature=truth.quadrature[taken],
-        names=names,
-        contacts=None if truth.contacts is None else truth.contacts[taken],
-        starts=None if truth.starts is None else truth.starts[taken],
-    )
+    tables: dict[str, Any] = {name: getattr(truth, name) for name in ("gains", "quadrature", "contacts", "starts")}
+    tables = {name: None if each is None else each[taken] for name, each in tables.items()}
+    return replace(truth, names=names, **tables)
 
 
 def truth_from_first_sample(truth: Truth, impacts: Impacts) -> Truth:

@@ -4,6 +4,7 @@ import base64
 import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -78,38 +79,32 @@ class StoredSound:
         return cls(content, torch.from_numpy(samples), float(rate))
 
     @property
+    def lowest(self) -> float:
+        """Hz at the lower edge of its picture; the upper one is half the sample rate."""
+        return min(_LOWEST, self.sample_rate / 100)
+
+    @cached_property
+    def levels(self) -> Float64[Tensor, "height width"]:
+        """Levels of its picture, dB."""
+        highest = self.sample_rate / 2
+        return log_spectrogram(
+            self.samples, sample_rate=self.sample_rate, lowest=self.lowest, highest=highest, width=240, height=120
+        )
+
+    @property
     def address(self) -> str:
         """The file as an address that a page plays without any network."""
         return f"data:audio/flac;base64,{base64.b64encode(self.content).decode()}"
 
 
-def draw_spectrogram(sound: StoredSound, *, loudest: float | None, width: int = 240, height: int = 120) -> str:
+def draw_spectrogram(sound: StoredSound, *, loudest: float | None) -> str:
     """Return the address of a picture of a sound: time to the right, frequency upwards on a logarithmic scale.
 
-    Colors span 80 dB below `loudest`, the largest magnitude of the recording it is compared with; None is its own.
+    Colors span 80 dB below `loudest`, dB, the brightest point of the recording it is compared with; None is its own.
     """
-    levels = _levels(sound, width, height)
-    top = float(levels.max()) if loudest is None else loudest
-    shown = ((levels - top) / RANGE_DB + 1).clamp(0, 1).flip(0)
+    top = float(sound.levels.max()) if loudest is None else loudest
+    shown = ((sound.levels - top) / RANGE_DB + 1).clamp(0, 1).flip(0)
     return _png((shown * 255).round().to(torch.uint8).numpy())
-
-
-def loudest_of(sound: StoredSound, *, width: int = 240, height: int = 120) -> float:
-    """Return the level, dB, of the brightest point in a sound's picture."""
-    return float(_levels(sound, width, height).max())
-
-
-def picture_span(sound: StoredSound) -> tuple[float, float, float]:
-    """Return a picture's seconds, and its lowest and highest frequency, Hz."""
-    highest = sound.sample_rate / 2
-    return len(sound.samples) / sound.sample_rate, min(_LOWEST, highest / 50), highest
-
-
-def _levels(sound: StoredSound, width: int, height: int) -> Float64[Tensor, "height width"]:
-    _, lowest, highest = picture_span(sound)
-    return log_spectrogram(
-        sound.samples, sample_rate=sound.sample_rate, lowest=lowest, highest=highest, width=width, height=height
-    )
 
 
 def _png(shades: UInt8[np.ndarray, "height width"]) -> str:
@@ -207,9 +202,8 @@ def _listening(records: Sequence[ObjectRecord], folder: Path) -> dict[str, list[
 
 def _cards(contact: StoredContact, folder: Path) -> Iterator[_Card]:
     recorded = StoredSound.read(folder / contact.recorded)
-    loudest = loudest_of(recorded)
-    seconds, lowest, highest = picture_span(recorded)
-    span = f"{seconds:.2g} s, {lowest:.0f} Hz to {highest:.0f} Hz"
+    loudest, seconds = float(recorded.levels.max()), len(recorded.samples) / recorded.sample_rate
+    span = f"{seconds:.2g} s, {recorded.lowest:.0f} Hz to {recorded.sample_rate / 2:.0f} Hz"
     yield _Card("recorded", span, draw_spectrogram(recorded, loudest=loudest), recorded.address)
     several = len({case.label for case, _ in contact.made}) > 1
     for case, outcome in contact.made:

@@ -13,20 +13,6 @@ from avmsf.evaluation.runner import Evaluation, run_object
 
 
 @dataclass(frozen=True)
-class Workers:
-    """Processes that compute."""
-
-    count: int = 1
-    """Number of parallel objects on this computer; with 1 and no address, ray is not needed."""
-    address: str | None = None
-    """A ray cluster's address, or `auto`; its computers must see data and results under the same paths."""
-
-    def __post_init__(self) -> None:
-        if self.count < 1:
-            raise EvaluationError(f"expected 1 worker or more, got {self.count}", name="workers", value=self.count)
-
-
-@dataclass(frozen=True)
 class RunProgress:
     """Progress of an evaluation."""
 
@@ -42,30 +28,33 @@ def run_objects(
     identifiers: Sequence[str],
     results: ResultsFolder,
     *,
-    workers: Workers | None = None,
-    progress: Callable[[RunProgress], None] | None = None,
+    workers: int = 1,
+    address: str | None = None,
+    progress: Callable[[RunProgress], None] = lambda event: None,
 ) -> None:
     """Evaluate the objects, and keep each figure as it comes; what has figures already is not computed again.
 
-    Each object is computed on one thread, so that figures do not depend on the number of workers. Raises as
-    `Evaluation.begin` and `run_object`, and EvaluationError where ray is needed and not installed.
+    `workers` is the number of parallel objects on this computer, `address` a ray cluster's or `auto`; its computers
+    must see data and results under the same paths. With one worker and no address, ray is not needed. Each object is
+    computed on one thread, so that figures do not depend on the number of workers. Raises as `Evaluation.begin` and
+    `run_object`, and EvaluationError where ray is needed and not installed.
     """
-    who = workers or Workers()
-    report = progress or (lambda event: None)
-    if who.address is None and who.count == 1:
+    if workers < 1:
+        raise EvaluationError(f"expected 1 worker or more, got {workers}", name="workers", value=workers)
+    if address is None and workers == 1:
         evaluation.begin(results)
         for done, identifier in enumerate(identifiers):
 
             def log(words: str, identifier: str = identifier, done: int = done) -> None:
-                report(RunProgress(f"{identifier}: {words}", done, len(identifiers)))
+                progress(RunProgress(f"{identifier}: {words}", done, len(identifiers)))
 
             run_object(evaluation, identifier, results, log)
-            report(RunProgress(f"{identifier}: done", done + 1, len(identifiers)))
+            progress(RunProgress(f"{identifier}: done", done + 1, len(identifiers)))
         return
     ray = _ray()
     evaluation.begin(results)
-    with _cluster(ray, who):
-        _run_remotely(ray, evaluation, identifiers, results, report)
+    with _cluster(ray, workers, address):
+        _run_remotely(ray, evaluation, identifiers, results, progress)
 
 
 def _run_remotely(
@@ -73,13 +62,13 @@ def _run_remotely(
     evaluation: Evaluation,
     identifiers: Sequence[str],
     results: ResultsFolder,
-    report: Callable[[RunProgress], None],
+    progress: Callable[[RunProgress], None],
 ) -> None:
     # max_retries: a worker that was killed for memory would be killed again.
     remote = ray.remote(num_cpus=1, max_retries=0)(_run_alone)
     shared = ray.put((evaluation, results))
     pending: dict[Any, str] = {remote.remote(shared, identifier): identifier for identifier in identifiers}
-    report(RunProgress(f"{len(pending)} objects on ray", 0, len(identifiers)))
+    progress(RunProgress(f"{len(pending)} objects on ray", 0, len(identifiers)))
     try:
         while pending:
             # A time limit lets Ctrl-C through.
@@ -98,7 +87,7 @@ def _run_remotely(
                         name=identifier,
                         advice="run the command again, with fewer --workers if memory ran out",
                     ) from error
-                report(RunProgress(f"{identifier}: done", len(identifiers) - len(pending), len(identifiers)))
+                progress(RunProgress(f"{identifier}: done", len(identifiers) - len(pending), len(identifiers)))
     finally:
         for reference in pending:
             ray.cancel(reference, force=True)
@@ -110,20 +99,20 @@ def _run_alone(shared: tuple[Evaluation, ResultsFolder], identifier: str) -> Non
 
 
 @contextmanager
-def _cluster(ray: ModuleType, workers: Workers) -> Iterator[None]:
+def _cluster(ray: ModuleType, workers: int, address: str | None) -> Iterator[None]:
     settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
-    if workers.address is None:
-        settings |= {"num_cpus": workers.count, "include_dashboard": False, "address": "local"}
+    if address is None:
+        settings |= {"num_cpus": workers, "include_dashboard": False, "address": "local"}
     else:
-        settings["address"] = workers.address
+        settings["address"] = address
     try:
         ray.init(**settings)
     except (ConnectionError, RuntimeError, ValueError) as error:
         wanted, advice = "a cluster to connect to", "check that it runs and has this address"
-        if workers.address is None:
+        if address is None:
             wanted, advice = "ray to start on this computer", "use --workers 1, which needs no ray"
         reason = " ".join(str(error).split())
-        raise EvaluationError.expected(wanted, workers.address, got=reason, name="ray", advice=advice) from error
+        raise EvaluationError.expected(wanted, address, got=reason, name="ray", advice=advice) from error
     try:
         yield
     finally:

@@ -28,7 +28,7 @@ from avmsf.evaluation.objects import ObjectInputs, draw_other_recording
 from avmsf.evaluation.page import keep_sound, listening_gain
 from avmsf.evaluation.protocols import EvaluationProtocol
 from avmsf.evaluation.results import ENCODER, CaseRecord, ObjectRecord, Outcome, ResultsFolder, failure_of
-from avmsf.evaluation.splits import MetricSettings, MetricValues, align_split, spread
+from avmsf.evaluation.splits import MetricSettings, Values, align_split, spread
 from avmsf.evaluation.task import Method, Renderer, Task, expect_renderer, report_of
 from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder
@@ -185,14 +185,14 @@ class CaseRun:
             with torch.no_grad():
                 sounds = renderer.render(recordings.test.contacts, directions=recordings.test.directions)
             render_seconds = time.perf_counter() - begun
-            values, maps = self._values(method, recordings, renderer, sounds)
+            values, figures, maps = self._values(method, recordings, renderer, sounds)
         except Exception as error:  # A fault in one method must not cost the others their hours.
             return Outcome(self.case.key, method.name, failure=failure_of(error))
         return Outcome(
             self.case.key,
             method.name,
-            values.values,
-            values.figures,
+            values,
+            figures,
             round(fit_seconds, 4),
             round(render_seconds, 4),
             self._keep_sounds(method.name, sounds),
@@ -208,13 +208,12 @@ class CaseRun:
 
     def _values(
         self, method: Method, recordings: _Recordings, renderer: Renderer, sounds: Float[Tensor, "contacts samples"]
-    ) -> tuple[MetricValues, dict[str, str]]:
-        """Return the metrics, and the files of contacts' maps by the names of their recordings."""
+    ) -> tuple[Values, dict[str, float | None], dict[str, str]]:
+        """Return the metrics, the figures, and the files of contacts' maps by the names of their recordings."""
         if not self.evaluation.protocol.locating:
             loudest = float(self.data.impacts.sounds.abs().max())
-            return self.evaluation.metric_settings.values(
-                renderer, sounds, self.scored.test, self.truth, loudest=loudest
-            ), {}
+            settings = self.evaluation.metric_settings
+            return *settings.values(renderer, sounds, self.scored.test, self.truth, loudest=loudest), {}
         points = self._shared(self.features)("surface").points
         published = isinstance(method, FieldMethod) and method.published
         found = located(
@@ -231,7 +230,7 @@ class CaseRun:
             file = f"maps/{self.place}/{row:03d} {_file_word(method.name)}.safetensors"
             write_map(self.folder / file, each, truth=recordings.test.contacts[row])
             maps[recordings.test.names[row]] = file
-        return MetricValues(dict(found.errors), {}), maps
+        return dict(found.errors), {}, maps
 
     def _task(self, recordings: _Recordings) -> Task:
         return Task(

@@ -199,14 +199,8 @@ def score(
     return Scores(names=impacts.names, values=values)
 
 
-@dataclass(frozen=True, eq=False)
-class MetricValues:
-    """Metrics of one method's sounds at the test contacts."""
-
-    values: dict[str, tuple[float | None, ...]]
-    """Each metric's value for every test contact; None where it was not computed."""
-    figures: dict[str, float | None]
-    """Values over all test contacts."""
+Values = dict[str, tuple[float | None, ...]]
+"""Each metric's value for every test contact; None where it was not computed."""
 
 
 @dataclass(frozen=True)
@@ -243,12 +237,12 @@ class MetricSettings:
         truth: Truth | None,
         *,
         loudest: float,
-    ) -> MetricValues:
-        """Compute the metrics of `renderer` at the test contacts; `truth`, if known, has the rows of `test`.
+    ) -> tuple[Values, dict[str, float | None]]:
+        """Return the metrics of `renderer` at the test contacts, and its figures over all of them.
 
-        Its time counts from the first sample of the recordings, as the renderer's does (`truth_from_first_sample`).
-        `loudest` is the peak of the object's loudest recording, in the unit of the recordings. Raises as `score`, and
-        EvaluationError for sounds of another sample rate.
+        `truth`, if known, has the rows of `test`; its time counts from the first sample of the recordings, as the
+        renderer's does (`truth_from_first_sample`). `loudest` is the peak of the object's loudest recording, in the
+        unit of the recordings. Raises as `score`, and EvaluationError for sounds of another sample rate.
         """
         if renderer.sample_rate != test.sample_rate:
             raise EvaluationError(
@@ -259,18 +253,16 @@ class MetricSettings:
         if self.level == "full-scale" and loudest > 0:
             sounds, test = sounds / loudest, replace(test, sounds=test.sounds / loudest)
         scores = score(sounds, test)
-        values: dict[str, tuple[float | None, ...]] = {
-            metric: tuple(figures.tolist()) for metric, figures in scores.values.items()
-        }
+        values: Values = {metric: tuple(figures.tolist()) for metric, figures in scores.values.items()}
         if self.cdpam:
             values["cdpam"] = self._cdpam_values(sounds, test)
-        return MetricValues(values, {} if truth is None else _modal_figures(renderer, test, truth))
+        return values, {} if truth is None else _modal_figures(renderer, test, truth)
 
     def _cdpam_values(self, sounds: Float[Tensor, "contacts samples"], test: Impacts) -> tuple[float | None, ...]:
         rows = spread(len(test), self.cdpam_contacts or len(test))
         taken = _cdpam().distance(sounds[rows], test.sounds[rows], sample_rate=test.sample_rate)
         found = dict(zip(rows, taken.tolist(), strict=True))
-        return tuple(found.get(row) for row in range(len(test)))
+        return tuple(map(found.get, range(len(test))))
 
 
 def spread(count: int, wanted: int) -> list[int]:
