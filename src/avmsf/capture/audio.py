@@ -79,14 +79,9 @@ class Recording:
             return number
         left = [index + 1 for index in range(len(self.channels)) if index + 1 != force_channel]
         if not left:
-            raise CaptureError.expected(
-                "a channel with the sound",
-                0,
-                got="only the force channel",
-                file=self.name,
-                name="response_channel",
-                advice="record both, or remove force_channel from capture.toml",
-            )
+            wanted, advice = "a channel with the sound", "record both, or remove force_channel from capture.toml"
+            got, key = "only the force channel", "response_channel"
+            raise CaptureError.expected(wanted, 0, got=got, file=self.name, name=key, advice=advice)
         if len(left) == 1:
             return left[0]
         loudest = max(left, key=lambda each: float(np.std(self.channels[each - 1])))

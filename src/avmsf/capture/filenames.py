@@ -21,7 +21,7 @@ _OTHER_NAMES = {
     **dict.fromkeys((".xlsx", ".xls", ".ods"), "export the table as impacts.csv"),
 }
 """Endings of shapes, pictures and tables that are not read, and what to do."""
-_OF_VIEWS = frozenset(("transforms.json", "images", "sparse", "cameras.bin", "cameras.txt", *SURFACE_FILES, *SPLATS))
+_OF_VIEWS = frozenset(("transforms.json", "sparse", "cameras.bin", "cameras.txt", *SPLATS))
 
 
 def number_key(name: str) -> list[tuple[bool, int, str]]:
@@ -72,14 +72,20 @@ def unused_files(folder: Path, settings: CaptureSettings) -> list[str]:
     return [f"{name} is not used: {what}" for name, what in advice.items()]
 
 
+def shows_object(folder: Path, settings: CaptureSettings) -> bool:
+    """Return whether a folder holds anything that shows the object, by the names of its files alone."""
+    surface = find_surface_file(folder, settings)
+    if (surface is not None and surface.is_file()) or pictures_in(folder / "images", deep=True):
+        return True
+    shown = (*PICTURE_SUFFIXES, *VIDEO_SUFFIXES)
+    return any(path.name in _OF_VIEWS or path.suffix.lower() in shown for path in folder.iterdir())
+
+
 def expect_views(folder: Path, settings: CaptureSettings) -> None:
     """Raise `SceneError` for a folder none of whose files, by their names alone, shows the object."""
     if not folder.is_dir():
         raise SceneError.expected("a folder with photographs, a video or a mesh", file=folder, advice="check the name")
-    shown = (*PICTURE_SUFFIXES, *VIDEO_SUFFIXES)
-    if settings.surface is None and not any(
-        path.name in _OF_VIEWS or path.suffix.lower() in shown for path in folder.iterdir()
-    ):
+    if settings.surface is None and not shows_object(folder, settings):
         raise no_views(folder)
 
 

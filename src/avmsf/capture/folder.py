@@ -10,7 +10,7 @@ import torch
 from avmsf._utils.files import new_folder
 from avmsf.capture.audio import wav_bytes
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.measure import RecordingReport, shared_problems
+from avmsf.capture.measure import RecordingReport, shared_problems, shortened
 from avmsf.capture.preprocess import Issues, preprocess
 from avmsf.capture.settings import SETTINGS, CaptureSettings, settings_of
 from avmsf.capture.table import DIRECTION, FORCE, REQUIRED, TABLE, in_folder
@@ -140,9 +140,6 @@ def _summary(reports: list[RecordingReport], folder: Path) -> list[CaptureWarnin
     wrong = [report for report in reports if report.problems]
     if not wrong:
         return []
-    sentences = shared_problems(wrong)
-    shown = "; ".join(sentences[:5])
-    more = f"; and {len(sentences) - 5} more" if len(sentences) > 5 else ""
-    look = "looks" if len(wrong) == 1 else "look"
-    message = f"{len(wrong)} of {len(reports)} recordings {look} wrong: {shown}{more}. `avmsf check {folder}` shows all"
+    found = f"{len(wrong)} of {len(reports)} recordings {'looks' if len(wrong) == 1 else 'look'} wrong"
+    message = f"{found}: {shortened(shared_problems(wrong))}. `avmsf check {folder}` shows all"
     return [CaptureWarning(message, file=folder, value=[report.file for report in wrong])]

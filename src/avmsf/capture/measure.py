@@ -128,6 +128,12 @@ def shared_problems(reports: Sequence[RecordingReport]) -> list[str]:
     return sentences
 
 
+def shortened(sentences: Sequence[str], *, most: int = 5) -> str:
+    """Return the first messages, and how many more there are."""
+    more = f"; and {len(sentences) - most} more" if len(sentences) > most else ""
+    return "; ".join(sentences[:most]) + more
+
+
 def noise_level(response: Float64[np.ndarray, " frames"], onset: int, rate: float) -> float:
     """Return the noise's root mean square: before the impact, or of the quietest tenth of 10 ms blocks."""
     before = response[: max(0, onset - round(SECONDS_BEFORE * rate))]

@@ -192,10 +192,11 @@ def propose_highpass(recordings: Iterable[tuple[Strike, Recording]], settings: C
         lead = response[: max(0, onset - round(SECONDS_BEFORE * rate))]
         later = response[onset : onset + round(settings.kept_seconds(rate) * rate)]
         if len(lead) >= MIN_LEAD_SECONDS * rate:
-            noise.append(_low_powers(lead, later, rate) / float(np.abs(response).max()) ** 2)
+            powers = np.array([_powers_below(signal, rate) for signal in (lead, later)])
+            noise.append(powers / float(np.abs(response).max()) ** 2)
         # Digital silence, as after a click at the start, has no rumble.
-        power = float(np.square(later).mean())
-        low.append(_low_power(later, CANDIDATES_HZ[0], rate) / power if power else 0.0)
+        lowest, *_, power = _powers_below(later, rate)
+        low.append(lowest / power if power else 0.0)
     if len(rates) != 1 or len(durations) < 2 or settings.highpass > 0.0:
         return None
     if min(rates) >= MIN_AUDIO_RATE_HZ and (share := float(np.median(low))) > MAX_LOW_SHARE:
@@ -207,11 +208,11 @@ def propose_highpass(recordings: Iterable[tuple[Strike, Recording]], settings: C
         )
     if len(noise) < len(durations) / 2:
         return None
-    before, below, later = np.mean(noise, axis=0)
-    if before[0] < MIN_NOISE_SHARE:
+    (*below, total), (*later, _) = np.mean(noise, axis=0)
+    if total < MIN_NOISE_SHARE:
         return None
-    chosen, left = None, before[0]
-    for cutoff, total, under, after in zip(CANDIDATES_HZ, before, below, later, strict=True):
+    chosen, left = None, total
+    for cutoff, under, after in zip(CANDIDATES_HZ, below, later, strict=True):
         rest = max(total - under, 1e-12 * total)
         impossible = cutoff * min(durations) < 1.0 or after > MAX_RUMBLE_RISE * under
         if impossible or left / rest < MIN_NOISE_RATIO:
@@ -223,7 +224,7 @@ def propose_highpass(recordings: Iterable[tuple[Strike, Recording]], settings: C
         "highpass",
         chosen,
         f"Before the impacts, an offset or rumble below {chosen:g} Hz is most of the noise: without it, noise is "
-        f"{10 * np.log10(before[0] / left):.0f} dB lower. The object does not vibrate there: the power below "
+        f"{10 * np.log10(total / left):.0f} dB lower. The object does not vibrate there: the power below "
         f"{chosen:g} Hz does not rise at the impact.",
     )
 
@@ -302,16 +303,9 @@ def _above_noise(channel: Float64[np.ndarray, " frames"], rate: float) -> float:
     return -decibels(noise / float(np.abs(channel).max()))
 
 
-def _low_powers(
-    lead: Float64[np.ndarray, " lead"], later: Float64[np.ndarray, " samples"], rate: float
-) -> Float64[np.ndarray, "kinds candidates"]:
-    """Return mean squares for each candidate: of all before the impact, of that below the candidate, and after it."""
-    rows = [[_low_power(signal, cutoff, rate) for cutoff in CANDIDATES_HZ] for signal in (lead, later)]
-    return np.array([[float(np.square(lead).mean())] * len(CANDIDATES_HZ), *rows])
-
-
-def _low_power(signal: Float64[np.ndarray, " samples"], cutoff: float, rate: float) -> float:
-    """Return the mean square of what lies below a frequency."""
+def _powers_below(signal: Float64[np.ndarray, " samples"], rate: float) -> Float64[np.ndarray, " limits"]:
+    """Return the mean squares of what lies below each of `CANDIDATES_HZ`, and of all."""
     power = np.abs(np.fft.rfft(signal) / len(signal)) ** 2
-    power[1:] *= 2.0
-    return float(power[np.fft.rfftfreq(len(signal), 1.0 / rate) < cutoff].sum())
+    power[1 : (len(signal) + 1) // 2] *= 2.0
+    frequency = np.fft.rfftfreq(len(signal), 1.0 / rate)
+    return np.array([power[frequency < limit].sum() for limit in (*CANDIDATES_HZ, np.inf)])

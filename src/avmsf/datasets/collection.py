@@ -5,9 +5,9 @@ from pathlib import Path
 
 import soundfile
 
-from avmsf.capture.filenames import PICTURE_SUFFIXES, find_surface_file
+from avmsf.capture.filenames import find_surface_file, shows_object
 from avmsf.capture.folder import Capture, read_capture
-from avmsf.capture.settings import CaptureSettings, settings_of
+from avmsf.capture.settings import settings_of
 from avmsf.capture.table import TABLE, read_strikes
 from avmsf.capture.together import common_rate
 from avmsf.datasets.dataset import Dataset, DatasetReport, ObjectFacts, ObjectReport, VisualSource
@@ -16,10 +16,6 @@ from avmsf.datasets.numbering import in_order, refuse_unknown
 from avmsf.datasets.objectfolder import ObjectFolderRaw
 from avmsf.datasets.realimpact import RealImpact
 from avmsf.errors import CaptureError, DatasetError
-from avmsf.photographs.colmap import find_model
-
-_SEEN_IN = ("*.mp4", "*.mov", "*.m4v", "*.avi", "*.mkv", "*.webm", "splats.ply", "point_cloud.ply", "transforms.json")
-"""Files other than meshes, photographs and COLMAP's models that show what an object looks like."""
 
 
 def open_dataset(path: str | Path, *, contacts: str | Path | None = None, time_zero: str | None = None) -> Dataset:
@@ -80,7 +76,7 @@ class CaptureCollection:
         folder = self._folder_of(identifier)
         try:
             settings = settings_of(folder)
-            return VisualSource(folder, settings) if _shows(folder, settings) else None
+            return VisualSource(folder, settings) if shows_object(folder, settings) else None
         except CaptureError as error:
             raise DatasetError(f"{folder}: {error}", **error.attributes) from error
 
@@ -122,15 +118,3 @@ class CaptureCollection:
 
 def _visible(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".")
-
-
-def _shows(folder: Path, settings: CaptureSettings) -> bool:
-    """Return whether there is anything in a capture folder that shows the object."""
-    surface = find_surface_file(folder, settings)
-    pictures = (folder / "images").rglob("*") if (folder / "images").is_dir() else folder.iterdir()
-    return (
-        (surface is not None and surface.is_file())
-        or any(path.suffix.lower() in PICTURE_SUFFIXES for path in pictures)
-        or any(next(folder.glob(pattern), None) for pattern in _SEEN_IN)
-        or find_model(folder) is not None
-    )

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from avmsf.capture.audio import Recording
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.measure import measure, shared_problems
+from avmsf.capture.measure import measure, shared_problems, shortened
 from avmsf.capture.placement import check_placement
 from avmsf.capture.prepare import Prepared, prepare
 from avmsf.capture.preprocess import build_impacts, shorten
@@ -22,7 +22,6 @@ from avmsf.errors import CaptureError, CaptureWarning, DatasetError
 from avmsf.mesh.surface import Surface, surface_points
 
 MIN_RECORDINGS = 2
-MAX_SHOWN = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +82,8 @@ def build_capture(
         raise DatasetError(f"{origin}: {error}", **error.attributes) from error
     remarks += [str(each) for each in warned] + _repeated(impacts) + _misplaced(impacts, surface, origin=origin)
     if remarks:
-        warnings.warn(CaptureWarning(f"{origin}: {listed(remarks)}", name=origin, value=tuple(remarks)), stacklevel=3)
+        message = f"{origin}: {shortened(remarks)}"
+        warnings.warn(CaptureWarning(message, name=origin, value=tuple(remarks)), stacklevel=3)
     return Capture(name, impacts, surface)
 
 
@@ -91,7 +91,7 @@ def refuse_few(count: int, *, origin: str, reasons: Sequence[str]) -> None:
     """Raise DatasetError with the reasons where fewer than two recordings can be used."""
     if count < MIN_RECORDINGS:
         raise DatasetError.expected(
-            f"at least {MIN_RECORDINGS} usable recordings with contacts", count, name=origin, advice=listed(reasons)
+            f"at least {MIN_RECORDINGS} usable recordings with contacts", count, name=origin, advice=shortened(reasons)
         )
 
 
@@ -119,18 +119,12 @@ def check_wav(path: Path, *, shown: str, rate: float, frames: int) -> DatasetErr
     return None
 
 
-def listed(sentences: Sequence[str]) -> str:
-    """Return the first messages, and how many more there are."""
-    more = f"; and {len(sentences) - MAX_SHOWN} more" if len(sentences) > MAX_SHOWN else ""
-    return "; ".join(sentences[:MAX_SHOWN]) + more
-
-
 def _repeated(impacts: Impacts) -> list[str]:
     places: dict[tuple[float, ...], list[str]] = {}
     for name, contact in zip(impacts.names, impacts.contacts.tolist(), strict=True):
         places.setdefault(tuple(round(value, 6) for value in contact), []).append(name)
     repeated = [", ".join(names) for names in places.values() if len(names) > 1]
-    return [f"impacts at the same contact: {' and '.join(repeated[:MAX_SHOWN])}"] if repeated else []
+    return [f"impacts at the same contact: {' and '.join(repeated[:5])}"] if repeated else []
 
 
 def _misplaced(impacts: Impacts, surface: Surface | None, *, origin: str) -> list[str]:

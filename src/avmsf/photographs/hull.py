@@ -227,14 +227,12 @@ def masked_views(views: Sequence[View]) -> list[View]:
 
 def no_common_point(views: int) -> SceneError:
     """Return the error of masks of this many views that no point of the object frame lies in."""
-    return SceneError.expected(
-        "masks with a common volume",
-        views,
-        got=f"none from {views} views",
-        name="masks",
-        advice="check that cameras and masks belong together and that the poses have the convention of their file "
-        "(shifted or small masks miss thin objects)",
+    advice = (
+        "check that cameras and masks belong together and that the poses have the convention of their file (shifted or "
+        "small masks miss thin objects)"
     )
+    got = f"none from {views} views"
+    return SceneError.expected("masks with a common volume", views, got=got, name="masks", advice=advice)
 
 
 def object_extent(views: Sequence[View]) -> tuple[np.ndarray, float]:

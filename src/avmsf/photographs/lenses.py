@@ -61,14 +61,8 @@ class Lens:
 
     def resized(self, width: int, height: int) -> "Lens":
         """Return the lens of the same picture with another number of pixels."""
-        across, down = width / self.width, height / self.height
-        return replace(
-            self,
-            focal=(self.focal[0] * across, self.focal[1] * down),
-            principal=(self.principal[0] * across, self.principal[1] * down),
-            width=width,
-            height=height,
-        )
+        same = self.camera(torch.eye(4)).resized(width, height)
+        return replace(self, focal=same.focal, principal=same.principal, width=width, height=height)
 
     def camera(self, world_to_camera: Float[Tensor, "4 4"]) -> Camera:
         """Return the pinhole camera with this lens's intrinsics, its distortion left aside."""

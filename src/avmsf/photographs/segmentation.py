@@ -179,13 +179,9 @@ def _check_plain(different: Sequence[Bool[np.ndarray, "height width"]], names: S
     borders = [np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]) for mask in different]
     share = float(np.concatenate(borders).mean())
     if share > MAX_BORDER_DIFFERENCE:
-        raise CaptureError.expected(
-            "a plain background",
-            share,
-            got=f"{share:.0%} of the images' borders in other colors ({listed(names)})",
-            name="background",
-            advice="give masks, or photograph the object in front of one color with a margin around it",
-        )
+        got = f"{share:.0%} of the images' borders in other colors ({listed(names)})"
+        advice = "give masks, or photograph the object in front of one color with a margin around it"
+        raise CaptureError.expected("a plain background", share, got=got, name="background", advice=advice)
 
 
 def _refuse_few(masks: Sequence[Bool[np.ndarray, "height width"]]) -> None:

@@ -122,24 +122,14 @@ def _stage_images(images: Path, begun: Path) -> tuple[dict[str, str], list[str]]
         _stage_mask(images, picture, name, begun / "masks" / f"{staged}.png")
     if len(names) < MIN_IMAGES:
         unread = f" and {len(lost)} that cannot be read: {listed(lost, most=8)}" if lost else ""
-        raise CaptureError.expected(
-            f"at least {MIN_IMAGES} photographs ({', '.join(PICTURE_SUFFIXES)})",
-            len(names),
-            got=f"{len(names)}{unread}",
-            file=images,
-            name="photographs",
-        )
+        wanted, got = f"at least {MIN_IMAGES} photographs ({', '.join(PICTURE_SUFFIXES)})", f"{len(names)}{unread}"
+        raise CaptureError.expected(wanted, len(names), got=got, file=images, name="photographs")
     usual = max(sizes.values(), key=list(sizes.values()).count)
     odd = [name for name, size in sizes.items() if size != usual]
     if odd:
-        raise CaptureError.expected(
-            "photographs of one size",
-            odd,
-            got=f"most of {usual[0]} x {usual[1]} pixels, but not {listed(odd, most=8)}",
-            file=images,
-            name="sizes",
-            advice="give photographs of one camera in one orientation",
-        )
+        got = f"most of {usual[0]} x {usual[1]} pixels, but not {listed(odd, most=8)}"
+        wanted, advice = "photographs of one size", "give photographs of one camera in one orientation"
+        raise CaptureError.expected(wanted, odd, got=got, file=images, name="sizes", advice=advice)
     return names, lost
 
 
@@ -185,14 +175,9 @@ def _run_worker(begun: Path, *, timeout: float) -> list[dict[str, Any]]:
         try:
             worker.wait(timeout)
         except subprocess.TimeoutExpired as error:
-            stage = _stage_and_lines(log)[0]
-            raise CaptureError.expected(
-                f"structure from motion within {timeout:g} s",
-                timeout,
-                got="no result",
-                name=stage,
-                advice="increase timeout, or give fewer or smaller photographs",
-            ) from error
+            wanted, stage = f"structure from motion within {timeout:g} s", _stage_and_lines(log)[0]
+            advice = "increase timeout, or give fewer or smaller photographs"
+            raise CaptureError.expected(wanted, timeout, got="no result", name=stage, advice=advice) from error
         finally:
             end_child(worker)
     if worker.returncode != 0 or not result.is_file():
@@ -222,14 +207,10 @@ def _refuse_few(models: Sequence[dict[str, Any]], everything: Sequence[str], *, 
         return
     lacking = [name for name in everything if name not in registered]
     apart = f" in {len(models)} groups that could not be joined" if len(models) > 1 else ""
-    raise CaptureError.expected(
-        "cameras of most photographs",
-        lacking,
-        got=f"{len(registered)} of {len(everything)}{apart}, none for {listed(lacking)}",
-        file=images,
-        name="cameras",
-        advice="take sharp photographs 10 to 15 degrees apart, with a patterned, fixed ground in view",
-    )
+    got = f"{len(registered)} of {len(everything)}{apart}, none for {listed(lacking)}"
+    advice = "take sharp photographs 10 to 15 degrees apart, with a patterned, fixed ground in view"
+    wanted = "cameras of most photographs"
+    raise CaptureError.expected(wanted, lacking, got=got, file=images, name="cameras", advice=advice)
 
 
 def _remarks(models: Sequence[dict[str, Any]], lost: Sequence[str], everything: Sequence[str]) -> list[Remark]:
