@@ -7,13 +7,13 @@ from jaxtyping import Float
 from scipy.signal import resample_poly
 from torch import Tensor
 
+Sounds = Float[Tensor, "contacts samples"]
+"""One a row."""
 _ATTACK = 0.02
 """Window of a sound's level, s: about the temporal integration of loudness for a click."""
 
 
-def resampled(
-    sounds: Float[Tensor, "contacts samples"], *, sample_rate: float, wanted: float
-) -> Float[Tensor, "contacts resampled"]:
+def resampled(sounds: Sounds, *, sample_rate: float, wanted: float) -> Float[Tensor, "contacts resampled"]:
     """Return sounds at another sample rate, Hz, by a polyphase filter; they are not differentiable in what was given.
 
     What lies above half the lower of the two rates is lost. Dtype and device stay. The ratio of the rates is the
@@ -26,13 +26,13 @@ def resampled(
     return torch.from_numpy(found).to(sounds)
 
 
-def with_length(sounds: Float[Tensor, "contacts samples"], samples: int) -> Float[Tensor, "contacts lasting"]:
+def with_length(sounds: Sounds, samples: int) -> Float[Tensor, "contacts lasting"]:
     """Return sounds of `samples` samples: cut at the end, or continued by silence."""
     missing = samples - sounds.shape[1]
     return torch.nn.functional.pad(sounds, (0, missing)) if missing > 0 else sounds[:, :samples]
 
 
-def level(sounds: Float[Tensor, "contacts samples"], *, sample_rate: float) -> Float[Tensor, " contacts"]:
+def level(sounds: Sounds, *, sample_rate: float) -> Float[Tensor, " contacts"]:
     """Return each sound's root mean square over its loudest 20 ms, which does not depend on its decay time.
 
     Differentiable; never zero, so that it can be a divisor.
@@ -42,8 +42,6 @@ def level(sounds: Float[Tensor, "contacts samples"], *, sample_rate: float) -> F
     return power.amax(dim=1).clamp_min(torch.finfo(sounds.dtype).tiny).sqrt()
 
 
-def levelled(
-    sounds: Float[Tensor, "contacts samples"], like: Float[Tensor, "contacts samples"], *, sample_rate: float
-) -> Float[Tensor, "contacts samples"]:
+def levelled(sounds: Sounds, like: Sounds, *, sample_rate: float) -> Sounds:
     """Return sounds scaled, row for row, to the level of `like`."""
     return sounds * (level(like, sample_rate=sample_rate) / level(sounds, sample_rate=sample_rate))[:, None]

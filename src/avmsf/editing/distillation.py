@@ -14,18 +14,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.editing.clips import levelled, resampled, with_length
+from avmsf.editing.clips import Sounds, levelled, resampled, with_length
 from avmsf.editing.config import DistillationConfig, check_prompt
 from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
-from avmsf.editing.stable_audio import StableAudio
+from avmsf.editing.stable_audio import Latents, StableAudio
 from avmsf.errors import AvmsfWarning, EditError
 
 
-def noised(
-    clean: Float[Tensor, "contacts dim frames"],
-    noise: Float[Tensor, "contacts dim frames"],
-    level: Float[Tensor, " contacts"],
-) -> Float[Tensor, "contacts dim frames"]:
+def noised(clean: Latents, noise: Latents, level: Float[Tensor, " contacts"]) -> Latents:
     """Return cos(a) clean + sin(a) noise, a = pi level / 2."""
     angle = (0.5 * math.pi * level)[:, None, None]
     return torch.cos(angle) * clean + torch.sin(angle) * noise
@@ -33,13 +29,13 @@ def noised(
 
 def partial_denoising(
     model: StableAudio,
-    noisy: Float[Tensor, "contacts dim frames"],
+    noisy: Latents,
     level: Float[Tensor, " contacts"],
     conditioning: Any,
     *,
     steps: int,
     guidance: float,
-) -> Float[Tensor, "contacts dim frames"]:
+) -> Latents:
     """Return clean latents by deterministic (DDIM) steps from `level`, one a contact, down to 0 in equal parts."""
     clean = noisy
     for step in range(steps):
@@ -88,9 +84,7 @@ class DecoderDistillation:
         """Return the field as it is: Audio-SDS starts from the object's own sound."""
         return ModalEdit.none(rendered.field.bank)
 
-    def targets(
-        self, sounds: Float[Tensor, "contacts samples"], step: int, generator: torch.Generator
-    ) -> Float[Tensor, "contacts samples"]:
+    def targets(self, sounds: Sounds, step: int, generator: torch.Generator) -> Sounds:
         """Return the model's denoised versions of rendered sounds, at their level; failed rows are not finite.
 
         A batch that does not fit into the GPU's memory is halved, with a warning, for all later steps too. Raises

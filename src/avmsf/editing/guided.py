@@ -17,7 +17,7 @@ from torch import Tensor
 
 from avmsf._utils.caching import key_of, source_digest
 from avmsf._utils.state import read_checkpoint, write_checkpoint
-from avmsf.editing.clips import level
+from avmsf.editing.clips import Sounds, level
 from avmsf.editing.config import GuidedEditConfig
 from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
 from avmsf.errors import AvmsfWarning, EditError
@@ -86,30 +86,27 @@ class EditVariables:
 
         Quantities whose rate is 0 stay where they begin.
         """
-        self.parameters, self.modes, self.edited = parameters, len(start.shift), edited
-        self.values: dict[str, Float64[Tensor, "*edited"]] = {}
+        self.parameters, self.edited = parameters, edited
+        own = torch.zeros(len(start.shift), dtype=torch.bool, device=edited.device).index_fill(0, edited, True)
+        self.values = {name: each.detach().clone() for name, each in vars(start.to(edited.device)).items()}
         groups = []
-        for name, value in vars(start.to(edited.device)).items():
+        for name, value in self.values.items():
             rate = getattr(parameters, f"{name}_rate")
-            chosen = value if value.ndim == 0 else value[edited]
-            self.values[name] = chosen.detach().clone().requires_grad_(rate > 0)
             if rate > 0:
-                groups.append({"params": [self.values[name]], "lr": rate, "rate": rate})
+                groups.append({"params": [value.requires_grad_()], "lr": rate, "rate": rate})
+                if value.ndim:
+                    value.register_hook(lambda gradient: torch.where(own, gradient, 0.0))
         # Targets change from step to step: a long memory of the gradient's square would brake what chance once pushed.
         self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
 
     def edit(self) -> ModalEdit:
         """Return the edit as it stands, differentiable in the values."""
-        whole = {
-            name: value if value.ndim == 0 else value.new_zeros(self.modes).index_put((self.edited,), value)
-            for name, value in self.values.items()
-        }
-        return ModalEdit(**whole)
+        return ModalEdit(**self.values)
 
     def penalty(self) -> Float64[Tensor, ""]:
         """Return the penalty on single modes, in the unit of the loss."""
-        scale = self.values["scale"]
-        own = {**self.values, "scale": scale - scale.mean()}
+        own = {name: self.values[name][self.edited] for name in _DEVIATIONS}
+        own["scale"] = own["scale"] - own["scale"].mean()
         parts = [(own[name] / deviation).square().mean() for name, deviation in _DEVIATIONS.items()]
         return 0.5 * self.parameters.stiffness * torch.stack(parts).sum()
 
@@ -128,7 +125,7 @@ class EditVariables:
 
     def state(self) -> dict[str, Any]:
         """Return the complete state: tensors, numbers, containers of these."""
-        values = {name: value.detach().cpu().clone() for name, value in self.values.items()}
+        values = {name: value.detach().cpu() for name, value in self.values.items()}
         return {"values": values, "optimizer": self.optimizer.state_dict()}
 
     def resume(self, state: dict[str, Any]) -> None:
@@ -164,9 +161,7 @@ class Guide(Protocol):
         """Return the initial edit, given the field at contacts far apart."""
         ...
 
-    def targets(
-        self, sounds: Float[Tensor, "contacts samples"], step: int, generator: torch.Generator
-    ) -> Float[Tensor, "contacts samples"]:
+    def targets(self, sounds: Sounds, step: int, generator: torch.Generator) -> Sounds:
         """Return the targets of rendered sounds, row for row, at their level.
 
         A row with a sample that is not finite is left out of the step.
@@ -311,7 +306,7 @@ class _Optimization:
         self.consistent = True
         return loss
 
-    def _update(self, sounds: Float[Tensor, "usable samples"], targets: Float[Tensor, "usable samples"]) -> float:
+    def _update(self, sounds: Sounds, targets: Sounds) -> float:
         target = spectral_target(targets, fft_sizes=self.sizes, hops=[size // 4 for size in self.sizes])
         error = spectral_loss(sounds, target) / len(self.sizes)
         if not self.variables.differentiate(error):

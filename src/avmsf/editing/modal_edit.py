@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
 from avmsf._utils.text import counted
+from avmsf.editing.clips import Sounds
 from avmsf.errors import EditError
 from avmsf.field.gain_field import Gains
 from avmsf.field.scaled_gains import ScaledGains, fitted_gains
@@ -271,7 +272,7 @@ class FieldAtContacts:
         """Return the field at the first `count` of the contacts."""
         return replace(self, known=_each_part(self.known, lambda part: part[:count]))
 
-    def sounds(self, edit: ModalEdit | None = None) -> Float[Tensor, "contacts samples"]:
+    def sounds(self, edit: ModalEdit | None = None) -> Sounds:
         """Return the sounds of the modes, edited if an edit is given, without the residual; differentiable in it."""
         if edit is None:
             return self.field.modal_sounds(self.known, self.samples)

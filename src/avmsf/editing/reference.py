@@ -19,7 +19,7 @@ from avmsf.capture.measure import check_impulsive, find_clipping
 from avmsf.capture.onset import find_second_impact
 from avmsf.capture.prepare import prepare, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
-from avmsf.editing.clips import levelled, resampled, with_length
+from avmsf.editing.clips import Sounds, levelled, resampled, with_length
 from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
 from avmsf.errors import AvmsfWarning, CaptureError, EditError
 from avmsf.fem.material import Material
@@ -125,16 +125,12 @@ class Reference:
         """Return the common pitch and decay with which the field comes nearest, from a search over both."""
         return _search_start(rendered, self._nearest)
 
-    def targets(
-        self, sounds: Float[Tensor, "contacts samples"], step: int, generator: torch.Generator
-    ) -> Float[Tensor, "contacts samples"]:
+    def targets(self, sounds: Sounds, step: int, generator: torch.Generator) -> Sounds:
         """Return the nearest clip of each sound, which goes on as the sound itself where the clip ends."""
         targets, share = self._nearest(sounds)
         return share * targets + (1 - share) * sounds
 
-    def _nearest(
-        self, sounds: Float[Tensor, "contacts samples"]
-    ) -> tuple[Float[Tensor, "contacts samples"], Float[Tensor, "contacts samples"]]:
+    def _nearest(self, sounds: Sounds) -> tuple[Sounds, Sounds]:
         """Return the nearest clip of each sound, and its share in the target: 1, and falling to 0 before its end."""
         samples = sounds.shape[1]
         clips = with_length(self.clips, samples).to(sounds)
@@ -221,9 +217,7 @@ def _synthetic(
     )
 
 
-_TargetFunction = Callable[
-    [Float[Tensor, "contacts samples"]], tuple[Float[Tensor, "contacts samples"], Float[Tensor, "contacts samples"]]
-]
+_TargetFunction = Callable[[Sounds], tuple[Sounds, Sounds]]
 """Gives the targets of sounds, and the weight of each sample, 0 where there is no target, at most 1."""
 _OCTAVES = 9
 """Of the analyzed band, down from half the sample rate."""
@@ -238,7 +232,7 @@ _MAX_CONTACTS = 6
 _FFT_SIZES = (2048, 1024, 512, 256)
 
 
-def band_spectrum(sounds: Float[Tensor, "contacts samples"]) -> Float[Tensor, "contacts bands"]:
+def band_spectrum(sounds: Sounds) -> Float[Tensor, "contacts bands"]:
     """Return the share of each band, 24 an octave, in a sound's amplitudes: nine octaves up to half the sample rate.
 
     Smoothed over an eighth of an octave; sums to one, so that level and unit do not matter.

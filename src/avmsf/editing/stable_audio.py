@@ -26,6 +26,11 @@ from avmsf.editing.clips import with_length
 from avmsf.editing.config import STABLE_AUDIO, check_prompt
 from avmsf.errors import EditError
 
+Latents = Float[Tensor, "contacts dim frames"]
+"""What the autoencoder makes of waveforms."""
+Waveforms = Float[Tensor, "contacts channels samples"]
+"""At the model's sample rate."""
+
 
 @dataclass(frozen=True, eq=False)
 class Conditioning:
@@ -112,7 +117,7 @@ class StableAudio:
                 found.update(sampled.numpy().tobytes())
         return found.hexdigest()
 
-    def encode(self, waveforms: Float[Tensor, "contacts channels samples"]) -> Float[Tensor, "contacts dim frames"]:
+    def encode(self, waveforms: Waveforms) -> Latents:
         """Return the means of the autoencoder's latents, continued by silence to the frames that are worked at."""
         samples = waveforms.shape[2]
         if samples > self._frames * self._hop:
@@ -133,9 +138,7 @@ class StableAudio:
         silence = self._silence.expand(len(latents), -1, self._frames - sounding)
         return torch.cat([latents[:, :, :sounding], silence], dim=2)
 
-    def decode(
-        self, latents: Float[Tensor, "contacts dim frames"], *, samples: int
-    ) -> Float[Tensor, "contacts channels samples"]:
+    def decode(self, latents: Latents, *, samples: int) -> Waveforms:
         """Return the beginning of the latents' waveforms; what cannot reach it is not decoded."""
         frames = math.ceil(samples / self._hop) + self._reach
         with torch.no_grad():
@@ -155,13 +158,8 @@ class StableAudio:
         return Conditioning(torch.cat([without, conditional]), torch.cat([both, both]))
 
     def denoised(
-        self,
-        latents: Float[Tensor, "contacts dim frames"],
-        level: Float[Tensor, " contacts"],
-        conditioning: Conditioning,
-        *,
-        guidance: float,
-    ) -> Float[Tensor, "contacts dim frames"]:
+        self, latents: Latents, level: Float[Tensor, " contacts"], conditioning: Conditioning, *, guidance: float
+    ) -> Latents:
         """Return the clean latents that the model sees in noisy ones."""
         from diffusers.models.embeddings import get_1d_rotary_pos_embed
 
@@ -234,7 +232,7 @@ class StableAudio:
             raise EditError.expected(f"more than 0 and at most {longest:.4g} for {self.name}", seconds, name="seconds")
         return math.ceil(seconds * self.sample_rate / self._hop)
 
-    def _encoded(self, waveforms: Float[Tensor, "contacts channels samples"]) -> Float[Tensor, "contacts dim frames"]:
+    def _encoded(self, waveforms: Waveforms) -> Latents:
         with torch.no_grad():
             latents: Tensor = self.pipeline.vae.encode(waveforms.to(self.device).float()).latent_dist.mode()
         return latents
