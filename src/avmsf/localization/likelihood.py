@@ -162,7 +162,7 @@ def evaluate_likelihood(
     unit = float(amplitudes.abs().max())
     values, errors = amplitudes / unit, (noise / unit**2).float()
     strength = None if force is None else replace(force, expected=force.expected / unit)
-    trial = _Trial.of(predicted, values, errors, strength)
+    trial = _Trial(predicted, values, errors, strength)
     rows = trial.preselect(_PRESELECTED)
     found = trial.evaluate(rows, RELATIVE_ERRORS)
     near = torch.nonzero(found[0] > found[0].max() - _NEGLIGIBLE).flatten()
@@ -178,39 +178,28 @@ def evaluate_likelihood(
     return LikelihoodResult(evidence, forces, shifts, trial.noise_fraction, trial.noise_log_likelihood())
 
 
-@dataclass(frozen=True, eq=False)
 class _Trial:
     """One sound's amplitudes, in units in which the strongest is one, and the predicted gains."""
 
-    predicted: PredictedGains
-    values: Complex128[Tensor, " modes"]
-    noise: Float32[Tensor, " modes"]
-    weights: Float32[Tensor, " modes"]
-    """One over the errors' variance, roughly: with these the shift is found."""
-    surplus: Float32[Tensor, " modes"]
-    """The sound's energy beyond the noise."""
-    force_weights: Float32[Tensor, " modes"]
-    """By which energies are summed that give the force at which an impact's errors are taken."""
-    force: Force | None
-    noise_fraction: float
-    """Fraction of the errors' variance that is noise."""
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         predicted: PredictedGains,
         values: Complex128[Tensor, " modes"],
         noise: Float32[Tensor, " modes"],
         force: Force | None,
-    ) -> "_Trial":
-        """Return the trial of amplitudes of which the greatest has magnitude one."""
+    ) -> None:
+        self.predicted, self.values, self.noise, self.force = predicted, values, noise, force
         mean_power, unknown = predicted.mean_power, predicted.variance.mean(0)
         surplus = (values.abs().square().float() - noise).clamp_min(0.0)
         level = (surplus.sum() / (mean_power + unknown).sum()).clamp_min(1e-12)
-        weights = 1.0 / (noise + level * (unknown + RELATIVE_ERRORS[1] ** 2 * mean_power))
-        force_weights = 1.0 / (noise + (surplus.sum() / mean_power.sum()).clamp_min(1e-12) * mean_power)
-        noise_fraction = float((weights * noise).mean())
-        return cls(predicted, values, noise, weights, surplus, force_weights, force, noise_fraction)
+        self.weights = 1.0 / (noise + level * (unknown + RELATIVE_ERRORS[1] ** 2 * mean_power))
+        """One over the errors' variance, roughly: with these the shift is found."""
+        self.force_weights = 1.0 / (noise + (surplus.sum() / mean_power.sum()).clamp_min(1e-12) * mean_power)
+        """By which energies are summed that give the force at which an impact's errors are taken."""
+        self.sound = self.force_weights @ surplus
+        """That sum of the sound's energy beyond the noise."""
+        self.noise_fraction = float((self.weights * noise).mean())
+        """Fraction of the errors' variance that is noise."""
 
     def noise_log_likelihood(self) -> float:
         """Return the log likelihood of noise, of any level, with the constant of `evaluate_likelihood`.
@@ -237,12 +226,8 @@ class _Trial:
         return torch.sort(torch.topk(match / size, count).indices).values
 
     def _rotated(self, step: float) -> tuple[Float64[Tensor, " shifts"], Complex64[Tensor, "shifts modes"]]:
-        """Return the shifts of `delays_of` for the amplitudes, and these turned back by each."""
-        frequency = self.predicted.frequency
         energy = self.weights.double() * self.values.abs().square()
-        shifts = delays_of(energy, frequency, step=step)
-        back = torch.polar(torch.ones((), dtype=torch.float64), -2.0 * math.pi * shifts[:, None] * frequency)
-        return shifts, (self.values * back).to(torch.complex64)
+        return delayed_back(self.values, self.predicted.frequency, power=energy, step=step)
 
     def _weighted(self, rotated: Complex64[Tensor, "shifts modes"]) -> Float32[Tensor, "two_modes shifts"]:
         return torch.view_as_real(rotated * self.weights).flatten(1).T.contiguous()
@@ -254,7 +239,7 @@ class _Trial:
         steps, rotated = self._rotated(_FINE)
         prior = -0.5 * (steps / SHIFT_DEVIATION).square()
         weighted, energy, mean_power = self._weighted(rotated), rotated[0].abs().square(), self.predicted.mean_power
-        sound, mean = self.force_weights @ self.surplus, self.force_weights @ mean_power
+        mean = self.force_weights @ mean_power
         evidence, forces, shifts = [], [], []
         for part in torch.split(rows, _BATCH):
             gains, power = self.predicted.gains[part], self.predicted.power[part]
@@ -268,49 +253,42 @@ class _Trial:
             for half in (0.5 * relative_error**2 for relative_error in relative_errors):
                 error = torch.add(variance, power + mean_power, alpha=half)
                 # At this force an impact, with its errors, has the sound's energy.
-                squares = (sound / ((1.0 + half) * own + spread + half * mean).clamp_min(_TINY)).clamp(1e-24, 1e24)
-                tried.append(self._marginalize_force(cross, energy, power, error, squares))
+                squares = (self.sound / ((1.0 + half) * own + spread + half * mean).clamp_min(_TINY)).clamp(1e-24, 1e24)
+                weights = error.mul_(squares[:, None]).add_(self.noise).reciprocal_()
+                match, size = torch.linalg.vecdot(weights, cross), torch.linalg.vecdot(weights, power).clamp_min(_TINY)
+                strength = match / size
+                found = weights.log().sum(1) - weights @ energy + match * strength - 0.5 * size.log()
+                tried.append((found + self._log_force_prior(strength, squares), strength))
             found, strength = (torch.stack(each) for each in zip(*tried, strict=True))
             evidence.append(torch.logsumexp(found, 0) + prior[chosen].float())
             forces.append(strength.gather(0, found.argmax(0)[None])[0])
             shifts.append(steps[chosen])
         return torch.cat(evidence), torch.cat(forces), torch.cat(shifts)
 
-    def _marginalize_force(
-        self,
-        cross: Float32[Tensor, "rows modes"],
-        energy: Float32[Tensor, " modes"],
-        power: Float32[Tensor, "rows modes"],
-        error: Float32[Tensor, "rows modes"],
-        squares: Float32[Tensor, " rows"],
-    ) -> tuple[Float32[Tensor, " rows"], Float32[Tensor, " rows"]]:
-        """Return the log likelihood, the force integrated over, and the force that fits best.
-
-        `squares` are those of the forces that the errors are taken at.
-        """
-        weights = error.mul_(squares[:, None]).add_(self.noise).reciprocal_()
-        match = torch.linalg.vecdot(weights, cross)
-        own = torch.linalg.vecdot(weights, power).clamp_min(_TINY)
-        strength = match / own
-        found = weights.log().sum(1) - weights @ energy + match * strength - 0.5 * own.log()
+    def _log_force_prior(
+        self, strength: Float32[Tensor, " rows"], squares: Float32[Tensor, " rows"]
+    ) -> Float32[Tensor, " rows"]:
+        """Return the logarithm of a force's prior, at the force that fits best or the square of the errors' force."""
         if self.force is None:
-            return found - 0.5 * squares.log(), strength
+            return -0.5 * squares.log()
         size = strength.abs().clamp_min(_TINY)
         spread = self.force.spread_db * math.log(10.0) / 20.0
-        return found - size.log() - 0.5 * ((size / self.force.expected).log() / spread).square(), strength
+        return -size.log() - 0.5 * ((size / self.force.expected).log() / spread).square()
 
 
-def delays_of(
-    power: Float64[Tensor, " modes"], frequency: Float64[Tensor, " modes"], *, step: float
-) -> Float64[Tensor, " delays"]:
-    """Return evenly spaced delays (seconds) up to `LARGEST_DELAY` either way, zero among them.
+def delayed_back(
+    values: Complex128[Tensor, " modes"], frequency: Float64[Tensor, " modes"], *, power: Tensor, step: float
+) -> tuple[Float64[Tensor, " delays"], Complex64[Tensor, "delays modes"]]:
+    """Return evenly spaced delays (seconds) up to `LARGEST_DELAY` either way, zero among them, and amplitudes before.
 
-    From one to the next the typical frequency, the root mean square of frequencies (Hz) weighted by `power`, turns by
-    `step` radians, or by more where that would take more than `MOST_DELAYS`.
+    From one delay to the next the typical frequency, the root mean square of frequencies (Hz) weighted by `power`,
+    turns by `step` radians, or by more where that would take more than `MOST_DELAYS`.
     """
     typical = 2.0 * math.pi * float(((power @ frequency.square()) / power.sum()).sqrt())
     count = min(MOST_DELAYS, 1 + 2 * math.ceil(LARGEST_DELAY * typical / step))
-    return torch.linspace(-LARGEST_DELAY, LARGEST_DELAY, count, dtype=torch.float64)
+    delays = torch.linspace(-LARGEST_DELAY, LARGEST_DELAY, count, dtype=torch.float64)
+    back = torch.polar(torch.ones((), dtype=torch.float64), -2.0 * math.pi * delays[:, None] * frequency)
+    return delays, (values * back).to(torch.complex64)
 
 
 def cosine_distance(
@@ -327,11 +305,7 @@ def cosine_distance(
     if not bool(recorded.any()):
         return torch.ones(len(gains), dtype=torch.float64)
     recorded = recorded / recorded.norm()
-    turns = 2.0 * math.pi * frequency
-    delays = delays_of(recorded.abs().square(), frequency, step=DELAY_STEP)
-    rotated = (recorded * torch.polar(torch.ones((), dtype=torch.float64), -delays[:, None] * turns)).to(
-        torch.complex64
-    )
+    _, rotated = delayed_back(recorded, frequency, power=recorded.abs().square(), step=DELAY_STEP)
     parts = torch.view_as_real(rotated).flatten(1).T.contiguous()
     found = [
         (torch.view_as_real(part).flatten(1) @ parts).abs().amax(1) / part.norm(dim=1).clamp_min(1e-30)
