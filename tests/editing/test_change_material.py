@@ -168,25 +168,6 @@ def test_ratios_of_gains_between_places_stay():
     torch.testing.assert_close(change, expected.expand_as(change), rtol=1e-6, atol=0)
 
 
-def test_modes_beyond_half_the_sample_rate_are_silent_reported_and_come_back():
-    field = plate_field(PLASTIC, highest=5000.0)
-    found = change_material(field, PLASTIC, OTHER)
-    silent = ~found.audible
-    assert 0 < int(silent.sum()) < len(silent)
-    told = found.origin.report["edits"][-1]
-    assert told["silent_hertz"] == found.bank.frequency[silent].tolist()
-    assert min(told["silent_hertz"]) >= RATE / 2
-    sounds, times = found.render(CONTACTS[:2]), torch.arange(2000, dtype=torch.float64) / RATE
-    known, expected = found.known(CONTACTS[:2]), torch.zeros(2, 2000, dtype=torch.float64)
-    for mode in torch.nonzero(found.audible).flatten().tolist():
-        angle = 2 * math.pi * found.bank.frequency[mode] * times
-        waves = known.mean[:, mode, None] * angle.sin() + known.quadrature[:, mode, None] * angle.cos()
-        expected += torch.exp(-found.bank.damping[mode] * times) * waves
-    # The residual is a millionth; float32 sums.
-    torch.testing.assert_close(sounds.double(), expected, rtol=0, atol=2e-6 * float(expected.abs().max()))
-    expect_same(change_material(found, OTHER, PLASTIC), field, CONTACTS)
-
-
 def test_modes_without_a_tone_are_mute_and_named_and_stay_where_they_are():
     field = plate_field(GLASS)
     lossy = replace(GLASS, name="felt", alpha=4000.0)

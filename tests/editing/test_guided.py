@@ -174,13 +174,6 @@ def test_an_interrupted_edit_goes_on_to_the_same_result(tmp_path, stop):
     assert torch.equal(sound_of(resumed), sound_of(whole))
 
 
-def test_seeds_reproduce_and_differ():
-    field, guide = ringing_field(), replace(towards(pitch=1.02), noise=0.5)
-    first, again, other = (edit_towards(field, guide, config=replace(QUICK, seed=seed)) for seed in (3, 3, 4))
-    assert torch.equal(first.bank.frequency, again.bank.frequency)
-    assert not torch.equal(first.bank.frequency, other.bank.frequency)
-
-
 def test_a_checkpoint_of_another_edit_is_refused_by_name(tmp_path):
     place, guide = tmp_path / "state", towards(pitch=1.02)
     edit_towards(ringing_field(), guide, config=QUICK, checkpoint=place)

@@ -127,13 +127,6 @@ def test_the_loudest_modes_by_energy():
         assert struck.loudest(count).tolist() == sorted(order[:count])
 
 
-def test_louder_scales_the_sound():
-    field, contacts = made_field(), made_fields.places(3, seed=4)
-    edit = made_edit()
-    plain, loud = (each.of(field).render(contacts) for each in (edit, edit.louder(torch.tensor(2.5))))
-    torch.testing.assert_close(loud, 2.5 * plain, rtol=0, atol=1e-6 * float(loud.abs().max()))
-
-
 def test_an_edit_of_another_bank_is_refused():
     other = replace(made_field(), bank=made_fields.BANK)
     edit = ModalEdit(*(torch.zeros(size, dtype=torch.float64) for size in ((), (3,), (), (3,), (3,))))

@@ -9,7 +9,7 @@ import pytest
 import soundfile
 import torch
 
-from avmsf.editing.clips import level, levelled, resampled, with_length
+from avmsf.editing.clips import level, levelled, with_length
 from avmsf.editing.modal_edit import FieldAtContacts
 from avmsf.editing.reference import Reference, _brightness, band_spectrum
 from avmsf.errors import AvmsfWarning, EditError
@@ -106,16 +106,6 @@ def test_heard_spectra_shift_with_pitch_and_ignore_level():
     torch.testing.assert_close(one.roll(24, 1)[:, 60:], double[:, 60:], rtol=0, atol=3e-3)
     loud = band_spectrum(1e3 * sound_of(ringing_field()))
     torch.testing.assert_close(loud, double, rtol=1e-4, atol=1e-7)
-
-
-def test_resampling_keeps_a_tone():
-    times = torch.arange(8000, dtype=torch.float64) / 8000
-    tone = torch.sin(2 * math.pi * 440.0 * times)[None]
-    found = resampled(tone, sample_rate=8000.0, wanted=44100.0)
-    expected = torch.sin(2 * math.pi * 440.0 * torch.arange(44100, dtype=torch.float64) / 44100)
-    assert found.shape == (1, 44100)
-    # The filter's pass-band ripple, away from the ends.
-    torch.testing.assert_close(found[0, 2000:-2000], expected[2000:-2000], rtol=0, atol=3e-3)
 
 
 def test_level_hears_the_blow_not_the_ringing():

@@ -78,16 +78,6 @@ def test_peaks_are_positions_apart_that_hold_some_probability():
     assert not made([0.1, 0.8, 0.1]).multimodal
 
 
-def test_small_peaks_make_a_map_multimodal():
-    chances = [0.0] * 40
-    for row, chance in ((0, 0.64), (8, 0.1), (16, 0.1), (24, 0.1), (32, 0.03), (39, 0.03)):
-        chances[row] = chance
-    found = made(chances)
-    assert found.multimodal
-    assert [round(each.probability, 2) for each in found.equivalent_points()] == [0.1, 0.1, 0.1]
-    assert len(found.equivalent_points(level=0.99)) == 3
-
-
 def test_other_positions_include_a_broader_peak_and_not_the_answer():
     chances = [0.0] * 30
     chances[20] = 0.15

@@ -13,11 +13,9 @@ from avmsf.localization.likelihood import Force
 from avmsf.localization.locate import MIN_EXPLAINED, REJECT_ABOVE, assess_match, locate
 from avmsf.localization.locator import Locator
 from avmsf.localization.prediction import distinct_contacts
-from avmsf.modal.synthesis import synthesize_phased
 from factories.believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
 from factories.located_plate import (
     PLATE,
-    RATE,
     TrueGains,
     bank,
     field_of,
@@ -65,12 +63,7 @@ def test_force_polarity_and_onset_do_not_matter():
 
 def test_phase_and_quadrature_are_what_the_field_renders():
     field = field_of(TrueGains(plate_surface_points(PLATE, 600).float(), turned=True), phase=0.7)
-    points = field.gain_field.points
-    known = field.known(points[123:124])
-    sound = synthesize_phased(
-        known.mean, bank().frequency, bank().damping, field.phase, samples=7200, sample_rate=RATE,
-        quadrature=known.quadrature,
-    )[0]  # fmt: skip
+    sound = field.modal_sounds(field.known(field.gain_field.points[123:124]), 7200)[0]
     found = Locator.of(field).locate(sound)
     assert float(found.distance[123]) < 1e-6
     assert found.explained_energy > 0.999
@@ -79,11 +72,7 @@ def test_phase_and_quadrature_are_what_the_field_renders():
 
 def test_dampings_that_vary_are_accounted_for():
     field = field_of(TrueGains(plate_surface_points(PLATE, 600).float(), factor=2.0))
-    points = field.gain_field.points
-    known = field.known(points[123:124])
-    sound = synthesize_phased(
-        known.mean, bank().frequency, bank().damping * known.damping, field.phase, samples=7200, sample_rate=RATE
-    )[0]
+    sound = field.modal_sounds(field.known(field.gain_field.points[123:124]), 7200)[0]
     corrected = Locator.of(field)
     plain = replace(corrected, dampings=None, lengths={})
     distance = [float(each.locate(sound).distance[123]) for each in (corrected, plain)]
@@ -209,12 +198,7 @@ def with_the_modes_of_no_place(seed):
     generator, gains = torch.Generator().manual_seed(seed), locator_of().gains
     drawn = torch.randn(len(bank()), 2, dtype=torch.float64, generator=generator)
     values = torch.view_as_complex(drawn) / gains.abs().square().mean(0).sqrt()
-    phase = torch.zeros(len(bank()), dtype=torch.float64)
-    sounds = synthesize_phased(
-        values.real[None], bank().frequency, bank().damping, phase, samples=7200, sample_rate=RATE,
-        quadrature=values.imag[None],
-    )  # fmt: skip
-    return sounds[0].float()
+    return true_field().modal_sounds(Gains(values.real[None], values.imag[None]), 7200)[0].float()
 
 
 @pytest.mark.parametrize("taps", [None, 25])

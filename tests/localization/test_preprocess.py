@@ -10,8 +10,8 @@ import torch
 from avmsf.capture.audio import Recording
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
+from avmsf.field.sound_field import SoundField
 from avmsf.localization.locate import locate
-from avmsf.localization.locator import Locator
 from avmsf.localization.preprocess import at_field_rate, preprocess_recording
 from factories.located_plate import RATE, locator_of, missed, struck, true_field
 from factories.raising import raises
@@ -24,43 +24,43 @@ def recorded(sound: torch.Tensor, *, before: float = 0.1, rate: float = RATE, se
     return Recording("hit.wav", (0.5 * (samples + noise) / np.abs(samples).max())[None], rate, "FLOAT")
 
 
-@pytest.fixture
-def locator() -> Locator:
-    return locator_of()
+def read_by(settings: CaptureSettings) -> SoundField:
+    """Return the plate's field, its own recordings read by these settings."""
+    return replace(true_field(), origin=replace(true_field().origin, settings=settings))
 
 
-def test_the_onset_is_found_and_the_impact_located(locator):
+def test_the_onset_is_found_and_the_impact_located():
     impacts = struck(6, seed=21)
     for sound, contact in zip(impacts.sounds, impacts.contacts, strict=True):
         impact = preprocess_recording(recorded(sound), true_field())
         assert abs(impact.onset - round(0.1 * RATE)) <= 8
         assert impact.notes == ()
-        found = locate(true_field(), recorded(sound), locator=locator)
+        found = locate(true_field(), recorded(sound), locator=locator_of())
         assert missed(found, found.most_probable, contact) < 0.03
         assert found.modal_energy > 0.95
 
 
 @pytest.mark.parametrize("rate", [44100.0, 48000.0, 12000.0])
-def test_another_rate_is_resampled_and_said(rate, locator):
+def test_another_rate_is_resampled_and_said(rate):
     impacts = struck(1, seed=22)
     sound = recorded(impacts.sounds[0]).channels[0]
     samples = scipy.signal.resample_poly(sound, round(rate / 100), round(RATE / 100))
     impact = preprocess_recording(torch.from_numpy(samples), true_field(), sample_rate=rate)
     assert f"resampled from {rate:g} Hz to the field's 18000 Hz" in impact.notes[0]
     assert ("modes, above 5400 Hz, left out" in impact.notes[0]) == (rate == 12000.0)
-    found = locate(true_field(), torch.from_numpy(samples), sample_rate=rate, locator=locator)
+    found = locate(true_field(), torch.from_numpy(samples), sample_rate=rate, locator=locator_of())
     assert missed(found, found.most_probable, impacts.contacts[0]) < 0.03
     assert found.modal_energy > 0.9
 
 
 @pytest.mark.parametrize("noise_db", [0.0, 3.0])
-def test_bands_that_resampling_emptied_are_not_taken_for_quiet(noise_db, locator):
+def test_bands_that_resampling_emptied_are_not_taken_for_quiet(noise_db):
     """Half the rate holds half of the noise, which is as loud as the impact is and no other object's sound."""
     for seed in (51, 52):
         sound = struck(1, seed=seed, noise_db=noise_db).sounds[0].double().numpy()
         halved = scipy.signal.resample_poly(sound, 1, 2)
         impact = at_field_rate(halved, Recording("half.wav", halved[None], RATE / 2, "FLOAT"), true_field())
-        found = locator.locate(impact[0], highest=impact[1])
+        found = locator_of().locate(impact[0], highest=impact[1])
         assert found.mismatch_ratio < 0.25
 
 
@@ -86,18 +86,18 @@ def test_a_rate_that_holds_no_mode_is_refused():
         preprocess_recording(sound, true_field(), sample_rate=450.0)
 
 
-def test_clipping_is_said_with_its_share(locator):
+def test_clipping_is_said_with_its_share():
     recording = recorded(struck(1, seed=23).sounds[0])
     clipped = Recording("hit.wav", np.clip(8 * recording.channels, -1, 1), RATE, "PCM_16")
-    note = locate(true_field(), clipped, locator=locator).notes[0]
+    note = locate(true_field(), clipped, locator=locator_of()).notes[0]
     assert note.startswith("hit.wav")
     assert "clipped" in note
 
 
-def test_a_second_impact_is_noted_and_not_used(locator):
+def test_a_second_impact_is_noted_and_not_used():
     impacts = struck(2, seed=24)
     both = torch.cat([impacts.sounds[0][:5400], impacts.sounds[1]])
-    found = locate(true_field(), recorded(both), locator=locator)
+    found = locate(true_field(), recorded(both), locator=locator_of())
     assert [float(each) for each in re.findall(r"([\d.]+) s\b", found.notes[0])] == pytest.approx([0.1, 0.4], abs=0.01)
     assert missed(found, found.most_probable, impacts.contacts[0]) < 0.03
 
@@ -134,7 +134,7 @@ def test_channels_follow_the_capture_where_the_recording_has_them():
     settings = CaptureSettings(response_channel=2, highpass=30.0)
     assert abs(preprocess_recording(two, true_field(), settings=settings).onset - 1800) <= 8
     # What the field was fitted to was read so, though from its first sample on: an impact is sought all the same.
-    like = replace(true_field(), origin=replace(true_field().origin, settings=replace(settings, align=False)))
+    like = read_by(replace(settings, align=False))
     torch.testing.assert_close(
         preprocess_recording(two, like).sound, preprocess_recording(two, true_field(), settings=settings).sound
     )
@@ -149,7 +149,7 @@ def test_channels_follow_the_capture_where_the_recording_has_them():
 
 def test_bare_samples_are_taken_as_they_are_and_files_as_the_capture_was():
     sped = CaptureSettings(playback_speed=2.0)
-    like = replace(true_field(), origin=replace(true_field().origin, settings=sped))
+    like = read_by(sped)
     whole = recorded(struck(1, seed=25).sounds[0])
     torch.testing.assert_close(
         preprocess_recording(whole.channels[0], like).sound, preprocess_recording(whole.channels[0], true_field()).sound
@@ -161,7 +161,7 @@ def test_bare_samples_are_taken_as_they_are_and_files_as_the_capture_was():
 def test_a_recording_that_starts_with_its_impact_is_read_as_those_of_a_capture_that_was_not_cut():
     """The first sample of a sine is zero, so that an onset is found behind it, where nothing was cut before."""
     field = true_field()
-    uncut = replace(field, origin=replace(field.origin, settings=replace(field.origin.settings, align=False)))
+    uncut = read_by(replace(field.origin.settings, align=False))
     sound = struck(1, seed=21).sounds[0].double()
     # Some samples that a threshold does not reach.
     whole = Recording("hit.wav", torch.cat([1e-4 * sound[:5], sound]).numpy()[None], RATE, "FLOAT")

@@ -146,14 +146,8 @@ def test_ringing_is_followed_and_fitted_exactly() -> None:
     size = torch.ones(len(BANK))
     modes = Ringing.of(BANK, size, sample_rate=RATE, window=480)
     amplitudes = torch.complex(*torch.randn(2, len(BANK), generator=torch.Generator().manual_seed(0)).double())
-    sound = synthesize(
-        amplitudes.real[None],
-        BANK.frequency,
-        BANK.damping,
-        samples=1200,
-        sample_rate=RATE,
-        quadrature=amplitudes.imag[None],
-    )[0]
+    parts = {"samples": 1200, "sample_rate": RATE, "quadrature": amplitudes.imag[None]}
+    sound = synthesize(amplitudes.real[None], BANK.frequency, BANK.damping, **parts)[0]
     assert torch.allclose(modes.render(amplitudes, 1200), sound, atol=1e-9)
     assert torch.allclose(modes.render(modes.after(amplitudes, 300), 900), sound[300:], atol=1e-9)
     assert torch.allclose(modes.fit(sound[:480], 0.0), amplitudes, atol=1e-6)
@@ -184,19 +178,24 @@ def test_nothing_is_heard_for_longer_than_the_fields_own_sounds() -> None:
     }
 
 
-def test_streams_that_cannot_be_listened_to_are_refused() -> None:
-    with raises(LocationError, name="sample_rate", value=44100.0):
-        StreamingLocalizer(locator(), sample_rate=44100.0)
-    with raises(LocationError, name="window", value=0.0):
-        StreamingLocalizer(locator(), window=0.0)
-    with raises(LocationError, name="window", value=0.01):
-        StreamingLocalizer(locator(), window=0.01)
+@pytest.mark.parametrize(
+    ("name", "value", "given"),
+    [
+        ("sample_rate", 44100.0, {}),
+        ("window", 0.0, {}),
+        ("window", 0.01, {}),
+        ("later", 0.05, {"window": 0.06}),
+        ("highpass", 4000.0, {}),
+    ],
+)
+def test_streams_that_cannot_be_listened_to_are_refused(name, value, given) -> None:
+    with raises(LocationError, name=name, value=value):
+        StreamingLocalizer(locator(), **{**given, name: value})
+
+
+def test_silent_fields_and_samples_that_are_no_numbers_are_refused() -> None:
     with raises(LocationError, name="field", value=0):
         StreamingLocalizer(replace(locator(), field=adjust_modes(locator().field, pitch=1000.0)))
-    with raises(LocationError, name="later", value=0.05):
-        StreamingLocalizer(locator(), window=0.06, later=0.05)
-    with raises(LocationError, name="highpass", value=4000.0):
-        StreamingLocalizer(locator(), highpass=4000.0)
     listener = StreamingLocalizer(locator())
     with raises(LocationError, name="block"):
         listener.process(torch.tensor([0.0, float("nan")]))
