@@ -15,6 +15,7 @@ from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.prepare import prepare, remove_rumble
 from avmsf.errors import CaptureError
 from factories.capture_folder import RATE, ROWS, fill, ring
+from factories.plate_capture import fill_plate
 from factories.raising import raises
 
 HAMMER = CaptureSettings(force_channel=1, response_channel=2, seconds=0.4)
@@ -228,3 +229,37 @@ def test_a_highpass_removes_rumble_and_moves_no_phase(tmp_path: Path) -> None:
     assert np.abs(kept - 0.5 * tone)[middle].max() < 2e-3
     with raises(CaptureError, file="hit.wav", name="highpass", value=4000.0):
         prepare(recording, CaptureSettings(highpass=4000.0))
+
+
+def peaked() -> Recording:
+    """Return 50 ms of silence, a small swing, and the largest sample 37 samples after it."""
+    sound = np.zeros(4000)
+    times = np.arange(3600)
+    sound[400:] = 0.4 * np.exp(-times / 800) * np.cos(0.3 * times)
+    sound[437] = -1.0
+    return Recording("a.wav", sound[None], 8000.0, "FLOAT")
+
+
+def test_a_sound_starts_at_its_largest_sample() -> None:
+    onset, peak = (prepare(peaked(), CaptureSettings(time_zero=name)) for name in ("onset", "peak"))
+    assert abs(onset.onset - 400) <= 1
+    assert peak.onset == 437
+    assert peak.sound[0] == -1.0
+    assert len(peak.sound) == 4000 - 437
+    # Files that start where they start are not moved.
+    assert len(prepare(peaked(), CaptureSettings(time_zero="peak", align=False)).sound) == 4000
+
+
+def test_recordings_from_their_peaks_are_final(tmp_path: Path) -> None:
+    folder = fill_plate(tmp_path / "plate")
+    impacts = read_capture(folder, CaptureSettings(time_zero="peak")).impacts
+    assert impacts.before is None
+    assert bool((impacts.sounds[:, 0].abs() == impacts.sounds.abs().amax(1)).all())
+    assert not torch.equal(read_capture(folder, CaptureSettings()).impacts.sounds, impacts.sounds)
+
+
+def test_settings_start_where_they_are_asked_to() -> None:
+    own = CaptureSettings(align=False)
+    assert own.starting(None) == own.starting("onset") == own
+    assert own.starting("peak").from_peaks
+    assert not own.starting("peak").starting("onset").from_peaks

@@ -1,15 +1,17 @@
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
 import trimesh
 
 from avmsf.errors import SceneError
+from avmsf.photographs.cameras import View
 from avmsf.reconstruction import ObjectShape, object_surface
 from factories.looked_at import HEIGHT, RADIUS, ball, cup, cup_volume, depth_of, mesh_of, tube, views_of
 
-CELLS = 64
+CELLS, COARSE = 64, 48
 WALL = 0.004
 
 
@@ -119,3 +121,77 @@ def test_a_wall_as_thick_as_the_cup_is_wide_is_refused(cup_shape: ObjectShape) -
     for wall in (0.0, -1.0, float("nan"), 0.05, 1.2 * RADIUS):
         with pytest.raises(SceneError):
             cup_shape.shell(wall)
+
+
+@pytest.fixture(scope="module")
+def block() -> ObjectShape:
+    """Return a cylinder as views show it; a tube whose ends are covered looks the same."""
+    solid = trimesh.creation.cylinder(radius=0.03, height=0.05, sections=96)
+    return object_surface(views_of(solid), depth_of(solid), cells=COARSE)
+
+
+def test_both_ends_of_a_cylinder_may_be_open(block: ObjectShape) -> None:
+    assert block.supposed
+    assert int(block.hollow.max()) == 2
+    for number in (1, 2):
+        # An opening is smaller than the end by the reach of its edge; a cavity is a cell deep.
+        area = int((block.hollow == number).sum()) * block.grid.spacing**2
+        assert 0.7 * np.pi * 0.03**2 < area < np.pi * 0.03**2
+    # What the views show is the block itself.
+    assert mesh_of(block.as_seen()).volume == pytest.approx(np.pi * 0.03**2 * 0.05, rel=0.03)
+
+
+@pytest.mark.parametrize("wall", [0.002, 0.004])
+def test_the_wall_around_a_supposed_cavity_is_a_tube(block: ObjectShape, wall: float) -> None:
+    mesh = mesh_of(block.shell(wall))
+    assert mesh.is_watertight
+    # The outer side of the hull is up to 1 % too wide, and the tube's ends are rounded.
+    assert mesh.volume == pytest.approx(np.pi * 0.05 * (0.03**2 - (0.03 - wall) ** 2), rel=0.1)
+
+
+def test_views_do_not_bound_the_wall_of_a_supposed_cavity(block: ObjectShape, cup_shape: ObjectShape) -> None:
+    assert block.thickness_range == pytest.approx((0.0025 * block.diagonal, 0.06 * block.diagonal))
+    # Into an open cup of a wall of 4 mm they do see.
+    assert not cup_shape.supposed
+    assert cup_shape.thickness_range is not None
+    assert cup_shape.thickness_range[1] < 0.06 * cup_shape.diagonal
+
+
+def _grown(view: View, pixels: int) -> View:
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(pixels) + 1,) * 2)
+    change = cv2.dilate if pixels > 0 else cv2.erode
+    return replace(view, mask=torch.from_numpy(change(view.mask.numpy(), kernel)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pixels", [-2, 2])
+def test_masks_that_are_all_too_large_or_too_small_leave_the_size_as_it_is(pixels: int) -> None:
+    mesh = ball(RADIUS)
+    views = [_grown(view, pixels) for view in views_of(mesh)]
+    shape = object_surface(views, depth_of(mesh), cells=COARSE)
+    # A pixel is 1 mm wide there.
+    radii = np.linalg.norm(mesh_of(shape.solid()).vertices, axis=1)
+    assert float(radii.mean()) == pytest.approx(RADIUS, abs=0.0005)
+    assert shape.report.mask_offset == pytest.approx(pixels, abs=0.4)
+
+
+@pytest.mark.slow
+def test_a_mask_that_is_wrong_about_a_small_part_is_left_out() -> None:
+    # Mirrored masks differ in the arm alone, which is a hundredth of the volume.
+    arm = trimesh.creation.box((0.03, 0.012, 0.012))
+    arm.apply_translation((0.05, 0.0, 0.02))
+    mesh = trimesh.util.concatenate([trimesh.creation.cylinder(radius=0.04, height=0.06, sections=96), arm])
+    views = list(views_of(mesh))
+    wrong = (3, 9)
+    for row in wrong:
+        views[row] = replace(views[row], mask=views[row].mask.flip((0, 1)).clone())
+    shape = object_surface(views, depth_of(mesh), cells=COARSE)
+    assert set(shape.report.rejected) == {views[row].name for row in wrong}
+    assert float(shape.solid().vertices[:, 0].max()) == pytest.approx(0.065, abs=0.002)
+
+
+def test_views_from_one_side_are_refused() -> None:
+    mesh = ball(RADIUS)
+    views = views_of(mesh, elevations=(0.0,), azimuths=72)[:3]
+    with pytest.raises(SceneError):
+        object_surface(views, depth_of(mesh), cells=COARSE)
