@@ -22,7 +22,7 @@ from factories.plate_capture import PLATE, TINY, fill_plate
 from factories.small_scene import SMALL_SPLAT, THICKNESS, slab_views, write_surface_file
 
 Streams = pytest.CaptureFixture[str]
-LIFT = ("--lift.encoder", "descriptors", "--lift.points", "600")
+LIFT = ("--lift.encoder", "descriptors", "--lift.points", "1200")
 RENDERED = ("--views.rendered", "48", "--views.count", "18")
 MODES = ("--modes", "12")
 FIT = TINY[: -len(MODES)]

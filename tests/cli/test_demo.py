@@ -15,10 +15,8 @@ from avmsf.evaluation.splits import Scores
 from avmsf.field.store import load
 from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.ply import read_splats
-from avmsf.mesh import read_surface
 from avmsf.pipeline.config import LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
 from avmsf.simulate.recipe import EXAMPLE
-from avmsf.simulate.simulation_folder import example_mesh
 from factories.plate_field import QUICK
 
 METHODS = {
@@ -31,9 +29,8 @@ METHODS = {
 def test_the_demo_goes_all_the_way(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    small = SceneConfig(
-        ViewsConfig(count=6), SplatConfig(steps=30, start_points=400), LiftConfig(encoder="descriptors")
-    )
+    lift = LiftConfig(encoder="descriptors", symmetry=False)
+    small = SceneConfig(ViewsConfig(count=6), SplatConfig(steps=30, start_points=400), lift)
     monkeypatch.setattr(demo, "CONFIG", PipelineConfig("network", scene=small, fit=QUICK))
     folder = tmp_path / "demo"
     assert main(["demo", str(folder), "--json"]) == 0
@@ -69,33 +66,10 @@ def test_the_demo_goes_all_the_way(
     assert (folder / "capture" / "notes.txt").is_file()
 
 
-@pytest.mark.slow
-def test_the_demo_as_shipped_uses_elastic_mode_shapes_and_beats_the_nearest_recordings(tmp_path: Path) -> None:
-    folder = tmp_path / "demo"
-    assert main(["demo", str(folder)]) == 0
-    record = json.loads((folder / "demo.json").read_text())
-    assert not list((folder / "capture").glob("surface.*"))
-    surface = read_surface(folder / "mug-surface.ply").vertices
-    true = example_mesh().vertices
-    # A pixel of the photographs is .6 mm wide; below the mug, the hull is three of them too low.
-    for side in (torch.amin, torch.amax):
-        assert float((side(surface, 0) - side(true, 0)).abs().max()) < 0.0025
-    # Bodies with walls, as they are and updated, are the most probable hypotheses by far.
-    bodies = record["report"]["bodies"]
-    assert sum(body["weight"] for body in bodies if body["wall_thickness"] is not None) > 0.5
-    assert 0.6 < record["report"]["thickness"]["median"] / record["true_wall"] < 1.2
-    error = {method: each["relative_stft"] for method, each in record["scores"].items()}
-    # .32 to .33 and .91 and .86; the held-out recordings' own gains have .13.
-    assert error["field"] < 0.5 * min(error["nearest recording"], error["mean waveform of 3 nearest"])
-    # The page holds the modes: its table of gains alone, in base64, is larger than this.
-    field = load(folder / "mug.safetensors")
-    assert (folder / "mug.html").stat().st_size > 4 * len(field.bank) * len(field.gain_field.points)
-
-
 @pytest.mark.parametrize("best", METHODS)
 def test_the_verdict_names_what_is_nearest_whatever_that_is(best: str) -> None:
     errors = torch.tensor([0.2, 0.3], dtype=torch.float64)
-    scores = {name: Scores("paper", ("a", "b"), {"relative_stft": errors + (name != best)}) for name in METHODS}
+    scores = {name: Scores(("a", "b"), {"relative_stft": errors + (name != best)}) for name in METHODS}
     words = verdict(scores, 2)
     assert f"has {METHODS[best]}." in words
     assert f"{METHODS[best]} has 0.25" in words

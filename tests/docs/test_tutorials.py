@@ -24,7 +24,7 @@ FEW_VIEWS = ("--views.rendered", "48", "--views.count", "18")
 SMALL = {
     "fit bowl.ply": ("--modes", "8", "--body.dofs", "2000", "--body.wall", "0.003"),
     "fit": (
-        *(*FEW_STEPS, *FEW_VIEWS, "--lift.encoder", "descriptors"),
+        *(*FEW_STEPS, *FEW_VIEWS, "--lift.encoder", "descriptors", "--lift.no-symmetry"),
         *("--gain-model", "smooth", "--modes", "8", "--steps", "4"),
     ),
     "evaluate": ("--modes", "8"),

@@ -24,7 +24,7 @@ from factories.small_scene import slab, slab_views, write_surface_file
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*neither texture nor colors")
 
-CONFIG = SceneConfig(views=ViewsConfig(rendered=24), lift=LiftConfig(encoder="descriptors", points=400, components=4))
+CONFIG = SceneConfig(views=ViewsConfig(rendered=24), lift=LiftConfig(encoder="descriptors", points=1200, components=4))
 
 
 class OneObject:
@@ -67,8 +67,8 @@ def test_looks_and_positions_are_of_the_same_points_and_made_once(seen: Path, tm
     )
     assert torch.equal(aligned.points, bare.points)
     assert torch.equal(aligned.points, unaligned.points)
-    assert bare.features.shape == (400, 3)
-    assert aligned.features.shape == (400, 3 + 4)
+    assert bare.features.shape == (1200, 3)
+    assert aligned.features.shape == (1200, 3 + 4)
     # A slab has symmetries, so that what is made to obey them is not what was seen.
     assert not torch.allclose(aligned.features, unaligned.features)
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")}
@@ -79,7 +79,7 @@ def test_looks_and_positions_are_of_the_same_points_and_made_once(seen: Path, tm
 
 @pytest.mark.slow
 def test_the_papers_features_are_of_gaussians_even_where_a_mesh_is_there(seen: Path, tmp_path: Path) -> None:
-    scene = replace(CONFIG, splat=SplatConfig(steps=30, start_points=400))
+    scene = replace(CONFIG, splat=SplatConfig(steps=30, start_points=1500))
     paper = replace(PRESETS["paper"].scene.lift, encoder="descriptors")
     inputs = ObjectInputs(OneObject(seen), tmp_path, scene, paper)
     features = inputs.features("slab", "paper")

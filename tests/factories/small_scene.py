@@ -12,7 +12,7 @@ from factories.plate_capture import PLATE
 
 THICKNESS = 0.02
 """Of the slab, meters; its upper side is the plate that is struck, at z = 0."""
-SMALL_SPLAT = ("--splat.steps", "60", "--splat.start-points", "800")
+SMALL_SPLAT = ("--splat.steps", "60", "--splat.start-points", "1500")
 
 
 def slab() -> Surface:

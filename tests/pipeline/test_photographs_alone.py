@@ -22,7 +22,7 @@ from factories.small_scene import SMALL_SPLAT, slab_views
 Streams = pytest.CaptureFixture[str]
 SMALL = (
     *SMALL_SPLAT,
-    *("--lift.encoder", "descriptors", "--lift.points", "600", "--modes", "12"),
+    *("--lift.encoder", "descriptors", "--lift.points", "600", "--lift.no-symmetry", "--modes", "12"),
     *TINY[:-2],
 )
 
@@ -39,7 +39,7 @@ def slab(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_photographs_alone_give_elastic_mode_shapes(slab: Path, capsys: Streams) -> None:
-    bodies = ("--body.wall", "0", "--body.shapes", "12", "--body.dofs", "3000", "--body.supports", "free")
+    bodies = ("--body.wall", "0", "--body.shapes", "6", "--body.dofs", "1500", "--body.supports", "free")
     assert main(["fit", str(slab), *SMALL, *bodies, "--json"]) == 0
     made = json.loads(capsys.readouterr().out)
     report = made["report"]
@@ -56,8 +56,10 @@ def test_photographs_alone_give_elastic_mode_shapes(slab: Path, capsys: Streams)
 def test_the_thickness_of_a_wall_reaches_the_report_and_the_summary(tmp_path: Path, capsys: Streams) -> None:
     folder = tmp_path / "mug"
     shutil.copytree(EXAMPLE_FOLDER, folder)
-    words = ["--splat.steps", "200", "--lift.encoder", "descriptors", "--steps", "2", "--train-count", "12"]
-    assert main(["fit", str(folder), *words, "--body.shapes", "40", "--body.supports", "free", "--json"]) == 0
+    words = ["--splat.steps", "100", "--splat.start-points", "3000", "--lift.encoder", "descriptors"]
+    words += ["--lift.no-symmetry", "--steps", "2", "--train-count", "12", "--modes", "32"]
+    bodies = ["--body.shapes", "16", "--body.dofs", "8000", "--body.supports", "free"]
+    assert main(["fit", str(folder), *words, *bodies, "--json"]) == 0
     made = json.loads(capsys.readouterr().out)
     found = made["report"]["thickness"]
     assert found["low"] < found["median"] < found["high"]
