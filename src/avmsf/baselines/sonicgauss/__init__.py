@@ -4,5 +4,4 @@
 - `training`: the objective of rectified flow, its Euler integration, training by it, and the renderer of both sizes.
 - `published`, `point_transformer`: the published architecture, which reads a user's copy of the published weights.
 - `small`, `patches`: a small generator of log spectrograms, and its latents.
-- `pretraining`: the small generator's training from scratch on simulated objects.
 """
