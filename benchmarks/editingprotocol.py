@@ -9,8 +9,9 @@ needs no weights.
 
 import argparse
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from statistics import mean
 
@@ -25,8 +26,6 @@ from avmsf.evaluation.editing import (
     GENERATED,
     PHYSICS,
     RECORDED_TRANSITIONS,
-    SEVEN_TRANSITIONS,
-    SIMULATED_TRANSITIONS,
     EditMethod,
     EditScore,
     EditTask,
@@ -38,16 +37,12 @@ from avmsf.evaluation.editing import (
     write_scores,
 )
 from avmsf.evaluation.editing_objects import (
-    OTHER_SHAPES,
     PUBLISHED,
     REALIMPACT_26,
-    SHAPES,
     KnownObject,
-    PaperFields,
-    SolvedShape,
-    drawn_size,
+    paper_object,
+    plain_object,
     recorded_objects,
-    simulated_objects,
 )
 from avmsf.evaluation.mode_embedding import FEATURES, MaterialSpace
 from avmsf.evaluation.objects import ObjectInputs
@@ -57,7 +52,13 @@ from avmsf.pipeline.config import DINO, PRESETS
 from avmsf.pipeline.features import choose_encoder
 from benchmarks.editingfigures import write_figures
 from benchmarks.report import Options, Report, Table, log, show
+from benchmarks.simulatedobjects import OTHER_SHAPES, SHAPES, SolvedShape, drawn_size, simulated_objects
 
+SIMULATED_TRANSITIONS: tuple[Transition, ...] = (("ceramic", "wood"), ("glass", "steel"), ("wood", "glass"))
+"""Those that are evaluated with recordings as target and several seeds."""
+_RING = ("ceramic", "wood", "glass", "steel", "plastic", "iron", "polycarbonate")
+SEVEN_TRANSITIONS: tuple[Transition, ...] = tuple(zip(_RING, (*_RING[1:], _RING[0]), strict=True))
+"""Every one of the seven simulated materials is left once and reached once, by a neighbor that it contrasts with."""
 LEAST = 8
 """Objects that an embedding of materials needs to mean anything."""
 PREVIEWS = 20
@@ -163,7 +164,9 @@ def recorded_cast(folder: Path, *, words: bool, seed: int = 0, paper: tuple[str,
             value=len(REALIMPACT_26) - len(missing),
         )
     log(f"editing: extracting modes of {len(REALIMPACT_26) - len(missing)} objects")
-    objects = recorded_objects(dataset, paper=None if paper is None else _paper_fields(dataset, *paper, seed=seed))
+    objects = recorded_objects(
+        dataset, make=plain_object if paper is None else _paper_maker(dataset, *paper, seed=seed)
+    )
     present = {each.material for each in objects}
     transitions = [each for each in RECORDED_TRANSITIONS if {*each} <= present]
     tasks = prompted_tasks(objects, transitions, seed=seed) if words else tuple(_referred_tasks(objects, seed=seed))
@@ -183,14 +186,15 @@ def recorded_cast(folder: Path, *, words: bool, seed: int = 0, paper: tuple[str,
     return Cast("realimpact", objects, tasks, what, known=False, remarks=(left_out,))
 
 
-def _paper_fields(dataset: Dataset, encoder: str, cache: Path, *, seed: int) -> PaperFields:
+def _paper_maker(dataset: Dataset, encoder: str, cache: Path, *, seed: int) -> Callable[..., KnownObject]:
     scene = PRESETS["paper"].scene
     lift = replace(scene.lift, encoder=encoder, seed=seed)
     # Before the modes of all objects: without the encoder nothing else is worth its time.
     choose_encoder(lift, log=log)
     scene = replace(scene, splat=replace(scene.splat, seed=seed), lift=lift)
-    inputs = ObjectInputs(dataset, cache, scene, lift)
-    return PaperFields(lambda name: inputs.features(name, "paper"), replace(PUBLISHED, seed=seed), cache / "training")
+    inputs, config = ObjectInputs(dataset, cache, scene, lift), replace(PUBLISHED, seed=seed)
+    features = partial(inputs.features, visual_input="paper")
+    return partial(paper_object, features=features, config=config, checkpoints=cache / "training")
 
 
 def simulated_cast(

@@ -3,7 +3,7 @@
 import json
 import math
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -23,8 +23,6 @@ from avmsf.evaluation.editing import (
     PHYSICS,
     PROMPTS,
     RECORDED_TRANSITIONS,
-    SEVEN_TRANSITIONS,
-    SIMULATED_TRANSITIONS,
     UNTOUCHED,
     EditMethod,
     EditTask,
@@ -39,12 +37,9 @@ from avmsf.evaluation.editing_objects import (
     PUBLISHED,
     REALIMPACT_26,
     KnownObject,
-    PaperFields,
-    SolvedShape,
     audible_modes,
-    drawn_size,
+    paper_object,
     recorded_objects,
-    simulated_objects,
 )
 from avmsf.evaluation.mode_embedding import FEATURES, MaterialSpace
 from avmsf.features.feature_field import FeatureField
@@ -55,6 +50,8 @@ from avmsf.modal.extraction.finders import ShortTime
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
 from benchmarks import editingprotocol as protocol
+from benchmarks.editingprotocol import SEVEN_TRANSITIONS, SIMULATED_TRANSITIONS
+from benchmarks.simulatedobjects import SolvedShape, drawn_size, simulated_objects
 from factories.made_audio import save_audio
 from factories.made_clap import save_clap
 from factories.made_modes import sliding_plate
@@ -216,7 +213,7 @@ def test_the_papers_objects_have_short_time_modes_and_a_trained_network():
         return FeatureField.from_points(plate_impacts(4).contacts)
 
     config = replace(PUBLISHED, warmup_steps=1, steps=1, clusters=4)
-    (found,) = recorded_objects(dataset, paper=PaperFields(features, config))
+    (found,) = recorded_objects(dataset, make=partial(paper_object, features=features, config=config))
     sounds = plate_impacts(4).sounds
     modes = extract_sounds(sounds, sample_rate=plate_impacts(4).sample_rate, method=ShortTime())
     assert torch.equal(found.modes.bank.frequency, modes.bank.frequency)
@@ -248,7 +245,7 @@ def test_the_protocol_of_recorded_objects_runs_without_words(tmp_path, monkeypat
         return Recorded(*names)
 
     monkeypatch.setattr(protocol, "open_dataset", opened)
-    monkeypatch.setattr(protocol, "recorded_objects", lambda dataset, paper: made)
+    monkeypatch.setattr(protocol, "recorded_objects", lambda dataset, make: made)
     monkeypatch.setattr(protocol, "RECORDED_TRANSITIONS", RECORDED_TRANSITIONS[:1])
     leave_out_umap(monkeypatch)
     report = protocol.measure(protocol.recorded_cast(tmp_path, words=False), steps=1, record=tmp_path / "scores.json")

@@ -74,12 +74,6 @@ RECORDED_TRANSITIONS: tuple[Transition, ...] = (
     ("glass", "metal"),
 )
 """Contrasting pairs for the 26 objects. The paper shows the first two and calls the others contrastive: ours."""
-SIMULATED_TRANSITIONS: tuple[Transition, ...] = (("ceramic", "wood"), ("glass", "steel"), ("wood", "glass"))
-"""Those that are evaluated with recordings as target and several seeds."""
-_RING = ("ceramic", "wood", "glass", "steel", "plastic", "iron", "polycarbonate")
-SEVEN_TRANSITIONS: tuple[Transition, ...] = tuple(zip(_RING, (*_RING[1:], _RING[0]), strict=True))
-"""Every one of the seven simulated materials is left once and reached once, by a neighbor that it contrasts with."""
-
 _Goal = TypeVar("_Goal")
 
 
