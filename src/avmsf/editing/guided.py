@@ -87,8 +87,8 @@ class EditVariables:
         Quantities whose rate is 0 stay where they begin.
         """
         self.parameters, self.edited = parameters, edited
-        own = torch.zeros(len(start.shift), dtype=torch.bool, device=edited.device).index_fill(0, edited, True)
-        self.values = {name: each.detach().clone() for name, each in vars(start.to(edited.device)).items()}
+        own = torch.zeros(len(start.shift), dtype=torch.bool).index_fill(0, edited, True)
+        self.values = {name: each.detach().clone() for name, each in vars(start).items()}
         groups = []
         for name, value in self.values.items():
             rate = getattr(parameters, f"{name}_rate")
@@ -125,7 +125,7 @@ class EditVariables:
 
     def state(self) -> dict[str, Any]:
         """Return the complete state: tensors, numbers, containers of these."""
-        values = {name: value.detach().cpu() for name, value in self.values.items()}
+        values = {name: value.detach() for name, value in self.values.items()}
         return {"values": values, "optimizer": self.optimizer.state_dict()}
 
     def resume(self, state: dict[str, Any]) -> None:
@@ -197,19 +197,18 @@ def edit_towards(
     parameters: Parameterization = HIERARCHICAL,
     progress: Callable[[GuidedEditProgress], None] | None = None,
     checkpoint: str | Path | None = None,
-    device: torch.device | str = "cpu",
 ) -> SoundField:
     """Return the field with its modes optimized towards the targets of `guide`; gain ratios between contacts stay.
 
     Each step renders random contacts, compares the sounds with the guide's targets by the multi-scale spectral loss of
     fitting, and updates the free `parameters`. The level is not edited: the sounds compared, and the field returned,
-    have the level of the given one. Rendering and loss run on `device`. With `checkpoint`, the state is stored there
+    have the level of the given one. With `checkpoint`, the state is stored there
     while the edit runs, on interruption and at the end, and an edit with the same arguments continues from it to the
     same result. Raises `EditError` for a field that is silent, for a guide at another rate, for a checkpoint of another
     edit, and where the guide's targets or the loss are not finite.
     """
     config = GuidedEditConfig() if config is None else config
-    run = _Optimization(field, guide, config, parameters, None if checkpoint is None else Path(checkpoint), device)
+    run = _Optimization(field, guide, config, parameters, None if checkpoint is None else Path(checkpoint))
     return run.finish(progress)
 
 
@@ -223,12 +222,11 @@ class _Optimization:
         config: GuidedEditConfig,
         parameters: Parameterization,
         checkpoint: Path | None,
-        device: torch.device | str,
     ) -> None:
         if guide.sample_rate != field.sample_rate:
             raise EditError.expected(f"the field's {field.sample_rate:g} Hz", guide.sample_rate, name="sample_rate")
         self.field, self.guide, self.config, self.parameters = field, guide, config, parameters
-        self.checkpoint, self.device, self.saved_at = checkpoint, torch.device(device), time.monotonic()
+        self.checkpoint, self.saved_at = checkpoint, time.monotonic()
         points = field.gain_field.points
         self.points = points if len(points) <= _MAX_POINTS else points[farthest_points(points, _MAX_POINTS)]
         probes = self.points[farthest_points(self.points, min(len(self.points), _MAX_PROBES))]
@@ -328,12 +326,12 @@ class _Optimization:
                 edit = edit.following(self.probes.field.bank)
             after = level(self.probes.sounds(edit), sample_rate=self.field.sample_rate)
             factor = (self.loudness.square().sum() / after.square().sum()).sqrt()
-            return edit.louder(factor).to("cpu")
+            return edit.louder(factor)
 
     def _at(self, contacts: Float[Tensor, "contacts 3"]) -> FieldAtContacts:
         seconds = self.config.seconds
         samples = self.field.samples if seconds is None else round(seconds * self.field.sample_rate)
-        return FieldAtContacts.at(self.field, contacts, samples=max(1, samples), device=self.device)
+        return FieldAtContacts.at(self.field, contacts, samples=max(1, samples))
 
     def _check_audible(self) -> Float[Tensor, " contacts"]:
         sounds = self.probes.sounds()

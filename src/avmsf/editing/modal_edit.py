@@ -1,8 +1,8 @@
 """An edit of an object's modes: common factors and one set of factors a mode, the same at all contacts."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -206,10 +206,6 @@ class ModalEdit:
         """Common factor on all decay times, without their own shifts: 1 / kappa, as `decay` of `adjust_modes`."""
         return 1.0 / float(self.damping.detach().exp())
 
-    def to(self, device: torch.device | str) -> "ModalEdit":
-        """Return the edit on a device."""
-        return ModalEdit(**{each.name: getattr(self, each.name).to(device) for each in fields(self)})
-
     def louder(self, factor: Float[Tensor, ""]) -> "ModalEdit":
         """Return the edit with all gains multiplied by a factor above 0."""
         return replace(self, scale=self.scale + factor.double().log())
@@ -248,29 +244,20 @@ class FieldAtContacts:
     """A field at some contacts, whose modes can be edited."""
 
     field: SoundField
-    """Its modes are on the device that computes."""
     known: Gains
     """Of the field itself at the contacts."""
     samples: int
     """Length of the sounds."""
 
     @classmethod
-    def at(
-        cls,
-        field: SoundField,
-        contacts: Float[Tensor, "contacts 3"],
-        *,
-        samples: int,
-        device: torch.device | str = "cpu",
-    ) -> "FieldAtContacts":
+    def at(cls, field: SoundField, contacts: Float[Tensor, "contacts 3"], *, samples: int) -> "FieldAtContacts":
         """Evaluate a field at contacts (object frame, meters) for impacts along the inward normals."""
-        bank = ModalBank(field.bank.frequency.to(device), field.bank.damping.to(device))
-        known = _each_part(field.known(contacts), lambda part: part.to(device))
-        return cls(replace(field, bank=bank, phase=field.phase.to(device)), known, samples)
+        return cls(field, field.known(contacts), samples)
 
     def first(self, count: int) -> "FieldAtContacts":
         """Return the field at the first `count` of the contacts."""
-        return replace(self, known=_each_part(self.known, lambda part: part[:count]))
+        parts = {name: part[:count] for name, part in vars(self.known).items() if part is not None}
+        return replace(self, known=Gains(**parts))
 
     def sounds(self, edit: ModalEdit | None = None) -> Sounds:
         """Return the sounds of the modes, edited if an edit is given, without the residual; differentiable in it."""
@@ -286,9 +273,3 @@ class FieldAtContacts:
         """Return the indices of the modes of most energy over time, at most `count` of them, ascending."""
         energy = torch.where(self.field.audible, self.known.energy(self.field.bank.damping), 0.0)
         return torch.argsort(energy, descending=True)[:count].sort().values
-
-
-def _each_part(gains: Gains, change: Callable[[Tensor], Tensor]) -> Gains:
-    """Return gains with a change to what they have of mean, quadrature and factors on dampings."""
-    parts = {name: change(part) for name, part in vars(gains).items() if part is not None}
-    return replace(gains, **parts)

@@ -137,9 +137,9 @@ class Reference:
         distance = torch.cdist(band_spectrum(sounds), band_spectrum(clips), p=1.0)
         chosen = distance.argmin(dim=1)
         targets = levelled(clips[chosen], sounds, sample_rate=self.sample_rate)
-        ends = torch.tensor(self.lengths, device=sounds.device)[chosen, None]
+        ends = torch.tensor(self.lengths)[chosen, None]
         fade = max(1, round(_FADE * self.sample_rate))
-        share = ((ends - torch.arange(samples, device=sounds.device)) / fade).clamp(0.0, 1.0).to(sounds)
+        share = ((ends - torch.arange(samples)) / fade).clamp(0.0, 1.0).to(sounds)
         return targets, torch.where(ends >= samples, torch.ones_like(share), share)
 
 
@@ -240,12 +240,12 @@ def band_spectrum(sounds: Sounds) -> Float[Tensor, "contacts bands"]:
     power = torch.fft.rfft(sounds).abs().square()
     bins = power.shape[1]
     # Octaves below half the rate, the last bin; the first bin, no frequency at all, is left out.
-    place = torch.arange(1, bins, device=sounds.device, dtype=torch.float64) / (bins - 1)
+    place = torch.arange(1, bins, dtype=torch.float64) / (bins - 1)
     band = (_PER_OCTAVE * (_OCTAVES + torch.log2(place))).floor().long().clamp_max(_OCTAVES * _PER_OCTAVE - 1)
     inside = band >= 0
     energy = power.new_zeros(len(power), _OCTAVES * _PER_OCTAVE).index_add(1, band[inside], power[:, 1:][:, inside])
     reach = math.ceil(4 * _WIDTH)
-    bell = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, device=sounds.device) / _WIDTH).square()).to(energy)
+    bell = torch.exp(-0.5 * (torch.arange(-reach, reach + 1) / _WIDTH).square()).to(energy)
     smooth = torch.nn.functional.conv1d(energy[:, None], (bell / bell.sum())[None, None], padding=reach)[:, 0]
     amplitude = smooth.clamp_min(0.0).sqrt()
     return amplitude / amplitude.sum(dim=1, keepdim=True).clamp_min(torch.finfo(amplitude.dtype).tiny)
@@ -296,7 +296,7 @@ def _pitches(rendered: FieldAtContacts, targets_of: _TargetFunction) -> list[flo
 
 def _quantiles(spectrum: Float[Tensor, " bands"]) -> Float[Tensor, " quantiles"]:
     """Return the frequencies below which 5, 10, ... 95 % of a spectrum lie, as logarithms up to a constant."""
-    shares = torch.linspace(0.05, 0.95, 19, device=spectrum.device, dtype=spectrum.dtype)
+    shares = torch.linspace(0.05, 0.95, 19, dtype=spectrum.dtype)
     below = torch.cumsum(spectrum, dim=0)
     band = torch.searchsorted(below / below[-1], shares).clamp(0, len(spectrum) - 1)
     return band.to(spectrum) * (math.log(2.0) / _PER_OCTAVE)

@@ -16,13 +16,7 @@ from avmsf.errors import LocationError
 from avmsf.field.sound_field import SoundField
 from avmsf.localization.amplitudes import Amplitudes, Extractor, detuned_extractors
 from avmsf.localization.contact_map import ContactMap
-from avmsf.localization.likelihood import (
-    Force,
-    LikelihoodResult,
-    PredictedGains,
-    cosine_distance,
-    evaluate_likelihood,
-)
+from avmsf.localization.likelihood import Force, LikelihoodResult, PredictedGains, cosine_distance, evaluate_likelihood
 from avmsf.localization.prediction import (
     calibrate_tempering,
     calibration_factor,
@@ -67,11 +61,7 @@ class Locator:
 
     @classmethod
     def of(
-        cls,
-        field: SoundField,
-        *,
-        points: ArrayLike | None = None,
-        directions: ArrayLike | None = None,
+        cls, field: SoundField, *, points: ArrayLike | None = None, directions: ArrayLike | None = None
     ) -> "Locator":
         """Return the locator of a field, over the points (meters) of its gains unless others are given.
 

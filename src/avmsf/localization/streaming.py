@@ -86,8 +86,8 @@ class StreamingLocalizer:
     The first estimate of an impact uses `window` seconds from its onset on. With `later`, longer than that, a second
     and better one uses that length, or all up to the next impact. Impacts closer to each other than `window` count as
     one, and one more than 11 dB below the decay of earlier ones is not detected. The first 15 ms of a stream count as
-    its noise. The stream is high-pass filtered at `highpass` Hz, by default a twentieth of the lowest mode's frequency,
-    at most 20 Hz; 0 turns the filter off. At most the length of the field's own sounds is used.
+    its noise. The stream is high-pass filtered at a twentieth of the lowest mode's frequency, at most 20 Hz. At most
+    the length of the field's own sounds is used.
 
     Raises LocationError for a sample rate that is not the field's, times that are not positive, a window of less than
     20 ms, and a field of which no mode is audible.
@@ -100,7 +100,6 @@ class StreamingLocalizer:
         sample_rate: float | None = None,
         window: float = WINDOW_SECONDS,
         later: float | None = None,
-        highpass: float | None = None,
     ) -> None:
         field = locator.field
         rate = field.sample_rate
@@ -112,10 +111,6 @@ class StreamingLocalizer:
             raise LocationError.expected("0 to 10 s", window, name="window")
         if not (later is None or window < later < 10.0):
             raise LocationError.expected(f"{window:g} s to 10 s", later, name="later")
-        lowest = min(_HIGHPASS_RATIO * float(field.bank.frequency.min()), _MAX_HIGHPASS_HZ)
-        cut = lowest if highpass is None else highpass
-        if not 0.0 <= cut < rate / 2:
-            raise LocationError.expected(f"0 for no filter, or less than {rate / 2:g} Hz", cut, name="highpass")
         if round(window * rate) < shortest_allowed(rate):
             wanted = f"{shortest_allowed(rate)} samples or more to resolve the modes"
             got = f"{round(window * rate)} ({window:g} s)"
@@ -128,7 +123,8 @@ class StreamingLocalizer:
         self.window = min(round(window * rate), field.samples)
         last = 0 if later is None else min(round(later * rate), field.samples)
         self.later = last if last > self.window else None
-        self.filter = scipy.signal.butter(2, cut, "highpass", fs=rate, output="sos") if cut > 0.0 else None
+        cut = min(_HIGHPASS_RATIO * float(field.bank.frequency.min()), _MAX_HIGHPASS_HZ)
+        self.filter = scipy.signal.butter(2, cut, "highpass", fs=rate, output="sos")
         strength = locator.gains[:, audible].abs().square().mean(0).sqrt()
         bank = field.bank.take(audible)
         self._modes = Ringing.of(bank, strength, sample_rate=rate, window=self.window)
@@ -144,7 +140,7 @@ class StreamingLocalizer:
         self.rejected, self.refusal = 0, ""
         """Number of detected sounds that were rejected, another object's or noise, and why the last one was."""
         self._pending: _PendingImpact | None = None
-        self._highpass = np.zeros((0 if self.filter is None else len(self.filter), 2))
+        self._highpass = np.zeros((len(self.filter), 2))
 
     def process(self, block: Float[Tensor, " samples"]) -> list[LocatedImpact]:
         """Return the estimates that the next samples of the stream complete, in the order of time.
@@ -156,7 +152,7 @@ class StreamingLocalizer:
             advice = "leave them out or send zeros"
             raise LocationError.expected("finite samples", got="NaN or infinity", name="block", advice=advice)
         samples = block.detach().double().cpu()
-        if self.filter is not None and len(samples):
+        if len(samples):
             passed, self._highpass = scipy.signal.sosfilt(self.filter, samples.numpy(), zi=self._highpass)
             samples = torch.from_numpy(passed)
         self.waiting = torch.cat([self.waiting, samples])
