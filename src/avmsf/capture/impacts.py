@@ -3,8 +3,8 @@
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import no_type_check
+from dataclasses import dataclass, fields, replace
+from typing import Any, no_type_check
 
 import numpy as np
 import scipy
@@ -110,16 +110,9 @@ class Impacts:
     def take(self, rows: Sequence[int]) -> "Impacts":
         """Return the given rows alone, in the given order."""
         index = torch.as_tensor(list(rows), dtype=torch.long)
-        return replace(
-            self,
-            contacts=self.contacts[index],
-            sounds=self.sounds[index],
-            names=tuple(self.names[row] for row in index.tolist()),
-            directions=None if self.directions is None else self.directions[index],
-            forces=None if self.forces is None else self.forces[index],
-            before=None if self.before is None else self.before[index],
-            after=None if self.after is None else self.after[index],
-        )
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        taken: dict[str, Any] = {name: value[index] for name, value in values.items() if isinstance(value, Tensor)}
+        return replace(self, names=tuple(self.names[row] for row in index.tolist()), **taken)
 
     def delayed(self, delays: Float64[Tensor, " contacts"]) -> "Impacts":
         """Return the recordings cut again, each starting `delays` samples later in its file (earlier where negative).

@@ -133,14 +133,10 @@ class View:
         found = tuple(self.image.shape[:2])
         expected = (self.camera.height, self.camera.width)
         if found != expected or (self.mask is not None and tuple(self.mask.shape) != expected):
-            raise CaptureError(
-                f"{self.name}: expected an image of the camera's {expected[1]} x {expected[0]} pixels, got {found[1]} "
-                f"x {found[0]}"
-                + ("" if self.mask is None else f" and a mask of {self.mask.shape[1]} x {self.mask.shape[0]}")
-                + ": give the camera of this image",
-                name=self.name,
-                value=list(found),
-            )
+            size = "" if self.mask is None else f" and a mask of {self.mask.shape[1]} x {self.mask.shape[0]}"
+            wanted, got = f"an image of the camera's {expected[1]} x {expected[0]} pixels", f"{found[1]} x {found[0]}"
+            advice = "give the camera of this image"
+            raise CaptureError.expected(wanted, list(found), got=got + size, name=self.name, advice=advice)
 
     @property
     def color(self) -> Float[Tensor, "height width 3"]:
