@@ -104,13 +104,9 @@ class DecoderDistillation:
                     continue
                 except torch.OutOfMemoryError as error:
                     if self.batch == 1:
-                        raise EditError.expected(
-                            f"memory on {self.model.device} for one sound of {self.model.name}",
-                            1,
-                            got="too little",
-                            name="batch",
-                            advice="use fewer seconds, free memory, or choose the device cpu",
-                        ) from error
+                        wanted = f"memory on {self.model.device} for one sound of {self.model.name}"
+                        advice = "use fewer seconds, free memory, or choose the device cpu"
+                        raise EditError.expected(wanted, 1, got="too little", name="batch", advice=advice) from error
                 # Not before the error is gone: its traceback holds the tensors that filled the memory.
                 self._halve()
             back = resampled(torch.stack(made), sample_rate=self.model.sample_rate, wanted=self.sample_rate)
@@ -143,11 +139,5 @@ class DecoderDistillation:
         self.batch //= 2
         if self.model.device.type == "cuda":
             torch.cuda.empty_cache()
-        warnings.warn(
-            AvmsfWarning(
-                f"{self.model.name}: out of memory on {self.model.device}; continuing with batches of {self.batch}",
-                name="batch",
-                value=self.batch,
-            ),
-            stacklevel=3,
-        )
+        message = f"{self.model.name}: out of memory on {self.model.device}; continuing with batches of {self.batch}"
+        warnings.warn(AvmsfWarning(message, name="batch", value=self.batch), stacklevel=3)

@@ -202,10 +202,10 @@ def edit_towards(
 
     Each step renders random contacts, compares the sounds with the guide's targets by the multi-scale spectral loss of
     fitting, and updates the free `parameters`. The level is not edited: the sounds compared, and the field returned,
-    have the level of the given one. With `checkpoint`, the state is stored there
-    while the edit runs, on interruption and at the end, and an edit with the same arguments continues from it to the
-    same result. Raises `EditError` for a field that is silent, for a guide at another rate, for a checkpoint of another
-    edit, and where the guide's targets or the loss are not finite.
+    have the level of the given one. With `checkpoint`, the state is stored there while the edit runs, on interruption
+    and at the end, and an edit with the same arguments continues from it to the same result. Raises `EditError` for a
+    field that is silent, for a guide at another rate, for a checkpoint of another edit, and where the guide's targets
+    or the loss are not finite.
     """
     config = GuidedEditConfig() if config is None else config
     run = _Optimization(field, guide, config, parameters, None if checkpoint is None else Path(checkpoint))
@@ -231,7 +231,11 @@ class _Optimization:
         self.points = points if len(points) <= _MAX_POINTS else points[farthest_points(points, _MAX_POINTS)]
         probes = self.points[farthest_points(self.points, min(len(self.points), _MAX_PROBES))]
         self.probes = self._at(probes)
-        self.loudness = self._check_audible()
+        sounds = self.probes.sounds()
+        if not bool(torch.isfinite(sounds).all()) or float(sounds.abs().max()) == 0.0:
+            got = "silence at all contacts"
+            raise EditError.expected("audible modes", 0.0, got=got, name="field", advice="fit it again")
+        self.loudness = level(sounds, sample_rate=field.sample_rate)
         self.loudest_point = probes[int(self.loudness.argmax())]
         self.sizes = [scaled_fft_size(size, sample_rate=field.sample_rate) for size in config.fft_sizes]
         self.settings = {**guide.describe(), "parameters": parameters.name, **asdict(config)}
@@ -293,13 +297,11 @@ class _Optimization:
         else:
             self.failed += 1
             if self.failed >= _MAX_FAILED_STEPS:
-                raise EditError.expected(
-                    "finite sounds",
-                    self.failed,
-                    got=f"NaN or inf in {self.failed} consecutive steps",
-                    name="targets",
-                    advice="lower the guidance, or compute in float32",
+                got, advice = (
+                    f"NaN or inf in {self.failed} consecutive steps",
+                    "lower the guidance, or compute in float32",
                 )
+                raise EditError.expected("finite sounds", self.failed, got=got, name="targets", advice=advice)
         self.step += 1
         self.consistent = True
         return loss
@@ -333,13 +335,6 @@ class _Optimization:
         samples = self.field.samples if seconds is None else round(seconds * self.field.sample_rate)
         return FieldAtContacts.at(self.field, contacts, samples=max(1, samples))
 
-    def _check_audible(self) -> Float[Tensor, " contacts"]:
-        sounds = self.probes.sounds()
-        if not bool(torch.isfinite(sounds).all()) or float(sounds.abs().max()) == 0.0:
-            got = "silence at all contacts"
-            raise EditError.expected("audible modes", 0.0, got=got, name="field", advice="fit it again")
-        return level(sounds, sample_rate=self.field.sample_rate)
-
     def _save(self) -> None:
         if self.checkpoint is None:
             return
@@ -348,9 +343,8 @@ class _Optimization:
             write_checkpoint(self.checkpoint, state, self.identity, raising=EditError)
         except EditError as error:
             # A full disk costs the checkpoint, not the edit.
-            warnings.warn(
-                AvmsfWarning(f"the edit continues without a checkpoint: {error}", **error.attributes), stacklevel=2
-            )
+            message = f"the edit continues without a checkpoint: {error}"
+            warnings.warn(AvmsfWarning(message, **error.attributes), stacklevel=2)
         self.saved_at = time.monotonic()
 
 

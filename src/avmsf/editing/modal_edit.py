@@ -40,13 +40,9 @@ def edited(
         fine = torch.isfinite(values) & (values > 0 if name != "gain factor" else True)
         if not bool(fine.all()):
             row = int(torch.nonzero(~fine)[0])
-            raise EditError(
-                f"mode {row} ({float(field.bank.frequency[row]):.4g} Hz): expected a finite {name}"
-                f"{'' if name == 'gain factor' else ' above 0'} after the edit, got {float(values[row]):g}; edit less",
-                row=row,
-                name=name,
-                value=float(values[row]),
-            )
+            above = "" if name == "gain factor" else " above 0"
+            wanted = f"a finite value{above} after the edit of the mode at {float(field.bank.frequency[row]):.4g} Hz"
+            raise EditError.expected(wanted, float(values[row]), row=row, name=name, advice="edit less")
     changed = replace(field, bank=bank, gain_field=ScaledGains(field.gain_field, scale, length))
     silent = bank.frequency[silenced(changed)].tolist()
     listed = [*field.origin.report.get(EDITS, []), {**entry, "silent_hertz": silent}]

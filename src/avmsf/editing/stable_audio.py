@@ -121,12 +121,9 @@ class StableAudio:
         """Return the means of the autoencoder's latents, continued by silence to the frames that are worked at."""
         samples = waveforms.shape[2]
         if samples > self._frames * self._hop:
-            raise EditError(
-                f"{self.name}: expected sounds of at most {self._frames * self._hop / self.sample_rate:.4g} s, got "
-                f"{samples / self.sample_rate:.4g} s; load the model with more seconds, or edit with fewer",
-                name="seconds",
-                value=samples / self.sample_rate,
-            )
+            wanted = f"sounds of at most {self._frames * self._hop / self.sample_rate:.4g} s for {self.name}"
+            advice = "load the model with more seconds, or edit with fewer"
+            raise EditError.expected(wanted, samples / self.sample_rate, name="seconds", advice=advice)
         # Beyond the reach of its filters the autoencoder hears silence alone, and says the same of all of it; as far
         # from the end of what it is given, it would hear that end.
         sounding = math.ceil(samples / self._hop) + self._reach
@@ -341,9 +338,7 @@ def _pipeline_class() -> Any:
         if find_spec("torchsde") is None:  # the scheduler imports it late, and its error names no remedy
             raise ImportError("no module named 'torchsde'")
     except (ImportError, RuntimeError) as error:  # RuntimeError: one of its own optional packages is broken
-        raise EditError(
-            f"text prompts: expected the packages diffusers, transformers and torchsde, got {error}; "
-            "pip install 'avmsf[text]', or edit towards a recording",
-            name="diffusers",
-        ) from error
+        wanted = "the packages diffusers, transformers and torchsde for text prompts"
+        advice = "pip install 'avmsf[text]', or edit towards a recording"
+        raise EditError.expected(wanted, got=str(error), name="diffusers", advice=advice) from error
     return StableAudioPipeline
