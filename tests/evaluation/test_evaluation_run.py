@@ -25,7 +25,7 @@ from avmsf.evaluation.report import write_summary
 from avmsf.evaluation.results import ENCODER, ResultsFolder
 from avmsf.evaluation.runner import Evaluation
 from avmsf.evaluation.simple_methods import NearestRecording
-from avmsf.evaluation.splits import MetricSettings, evaluate, split, spread
+from avmsf.evaluation.splits import MetricSettings, split, spread
 from avmsf.evaluation.task import Method, Renderer, Task
 from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
 from factories.plate_set import PlateInputs, fill_plates
@@ -88,20 +88,6 @@ class Asking:
 
     def __repr__(self) -> str:
         return "Asking()"
-
-
-def test_figures_are_those_of_the_one_line_of_evaluation(plates: Path, tmp_path: Path) -> None:
-    evaluation = replace(planned(plates, "nearest"), metric_settings=MetricSettings(level="raw", cdpam=False))
-    run_objects(evaluation, ("a",), ResultsFolder(tmp_path / "results"))
-    record = ResultsFolder(tmp_path / "results").read("a")
-    assert record is not None
-    (outcome,) = record.outcomes
-    train, test = split(read_capture(plates / "a").impacts, 0.2)
-    expected = evaluate(NearestRecording(train), test)
-    assert record.cases[0].train == train.names
-    assert record.cases[0].test == test.names
-    for metric, values in expected.values.items():
-        assert outcome.values[metric] == pytest.approx(values.tolist(), rel=1e-9)
 
 
 def test_what_is_done_is_not_done_again_and_more_may_be_added(plates: Path, tmp_path: Path) -> None:
