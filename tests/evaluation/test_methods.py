@@ -418,10 +418,10 @@ def test_others_sounds_that_do_not_fit_are_refused_by_name(tmp_path):
     sound = test.sounds[0].numpy()
     for data, rate in ((sound[:700], 8000), (sound, 16000)):
         soundfile.write(path, data, rate, subtype="FLOAT")
-        with raises(EvaluationError, file=path, name="samples", value=(len(data), rate)):
+        with raises(EvaluationError, file=path, name="samples", value=(len(data), rate, 1)):
             renderer.render(test.contacts[:1])
     soundfile.write(path, np.stack([sound, 0.5 * sound], axis=1), 8000, subtype="FLOAT")
-    with raises(EvaluationError, file=path, name="channels", value=2):
+    with raises(EvaluationError, file=path, name="samples", value=(SAMPLES, RATE, 2)):
         renderer.render(test.contacts[:1])
     soundfile.write(path, np.stack([sound, sound], axis=1), 8000, subtype="FLOAT")
     assert torch.equal(renderer.render(test.contacts[:1]), test.sounds[:1])

@@ -60,11 +60,17 @@ class Clap:
                 name="source",
                 advice="check the path",
             )
-        model_class, processor_class = _transformers()
+        try:
+            from transformers import ClapModel, ClapProcessor
+        except (ImportError, RuntimeError) as error:  # RuntimeError: one of its own optional packages is broken
+            raise EvaluationError(
+                f"CLAP score: expected the package transformers, got {error}; pip install 'avmsf[eval]'",
+                name="transformers",
+            ) from error
         place = folder if folder.is_dir() else str(source)
         try:
-            model, report = model_class.from_pretrained(place, output_loading_info=True)
-            processor = processor_class.from_pretrained(place)
+            loaded: Any = ClapModel.from_pretrained(place, output_loading_info=True)
+            (model, report), processor = loaded, ClapProcessor.from_pretrained(place)
         except Exception as error:  # transformers, safetensors and the hub's client have their own errors
             raise EvaluationError.expected(
                 "a CLAP model",
@@ -168,14 +174,3 @@ def _how_to_download(name: str) -> str:
     return (
         f"on a computer with a network run hf download {name} --local-dir FOLDER, copy FOLDER here, and give its path"
     )
-
-
-def _transformers() -> tuple[Any, Any]:
-    try:
-        from transformers import ClapModel, ClapProcessor
-    except (ImportError, RuntimeError) as error:  # RuntimeError: one of its own optional packages is broken
-        raise EvaluationError(
-            f"CLAP score: expected the package transformers, got {error}; pip install 'avmsf[eval]'",
-            name="transformers",
-        ) from error
-    return ClapModel, ClapProcessor

@@ -73,11 +73,12 @@ def located(
     """
     points = points[farthest_points(points, min(CANDIDATES, len(points)))].double()
     diagonal = float((points.amax(0) - points.amin(0)).norm())
+    names: tuple[str, ...]
     if isinstance(renderer, SoundField):
-        find = _by_field(renderer, points, published)
+        names, find = ("rmed", "rmed_posterior"), _by_field(renderer, points, published)
     else:
-        find = _finder(renderer, train, points if vertices is None else _fewer(vertices.double()))
-    names = ("rmed", "rmed_posterior") if isinstance(renderer, SoundField) else ("rmed",)
+        searched = points if vertices is None else _fewer(vertices.double())
+        names, find = ("rmed",), _finder(renderer, train, searched)
     rows, maps = [], {}
     for row, (sound, truth) in enumerate(zip(test.sounds, test.contacts.double(), strict=True)):
         try:

@@ -116,11 +116,7 @@ class Recorded:
         present = [path for path in paths if path.is_file()]
         if not present:
             raise EvaluationError.expected(
-                f"a mono wav of {self.samples} samples at {self.sample_rate:g} Hz",
-                got="no such file",
-                file=paths[0],
-                name=self.names[rows[0]],
-                advice="render it",
+                self._wanted, got="no such file", file=paths[0], name=self.names[rows[0]], advice="render it"
             )
         return present[0]
 
@@ -129,23 +125,16 @@ class Recorded:
             recording = read_recording(path)
         except CaptureError as error:
             raise EvaluationError(str(error), **{**error.attributes, "file": path}) from error
-        if recording.sample_rate != self.sample_rate or recording.frames != self.samples:
-            raise EvaluationError(
-                f"{path}: expected {self.samples} samples at {self.sample_rate:g} Hz, as the recordings have, got "
-                f"{recording.frames} at {recording.sample_rate:g} Hz; render it again, from the onset on",
-                file=path,
-                name="samples",
-                value=(recording.frames, recording.sample_rate),
-            )
-        first = recording.channels[0]
-        if any(not np.array_equal(channel, first) for channel in recording.channels[1:]):
-            raise EvaluationError(
-                f"{path}: expected one channel, got {len(recording.channels)} different ones; save it as mono",
-                file=path,
-                name="channels",
-                value=len(recording.channels),
-            )
-        return torch.from_numpy(first.copy()).float()
+        found = recording.frames, recording.sample_rate, len(np.unique(recording.channels, axis=0))
+        if found != (self.samples, self.sample_rate, 1):
+            shown = f"{found[0]} samples at {found[1]:g} Hz in {found[2]} different channels"
+            advice = "render it again, from the onset on, and save it as mono"
+            raise EvaluationError.expected(self._wanted, found, got=shown, file=path, name="samples", advice=advice)
+        return torch.from_numpy(recording.channels[0].copy()).float()
+
+    @property
+    def _wanted(self) -> str:
+        return f"a mono wav of {self.samples} samples at {self.sample_rate:g} Hz, as the recordings have"
 
 
 NEIGHBORS = 3

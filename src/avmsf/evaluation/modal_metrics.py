@@ -286,18 +286,11 @@ def _signs(values: Float64[Tensor, " contacts"]) -> Float64[Tensor, " contacts"]
 
 def _expect_amplitudes(amplitudes: Complex128[Tensor, "..."], frequency: Float[Tensor, " modes"], what: str) -> None:
     if amplitudes.ndim != 2 or amplitudes.shape[1] != len(frequency) or not len(amplitudes):
-        raise EvaluationError(
-            f"{what}: expected gains [contacts, {len(frequency)} modes] at one contact or more, got the shape "
-            f"{tuple(amplitudes.shape)}",
-            name=what,
-            value=list(amplitudes.shape),
-        )
+        shape = list(amplitudes.shape)
+        wanted = f"gains [contacts, {len(frequency)} modes] at one contact or more"
+        raise EvaluationError.expected(wanted, shape, got=f"the shape {shape}", name=what)
     bad = torch.nonzero(~torch.isfinite(amplitudes.abs()))
     if len(bad):
         row, mode = bad[0].tolist()
-        raise EvaluationError(
-            f"{what}, row {row}: expected finite gains, got {amplitudes[row, mode].item()} of mode {mode}",
-            row=row,
-            name=what,
-            value=amplitudes[row, mode].item(),
-        )
+        value = amplitudes[row, mode].item()
+        raise EvaluationError.expected("finite gains", value, got=f"{value} of mode {mode}", row=row, name=what)

@@ -163,16 +163,13 @@ def draw_other_recording(dataset: Dataset, identifier: str, train: Impacts, *, s
     )
 
 
-ABLATED, NOT_SYMMETRIC = "ablation", "non-symmetric"
-"""The groups' names."""
 SUBSETS: Mapping[str, str] = {
-    ABLATED: "those of the paper's ablations or the simulated ones in their place",
-    NOT_SYMMETRIC: "those without rotational symmetry",
+    "ablation": "those of the paper's ablations or the simulated ones in their place",
+    "non-symmetric": "those without rotational symmetry",
 }
-"""What the objects of each group have in common."""
-_NUMBERS: Mapping[str, Sequence[str]] = {ABLATED: ABLATION, NOT_SYMMETRIC: NON_SYMMETRIC}
-
-_SIMULATED: Mapping[str, Sequence[str]] = {ABLATED: sim20.ABLATED, NOT_SYMMETRIC: sim20.NON_SYMMETRIC}
+"""What the objects of each group have in common, by the group's name."""
+_NUMBERS: Mapping[str, Sequence[str]] = {"ablation": ABLATION, "non-symmetric": NON_SYMMETRIC}
+_SIMULATED: Mapping[str, Sequence[str]] = {"ablation": sim20.ABLATED, "non-symmetric": sim20.NON_SYMMETRIC}
 
 
 def members(dataset: Dataset) -> dict[str, frozenset[str]]:

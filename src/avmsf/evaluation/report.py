@@ -11,7 +11,7 @@ from avmsf.errors import EvaluationError
 from avmsf.evaluation.localization import read_map
 from avmsf.evaluation.page import StoredSound, page, stored_contacts
 from avmsf.evaluation.report_tables import Section, markdown, sections
-from avmsf.evaluation.results import ObjectRecord, ResultsFolder, write_json
+from avmsf.evaluation.results import ObjectRecord, ResultsFolder, file_word, write_json
 from avmsf.evaluation.summary import missing_of, summarize, times_of
 from avmsf.plotting.contacts import draw_contact
 from avmsf.plotting.pictures import save_picture
@@ -83,8 +83,7 @@ def _write_spectrograms(record: ObjectRecord, folder: Path) -> list[Path]:
         figure = draw_method_spectrograms(
             rows, methods, sample_rate=sound.sample_rate, highest=0.5 * record.sample_rate, title=title
         )
-        word = "".join(mark if mark.isalnum() or mark in "-_" else "-" for mark in label)
-        name = record.identifier if len(labels) == 1 else f"{record.identifier} {word}"
+        name = record.identifier if len(labels) == 1 else f"{record.identifier} {file_word(label)}"
         paths.append(folder / FIGURES / f"{name}.png")
         save_picture(figure, paths[-1])
     return paths

@@ -120,27 +120,25 @@ class ResultsFolder:
             )
         kept = known.pop("methods")
         if wanted != known:
-            raise self._of_another(*_first_difference(wanted, known))
+            name, asked, found = _first_difference(wanted, known)
+            ours, theirs = f"of {name} {_brief(asked)}", _brief(found)
+            if name == "source":
+                ours, theirs = "made by this version of avmsf", "those of another, whose code differs"
+            raise self._of_another(name, found, ours, theirs)
         for name in methods:
             if name in kept and kept[name] != methods[name]:
-                raise self._of_another_method(name, methods[name], kept[name])
+                parts = [each.partition(ENCODER) for each in (methods[name], kept[name])]
+                ours, theirs = "these settings and weights", "others"
+                if parts[0][0] == parts[1][0]:
+                    ours, theirs = (f"--lift.encoder {each[2]}" for each in parts)
+                raise self._of_another(name, kept[name], f"of {name} made with {ours}", f"those made with {theirs}")
         write_json(place, {**wanted, "methods": {**kept, **methods}})
 
-    def _of_another(self, name: str, wanted: object, found: object) -> EvaluationError:
-        differing = f"of {name} {_brief(wanted)}, got {_brief(found)}"
-        if name == "source":
-            differing = "made by this version of avmsf, got those of another, whose code differs"
-        text = f"{self.path}: expected results {differing}; give the same options, or choose another --output"
-        return EvaluationError(text, file=self.path, name=name, value=found)
-
-    def _of_another_method(self, name: str, wanted: str, known: str) -> EvaluationError:
-        parts = [each.partition(ENCODER) for each in (wanted, known)]
-        if parts[0][0] == parts[1][0]:
-            asked, found = (f"--lift.encoder {each[2]}" for each in parts)
-        else:
-            asked, found = "these settings and weights", "others"
-        text = f"{self.path}: expected results of {name} made with {asked}, got those made with {found}"
-        return EvaluationError(f"{text}; choose another --output", file=self.path, name=name, value=known)
+    def _of_another(self, name: str, value: object, wanted: str, found: str) -> EvaluationError:
+        advice = "give the same options, or choose another --output"
+        return EvaluationError(
+            f"{self.path}: expected results {wanted}, got {found}; {advice}", file=self.path, name=name, value=value
+        )
 
     def identity(self) -> dict[str, Any]:
         """Return the evaluation that the folder holds, with its methods. Raises EvaluationError where there is none."""
@@ -211,6 +209,11 @@ def failure_of(error: Exception) -> str:
     if isinstance(error, AvmsfError):
         return message
     return "\n".join((f"{type(error).__name__}: {message}", *traceback.format_tb(error.__traceback__)))
+
+
+def file_word(name: str) -> str:
+    """Return a name for files: methods that read a folder have its path in their name."""
+    return "".join(mark if mark.isalnum() or mark in "-_" else "-" for mark in name)
 
 
 def natural(words: str) -> tuple[tuple[int, int, str], ...]:

@@ -27,7 +27,7 @@ from avmsf.evaluation.modal_metrics import truth_at, truth_from_first_sample, tr
 from avmsf.evaluation.objects import ObjectInputs, draw_other_recording
 from avmsf.evaluation.page import keep_sound, listening_gain
 from avmsf.evaluation.protocols import EvaluationProtocol
-from avmsf.evaluation.results import ENCODER, CaseRecord, ObjectRecord, Outcome, ResultsFolder, failure_of
+from avmsf.evaluation.results import ENCODER, CaseRecord, ObjectRecord, Outcome, ResultsFolder, failure_of, file_word
 from avmsf.evaluation.splits import MetricSettings, Values, align_split, spread
 from avmsf.evaluation.task import Method, Renderer, Task, expect_renderer, report_of
 from avmsf.modal.extraction.extract import Extraction, extract_once
@@ -227,7 +227,7 @@ class CaseRun:
         )
         maps = {}
         for row, each in found.maps.items():
-            file = f"maps/{self.place}/{row:03d} {_file_word(method.name)}.safetensors"
+            file = f"maps/{self.place}/{row:03d} {file_word(method.name)}.safetensors"
             write_map(self.folder / file, each, truth=recordings.test.contacts[row])
             maps[recordings.test.names[row]] = file
         return dict(found.errors), {}, maps
@@ -268,7 +268,7 @@ class CaseRun:
     def _keep_sounds(self, name: str, sounds: Float[Tensor, "contacts samples"]) -> dict[str, str]:
         """Write the sounds to listen to, and return their files by the names of their recordings."""
         kept = {}
-        word = _file_word(name)
+        word = file_word(name)
         for row in self.stored_rows:
             file = f"sounds/{self.place}/{row:03d} {word}.flac"
             test = self.scored.test
@@ -277,11 +277,6 @@ class CaseRun:
             )
             kept[test.names[row]] = file
         return kept
-
-
-def _file_word(method: str) -> str:
-    """Return a method's name for files: methods that read a folder have its path in their name."""
-    return "".join(mark if mark.isalnum() or mark in "-_" else "-" for mark in method)
 
 
 def run_object(

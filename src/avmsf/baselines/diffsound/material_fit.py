@@ -83,9 +83,6 @@ class DiffSoundConfig:
     def __post_init__(self) -> None:
         if self.material is not None:
             material_named(self.material)
-        for name in ("transport_steps", "difference_steps", "search"):
-            if getattr(self, name) < 0:
-                raise EvaluationError.expected("0 or more", getattr(self, name), name=name)
 
 
 @dataclass(frozen=True)

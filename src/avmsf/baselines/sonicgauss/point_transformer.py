@@ -6,7 +6,7 @@ are not shuffled, stochastic depth is off, and of several points in one voxel th
 convolutions of the others.
 """
 
-from collections.abc import Sequence
+from collections import OrderedDict
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -152,16 +152,6 @@ class SerializedAttention(nn.Module):
         return attended
 
 
-class _Perceptron(nn.Module):
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.fc1, self.fc2 = nn.Linear(channels, 4 * channels), nn.Linear(4 * channels, channels)
-
-    def forward(self, features: Float[Tensor, "points dim"]) -> Float[Tensor, "points dim"]:
-        hidden: Tensor = self.fc2(torch.nn.functional.gelu(self.fc1(features)))
-        return hidden
-
-
 class _Block(nn.Module):
     def __init__(self, channels: int, heads: int, patch: int, order: int) -> None:
         super().__init__()
@@ -172,7 +162,9 @@ class _Block(nn.Module):
         self.norm1 = nn.Sequential(nn.LayerNorm(channels))
         self.attn = SerializedAttention(channels, heads, patch)
         self.norm2 = nn.Sequential(nn.LayerNorm(channels))
-        self.mlp = nn.Sequential(_Perceptron(channels))
+        wide = 4 * channels
+        layers = {"fc1": nn.Linear(channels, wide), "act": nn.GELU(), "fc2": nn.Linear(wide, channels)}
+        self.mlp = nn.Sequential(nn.Sequential(OrderedDict(layers)))
 
     def forward(self, features: Float[Tensor, "points dim"], voxels: Voxels) -> Float[Tensor, "points dim"]:
         convolution, linear, norm = self.cpe
@@ -221,16 +213,12 @@ class PointEncoder(nn.Module):
         voxels = Voxels.of(centers)
         state: Tensor = self.embedding(features)
         for stage in self.enc.values():
-            for part in _parts(stage):
+            for part in stage.children():
                 if isinstance(part, _Pooling):
                     state, voxels = part(state, voxels)
                 else:
                     state = part(state, voxels)
         return state
-
-
-def _parts(stage: nn.Module) -> Sequence[nn.Module]:
-    return tuple(stage.children())
 
 
 def _batch_norm(channels: int) -> nn.BatchNorm1d:
