@@ -9,9 +9,9 @@ import trimesh
 
 from avmsf.datasets import RealImpact
 from avmsf.datasets.realimpact import closest_rows
-from avmsf.errors import CaptureWarning, DatasetError
-from factories.dataset_folders import ROWS, microphones, write_realimpact
-from factories.raising import raises, warns
+from avmsf.errors import DatasetError
+from factories.dataset_folders import ROWS, write_realimpact
+from factories.raising import raises
 
 NAME = "43_IronMortar"
 
@@ -65,22 +65,6 @@ def test_one_position_for_all_impacts_goes_before_a_closer_one_for_some() -> Non
     assert closest_rows(vertices, listeners, surface) == ([1, 4], True)
     listeners[3:] += 0.01
     assert closest_rows(vertices, listeners, surface) == ([0, 5], False)
-
-
-def test_blows_heard_from_nowhere_in_common_are_told(tmp_path: Path) -> None:
-    write_realimpact(tmp_path, NAME, turned=(0, 5, 0, 0, 0))
-    with warns(CaptureWarning, name=f"RealImpact, {NAME}") as caught:
-        capture = RealImpact(tmp_path).capture(NAME)
-    assert any("no microphone position is common" in remark for remark in caught[0].message.value)
-    assert len(capture.impacts) == 5
-
-
-def test_a_turned_grid_with_places_in_common_is_heard_from_one_of_them(tmp_path: Path) -> None:
-    write_realimpact(tmp_path, NAME, turned=(0, 20, 0, 40, 0))
-    impacts = RealImpact(tmp_path).capture(NAME).impacts
-    rows = [round(row_of(sound)) for sound in impacts.sounds.numpy()]
-    listeners = np.concatenate([microphones(turned=turn) for turn in (0, 20, 0, 40, 0)])
-    assert np.ptp(listeners[rows], axis=0).max() < 1e-9
 
 
 def test_the_mesh_is_surface_and_look(whole: Path) -> None:

@@ -95,14 +95,14 @@ def write_mesh(path: Path, *, radius: float = 0.1, middle: tuple[float, float, f
     return mesh
 
 
-def microphones(*, turned: float = 0.0) -> np.ndarray:
+def microphones() -> np.ndarray:
     """Return where 600 microphones stand: angle > distance > microphone, a vertical row of 15 on an arm that turns."""
     places = []
     for angle in range(0, 181, 20):
         for distance in (0, 333, 667, 1000):
             for microphone in range(15):
                 radius, height = (230 + distance) / 1000, -0.91 + 1.82 * microphone / 14
-                turn = math.radians(angle + turned)
+                turn = math.radians(angle)
                 across, along = -0.04345, radius
                 places.append(
                     (
@@ -114,12 +114,12 @@ def microphones(*, turned: float = 0.0) -> np.ndarray:
     return np.array(places)
 
 
-def write_realimpact(folder: Path, name: str, *, samples: int = 2400, turned: Sequence[float] = (0.0,) * 5) -> Path:
+def write_realimpact(folder: Path, name: str, *, samples: int = 2400) -> Path:
     """Write an object of RealImpact, each row's sound a decay as high as the row's number, over 3000, plus one."""
     home = folder / name / "preprocessed"
     mesh = write_mesh(home / "transformed.obj", radius=0.08, middle=(0.013, 0.047, 0.21))
     vertices = np.array([5, 77, 190, 333, 601])
-    listeners = np.concatenate([microphones(turned=turn) for turn in turned])
+    listeners = np.tile(microphones(), (5, 1))
     np.save(home / "vertexID.npy", np.repeat(vertices, 600).astype(np.int64))
     np.save(home / "vertexXYZ.npy", np.repeat(np.asarray(mesh.vertices)[vertices], 600, axis=0))
     np.save(home / "listenerXYZ.npy", listeners)

@@ -10,7 +10,6 @@ import torch
 from avmsf.photographs import find_foreground, read_views
 from avmsf.photographs.cameras import View
 from avmsf.photographs.hull import carve
-from factories.views_folder import quaternion
 
 LOW, HIGH = (-0.0419, 0.0011, -0.0378), (0.0309, 0.0882, 0.0355)
 
@@ -54,22 +53,6 @@ def test_what_is_bright_in_all_views_fills_the_bounding_box(dino: tuple[View, ..
     # Millimetres: shadows cost some, a cube is 1 mm, and a pixel 0.4 mm.
     assert np.abs(inside.min(axis=0) - LOW).max() < 4e-3
     assert np.abs(inside.max(axis=0) - HIGH).max() < 4e-3
-
-
-def test_a_colmap_model_of_them_says_the_same(shared: Path, dino: tuple[View, ...], tmp_path: Path) -> None:
-    (tmp_path / "images").symlink_to(shared / "dino" / "images")
-    (tmp_path / "sparse").mkdir()
-    (tmp_path / "sparse" / "cameras.txt").write_text("1 PINHOLE 640 480 3310.4 3325.5 316.73 200.55\n")
-    rows = []
-    for view in dino:
-        pose = (*quaternion(view.camera), *view.camera.world_to_camera[:3, 3].tolist())
-        rows.append(f"1 {' '.join(map(repr, pose))} 1 {view.name}\n\n")
-    (tmp_path / "sparse" / "images.txt").write_text("".join(rows))
-    for one, other in zip(dino, read_views(tmp_path, longest=64), strict=True):
-        assert one.name == other.name
-        # A quaternion's rounding in float64.
-        assert torch.allclose(one.camera.world_to_camera, other.camera.world_to_camera, rtol=0, atol=1e-12)
-        assert other.camera.focal == pytest.approx((331.04, 332.55))
 
 
 @pytest.mark.slow

@@ -1,7 +1,7 @@
 """Pictures of a mesh, taken by casting rays: what stands for photographs where there is a scan."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -85,44 +85,35 @@ class MeshTracer:
         color, mask = np.ascontiguousarray(shaped[..., :3]), np.ascontiguousarray(shaped[..., 3])
         return View(name, torch.from_numpy(color), camera, torch.from_numpy(mask))
 
-    def _cast(self, camera: Camera) -> "list[_Hits]":
+    def _cast(self, camera: Camera) -> "Iterator[_Hits]":
         """Cast a ray through each pixel of the rectangle that the mesh fills, a band of rows at a time."""
         left, top, right, bottom = self._rectangle(camera)
         if right <= left:
-            return []
-        height = max(1, MOST_RAYS // (right - left))
-        bands = []
-        for start in range(top, bottom, height):
-            stop = min(start + height, bottom)
-            cut = replace(
-                camera,
-                principal=(camera.principal[0] - left, camera.principal[1] - start),
-                width=right - left,
-                height=stop - start,
-            )
-            bands.append(self._cast_band(cut, left=left, top=start))
-        return bands
-
-    def _cast_band(self, camera: Camera, *, left: int, top: int) -> "_Hits":
-        directions = camera.rays().reshape(-1, 3).numpy()
-        origin = (camera.position.numpy() - self.middle) / self.size
-        origins = np.broadcast_to(origin.astype(np.float32), directions.shape)
-        found = self.scene.run(np.ascontiguousarray(origins), directions.astype(np.float32), output=1)
-        hit = np.flatnonzero(found["primID"] >= 0)
-        faces = found["primID"][hit].astype(np.int64)
-        u, v = found["u"][hit].astype(np.float64), found["v"][hit].astype(np.float64)
-        weights = np.stack([1 - u - v, u, v], axis=1)
+            return
+        origin = ((camera.position.numpy() - self.middle) / self.size).astype(np.float32)
         # The distance of a float32 ray is coarse beside the corners' own depths, of which it is the mean.
         pose = camera.world_to_camera.numpy()
         depths = self.vertices @ pose[2, :3] + pose[2, 3]
-        return _Hits(
-            rows=hit // camera.width + top,
-            columns=hit % camera.width + left,
-            faces=faces,
-            weights=weights.astype(np.float32),
-            directions=directions[hit].astype(np.float32),
-            depth=(depths[self.faces[faces]] * weights).sum(axis=1),
-        )
+        x, y = camera.principal
+        width, height = right - left, max(1, MOST_RAYS // (right - left))
+        for start in range(top, bottom, height):
+            high = min(height, bottom - start)
+            band = replace(camera, principal=(x - left, y - start), width=width, height=high)
+            directions = band.rays().reshape(-1, 3).numpy()
+            origins = np.ascontiguousarray(np.broadcast_to(origin, directions.shape))
+            found = self.scene.run(origins, directions.astype(np.float32), output=1)
+            hit = np.flatnonzero(found["primID"] >= 0)
+            faces = found["primID"][hit].astype(np.int64)
+            u, v = found["u"][hit].astype(np.float64), found["v"][hit].astype(np.float64)
+            weights = np.stack([1 - u - v, u, v], axis=1)
+            yield _Hits(
+                rows=hit // width + start,
+                columns=hit % width + left,
+                faces=faces,
+                weights=weights.astype(np.float32),
+                directions=directions[hit].astype(np.float32),
+                depth=(depths[self.faces[faces]] * weights).sum(axis=1),
+            )
 
     def _rectangle(self, camera: Camera) -> tuple[int, int, int, int]:
         """Return the left, top, right and bottom pixel edges around all that the mesh can fill."""

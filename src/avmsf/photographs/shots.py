@@ -67,12 +67,6 @@ def refuse_many(count: int, where: Path) -> None:
         )
 
 
-def mask_places(shot: Shot, folder: Path) -> list[Path]:
-    """Return the paths where a shot's mask may be, the likeliest first."""
-    places = mask_names(shot.name, folder)
-    return places if shot.mask is None else [shot.mask, *places]
-
-
 def mask_names(name: str, folder: Path) -> list[Path]:
     """Return the paths where the mask of the photograph of this name may be, the likeliest first."""
     path = PurePosixPath(name)
@@ -146,7 +140,8 @@ def _with_mask(shot: Shot, base: Path, picture: Picture, findings: defaultdict[s
     """Return the picture with the mask that lies in a file, where it has none of its own."""
     if picture.mask is not None:
         return picture
-    path = next((place for place in mask_places(shot, base) if place.is_file()), shot.mask)
+    places = [*([] if shot.mask is None else [shot.mask]), *mask_names(shot.name, base)]
+    path = next((place for place in places if place.is_file()), shot.mask)
     if path is None:
         return picture
     try:
