@@ -11,7 +11,7 @@ from avmsf._utils.files import new_folder
 from avmsf.capture.audio import wav_bytes
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.measure import RecordingReport, shared_problems, shortened
-from avmsf.capture.preprocess import Issues, preprocess
+from avmsf.capture.preprocess import preprocess
 from avmsf.capture.settings import SETTINGS, CaptureSettings, settings_of
 from avmsf.capture.table import DIRECTION, FORCE, REQUIRED, TABLE, in_folder
 from avmsf.errors import CaptureError, CaptureWarning
@@ -51,15 +51,11 @@ def read_capture(folder: str | Path, settings: CaptureSettings | None = None) ->
     """
     folder = Path(folder)
     with in_folder(folder):
-        return _read_capture(folder, settings or settings_of(folder))
-
-
-def _read_capture(folder: Path, settings: CaptureSettings) -> Capture:
-    issues = Issues()
-    found = preprocess(folder, settings, issues)
+        settings = settings or settings_of(folder)
+        found = preprocess(folder, settings)
     assert found.impacts is not None
-    for remark in issues.warnings + _summary(list(found.reports.values()), folder):
-        warnings.warn(remark, stacklevel=3)
+    for remark in found.warnings + _summary(list(found.reports.values()), folder):
+        warnings.warn(remark, stacklevel=2)
     return Capture(settings.name or folder.resolve().name, found.impacts, found.surface, settings, folder)
 
 

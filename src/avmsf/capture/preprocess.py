@@ -144,34 +144,16 @@ def build_impacts(
 
 
 @dataclass
-class Issues:
-    """What is wrong with a capture. Errors are raised, unless `collect` is set: then they are kept."""
-
-    collect: bool = False
-    errors: list[CaptureError] = field(default_factory=list)
-    rows: dict[int, CaptureError] = field(default_factory=dict)
-    """Errors of single recordings, by their lines in the table."""
-    warnings: list[CaptureWarning] = field(default_factory=list)
-
-    @contextmanager
-    def kept(self, line: int | None = None) -> Iterator[None]:
-        """Keep an error, of the capture or of one row of its table, and go on."""
-        try:
-            yield
-        except CaptureError as error:
-            if not self.collect:
-                raise
-            if line is None:
-                self.errors.append(error)
-            else:
-                self.rows[line] = error
-
-
-@dataclass
 class Preprocessed:
-    """What could be read of a capture folder."""
+    """What could be read of a capture folder, and what is wrong with it."""
 
     rows: list[Row]
+    warnings: list[CaptureWarning]
+    collect: bool
+    """Whether errors are kept, and not raised."""
+    errors: list[CaptureError] = field(default_factory=list)
+    row_errors: dict[int, CaptureError] = field(default_factory=dict)
+    """Errors of single recordings, by their lines in the table."""
     strikes: dict[int, Strike] = field(default_factory=dict)
     """The rows that can be parsed, by their lines."""
     reports: dict[int, RecordingReport] = field(default_factory=dict)
@@ -182,33 +164,44 @@ class Preprocessed:
     """The part of it that the contacts lie on."""
     impacts: Impacts | None = None
 
+    @contextmanager
+    def keep(self, line: int | None = None) -> Iterator[None]:
+        """Keep an error, of the capture or of one row of its table, or raise it."""
+        try:
+            yield
+        except CaptureError as error:
+            if not self.collect:
+                raise
+            if line is None:
+                self.errors.append(error)
+            else:
+                self.row_errors[line] = error
 
-def preprocess(folder: Path, settings: CaptureSettings, issues: Issues) -> Preprocessed:
-    """Read a capture folder; what is wrong with it is raised or kept, as `issues` say.
+
+def preprocess(folder: Path, settings: CaptureSettings, *, collect: bool = False) -> Preprocessed:
+    """Read a capture folder; what is wrong with it is raised, or with `collect` kept.
 
     Raises `CaptureError` for a table that cannot be read in any case.
     """
-    rows, warned = read_rows(folder)
-    issues.warnings += warned
-    found = Preprocessed(rows)
-    for row in rows:
-        with issues.kept(row.line):
+    found = Preprocessed(*read_rows(folder), collect)
+    for row in found.rows:
+        with found.keep(row.line):
             found.strikes[row.line] = parse_row(row, settings)
     strikes = list(found.strikes.values())
     if strikes:
-        with issues.kept():
+        with found.keep():
             refuse_repeated_files(strikes)
-        with issues.kept():
+        with found.keep():
             refuse_missing(folder, strikes)
-        issues.warnings += check_contacts(strikes, settings)
-    with issues.kept():
+        found.warnings += check_contacts(strikes, settings)
+    with found.keep():
         found.surface = find_surface(folder, settings)
         if found.surface is not None and strikes:
-            issues.warnings += check_surface(strikes, found.surface, settings=settings)
+            found.warnings += check_surface(strikes, found.surface, settings=settings)
             contacts = torch.tensor([strike.contact for strike in strikes])
             found.surface, _ = contacted_part(found.surface, contacts)
     for line, strike in found.strikes.items():
-        with issues.kept(line):
+        with found.keep(line):
             # Reading would name similar files, for which it compares up to a thousand names.
             if is_missing(folder / strike.file):
                 raise CaptureError.expected("a sound file", file=strike.file)
@@ -217,19 +210,19 @@ def preprocess(folder: Path, settings: CaptureSettings, issues: Issues) -> Prepr
             prepared = prepare(recording, settings, newtons=strike.newtons)
             found.reports[line] = measure(recording, prepared, settings=settings, line=line)
             found.sounds[line] = shorten(prepared, settings)
-    _join(found, settings, issues)
+    _join(found, settings)
     return found
 
 
-def _join(found: Preprocessed, settings: CaptureSettings, issues: Issues) -> None:
+def _join(found: Preprocessed, settings: CaptureSettings) -> None:
     """Make impacts of the recordings that can be read, and compare them."""
     strikes, sounds = [found.strikes[line] for line in found.sounds], list(found.sounds.values())
     if not sounds:
         return
     names, directions = [strike.file for strike in strikes], [strike.direction for strike in strikes]
-    with issues.kept():
-        issues.warnings += check_levels([sound.peak for sound in sounds], names)
-    with issues.kept():
+    with found.keep():
+        found.warnings += check_levels([sound.peak for sound in sounds], names)
+    with found.keep():
         found.impacts, warned = build_impacts(
             sounds,
             torch.tensor([strike.contact for strike in strikes], dtype=torch.float64),
@@ -237,7 +230,7 @@ def _join(found: Preprocessed, settings: CaptureSettings, issues: Issues) -> Non
             settings=settings,
             directions=None if None in directions else torch.tensor(directions, dtype=torch.float32),
         )
-        issues.warnings += warned
+        found.warnings += warned
 
 
 @dataclass(frozen=True)
@@ -256,14 +249,14 @@ class CaptureReport:
 
 def check(folder: str | Path, settings: CaptureSettings | None = None) -> CaptureReport:
     """Check a capture folder as `read_capture` would and report on every recording; raises nothing for bad input."""
-    folder, issues = Path(folder), Issues(collect=True)
+    folder = Path(folder)
     try:
         settings = settings or settings_of(folder)
-        found = preprocess(folder, settings, issues)
+        found = preprocess(folder, settings, collect=True)
     except CaptureError as error:
         return CaptureReport(False, (), (str(error),))
-    reports = [found.reports.get(row.line) or _unreadable(row, found, issues) for row in found.rows]
-    far = [error for error in issues.rows.values() if error.name == "unit"]
+    reports = [found.reports.get(row.line) or _unreadable(row, found) for row in found.rows]
+    far = [error for error in found.row_errors.values() if error.name == "unit"]
     if len(far) > 1:
         # One message for all, with which they are listed together.
         largest = max(abs(value) for error in far for value in error.value)
@@ -271,7 +264,7 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
             f"expected a contact within {FARTHEST:g} m of the origin, got coordinates of up to {largest:g} "
             f"(unit = {settings.unit!r}): {fitting_units(largest)}"
         )
-        lines = [line for line, error in issues.rows.items() if error in far]
+        lines = [line for line, error in found.row_errors.items() if error in far]
         reports = [replace(each, problems=(words,)) if each.line in lines else each for each in reports]
     sounds = list(found.sounds.values())
     comparable = len(sounds) > 1 and len({each.rate for each in sounds}) == 1
@@ -282,15 +275,15 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
     names = [report.file for report in reports]
     if names == sorted(names) != sorted(names, key=number_key):
         remarks.append(TEXT_ORDER)
-    readable = not issues.errors and all(report.readable for report in reports)
-    problems = [*map(str, issues.errors), *map(str, issues.warnings), *_copies(found), *_unlisted(folder, set(names))]
+    readable = not found.errors and all(report.readable for report in reports)
+    problems = [*map(str, found.errors), *map(str, found.warnings), *_copies(found), *_unlisted(folder, set(names))]
     return CaptureReport(readable, tuple(reports), tuple(problems), tuple(remarks))
 
 
-def _unreadable(row: Row, found: Preprocessed, issues: Issues) -> RecordingReport:
+def _unreadable(row: Row, found: Preprocessed) -> RecordingReport:
     strike = found.strikes.get(row.line)
     file = row.cells["file"] if strike is None else strike.file
-    return RecordingReport(file=file, line=row.line, readable=False, problems=(str(issues.rows[row.line]),))
+    return RecordingReport(file=file, line=row.line, readable=False, problems=(str(found.row_errors[row.line]),))
 
 
 def _copies(found: Preprocessed) -> list[str]:
