@@ -40,17 +40,8 @@ SMALL_FLOAT = 1e-6
 
 
 def plate_of(material: Material, *, size: float = 1.0) -> Plate:
-    plain = Plate()
-    return Plate(
-        size * plain.length,
-        size * plain.width,
-        size * plain.thickness,
-        material.young,
-        material.density,
-        material.poisson,
-        material.alpha,
-        material.beta,
-    )
+    sizes = {name: size * getattr(Plate(), name) for name in ("length", "width", "thickness")}
+    return Plate(**sizes, **{name: value for name, value in vars(material).items() if name != "name"})
 
 
 def field_of(frequency: torch.Tensor, damping: torch.Tensor, gains: torch.Tensor, contacts: torch.Tensor) -> SoundField:

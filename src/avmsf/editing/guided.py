@@ -297,10 +297,8 @@ class _Optimization:
         else:
             self.failed += 1
             if self.failed >= _MAX_FAILED_STEPS:
-                got, advice = (
-                    f"NaN or inf in {self.failed} consecutive steps",
-                    "lower the guidance, or compute in float32",
-                )
+                got = f"NaN or inf in {self.failed} consecutive steps"
+                advice = "lower the guidance, or compute in float32"
                 raise EditError.expected("finite sounds", self.failed, got=got, name="targets", advice=advice)
         self.step += 1
         self.consistent = True

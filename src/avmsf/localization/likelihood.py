@@ -22,7 +22,8 @@ from jaxtyping import Complex64, Complex128, Float32, Float64, Int64
 from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_floats
-from avmsf.errors import ArrayError, LocationError
+from avmsf.errors import LocationError
+from avmsf.localization.preprocess import location_errors
 
 RELATIVE_ERRORS = (0.8, 0.15, 0.03)
 """Relative errors r of the gains for which the likelihood of every point is computed."""
@@ -101,10 +102,8 @@ class Force:
         """
         if isinstance(given, Force):
             return given
-        try:
+        with location_errors():
             values = as_floats(given, "force")
-        except ArrayError as error:
-            raise LocationError(str(error), **error.attributes) from error
         if values.numel() != 1:
             shape = list(values.shape)
             raise LocationError.expected(
