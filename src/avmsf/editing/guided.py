@@ -326,7 +326,7 @@ class _Optimization:
                 edit = edit.following(self.probes.field.bank)
             after = level(self.probes.sounds(edit), sample_rate=self.field.sample_rate)
             factor = (self.loudness.square().sum() / after.square().sum()).sqrt()
-            return edit.louder(factor)
+            return replace(edit, scale=edit.scale + factor.double().log())
 
     def _at(self, contacts: Float[Tensor, "contacts 3"]) -> FieldAtContacts:
         seconds = self.config.seconds

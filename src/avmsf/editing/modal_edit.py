@@ -202,10 +202,6 @@ class ModalEdit:
         """Common factor on all decay times, without their own shifts: 1 / kappa, as `decay` of `adjust_modes`."""
         return 1.0 / float(self.damping.detach().exp())
 
-    def louder(self, factor: Float[Tensor, ""]) -> "ModalEdit":
-        """Return the edit with all gains multiplied by a factor above 0."""
-        return replace(self, scale=self.scale + factor.double().log())
-
     def following(self, bank: ModalBank) -> "ModalEdit":
         """Return the edit of a bank with the gains of a mode from f1 to f2 Hz multiplied by f1 / f2 (paper, eq. 21)."""
         return replace(self, scale=self.scale + (bank.frequency / self.bank(bank).frequency).log())

@@ -26,6 +26,7 @@ from avmsf.localization.contact_map import ContactMap
 from avmsf.localization.likelihood import Force
 from avmsf.localization.locator import Locator
 from avmsf.localization.preprocess import Sound, at_field_rate, location_errors, open_recording, preprocess_recording
+from avmsf.modal.inner_products import poles_of
 from avmsf.modal.synthesis import synthesize
 
 REJECT_ABOVE = 0.5
@@ -271,7 +272,6 @@ def predict_ringing(
     bank = field.bank.take(audible)
     extractor = Extractor.of(bank, sample_rate=rate, samples=stop - begin)
     values = extractor.extract(sound[begin:stop], color=None).values
-    seconds = (start - begin) / rate
-    values = values * torch.polar(torch.exp(-bank.damping * seconds), 2.0 * torch.pi * bank.frequency * seconds)
+    values = values * poles_of(bank, rate) ** (start - begin)
     sines, cosines = values.real[None], values.imag[None]
     return synthesize(sines, bank.frequency, bank.damping, samples=samples, sample_rate=rate, quadrature=cosines)[0]

@@ -189,8 +189,11 @@ class StreamingLocalizer:
         if detected:
             start = self.clock - self.hop
             self._pending = _PendingImpact(start, self._modes.after(self.ringing, -self.hop), start)
-        elif self.clock // self.hop % _UPDATE_HOPS == 0 and self._is_settled():
-            self._correct(self.clock - self.window)
+        elif self.clock // self.hop % _UPDATE_HOPS == 0:
+            # The window must not hold the beginning of an impact that the decay was not fitted to.
+            since = 0 if self._pending is None else self._pending.onset
+            if self.clock - self.window >= since and len(self.recent) >= self.window:
+                self._correct(self.clock - self.window)
         return answer
 
     def _answer(self, pending: _PendingImpact) -> LocatedImpact | None:
@@ -233,11 +236,6 @@ class StreamingLocalizer:
         return len(known) >= _MIN_MEMORY_HOPS and float(hops[-1]) > _ONSET_ENERGY_RATIO * (
             float(known.max()) + _MAX_UNEXPLAINED * ringing
         )
-
-    def _is_settled(self) -> bool:
-        """Return whether the last window holds no beginning of an impact that the decay was not fitted to."""
-        since = 0 if self._pending is None else self._pending.onset
-        return self.clock - self.window >= since and len(self.recent) >= self.window
 
     def _correct(self, start: int) -> None:
         """Add the modal amplitudes of the residual in the window from sample `start` on."""
