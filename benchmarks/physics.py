@@ -1,7 +1,6 @@
 """Time and memory that a fit with elastic mode shapes takes, and how often its intervals hold the true gains."""
 
 import json
-import resource
 import subprocess
 import sys
 import tempfile
@@ -30,6 +29,7 @@ from avmsf.simulate.simulation import simulate_object
 from benchmarks.field import measured_parts
 from benchmarks.material import surface_features
 from benchmarks.report import Options, Report, Table, log
+from benchmarks.scans import processor_seconds, scans
 from benchmarks.step import peak_gigabytes
 
 COSTED = "skillet-iron"
@@ -155,9 +155,9 @@ def _frequencies(options: Options) -> Report:
         true = make_body(replace(recipe, elastic_modes=COMPARED), cache=None, log=lambda words: None)
         dofs = 3000 if options.quick_look else 40_000
         heard: list[str] = []
-        begun = _processor_seconds()
+        begun = processor_seconds()
         made = nominal_bodies(true.surface, walls=[None], count=COMPARED, dofs=dofs, log=heard.append)
-        taken, material = _processor_seconds() - begun, material_named(recipe.material)
+        taken, material = processor_seconds() - begun, material_named(recipe.material)
         speed = (material.young / material.density * NOMINAL.density / NOMINAL.young) ** 0.5
         error = made.bodies[0].elastic.frequency * speed / true.elastic.frequency - 1.0
         rows.append([name, float(error.abs().max()), float(error.mean()), taken, "; ".join(heard[-1:])])
@@ -172,13 +172,12 @@ def _frequencies(options: Options) -> Report:
     )
 
 
-def _processor_seconds() -> float:
-    """Return the processor time of this process and of those that it started and that have ended."""
-    own, others = resource.getrusage(resource.RUSAGE_SELF), resource.getrusage(resource.RUSAGE_CHILDREN)
-    return own.ru_utime + own.ru_stime + others.ru_utime + others.ru_stime
-
-
-PARTS: dict[str, Callable[[Options], Report]] = {"cost": _cost, "coverage": _coverage, "frequencies": _frequencies}
+PARTS: dict[str, Callable[[Options], Report]] = {
+    "cost": _cost,
+    "coverage": _coverage,
+    "frequencies": _frequencies,
+    "scans": scans,
+}
 
 if __name__ == "__main__":
     print(json.dumps(_fitted(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3], int(sys.argv[4]))))
