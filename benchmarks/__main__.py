@@ -9,7 +9,7 @@ from types import ModuleType
 
 from avmsf._utils.device import TRAINABLE
 from avmsf.errors import AvmsfError, CaptureWarning
-from avmsf.simulate.sim20 import SIM20
+from avmsf.simulate.recipe import SIM20
 from benchmarks import (
     align,
     baselines,

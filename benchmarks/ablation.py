@@ -29,8 +29,8 @@ from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.pipeline.bodies import candidate_bodies, roughened
 from avmsf.pipeline.config import BodyConfig
+from avmsf.simulate.recipe import ABLATED
 from avmsf.simulate.shapes import make_shape
-from avmsf.simulate.sim20 import ABLATED
 from benchmarks.report import Options, Report, Table, log
 from benchmarks.splitcases import COUNTS, ROUGH, SplitCase, bodies_of, measured, simulated, split_case, splits_of
 from tests.oracles.block import block

@@ -20,7 +20,7 @@ from avmsf.fem.material import Material, material_named
 from avmsf.mesh import Surface
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
-from avmsf.simulate.sim20 import sim20_recipe
+from avmsf.simulate.recipe import sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from avmsf.simulate.simulation_folder import write_simulation
 from benchmarks.costs import method_costs

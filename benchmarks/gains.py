@@ -36,7 +36,7 @@ from avmsf.pipeline.bodies import roughened
 from avmsf.pipeline.cloud_shape import shape_of_cloud
 from avmsf.reconstruction import ObjectShape
 from avmsf.simulate.ground_truth import Truth
-from avmsf.simulate.sim20 import SIM20
+from avmsf.simulate.recipe import SIM20
 from benchmarks.ablation import ablation, outliers, supports
 from benchmarks.material import MissingDataError, example_capture
 from benchmarks.report import Options, Report, Table, log

@@ -21,7 +21,7 @@ from avmsf.field.training import Targets, TrainingRun
 from avmsf.modal.extraction.extract import extract_sounds
 from avmsf.modal.extraction.finders import ShortTime
 from avmsf.pipeline.config import DESCRIPTORS, PRESETS
-from avmsf.simulate.sim20 import sim20_recipe
+from avmsf.simulate.recipe import sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from avmsf.simulate.simulation_folder import write_simulation
 from benchmarks.material import shared_data

@@ -24,7 +24,7 @@ from avmsf.modal.extraction.extract import extract_modes
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.bodies import make_body
-from avmsf.simulate.sim20 import SIM20, sim20_recipe
+from avmsf.simulate.recipe import SIM20, sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from benchmarks.field import measured_parts
 from benchmarks.material import surface_features

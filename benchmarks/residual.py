@@ -16,7 +16,7 @@ from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.sound_field import SoundField
 from avmsf.modal.extraction.extract import extract_modes
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.simulate.sim20 import SIM20, sim20_recipe
+from avmsf.simulate.recipe import SIM20, sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from benchmarks.field import QUICK_LOOK, filled_estimator
 from benchmarks.material import STRUCK, capture_in_place, example_capture, surface_features

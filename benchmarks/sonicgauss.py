@@ -25,9 +25,8 @@ from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.fit import splat
 from avmsf.photographs.mesh_views import orbit_cameras, render_views
-from avmsf.simulate.recipe import ObjectRecipe
+from avmsf.simulate.recipe import SIM20, ObjectRecipe
 from avmsf.simulate.shapes.kinds import KINDS
-from avmsf.simulate.sim20 import SIM20
 from avmsf.simulate.simulation import simulate_object
 from benchmarks.report import Report, Table, log
 

@@ -24,7 +24,7 @@ from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig
 from avmsf.reconstruction import ObjectShape
 from avmsf.simulate.ground_truth import Truth, read_truth
-from avmsf.simulate.sim20 import sim20_recipe
+from avmsf.simulate.recipe import sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from avmsf.symmetry.characters import groups_of
 from avmsf.symmetry.find import find_symmetries

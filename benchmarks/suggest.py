@@ -19,7 +19,7 @@ from avmsf.modal.extraction.alignment import align
 from avmsf.modal.extraction.extract import extract_modes
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig
-from avmsf.simulate.sim20 import sim20_recipe
+from avmsf.simulate.recipe import sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from benchmarks.material import capture_in_place, surface_features
 from benchmarks.report import Options, Report, Table, log

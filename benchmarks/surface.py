@@ -26,7 +26,7 @@ from avmsf.mesh.surface import Surface, read_surface
 from avmsf.photographs import find_foreground, read_views
 from avmsf.photographs.cameras import View
 from avmsf.reconstruction import ObjectShape, object_surface
-from avmsf.simulate.sim20 import SIM20
+from avmsf.simulate.recipe import SIM20
 from benchmarks.material import MissingDataError
 from benchmarks.report import Options, Report, Table, log
 

@@ -27,7 +27,7 @@ from avmsf.baselines.sonicgauss.small import SmallConfig, SmallSonicGauss, Small
 from avmsf.baselines.sonicgauss.training import TrainingConfig, TunedRenderer, draw_times, flow_loss, integrate, train
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.methods import method_named
-from avmsf.simulate.sim20 import SIM20
+from avmsf.simulate.recipe import SIM20
 from factories.raising import raises
 from factories.sonicgauss_cases import SECONDS, cloud, impacts
 

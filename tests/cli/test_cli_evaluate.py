@@ -14,7 +14,7 @@ from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.runner import Evaluation
 from avmsf.evaluation.task import Task
 from avmsf.modal.extraction.finders import ShortTime
-from avmsf.simulate.sim20 import ABLATED
+from avmsf.simulate.recipe import ABLATED
 from factories.plate_set import fill_plates
 from factories.raising import raises
 

@@ -19,8 +19,7 @@ from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh, read_textured_mesh
 from avmsf.photographs.folder import read_views
 from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
-from avmsf.simulate.recipe import Imperfections, ObjectRecipe
-from avmsf.simulate.sim20 import sim20_recipe
+from avmsf.simulate.recipe import Imperfections, ObjectRecipe, sim20_recipe
 from avmsf.simulate.simulation import Simulation, simulate_object
 from avmsf.simulate.simulation_folder import is_written, simulate_set, write_simulation, write_textured
 from avmsf.simulate.strikes import STEEPEST, draw_strikes, nearest_on

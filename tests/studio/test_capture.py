@@ -13,7 +13,7 @@ import pytest
 import soundfile
 import torch
 
-from avmsf._utils.locks import write_lock
+from avmsf._utils.processes import write_lock
 from avmsf.capture import check, read_capture
 from avmsf.errors import CaptureError, FolderInUseError, RecordingLengthError
 from avmsf.pipeline.config import CACHE

@@ -166,7 +166,7 @@ def gone(processes: list[int]) -> bool:
 
 LIFELINE = """
 import threading
-from avmsf._utils.children import end_with_parent, start_child
+from avmsf._utils.processes import end_with_parent, start_child
 threading.Thread(target=end_with_parent, daemon=True).start()
 """
 WAITS = "import time; time.sleep(60)"
@@ -180,7 +180,7 @@ def pair(begin: str, child: str = WAITS) -> tuple[str, ...]:
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="processes are looked up in /proc")
 @pytest.mark.parametrize(
-    "worker", [pair(LIFELINE), pair("from avmsf._utils.children import start_child\n", LIFELINE + WAITS)]
+    "worker", [pair(LIFELINE), pair("from avmsf._utils.processes import start_child\n", LIFELINE + WAITS)]
 )
 def test_cancelling_ends_all_processes_also_of_a_worker_that_does_not_end_itself(
     worker: tuple[str, ...], monkeypatch: pytest.MonkeyPatch

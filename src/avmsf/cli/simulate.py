@@ -8,9 +8,8 @@ from avmsf.cli.options.simulate import Options
 from avmsf.cli.printing import console, next_command, print_json, print_result, say, table
 from avmsf.cli.progress import ProgressBar
 from avmsf.fem.material import MATERIALS
-from avmsf.simulate.recipe import ObjectRecipe
+from avmsf.simulate.recipe import NON_SYMMETRIC, SET, SIM20, ObjectRecipe
 from avmsf.simulate.shapes import KINDS
-from avmsf.simulate.sim20 import NON_SYMMETRIC, SET, SIM20
 from avmsf.simulate.simulation_folder import SetProgress, simulate_set
 
 

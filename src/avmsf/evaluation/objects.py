@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf._utils.locks import NO_LIMIT
+from avmsf._utils.processes import NO_LIMIT
 from avmsf.baselines.diffsound.material_fit import MODES as DIFFSOUND_MODES
 from avmsf.capture.impacts import Impacts
 from avmsf.datasets import CaptureCollection
@@ -33,7 +33,7 @@ from avmsf.pipeline.config import AUTO, DESCRIPTORS, PRESETS, BodyConfig, Geomet
 from avmsf.pipeline.scene import FEATURES, SceneStages
 from avmsf.pipeline.stages import StageFolder
 from avmsf.reconstruction import ObjectShape
-from avmsf.simulate import sim20
+from avmsf.simulate import recipe
 
 NAMES: Mapping[VisualInput, str] = {
     "unaligned": "unaligned.safetensors",
@@ -169,7 +169,7 @@ SUBSETS: Mapping[str, str] = {
 }
 """What the objects of each group have in common, by the group's name."""
 _NUMBERS: Mapping[str, Sequence[str]] = {"ablation": ABLATION, "non-symmetric": NON_SYMMETRIC}
-_SIMULATED: Mapping[str, Sequence[str]] = {"ablation": sim20.ABLATED, "non-symmetric": sim20.NON_SYMMETRIC}
+_SIMULATED: Mapping[str, Sequence[str]] = {"ablation": recipe.ABLATED, "non-symmetric": recipe.NON_SYMMETRIC}
 
 
 def members(dataset: Dataset) -> dict[str, frozenset[str]]:

@@ -22,8 +22,8 @@ import torch
 from jaxtyping import Bool, Float64
 
 from avmsf._utils.caching import discard, keep_if_possible, source_digest
-from avmsf._utils.children import end_child, start_child
 from avmsf._utils.files import write_whole
+from avmsf._utils.processes import end_child, start_child
 from avmsf.errors import SimulationError
 from avmsf.fem import tetrahedra_worker
 from avmsf.fem.skin import Skin

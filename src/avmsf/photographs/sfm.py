@@ -14,8 +14,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from avmsf._utils.children import end_child, ending_of, start_child
 from avmsf._utils.files import temporary_path, unwritable
+from avmsf._utils.processes import end_child, ending_of, start_child
 from avmsf._utils.text import counted, listed
 from avmsf.capture.filenames import PICTURE_SUFFIXES, pictures_in
 from avmsf.errors import CaptureError, Remark

@@ -12,7 +12,7 @@ from typing import Any
 import avmsf
 from avmsf._utils.caching import discard, source_digest
 from avmsf._utils.files import way_out, write_whole
-from avmsf._utils.locks import WAIT, write_lock
+from avmsf._utils.processes import WAIT, write_lock
 from avmsf._utils.text import read_json
 from avmsf.errors import CaptureError
 

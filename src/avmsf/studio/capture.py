@@ -22,7 +22,7 @@ from typing import Any
 import soundfile
 
 from avmsf._utils.files import copy_whole, write_whole
-from avmsf._utils.locks import write_lock
+from avmsf._utils.processes import write_lock
 from avmsf._utils.text import counted
 from avmsf.capture.audio import Recording, SoundBytes, decode_recording, read_recording, wav_bytes
 from avmsf.capture.measure import RecordingReport, measure

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import anyio
 import anyio.to_thread
 
-from avmsf._utils.children import ending_of
+from avmsf._utils.processes import ending_of
 from avmsf._utils.text import printable
 from avmsf.errors import AvmsfError
 from avmsf.studio.responses import bad_request

@@ -17,8 +17,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TextIO
 
-from avmsf._utils.children import end_with_parent
 from avmsf._utils.files import copy_whole
+from avmsf._utils.processes import end_with_parent
 from avmsf.capture import read_capture
 from avmsf.capture.settings import settings_of
 from avmsf.editing.config import GuidedEditConfig

@@ -9,8 +9,7 @@ import tyro
 from avmsf.cli.options.common import Flag, Printing, parse_options
 from avmsf.cli.options.paths import CacheFolder, InputError, OutputFolder
 from avmsf.errors import SimulationError
-from avmsf.simulate.recipe import EXAMPLE, ObjectRecipe
-from avmsf.simulate.sim20 import SET, sim20_recipe
+from avmsf.simulate.recipe import EXAMPLE, SET, ObjectRecipe, sim20_recipe
 
 
 @dataclass(frozen=True)

@@ -1,16 +1,21 @@
-"""Advisory locks: one writer at a time in a folder that several processes share.
+"""Processes beside each other: one writer at a time in a shared folder, and children that end with their parent.
 
-The lock is `flock` on a file that stays in the folder, so the system releases it when its process ends, by `kill -9`
-too. A second file says for people who holds it; it means nothing while the lock is free.
+The lock of a folder is `flock` on a file that stays there: the system releases it when its process ends, by `kill -9`
+too. A second file says for people who holds it, and means nothing while the lock is free. Children end, on every
+system, when the pipe to their standard input closes.
 """
 
 import errno
 import json
 import os
-from collections.abc import Iterator
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock, Timeout
 
@@ -26,6 +31,7 @@ _NO_PLACE = (errno.EROFS, errno.ENOENT, errno.ENOTDIR)
 """Errors of a folder that nobody can write to."""
 _NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
 """Errors of a disk that has no locks."""
+_RUNNING: set["subprocess.Popen[bytes]"] = set()
 
 
 @contextmanager
@@ -97,3 +103,34 @@ def _read_holder(path: Path) -> dict[str, object]:
     except (OSError, ValueError):
         return {}
     return known if isinstance(known, dict) else {}
+
+
+def start_child(command: Sequence[str], **settings: Any) -> "subprocess.Popen[bytes]":
+    """Start a process that `end_child` or `end_with_parent` ends; `settings` are those of Popen. Raises OSError."""
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, **settings)
+    _RUNNING.add(process)
+    return process
+
+
+def end_child(process: "subprocess.Popen[bytes]") -> None:
+    """Kill a process, where it runs."""
+    with process:
+        process.kill()
+    _RUNNING.discard(process)
+
+
+def end_with_parent() -> None:
+    """Wait for the end of the standard input, which is the parent's; end this process and those that it started."""
+    while sys.stdin.buffer.read(1):
+        pass
+    for process in _RUNNING.copy():
+        process.kill()
+    os._exit(1)
+
+
+def ending_of(status: int) -> str:
+    """Return what ended a process: the name of a signal, or the exit status."""
+    if status >= 0:
+        return f"exit status {status}"
+    names = {each.value: each.name for each in signal.Signals}
+    return names.get(-status, f"signal {-status}")

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import pytest
 
-from avmsf._utils.locks import NO_LIMIT, write_lock
+from avmsf._utils.processes import NO_LIMIT, write_lock
 from avmsf.errors import AvmsfError, FolderInUseError
 
 HOLD = """
 import sys
 from pathlib import Path
-from avmsf._utils.locks import write_lock
+from avmsf._utils.processes import write_lock
 with write_lock(Path(sys.argv[1]), "stages", command="avmsf splat mug"):
     print("held", flush=True)
     sys.stdin.read()
