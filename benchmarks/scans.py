@@ -113,9 +113,9 @@ def _measured(surface: Surface, true: ElasticModes | None) -> list[str | float]:
         finest = true.frequency if true is not None else _body(surface, 160_000, heard.append).frequency
     except SimulationError as error:
         return [processor_seconds() - begun, math.nan, math.nan, math.nan, str(error)]
-    error = (made.frequency[:LOWEST] / finest[:LOWEST] - 1.0).abs()
+    errors = (made.frequency[:LOWEST] / finest[:LOWEST] - 1.0).abs()
     fitted = math.nan if true is None else _fitted(surface, true)
-    return [taken, float(error.max()), float(error.mean()), fitted, "; ".join(heard[-1:])]
+    return [taken, float(errors.max()), float(errors.mean()), fitted, "; ".join(heard[-1:])]
 
 
 def _body(surface: Surface, dofs: int, hear: Callable[[str], None]) -> ElasticModes:
