@@ -19,6 +19,12 @@ from factories.plate_capture import fill_plate
 Streams = pytest.CaptureFixture[str]
 
 
+@pytest.fixture(autouse=True)
+def _at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait for no other writer."""
+    monkeypatch.setitem(StageFolder.lock.__kwdefaults__, "wait", 0.0)
+
+
 @contextmanager
 def held(folder: Path) -> Iterator[None]:
     """Let another thread make stages in a folder."""
