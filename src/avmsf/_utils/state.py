@@ -1,7 +1,9 @@
 """Tensors in files: safetensors with one text, and checkpoints of work that may be interrupted."""
 
 import io
-from collections.abc import Mapping
+import json
+from collections.abc import Callable, Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ from torch import Tensor
 
 from avmsf._utils.files import write_whole
 from avmsf._utils.headers import read_header_text, unreadable
+from avmsf._utils.text import parse_json
 from avmsf.errors import AvmsfError
 
 
@@ -28,6 +31,66 @@ def read_tensors(
             return text, {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise unreadable(path, what=what, advice=advice, raising=raising) from error
+
+
+def parse_record(
+    text: str,
+    path: Path,
+    check: Callable[[dict[str, Any]], None],
+    *,
+    formats: tuple[int, ...],
+    what: str,
+    advice: str,
+    raising: type[AvmsfError],
+) -> dict[str, Any]:
+    """Return the record that a file's header has as JSON, with a `format` and the `version` that wrote it.
+
+    `check` raises ValueError, TypeError or KeyError for a record whose entries are not those of the formats. Raises
+    `raising` for such a record, and for a format of another version.
+    """
+    try:
+        record = parse_json(text)
+        found, writer = record["format"], record["version"]
+        if found in formats:
+            check(record)
+    except (ValueError, TypeError, KeyError) as error:
+        got = f"a damaged one ({type(error).__name__}: {error})"
+        raise raising.expected(f"the header of {what}", got=got, file=path, name="header", advice=advice) from error
+    if found not in formats:
+        wanted = f"{what} in format {' or '.join(map(str, formats))}"
+        got = f"format {found}, written by avmsf {writer} (this is avmsf {version('avmsf')})"
+        advice = f"install avmsf {writer} or newer, or {advice}"
+        raise raising.expected(wanted, found, got=got, file=path, name="format", advice=advice)
+    return record
+
+
+def record_text(record: Mapping[str, Any], path: Path, *, name: str, raising: type[AvmsfError]) -> str:
+    """Return a record as JSON. Raises `raising` for what JSON does not hold, which came in its entry `name`."""
+    try:
+        return json.dumps(record, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        wanted, got = "finite numbers, text, lists and dicts", f"other values ({error})"
+        raise raising.expected(wanted, str(error), got=got, file=path, name=name) from error
+
+
+def expect_tensors(
+    tensors: Mapping[str, Tensor],
+    sizes: Mapping[str, tuple[int, ...]],
+    path: Path,
+    *,
+    dtype: torch.dtype,
+    advice: str,
+    raising: type[AvmsfError],
+) -> None:
+    """Raise `raising` unless these are the tensors of these names, sizes and type, all of finite numbers."""
+    found = {name: tuple(tensor.shape) for name, tensor in tensors.items() if tensor.dtype == dtype}
+    if found != sizes or tensors.keys() != sizes.keys():
+        wanted = f"the {str(dtype).removeprefix('torch.')} tensors {dict(sizes)}"
+        shapes = {name: list(tensor.shape) for name, tensor in tensors.items()}
+        raise raising.expected(wanted, shapes, file=path, name="tensors", advice=advice)
+    for name, tensor in tensors.items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise raising.expected(f"finite {name}", got="others", file=path, name=name, advice=advice)
 
 
 def write_checkpoint(

@@ -3,7 +3,6 @@
 {"format": 1, "version": "0.1.0", "encoder": "descriptors", "sizes": {"points": 8192, "dim": 36}, "report": {...}}
 """
 
-import json
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,7 @@ from safetensors.torch import save as to_bytes
 from torch import Tensor
 
 from avmsf._utils.files import write_whole
-from avmsf._utils.state import read_tensors
-from avmsf._utils.text import parse_json
+from avmsf._utils.state import expect_tensors, parse_record, read_tensors, record_text
 from avmsf.errors import SceneError
 from avmsf.features.feature_field import FeatureField
 from avmsf.features.header import KEY
@@ -42,14 +40,8 @@ def save_features(features: FeatureField, path: str | Path, *, report: dict[str,
         "sizes": {"points": features.features.shape[0], "dim": features.features.shape[1]},
         "report": report or {},
     }
-    _check_finite(tensors, path)
-    try:
-        text = json.dumps(record, allow_nan=False)
-    except (TypeError, ValueError) as error:
-        got = f"other values ({error})"
-        raise SceneError.expected(
-            "a report of finite numbers, text, lists and dicts", got=got, file=path, name="report"
-        ) from error
+    expect_tensors(tensors, _sizes(record), path, dtype=torch.float32, advice=_ADVICE, raising=SceneError)
+    text = record_text(record, path, name="report", raising=SceneError)
     content = to_bytes(tensors, {KEY: text})
     write_whole(path, lambda place: place.write_bytes(content), raising=SceneError)
 
@@ -61,58 +53,31 @@ def load_features(path: str | Path) -> FeatureField:
     are not those of its header.
     """
     path = Path(path)
-    text, tensors = _read(path)
-    record = _parse_record(text, path)
-    sizes = record["sizes"]
-    expected = {"points": (sizes["points"], 3), "features": (sizes["points"], sizes["dim"])}
-    found = {name: tuple(tensor.shape) for name, tensor in tensors.items() if tensor.dtype == torch.float32}
-    if found != expected or tensors.keys() != expected.keys():
-        shapes = {name: list(tensor.shape) for name, tensor in tensors.items()}
-        raise SceneError.expected(f"the float32 tensors {expected}", shapes, file=path, name="tensors", advice=_ADVICE)
-    _check_finite(tensors, path)
+    record, tensors = _read(path)
+    expect_tensors(tensors, _sizes(record), path, dtype=torch.float32, advice=_ADVICE, raising=SceneError)
     return FeatureField(tensors["points"], tensors["features"], record["encoder"])
 
 
 def read_report(path: str | Path) -> dict[str, Any]:
     """Return the report that features were saved with. Raises SceneError as `load_features`."""
-    path = Path(path)
-    return _parse_record(_read(path)[0], path)["report"]
+    return _read(Path(path))[0]["report"]
 
 
-def _read(path: Path) -> tuple[str, dict[str, Tensor]]:
-    return read_tensors(path, KEY, what="a file of features", advice=_ADVICE, raising=SceneError)
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Return the header's record after checking every entry of it, and the tensors."""
+    what = "a file of features"
+    text, tensors = read_tensors(path, KEY, what=what, advice=_ADVICE, raising=SceneError)
+    record = parse_record(text, path, _check_record, formats=(FORMAT,), what=what, advice=_ADVICE, raising=SceneError)
+    return record, tensors
 
 
-def _parse_record(text: str, path: Path) -> dict[str, Any]:
-    """Return the header's record after checking every entry of it."""
-    try:
-        record = parse_json(text)
-        found, writer = record["format"], record["version"]
-        if found == FORMAT:
-            counts = [record["sizes"][name] for name in ("points", "dim")]
-            kinds = isinstance(record["encoder"], str) and isinstance(record["report"], dict)
-            if not kinds or any(type(count) is not int or count < 1 for count in counts):
-                raise ValueError(f"sizes {record['sizes']}, encoder {record['encoder']!r}")
-    except (ValueError, TypeError, KeyError) as error:
-        got = f"a damaged one ({type(error).__name__}: {error})"
-        raise SceneError.expected(
-            "the header of a file of features", got=got, file=path, name="header", advice=_ADVICE
-        ) from error
-    if found != FORMAT:
-        raise SceneError.expected(
-            f"features of format {FORMAT}",
-            found,
-            got=f"format {found}, written by avmsf {writer} (this is avmsf {version('avmsf')})",
-            file=path,
-            name="format",
-            advice=f"install avmsf {writer} or newer, or {_ADVICE}",
-        )
-    return record
+def _check_record(record: dict[str, Any]) -> None:
+    counts = [record["sizes"][name] for name in ("points", "dim")]
+    kinds = isinstance(record["encoder"], str) and isinstance(record["report"], dict)
+    if not kinds or any(type(count) is not int or count < 1 for count in counts):
+        raise ValueError(f"sizes {record['sizes']}, encoder {record['encoder']!r}")
 
 
-def _check_finite(tensors: dict[str, Tensor], path: Path) -> None:
-    for name, tensor in tensors.items():
-        if not tensor.numel() or not bool(torch.isfinite(tensor).all()):
-            raise SceneError.expected(
-                f"finite numbers as {name}", got="others or none", file=path, name=name, advice=_ADVICE
-            )
+def _sizes(record: dict[str, Any]) -> dict[str, tuple[int, ...]]:
+    points, dim = (record["sizes"][name] for name in ("points", "dim"))
+    return {"points": (points, 3), "features": (points, dim)}

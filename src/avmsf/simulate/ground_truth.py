@@ -6,7 +6,6 @@ A file `truth.safetensors` holds the tensors under the names of their fields, an
 Format 1 is the same without `starts`; it is read too.
 """
 
-import json
 import math
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
@@ -19,8 +18,7 @@ from safetensors.torch import save as to_bytes
 from torch import Tensor
 
 from avmsf._utils.files import write_whole
-from avmsf._utils.state import read_tensors
-from avmsf._utils.text import parse_json
+from avmsf._utils.state import expect_tensors, parse_record, read_tensors, record_text
 from avmsf.errors import SimulationError
 
 FORMAT = 2
@@ -30,6 +28,7 @@ TRUTH = "truth.safetensors"
 _KEY = "avmsf_truth"
 _MODES, _TABLES = ("frequency", "damping"), ("gains", "quadrature")
 _OPTIONAL = ("contacts", "starts")
+_WHAT, _ADVICE = "the ground truth of a simulated object", "make the object with avmsf simulate"
 _RENAMED = {"modes": "elastic_modes", "contacts": "impacts"}
 """Settings of recipes in files of earlier versions, and their names now."""
 
@@ -84,17 +83,9 @@ def write_truth(truth: Truth, path: str | Path) -> None:
     path = Path(path)
     tensors = {name: getattr(truth, name) for name in (*_MODES, *_TABLES, *_OPTIONAL)}
     tensors = {name: tensor.clone().contiguous() for name, tensor in tensors.items() if tensor is not None}
-    _expect_tensors(tensors, len(truth.names), path)
     record = {"format": FORMAT, "version": version("avmsf"), "names": list(truth.names), "recipe": truth.recipe}
-    try:
-        words = json.dumps(record, allow_nan=False)
-    except (TypeError, ValueError) as error:
-        raise SimulationError(
-            f"{path}: expected settings of finite numbers, strings, lists and dicts, got others ({error})",
-            file=path,
-            name="recipe",
-            value=str(error),
-        ) from error
+    _expect(tensors, record, path)
+    words = record_text(record, path, name="recipe", raising=SimulationError)
     content = to_bytes(tensors, {_KEY: words})
     write_whole(path, lambda place: place.write_bytes(content), raising=SimulationError)
 
@@ -107,60 +98,26 @@ def read_truth(path: str | Path) -> Truth:
     """
     path = Path(path)
     path = path / TRUTH if path.is_dir() else path
-    words, tensors = _read(path)
-    record = _understand(words, path)
-    _expect_tensors(tensors, len(record["names"]), path)
+    words, tensors = read_tensors(path, _KEY, what=_WHAT, advice=_ADVICE, raising=SimulationError)
+    record = parse_record(
+        words, path, _check_record, formats=(1, FORMAT), what=_WHAT, advice=_ADVICE, raising=SimulationError
+    )
+    _expect(tensors, record, path)
     recipe = {_RENAMED.get(name, name): value for name, value in record["recipe"].items()}
     return Truth(names=tuple(record["names"]), recipe=recipe, **tensors)
 
 
-def _read(path: Path) -> tuple[str, dict[str, Tensor]]:
-    what, advice = "the ground truth of a simulated object", "make the object with avmsf simulate"
-    return read_tensors(path, _KEY, what=what, advice=advice, raising=SimulationError)
+def _check_record(record: dict[str, Any]) -> None:
+    names = record["names"]
+    listed = isinstance(names, list) and all(isinstance(name, str) for name in names)
+    if not (listed and isinstance(record["recipe"], dict)):
+        raise ValueError("names or settings of another type")
 
 
-def _understand(words: str, path: Path) -> dict[str, Any]:
-    """Return the header's record after looking at every entry of it."""
-    try:
-        record = parse_json(words)
-        found, writer, names = record["format"], record["version"], record["names"]
-        listed = isinstance(names, list) and all(isinstance(name, str) for name in names)
-        if found in (1, FORMAT) and not (listed and isinstance(record["recipe"], dict)):
-            raise ValueError("names or settings of another type")
-    except (ValueError, TypeError, KeyError) as error:
-        raise SimulationError(
-            f"{path}: expected the header of a simulated object's ground truth, got {error!r}; simulate the object "
-            "again",
-            file=path,
-            name="header",
-            value=repr(error),
-        ) from error
-    if found not in (1, FORMAT):
-        raise SimulationError(
-            f"{path}: expected a ground truth of format 1 or {FORMAT}, got format {found}, written by avmsf {writer} "
-            f"(this is avmsf {version('avmsf')}); install avmsf {writer} or newer, or simulate the object again",
-            file=path,
-            name="format",
-            value=found,
-        )
-    return record
-
-
-def _expect_tensors(tensors: dict[str, Tensor], contacts: int, path: Path) -> None:
-    modes = len(tensors["frequency"]) if "frequency" in tensors and tensors["frequency"].ndim == 1 else 0
-    expected: dict[str, tuple[int, ...]] = dict.fromkeys(_MODES, (modes,)) | dict.fromkeys(_TABLES, (contacts, modes))
-    expected |= {name: size for name, size in (("contacts", (contacts, 3)), ("starts", (contacts,))) if name in tensors}
-    found = {name: tuple(tensor.shape) for name, tensor in tensors.items() if tensor.dtype == torch.float64}
-    if found != expected or tensors.keys() != expected.keys():
-        raise SimulationError(
-            f"{path}: expected the float64 tensors {expected}, got "
-            f"{ {name: tuple(tensor.shape) for name, tensor in tensors.items()} }; simulate the object again",
-            file=path,
-            name="tensors",
-            value=sorted(name for name in expected.keys() | tensors.keys() if expected.get(name) != found.get(name)),
-        )
-    for name, tensor in tensors.items():
-        if not bool(torch.isfinite(tensor).all()):
-            raise SimulationError(
-                f"{path}: expected finite {name}, got others; simulate the object again", file=path, name=name
-            )
+def _expect(tensors: dict[str, Tensor], record: dict[str, Any], path: Path) -> None:
+    """Raise SimulationError unless the tensors fit together and to the record's names, and are finite."""
+    contacts = len(record["names"])
+    modes = tensors["frequency"].numel() if "frequency" in tensors else 0
+    sizes: dict[str, tuple[int, ...]] = dict.fromkeys(_MODES, (modes,)) | dict.fromkeys(_TABLES, (contacts, modes))
+    sizes |= {name: size for name, size in (("contacts", (contacts, 3)), ("starts", (contacts,))) if name in tensors}
+    expect_tensors(tensors, sizes, path, dtype=torch.float64, advice=_ADVICE, raising=SimulationError)
