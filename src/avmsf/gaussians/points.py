@@ -53,7 +53,7 @@ def closest_points(points: Float[Tensor, "points 3"], count: int, *, start: int 
     Raises as `farthest_points`.
     """
     _expect_rows(points, count, start)
-    distance = _distances(points.double(), start)
+    distance = (points.double() - points[start].double()).square().sum(dim=1).sqrt()
     distance[start] = -1.0
     return torch.argsort(distance, stable=True)[:count]
 
@@ -164,10 +164,6 @@ def _centers(
     if len(empty):
         means[empty[0]] = places[torch.argmax((places - means[labels]).norm(dim=1))]
     return means
-
-
-def _distances(places: Float[Tensor, "points 3"], row: int) -> Float[Tensor, " points"]:
-    return (places - places[row]).square().sum(dim=1).sqrt()
 
 
 def _expect_rows(points: Float[Tensor, "points 3"], count: int, start: int) -> None:

@@ -93,11 +93,8 @@ def _check_size(path: Path) -> None:
     if not path.is_file():
         raise CaptureError("expected a mesh file, got none")
     if suffix not in MESH_SUFFIXES:
-        raise CaptureError(
-            f"expected a mesh ({', '.join(MESH_SUFFIXES)}), got {path.suffix or 'no suffix'}",
-            name="suffix",
-            value=path.suffix,
-        )
+        wanted, got = f"expected a mesh ({', '.join(MESH_SUFFIXES)})", path.suffix or "no suffix"
+        raise CaptureError(f"{wanted}, got {got}", name="suffix", value=path.suffix)
     if is_lfs_pointer(path):
         raise CaptureError("expected a mesh, got a Git LFS pointer; run git lfs pull")
     size, most = path.stat().st_size, MAX_GLTF_BYTES if suffix == ".gltf" else MAX_BYTES
@@ -124,11 +121,8 @@ def _check_scene(scene: trimesh.Scene) -> None:
         vertices = np.asarray(getattr(geometry, "vertices", np.zeros((0, 3))), dtype=np.float64)
         _check_at_most(3 * MAX_FACES, len(vertices), "vertices")
         if vertices.shape[1:] != (3,):
-            raise CaptureError(
-                f"expected vertices of three coordinates, got {vertices.shape[1]}; export it again",
-                name="vertices",
-                value=list(vertices.shape),
-            )
+            message = f"expected vertices of three coordinates, got {vertices.shape[1]}; export it again"
+            raise CaptureError(message, name="vertices", value=list(vertices.shape))
         check_finite_vertices(vertices)
         check_corners(np.asarray(getattr(geometry, "faces", np.zeros((0, 3))), dtype=np.int64), len(vertices))
     pixels = sum(image.width * image.height for geometry in scene.geometry.values() for image in _textures(geometry))
@@ -215,11 +209,8 @@ def _check_gltf(record: Any) -> None:
     """Raise CaptureError for the JSON of a glTF that is compressed, or whose arrays or nodes are beyond the bounds."""
     for name in record.get("extensionsRequired", ()):
         if name in _COMPRESSED:
-            raise CaptureError(
-                f"expected a mesh without compression, got one compressed by {_COMPRESSED[name]}; export it without",
-                name="extensionsRequired",
-                value=name,
-            )
+            got = f"one compressed by {_COMPRESSED[name]}; export it without"
+            raise CaptureError(f"expected a mesh without compression, got {got}", name="extensionsRequired", value=name)
     _check_at_most(MAX_PARTS, len(record.get("nodes", ())), "nodes")
     # Four vectors (position, normal, color, texture) for each corner; an array without a buffer is zeros in memory.
     _check_at_most(12 * MAX_FACES, sum(abs(each["count"]) for each in record.get("accessors", ())), "values")

@@ -10,6 +10,7 @@ import numpy as np
 import scipy.special
 import torch
 from jaxtyping import Bool, Float, Float64
+from scipy.fft import next_fast_len
 from torch import Tensor
 
 from avmsf._utils.arrays import short_repr
@@ -73,7 +74,8 @@ def shape_noise(
     interpolated linearly between its bins. The white noise is drawn as its spectrum, which is white too, on the
     generator's device. Differentiable in `magnitude`.
     """
-    length = _even_length(samples)
+    # The next even length of small primes, on which an FFT is fast.
+    length = 2 * next_fast_len((samples + 1) // 2, real=True)
     frequencies = length // 2 + 1
     options: dict[str, Any] = {"dtype": torch.complex64, "device": generator.device}
     white = torch.randn(contacts, frequencies, generator=generator, **options).to(magnitude.device)
@@ -205,16 +207,3 @@ def _frame_power(sounds: Float[Tensor, "contacts samples"], fft_size: int) -> Fl
     spectrum = torch.fft.rfft(frames * window)
     # Faster than the square of abs(), which takes a root first.
     return (spectrum.real.square() + spectrum.imag.square()) / window.square().sum()
-
-
-def _even_length(samples: int) -> int:
-    """Return the next even length that factors into small primes, on which an FFT is fast."""
-    length = samples + samples % 2
-    while True:
-        rest = length
-        for prime in (2, 3, 5):
-            while rest % prime == 0:
-                rest //= prime
-        if rest == 1:
-            return length
-        length += 2

@@ -54,7 +54,8 @@ def make_body(recipe: ObjectRecipe, *, cache: Path | None, log: Callable[[str], 
 
     def compute() -> ElasticModes:
         log("dividing the body into tetrahedra")
-        solid = _uneven(recipe, make_solid())
+        part, generator = recipe.imperfections.thickness, stream(recipe.seed, "thickness")
+        solid = vary_thickness(make_solid(), part, generator=generator)
         log(f"elastic modes of {len(solid.cells)} tetrahedra")
         return _elastic(recipe, solid, legs)
 
@@ -89,11 +90,6 @@ def _made_solid(recipe: ObjectRecipe, surface: Surface) -> Solid:
         ) from error
 
 
-def _uneven(recipe: ObjectRecipe, solid: Solid) -> Solid:
-    part = recipe.imperfections.thickness
-    return solid if part == 0.0 else vary_thickness(solid, part, generator=stream(recipe.seed, "thickness"))
-
-
 def _elastic(recipe: ObjectRecipe, solid: Solid, legs: Float64[Tensor, "legs 3"]) -> ElasticModes:
     material, imperfections = material_named(recipe.material), recipe.imperfections
     middles = solid.points[solid.cells].mean(dim=1)
@@ -122,11 +118,7 @@ def _scale(recipe: ObjectRecipe, vertices: Tensor) -> float:
             "a mesh with an extent", longest, got="one point", file=recipe.mesh, name="size", advice="export it again"
         )
     if recipe.size is None and longest > _LARGEST:
-        raise SimulationError(
-            f"{recipe.mesh}: expected a mesh of at most {_LARGEST:g} m, got {longest:g} m; if it is in millimeters, "
-            f"give --size {longest / 1000:g}, else its length by --size",
-            file=recipe.mesh,
-            name="size",
-            value=longest,
-        )
+        advice = f"if it is in millimeters, give --size {longest / 1000:g}, else its length by --size"
+        wanted, got = f"a mesh of at most {_LARGEST:g} m", f"{longest:g} m"
+        raise SimulationError.expected(wanted, longest, got=got, file=recipe.mesh, name="size", advice=advice)
     return 1.0 if recipe.size is None else recipe.size / longest

@@ -50,12 +50,8 @@ def contact_times(
         times = _computed_times(hammer, material, mass=mass, speeds=speeds)
     if float(times.max()) > LONGEST:
         longest = float(times.max())
-        raise SimulationError(
-            f"hammer: expected a contact time up to {LONGEST:g} s, got {longest:.2g} s; use a lighter hammer, a "
-            "stiffer tip, or a higher speed",
-            name="hammer",
-            value=longest,
-        )
+        wanted, advice = f"a contact time up to {LONGEST:g} s", "use a lighter hammer, a stiffer tip, or a higher speed"
+        raise SimulationError.expected(wanted, longest, got=f"{longest:.2g} s", name="hammer", advice=advice)
     return times
 
 

@@ -118,7 +118,8 @@ class SoundingBody:
         the hammer's first touch arrives at the microphone, and the sound is the one that goes on once the hammer has
         left, continued back to that moment.
         """
-        times = self.times(self._speeds(places, speeds))
+        relative = torch.ones(len(places), dtype=torch.float64) if speeds is None else speeds
+        times = self.times(self.hammer.speed * relative)
         if contact_times is not None:
             times = contact_times * times
         pushed = self.elastic.gains(places, directions).to(torch.complex128) @ self.vibration.pushes.T
@@ -135,12 +136,6 @@ class SoundingBody:
         speeds = self.hammer.speed * speeds
         times = self.times(speeds) if contact_times is None else contact_times * self.times(speeds)
         return peak_forces(self.hammer, mass=self.elastic.mass, speeds=speeds, times=times)
-
-    def _speeds(
-        self, places: Float64[Tensor, "contacts 3"], speeds: Float64[Tensor, " contacts"] | None
-    ) -> Float64[Tensor, " contacts"]:
-        relative = torch.ones(len(places), dtype=torch.float64) if speeds is None else speeds
-        return self.hammer.speed * relative
 
 
 HIGHEST = 0.45

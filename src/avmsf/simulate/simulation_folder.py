@@ -37,7 +37,11 @@ def write_simulation(
     folder = Path(folder)
     try:
         with new_folder(folder, raising=SimulationError) as begun:
-            _write_recordings(simulation, begun)
+            # The whole recordings, and settings by which they are read as the simulation's own capture is.
+            capture = simulation.capture
+            impacts = replace(capture.impacts, sounds=simulation.recordings, before=None, after=None)
+            seconds = capture.settings.seconds if capture.settings.align else None
+            write_capture(replace(capture, surface=None, impacts=impacts), begun, onsets_within=seconds)
             for sound in begun.glob("*.wav"):
                 _forget_the_hour(sound)
             if simulation.recipe.surface:
@@ -50,14 +54,6 @@ def write_simulation(
         ) from error
 
 
-def _write_recordings(simulation: Simulation, folder: Path) -> None:
-    """Write the whole recordings, and settings by which they are read as the simulation's own capture is."""
-    capture = simulation.capture
-    impacts = replace(capture.impacts, sounds=simulation.recordings, before=None, after=None)
-    seconds = capture.settings.seconds if capture.settings.align else None
-    write_capture(replace(capture, surface=None, impacts=impacts), folder, onsets_within=seconds)
-
-
 def is_written(recipe: ObjectRecipe, folder: str | Path) -> bool:
     """Return whether the folder holds the object of this recipe, made by this version of the package.
 
@@ -67,20 +63,15 @@ def is_written(recipe: ObjectRecipe, folder: str | Path) -> bool:
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return False
     if not (folder / TRUTH).is_file():
-        raise SimulationError(
-            f"{folder}: expected a simulated object or no files, got no {TRUTH}; choose another name or remove it",
-            file=folder,
-            name=TRUTH,
+        advice = "choose another name or remove it"
+        raise SimulationError.expected(
+            "a simulated object or no files", got=f"no {TRUTH}", file=folder, name=TRUTH, advice=advice
         )
     found, wanted = read_truth(folder).recipe, recipe.values()
     if found != wanted:
         differing = sorted(key for key in found.keys() | wanted.keys() if found.get(key) != wanted.get(key))
-        raise SimulationError(
-            f"{folder}: expected an object of these settings, got another {', '.join(differing)}; remove it, or choose "
-            "another folder",
-            file=folder,
-            value=differing,
-        )
+        got, advice = f"another {', '.join(differing)}", "remove it, or choose another folder"
+        raise SimulationError.expected("an object of these settings", differing, got=got, file=folder, advice=advice)
     return True
 
 

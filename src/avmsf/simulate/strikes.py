@@ -10,6 +10,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float64, Int
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from avmsf.errors import SimulationError
 from avmsf.mesh.closest_point import ClosestPoints
@@ -55,13 +56,13 @@ def draw_strikes(
     inward = -normals
     offsets = _across(normals, imperfections.contact, generator=stream(seed, "contact jitter"))
     tilts = _across(normals, math.radians(imperfections.direction), generator=stream(seed, "direction jitter"))
-    directions = inward + torch.tan(tilts.norm(dim=1, keepdim=True)) * _unit(tilts)
+    directions = inward + torch.tan(tilts.norm(dim=1, keepdim=True)) * normalize(tilts, eps=1e-300)
     speeds = stream(seed, "speeds").standard_normal(count)
     times = stream(seed, "contact times").standard_normal(count)
     errors = stream(seed, "force errors").standard_normal(count)
     return Strikes(
         places=places,
-        directions=_unit(directions),
+        directions=normalize(directions, eps=1e-300),
         written_places=nearest_on(surface, places + offsets) if imperfections.contact > 0.0 else places,
         written_directions=inward,
         speeds=torch.from_numpy(np.exp(imperfections.speed * speeds)),
@@ -85,11 +86,9 @@ def _reached(
     """Return `_CANDIDATES` times `count` places that a hammer reaches, drawn evenly by area, and their normals."""
     mesh = trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=False)
     if not (len(mesh.faces) and math.isfinite(mesh.area) and mesh.area > 0.0):
-        raise SimulationError(
-            f"surface: expected triangles with an area, got {len(mesh.faces)} without; give a mesh with faces",
-            name="surface",
-            value=len(mesh.faces),
-        )
+        count, advice = len(mesh.faces), "give a mesh with faces"
+        got = f"{count} without"
+        raise SimulationError.expected("triangles with an area", count, got=got, name="surface", advice=advice)
     generator = stream(seed, "contacts")
     wanted = _CANDIDATES * count
     places, normals, drawn = np.zeros((0, 3)), np.zeros((0, 3)), 0
@@ -140,7 +139,3 @@ def _across(
     """Return Gaussian vectors across the normals whose lengths have this root mean square."""
     drawn = torch.from_numpy(generator.standard_normal(tuple(normals.shape)))
     return spread / math.sqrt(2.0) * (drawn - (drawn * normals).sum(dim=1, keepdim=True) * normals)
-
-
-def _unit(vectors: Float64[Tensor, "contacts 3"]) -> Float64[Tensor, "contacts 3"]:
-    return vectors / vectors.norm(dim=1, keepdim=True).clamp(min=1e-300)

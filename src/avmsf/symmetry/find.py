@@ -102,8 +102,9 @@ def _symmetries(group: Group, spacing: float, middle: Float[np.ndarray, " 3"], d
     ]
 
     def vectors(found: ScoredMotion) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
-        point = middle + diagonal * found.motion.centered().point
-        return torch.from_numpy(_pointing(found.motion.direction)), torch.from_numpy(point)
+        point, direction = middle + diagonal * found.motion.centered().point, found.motion.direction
+        # Of two opposite vectors the one whose largest number is positive.
+        return torch.from_numpy(direction * np.sign(direction[np.argmax(np.abs(direction))])), torch.from_numpy(point)
 
     turns = sorted(group.turns, key=lambda each: (not each.continuous, -(each.order or 0), each.error))
     mirrors = sorted(group.mirrors, key=lambda each: each.error)
@@ -144,8 +145,3 @@ def _normalized(
     # A box along the principal axes: the diagonal must not depend on how the object lies.
     diagonal = float(np.linalg.norm(np.ptp((places - middle) @ axes.T, axis=0)))
     return (places - middle) / diagonal, middle, diagonal
-
-
-def _pointing(direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
-    """Return the one of two opposite vectors whose largest number is positive."""
-    return direction * np.sign(direction[np.argmax(np.abs(direction))])

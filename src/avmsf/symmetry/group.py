@@ -171,7 +171,8 @@ class Group:
         """Drop the worse of planes that cross at less than 15 degrees, which an axis of at most 12 turns lacks."""
         for each in sorted(self.mirrors, key=lambda mirror: mirror.error):
             if each in self.mirrors:
-                worse = [other for other in self.mirrors if other.error > each.error and _crowded(each, other)]
+                near = [m for m in self.mirrors if each.motion.separation(m.motion)[0] < 180 / MAX_ORDER - 2]
+                worse = [other for other in near if other.error > each.error]
                 self.rejected += worse
                 self.mirrors = [other for other in self.mirrors if other not in worse]
 
@@ -227,10 +228,6 @@ def is_ball(continuous: list[ScoredMotion]) -> bool:
 def _angles(order: int) -> tuple[float, ...]:
     """Return an order's turns up to the half one; the others are their reverse."""
     return tuple(2 * math.pi * step / order for step in range(1, order // 2 + 1))
-
-
-def _crowded(one: ScoredMotion, other: ScoredMotion) -> bool:
-    return one.motion.separation(other.motion)[0] < 180 / MAX_ORDER - 2
 
 
 def _same(one: Motion, other: Motion) -> bool:

@@ -104,46 +104,33 @@ def _no_mode(sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> E
     """Return the error for sounds without modes: `name` is the property at fault, `value` how large it is."""
     samples = sounds.shape[1]
     duration = samples / sample_rate
+    expected = f"{SHORTEST} samples or more"
+
+    def failed(got: str, advice: str, name: str, value: float) -> ExtractionError:
+        return ExtractionError(f"expected {expected}, got {got}; {advice}", name=name, value=value)
+
     if samples < SHORTEST:
-        return ExtractionError(
-            f"expected {SHORTEST} samples or more, got {samples} ({duration:.3g} s) in each of {len(sounds)} "
-            "recordings; use more seconds after the onset",
-            name="samples",
-            value=samples,
-        )
+        got = f"{samples} ({duration:.3g} s) in each of {len(sounds)} recordings"
+        return failed(got, "use more seconds after the onset", "samples", samples)
     lowest = lowest_frequency(samples, sample_rate)
     moving = sounds.to(torch.float64) - sounds.mean(1, keepdim=True)
     tenth = samples // 10
     head, tail = (float(part.square().mean()) for part in (moving[:, :tenth], moving[:, -tenth:]))
+    expected = "sound"
     if head + tail == 0:
-        return ExtractionError(
-            f"expected sound, got silence in all {len(sounds)} recordings; check the channel", name="sounds", value=0.0
-        )
+        return failed(f"silence in all {len(sounds)} recordings", "check the channel", "sounds", 0.0)
     fall = 10 * math.log10(max(head, 1e-30) / max(tail, 1e-30))
-    expected = (
-        f"expected modes from {lowest:.0f} to {sample_rate / 2:.0f} Hz in {len(sounds)} recordings of {duration:.3g} s"
-    )
+    band = f"{lowest:.0f} to {sample_rate / 2:.0f} Hz"
+    expected = f"modes from {band} in {len(sounds)} recordings of {duration:.3g} s"
     power = torch.fft.rfft(moving).abs().square().sum(0)
     below = float(power[: math.ceil(lowest * duration)].sum() / power.sum())
     if fall < 6:
-        return ExtractionError(
-            f"{expected}, got noise or hum that decays by {fall:.0f} dB; check the onset and the noise (avmsf check), "
-            "or record louder impacts",
-            name="decay",
-            value=fall,
-        )
+        advice = "check the onset and the noise (avmsf check), or record louder impacts"
+        return failed(f"noise or hum that decays by {fall:.0f} dB", advice, "decay", fall)
     if below > 0.5:
-        return ExtractionError(
-            f"{expected}, got {100 * below:.0f} % of the energy below {lowest:.0f} Hz; use more seconds after the "
-            "onset, which lowers this limit",
-            name="energy",
-            value=below,
-        )
-    return ExtractionError(
-        f"{expected}, got none above the noise; record at a higher rate, closer, or a less damped object",
-        name="modes",
-        value=0,
-    )
+        advice = "use more seconds after the onset, which lowers this limit"
+        return failed(f"{100 * below:.0f} % of the energy below {lowest:.0f} Hz", advice, "energy", below)
+    return failed("none above the noise", "record at a higher rate, closer, or a less damped object", "modes", 0)
 
 
 def extract_once(train: Impacts, method: ModeFinder, path: Path, *, needed: bool = False) -> Extraction:

@@ -70,7 +70,7 @@ def _predicted(modes: Extraction, impacts: Impacts) -> Float64[Tensor, " contact
     facing = torch.ones_like(distance)
     if impacts.directions is not None:
         facing = impacts.directions.double() @ impacts.directions.double().T
-    best, chosen = -math.inf, along
+    best, chosen, share = -math.inf, along, along.square().sum(0) / along.square().sum()
     for length, noise in itertools.product(_LENGTHS, _NOISES):
         kernel = facing * torch.exp(-0.5 * (distance / length).square())
         whole = kernel + noise * torch.eye(len(kernel), dtype=torch.float64)
@@ -78,13 +78,8 @@ def _predicted(modes: Extraction, impacts: Impacts) -> Float64[Tensor, " contact
         solved = inverse @ along
         scale = (along * solved).sum(0).clamp_min(1e-300)
         # Each mode's own variance is integrated out.
-        likelihood = -0.5 * len(along) * (scale.log() * _share(along)).sum() - 0.5 * torch.logdet(whole)
+        likelihood = -0.5 * len(along) * (scale.log() * share).sum() - 0.5 * torch.logdet(whole)
         if float(likelihood) > best:
             best, chosen = float(likelihood), along - solved / torch.diagonal(inverse)[:, None]
     sizes = (along.norm(dim=1) * chosen.norm(dim=1)).clamp_min(1e-300)
     return (along * chosen).sum(1) / sizes
-
-
-def _share(along: Float64[Tensor, "contacts modes"]) -> Float64[Tensor, " modes"]:
-    energy = along.square().sum(0)
-    return energy / energy.sum()

@@ -177,10 +177,6 @@ def prune(
     return bank.take(strongest)
 
 
-def _determinants(own: Float64[Tensor, "modes 2 2"]) -> Float64[Tensor, " modes"]:
-    return own[:, 0, 0] * own[:, 1, 1] - own[:, 0, 1] * own[:, 1, 0]
-
-
 def _explained(
     own: Float64[Tensor, "modes 2 2"], products: Float64[Tensor, "modes 2 contacts"]
 ) -> Float64[Tensor, "modes contacts"]:
@@ -188,4 +184,4 @@ def _explained(
     sine, cosine = products.unbind(1)
     crossed = (own[:, 0, 1] + own[:, 1, 0])[:, None] * sine * cosine
     energy = own[:, 1, 1, None] * sine.square() - crossed + own[:, 0, 0, None] * cosine.square()
-    return energy / _determinants(own)[:, None]
+    return energy / (own[:, 0, 0] * own[:, 1, 1] - own[:, 0, 1] * own[:, 1, 0])[:, None]

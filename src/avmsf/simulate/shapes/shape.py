@@ -14,14 +14,6 @@ from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.simulate.shapes.body import Body
 
 
-def _origin() -> Tensor:
-    return torch.zeros(3, dtype=torch.float64)
-
-
-def _no_planes() -> Tensor:
-    return torch.zeros(0, 3, dtype=torch.float64)
-
-
 @dataclass(frozen=True, eq=False)
 class Symmetry:
     """Rotations about one axis and mirror planes that are symmetries of a shape; compositions are not listed."""
@@ -31,9 +23,9 @@ class Symmetry:
     order: int | None = None
     """Turns by 1/order are symmetries; None with an axis means every angle (of the shape that the triangles
     approximate), and every plane that contains the axis."""
-    mirrors: Float64[Tensor, "planes 3"] = field(default_factory=_no_planes)
+    mirrors: Float64[Tensor, "planes 3"] = field(default_factory=lambda: torch.zeros(0, 3).double())
     """Unit normals of mirror planes, apart from those that contain an axis of every angle."""
-    point: Float64[Tensor, " 3"] = field(default_factory=_origin)
+    point: Float64[Tensor, " 3"] = field(default_factory=lambda: torch.zeros(3).double())
     """A point of the axis and of all planes, object frame, meters."""
 
 

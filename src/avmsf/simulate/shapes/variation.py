@@ -114,9 +114,7 @@ def _repaired(solid: Solid, motion: Float64[np.ndarray, "points 3"]) -> Float64[
         motion = motion.copy()
         for axis in range(3):
             motion[touched, axis] = np.bincount(which.ravel(), weights=means[:, axis]) / number
-    raise SimulationError(
-        f"part: expected a variation that keeps all tetrahedra, got {len(crushed)} of {len(cells)} inverted; vary the "
-        "thickness less, or make the tetrahedra with another detail",
-        name="part",
-        value=len(crushed),
-    )
+    got = f"{len(crushed)} of {len(cells)} inverted"
+    advice = "vary the thickness less, or make the tetrahedra with another detail"
+    wanted = "a variation that keeps all tetrahedra"
+    raise SimulationError.expected(wanted, len(crushed), got=got, name="part", advice=advice)
