@@ -145,20 +145,16 @@ class Shots:
 
 @dataclass(frozen=True)
 class FewerViews:
-    """The same training contacts, with all views of the object and with fewer."""
+    """The training contacts of `Farthest`, with all views of the object and with fewer."""
 
     counts: tuple[int | None, ...] = (None, 12)
     """Numbers of views; None is all."""
-    choosing: Choosing = Farthest()
-    """How training contacts are chosen."""
 
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
-        """Return the cases of `choosing`, once for each number of views."""
-        return tuple(
-            Case("all views" if views is None else f"{views} views", case.train, case.test, case.fold, views)
-            for views in self.counts
-            for case in self.choosing.cases(impacts)
-        )
+        """Return the case of `Farthest`, once for each number of views."""
+        (case,) = Farthest().cases(impacts)
+        labels = {views: "all views" if views is None else f"{views} views" for views in self.counts}
+        return tuple(replace(case, label=label, views=views) for views, label in labels.items())
 
 
 @dataclass(frozen=True, eq=False)

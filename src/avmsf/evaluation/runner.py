@@ -280,7 +280,7 @@ class CaseRun:
 
 
 def run_object(
-    evaluation: Evaluation, identifier: str, results: ResultsFolder, log: Callable[[str], None] | None = None
+    evaluation: Evaluation, identifier: str, results: ResultsFolder, log: Callable[[str], None] = lambda message: None
 ) -> None:
     """Evaluate all methods on one object, except those with stored results; each result is stored at once.
 
@@ -345,17 +345,14 @@ def digest_of(impacts: Impacts, truth: Truth | None) -> str:
     return digest.hexdigest()
 
 
-def _run_case(
-    run: CaseRun, record: ObjectRecord, results: ResultsFolder, log: Callable[[str], None] | None
-) -> ObjectRecord:
+def _run_case(run: CaseRun, record: ObjectRecord, results: ResultsFolder, log: Callable[[str], None]) -> ObjectRecord:
     """Run the methods that have no figures in a case, and return the object's record with them."""
     key = run.case.key
     for method in run.evaluation.methods:
         digest = method.digest(run.data.identifier) if isinstance(method, RecordedMethod) else ""
         if record.done(key, method.name, digest):
             continue
-        if log is not None:
-            log(f"{key}, {method.name}")
+        log(f"{key}, {method.name}")
         outcome = replace(run.outcome(method), digest=digest)
         cases = tuple(run.described(case) if case.key == key else case for case in record.cases)
         record = replace(record, cases=cases).adding(outcome)

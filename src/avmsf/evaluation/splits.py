@@ -242,14 +242,8 @@ class MetricSettings:
 
         `truth`, if known, has the rows of `test`; its time counts from the first sample of the recordings, as the
         renderer's does (`truth_from_first_sample`). `loudest` is the peak of the object's loudest recording, in the
-        unit of the recordings. Raises as `score`, and EvaluationError for sounds of another sample rate.
+        unit of the recordings. Raises as `score`.
         """
-        if renderer.sample_rate != test.sample_rate:
-            raise EvaluationError(
-                f"expected a renderer at the recordings' {test.sample_rate:g} Hz, got {renderer.sample_rate:g} Hz",
-                name="sample_rate",
-                value=renderer.sample_rate,
-            )
         if self.level == "full-scale" and loudest > 0:
             sounds, test = sounds / loudest, replace(test, sounds=test.sounds / loudest)
         scores = score(sounds, test)
