@@ -5,12 +5,13 @@ import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
 import soundfile
 import torch
-from jaxtyping import Float, Float64, UInt8
+from jaxtyping import Float, Float64
 from matplotlib import colormaps
 from PIL import Image
 from scipy.signal import resample_poly
@@ -97,18 +98,13 @@ class StoredSound:
         return f"data:audio/flac;base64,{base64.b64encode(self.content).decode()}"
 
 
-def draw_spectrogram(sound: StoredSound, *, loudest: float | None) -> str:
+def draw_spectrogram(sound: StoredSound, *, loudest: float) -> str:
     """Return the address of a picture of a sound: time to the right, frequency upwards on a logarithmic scale.
 
-    Colors span 80 dB below `loudest`, dB, the brightest point of the recording it is compared with; None is its own.
+    Colors span 80 dB below `loudest`, dB, the brightest point of the recording it is compared with.
     """
-    top = float(sound.levels.max()) if loudest is None else loudest
-    shown = ((sound.levels - top) / RANGE_DB + 1).clamp(0, 1).flip(0)
-    return _png((shown * 255).round().to(torch.uint8).numpy())
-
-
-def _png(shades: UInt8[np.ndarray, "height width"]) -> str:
-    picture = Image.fromarray(shades).convert("P")
+    shown = ((sound.levels - loudest) / RANGE_DB + 1).clamp(0, 1).flip(0)
+    picture = Image.fromarray((shown * 255).round().to(torch.uint8).numpy()).convert("P")
     colors = (colormaps[SEQUENTIAL](np.arange(256))[:, :3] * 255).round().astype(np.uint8)
     picture.putpalette(colors.tobytes())
     memory = io.BytesIO()
@@ -151,8 +147,8 @@ def _contacts(records: Sequence[ObjectRecord]) -> Iterator[StoredContact]:
     """Yield contacts with sounds: one of each object first, then a second one, and so on."""
     stored = [record for record in records if any(case.sounds for case in record.cases)]
     chosen = [list(stored_contacts(stored[row])) for row in spread(len(stored), OBJECTS)]
-    for place in range(max(map(len, chosen), default=0)):
-        yield from (contacts[place] for contacts in chosen if place < len(contacts))
+    for contacts in zip_longest(*chosen):
+        yield from filter(None, contacts)
 
 
 def stored_contacts(record: ObjectRecord) -> Iterator[StoredContact]:
@@ -168,20 +164,8 @@ def stored_contacts(record: ObjectRecord) -> Iterator[StoredContact]:
         yield StoredContact(record, name, file, made)
 
 
-@dataclass(frozen=True)
-class _Card:
-    """One sound on the page."""
-
-    title: str
-    words: str
-    picture: str
-    """Address of its spectrogram."""
-    sound: str
-    """Address of its file."""
-
-    @property
-    def size(self) -> int:
-        return len(self.picture) + len(self.sound)
+_Card = dict[str, str]
+"""One sound on the page: its `title`, `words` on it, and the addresses of its `picture` and its `sound`."""
 
 
 def _listening(records: Sequence[ObjectRecord], folder: Path) -> dict[str, list[tuple[str, list[_Card]]]]:
@@ -190,7 +174,7 @@ def _listening(records: Sequence[ObjectRecord], folder: Path) -> dict[str, list[
     size = 0
     for contact in _contacts(records):
         cards = list(_cards(contact, folder))
-        size += sum(card.size for card in cards)
+        size += sum(len(card["picture"]) + len(card["sound"]) for card in cards)
         if size > LARGEST:
             break
         facts = contact.record
@@ -203,16 +187,19 @@ def _listening(records: Sequence[ObjectRecord], folder: Path) -> dict[str, list[
 def _cards(contact: StoredContact, folder: Path) -> Iterator[_Card]:
     recorded = StoredSound.read(folder / contact.recorded)
     loudest, seconds = float(recorded.levels.max()), len(recorded.samples) / recorded.sample_rate
-    span = f"{seconds:.2g} s, {recorded.lowest:.0f} Hz to {recorded.sample_rate / 2:.0f} Hz"
-    yield _Card("recorded", span, draw_spectrogram(recorded, loudest=loudest), recorded.address)
+
+    def card(title: str, words: str, sound: StoredSound) -> _Card:
+        picture = draw_spectrogram(sound, loudest=loudest)
+        return {"title": title, "words": words, "picture": picture, "sound": sound.address}
+
+    yield card("recorded", f"{seconds:.2g} s, {recorded.lowest:.0f} Hz to {recorded.sample_rate / 2:.0f} Hz", recorded)
     several = len({case.label for case, _ in contact.made}) > 1
     for case, outcome in contact.made:
-        title = f"{outcome.method}, {case.label}" if several else outcome.method
         row = case.test.index(contact.name)
         scores = [
             f"{heading} {figure(values[row])}"
             for metric, heading in (("l1", "L1"), ("l1_log", "L1-log"), ("relative_stft", "relative STFT"))
             if (values := outcome.values.get(metric)) is not None
         ]
-        sound = StoredSound.read(folder / outcome.sounds[contact.name])
-        yield _Card(title, ", ".join(scores), draw_spectrogram(sound, loudest=loudest), sound.address)
+        title = f"{outcome.method}, {case.label}" if several else outcome.method
+        yield card(title, ", ".join(scores), StoredSound.read(folder / outcome.sounds[contact.name]))

@@ -82,23 +82,14 @@ class _Fourier(nn.Module):
         return torch.cat([values[:, None], angles.sin(), angles.cos()], dim=1)
 
 
-class _Duration(nn.Module):
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.time_positional_embedding = nn.Sequential(_Fourier(), nn.Linear(257, width))
-
-    def forward(self, seconds: Float[Tensor, " batch"]) -> Float[Tensor, "batch 1 width"]:
-        token: Tensor = self.time_positional_embedding(seconds.clamp(0.0, LONGEST) / LONGEST)
-        return token[:, None]
-
-
 class _Generator(nn.Module):
     def __init__(self, sizes: PublishedSizes) -> None:
         super().__init__()
         width = sizes.width
         self.fc = nn.Sequential(nn.Linear(width, width), nn.ReLU())
-        # The published name.
-        self.duration_emebdder = _Duration(width)
+        # The published names.
+        embedding = nn.Sequential(_Fourier(), nn.Linear(257, width))
+        self.duration_emebdder = nn.ModuleDict({"time_positional_embedding": embedding})
         self.transformer = _diffusers()[1](
             **sizes.transformer, joint_attention_dim=width, pooled_projection_dim=width, guidance_embeds=False
         )
@@ -184,8 +175,9 @@ class PublishedSonicGauss(nn.Module):
         What is pooled of the tokens stays, as published.
         """
         pooled = self.generator.fc(tokens.mean(1))
-        duration = self.generator.duration_emebdder(times.new_full((len(times),), seconds))
-        states = torch.cat([tokens, duration], dim=1)
+        embedding = self.generator.duration_emebdder["time_positional_embedding"]
+        duration = embedding(times.new_full((len(times),), min(max(seconds, 0.0), LONGEST) / LONGEST))
+        states = torch.cat([tokens, duration[:, None]], dim=1)
         found: Tensor = self.generator.transformer(
             hidden_states=latents,
             timestep=times,
