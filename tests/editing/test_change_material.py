@@ -10,7 +10,7 @@ from avmsf.editing.material import (
     ACCELERATION,
     DISPLACEMENT,
     LAWS,
-    MAX_MISFIT_RATIO,
+    MAX_MISMATCH,
     RATIO_ONLY,
     VELOCITY,
     change_material,
@@ -234,7 +234,7 @@ def test_the_material_is_guessed_by_its_dampings(material):
     # A normal deviation of .1 has its middle at .067; one mode that is quite off counts for little.
     assert 1.02 < ratio < 1.12
     assert second > ratio
-    assert guess_materials(ModalBank(field.bank.frequency, 30 * field.bank.frequency))[0][1] > MAX_MISFIT_RATIO
+    assert guess_materials(ModalBank(field.bank.frequency, 30 * field.bank.frequency))[0][1] > MAX_MISMATCH
 
 
 def test_supporting_poles_say_nothing_about_the_material():

@@ -143,7 +143,7 @@ def _check(old: Material, new: Material, size: float) -> None:
             raise EditError.expected(wanted, (material.alpha, material.beta), name=name)
 
 
-MAX_MISFIT_RATIO = 1.5
+MAX_MISMATCH = 1.5
 """By which factor, up or down, the middle one of a field's dampings may miss a law that is said to fit."""
 
 
@@ -196,7 +196,7 @@ def infer_material(field: SoundField, *, option: str, new: Material | None = Non
     body = ProbableBody.of(report)
     stiff = "" if body is None else f", and the most probable body has {body.specific_stiffness}"
     guesses = guess_materials(bank, _weight(field), materials=MATERIALS.values() if body is None else body.materials)
-    if not guesses or guesses[0][1] > MAX_MISFIT_RATIO:
+    if not guesses or guesses[0][1] > MAX_MISMATCH:
         near = [f": the nearest, {each.name}, differs by a factor of {ratio:.3g}" for each, ratio in guesses[:1]]
         wanted = f"the present material, as none has the dampings of the modes{''.join(near)}{stiff}"
         found = guesses[0][0].name if guesses else None

@@ -43,7 +43,7 @@ class Conditioning:
 
 
 class StableAudio:
-    """A `StableAudioPipeline` as an `AudioDiffusion`: its autoencoder, text encoder and denoiser; all frozen."""
+    """A `StableAudioPipeline`: its autoencoder, text encoder and denoiser; all frozen."""
 
     def __init__(self, pipeline: Any, *, name: str, seconds: float | None = None) -> None:
         """Wrap a pipeline on whatever device it is.
