@@ -242,7 +242,7 @@ def test_only_the_current_revision_is_prepared_and_symmetries_once(
     finder = plate.studio.searches.finder_of(plate.studio.session.current)
     _ = finder.symmetries
     assert len(searched) == 1
-    assert {"locator", "_tempering_factor"} <= vars(finder).keys() | vars(finder.locator).keys()
+    assert {"locator", "tempering_factor"} <= vars(finder).keys() | vars(finder.locator).keys()
 
 
 @pytest.mark.slow
