@@ -63,24 +63,18 @@ class Dataset(Protocol):
     @property
     def name(self) -> str:
         """Name of the dataset in reports."""
-        ...
 
     def objects(self) -> tuple[str, ...]:
         """Return the identifiers of all objects that have recordings here, in natural order."""
-        ...
 
     def facts(self, identifier: str) -> ObjectFacts:
         """Return an object's name and material. Raises DatasetError for an unknown one."""
-        ...
 
     def capture(self, identifier: str) -> Capture:
         """Read one object's recordings. Raises DatasetError for an unknown or an incomplete one."""
-        ...
 
     def visual_source(self, identifier: str) -> VisualSource | None:
         """Return the object's visual source; None where there is neither mesh nor photograph."""
-        ...
 
     def check(self) -> DatasetReport:
         """Report available and missing data, without reading the sounds."""
-        ...

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -68,6 +67,8 @@ class RealImpact:
     def __init__(self, folder: str | Path, *, time_zero: str | None = None) -> None:
         self.folder = Path(folder)
         self._settings = SETTINGS.starting(time_zero)
+        folders = (path for path in self.folder.iterdir() if (path / FOLDER).is_dir() and path.name[0] != ".")
+        self._objects = in_order(path.name for path in folders)
 
     def objects(self) -> tuple[str, ...]:
         """Return the names of all objects with recordings, by their numbers."""
@@ -135,10 +136,6 @@ class RealImpact:
         if knotted:
             remarks.append(f"the meshes of {', '.join(knotted)} are self-intersecting")
         return DatasetReport(self.name, reports, tuple(missing), tuple(remarks))
-
-    @cached_property
-    def _objects(self) -> tuple[str, ...]:
-        return in_order(path.name for path in self.folder.iterdir() if (path / FOLDER).is_dir() and path.name[0] != ".")
 
     def _check_known(self, identifier: str) -> None:
         if identifier not in self.objects():

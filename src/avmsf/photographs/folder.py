@@ -21,12 +21,11 @@ from avmsf.errors import CaptureError, Remark
 from avmsf.mesh.io import load_parts
 from avmsf.photographs.cameras import Camera, View, nearest_to_lines
 from avmsf.photographs.colmap import PLACES, find_model, read_colmap, read_points
-from avmsf.photographs.nerf_json import load_record, read_transforms
+from avmsf.photographs.nerf_json import OPENCV_FROM_OPENGL, load_record, read_transforms
 from avmsf.photographs.shots import Shot, Shots, read_view, summarize, without_camera
 
 MIN_VIEWS = 3
 _NO_CAMERAS = "neither: photographs without cameras need structure from motion first"
-_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def read_views(
@@ -197,7 +196,7 @@ def write_views(views: Sequence[View], folder: str | Path) -> None:
 
 def _frame(name: str, view: View) -> dict[str, Any]:
     camera = view.camera
-    pose = np.linalg.inv(camera.world_to_camera.cpu().numpy()) @ _OPENCV_FROM_OPENGL
+    pose = np.linalg.inv(camera.world_to_camera.cpu().numpy()) @ OPENCV_FROM_OPENGL
     frame = {
         "file_path": f"images/{name}",
         "transform_matrix": pose.tolist(),

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from avmsf._utils.text import listed, read_json
 from avmsf.capture.filenames import PICTURE_SUFFIXES
@@ -21,6 +20,8 @@ from avmsf.photographs.lenses import Lens
 from avmsf.photographs.shots import Shot, Shots, refuse_many
 
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Axes of cameras: y and z the other way; its own inverse."""
 FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 # Poses written with four digits and rotations that drifted by rounding pass; shears and scales do not.
@@ -52,7 +53,8 @@ def read_transforms(path: Path) -> Shots:
         settings = ChainMap(frame, common)
         mask = path.parent / _text(frame, "mask_path", where) if frame.get("mask_path") else None
         _camera_model(settings, where)
-        shots.append(Shot(name, image, _opencv_from_opengl(pose), partial(_lens, settings, where), mask))
+        world_to_camera = torch.from_numpy(np.linalg.inv(pose @ OPENCV_FROM_OPENGL))
+        shots.append(Shot(name, image, world_to_camera, partial(_lens, settings, where), mask))
     message = f"poses have a scaled rotation; the scale was removed: {listed(scaled)}"
     return Shots(path, tuple(shots), (Remark(message, name="transform_matrix", value=scaled),) if scaled else ())
 
@@ -226,12 +228,3 @@ def _rigid(matrix: Float[np.ndarray, "rows 4"], where: Location) -> tuple[Float[
     rigid = np.eye(4)
     rigid[:3, :3], rigid[:3, 3] = left @ right, matrix[:3, 3]
     return rigid, scale
-
-
-def _opencv_from_opengl(camera_to_world: Float[np.ndarray, "4 4"]) -> Float[Tensor, "4 4"]:
-    """Return world to camera with OpenCV's axes from a rigid camera-to-world matrix with OpenGL's."""
-    turned = camera_to_world * np.array([1.0, -1.0, -1.0, 1.0])
-    inverse = np.eye(4)
-    inverse[:3, :3] = turned[:3, :3].T
-    inverse[:3, 3] = -turned[:3, :3].T @ turned[:3, 3]
-    return torch.from_numpy(inverse)

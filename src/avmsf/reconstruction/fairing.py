@@ -129,6 +129,5 @@ def _normals(
     corners = places[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     total = np.zeros_like(places)
-    for corner in range(3):
-        np.add.at(total, faces[:, corner], across)
+    np.add.at(total, faces.ravel(), np.repeat(across, 3, axis=0))
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
