@@ -21,7 +21,7 @@ from avmsf.field.training import Targets, TrainingRun
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
 from avmsf.modal.modes import ModalBank
-from avmsf.modal.synthesis import synthesize_phased
+from avmsf.modal.synthesis import synthesize
 from factories.plate_field import PLATE, QUICK, RATE, plate_extraction, plate_features, plate_impacts
 from factories.raising import raises
 from oracles.plate import plate_modes
@@ -148,7 +148,7 @@ def test_modes_that_start_late_keep_their_phase_unless_sines_are_asked_for(phase
     impacts = plate_impacts()
     modes = plate_extraction(impacts)
     turn = torch.full((len(modes.bank),), 1.2, dtype=torch.float64)
-    late = synthesize_phased(
+    late = synthesize(
         modes.gains, modes.bank.frequency, modes.bank.damping, turn, samples=impacts.sounds.shape[1], sample_rate=RATE
     )
     amplitudes = {"gains": modes.gains * math.cos(1.2), "quadrature": modes.gains * math.sin(1.2)}

@@ -22,7 +22,7 @@ from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
-from avmsf.modal.synthesis import synthesize_phased
+from avmsf.modal.synthesis import synthesize
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig
 from factories.made_dome import STIFFER, WALLS, bodies, dome, points, truth
@@ -70,7 +70,7 @@ def recorded(count: int, seed: int = 0) -> tuple[Impacts, Extraction]:
     directions = -truth(WALLS[1]).normals(contacts)
     bank, gains = modes_of(contacts, directions)
     still = torch.zeros_like(bank.frequency)
-    sounds = synthesize_phased(gains, bank.frequency, bank.damping, still, samples=SAMPLES, sample_rate=RATE)
+    sounds = synthesize(gains, bank.frequency, bank.damping, still, samples=SAMPLES, sample_rate=RATE)
     sounds = sounds + LEVEL * torch.randn(sounds.shape, generator=generator)
     names = tuple(f"dome/{row:02d}" for row in range(count))
     impacts = Impacts(contacts, sounds, RATE, names, directions.float())

@@ -112,14 +112,8 @@ def _model_folder(source: str | Path) -> tuple[Path, str]:
     if folder.is_dir():
         return folder, f"DINOv2 from the folder {folder.resolve().name}"
     if name not in MODELS:
-        raise SceneError.expected(
-            f"a folder with {_CONFIG} and {_WEIGHTS}, or one of {', '.join(MODELS)}",
-            name,
-            got="no such folder",
-            name="encoder",
-            file=folder,
-            advice="check the path",
-        )
+        wanted, got = f"a folder with {_CONFIG} and {_WEIGHTS}, or one of {', '.join(MODELS)}", "no such folder"
+        raise SceneError.expected(wanted, name, got=got, name="encoder", file=folder, advice="check the path")
     _transformers()
     from huggingface_hub import snapshot_download, try_to_load_from_cache
 
@@ -129,14 +123,12 @@ def _model_folder(source: str | Path) -> tuple[Path, str]:
     try:
         return Path(snapshot_download(name, allow_patterns=list(_FILES), etag_timeout=HUB_SECONDS)), name
     except Exception as error:  # the hub's client raises whatever the network beneath it does
-        raise SceneError.expected(
-            f"the weights of {name}",
-            name,
-            got=f"none: they could not be downloaded ({why_not(error)})",
-            name="encoder",
-            advice=f"save {', '.join(_FILES)} from https://huggingface.co/{name}/tree/main in one FOLDER and use "
-            "--lift.encoder FOLDER, or use --lift.encoder descriptors, which needs no download",
-        ) from error
+        got = f"none: they could not be downloaded ({why_not(error)})"
+        advice = (
+            f"save {', '.join(_FILES)} from https://huggingface.co/{name}/tree/main in one FOLDER and use "
+            "--lift.encoder FOLDER, or use --lift.encoder descriptors, which needs no download"
+        )
+        raise SceneError.expected(f"the weights of {name}", name, got=got, name="encoder", advice=advice) from error
 
 
 def _load_model(folder: Path, device: torch.device) -> nn.Module:
@@ -188,10 +180,7 @@ def _transformers() -> Any:
         import transformers
         from transformers import Dinov2Model, Dinov2WithRegistersModel  # noqa: F401
     except (ImportError, RuntimeError) as error:  # RuntimeError: one of its own optional packages is broken
-        raise SceneError.expected(
-            "the package transformers for DINOv2",
-            got=f"an import error ({error})",
-            name="transformers",
-            advice="pip install 'avmsf[vision]', or use --lift.encoder descriptors",
-        ) from error
+        wanted, got = "the package transformers for DINOv2", f"an import error ({error})"
+        advice = "pip install 'avmsf[vision]', or use --lift.encoder descriptors"
+        raise SceneError.expected(wanted, got=got, name="transformers", advice=advice) from error
     return transformers

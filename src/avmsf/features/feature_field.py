@@ -111,13 +111,9 @@ def reduce(features: FeatureField, dim: int) -> FeatureField:
     # What is below the rounding of float32 features varies in no direction.
     kept = min(dim, int((variances > 1e-10 * variances[0]).sum()))
     if not float(variances[0]) > 0:
-        raise SceneError.expected(
-            "features that differ over the object",
-            len(values),
-            got=f"{len(values)} equal ones",
-            name=features.encoder,
-            advice="use another encoder, or only positions",
-        )
+        wanted, got = "features that differ over the object", f"{len(values)} equal ones"
+        advice = "use another encoder, or only positions"
+        raise SceneError.expected(wanted, len(values), got=got, name=features.encoder, advice=advice)
     variances, directions = variances[:kept], directions[:, :kept]
     largest = directions.gather(0, directions.abs().argmax(0, keepdim=True))
     reduced = values @ (directions * largest.sign()) / variances.sqrt()

@@ -81,13 +81,10 @@ def supported(lifted: Lifted, views: Sequence[View]) -> Lifted:
         held += ((depth > 0) & (places >= 0).all(1) & (places <= size).all(1)).to(held)
     kept = (lifted.seen >= (LEAST_SEEN * held).clamp_min(1.0)) & (2 * lifted.past <= lifted.seen)
     if not bool(kept.any()):
-        raise SceneError.expected(
-            f"points visible in {100 * LEAST_SEEN:g} % of the views that show their position",
-            0,
-            got=f"none of {len(points)} ({int((lifted.seen > 0).sum())} are visible in any)",
-            name="points",
-            advice="check that cameras and points are in one frame and unit, and that the Gaussians are of these views",
-        )
+        wanted = f"points visible in {100 * LEAST_SEEN:g} % of the views that show their position"
+        got = f"none of {len(points)} ({int((lifted.seen > 0).sum())} are visible in any)"
+        advice = "check that cameras and points are in one frame and unit, and that the Gaussians are of these views"
+        raise SceneError.expected(wanted, 0, got=got, name="points", advice=advice)
     features = replace(lifted.features, points=points[kept], features=lifted.features.features[kept])
     return replace(
         lifted, features=features, seen=lifted.seen[kept], past=lifted.past[kept], dropped=int((~kept).sum())

@@ -23,7 +23,7 @@ from avmsf.field.scaled_gains import fitted_gains, length_of
 from avmsf.modal.extraction.alignment import Alignment
 from avmsf.modal.modes import ForcePulse, ModalBank
 from avmsf.modal.residual_noise import Residual, low_fluctuation_noise, shape_noise
-from avmsf.modal.synthesis import synthesize_phased
+from avmsf.modal.synthesis import synthesize
 
 SUPPORTING = "supporting_poles"
 """What a report calls the rows of the bank's poles that are no modes of the object."""
@@ -346,7 +346,7 @@ class SoundField:
         """Return the sounds of the audible modes with these gains, without noise."""
         damping = self.bank.damping if known.damping is None else self.bank.damping * known.damping
         rows = torch.nonzero(self.audible).flatten()
-        return synthesize_phased(
+        return synthesize(
             known.mean[:, rows],
             self.bank.frequency[rows],
             damping[..., rows],

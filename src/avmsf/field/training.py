@@ -19,7 +19,7 @@ from avmsf.field.losses import SpectralTarget, spectral_loss, spectral_target
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual, shape_noise
-from avmsf.modal.synthesis import synthesize_phased
+from avmsf.modal.synthesis import synthesize
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +176,7 @@ class TrainingRun:
     def sounds(self, rows: Int[Tensor, " contacts"]) -> Float[Tensor, "contacts samples"]:
         """Return the sounds at points of the gain field, with a fresh draw of noise (paper, eq. 12)."""
         gains, bank = self.network.read(rows), self.bank
-        sounds = synthesize_phased(
+        sounds = synthesize(
             gains.mean,
             bank.frequency,
             bank.damping if gains.damping is None else bank.damping * gains.damping,

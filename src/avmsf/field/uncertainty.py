@@ -17,7 +17,7 @@ from avmsf.field.gains.model import MixtureGains
 from avmsf.field.scaled_gains import BodyGains, ScaledGains, fitted_gains
 from avmsf.field.sound_field import SoundField
 from avmsf.modal.modes import turned_like
-from avmsf.modal.synthesis import synthesize_phased
+from avmsf.modal.synthesis import synthesize
 
 LEVEL = 0.9
 """Default probability of credible intervals."""
@@ -223,7 +223,7 @@ def _spectra(field: SoundField, modes: Tensor) -> Tensor:
     """Return the spectrum of each mode by itself, [modes, 2, frequencies], of a gain of one in either part."""
     one = torch.eye(len(modes), dtype=torch.float64)
     sounds = [
-        synthesize_phased(
+        synthesize(
             first, field.bank.frequency[modes], field.bank.damping[modes], field.phase[modes],
             samples=field.samples, sample_rate=field.sample_rate, quadrature=second,
         )

@@ -127,13 +127,8 @@ def vertices_start(path: Path, header: Header, vertices: Element, *, size: int) 
     """
     before = header.elements[: header.elements.index(vertices)]
     if any(kind == "list" for element in (*before, vertices) for _, kind in element.properties):
-        raise SceneError.expected(
-            "single numbers before and in the vertices",
-            got="lists",
-            file=path,
-            name="list",
-            advice="export it with 3DGS",
-        )
+        wanted, advice = "single numbers before and in the vertices", "export it with 3DGS"
+        raise SceneError.expected(wanted, got="lists", file=path, name="list", advice=advice)
     if header.order == "ascii":
         return header.length
     start = header.length + sum(each.count * _bytes_of(each) for each in before)

@@ -92,13 +92,9 @@ def depth_of_cloud(cloud: GaussianCloud, rasterizer: Rasterizer) -> DepthMap:
 def depth_of_surface(surface: Surface) -> DepthMap:
     """Return a depth map by rays through each pixel's center to a surface. Raises SceneError without triangles."""
     if len(surface.faces) == 0:
-        raise SceneError.expected(
-            "triangles, which can hide points from a camera",
-            0,
-            got=f"{len(surface.vertices)} points alone",
-            name="surface",
-            advice="compute the features of Gaussians instead, or give a mesh",
-        )
+        wanted, got = "triangles, which can hide points from a camera", f"{len(surface.vertices)} points alone"
+        advice = "compute the features of Gaussians instead, or give a mesh"
+        raise SceneError.expected(wanted, 0, got=got, name="surface", advice=advice)
     tracer = MeshTracer(TexturedMesh.plain(surface))
 
     def cast(camera: Camera) -> Float[Tensor, "height width"]:

@@ -22,6 +22,7 @@ def synthesize(
     gains: Float[Tensor, "contacts modes"],
     frequency: Float64[Tensor, " modes"],
     damping: Float64[Tensor, "*contacts modes"],
+    phase: Float64[Tensor, " modes"] | None = None,
     *,
     samples: int,
     sample_rate: float,
@@ -29,41 +30,23 @@ def synthesize(
 ) -> Float[Tensor, "contacts samples"]:
     """Return the sum over modes of gains exp(-d t) sin(2 pi f t) (paper, eq. 3), plus quadrature's cosines if given.
 
-    `frequency` in Hz, `damping` in 1/s, shared by all contacts or with one row a contact; differentiable in all of
-    them. Modes at or above half the sample rate would alias: the caller leaves them out. The output has the dtype of
-    `gains`: in float32 its error is about 1e-7 of the loudest sample, in float64 it is exact.
-    """
-    phase = torch.zeros_like(frequency)
-    return synthesize_phased(
-        gains, frequency, damping, phase, samples=samples, sample_rate=sample_rate, quadrature=quadrature
-    )
-
-
-def synthesize_phased(
-    gains: Float[Tensor, "contacts modes"],
-    frequency: Float64[Tensor, " modes"],
-    damping: Float64[Tensor, "*contacts modes"],
-    phase: Float64[Tensor, " modes"],
-    *,
-    samples: int,
-    sample_rate: float,
-    quadrature: Float[Tensor, "contacts modes"] | None = None,
-) -> Float[Tensor, "contacts samples"]:
-    """Return the sum over modes of gains exp(-d t) sin(2 pi f t + phase), phases in radians; else as `synthesize`.
-
-    The quadrature's cosines, too, are ahead by the phase.
+    `frequency` in Hz, `damping` in 1/s, shared by all contacts or with one row a contact; sines and cosines are ahead
+    by `phase`, radians, zero without it; differentiable in all of them. Modes at or above half the sample rate would
+    alias: the caller leaves them out. The output has the dtype of `gains`: in float32 its error is about 1e-7 of the
+    loudest sample, in float64 it is exact.
     """
     # As the real part of a exp(i x), since products of complex tables are few calls.
     amplitudes = torch.complex(torch.zeros_like(gains) if quadrature is None else quadrature, -gains)
-    amplitudes = amplitudes * torch.exp(1j * phase).to(amplitudes.dtype)
+    if phase is not None:
+        amplitudes = amplitudes * torch.exp(1j * phase).to(amplitudes.dtype)
     blocks = math.ceil(samples / _BLOCK)
     options: dict[str, Any] = {"dtype": torch.float64, "device": amplitudes.device}
     # Those of a block's samples turn backwards, for Re(a b) = Re a Re conj(b) + Im a Im conj(b): a real product.
     counts = torch.arange(0, blocks * _BLOCK, _BLOCK, **options), torch.arange(0, -_BLOCK, -1, **options)
     times = torch.cat(counts)[:, None] / sample_rate
-    decay, phase = torch.exp(damping[..., None, :] * -times.abs()), 2 * math.pi * frequency * times
+    decay, angle = torch.exp(damping[..., None, :] * -times.abs()), 2 * math.pi * frequency * times
     # Processors take five times as long for torch.polar in float64.
-    powers = torch.complex(decay * torch.cos(phase), decay * torch.sin(phase)).to(amplitudes.dtype)
+    powers = torch.complex(decay * torch.cos(angle), decay * torch.sin(angle)).to(amplitudes.dtype)
     starts, steps = torch.tensor_split(powers, [blocks], dim=-2)
     left, right = (torch.view_as_real(each).flatten(-2) for each in (amplitudes[:, None, :] * starts, steps))
     sounds = left.flatten(0, 1) @ right.mT if damping.ndim == 1 else left @ right.mT

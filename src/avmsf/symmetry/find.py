@@ -122,12 +122,9 @@ def _normalized(
 ) -> tuple[Float[np.ndarray, "points 3"], Float[np.ndarray, " 3"], float]:
     """Return the points about their middle in units of their diagonal, and both."""
     if len(points) < _MIN_POINTS:
-        raise SceneError.expected(
-            f"at least {_MIN_POINTS} points of a surface to find symmetries",
-            len(points),
-            name="points",
-            advice="draw more points from it, or reconstruct with more Gaussians",
-        )
+        wanted = f"at least {_MIN_POINTS} points of a surface to find symmetries"
+        advice = "draw more points from it, or reconstruct with more Gaussians"
+        raise SceneError.expected(wanted, len(points), name="points", advice=advice)
     wrong = torch.nonzero(~torch.isfinite(points).all(dim=1)).flatten()
     if len(wrong):
         row = int(wrong[0])
@@ -136,12 +133,9 @@ def _normalized(
     middle = places.mean(axis=0)
     _, extent, axes = np.linalg.svd(places - middle, full_matrices=False)
     if extent[1] < 1e-3 * extent[0] or extent[0] == 0.0:
-        raise SceneError.expected(
-            "points all over an object's surface, not on one line or at one position",
-            extent.tolist(),
-            got=f"{len(points)} with an extent of {extent[0]:.3g}, {extent[1]:.3g} and {extent[2]:.3g} m",
-            name="points",
-        )
+        wanted = "points all over an object's surface, not on one line or at one position"
+        got = f"{len(points)} with an extent of {extent[0]:.3g}, {extent[1]:.3g} and {extent[2]:.3g} m"
+        raise SceneError.expected(wanted, extent.tolist(), got=got, name="points")
     # A box along the principal axes: the diagonal must not depend on how the object lies.
     diagonal = float(np.linalg.norm(np.ptp((places - middle) @ axes.T, axis=0)))
     return (places - middle) / diagonal, middle, diagonal

@@ -24,13 +24,9 @@ _WIDTH = 16
 """Numbers a Gaussian's packed row holds: one cache line."""
 _SCALE = np.float32(np.sqrt(0.5 / np.log(2.0)))
 """Takes standard deviations to such units that a Gaussian is 2 to minus their square."""
-
-
 _REACH_MARGIN = 1e-4
 """By how much the squared reach is widened, so that rounding of the ellipse's edge loses no pixel that counts."""
 _LOG2_MIN_ALPHA = np.float32(np.log2(MIN_ALPHA))
-
-
 _TILE_WORK = 8
 """A tile itself takes about as long as this many Gaussians on it."""
 

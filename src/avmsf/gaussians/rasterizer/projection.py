@@ -83,18 +83,7 @@ def project(cloud: GaussianCloud, camera: Camera) -> tuple[Tensor, ...]:
 def _lens(camera: Camera) -> Float64[np.ndarray, "10"]:
     """Return focal lengths, principal point, size, and the tangents left, right, up and down where the slope ends."""
     (across, down), (middle, center) = camera.focal, camera.principal
-    margins = _MARGIN * 0.5 * camera.width / across, _MARGIN * 0.5 * camera.height / down
-    return np.array(
-        [
-            across,
-            down,
-            middle,
-            center,
-            camera.width,
-            camera.height,
-            -middle / across - margins[0],
-            (camera.width - middle) / across + margins[0],
-            -center / down - margins[1],
-            (camera.height - center) / down + margins[1],
-        ]
-    )
+    sides, ends = _MARGIN * 0.5 * camera.width / across, _MARGIN * 0.5 * camera.height / down
+    left, right = -middle / across - sides, (camera.width - middle) / across + sides
+    top, bottom = -center / down - ends, (camera.height - center) / down + ends
+    return np.array([across, down, middle, center, camera.width, camera.height, left, right, top, bottom])
