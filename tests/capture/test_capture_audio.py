@@ -1,4 +1,4 @@
-"""Sound files: every way in which one can be wrong is refused or warned of by name, and so is one channel of several."""
+"""Sound files and their channels: every way in which one can be wrong is refused or warned of by name."""
 
 import warnings
 from pathlib import Path
