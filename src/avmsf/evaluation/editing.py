@@ -37,7 +37,7 @@ from avmsf.editing.reference import Reference
 from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import AvmsfError, AvmsfWarning, EvaluationError
 from avmsf.evaluation.clap import Clap
-from avmsf.evaluation.editing_objects import KnownObject, amplitudes_of, audible_modes
+from avmsf.evaluation.editing_objects import KnownObject, audible_modes
 from avmsf.evaluation.metrics import default_fft_sizes, relative_stft_error
 from avmsf.evaluation.mode_embedding import MaterialSpace
 from avmsf.evaluation.results import write_json
@@ -132,7 +132,7 @@ class Edited:
     @classmethod
     def of(cls, field: SoundField, task: EditTask, **more: Any) -> "Edited":
         """Return a field's modes and sounds at the task's contacts."""
-        bank = audible_modes(field.bank, amplitudes_of(field, task.contacts), sample_rate=field.sample_rate)
+        bank = audible_modes(field.bank, field.complex_gains(task.contacts), sample_rate=field.sample_rate)
         return cls(bank, field.render(task.contacts), field.sample_rate, **more)
 
 
@@ -199,8 +199,7 @@ def generation(model: StableAudio, seconds: float = GENERATED, finder: ModeFinde
         recording = Recording(f"generated from {prompt!r}", made[None].numpy(), rate, "FLOAT")
         sound = torch.from_numpy(np.array(prepare(recording, CaptureSettings()).sound))[None]
         modes = extract_sounds(sound, sample_rate=rate, method=finder or HighResolution())
-        bank = audible_modes(modes.bank, torch.complex(modes.gains.double(), modes.quadrature.double()))
-        return Edited(bank, sound.float(), rate)
+        return Edited(audible_modes(modes.bank, torch.hypot(modes.gains, modes.quadrature)), sound.float(), rate)
 
     return EditMethod("generation", edit)
 

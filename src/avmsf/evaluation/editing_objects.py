@@ -8,7 +8,6 @@ from pathlib import Path
 from types import MappingProxyType
 
 import torch
-from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
@@ -70,7 +69,7 @@ class KnownObject:
     @property
     def bank(self) -> ModalBank:
         """Its audible modes."""
-        return audible_modes(self.modes.bank, torch.complex(self.modes.gains.double(), self.modes.quadrature.double()))
+        return audible_modes(self.modes.bank, torch.hypot(self.modes.gains, self.modes.quadrature))
 
     @cached_property
     def sound_field(self) -> SoundField:
@@ -135,22 +134,11 @@ def paper_object(
 
 
 def recorded_objects(
-    dataset: Dataset,
-    materials: Mapping[str, str] = REALIMPACT_26,
-    *,
-    make: Callable[[str, str, Impacts], KnownObject] = plain_object,
+    dataset: Dataset, *, make: Callable[[str, str, Impacts], KnownObject] = plain_object
 ) -> tuple[KnownObject, ...]:
-    """Read objects of a dataset by name and material, and `make` them of all of their recordings.
+    """Read the 26 objects of RealImpact, and `make` them of all of their recordings.
 
     Objects that the dataset does not hold are left out, so that a part of it will do. Raises as reading and making do.
     """
-    return tuple(
-        make(name, materials[name], dataset.capture(name).impacts) for name in dataset.objects() if name in materials
-    )
-
-
-def amplitudes_of(field: SoundField, contacts: Float64[Tensor, "contacts 3"]) -> Tensor:
-    """Return the complex amplitudes of a field's modes at contacts, for `audible_modes`."""
-    known = field.known(contacts)
-    quadrature = torch.zeros_like(known.mean) if known.quadrature is None else known.quadrature
-    return torch.complex(known.mean.double(), quadrature.double())
+    held = [name for name in dataset.objects() if name in REALIMPACT_26]
+    return tuple(make(name, REALIMPACT_26[name], dataset.capture(name).impacts) for name in held)
