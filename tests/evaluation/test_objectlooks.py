@@ -9,7 +9,7 @@ import torch
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
-from avmsf.datasets.dataset import DatasetReport, ObjectFacts, VisualSource
+from avmsf.datasets.dataset import VisualSource
 from avmsf.errors import SceneError
 from avmsf.evaluation.objects import ObjectInputs
 from avmsf.features.feature_field import FeatureField
@@ -30,16 +30,8 @@ CONFIG = SceneConfig(views=ViewsConfig(rendered=24), lift=LiftConfig(encoder="de
 class OneObject:
     """A dataset of one object, which can be seen in `seen` or nowhere."""
 
-    name = "one"
-
     def __init__(self, seen: Path | None, surface: Surface | None = None) -> None:
         self.seen, self.surface = seen, surface
-
-    def objects(self) -> tuple[str, ...]:
-        return ("slab",)
-
-    def facts(self, identifier: str) -> ObjectFacts:
-        return ObjectFacts(identifier, identifier)
 
     def capture(self, identifier: str) -> Capture:
         contacts = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.2, 0.0], [0.1, 0.0, 0.1]], dtype=torch.float64)
@@ -47,9 +39,6 @@ class OneObject:
 
     def visual_source(self, identifier: str) -> VisualSource | None:
         return None if self.seen is None else VisualSource(self.seen)
-
-    def check(self) -> DatasetReport:
-        return DatasetReport(self.name, ())
 
 
 @pytest.fixture(scope="module")
