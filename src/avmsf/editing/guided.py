@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Float64, Int
@@ -145,6 +145,7 @@ _MAX_FAILED_STEPS = 20
 _CHECKPOINT_SECONDS = 30.0
 
 
+@runtime_checkable
 class Guide(Protocol):
     """Gives target sounds."""
 

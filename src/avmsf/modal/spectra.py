@@ -73,29 +73,17 @@ def htk_filters(
     ends = [2595.0 * math.log10(1.0 + frequency / 700.0) for frequency in (lowest, highest)]
     mels = torch.linspace(ends[0], ends[1], count + 2, dtype=torch.float64)
     edges = 700.0 * (10.0 ** (mels / 2595.0) - 1.0)
-    return _triangles(edges, fft_size=fft_size, sample_rate=sample_rate)
-
-
-def _triangles(edges: Float[Tensor, " edges"], *, fft_size: int, sample_rate: float) -> Float[Tensor, "mels bins"]:
-    """Return triangles of height one over each three edges in a row (Hz), sampled at the FFT's bins."""
     # Edges come back from the mel scale with rounding, so that the top may exceed half the rate by its last digit.
     if not 0.0 <= edges[0] < edges[-1] <= 0.5 * sample_rate * (1.0 + 1e-9):
-        raise ArrayError.expected(
-            f"mel filters from 0 Hz or above to {0.5 * sample_rate:g} Hz, half the sample rate, at most",
-            f"{edges[0]:g} to {edges[-1]:g} Hz",
-            name="highest",
-        )
+        wanted = f"mel filters from 0 Hz or above to {0.5 * sample_rate:g} Hz, half the sample rate, at most"
+        raise ArrayError.expected(wanted, f"{edges[0]:g} to {edges[-1]:g} Hz", name="highest")
     bins = torch.arange(fft_size // 2 + 1, dtype=torch.float64) * (sample_rate / fft_size)
     rising = (bins - edges[:-2, None]) / (edges[1:-1] - edges[:-2])[:, None]
     falling = (edges[2:, None] - bins) / (edges[2:] - edges[1:-1])[:, None]
     triangles = torch.clamp(torch.minimum(rising, falling), min=0.0)
     empty = torch.nonzero(triangles.sum(dim=1) == 0.0).flatten()
     if len(empty):
-        raise ArrayError.expected(
-            f"mel filters that each hold a bin of an FFT of {fft_size} samples at {sample_rate:g} Hz",
-            len(edges) - 2,
-            got=f"{len(edges) - 2} filters, of which number {int(empty[0]) + 1} falls between two bins",
-            name="count",
-            advice="use fewer filters or a longer FFT",
-        )
+        wanted = f"mel filters that each hold a bin of an FFT of {fft_size} samples at {sample_rate:g} Hz"
+        got = f"{count} filters, of which number {int(empty[0]) + 1} falls between two bins"
+        raise ArrayError.expected(wanted, count, got=got, name="count", advice="use fewer filters or a longer FFT")
     return triangles

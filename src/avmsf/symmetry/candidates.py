@@ -45,12 +45,10 @@ class CoarseCloud:
         return cls(distance_transform_edt(empty) * cell, lowest, cell, few, width)
 
     def score(
-        self,
-        linear: Float[np.ndarray, "motions 3 3"],
-        offset: Float[np.ndarray, "motions 3"],
+        self, linear: Float[np.ndarray, "motions 3 3"], fixed: Float[np.ndarray, "motions 3"]
     ) -> Float[np.ndarray, " motions"]:
-        """Return for each motion x -> L x + t how much of the cloud it carries onto the cloud, 0 to 1."""
-        scores = np.empty(len(linear))
+        """Return how much of the cloud each motion L, with a point that it leaves, carries onto the cloud, 0 to 1."""
+        scores, offset = np.empty(len(linear)), fixed - np.einsum("mij,mj->mi", linear, fixed)
         for start in range(0, len(linear), 2000):
             part = slice(start, start + 2000)
             # Single precision is exact to a millionth of the object and takes half the time.
@@ -68,9 +66,7 @@ class CoarseCloud:
         """Return `score` of each motion."""
         if not motions:
             return np.zeros(0)
-        linear = np.stack([motion.linear for motion in motions])
-        points = np.stack([motion.point for motion in motions])
-        return self.score(linear, points - np.einsum("mij,mj->mi", linear, points))
+        return self.score(np.stack([each.linear for each in motions]), np.stack([each.point for each in motions]))
 
 
 def principal_motions(surface: Neighborhoods) -> list[Motion]:
@@ -100,8 +96,7 @@ def mirrors_of_pairs(surface: Neighborhoods, pairs: Pairs, *, coarse: CoarseClou
     fits = np.abs(np.einsum("ni,ni->n", mirrored, normals[second])) > math.cos(math.radians(25))
     direction, middle = direction[fits], ((points[first] + points[second]) / 2)[fits]
     linear = np.eye(3) - 2 * direction[:, :, None] * direction[:, None, :]
-    scores = coarse.score(linear, middle - np.einsum("mij,mj->mi", linear, middle))
-    order = np.argsort(-scores)[: 60 * most]
+    order = np.argsort(-coarse.score(linear, middle))[: 60 * most]
     return distinct([Motion(direction[row], middle[row], None) for row in order], most=most)
 
 
@@ -132,8 +127,7 @@ def turns_of_pairs(surface: Neighborhoods, pairs: Pairs, *, coarse: CoarseCloud,
     near = np.linalg.norm(place - surface.points.mean(0), axis=1) < 1.0
     axis, place, angle = axis[near], place[near], angle[near]
     linear = Rotation.from_rotvec(angle[:, None] * axis).as_matrix()
-    scores = coarse.score(linear, place - np.einsum("mij,mj->mi", linear, place))
-    order = np.argsort(-scores)[: 60 * most]
+    order = np.argsort(-coarse.score(linear, place))[: 60 * most]
     return distinct([Motion(axis[row], place[row], float(angle[row])) for row in order], most=most)
 
 
