@@ -123,9 +123,6 @@ def write_realimpact(folder: Path, name: str, *, samples: int = 2400) -> Path:
     np.save(home / "vertexID.npy", np.repeat(vertices, 600).astype(np.int64))
     np.save(home / "vertexXYZ.npy", np.repeat(np.asarray(mesh.vertices)[vertices], 600, axis=0))
     np.save(home / "listenerXYZ.npy", listeners)
-    angles, distances, numbers = np.meshgrid(range(0, 181, 20), (0, 333, 667, 1000), range(15), indexing="ij")
-    for file, grid in (("angle", angles), ("distance", distances), ("micID", numbers)):
-        np.save(home / f"{file}.npy", np.tile(grid.ravel(), 5).astype(np.int64))
     sounds = np.lib.format.open_memmap(home / "deconvolved_0db.npy", mode="w+", dtype=np.float32, shape=(ROWS, samples))
     time = np.arange(samples)
     # Sound takes a while to arrive: the first samples, which belong to the response, are faint.

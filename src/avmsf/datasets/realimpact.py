@@ -32,18 +32,15 @@ ROWS = 3000
 MESH = "transformed.obj"
 FOLDER, SOUNDS = "preprocessed", "deconvolved_0db.npy"
 """An object's folder of arrays, and its sounds."""
+POINTS = ("vertexID.npy", "vertexXYZ.npy", "listenerXYZ.npy")
 FORMS: dict[str, tuple[str, tuple[int | None, ...]]] = {
     SOUNDS: ("float32", (ROWS, None)),
     "vertexID.npy": ("int64", (ROWS,)),
     "vertexXYZ.npy": ("float64", (ROWS, 3)),
     "listenerXYZ.npy": ("float64", (ROWS, 3)),
-    "angle.npy": ("int64", (ROWS,)),
-    "distance.npy": ("int64", (ROWS,)),
-    "micID.npy": ("int64", (ROWS,)),
 }
-"""Types and shapes of the arrays; None for any length."""
-NEEDED = (SOUNDS, "vertexID.npy", "vertexXYZ.npy", "listenerXYZ.npy")
-"""The arrays that a capture is made of; the others repeat where the microphones stood."""
+"""Types and shapes of the arrays that a capture is made of; None for any length. The other files of the dataset repeat
+where the microphones stood."""
 SAME_POSITION_M = 1e-3
 """Distance within which two microphone positions are equal."""
 DOWNLOAD = "http://downloads.cs.stanford.edu/viscam/RealImpact"
@@ -89,7 +86,7 @@ class RealImpact:
         self._check_known(identifier)
         origin = f"{self.name}, {identifier}"
         surface = self._mesh(identifier)
-        vertices, positions, microphones = (self._array(identifier, name) for name in NEEDED[1:])
+        vertices, positions, microphones = (self._array(identifier, name) for name in POINTS)
         corners = surface.vertices.double().numpy()
         rows, common = closest_rows(vertices, microphones, corners)
         contacts = torch.from_numpy(positions[rows])
@@ -169,18 +166,16 @@ class RealImpact:
 
     def _report(self, identifier: str) -> ObjectReport:
         folder = self.folder / identifier / FOLDER
-        problems, unusable = [], set()
+        problems = []
         for name in FORMS:
             try:
                 self._array(identifier, name)
             except DatasetError as error:
                 problems.append(str(error))
-                unusable.add(name)
         if not (folder / MESH).is_file():
             wanted = "a file to find the closest microphone"
             problems.append(f"{FOLDER}/{MESH}: expected {wanted}, got none; unpack it again")
-            unusable.add(NEEDED[0])
-        count = 0 if unusable & set(NEEDED) else len(np.unique(self._array(identifier, "vertexID.npy")))
+        count = 0 if problems else len(np.unique(self._array(identifier, "vertexID.npy")))
         return ObjectReport(self.facts(identifier), count, tuple(problems))
 
 
