@@ -69,15 +69,10 @@ class ObjectRecord:
     identifier: str
     name: str = ""
     material: str | None = None
-    inferred: bool = False
-    """Whether name and material are inferred rather than read."""
     digest: str = ""
     """Of the recordings, and of the ground truth where it is known."""
-    contacts: int = 0
-    """Number of distinct contacts."""
     sample_rate: float = 0.0
-    duration: float = 0.0
-    """Seconds of every sound."""
+    """Of the recordings, Hz."""
     cases: tuple[CaseRecord, ...] = ()
     outcomes: tuple[Outcome, ...] = ()
     failure: str | None = None

@@ -19,7 +19,7 @@ from avmsf._utils.device import one_thread
 from avmsf.capture.impacts import Impacts
 from avmsf.datasets.dataset import Dataset
 from avmsf.errors import AvmsfError, EvaluationError
-from avmsf.evaluation.cases import Case, Places
+from avmsf.evaluation.cases import Case
 from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.localization import located, write_map
 from avmsf.evaluation.methods import RecordedMethod
@@ -328,10 +328,7 @@ def _described(record: ObjectRecord, data: ObjectData, cases: Sequence[Case]) ->
         record,
         name=data.facts.name,
         material=data.facts.material,
-        inferred=data.facts.inferred,
-        contacts=len(Places.of(impacts).rows),
         sample_rate=impacts.sample_rate,
-        duration=impacts.duration,
         cases=tuple(known.get(case.key) or _named(case, impacts) for case in cases),
         failure=None,
     )

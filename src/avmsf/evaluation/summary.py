@@ -125,10 +125,8 @@ def summarize(
         "main_case": labels[0] if labels else None,
         "objects": len(records),
         "test_contacts": sum(
-            len(set().union(*(case.test for case in record.cases if case.label == labels[0]))) for record in records
-        )
-        if labels
-        else 0,
+            len({name for case in each.cases if case.label in labels[:1] for name in case.test}) for each in records
+        ),
         "methods": _plain(found, lambda each: each.mean),
         "standard_errors": _plain(found, lambda each: each.standard_error),
         "counts": {method: max(each.objects for each in figures.values()) for method, figures in found.items()},
