@@ -30,7 +30,7 @@ from avmsf.evaluation.protocols import EvaluationProtocol
 from avmsf.evaluation.results import ENCODER, CaseRecord, ObjectRecord, Outcome, ResultsFolder, failure_of, file_word
 from avmsf.evaluation.splits import MetricSettings, Values, align_split, spread
 from avmsf.evaluation.task import Method, Renderer, Task, expect_renderer, report_of
-from avmsf.modal.extraction.extract import Extraction, extract_once
+from avmsf.modal.extraction.extract import extract_once
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder
 from avmsf.simulate.ground_truth import Truth
 
@@ -108,13 +108,7 @@ class _Recordings:
 
     def __init__(self, impacts: Impacts, case: Case, finder: ModeFinder, path: Path) -> None:
         self.train, self.test = impacts.take(case.train), impacts.take(case.test)
-        self._finder, self._path = finder, path
-        self._found: Extraction | None = None
-
-    def modes(self) -> Extraction:
-        if self._found is None:
-            self._found = extract_once(self.train, self._finder, self._path)
-        return self._found
+        self.modes = once(lambda: extract_once(self.train, finder, path))
 
     def align(self) -> None:
         """Give all recordings the starts that the training ones have in common."""

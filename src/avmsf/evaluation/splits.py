@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
+from typing import Any, Literal, TypeVar, cast
 
 import torch
 from jaxtyping import Float
@@ -18,6 +18,7 @@ from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, ExtractionError, FitError, PositionWarning
 from avmsf.evaluation.cases import Places
+from avmsf.evaluation.cdpam import Cdpam
 from avmsf.evaluation.metrics import PerContact, default_fft_sizes, paper_distances, relative_stft_error, validate
 from avmsf.evaluation.modal_metrics import ModalRenderer, compare_modes
 from avmsf.evaluation.task import Renderer, expect_renderer
@@ -25,10 +26,6 @@ from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.points import farthest_points
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.simulate.ground_truth import Truth
-
-if TYPE_CHECKING:
-    from avmsf.evaluation.cdpam import Cdpam
-
 
 Recordings = TypeVar("Recordings", bound=Capture | Impacts)
 
@@ -275,8 +272,4 @@ def _modal_figures(renderer: Renderer, test: Impacts, truth: Truth) -> dict[str,
     return {name: value for name, value in figures.items() if name != "mac" or len(test) > 1}
 
 
-@lru_cache(maxsize=1)
-def _cdpam() -> "Cdpam":
-    from avmsf.evaluation.cdpam import Cdpam
-
-    return Cdpam.load()
+_cdpam = lru_cache(maxsize=1)(Cdpam.load)
