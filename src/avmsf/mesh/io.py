@@ -129,12 +129,9 @@ def _check_scene(scene: trimesh.Scene) -> None:
     _check_at_most(MAX_TEXTURE_PIXELS, pixels, "pixels in its textures")
     farthest = 0.0 if scene.bounds is None else float(np.abs(scene.bounds).max())
     if not farthest <= MAX_COORDINATE:
-        raise CaptureError(
-            f"expected coordinates up to {MAX_COORDINATE:g}, got {farthest:.3g} (with all parts positioned); export "
-            "the mesh again",
-            name="coordinates",
-            value=farthest,
-        )
+        got = f"{farthest:.3g} (with all parts positioned); export the mesh again"
+        message = f"expected coordinates up to {MAX_COORDINATE:g}, got {got}"
+        raise CaptureError(message, name="coordinates", value=farthest)
 
 
 def _textures(geometry: Any) -> list[Image.Image]:
@@ -149,25 +146,18 @@ def check_finite_vertices(vertices: np.ndarray) -> None:
     unfit = ~np.isfinite(vertices).all(axis=1)
     if unfit.any():
         row = int(unfit.argmax())
-        raise CaptureError(
-            f"vertex {row}: expected finite coordinates, got {vertices[row].tolist()} ({int(unfit.sum())} of "
-            f"{len(vertices)} vertices are not finite); export the mesh again",
-            row=row,
-            name="vertices",
-            value=vertices[row].tolist(),
-        )
+        value, part = vertices[row].tolist(), f"{int(unfit.sum())} of {len(vertices)} vertices are not finite"
+        message = f"vertex {row}: expected finite coordinates, got {value} ({part}); export the mesh again"
+        raise CaptureError(message, row=row, name="vertices", value=value)
 
 
 def check_corners(faces: np.ndarray, vertices: int) -> None:
     """Raise CaptureError where corners of faces [faces, 3] are not indices of this number of vertices."""
     for corner in () if not faces.size else (int(faces.min()), int(faces.max())):
         if not 0 <= corner < vertices:
-            raise CaptureError(
-                f"expected corners of faces from 0 to {vertices - 1}, got {corner}: the file is truncated or corrupt; "
-                "export the mesh again",
-                name="faces",
-                value=corner,
-            )
+            got = f"{corner}: the file is truncated or corrupt; export the mesh again"
+            message = f"expected corners of faces from 0 to {vertices - 1}, got {got}"
+            raise CaptureError(message, name="faces", value=corner)
 
 
 def _plain_mesh(path: Path) -> bytes | None:

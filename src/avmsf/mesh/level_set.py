@@ -33,12 +33,9 @@ def enclose(
     if not float(values.max()) > level or any(
         float(values.take(end, axis=axis).max()) >= level for axis in range(3) for end in (0, -1)
     ):
-        raise CaptureError(
-            f"expected values above {level:g} inside the grid and none at its edge, got {values.min():g} to "
-            f"{values.max():g}",
-            name="values",
-            value=[float(values.min()), float(values.max())],
-        )
+        least, most = float(values.min()), float(values.max())
+        message = f"expected values above {level:g} inside the grid and none at its edge, got {least:g} to {most:g}"
+        raise CaptureError(message, name="values", value=[least, most])
     # Imported here, for it takes a third of a second that hardly any command needs.
     from skimage import measure
 
@@ -98,11 +95,9 @@ def difference(surface: Surface, cut: Surface) -> Surface:
     """
     left = _manifold(surface) - _manifold(cut)
     if left.status() != manifold3d.Error.NoError:
-        raise SceneError(
-            f"expected two closed surfaces, got {left.status().name}; make the shape on finer cells",
-            name="surface",
-            value=left.status().name,
-        )
+        status = left.status().name
+        message = f"expected two closed surfaces, got {status}; make the shape on finer cells"
+        raise SceneError(message, name="surface", value=status)
     mesh = max(left.decompose(), key=lambda part: float(part.volume()), default=left).to_mesh()
     vertices, faces = np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts)
     return Surface(torch.from_numpy(vertices).float(), torch.from_numpy(faces).long())

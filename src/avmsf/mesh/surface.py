@@ -41,12 +41,8 @@ class Surface:
         wrong = torch.nonzero(((corners != given) | (corners < 0) | (corners >= len(places))).any(1)).flatten()
         if len(wrong):
             row = int(wrong[0])
-            raise ArrayError(
-                f"faces: expected indices of vertices, 0 to {len(places) - 1}, got {given[row].tolist()} (row {row})",
-                name="faces",
-                row=row,
-                value=given[row].tolist(),
-            )
+            wanted, found = f"indices of vertices, 0 to {len(places) - 1}", given[row].tolist()
+            raise ArrayError.expected(wanted, found, name="faces", row=row)
         return cls(places, corners)
 
     @classmethod

@@ -105,13 +105,9 @@ def read_textured_mesh(path: str | Path, *, meters: float = 1.0) -> TexturedMesh
     path = Path(path)
     parts = [part for part in load_parts(path) if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     if not parts:
-        raise CaptureError(
-            f"{path}: expected a mesh with triangles to render, got none; export the mesh with its faces, or give the "
-            "points as the capture's surface",
-            file=path,
-            name="faces",
-            value=0,
-        )
+        wanted = "a mesh with triangles to render"
+        advice = "export the mesh with its faces, or give the points as the capture's surface"
+        raise CaptureError.expected(wanted, 0, got="none", file=path, name="faces", advice=advice)
     lacking = _missing_images(path)
     painted = [_paint(part, lacking) for part in parts]
     remarks = dict.fromkeys(paint.remark for paint in painted if paint.remark)
@@ -237,8 +233,5 @@ def _check_mesh(vertices: Tensor, faces: Tensor) -> None:
     corners = vertices.double()[faces]
     doubled = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     if not bool((doubled != 0).any()):
-        raise CaptureError(
-            f"expected triangles with an area, got {len(faces)} without; export the mesh again",
-            name="area",
-            value=0.0,
-        )
+        message = f"expected triangles with an area, got {len(faces)} without; export the mesh again"
+        raise CaptureError(message, name="area", value=0.0)

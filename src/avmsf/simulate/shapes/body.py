@@ -124,13 +124,9 @@ class Body:
         unfit = np.flatnonzero(~(np.linalg.det(edges) / 6.0 > FLATTEST * longest**3))
         if len(unfit):
             where = ", ".join(f"{value:.3f}" for value in points[cells[unfit[0]]].mean(axis=0))
-            raise SimulationError(
-                f"expected tetrahedra of positive volume, got {len(unfit)} of {len(cells)} inverted, first at "
-                f"({where}) m; use thinner walls or a larger shape",
-                row=int(unfit[0]),
-                name="cells",
-                value=len(unfit),
-            )
+            got = f"{len(unfit)} of {len(cells)} inverted, first at ({where}) m"
+            message = f"expected tetrahedra of positive volume, got {got}; use thinner walls or a larger shape"
+            raise SimulationError(message, row=int(unfit[0]), name="cells", value=len(unfit))
         return Solid.build(torch.from_numpy(points), torch.from_numpy(cells))
 
     def _stack(

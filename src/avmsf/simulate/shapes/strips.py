@@ -67,7 +67,7 @@ def platter(random: np.random.Generator, wall: float | None) -> Draft:
     middle = np.concatenate([places, np.zeros((len(places), 1))], axis=1)
     # Half turns about x, y and z.
     symmetry = Symmetry(_UP, 2, torch.eye(3, dtype=torch.float64))
-    return Draft(_body(grid, middle, np.full(len(middle), wall)), wall, symmetry)
+    return Draft(_body(middle, wall, grid.triangles, grid.order), wall, symmetry)
 
 
 def tray(random: np.random.Generator, wall: float | None) -> Draft:
@@ -87,7 +87,7 @@ def tray(random: np.random.Generator, wall: float | None) -> Draft:
         axis=1,
     )
     symmetry = Symmetry(_UP, 2, torch.eye(3).double()[:2])
-    return Draft(_body(grid, middle, np.full(len(middle), wall)), wall, symmetry)
+    return Draft(_body(middle, wall, grid.triangles, grid.order), wall, symmetry)
 
 
 def bracket(random: np.random.Generator, wall: float | None) -> Draft:
@@ -107,9 +107,7 @@ def bracket(random: np.random.Generator, wall: float | None) -> Draft:
         kept &= _punch(grid, flat, row, column)
     x, z = _bent(flat[:, 0], lengths[0], angle, bend)
     middle = np.stack([x, flat[:, 1], z], axis=1)
-    body = Body()
-    body.lay(Sheet.of(middle, np.full(len(middle), wall), grid.triangles[kept], grid.order))
-    return Draft(body, wall, Symmetry())
+    return Draft(_body(middle, wall, grid.triangles[kept], grid.order), wall, Symmetry())
 
 
 def spoon(random: np.random.Generator, wall: float | None) -> Draft:
@@ -153,10 +151,8 @@ def spoon(random: np.random.Generator, wall: float | None) -> Draft:
     ).reshape(-1, 3)
     triangles, order = _attach(rings, rim, rows)
     swelling = np.repeat(wall * (1.0 + 0.9 * np.sin(math.pi * part_along[:, 0]) ** 0.5), len(across))
-    middle = np.concatenate([disc, strip])
     walls = np.concatenate([np.full(len(disc), wall), swelling])
-    body = Body()
-    body.lay(Sheet.of(middle, walls, triangles, order))
+    body = _body(np.concatenate([disc, strip]), walls, triangles, order)
     mirror = torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64)
     return Draft(body, wall, Symmetry(mirrors=mirror))
 
@@ -167,9 +163,9 @@ def _even_grid(length: float, width: float) -> Grid:
     return Grid(2 * round(0.5 * _POINTS / columns) + 1, columns)
 
 
-def _body(grid: Grid, middle: np.ndarray, walls: np.ndarray) -> Body:
+def _body(middle: np.ndarray, walls: np.ndarray | float, triangles: np.ndarray, order: np.ndarray) -> Body:
     body = Body()
-    body.lay(Sheet.of(middle, walls, grid.triangles, grid.order))
+    body.lay(Sheet.of(middle, np.broadcast_to(walls, len(middle)), triangles, order))
     return body
 
 
