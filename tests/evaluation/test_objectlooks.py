@@ -9,7 +9,7 @@ import torch
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
-from avmsf.datasets.dataset import VisualSource
+from avmsf.datasets.dataset import Dataset, VisualSource
 from avmsf.errors import SceneError
 from avmsf.evaluation.objects import ObjectInputs
 from avmsf.features.feature_field import FeatureField
@@ -27,8 +27,10 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*neither texture nor colors")
 CONFIG = SceneConfig(views=ViewsConfig(rendered=24), lift=LiftConfig(encoder="descriptors", points=1200, components=4))
 
 
-class OneObject:
+class OneObject(Dataset):
     """A dataset of one object, which can be seen in `seen` or nowhere."""
+
+    name = "one"
 
     def __init__(self, seen: Path | None, surface: Surface | None = None) -> None:
         self.seen, self.surface = seen, surface

@@ -1,12 +1,13 @@
 """A few small plates as a folder of captures, and features of them that take no time."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
 from avmsf.capture import Capture, write_capture
 from avmsf.errors import SceneError, SimulationError
+from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.task import VisualInput
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.body_family import BodyFamily
@@ -63,9 +64,14 @@ def _surface(plate: Plate) -> Surface:
     return Surface(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]))
 
 
-@dataclass(frozen=True)
-class PlateInputs:
+class PlateInputs(ObjectInputs):
     """Positions of a plate, and no looks and no shape."""
+
+    def __init__(self) -> None:
+        """Read no dataset."""
+
+    def __repr__(self) -> str:
+        return "PlateInputs()"
 
     def features(self, identifier: str, visual_input: VisualInput, views: int | None = None) -> FeatureField:
         if visual_input not in ("surface", "positions"):

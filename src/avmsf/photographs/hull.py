@@ -8,7 +8,7 @@ from typing import no_type_check
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, Int
+from jaxtyping import Bool, Float, Float64, Real, UInt16
 
 from avmsf._utils.compiled import compiled, lane_count, run_lanes
 from avmsf.errors import CaptureWarning, SceneError
@@ -52,7 +52,7 @@ class Grid:
         """Diagonal of the box of all cells, meters."""
         return self.spacing * float(np.linalg.norm(self.shape))
 
-    def places(self, rows: Int[np.ndarray, "*cells 3"]) -> Float64[np.ndarray, "*cells 3"]:
+    def places(self, rows: Real[np.ndarray, "*cells 3"]) -> Float64[np.ndarray, "*cells 3"]:
         """Return the middles of cells given by their indices, meters."""
         return self.lowest + self.spacing * rows
 
@@ -74,7 +74,7 @@ def touches_edge(solid: Bool[np.ndarray, "x y z"]) -> bool:
 
 def count_votes(
     masks: Sequence[Bool[np.ndarray, "height width"]], cameras: Sequence[Camera], grid: Grid
-) -> tuple[Int[np.ndarray, "x y z"], Int[np.ndarray, "x y z"]]:
+) -> tuple[UInt16[np.ndarray, "x y z"], UInt16[np.ndarray, "x y z"]]:
     """Return how many views have the middle of each cell in their image, and how many of these show object there."""
     seen, inside = np.zeros(grid.shape, dtype=np.uint16), np.zeros(grid.shape, dtype=np.uint16)
     for mask, camera in zip(masks, cameras, strict=True):
@@ -110,9 +110,9 @@ class Hull:
     """Cells around an object with the votes of the views on each."""
 
     grid: Grid
-    seeing: Int[np.ndarray, "x y z"]
+    seeing: UInt16[np.ndarray, "x y z"]
     """How many views have the cell inside their image."""
-    agreeing: Int[np.ndarray, "x y z"]
+    agreeing: UInt16[np.ndarray, "x y z"]
     """How many of these show object there."""
     views: int
     """How many views voted."""

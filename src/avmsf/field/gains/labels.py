@@ -32,8 +32,8 @@ from avmsf.field.gains.outliers import CHANCE, WIDE_NOISE_SHARES, PredictiveRati
 
 _FEWEST = 3
 """Recordings of a group: of fewer, each is judged by itself."""
-_COARSE = (-30, -24, -18, -12, -6, 6, 12, 18, 24, 30)
-_FINE = (-3, -2, -1, 0, 1, 2, 3)
+_COARSE = (-30.0, -24.0, -18.0, -12.0, -6.0, 6.0, 12.0, 18.0, 24.0, 30.0)
+_FINE = (-3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0)
 """Levels tried, dB, and those about the best of them."""
 _SURE = 0.5
 """Nats for each series by which the evidence has to rise, beside the logarithm of how many steps are tried."""
