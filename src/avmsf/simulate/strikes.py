@@ -99,10 +99,10 @@ def _reached(
         places, normals = np.concatenate([places, points[reached]]), np.concatenate([normals, outward[reached]])
         drawn += 8 * wanted
     if len(places) < count:
-        wanted = f"{count} positions that a hammer reaches from above or the side"
+        reachable = f"{count} positions that a hammer reaches from above or the side"
         advice = "choose another upward axis, or make the mesh's triangles face outwards"
         got = f"{len(places)} of {drawn}"
-        raise SimulationError.expected(wanted, len(places), got=got, name="up", advice=advice)
+        raise SimulationError.expected(reachable, len(places), got=got, name="up", advice=advice)
     return torch.from_numpy(places[:wanted]), torch.from_numpy(normals[:wanted])
 
 
