@@ -122,7 +122,8 @@ def test_one_line_says_what_is_wrong(words: str, place: Path, capsys: Streams, m
     before = {path.name for path in place.iterdir()}
     verb, *arguments = words.split()
     with raises(AvmsfError, **WRONG[words]) as caught:
-        options = import_module(f"avmsf.cli.options.{verb}").Options.parse(arguments)
+        package = "avmsf.cli" if verb == "demo" else "avmsf.cli.options"
+        options = import_module(f"{package}.{verb}").Options.parse(arguments)
         options.check_inputs()
         import_module(f"avmsf.cli.{verb}").run(options)
     capsys.readouterr()

@@ -10,7 +10,7 @@ from matplotlib.collections import LineCollection
 
 from avmsf.errors import EvaluationError
 from avmsf.modal.modes import ModalBank
-from avmsf.plotting.pictures import draw_gains, draw_modes, draw_scores, save_picture
+from avmsf.plotting.pictures import draw_gains, draw_modes, save_picture
 from avmsf.plotting.spectrograms import draw_spectrograms
 from factories.raising import raises
 
@@ -96,14 +96,6 @@ def test_both_spectrograms_are_on_the_recordings_scale() -> None:
     assert line == pytest.approx(1000.0, abs=16.0)
     # The band above the tone holds next to nothing and is left out.
     assert 1000.0 < recorded.get_ylim()[1] < 2500.0
-
-
-def test_bars_are_mean_errors_best_on_top() -> None:
-    figure = draw_scores({"field": 0.2, "noise": 5.0}, {"field": 0.1, "noise": math.nan}, title="errors")
-    axes = figure.axes[0]
-    assert [label.get_text() for label in axes.get_yticklabels()] == ["noise", "field"]
-    assert [bar.get_width() for bar in axes.patches] == pytest.approx([5.0, 0.2])
-    assert [text.get_text() for text in axes.texts] == ["5.000", "0.200"]
 
 
 def test_a_picture_has_the_format_that_its_name_says(tmp_path: Path) -> None:

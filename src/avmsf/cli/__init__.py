@@ -61,8 +61,8 @@ TERMINATED = 143
 """The exit code that shells give a command ended by SIGTERM."""
 BAD_INPUT = 2
 """The exit code of input that cannot be used."""
-_WAITING = frozenset({"studio"})
-"""Verbs that wait for their user most of the time."""
+_COMPOSED = frozenset({"demo", "studio"})
+"""Verbs that run others or wait for their user; their modules import late what computes, and hold their options too."""
 _COMMON = frozenset({"--quiet", "--verbose", "--json"})
 """Options that may also stand before the verb."""
 _OUTPUTS = ("output", "plots")
@@ -103,11 +103,12 @@ def _run(words: list[str]) -> int:
         return _explain(words)
     # Threads that wait actively for each other make many small sums several times slower where other programs run.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    heart = nullcontext() if words[0] in _WAITING else beating(f"avmsf {words[0]}")
+    heart = nullcontext() if words[0] in _COMPOSED else beating(f"avmsf {words[0]}")
     with warnings.catch_warnings(), _interrupting() as received, heart:
         try:
             # Options import nothing that computes: help and mistakes are answered before torch is loaded for seconds.
-            options = import_module(f"avmsf.cli.options.{words[0]}").Options.parse(words[1:])
+            package = "avmsf.cli" if words[0] in _COMPOSED else "avmsf.cli.options"
+            options = import_module(f"{package}.{words[0]}").Options.parse(words[1:])
             options.check_inputs()
             verbosity.quiet, verbosity.verbose = options.quiet, options.verbose
             with _loading(quiet=options.quiet):

@@ -194,6 +194,7 @@ def _web(field: SoundField, options: Options) -> Written:
         options.output,
         object=source,
         meters=meters,
+        surface=None if isinstance(source, Surface) else surface_of(field.gain_field),
         strikes=_recordings(field, options.capture),
         limit=options.contacts or POINTS["web"],
         force=options.overwrite,

@@ -107,15 +107,6 @@ def score_table(title: str, scores: Mapping[str, Scores]) -> Table:
     return table(title, ["", *HEADINGS.values()], rows)
 
 
-def score_markdown(scores: Mapping[str, Scores]) -> str:
-    """Return the means as a markdown table."""
-    lines = [f"| | {' | '.join(HEADINGS.values())} |", f"|---|{'---:|' * len(HEADINGS)}"]
-    for method, each in scores.items():
-        mean = each.mean()
-        lines.append(f"| {method} | {' | '.join(figure(mean[metric]) for metric in HEADINGS)} |")
-    return "\n".join(lines) + "\n"
-
-
 def score_values(scores: Mapping[str, Scores]) -> dict[str, dict[str, float]]:
     """Return the means as plain values for JSON."""
     return {method: each.mean() for method, each in scores.items()}

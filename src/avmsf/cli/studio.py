@@ -2,10 +2,66 @@
 
 import os
 import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
 
-from avmsf.cli.options.studio import Options
+import tyro
+
+from avmsf.cli.options.checks import expect_modes
+from avmsf.cli.options.common import Flag, Printing
+from avmsf.cli.options.paths import Existing, ShapeFile
 from avmsf.cli.printing import print_json, say
 from avmsf.errors import StudioError
+from avmsf.pipeline.config import Preset
+
+
+@dataclass(frozen=True)
+class Options(Printing):
+    """Open a web page that plays an object, locates impacts, edits fields and records captures.
+
+    The page plays and edits a field and locates recordings with it; of a capture folder, a folder of images or a mesh
+    it records impacts and reconstructs a field. The page is served only to this computer, at an address that holds a
+    secret; Ctrl-C ends it.
+    """
+
+    target: tyro.conf.Positional[
+        Annotated[
+            Path | None,
+            tyro.conf.arg(metavar="FIELD|FOLDER|MESH"),
+            Existing(
+                "a field, a capture folder, a folder of images or a mesh",
+                ("a sound field", "a folder", "a mesh or Gaussians"),
+            ),
+        ]
+    ] = None
+    """A field file, a capture folder, a folder that shows the object, or a mesh. A mesh is copied to a folder of its
+    name next to it, which becomes the capture; but surface.obj, .ply, .glb or .stl, and Gaussians called splats.ply or
+    point_cloud.ply, open the folder that holds them as the capture. --capture names another folder for either."""
+    object: ShapeFile = None
+    """Mesh, in meters, or Gaussians to show; by default what the capture folder holds."""
+    capture: Annotated[Path | None, tyro.conf.arg(metavar="CAPTURE")] = None
+    """Capture folder of a field, to show its recordings and record more; for a mesh, the folder to make."""
+    port: int | None = None
+    """Port to serve at; 0 for any free one. By default 8634, for which a browser remembers that the page may record, or
+    any free one if that is taken."""
+    no_browser: Flag = False
+    """Do not open the browser."""
+    model: Annotated[str | None, tyro.conf.arg(metavar="FOLDER|NAME")] = None
+    """Stable Audio pipeline for edits by text: a folder, or its name on the hub; needs the extra `text`."""
+    modes: int = 128
+    """Maximum number of modes of a reconstruction."""
+    preset: Preset = "default"
+    """Settings of a reconstruction; paper: everything as published, which takes hours."""
+
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        expect_modes(self.modes)
+        if self.target is None:
+            raise StudioError(
+                "expected a field, a capture folder, a folder of images or a mesh, got none", name="target"
+            )
 
 
 def run(options: Options) -> int:

@@ -2,7 +2,7 @@
 
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -115,34 +115,6 @@ def draw_gains(
             drawn, ax=axes, shrink=0.8 if len(wide) == 2 else 0.6, pad=0.02 if len(wide) == 2 else 0.16
         ).ax.tick_params(labelsize=8)
     figure.suptitle(f"{title}\n(color: signed gain, in the unit of the recordings)")
-    return figure
-
-
-@styled
-def draw_scores(means: Mapping[str, float], errors: Mapping[str, float], *, title: str) -> Figure:
-    """Draw each method's mean error as a bar with its standard error, best on top, on a logarithmic axis."""
-    order = sorted(means, key=lambda method: -means[method])
-    figure = Figure(figsize=(8, 0.5 * len(order) + 1.6), layout="constrained")
-    axes = figure.subplots()
-    heights = [means[method] for method in order]
-    spread = [0.0 if math.isnan(errors[method]) else errors[method] for method in order]
-    colors = [SECOND if method == "field" else FIRST for method in order]
-    axes.barh(order, heights, xerr=spread, color=colors, alpha=0.85, capsize=3)
-    axes.set_xscale("log")
-    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axes.set_xlim(0.5 * min(heights), 2 * max(heights))
-    for method, height, error in zip(order, heights, spread, strict=True):
-        axes.annotate(
-            f"{height:.3f}",
-            (height + error, method),
-            xytext=(5, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=9,
-        )
-    axes.set_xlabel("relative STFT error (0 = recording, 1 = silence)")
-    axes.grid(axis="x", which="both")
-    figure.suptitle(title)
     return figure
 
 
