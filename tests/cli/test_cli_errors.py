@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from avmsf.cli import main
+from avmsf.cli import main, options_of
 from avmsf.errors import AvmsfError
 from factories.plate_capture import TINY, fill_plate
 from factories.raising import raises
@@ -122,8 +122,7 @@ def test_one_line_says_what_is_wrong(words: str, place: Path, capsys: Streams, m
     before = {path.name for path in place.iterdir()}
     verb, *arguments = words.split()
     with raises(AvmsfError, **WRONG[words]) as caught:
-        package = "avmsf.cli" if verb == "demo" else "avmsf.cli.options"
-        options = import_module(f"{package}.{verb}").Options.parse(arguments)
+        options = options_of(verb, arguments)
         options.check_inputs()
         import_module(f"avmsf.cli.{verb}").run(options)
     capsys.readouterr()

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 from rich.file_proxy import FileProxy
 
-from avmsf.cli import check, heartbeat, main
+from avmsf.cli import check, heartbeat, main, studio
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.printing import say
 from avmsf.cli.progress import ProgressBar
@@ -94,6 +94,7 @@ def test_a_verb_that_prints_often_enough_gets_no_more_lines(monkeypatch: pytest.
 
 @pytest.mark.usefixtures("fast")
 def test_verbs_that_wait_for_their_user_stay_silent(monkeypatch: pytest.MonkeyPatch, capsys: Streams) -> None:
-    monkeypatch.setattr("avmsf.cli._WAITING", {"check"})
-    run_check(lambda: time.sleep(0.1), monkeypatch)
+    monkeypatch.setattr(studio, "run", lambda options: time.sleep(0.1) or 0)
+    monkeypatch.setattr(studio.Options, "check_inputs", lambda options: None)
+    assert main(["studio", "."]) == 0
     assert capsys.readouterr().err == ""

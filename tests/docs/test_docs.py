@@ -8,13 +8,13 @@ import pkgutil
 import re
 import shlex
 import tomllib
-from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 import avmsf
 from avmsf.capture import CaptureSettings
+from avmsf.cli import options_of
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
@@ -39,7 +39,7 @@ def _anchors(page: Path) -> set[str]:
 @pytest.mark.parametrize("command", _commands())
 def test_every_command_of_the_docs_parses(command: str) -> None:
     _, verb, *arguments = shlex.split(command)
-    import_module(f"avmsf.cli.options.{verb}").Options.parse(arguments)
+    options_of(verb, arguments)
 
 
 @pytest.mark.parametrize("block", _blocks("python"))

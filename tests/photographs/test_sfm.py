@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import signal
 import subprocess
 import sys
 import textwrap
@@ -243,13 +244,17 @@ def test_time_and_interruption_end_the_worker(tmp_path: Path, monkeypatch: pytes
         with raises(CaptureError, name="features", value=3.0):
             estimate_cameras(folder / "images", folder, timeout=3.0)
     else:
-        # The process of the test itself is interrupted, once the worker runs.
+        # The process of the test itself is interrupted, once the worker runs; in the background it may ignore that.
         script = 'while [ ! -s "$0" ]; do sleep 0.05; done; kill -INT "$1"'
-        with (
-            subprocess.Popen(["sh", "-c", script, str(tmp_path / "pid"), str(os.getpid())]),
-            pytest.raises(KeyboardInterrupt),
-        ):
-            estimate_cameras(folder / "images", folder)
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
+        try:
+            with (
+                subprocess.Popen(["sh", "-c", script, str(tmp_path / "pid"), str(os.getpid())]),
+                pytest.raises(KeyboardInterrupt),
+            ):
+                estimate_cameras(folder / "images", folder)
+        finally:
+            signal.signal(signal.SIGINT, before)
     assert gone(int((tmp_path / "pid").read_text()))
     assert [path.name for path in folder.iterdir()] == ["images"]
 

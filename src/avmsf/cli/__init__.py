@@ -14,7 +14,7 @@ from difflib import get_close_matches
 from importlib import import_module
 from itertools import takewhile
 from types import FrameType
-from typing import TextIO
+from typing import Any, TextIO
 
 import avmsf
 from avmsf._utils.text import printable
@@ -107,8 +107,7 @@ def _run(words: list[str]) -> int:
     with warnings.catch_warnings(), _interrupting() as received, heart:
         try:
             # Options import nothing that computes: help and mistakes are answered before torch is loaded for seconds.
-            package = "avmsf.cli" if words[0] in _COMPOSED else "avmsf.cli.options"
-            options = import_module(f"{package}.{words[0]}").Options.parse(words[1:])
+            options = options_of(words[0], words[1:])
             options.check_inputs()
             verbosity.quiet, verbosity.verbose = options.quiet, options.verbose
             with _loading(quiet=options.quiet):
@@ -140,6 +139,12 @@ def _run(words: list[str]) -> int:
         finally:
             verbosity.quiet = verbosity.verbose = False
         return TERMINATED if code == INTERRUPTED and signal.SIGTERM in received else code
+
+
+def options_of(verb: str, words: Sequence[str]) -> Any:
+    """Return a verb's options that the words spell. Raises SystemExit for help and for words that are no options."""
+    package = "avmsf.cli" if verb in _COMPOSED else "avmsf.cli.options"
+    return import_module(f"{package}.{verb}").Options.parse(words)
 
 
 def _report_error(error: AvmsfError, words: Sequence[str]) -> int:
