@@ -242,7 +242,7 @@ def _explain(words: list[str]) -> int:
     print("usage: avmsf COMMAND [OPTIONS]\n")
     print("The sound of an impact anywhere on an object, from a few recordings.")
     print("`avmsf COMMAND --help` explains a command; `avmsf demo` runs a complete example.")
-    print("--quiet, --verbose and --json may stand before or after the command.\n")
+    print("--quiet, --verbose and, but for demo, --json may stand before or after the command.\n")
     separator = "\n" + " " * indent
     for name, sentence in rows.items():
         lines = textwrap.wrap(sentence, max(30, width - indent))

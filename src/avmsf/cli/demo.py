@@ -97,5 +97,5 @@ Open {folder / "mug.html"} in a browser and click the mug to strike it.
 
 Next, try:
   {own} render {place}/mug.safetensors --position 0.04 0 0.05 -o impact.wav   # an impact anywhere, in meters
-  {own} locate {place}/mug.safetensors {place}/capture/impacts/001.wav   # the contact of a recording
+  {own} locate {place}/mug.safetensors {place}/capture/001.wav   # the contact of a recording
   {own} fit YOUR_FOLDER --output yours.safetensors   # your own object"""

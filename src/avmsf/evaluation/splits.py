@@ -241,6 +241,10 @@ class MetricSettings:
         renderer's does (`truth_from_first_sample`). `loudest` is the peak of the object's loudest recording, in the
         unit of the recordings. Raises as `score`.
         """
+        if renderer.sample_rate != test.sample_rate:
+            raise EvaluationError.expected(
+                f"sounds at the recordings' {test.sample_rate:g} Hz", renderer.sample_rate, name="sample_rate"
+            )
         if self.level == "full-scale" and loudest > 0:
             sounds, test = sounds / loudest, replace(test, sounds=test.sounds / loudest)
         scores = score(sounds, test)
