@@ -14,6 +14,7 @@ import torch
 import trimesh
 
 import avmsf
+from avmsf._utils.arrays import as_directions
 from avmsf.capture import Impacts
 from avmsf.cli import main
 from avmsf.editing import adjust_modes, change_material
@@ -366,3 +367,9 @@ def test_a_field_is_written_in_the_format_of_its_ending(tmp_path):
     assert len(list((tmp_path / "samples").rglob("*.wav"))) == 3
     with raises(ExportError, name="to", value=".xyz"):
         avmsf.write(field(), tmp_path / "plate.xyz")
+
+
+def test_directions_count_as_unit_vectors():
+    along, straight = [[0.0, 0.6, -0.8]], [[0.0, 0.0, 0.0]]
+    torch.testing.assert_close(as_directions(np.array(along) * 5, "directions", count=1).tolist(), along)
+    assert torch.equal(field().render([CONTACT], straight), field().render([CONTACT]))

@@ -1,5 +1,6 @@
 """Methods learn from, and are compared with, recordings that all start at one time after their impacts."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from torch import Tensor
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.datasets.dataset import ObjectFacts
+from avmsf.errors import EvaluationError
 from avmsf.evaluation import align_split, evaluate
 from avmsf.evaluation.cases import Case
 from avmsf.evaluation.field_methods import FieldMethod
@@ -20,6 +22,7 @@ from avmsf.evaluation.splits import MetricSettings
 from avmsf.evaluation.task import Task
 from factories.delayed_plate import ALIGNED, delays, distance, strikes, without_delays
 from factories.plate_set import PlateInputs
+from factories.raising import raises
 
 COUNT, TRAIN = 16, 12
 METHODS = ("nearest", "knn3", "knn-gains")
@@ -114,3 +117,10 @@ def test_fields_are_fitted_to_own_starts_and_all_are_scored_from_the_peaks(
     assert torch.equal(fitted[0], run.own.modes().aligned(own.take(range(TRAIN))).sounds)
     assert torch.equal(fitted[1], peaks.take(range(TRAIN)).sounds)
     assert published.values["relative_stft"] == nearest.values["relative_stft"] != ours.values["relative_stft"]
+
+
+def test_sounds_of_another_rate_than_the_recordings_are_not_scored() -> None:
+    impacts = strikes(4, starts=delays(4))
+    renderer, other = NearestRecording(impacts), replace(impacts, sample_rate=2 * impacts.sample_rate)
+    with raises(EvaluationError, name="sample_rate", value=impacts.sample_rate):
+        MetricSettings(cdpam=False).values(renderer, impacts.sounds, other, None, loudest=1.0)
