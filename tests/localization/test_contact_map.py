@@ -114,17 +114,17 @@ def test_a_symmetric_plate_is_ambiguous_and_each_counterpart_is_named():
             else each.symmetry.turn(found.position[None], each.angle)
         )[0]
         assert float((image - each.position).norm()) < 2 * found.linking_length
-    words = " ".join(str(each) for each in others)
+    words = " ".join(each.message for each in others)
     assert "its image in the mirror plane with normal (1 0 0)" in words
     assert "by 180 degrees about the axis (0 0 1)" in words
-    assert all("no known symmetry" in str(each) for each in found.equivalent_points())
+    assert all("no known symmetry" in each.message for each in found.equivalent_points())
 
 
 def test_a_place_that_no_symmetry_reaches_is_not_explained():
     place, other = torch.tensor([0.02, 0.03, 0.0]), torch.tensor([0.1, 0.05, 0.0])
     named = Peak(1, other, 0.4, torch.ones(2) > 0).explained(place, plate_symmetries(), tolerance=0.01)
     assert named.symmetry is None
-    assert str(named).startswith("also at (0.1, 0.05, 0) m, with 40 %: no known symmetry")
+    assert named.message.startswith("also at (0.1, 0.05, 0) m, with 40 %: no known symmetry")
 
 
 def test_any_turn_is_found_for_a_round_object():

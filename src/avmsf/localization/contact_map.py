@@ -55,7 +55,9 @@ class Peak:
     angle: float | None = None
     """Its angle in radians, for a rotation."""
 
-    def __str__(self) -> str:
+    @property
+    def message(self) -> str:
+        """Say that the contact may be here too, and by which symmetry."""
         where = ", ".join(f"{round(value, 4) + 0.0:.4g}" for value in self.position.tolist())
         if self.symmetry is None:
             why = "no known symmetry of the object explains it"
@@ -275,7 +277,7 @@ class ContactMap:
             "cosine": {"position": self.points[self.best].tolist(), "distance": float(self.distance[self.best])},
             "multimodal": bool(others),
             "equivalent_points": [
-                {"position": each.position.tolist(), "probability": each.probability, "message": str(each)}
+                {"position": each.position.tolist(), "probability": each.probability, "message": each.message}
                 for each in others
             ],
         }
