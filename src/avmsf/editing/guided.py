@@ -354,8 +354,8 @@ def checkpoint_identity(
 
     `contacts` are places at which the field's gains are looked at; `guide` and `settings` plain values.
     """
-    tensors = {**vars(field.bank), **vars(field.known(contacts)), "phase": field.phase}
-    tensors["points"] = field.gain_field.points
+    tensors = {f"bank.{name}": each for name, each in vars(field.bank).items()} | vars(field.known(contacts))
+    tensors |= {"phase": field.phase, "points": field.gain_field.points}
     content = save(
         {name: each.detach().cpu().clone().contiguous() for name, each in tensors.items() if each is not None}
     )
