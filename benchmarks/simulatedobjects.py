@@ -16,7 +16,6 @@ from jaxtyping import Int
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
-from avmsf.evaluation.editing_objects import KnownObject
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.candidate_bodies import NominalBodies, NominalBody
 from avmsf.fem.damping import damped, rayleigh
@@ -33,6 +32,7 @@ from avmsf.simulate.imperfections import stream
 from avmsf.simulate.recipe import Hammer
 from avmsf.simulate.shapes import make_shape
 from avmsf.simulate.simulation import HIGHEST, SoundingBody, recorded
+from benchmarks.editing_objects import KnownObject
 
 SHAPES = ("bowl", "mug", "plate", "pot")
 """Kinds of the simulated objects in the clusters."""

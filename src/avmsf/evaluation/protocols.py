@@ -196,10 +196,6 @@ PUBLISHED: Mapping[tuple[str, str], tuple[PublishedRow, ...]] = {
 """All the paper's tables that the protocols compute (its tables 1 to 3, and the supplement's), by dataset and
 protocol."""
 
-EDITING_UMAP: Mapping[str, float] = {"Generation": 3.077, "Audio-SDS": 4.234, "AV-MSF": 2.753}
-"""UMAP distance to the target material after an edit, by what the paper calls the method."""
-
-
 COMPUTATION: Mapping[str, tuple[float, float]] = {
     "AV-MSF": (0.27 * 3600, 0.0438),
     "SonicGauss": (0.59 * 3600, 3.2),

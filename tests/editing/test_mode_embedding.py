@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.mode_embedding import FEATURES, MaterialSpace, pitches, rings
 from avmsf.modal.modes import ModalBank
+from benchmarks.mode_embedding import FEATURES, MaterialSpace, pitches, rings
 from factories.raising import raises
 
 

@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from test_editing import QUICK, Generator, embedded, flat_space, struck
+from test_editing_protocol import QUICK, Generator, embedded, flat_space, struck
 
 from avmsf.editing.config import DistillationConfig
 from avmsf.evaluation.clap import Clap
-from avmsf.evaluation.editing import EditScore, EditTask, score_edits, towards_words, write_scores
-from avmsf.evaluation.mode_embedding import MaterialSpace, pitches
 from benchmarks import editingfigures
+from benchmarks.editing import EditScore, EditTask, score_edits, towards_words, write_scores
+from benchmarks.mode_embedding import MaterialSpace, pitches
 from factories.made_clap import save_clap
 
 PROMPT = "a glass is struck"

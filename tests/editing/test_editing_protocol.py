@@ -18,7 +18,14 @@ from avmsf.editing.reference import Reference
 from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import AvmsfWarning, EditError, EvaluationError, SimulationError
 from avmsf.evaluation.clap import Clap
-from avmsf.evaluation.editing import (
+from avmsf.features.feature_field import FeatureField
+from avmsf.fem.elastic_modes import elastic_modes
+from avmsf.fem.material import GLASS, MATERIALS, STEEL, WOOD
+from avmsf.modal.extraction.extract import extract_sounds
+from avmsf.modal.extraction.finders import ShortTime
+from avmsf.modal.modes import ModalBank
+from benchmarks import editingprotocol as protocol
+from benchmarks.editing import (
     PHYSICS,
     PROMPTS,
     RECORDED_TRANSITIONS,
@@ -32,7 +39,7 @@ from avmsf.evaluation.editing import (
     towards_reference,
     towards_words,
 )
-from avmsf.evaluation.editing_objects import (
+from benchmarks.editing_objects import (
     PUBLISHED,
     REALIMPACT_26,
     KnownObject,
@@ -40,15 +47,8 @@ from avmsf.evaluation.editing_objects import (
     paper_object,
     recorded_objects,
 )
-from avmsf.evaluation.mode_embedding import FEATURES, MaterialSpace
-from avmsf.features.feature_field import FeatureField
-from avmsf.fem.elastic_modes import elastic_modes
-from avmsf.fem.material import GLASS, MATERIALS, STEEL, WOOD
-from avmsf.modal.extraction.extract import extract_sounds
-from avmsf.modal.extraction.finders import ShortTime
-from avmsf.modal.modes import ModalBank
-from benchmarks import editingprotocol as protocol
 from benchmarks.editingprotocol import SEVEN_TRANSITIONS, SIMULATED_TRANSITIONS
+from benchmarks.mode_embedding import FEATURES, MaterialSpace
 from benchmarks.simulatedobjects import SolvedShape
 from factories.made_audio import save_audio
 from factories.made_clap import save_clap

@@ -1,7 +1,7 @@
 """Evaluation of material edits: the paper's protocol, its baselines, and one without prompts (supplement).
 
 An object of one material is edited towards another, by a prompt or by recordings of objects of that material. Scores
-are the distance of its modes from those of labelled objects (`avmsf.evaluation.mode_embedding`), of its sounds from the
+are the distance of its modes from those of labelled objects (`benchmarks.mode_embedding`), of its sounds from the
 reference's, and, for prompts, the CLAP score; they are compared with those of the unedited object.
 """
 
@@ -37,15 +37,15 @@ from avmsf.editing.reference import Reference
 from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import AvmsfError, AvmsfWarning, EvaluationError
 from avmsf.evaluation.clap import Clap
-from avmsf.evaluation.editing_objects import KnownObject, audible_modes
 from avmsf.evaluation.metrics import default_fft_sizes, relative_stft_error
-from avmsf.evaluation.mode_embedding import MaterialSpace
 from avmsf.evaluation.results import write_json
 from avmsf.fem.material import material_named
 from avmsf.field.sound_field import SoundField
 from avmsf.modal.extraction.extract import extract_sounds
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder, ShortTime
 from avmsf.modal.modes import ModalBank
+from benchmarks.editing_objects import KnownObject, audible_modes
+from benchmarks.mode_embedding import MaterialSpace
 
 _MAX_STORED_SOUNDS = 8
 """Contacts at which an edited object is rendered."""
