@@ -1,11 +1,9 @@
 """SonicGauss: what flow, conditioning, patches and points must obey, and the small generator as a whole."""
 
 import math
-import sys
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
-from pathlib import Path
 
 import pytest
 import torch
@@ -28,12 +26,9 @@ from avmsf.baselines.sonicgauss.training import TrainingConfig, TunedRenderer, d
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.methods import method_named
 from avmsf.simulate.recipe import SIM20
+from benchmarks.sonicgauss import pretrain, training_recipes
 from factories.raising import raises
 from factories.sonicgauss_cases import SECONDS, cloud, impacts
-
-# The benchmarks, which train the weights, are no part of the package.
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from benchmarks.sonicgauss import pretrain, training_recipes
 
 TINY = SmallConfig(width=16, heads=2, blocks=1, encoder_blocks=1, tokens=4), TrainingConfig(4, batch=4, rate=1e-3)
 

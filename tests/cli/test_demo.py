@@ -1,5 +1,6 @@
 """The demo runs the commands that it prints, to the end, and again from what they have made."""
 
+import json
 import shlex
 from pathlib import Path
 
@@ -11,6 +12,19 @@ from avmsf.field.store import load
 from avmsf.gaussians.ply import read_splats
 
 SMALL = "--views.count 6 --splat.steps 30 --splat.start-points 400 --gain-model thin-plate --steps 2"
+
+
+@pytest.mark.slow
+def test_the_demo_errs_by_half_of_the_nearest_recording_and_finds_the_wall(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["demo", str(tmp_path), "--quiet"]) == 0
+    capsys.readouterr()
+    assert main([*shlex.split(demo.COMMANDS[1].format(tmp_path)), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    errors = {method: each["relative_stft"] for method, each in found["scores"].items()}
+    assert errors["field"] < 0.5 * errors["nearest recording"]
+    assert 0.6 < found["body"]["thickness"] / (demo.EXAMPLE.thickness or 0.0) < 1.2
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import torch
 
 from avmsf.editing.clips import level, levelled, with_length
 from avmsf.editing.modal_edit import FieldAtContacts
-from avmsf.editing.reference import Reference, _brightness, band_spectrum
+from avmsf.editing.reference import Reference, band_spectrum, gain_slope
 from avmsf.errors import AvmsfWarning, EditError
 from avmsf.fem.material import CERAMIC, WOOD
 from avmsf.field.gain_field import Gains
@@ -169,7 +169,7 @@ def test_brightness_is_the_slope_of_audible_gains():
     # Gains in inverse proportion to frequency fall by 6.02 dB an octave; muted modes say nothing of it.
     for muted in (None, 0, 49):
         heard = gains.clone() if muted is None else gains.index_fill(0, torch.tensor(muted), 0.0)
-        assert _brightness(frequency, heard) == pytest.approx(-20 * math.log10(2), rel=1e-6)
+        assert gain_slope(frequency, heard) == pytest.approx(-20 * math.log10(2), rel=1e-6)
 
 
 def test_made_up_impacts_are_of_the_object_in_another_material():

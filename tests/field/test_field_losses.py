@@ -7,7 +7,9 @@ import torch
 
 from avmsf.field import losses
 from avmsf.field.losses import spectral_loss, spectral_target
+from avmsf.field.training import TrainingRun
 from avmsf.modal.spectra import magnitude_stft
+from benchmarks.step import STEPS, PlainRun, full_setting, start
 
 SIZES, HOPS = (256, 64, 30), (64, 16, 7)
 
@@ -214,3 +216,15 @@ def test_the_loss_does_not_depend_on_the_unit_of_the_sounds(scale: float) -> Non
     assert losses[1] == pytest.approx(losses[0], rel=1e-4)
     silence = spectral_loss(torch.zeros_like(truth), spectral_target(scale * truth, fft_sizes=(512,), hops=(128,)))
     assert float(silence) == pytest.approx(1.0, rel=1e-4)
+
+
+def test_a_step_has_the_loss_and_gradient_of_the_plain_product_of_gains_and_atoms():
+    setting, found = full_setting(0.1, count=3, sample_rate=16000.0), []
+    for kind in (TrainingRun, PlainRun):
+        run, targets = start(*setting, STEPS, kind=kind)
+        loss = run.spectral_loss(targets)
+        parameters = [each for each in run.network.parameters() if each.requires_grad]
+        found.append([loss.detach(), *torch.autograd.grad(loss, parameters, allow_unused=True, materialize_grads=True)])
+    for ours, plain in zip(*found, strict=True):
+        # Float32's error of the phase at the highest frequency.
+        torch.testing.assert_close(ours, plain, rtol=2e-3, atol=2e-3 * float(plain.abs().max()))

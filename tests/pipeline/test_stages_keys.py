@@ -3,6 +3,7 @@
 import json
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -92,6 +93,14 @@ def test_other_code_has_another_key(
     assert key() == before
     monkeypatch.setattr(module, "source_digest", lambda module: "changed")
     assert key() != before
+
+
+def test_the_checkpoint_of_an_edit_is_of_one_field_alone() -> None:
+    field, changed = ringing_field(), ({"pitch": 1.001}, {"damping": 1.001}, {"level": 1.001}, {"seconds": 0.501})
+    others = [*(ringing_field(**each) for each in changed), replace(field, phase=field.phase + 0.001)]
+    contacts = field.gain_field.points[:2]
+    keys = [guided.checkpoint_identity(each, contacts, {}, {})["field"] for each in (field, *others)]
+    assert len(set(keys)) == len(keys)
 
 
 @pytest.mark.slow

@@ -46,7 +46,7 @@ class GuidedEditConfig:
             ),
             seconds=(
                 self.seconds is None or longest <= self.seconds < math.inf,
-                f"at least {longest:.2g}, the largest of fft_sizes at 44.1 kHz, or smaller fft_sizes",
+                f"finite, at least {longest:.2g}, the largest of fft_sizes at 44.1 kHz, or smaller fft_sizes",
             ),
         )
 
@@ -71,7 +71,7 @@ class DistillationConfig:
         _check(
             self,
             lowest=(0 < self.lowest < 1, "above 0 and below 1"),
-            highest=(self.lowest <= self.highest < 1, "lowest or more, and below 1"),
+            highest=(self.lowest <= self.highest < 1, f"lowest, {self.lowest:g}, or more, and below 1"),
             denoising=(self.denoising >= 1, "1 or more"),
             batch=(self.batch >= 1, "1 or more"),
             guidance=(self.guidance >= 0 and math.isfinite(self.guidance), "0 or more, such as 15"),

@@ -36,7 +36,8 @@ class Parameterization:
     """Rates are those of Adam, in logarithms a step, falling to a twentieth; 0 fixes a quantity at its initial value.
 
     The penalty on a quantity of single modes is half the mean square over modes of its value over its standard
-    deviation (`_DEVIATIONS`), times `stiffness`, in the unit of the loss, which is a relative error.
+    deviation (.05 of shift, .3 of damping_shift, 1 of scale), times `stiffness`, in the unit of the loss, which is a
+    relative error.
     """
 
     name: str

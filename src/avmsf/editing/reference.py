@@ -84,7 +84,7 @@ class Reference:
         if not (bool(torch.isfinite(size).all()) and bool(size.any())):
             raise EditError.expected("some above 0", float(size.sum()), name="gains", advice="fit the field again")
         frequency = field.bank.frequency * math.sqrt(new.young / old.young * old.density / new.density)
-        slope, generator = _brightness(frequency, size), generator_of(seed)
+        slope, generator = gain_slope(frequency, size), generator_of(seed)
         order = torch.argsort(frequency)
         reached = torch.cumsum(size[order], dim=0) / size.sum()
         middles = (torch.arange(_QUANTILES, dtype=torch.float64) + 0.5) / _QUANTILES
@@ -189,7 +189,7 @@ _SCATTER = 0.5
 """Standard deviation of a mode's gain about the slope, logarithm: contacts and shapes differ."""
 
 
-def _brightness(frequency: Float64[Tensor, " modes"], size: Float64[Tensor, " modes"]) -> float:
+def gain_slope(frequency: Float64[Tensor, " modes"], size: Float64[Tensor, " modes"]) -> float:
     """Return the slope of gains over frequency, decibels an octave, by least squares over the modes within 60 dB."""
     audible = size > _MIN_RELATIVE_GAIN * size.max()
     octave, loud = torch.log2(frequency[audible]), 20 * torch.log10(size[audible])

@@ -57,11 +57,6 @@ class StableAudio:
         """Of its waveforms, Hz."""
         self.channels = int(pipeline.vae.config.audio_channels)
         """Of its waveforms."""
-        weight = next(pipeline.transformer.parameters())
-        self.device: torch.device = weight.device
-        """Where it computes."""
-        self.dtype: torch.dtype = weight.dtype
-        """Precision of the denoiser."""
         for part in (pipeline.vae, pipeline.text_encoder, pipeline.projection_model, pipeline.transformer):
             part.eval().requires_grad_(False)
         pipeline.set_progress_bar_config(disable=True)
@@ -69,6 +64,16 @@ class StableAudio:
         self._longest = int(pipeline.transformer.config.sample_size)
         self._frames = self._longest if seconds is None else self._frames_of(seconds)
         self._reach = _reach(pipeline.vae.config.downsampling_ratios)
+
+    @property
+    def device(self) -> torch.device:
+        """Where it computes now."""
+        return next(self.pipeline.transformer.parameters()).device
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Precision of the denoiser."""
+        return next(self.pipeline.transformer.parameters()).dtype
 
     @classmethod
     def load(

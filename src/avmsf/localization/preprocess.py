@@ -94,12 +94,14 @@ def preprocess_recording(
 
 
 @contextmanager
-def location_errors() -> Iterator[None]:
-    """Raise errors of a recording or an array, with their attributes, as a LocationError."""
+def location_errors(file: str | None = None) -> Iterator[None]:
+    """Raise errors of a recording or an array, with their attributes and the file's name, as a LocationError."""
     try:
         yield
     except (ArrayError, CaptureError) as error:
-        raise LocationError(str(error), **error.attributes) from error
+        if error.file is not None or file is None:
+            raise LocationError(str(error), **error.attributes) from error
+        raise LocationError(f"{file}: {error}", **{**error.attributes, "file": file}) from error
 
 
 def open_recording(
@@ -124,7 +126,7 @@ def open_recording(
     elif sample_rate is not None and sample_rate != recording.sample_rate:
         wanted, advice = f"its own sample rate, {recording.sample_rate:g} Hz", "leave sample_rate out"
         raise LocationError.expected(wanted, sample_rate, file=recording.name, name="sample_rate", advice=advice)
-    with location_errors():
+    with location_errors(recording.name):
         recording = replace(recording, sample_rate=as_rate(recording.sample_rate))
     check_sound(recording.channels, recording.sample_rate, file=recording.name)
     chosen = _settings_for(recording, own if settings is None else settings)

@@ -3,8 +3,8 @@
 The modes are known, so the free decay after an impact is predicted: its modal amplitudes are fitted once, propagated
 from sample to sample, and updated regularly from the stream. A new impact is detected where the energy of the residual,
 in hops of 2.5 ms, jumps above all of the last 60 ms. The first `window` seconds from its onset on go to the locator,
-without the predicted decay of earlier impacts. The state has a fixed size. The result does not depend
-on the lengths of the blocks: samples are processed hop by hop.
+without the predicted decay of earlier impacts. The state has a fixed size. The result does not depend on the lengths of
+the blocks: samples are processed hop by hop.
 """
 
 import time

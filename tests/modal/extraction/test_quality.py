@@ -1,18 +1,23 @@
 """Quality of modes on sums of known damped sines, where every figure has a closed form or a known answer."""
 
 import math
+import warnings
+from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
+from avmsf.capture import CaptureSettings, read_capture
+from avmsf.errors import CaptureWarning
 from avmsf.modal.extraction.esprit import stable_orders
-from avmsf.modal.extraction.extract import Extraction, extract_sounds
+from avmsf.modal.extraction.extract import Extraction, extract_modes, extract_sounds
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.extraction.quality import ModeQuality, measure_quality
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
+from benchmarks.modes import AIRCRAFT, count_modes, tree_frequencies
 
 RATE = 8000.0
 SAMPLES = 8000
@@ -148,3 +153,12 @@ def test_a_pole_that_is_not_there_is_stable_at_no_order() -> None:
     stable = stable_orders(sounds, bank_of((400.0, 8.0), (550.0, 10.0)), sample_rate=RATE)
     assert float(stable[0]) > 0.8
     assert float(stable[1]) < 0.2
+
+
+@pytest.mark.slow
+def test_all_known_modes_of_measured_objects_are_found_and_called_modes(shared: Path) -> None:
+    for name, known in (("aircraft_response", AIRCRAFT), ("tree43", tree_frequencies())):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CaptureWarning)
+            impacts = read_capture(shared / name, CaptureSettings()).impacts
+        assert count_modes(impacts, extract_modes(impacts), known).found == len(known)

@@ -59,9 +59,8 @@ def load_tensors(part: nn.Module, tensors: Mapping[str, Tensor], path: Path, adv
         part.load_state_dict(tensors)
     except RuntimeError as error:
         reason = " ".join(" ".join(str(error).splitlines()[1:]).split())[:400]
-        raise EvaluationError(
-            f"{path}: expected the tensors of this model, got others: {reason}; {advice}", file=path
-        ) from error
+        wanted, got = "the tensors of this model", f"others: {reason}"
+        raise EvaluationError.expected(wanted, got=got, file=path, name="tensors", advice=advice) from error
 
 
 Loss = Callable[[Int[Tensor, " batch"], torch.Generator], Float[Tensor, ""]]
