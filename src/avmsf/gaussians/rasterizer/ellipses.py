@@ -171,6 +171,62 @@ def project_points(
         opacities[i, 0], depths[i, 0] = opacity, z
 
 
+@compiled(inline="always")
+@no_type_check
+def _axes_slope(by_ellipse, axes, by_axes):
+    """Write the derivatives by J W R S into `by_axes`, given those by p = D^(-1/2), r = -p xy / yy, s = yy^(-1/2).
+
+    D = xx - xy^2 / yy is what is left of the variance along x where y is known.
+    """
+    _, xy, yy, determinant = _variances(axes)
+    steep, slant = math.sqrt(yy / determinant), xy / yy
+    by_p, by_r, by_s = float(by_ellipse[0]), float(by_ellipse[1]), float(by_ellipse[2])
+    by_xx = -0.5 * steep * steep * steep * (by_p - slant * by_r)
+    by_xy = -2.0 * slant * by_xx - steep / yy * by_r
+    by_yy = slant * slant * by_xx + slant * steep / yy * by_r - 0.5 * by_s / (yy * math.sqrt(yy))
+    for j in range(3):
+        by_axes[0, j] = 2.0 * by_xx * axes[0, j] + by_xy * axes[1, j]
+        by_axes[1, j] = 2.0 * by_yy * axes[1, j] + by_xy * axes[0, j]
+
+
+@compiled(inline="always")
+@no_type_check
+def _factor_slopes(by_axes, turn, scales, slope, axes, by_log_scale, by_turn, by_slope):
+    """Write the derivatives by the logarithms of S, by R and by J W, given those by their product J W R S."""
+    for j in range(3):
+        by_log_scale[j] = by_axes[0, j] * axes[0, j] + by_axes[1, j] * axes[1, j]
+        for k in range(3):
+            by_turn[k, j] = (slope[0, k] * by_axes[0, j] + slope[1, k] * by_axes[1, j]) * scales[j]
+    for row in range(2):
+        for k in range(3):
+            by_slope[row, k] = 0.0
+            for j in range(3):
+                by_slope[row, k] += by_axes[row, j] * turn[k, j] * scales[j]
+
+
+@compiled(inline="always")
+@no_type_check
+def _center_slope(by_place, by_depth, by_slope, x, y, z, across, down, pose, lens, inner):
+    """Write the derivatives by a center in the camera's frame into `inner` [3].
+
+    They come through its place in the image, and through J, whose first row is focal / z (1, 0, -x / z).
+    """
+    inner[0] = lens[0] / z * float(by_place[0])
+    inner[1] = lens[1] / z * float(by_place[1])
+    inner[2] = -(x * inner[0] + y * inner[1]) / z + float(by_depth)
+    for row in range(2):
+        focal = lens[row] / z
+        tangent, place, clear = (across, x, across == x / z) if row == 0 else (down, y, down == y / z)
+        along, ahead = 0.0, 0.0
+        for k in range(3):
+            along += by_slope[row, k] * pose[row, k]
+            ahead += by_slope[row, k] * pose[2, k]
+        inner[2] -= focal / z * (along - tangent * ahead)
+        if clear:
+            inner[row] -= focal / z * ahead
+            inner[2] += focal / z * ahead * place / z
+
+
 @compiled(error_model="numpy")
 @no_type_check
 def project_points_back(
@@ -197,6 +253,7 @@ def project_points_back(
 
     The arrays come as zeros, and stay so where the radius is zero. `scratch` is that of `project_points`.
     """
+    # Inlined, for views of rows that a call hands over cost more than these steps.
     points = len(centers)
     turn, slope, axes, scales = scratch[lane, :3], scratch[lane, 3:5], scratch[lane, 5:7], scratch[lane, 7]
     by_turn, by_slope, by_axes = scratch[lane, 8:11], scratch[lane, 11:13], scratch[lane, 13:15]
@@ -209,45 +266,10 @@ def project_points_back(
             scales[j] = math.exp(float(log_scales[i, j]))
         length = _rotate(rotations[i], turn)
         across, down = _axes(turn, scales, pose, x, y, z, lens, slope, axes)
-        _, xy, yy, determinant = _variances(axes)
-
-        # p = D^(-1/2), r = -p xy / yy, s = yy^(-1/2), where D = xx - xy^2 / yy.
-        steep, slant = math.sqrt(yy / determinant), xy / yy
-        by_p, by_r, by_s = float(by_ellipses[i, 0]), float(by_ellipses[i, 1]), float(by_ellipses[i, 2])
-        by_xx = -0.5 * steep * steep * steep * (by_p - slant * by_r)
-        by_xy = -2.0 * slant * by_xx - steep / yy * by_r
-        by_yy = slant * slant * by_xx + slant * steep / yy * by_r - 0.5 * by_s / (yy * math.sqrt(yy))
-        for j in range(3):
-            by_axes[0, j] = 2.0 * by_xx * axes[0, j] + by_xy * axes[1, j]
-            by_axes[1, j] = 2.0 * by_yy * axes[1, j] + by_xy * axes[0, j]
-
-        for j in range(3):
-            by_log_scales[i, j] = by_axes[0, j] * axes[0, j] + by_axes[1, j] * axes[1, j]
-            for k in range(3):
-                by_turn[k, j] = (slope[0, k] * by_axes[0, j] + slope[1, k] * by_axes[1, j]) * scales[j]
+        _axes_slope(by_ellipses[i], axes, by_axes)
+        _factor_slopes(by_axes, turn, scales, slope, axes, by_log_scales[i], by_turn, by_slope)
         _unrotate(rotations[i], length, by_turn, by_rotations[i])
-        for row in range(2):
-            for k in range(3):
-                by_slope[row, k] = 0.0
-                for j in range(3):
-                    by_slope[row, k] += by_axes[row, j] * turn[k, j] * scales[j]
-
-        # Through the places in the image, and through J, whose first row is focal / z (1, 0, -x / z).
-        inner[0] = lens[0] / z * float(by_screen[i, 0])
-        inner[1] = lens[1] / z * float(by_screen[i, 1])
-        inner[2] = -(x * inner[0] + y * inner[1]) / z + float(by_depths[i, 0])
-        for row in range(2):
-            focal = lens[row] / z
-            tangent, place, clear = (across, x, across == x / z) if row == 0 else (down, y, down == y / z)
-            along, ahead = 0.0, 0.0
-            for k in range(3):
-                along += by_slope[row, k] * pose[row, k]
-                ahead += by_slope[row, k] * pose[2, k]
-            inner[2] -= focal / z * (along - tangent * ahead)
-            if clear:
-                inner[row] -= focal / z * ahead
-                inner[2] += focal / z * ahead * place / z
-
+        _center_slope(by_screen[i], by_depths[i, 0], by_slope, x, y, z, across, down, pose, lens, inner)
         opacity = 1.0 / (1.0 + math.exp(-float(logits[i])))
         by_logits[i] = float(by_opacities[i, 0]) * opacity * (1.0 - opacity)
         for j in range(3):
