@@ -130,6 +130,7 @@ def test_numbers_that_no_gaussian_has_are_refused(tmp_path: Path) -> None:
         (b"ply\nformat ascii 1.0\n", "header", b"ply\nformat a"),
         (b"ply\nelement vertex 1\nend_header\n", "format", None),
         (b"ply\nformat ascii 1.0\nelement vertex many\nend_header\n", "header", "element vertex many"),
+        (_header("ascii", 1, [*ORDER, "x"]).encode(), "header", "property float x"),
         (_header("ascii", 1, [*ORDER[:-1]]).encode(), "rot_3", ["rot_3"]),
         (_header("ascii", 1, [*ORDER, "f_rest_0"]).encode(), "f_rest", 1),
         (_header("ascii", 0, ORDER).encode(), "vertex", 0),

@@ -11,7 +11,7 @@ from avmsf.cli.options.common import Printing
 from avmsf.cli.options.paths import Existing, OtherCapture, PlotsFolder, SettingsFile
 from avmsf.features.header import holds_features
 from avmsf.field.header import read_record
-from avmsf.gaussians.ply_header import expect_splats
+from avmsf.gaussians.ply_header import read_header
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Options(Printing):
         suffix = self.file.suffix.lower()
         for cloud in (self.file if suffix == ".ply" else None, self.cloud):
             if cloud is not None:
-                expect_splats(cloud)
+                read_header(cloud)
         if suffix != ".ply" and not (suffix == ".safetensors" and holds_features(self.file)):
             read_record(self.file)
             if self.capture is not None:
