@@ -288,7 +288,7 @@ def test_points_that_the_views_agree_to_be_hidden_are_left_out() -> None:
     lifted = lift_points(
         points, views, painted_sphere(AROUND), depth_map=sphere_depth, reach=lambda _: torch.zeros(1000)
     )
-    kept = supported(lifted, views)
+    kept = supported(lifted)
     # The inner ones lie 20 mm beneath a surface that the views know to a millimeter.
     assert bool((lifted.seen[500:] == 0).all())
     assert torch.equal(kept.features.points, outside[lifted.seen[:500] > 0].float())
@@ -302,7 +302,7 @@ def test_points_afloat_before_a_surface_that_the_views_see_are_left_out() -> Non
     points = torch.cat([outside, torch.tensor([[0.0, 0.0, 1.3 * RADIUS], [1.3 * RADIUS, 0.0, 0.0]])])
     views = [view_of(camera) for camera in AROUND]
     lifted = lift_points(points, views, painted_sphere(AROUND), depth_map=sphere_depth)
-    kept = supported(lifted, views)
+    kept = supported(lifted)
     assert bool((lifted.past[500:] > 0).all())
     # Hardly any of the surface, though depth changes by more than two pixels beside its outlines.
     assert len(kept.features.points) > 450
@@ -324,7 +324,7 @@ def _lift(points=None, count: int = 1, maps=None):
         (lambda: _lift(maps=[torch.full((2, 3, 4), torch.nan)]), "painted", [2, 3, 4]),
         (lambda: _lift(maps=[torch.zeros(2, 0, 4)]), "painted", [2, 0, 4]),
         (lambda: _lift(count=2, maps=[torch.zeros(2, 3, 4), torch.zeros(3, 3, 4)]), "a view", 3),
-        (lambda: supported(replace((lifted := _lift()), past=lifted.seen), [view_of(AROUND[0])]), "points", 0),
+        (lambda: supported(replace((lifted := _lift()), past=lifted.seen)), "points", 0),
         (lambda: depth_of_surface(Surface(torch.zeros(5, 3), torch.zeros(0, 3, dtype=torch.long))), "surface", 0),
     ],
 )

@@ -8,6 +8,8 @@ from avmsf.errors import AvmsfError
 
 MAX_HEADER_BYTES = 100_000_000
 """Longest header, as the format bounds it."""
+FEATURES_KEY = "avmsf_features"
+"""Entry of a file's metadata that holds the record of features."""
 
 
 def read_header_text(path: Path, key: str, *, what: str, advice: str, raising: type[AvmsfError]) -> str:

@@ -13,10 +13,10 @@ from avmsf.capture import CaptureSettings, Impacts, read_capture
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.mode_table import levels, listed, mode_rows, mode_table
 from avmsf.cli.options.info import Options
+from avmsf.cli.options.paths import kind_of
 from avmsf.cli.printing import console, next_command, print_json, say
 from avmsf.cli.scores import body_warnings, outlier_words, quality_words, score_table, score_values
 from avmsf.evaluation.splits import evaluate
-from avmsf.features.header import holds_features
 from avmsf.field.attention import AttentionGains
 from avmsf.field.config import NETWORK
 from avmsf.field.scaled_gains import BodyGains, surface_of
@@ -36,7 +36,7 @@ _BATCH = 1024
 def run(options: Options) -> int:
     """Describe and draw a file, whose kind its content shows."""
     suffix = options.file.suffix.lower()
-    if suffix == ".ply" or (suffix == ".safetensors" and holds_features(options.file)):
+    if suffix == ".ply" or kind_of(options.file) == "features":
         from avmsf.cli.info_clouds import describe_cloud, describe_features
 
         values = describe_cloud(options) if suffix == ".ply" else describe_features(options)

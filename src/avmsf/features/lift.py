@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -24,7 +24,7 @@ twice as many through thin walls; what one turns away is seen at a slant, and by
 _NEIGHBORS = 3
 """Seen points whose features an unseen one takes the mean of."""
 
-LEAST_SEEN = 0.05
+MIN_SEEN_FRACTION = 0.05
 """Part of the views that have a point in their image that must see it, for it to be one of the surface.
 
 Fitted Gaussians also fill walls and the space behind them. On a simulated mug with 48 views of 192 pixels, 34 % of
@@ -33,17 +33,6 @@ leaves out 1.7 %. A part of .1 costs three times as many of these.
 """
 Weighting = Callable[[Visibility], Float[Tensor, " points"]]
 """How much one view's word counts for each point, given what it sees of them; zero where it sees nothing."""
-
-
-@dataclass(frozen=True)
-class LiftProgress:
-    """How far a lift has come."""
-
-    view: str
-    """Name of the view just described."""
-    done: int
-    """Views described."""
-    total: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +44,8 @@ class Lifted:
     """Number of views that see each point; where it is 0 the feature is its neighbors'."""
     past: Int[Tensor, " points"]
     """Number of these that see a surface behind the point."""
+    in_image: Int[Tensor, " points"]
+    """Number of views that have each point in their image, hidden or not."""
     agreement: float
     """Share of the features' variance over points and views that lies between points, not between views of a point."""
     dropped: int = 0
@@ -66,29 +57,23 @@ class Lifted:
         return int((self.seen == 0).sum())
 
 
-def supported(lifted: Lifted, views: Sequence[View]) -> Lifted:
+def supported(lifted: Lifted) -> Lifted:
     """Return the points that views see as part of the surface.
 
-    That are at least one view and `LEAST_SEEN` of those that have the point in their image: what the views agree to be
-    hidden is inside the object or behind its surface. And at least as many as see a surface behind the point, which is
-    then afloat before it. Raises SceneError where no point is left.
+    That are at least one view and `MIN_SEEN_FRACTION` of those that have the point in their image: what the views agree
+    to be hidden is inside the object or behind its surface. And at least as many as see a surface behind the point,
+    which is then afloat before it. Raises SceneError where no point is left.
     """
-    points = lifted.features.points
-    held = torch.zeros(len(points), device=points.device)
-    for view in views:
-        places, depth = view.camera.project(points.cpu())
-        size = places.new_tensor([view.camera.width, view.camera.height])
-        held += ((depth > 0) & (places >= 0).all(1) & (places <= size).all(1)).to(held)
-    kept = (lifted.seen >= (LEAST_SEEN * held).clamp_min(1.0)) & (2 * lifted.past <= lifted.seen)
+    points, seen, past = lifted.features.points, lifted.seen, lifted.past
+    kept = (seen >= (MIN_SEEN_FRACTION * lifted.in_image).clamp_min(1.0)) & (2 * past <= seen)
     if not bool(kept.any()):
-        wanted = f"points visible in {100 * LEAST_SEEN:g} % of the views that show their position"
-        got = f"none of {len(points)} ({int((lifted.seen > 0).sum())} are visible in any)"
+        wanted = f"points visible in {100 * MIN_SEEN_FRACTION:g} % of the views that show their position"
+        got = f"none of {len(points)} ({int((seen > 0).sum())} are visible in any)"
         advice = "check that cameras and points are in one frame and unit, and that the Gaussians are of these views"
         raise SceneError.expected(wanted, 0, got=got, name="points", advice=advice)
     features = replace(lifted.features, points=points[kept], features=lifted.features.features[kept])
-    return replace(
-        lifted, features=features, seen=lifted.seen[kept], past=lifted.past[kept], dropped=int((~kept).sum())
-    )
+    dropped = int((~kept).sum())
+    return Lifted(features, seen[kept], past[kept], lifted.in_image[kept], lifted.agreement, dropped)
 
 
 def by_presence(visibility: Visibility) -> Float[Tensor, " points"]:
@@ -111,7 +96,7 @@ def lift(
     rasterizer: Rasterizer | None = None,
     weighting: Weighting = by_presence,
     inpainted: bool = True,
-    progress: Callable[[LiftProgress], None] | None = None,
+    progress: Callable[[int, int, str], None] | None = None,
 ) -> Lifted:
     """Give every Gaussian the mean of the features at its places in the views that see it.
 
@@ -141,74 +126,73 @@ def lift_points(
     reach: Callable[[Camera], Float[Tensor, " points"]] | None = None,
     weighting: Weighting = by_presence,
     inpainted: bool = True,
-    progress: Callable[[LiftProgress], None] | None = None,
+    progress: Callable[[int, int, str], None] | None = None,
 ) -> Lifted:
     """Give points of a surface, whose depth in a camera `depth_map` knows, the mean of the features in their views.
 
     `reach` says how far behind that depth a point may lie, meters; without it, points lie on the surface. Images are
-    `inpainted` outside their masks with the object's colors, or described as they are (paper). One view is
-    described at a time. Raises SceneError where there is nothing to lift or where no view sees any point.
+    `inpainted` outside their masks with the object's colors, or described as they are (paper). One view is described at
+    a time; then `progress` receives the number of those done, of all, and its name. Raises SceneError where there is
+    nothing to lift or where no view sees any point.
     """
     if not len(points) or not len(views):
         name = "views" if len(points) else "points"
         raise SceneError.expected("at least one", 0, name=name)
-    tally = _Tally(len(points))
+    seen, past, in_image = torch.zeros(3, len(points), dtype=torch.long)
+    weights, squares = torch.zeros(len(points)), torch.zeros(len(points), dtype=torch.float64)
+    sums: Tensor | None = None
     for done, view in enumerate(views, start=1):
         behind = points.new_zeros(len(points)) if reach is None else reach(view.camera)
         visibility = depth_test(points.detach(), view, depth_map(view.camera), reach=behind)
         found = _sample(_describe(view, encoder, inpainted=inpainted), visibility)
-        tally.add(found, torch.where(visibility.seen, weighting(visibility), 0.0).float(), view.name)
-        tally.past += visibility.seen & (visibility.past > 0.5)
+        sums = torch.zeros_like(found) if sums is None else sums
+        if found.shape != sums.shape:
+            wanted = f"{sums.shape[1]} features as in the other views"
+            raise SceneError.expected(wanted, found.shape[1], name=view.name, advice="use an encoder of one dimension")
+        weight = torch.where(visibility.seen, weighting(visibility), 0.0).float()
+        seen += weight > 0
+        past += visibility.seen & (visibility.past > 0.5)
+        in_image += visibility.in_image
+        weights += weight
+        sums += weight[:, None] * found
+        squares += weight * found.double().square().sum(1)
         if progress is not None:
-            progress(LiftProgress(view.name, done, len(views)))
-    return tally.result(points, encoder.name)
+            progress(done, len(views), view.name)
+    assert sums is not None
+    means = _means(points.detach().cpu(), sums, weights, seen > 0)
+    field = FeatureField(points.detach().float(), means.to(points.device), encoder.name)
+    often = seen > 1
+    agreement = _agreement(weights[often].double(), sums[often].double(), squares[often])
+    seen, past, in_image = (count.to(points.device) for count in (seen, past, in_image))
+    return Lifted(field, seen, past, in_image, agreement)
 
 
-class _Tally:
-    """Sums over the views so far."""
+def _means(
+    points: Float[Tensor, "points 3"],
+    sums: Float[Tensor, "points dim"],
+    weights: Float[Tensor, " points"],
+    known: Bool[Tensor, " points"],
+) -> Float[Tensor, "points dim"]:
+    """Return the weighted means of the points that views see, and for the others those of their nearest neighbors."""
+    if not bool(known.any()):
+        advice = "check that points and cameras are in one frame and in meters, and that the masks are not empty"
+        got = f"none of {len(points)}"
+        raise SceneError.expected("points visible in the views", 0, got=got, name="points", advice=advice)
+    means = torch.zeros_like(sums)
+    means[known] = sums[known] / weights[known][:, None]
+    if not bool(known.all()):
+        near = nearest_points(points[known], points[~known], count=min(_NEIGHBORS, int(known.sum())))
+        means[~known] = means[known][near].mean(1)
+    return means
 
-    def __init__(self, count: int) -> None:
-        self.weights = torch.zeros(count)
-        self.seen, self.past = torch.zeros(count, dtype=torch.long), torch.zeros(count, dtype=torch.long)
-        self.sums, self.squares = torch.zeros(count, 0), torch.zeros(count, dtype=torch.float64)
 
-    def add(self, found: Float[Tensor, "points dim"], weights: Float[Tensor, " points"], view: str) -> None:
-        """Add the features of one view."""
-        if not self.sums.shape[1]:
-            self.sums = torch.zeros(found.shape)
-        if found.shape != self.sums.shape:
-            wanted = f"{self.sums.shape[1]} features as in the other views"
-            raise SceneError.expected(wanted, found.shape[1], name=view, advice="use an encoder of one dimension")
-        self.seen += weights > 0
-        self.weights += weights
-        self.sums += weights[:, None] * found
-        self.squares += weights * found.double().square().sum(1)
-
-    def result(self, points: Float[Tensor, "points 3"], encoder: str) -> Lifted:
-        """Return the means, with those of seen neighbors where there is none."""
-        known = self.seen > 0
-        if not bool(known.any()):
-            advice = "check that points and cameras are in one frame and in meters, and that the masks are not empty"
-            raise SceneError.expected(
-                "points visible in the views", 0, got=f"none of {len(points)}", name="points", advice=advice
-            )
-        means = self.sums[known] / self.weights[known][:, None]
-        features = torch.zeros_like(self.sums)
-        features[known] = means
-        if not bool(known.all()):
-            places = points.detach().cpu()
-            near = nearest_points(places[known], places[~known], count=min(_NEIGHBORS, int(known.sum())))
-            features[~known] = means[near].mean(1)
-        field = FeatureField(points.detach().float(), features.to(points.device), encoder)
-        return Lifted(field, self.seen.to(points.device), self.past.to(points.device), self._agreement())
-
-    def _agreement(self) -> float:
-        """Return 1 - (variance between views of one point) / (variance in all), of the points that two views see."""
-        often = self.seen > 1
-        weights, sums = self.weights[often].double(), self.sums[often].double()
-        own = float((self.squares[often] - sums.square().sum(1) / weights).sum())
-        total = float(self.squares[often].sum() - sums.sum(0).square().sum() / weights.sum())
-        return 1.0 - own / total if total > 0 else 1.0
+def _agreement(
+    weights: Float[Tensor, " points"], sums: Float[Tensor, "points dim"], squares: Float[Tensor, " points"]
+) -> float:
+    """Return 1 - (variance between views of one point) / (variance in all), of the points that two views see."""
+    own = float((squares - sums.square().sum(1) / weights).sum())
+    total = float(squares.sum() - sums.sum(0).square().sum() / weights.sum())
+    return 1.0 - own / total if total > 0 else 1.0
 
 
 def _describe(view: View, encoder: Encoder, *, inpainted: bool) -> Float[Tensor, "dim rows columns"]:

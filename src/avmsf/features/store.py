@@ -12,10 +12,10 @@ from safetensors.torch import save as to_bytes
 from torch import Tensor
 
 from avmsf._utils.files import write_whole
+from avmsf._utils.headers import FEATURES_KEY
 from avmsf._utils.state import expect_tensors, parse_record, read_tensors, record_text
 from avmsf.errors import SceneError
 from avmsf.features.feature_field import FeatureField
-from avmsf.features.header import KEY
 
 FORMAT = 1
 """Number of this format; it grows with every change that older versions could not read."""
@@ -25,8 +25,8 @@ _ADVICE = "compute the features again"
 def save_features(features: FeatureField, path: str | Path, *, report: dict[str, Any] | None = None) -> None:
     """Write features to one file, which `load_features` reads back to the last bit.
 
-    `report` is saved with them as JSON. An existing file is replaced only when the new one is
-    complete. Raises SceneError where the file cannot be written, or could not be read back.
+    `report` is saved with them as JSON. An existing file is replaced only when the new one is complete. Raises
+    SceneError where the file cannot be written, or could not be read back.
     """
     path = Path(path)
     tensors = {
@@ -42,7 +42,7 @@ def save_features(features: FeatureField, path: str | Path, *, report: dict[str,
     }
     expect_tensors(tensors, _sizes(record), path, dtype=torch.float32, advice=_ADVICE, raising=SceneError)
     text = record_text(record, path, name="report", raising=SceneError)
-    content = to_bytes(tensors, {KEY: text})
+    content = to_bytes(tensors, {FEATURES_KEY: text})
     write_whole(path, lambda place: place.write_bytes(content), raising=SceneError)
 
 
@@ -52,9 +52,7 @@ def load_features(path: str | Path) -> FeatureField:
     Raises SceneError for a file that is missing, truncated, of another kind or of another format, and where its tensors
     are not those of its header.
     """
-    path = Path(path)
-    record, tensors = _read(path)
-    expect_tensors(tensors, _sizes(record), path, dtype=torch.float32, advice=_ADVICE, raising=SceneError)
+    record, tensors = _read(Path(path))
     return FeatureField(tensors["points"], tensors["features"], record["encoder"])
 
 
@@ -64,10 +62,11 @@ def read_report(path: str | Path) -> dict[str, Any]:
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Return the header's record after checking every entry of it, and the tensors."""
+    """Return the header's record and the tensors, both checked."""
     what = "a file of features"
-    text, tensors = read_tensors(path, KEY, what=what, advice=_ADVICE, raising=SceneError)
+    text, tensors = read_tensors(path, FEATURES_KEY, what=what, advice=_ADVICE, raising=SceneError)
     record = parse_record(text, path, _check_record, formats=(FORMAT,), what=what, advice=_ADVICE, raising=SceneError)
+    expect_tensors(tensors, _sizes(record), path, dtype=torch.float32, advice=_ADVICE, raising=SceneError)
     return record, tensors
 
 

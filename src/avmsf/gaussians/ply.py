@@ -85,7 +85,7 @@ def _read_columns(path: Path, header: Header) -> Mapping[str, Shaped[np.ndarray,
     words = path.read_bytes().split()[header.start : header.start + vertices.count * width]
     expect_count(path, vertices.count, len(words) // width)
     try:
-        table = np.array(words, dtype="S").astype(np.float64).reshape(vertices.count, width)
+        rows = np.array(words, dtype="S").astype(np.float64).reshape(vertices.count, width)
     except ValueError as error:
         raise SceneError.expected("numbers in the vertices", got=str(error), file=path, name="vertex") from error
-    return dict(zip(vertices.properties, table.T, strict=True))
+    return dict(zip(vertices.properties, rows.T, strict=True))

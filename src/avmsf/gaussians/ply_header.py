@@ -122,6 +122,7 @@ def _find_gaussians(path: Path, elements: Sequence[Element]) -> Element:
     named = {element.name: element for element in elements}
     vertices, faces = (named.get(name, Element(name, 0)) for name in ("vertex", "face"))
     missing = [name for name in NEEDED if name not in vertices.properties]
+    value: object
     if any(name.startswith("packed_") for element in elements for name in element.properties):
         got, name, value, advice = "compressed ones", "compression", list(named), "export them uncompressed"
     elif not missing:

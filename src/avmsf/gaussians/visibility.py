@@ -40,6 +40,8 @@ class Visibility:
     """From 0, hidden or outside the image or its mask, to 1, seen."""
     past: Float[Tensor, " points"]
     """Likewise, of what surrounds a point's place and shows a surface behind the point."""
+    in_image: Bool[Tensor, " points"]
+    """Whether a point's place lies in the image, hidden or not."""
     camera: Camera
 
     @property
@@ -75,7 +77,7 @@ def depth_test(
             shows &= coverage[rows, columns] >= _COVERED
         share += weight * shows
         past += weight * (shows & (there > deep + tolerance))
-    return Visibility(places, deep, torch.where(inside, share, 0.0), torch.where(inside, past, 0.0), camera)
+    return Visibility(places, deep, torch.where(inside, share, 0.0), torch.where(inside, past, 0.0), inside, camera)
 
 
 def depth_of_cloud(cloud: GaussianCloud, rasterizer: Rasterizer) -> DepthMap:

@@ -12,7 +12,7 @@ from avmsf.features.descriptors import ImageDescriptors
 from avmsf.features.dino import DinoEncoder
 from avmsf.features.encoder import Encoder
 from avmsf.features.feature_field import FeatureField, reduce, resize, with_positions
-from avmsf.features.lift import Lifted, LiftProgress, by_presence, by_visibility, lift, lift_points, supported
+from avmsf.features.lift import Lifted, by_presence, by_visibility, lift, lift_points, supported
 from avmsf.features.pooling import orbit_spread, refine
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.points import sample_surface
@@ -71,7 +71,7 @@ def lift_to_cloud(
     config: LiftConfig,
     *,
     rasterizer: Rasterizer,
-    progress: Callable[[LiftProgress], None] | None = None,
+    progress: Callable[[int, int, str], None] | None = None,
 ) -> Lifted:
     """Lift features onto the Gaussians that views see, as the settings say."""
     weighting = _WEIGHTINGS[config.weighting]
@@ -84,7 +84,7 @@ def lift_to_cloud(
         inpainted=config.encoder_background == "inpainted",
         progress=progress,
     )
-    return supported(lifted, views)
+    return supported(lifted)
 
 
 def lift_to_surface(
@@ -93,7 +93,7 @@ def lift_to_surface(
     encoder: Encoder,
     config: LiftConfig,
     *,
-    progress: Callable[[LiftProgress], None] | None = None,
+    progress: Callable[[int, int, str], None] | None = None,
 ) -> Lifted:
     """Lift features onto points drawn evenly from a mesh, whose triangles hide what lies behind them."""
     generator = torch.Generator().manual_seed(config.seed)

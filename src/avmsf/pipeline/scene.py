@@ -16,7 +16,7 @@ from avmsf.capture.filenames import no_views
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import SceneError
 from avmsf.features.encoder import Encoder
-from avmsf.features.lift import Lifted, LiftProgress
+from avmsf.features.lift import Lifted
 from avmsf.features.store import save_features
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.fit import SplatProgress, splat
@@ -58,9 +58,9 @@ class ProgressListener:
         message = f"loss {progress.loss:.3g}, {progress.psnr:.1f} dB, {progress.gaussians} Gaussians"
         self.step("splat", progress.step, progress.steps, message)
 
-    def lifting(self, progress: LiftProgress) -> None:
+    def lifting(self, done: int, total: int, view: str) -> None:
         """Pass on how many views are described."""
-        self.step("features", progress.done, progress.total, progress.view)
+        self.step("features", done, total, view)
 
 
 class SceneStages:

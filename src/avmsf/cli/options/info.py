@@ -8,8 +8,7 @@ import tyro
 
 from avmsf.cli.options.checks import expect_capture
 from avmsf.cli.options.common import Printing
-from avmsf.cli.options.paths import Existing, OtherCapture, PlotsFolder, SettingsFile
-from avmsf.features.header import holds_features
+from avmsf.cli.options.paths import Existing, OtherCapture, PlotsFolder, SettingsFile, kind_of
 from avmsf.field.header import read_record
 from avmsf.gaussians.ply_header import read_header
 
@@ -48,7 +47,7 @@ class Options(Printing):
         for cloud in (self.file if suffix == ".ply" else None, self.cloud):
             if cloud is not None:
                 read_header(cloud)
-        if suffix != ".ply" and not (suffix == ".safetensors" and holds_features(self.file)):
+        if suffix != ".ply" and kind_of(self.file) != "features":
             read_record(self.file)
             if self.capture is not None:
                 expect_capture(self.capture, self.settings)

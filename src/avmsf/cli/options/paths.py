@@ -9,11 +9,10 @@ from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
-from avmsf._utils.headers import read_metadata
+from avmsf._utils.headers import FEATURES_KEY, read_metadata
 from avmsf.capture.filenames import PICTURE_SUFFIXES, VIDEO_SUFFIXES
 from avmsf.cli.options.checks import OutputError, expect_writable, is_folder
 from avmsf.errors import AvmsfError
-from avmsf.features import header as featureheader
 from avmsf.field import header as field_header
 from avmsf.pipeline.config import CACHE, CACHED_FIELD
 
@@ -162,6 +161,6 @@ def kind_of(path: Path) -> FileKind | None:
         entries = read_metadata(path)
     except (OSError, ValueError):
         return None
-    if featureheader.KEY in entries:
+    if FEATURES_KEY in entries:
         return "features"
     return "a sound field" if field_header.KEY in entries else None
