@@ -235,7 +235,7 @@ def test_only_the_current_revision_is_prepared_and_symmetries_once(
             assert time.monotonic() < end
             time.sleep(0.01)
     edited.set()
-    while not prepared or prepared[-1] != 6 or plate.studio.busy:
+    while not prepared or prepared[-1] != 6 or plate.studio.threads.busy:
         assert time.monotonic() < end
         time.sleep(0.01)
     assert len(prepared) == 2

@@ -33,8 +33,8 @@ from avmsf.cli.progress import ProgressBar
 from avmsf.cli.writing import Level, write_sound
 from avmsf.editing.distillation import DecoderDistillation
 from avmsf.editing.guided import PARAMETERISATIONS, Guide, GuidedEditProgress, edit_towards
-from avmsf.editing.material import LAWS, change_material, infer_material
-from avmsf.editing.modal_edit import EDITS, adjust_modes, remarks, silenced
+from avmsf.editing.material import LAWS, edit, infer_material
+from avmsf.editing.modal_edit import EDITS, remarks, silenced
 from avmsf.editing.reference import Reference
 from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import EditError
@@ -62,8 +62,8 @@ _LOUD_NOISE_DB = 6.0
 """Decrease of the modes' level, dB, from which on the noise, whose level stays, may be too loud: half the amplitude."""
 
 
-def _adjusted(options: ModeOptions, field: SoundField, *, named: Float[Tensor, " modes"]) -> SoundField:
-    """Return the field with each mode adjusted by hand; modes are called by the frequencies `named`, Hz."""
+def _adjustments(options: ModeOptions, named: Float[Tensor, " modes"]) -> dict[str, Any]:
+    """Return what `edit` does with each mode by hand; modes are called by the frequencies `named`, Hz."""
     levels = torch.zeros(len(named), dtype=torch.float64)
     pitch, decay = torch.full_like(levels, options.pitch), torch.full_like(levels, options.decay)
     for frequency, level in options.mode_db:
@@ -74,7 +74,7 @@ def _adjusted(options: ModeOptions, field: SoundField, *, named: Float[Tensor, "
     ):
         for frequency, factor in given:
             values[_called(frequency, named, option)] *= factor
-    return adjust_modes(field, pitch=pitch, decay=decay, brightness_db=options.brightness, gains_db=levels)
+    return {"pitch": pitch, "decay": decay, "brightness_db": options.brightness, "gains_db": levels}
 
 
 def _called(frequency: float, named: Float[Tensor, " modes"], option: str) -> int:
@@ -148,19 +148,20 @@ def run(options: Options) -> int:
 
 
 def _edited(options: Options, field: SoundField) -> SoundField:
-    """Return the edited field: material and size first, then modes, then the guided edit."""
-    named, change, guide = field.bank.frequency, options.change, options.steering
+    """Return the edited field: material, size and modes by `edit`, then the guided edit."""
+    change, guide = options.change, options.steering
     old: Material | None = None
+    target: Material | None = None
     if change.asked or guide.like_material is not None:
         new = None if change.material is None else material_named(change.material)
         old = old_material(field, new=new) if change.old is None else material_named(change.old)
     if change.asked and old is not None:
         target = _target(change, old)
-        field, old = change_material(field, old, target, size=change.size, law=LAWS[change.law]), target
-    if options.sliders.asked:
-        field = _adjusted(options.sliders, field, named=named)
+    if change.asked or options.sliders.asked:
+        adjusted = _adjustments(options.sliders, field.bank.frequency) if options.sliders.asked else dict[str, Any]()
+        field = edit(field, material=target, old_material=old, size=change.size, law=LAWS[change.law], **adjusted)
     if guide.asked:
-        field = _guided(guide, field, output=options.output, old=old)
+        field = _guided(guide, field, output=options.output, old=target or old)
     return field
 
 

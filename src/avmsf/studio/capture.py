@@ -13,8 +13,8 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import asdict
+from functools import lru_cache, partial
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -31,7 +31,6 @@ from avmsf.capture.preprocess import check
 from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.table import (
     DIRECTION,
-    FARTHEST,
     FORCE,
     REQUIRED,
     TABLE,
@@ -43,60 +42,33 @@ from avmsf.capture.table import (
 )
 from avmsf.errors import AvmsfError, CaptureError
 from avmsf.pipeline.config import CACHE
-from avmsf.studio.responses import bad_request
+from avmsf.studio.responses import RequestError, bad_request
 
 COMMAND = "avmsf studio"
 """What other processes wait for, in their messages."""
-REMOVED = "removed"
+_REMOVED = "removed"
 """In the capture's cache: the recordings that were replaced or removed."""
 _LOCK_TIMEOUT_SECONDS = 10.0
 """How long to wait for another studio's change, which takes a fraction of a second."""
 _NUMBERED = re.compile(r"(\d{1,6})\.wav", re.IGNORECASE)
 
 
-@dataclass(frozen=True)
-class Contact:
-    """Contact, direction and force of one impact."""
+def read_contact(query: Mapping[str, str]) -> Strike:
+    """Return the contact, meters, of a query x, y, z, with the direction nx, ny, nz and the force, newtons, if given.
 
-    point: tuple[float, float, float]
-    """Object frame, meters."""
-    direction: tuple[float, float, float] | None = None
-    """Along which the hammer moved, into the object; any length but zero."""
-    newtons: float | None = None
-    """Peak force, where it is known."""
-
-    @classmethod
-    def read(cls, query: Mapping[str, str]) -> "Contact":
-        """Return the contact of a query x, y, z and optionally nx, ny, nz, newtons. Raises RequestError (400)."""
-        point = _vector(query, REQUIRED[1:])
-        if point is None:
-            raise bad_request("contact", "x, y and z in meters", None, got="none", advice="click the object first")
-        if max(map(abs, point)) > FARTHEST:
-            raise bad_request("contact", f"a point within {FARTHEST:g} m of the origin", point)
-        direction = _vector(query, DIRECTION)
-        if direction is not None and math.hypot(*direction) == 0:
-            raise bad_request("direction", "a vector nx, ny, nz", direction, got="the zero vector")
-        newtons = _finite(query, "newtons") if "newtons" in query else None
-        if newtons is not None and newtons <= 0:
-            raise bad_request("newtons", "a peak force above 0", newtons, got=f"{newtons:g}")
-        return cls(point, direction, newtons)
-
-
-def _vector(query: Mapping[str, str], names: Sequence[str]) -> tuple[float, float, float] | None:
-    if not any(name in query for name in names):
-        return None
-    x, y, z = (_finite(query, name) for name in names)
-    return (x, y, z)
-
-
-def _finite(query: Mapping[str, str], name: str) -> float:
+    Raises RequestError (400).
+    """
+    names = (*REQUIRED[1:], *(DIRECTION if any(name in query for name in DIRECTION) else ()))
+    cells = {REQUIRED[0]: "recording", **{name: query.get(name, "") for name in names}}
+    if "newtons" in query:
+        cells[FORCE] = query["newtons"]
     try:
-        value = float(query[name])
-    except (KeyError, ValueError):
-        value = math.nan
-    if not math.isfinite(value):
-        raise bad_request(name, "a number", query.get(name))
-    return value
+        return parse_row(Row(0, cells, decimal_comma=False), CaptureSettings())
+    except CaptureError as error:
+        reason = str(error).partition(": ")[2]
+        raise RequestError(
+            400, f"contact: {reason[:200]}; click the object", name=error.name, value=error.value
+        ) from error
 
 
 def read_upload(content: bytes) -> Recording:
@@ -128,24 +100,20 @@ class ImpactTable:
         return [name.lower() for name in self.header]
 
     def rows_of(self, file: str) -> list[int]:
-        """Return the indices of the rows with this recording."""
-        return [index for index, row in enumerate(self.rows) if file_of(row) == file]
+        """Return the indices of the rows with this recording. Raises RequestError (404) for none."""
+        indices = [index for index, row in enumerate(self.rows) if file_of(row) == file]
+        if not indices:
+            wanted = f"a row of {file[:80]!r}"
+            raise bad_request("file", wanted, file, got="none", advice="reload the page", status=404, file=TABLE)
+        return indices
 
-    def check_complete(self, contact: Contact) -> None:
-        """Raise RequestError (422) for an impact without a value that every row of the table has."""
-        for column, value, name in ((DIRECTION[0], contact.direction, "direction"), (FORCE, contact.newtons, "force")):
-            if column in self.names and value is None:
-                wanted = f"a {name} as in all rows"
-                raise bad_request(name, wanted, got="none", advice="add it", status=422, file=self.path)
-
-    def add(self, file: str, contact: Contact, settings: CaptureSettings) -> None:
+    def add(self, file: str, impact: Strike, settings: CaptureSettings) -> None:
         """Append a row; a new table gets columns for the known values of the impact."""
-        numbers = dict(zip(REQUIRED[1:], (value / settings.meters for value in contact.point), strict=True))
-        if contact.direction is not None:
-            length = math.hypot(*contact.direction)
-            numbers |= dict(zip(DIRECTION, (value / length for value in contact.direction), strict=True))
-        if contact.newtons is not None:
-            numbers[FORCE] = contact.newtons
+        numbers = dict(zip(REQUIRED[1:], (value / settings.meters for value in impact.contact), strict=True))
+        if impact.direction is not None:
+            numbers |= dict(zip(DIRECTION, impact.direction, strict=True))
+        if impact.newtons is not None:
+            numbers[FORCE] = impact.newtons
         self.header = self.header or [REQUIRED[0], *numbers]
         written = {name: repr(float(value)) for name, value in numbers.items()}
         if any("," in row.cells.get(name, "") for row in self.rows for name in (*REQUIRED[1:], *DIRECTION, FORCE)):
@@ -170,16 +138,14 @@ class ImpactTable:
         before = self.path.read_bytes().decode() if self.path.is_file() else ""
         mark = before[: before.startswith("\ufeff")]
         memory = io.StringIO()
-        memory.writelines(takewhile(_is_no_row, before.removeprefix(mark).splitlines(keepends=True)))
+        # Comments above the header, and what names Excel's separator.
+        above = takewhile(
+            lambda line: line.startswith(("#", "sep=")), before.removeprefix(mark).splitlines(keepends=True)
+        )
+        memory.writelines(above)
         ending = "\r\n" if "\r\n" in before else "\n"
         csv.writer(memory, delimiter=self.separator, lineterminator=ending).writerows([self.header, *cells])
-        content = f"{mark}{memory.getvalue()}".encode()
-        write_whole(self.path, lambda path: path.write_bytes(content), raising=CaptureError)
-
-
-def _is_no_row(line: str) -> bool:
-    """Whether a line above the header is a comment, or names Excel's separator."""
-    return line.startswith(("#", "sep="))
+        _write(self.path, f"{mark}{memory.getvalue()}".encode())
 
 
 def file_of(row: Row) -> str:
@@ -224,27 +190,30 @@ class CaptureEditor:
         """Return the report on a recording, without writing it. Raises CaptureError for what cannot be used."""
         return _plain(self._check_usable(read_upload(content), newtons=1.0))
 
-    def add(self, content: bytes, contact: Contact) -> dict[str, Any]:
-        """Write an impact and return it; one of the same recording and contact is returned as it is.
+    def add(self, content: bytes, impact: Strike) -> dict[str, Any]:
+        """Write the recording of an impact and return it; one of the same recording and contact is returned as it is.
 
-        Raises CaptureError for a recording that cannot be used, and RequestError for a missing direction or force.
+        Raises CaptureError for a recording that cannot be used, and RequestError (422) for an impact without a value
+        that every row of the table has.
         """
         with self._lock():
             settings, table = self.settings, ImpactTable(self.folder)
-            digest = hashlib.sha256(content).hexdigest()
             for index, row in enumerate(table.rows):
-                impact = self._described(index, row, settings)
-                # Equal but for the conversion of units.
-                same_place = impact["contact"] and math.dist(impact["contact"], contact.point) < 1e-9
-                if impact["digest"] == digest and same_place:
-                    return impact
+                added = self._described(index, row, settings)
+                # Contacts are equal but for the conversion of units.
+                if added["digest"] == _digest(content) and math.dist(added["contact"], impact.contact) < 1e-9:
+                    return added
             recording = read_upload(content)
-            self._check_usable(recording, newtons=contact.newtons)
-            table.check_complete(contact)
+            self._check_usable(recording, newtons=impact.newtons)
+            needed = {"direction": (DIRECTION[0], impact.direction), "force": (FORCE, impact.newtons)}
+            for name, (column, value) in needed.items():
+                if column in table.names and value is None:
+                    wanted = f"a {name} as in all rows"
+                    raise bad_request(name, wanted, got="none", advice="add it", status=422, file=table.path)
             file = self._next_name(table)
-            self._write(file, content, recording)
+            _write(self.folder / file, _as_wav(content, recording))
             try:
-                table.add(file, contact, settings)
+                table.add(file, impact, settings)
             except BaseException:
                 (self.folder / file).unlink(missing_ok=True)
                 raise
@@ -257,18 +226,18 @@ class CaptureEditor:
         (409) if the digest of the recording is not `match`.
         """
         with self._lock():
-            if self._found(file)["digest"] == hashlib.sha256(content).hexdigest():
+            if self._found(file)["digest"] == _digest(content):
                 return self._found(file)
             table, index = self._owned(file, match)
             recording = read_upload(content)
             self._check_usable(recording, newtons=1.0, replaced=file)
-            new = file
-            if PurePosixPath(file).suffix.lower() != ".wav":
-                new = str(PurePosixPath(file).with_suffix(".wav"))
-                if os.path.lexists(self.folder / new) or table.rows_of(new):
-                    new = self._next_name(table)
+            new = str(PurePosixPath(file).with_suffix(".wav"))
+            if PurePosixPath(file).suffix.lower() == ".wav":
+                new = file
+            elif os.path.lexists(self.folder / new) or new in map(file_of, table.rows):
+                new = self._next_name(table)
             self._set_aside(file)
-            self._write(new, content, recording)
+            _write(self.folder / new, _as_wav(content, recording))
             if new != file:
                 table.rename(index, new)
                 (self.folder / file).unlink(missing_ok=True)
@@ -296,22 +265,23 @@ class CaptureEditor:
 
     def _described(self, index: int, row: Row, settings: CaptureSettings) -> dict[str, Any]:
         values: dict[str, Any] = {"row": index, "file": file_of(row), "contact": None, "direction": None}
+        digest = None
         try:
             impact = parse_row(row, settings)
             values |= {"file": impact.file, "contact": impact.contact, "direction": impact.direction}
             path = self._readable(impact.file)
-            report, digest = _measured(path, _state(path), impact, settings)
+            state = path.stat() if os.path.exists(path) else None
+            changing = state and (state.st_mtime_ns, state.st_size, state.st_ino)
+            report, digest = _measured(path, changing, impact, settings)
         except AvmsfError as error:
             report = RecordingReport(values["file"], row.line, readable=False, problems=(str(error),))
-            digest = None
         return {**_plain(report), **values, "digest": digest}
 
     def _found(self, file: str) -> dict[str, Any]:
+        """Return an impact as `describe` does. Raises RequestError (404)."""
         table = ImpactTable(self.folder)
-        for index in table.rows_of(file):
-            return self._described(index, table.rows[index], self.settings)
-        wanted = f"a row of {file[:80]!r}"
-        raise bad_request("file", wanted, file, got="none", advice="reload the page", status=404, file=TABLE)
+        index = table.rows_of(file)[0]
+        return self._described(index, table.rows[index], self.settings)
 
     def _owned(self, file: str, match: str | None) -> tuple[ImpactTable, int]:
         """Return the table and the row of a recording to change.
@@ -319,23 +289,20 @@ class CaptureEditor:
         Raises RequestError (409) unless it is the only row, the recording is no link, which may belong to another
         impact or capture, and its digest is `match`.
         """
-        self._found(file)
         table = ImpactTable(self.folder)
         indices = table.rows_of(file)
-        lines = [table.rows[index].line for index in indices]
-        if len(lines) > 1:
-            got = f"rows {', '.join(map(str, lines))}"
-            raise bad_request(
-                file, f"one row of {file}", lines, got=got, advice="correct the table", status=409, file=TABLE
-            )
+        conflict = partial(bad_request, status=409)
+        if len(indices) > 1:
+            lines = [table.rows[index].line for index in indices]
+            got, advice = f"rows {', '.join(map(str, lines))}", "correct the table"
+            raise conflict(file, f"one row of {file}", lines, got=got, advice=advice, file=TABLE)
         path = self.folder / file
         if path.resolve() != path:
-            advice = "copy the file there first"
-            raise bad_request("file", "a file", "link", got="a link", advice=advice, status=409, file=file)
-        if match is not None and not (path.is_file() and match == hashlib.sha256(path.read_bytes()).hexdigest()):
+            raise conflict("file", "a file", "link", got="a link", advice="copy the file there first", file=file)
+        if match is not None and not (path.is_file() and match == _digest(path.read_bytes())):
             wanted, got = "the recording that the page shows", "another one from another tab or program"
             advice = "nothing was overwritten; play it and repeat the change"
-            raise bad_request("digest", wanted, match, got=got, advice=advice, status=409, file=file)
+            raise conflict("digest", wanted, match, got=got, advice=advice, file=file)
         return table, indices[0]
 
     def _readable(self, file: str) -> Path:
@@ -353,9 +320,7 @@ class CaptureEditor:
 
         `replaced` is the recording that it takes the place of.
         """
-        settings = self.settings
-        prepared = prepare(recording, settings, newtons=newtons)
-        report = measure(recording, prepared, settings=settings, line=0)
+        report = _report(recording, self.settings, newtons=newtons)
         rates = []
         for impact in self.impacts():
             with suppress(soundfile.LibsndfileError, OSError):
@@ -375,41 +340,45 @@ class CaptureEditor:
         numbers = [int(found[1]) for name in names if (found := _NUMBERED.fullmatch(name))]
         return f"{max(numbers, default=0) + 1:03d}.wav"
 
-    def _write(self, file: str, content: bytes, recording: Recording) -> None:
-        """Write what was sent, to the last bit where it is a wav file, else the same samples as one."""
-        if not (content[:4] == b"RIFF" and content[8:12] == b"WAVE"):
-            content = wav_bytes(recording.channels.T, round(recording.sample_rate))
-        write_whole(self.folder / file, lambda path: path.write_bytes(content), raising=CaptureError)
-
     def _set_aside(self, file: str) -> None:
         """Keep a copy of a recording in the cache."""
         path = self.folder / file
         if path.is_file():
-            digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
-            saved = self.folder / CACHE / REMOVED / f"{path.stem}-{digest}{path.suffix}"
-            copy_whole(path, saved, raising=CaptureError)
+            name = f"{path.stem}-{_digest(path.read_bytes())[:12]}{path.suffix}"
+            copy_whole(path, self.folder / CACHE / _REMOVED / name, raising=CaptureError)
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _write(path: Path, content: bytes) -> None:
+    write_whole(path, lambda temporary: temporary.write_bytes(content), raising=CaptureError)
+
+
+def _as_wav(content: bytes, recording: Recording) -> bytes:
+    """Return what was sent, to the last bit where it is a wav file, else the same samples as one."""
+    if content[:4] == b"RIFF" and content[8:12] == b"WAVE":
+        return content
+    return wav_bytes(recording.channels.T, round(recording.sample_rate))
 
 
 def _plain(report: RecordingReport) -> dict[str, Any]:
     """Return what the page shows of a recording."""
-    names = ("readable", "seconds", "sample_rate", "channels", "coding", "peak_db", "noise_db", "onset_seconds")
-    values = {name: getattr(report, name) for name in (*names, "clipped", "double_hit_seconds")}
-    return {"file": report.file, **values, "warnings": list(report.problems)}
+    values = asdict(report)
+    del values["line"]
+    return {**values, "warnings": list(values.pop("problems"))}
+
+
+def _report(
+    recording: Recording, settings: CaptureSettings, *, newtons: float | None, line: int = 0
+) -> RecordingReport:
+    return measure(recording, prepare(recording, settings, newtons=newtons), settings=settings, line=line)
 
 
 @lru_cache(maxsize=4096)
 def _measured(path: Path, state: object, impact: Strike, settings: CaptureSettings) -> tuple[RecordingReport, str]:
     """Return the report on an impact's recording, and its digest. Raises CaptureError for an unreadable one."""
     recording = read_recording(path, impact.file)
-    prepared = prepare(recording, settings, newtons=impact.newtons)
-    report = measure(recording, prepared, settings=settings, line=impact.line)
-    return report, hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def _state(path: Path) -> tuple[int, int, int] | None:
-    """Return what changes where a file does; None for none."""
-    try:
-        state = path.stat()
-    except OSError:
-        return None
-    return state.st_mtime_ns, state.st_size, state.st_ino
+    report = _report(recording, settings, newtons=impact.newtons, line=impact.line)
+    return report, _digest(path.read_bytes())

@@ -1,27 +1,25 @@
 """The page's sliders as one value, and the edited field that they give."""
 
 import math
-from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import torch
 
 from avmsf.editing.config import STABLE_AUDIO
-from avmsf.editing.material import LAWS, change_material, infer_material
-from avmsf.editing.modal_edit import EDITS, adjust_modes, remarks
+from avmsf.editing.material import LAWS, edit, infer_material
+from avmsf.editing.modal_edit import EDITS, remarks
 from avmsf.errors import EditError
 from avmsf.fem.material import material_named
 from avmsf.field.sound_field import SoundField
 from avmsf.studio.responses import bad_request
 
-_MATERIAL, _MODE = ("from", "to"), ("mode", "db", "pitch", "decay")
 _OLD_CONTROL = '"Present material"'
 """What the page calls its choice of the old material."""
+_NEUTRAL = {"size": 1.0, "pitch": 1.0, "decay": 1.0, "brightness": 0.0, "db": 0.0}
 _LIMITS = {
     # Lengths of struck objects lie between a millimeter and tens of meters; frequencies go with 1 / size.
     "size": (1e-3, 1e3),
@@ -29,7 +27,7 @@ _LIMITS = {
     "pitch": (1e-3, 1e3),
     # Decay times of objects lie between 10 ms (rubber) and 10 s (bells).
     "decay": (1e-3, 1e3),
-    # A mode farther below the others cannot be represented beside them in float32, whose range of precision is 144 dB.
+    # A mode farther below the others cannot be represented in float32 with them, whose precision spans 144 dB.
     "db": (-120.0, 120.0),
     # Decibels an octave: over the ten octaves of hearing no more than float32 holds.
     "brightness": (-40.0, 40.0),
@@ -39,6 +37,8 @@ _MAX_ROW = 1 << 31
 """Rows of a field's bank: far more than any has, and few enough digits to repeat."""
 _MAX_NAME = 100
 """Characters of a material's name."""
+_MAX_PROMPT = 2000
+"""Characters, several paragraphs: a description of a sound is a sentence."""
 MUTE = -math.inf
 """Decibels that a mode is muted by; in JSON, where there are no such numbers, null."""
 
@@ -78,62 +78,63 @@ class Sliders:
     modes: tuple[ModeChange, ...] = field(default=())
 
     @classmethod
-    def read(cls, words: Mapping[str, Any], *, modes: int | None = None) -> "Sliders":
+    def read(cls, request: Mapping[str, Any], *, modes: int | None = None) -> "Sliders":
         """Return the sliders of a request for a field of so many `modes`.
 
         Raises RequestError (400), with the name of the entry, for unknown entries, values that are no numbers or
         outside `_LIMITS`, and for more rows than modes.
         """
-        known = ("base", "material", "size", "pitch", "decay", "brightness", "law", "modes")
-        _expect_keys(words, known, "an edit")
-        material = words.get("material") or {}
-        _expect_keys(material, _MATERIAL, "material")
-        rows = words.get("modes") or []
+        sliders = ("size", "pitch", "decay", "brightness")
+        _check_keys(request, ("base", "material", "law", "modes", *sliders), "an edit")
+        material = request.get("material") or {}
+        _check_keys(material, ("from", "to"), "material")
+        rows = request.get("modes") or []
         if not isinstance(rows, list):
             raise bad_request("modes", "a list", rows, advice="reload the page")
         if modes is not None and len(rows) > modes:
             raise bad_request("modes", f"at most {modes} rows, one per mode", len(rows))
         changes = tuple(_mode(row) for row in rows)
-        repeated = [mode for mode, count in Counter(change.mode for change in changes).items() if count > 1]
+        numbers = [change.mode for change in changes]
+        repeated = sorted({mode for mode in numbers if numbers.count(mode) > 1})
         if repeated:
             raise bad_request("modes", "one row per mode", repeated, got=f"several of mode {repeated[0]}")
-        law = words.get("law", "displacement")
+        law = request.get("law", "displacement")
         if not isinstance(law, str) or law not in LAWS:
             raise bad_request("law", f"one of {', '.join(LAWS)}", law)
-        return cls(
-            _name(material.get("to"), "to"),
-            _name(material.get("from"), "from"),
-            law=law,
-            modes=changes,
-            **{name: _number(words, name, rest) for name, rest in _RESTS.items()},
-        )
+        values = {name: _number(request, name) for name in sliders}
+        return cls(_name(material, "to"), _name(material, "from"), law=law, modes=changes, **values)
 
     def to_json(self) -> dict[str, Any]:
         """Return what `read` makes these sliders of."""
         values = asdict(self)
-        made, old = values.pop("material"), values.pop("old")
+        names = {"from": values.pop("old"), "to": values.pop("material")}
         values["modes"] = [{**row, "db": None if row["db"] == MUTE else row["db"]} for row in values["modes"]]
-        return {"material": {"from": old, "to": made} if made or old else None, **values}
+        return {"material": names if any(names.values()) else None, **values}
 
     def apply(self, ground: SoundField) -> tuple[SoundField, list[str]]:
         """Return the edited field and what its owner should know. Raises EditError and SimulationError as edits do."""
-        edited, words = ground, []
-        if self.material is not None or self.size != 1.0:
-            if self.old is None:
-                wanted = None if self.material is None else material_named(self.material)
-                old, known = infer_material(ground, option=_OLD_CONTROL, new=wanted)
-                words.append(known)
-            else:
-                old = material_named(self.old)
-            new = old if self.material is None else material_named(self.material)
-            edited = change_material(ground, old, new, size=self.size, law=LAWS[self.law])
-        if (self.pitch, self.decay, self.brightness) != (1.0, 1.0, 0.0) or self.modes:
-            edited = self._adjusted(edited)
+        edited, notes, old = ground, list[str](), None if self.old is None else material_named(self.old)
+        new = None if self.material is None else material_named(self.material)
+        if old is None and (new is not None or self.size != 1.0):
+            old, known = infer_material(ground, option=_OLD_CONTROL, new=new)
+            notes.append(known)
+        if replace(self, old=None, law=REST.law) != REST:
+            edited = edit(
+                ground,
+                material=new,
+                old_material=old,
+                size=self.size,
+                law=LAWS[self.law],
+                brightness_db=self.brightness,
+                **self._mode_values(len(ground.bank)),
+            )
         entries = edited.origin.report.get(EDITS, [])[len(ground.origin.report.get(EDITS, [])) :]
-        return edited, words + remarks(entries, edited)
+        return edited, notes + remarks(entries, edited)
 
-    def _adjusted(self, changed: SoundField) -> SoundField:
-        count = len(changed.bank)
+    def _mode_values(self, count: int) -> dict[str, Any]:
+        """Return pitch, decay and level: one value for all modes, or where modes were set by hand one for each."""
+        if not self.modes:
+            return {"pitch": self.pitch, "decay": self.decay}
         levels = torch.zeros(count, dtype=torch.float64)
         pitch, decay = torch.full_like(levels, self.pitch), torch.full_like(levels, self.decay)
         for row in self.modes:
@@ -142,37 +143,60 @@ class Sliders:
             levels[row.mode] += row.db
             pitch[row.mode] *= row.pitch
             decay[row.mode] *= row.decay
-        return adjust_modes(changed, pitch=pitch, decay=decay, brightness_db=self.brightness, gains_db=levels)
+        return {"pitch": pitch, "decay": decay, "gains_db": levels}
 
 
 REST = Sliders()
 """Sliders that change nothing."""
-_RESTS = {"size": 1.0, "pitch": 1.0, "decay": 1.0, "brightness": 0.0}
+
+
+def read_prompt(request: Mapping[str, Any], *, model: str | None) -> str:
+    """Return the text of a guided edit. Raises RequestError (400), and EditError without a `model`."""
+    unknown = sorted(set(request) - {"base", "prompt"})
+    if unknown:
+        raise bad_request("prompt", "only base, prompt", unknown, advice="set the sliders before or after")
+    if model is None:
+        advice = "pip install 'avmsf[text]' and start avmsf studio with --model FOLDER"
+        raise EditError.expected("the extra and the model for edits by text", name="model", advice=advice)
+    prompt = request.get("prompt")
+    if not isinstance(prompt, str) or not prompt.strip() or len(prompt) > _MAX_PROMPT:
+        raise bad_request("prompt", f'1 to {_MAX_PROMPT} characters, such as "a wooden bowl is hit"', prompt)
+    return prompt
+
+
+def text_model(given: str | None) -> str | None:
+    """Return the model for text edits: the given one, or that in the hub's cache; None if there is none."""
+    if any(find_spec(name) is None for name in ("diffusers", "torchsde", "transformers")):
+        return None
+    if given is not None:
+        return given
+    from huggingface_hub import try_to_load_from_cache
+
+    return STABLE_AUDIO if isinstance(try_to_load_from_cache(STABLE_AUDIO, "model_index.json"), str) else None
 
 
 def _mode(row: Any) -> ModeChange:
-    _expect_keys(row, _MODE, "a mode")
+    _check_keys(row, ("mode", "db", "pitch", "decay"), "a mode")
     mode = row.get("mode")
     if not isinstance(mode, int) or isinstance(mode, bool) or not 0 <= mode < _MAX_ROW:
         raise bad_request("mode", "an index from 0", mode, advice="reload the page")
     mute = "db" in row and row["db"] is None
-    return ModeChange(
-        mode, MUTE if mute else _number(row, "db", 0.0), _number(row, "pitch", 1.0), _number(row, "decay", 1.0)
-    )
+    return ModeChange(mode, MUTE if mute else _number(row, "db"), _number(row, "pitch"), _number(row, "decay"))
 
 
-def _expect_keys(words: Any, known: tuple[str, ...], what: str) -> None:
-    if not isinstance(words, Mapping):
-        raise bad_request(what, f"an object with {', '.join(known)}", words, advice="reload the page")
-    unknown = sorted(set(words) - set(known))
+def _check_keys(values: Any, known: tuple[str, ...], what: str) -> None:
+    if not isinstance(values, Mapping):
+        raise bad_request(what, f"an object with {', '.join(known)}", values, advice="reload the page")
+    unknown = sorted(set(values) - set(known))
     if unknown:
         raise bad_request(what, ", ".join(known), unknown, advice="reload the page")
 
 
-def _number(words: Mapping[str, Any], name: str, rest: float) -> float:
-    value = words.get(name, rest)
+def _number(values: Mapping[str, Any], name: str) -> float:
+    """Return a slider's value, its neutral one where none is given. Raises RequestError (400)."""
+    value = values.get(name)
     if value is None:
-        return rest
+        return _NEUTRAL[name]
     number = math.nan
     if isinstance(value, int | float) and not isinstance(value, bool):
         with suppress(OverflowError):
@@ -185,54 +209,8 @@ def _number(words: Mapping[str, Any], name: str, rest: float) -> float:
     return number
 
 
-def _name(value: Any, what: str) -> str | None:
+def _name(material: Mapping[str, Any], key: str) -> str | None:
+    value = material.get(key)
     if value is not None and not (isinstance(value, str) and len(value) <= _MAX_NAME):
-        raise bad_request(f"material.{what}", "a name", value)
+        raise bad_request(f"material.{key}", "a name", value)
     return value or None
-
-
-_KEYS = ("base", "prompt")
-_MAX_PROMPT = 2000
-"""Characters, several paragraphs: a description of a sound is a sentence."""
-
-
-@dataclass(frozen=True)
-class GuidedEditTarget:
-    """Target of a guided edit: a recording or a text."""
-
-    like: bytes | None = None
-    """A sound file."""
-    prompt: str | None = None
-
-    @classmethod
-    def read(cls, words: Mapping[str, Any], *, model: str | None) -> "GuidedEditTarget":
-        """Return the target of a request with a text. Raises RequestError (400), and EditError without a `model`."""
-        unknown = sorted(set(words) - set(_KEYS))
-        if unknown:
-            raise bad_request("prompt", f"only {', '.join(_KEYS)}", unknown, advice="set the sliders before or after")
-        if model is None:
-            advice = "pip install 'avmsf[text]' and start avmsf studio with --model FOLDER"
-            raise EditError.expected("the extra and the model for edits by text", name="model", advice=advice)
-        prompt = words.get("prompt")
-        if not isinstance(prompt, str) or not prompt.strip() or len(prompt) > _MAX_PROMPT:
-            raise bad_request("prompt", f'1 to {_MAX_PROMPT} characters, such as "a wooden bowl is hit"', prompt)
-        return cls(prompt=prompt)
-
-    def task(self, place: Path, *, steps: int, model: str | None) -> dict[str, Any]:
-        """Return the worker's task, with its files in `place`; the edited field is written there as `field`."""
-        task = {"task": "lead", "field": str(place / "field"), "output": str(place / "led"), "steps": steps}
-        if self.like is None:
-            return {**task, "prompt": self.prompt, "model": model}
-        (place / "like.wav").write_bytes(self.like)
-        return {**task, "recording": str(place / "like.wav")}
-
-
-def text_model(given: str | None) -> str | None:
-    """Return the model for text edits: the given one, or that in the hub's cache; None if there is none."""
-    if any(find_spec(name) is None for name in ("diffusers", "torchsde", "transformers")):
-        return None
-    if given is not None:
-        return given
-    from huggingface_hub import try_to_load_from_cache
-
-    return STABLE_AUDIO if isinstance(try_to_load_from_cache(STABLE_AUDIO, "model_index.json"), str) else None

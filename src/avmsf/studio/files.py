@@ -32,7 +32,7 @@ from avmsf.studio.capture import CaptureEditor
 from avmsf.studio.opening import Opened, find_object, find_reconstructed, is_gaussians
 from avmsf.studio.session import Revision
 
-_CLICKED = 8_000
+_MAX_OBJECT_POINTS = 8_000
 """Points of an object without a field."""
 _CACHED_REVISIONS = 4
 """Number of revisions whose files are kept: a page may still be reading the previous ones."""
@@ -66,8 +66,7 @@ class Showcase:
 
     def files_of(self, number: int) -> Path:
         """Return the folder of a revision's files, or of the last one's if they are no longer kept."""
-        shown = self._shown.get(number)
-        return (self.current if shown is None else shown).folder
+        return self._shown.get(number, self.current).folder
 
     @property
     def object_folder(self) -> Path:
@@ -75,30 +74,39 @@ class Showcase:
         assert self._first_of_field is not None
         return self._first_of_field.folder
 
+    @property
+    def meters(self) -> float:
+        """Meters in one unit of the object's mesh."""
+        return 1.0 if self.opened.object is not None else self.opened.settings.surface_meters
+
     def show(self, revision: Revision) -> None:
         """Write a revision's files. Raises the errors of `make_bundle`, and StudioError without geometry."""
         with self._lock:
             sampled = self._sampled(revision)
             path = self.folder / f"revision-{revision.number}"
-            fresh = self._is_other_field(revision)
-            shown = find_object(self.opened) if fresh else None
-            strikes, remarks = self._strikes(revision.field) if fresh else (None, ())
-            mute = revision.field is None
-            surface = self._surface(revision.field) if fresh else None
-            bundle = make_bundle(sampled, object=shown, meters=self.meters, surface=surface, strikes=strikes, mute=mute)
-            remarks += bundle.write(path, force=True).remarks
+            first, shows = self._first_of_field, dict[str, Any]()
+            remarks: tuple[str, ...] = ()
+            if self._is_other_field(revision):
+                first, field = None, revision.field
+                strikes, remarks = self._strikes(field)
+                surface = self._surface(field)
+                shows = {"object": find_object(self.opened), "surface": surface, "strikes": strikes}
+            bundle = make_bundle(sampled, meters=self.meters, mute=revision.field is None, **shows)
+            written = bundle.write(path, force=True).remarks
             manifest = json.loads((path / "manifest.json").read_text(encoding="utf-8"))
             manifest["name"] = revision.name or manifest["name"] or self.opened.name
-            if fresh:
-                self._first_of_field = Shown(path, manifest, sampled, revision, remarks)
-            assert self._first_of_field is not None
-            for part in ("object", "surface", "strikes"):
-                manifest[part] = self._first_of_field.manifest[part]
+            if first is not None:
+                manifest |= {part: first.manifest[part] for part in ("object", "surface", "strikes")}
             for tensor in manifest["tensors"].values():
                 # By revision, so that a page never reads one's manifest with another's numbers.
                 tensor["file"] = f"revisions/{revision.number}/field.bin"
-            self._shown[revision.number] = Shown(path, manifest, sampled, revision, self._first_of_field.remarks)
-            self._forget()
+            notes = remarks + written if first is None else first.remarks
+            self._shown[revision.number] = shown = Shown(path, manifest, sampled, revision, notes)
+            self._first_of_field = first or shown
+            while len(self._shown) > _CACHED_REVISIONS:
+                _, old = self._shown.popitem(last=False)
+                if old.folder != self.object_folder:
+                    shutil.rmtree(old.folder, ignore_errors=True)
 
     def _surface(self, field: SoundField | None) -> Path | Surface | None:
         """Return the surface to show in place of Gaussians or points: the field's body, or the reconstructed surface.
@@ -111,39 +119,30 @@ class Showcase:
         return surface_of(fitted_gains(field.gain_field)) or find_reconstructed(self.opened)
 
     def _sampled(self, revision: Revision) -> SampledField:
+        """Return a revision's table: that of the one before, changed, where the field is the same."""
         field = revision.field
         if field is None:
-            return self._without_field()
+            points, normals = self._clickable()
+            nothing, empty = torch.zeros(len(points), 0), torch.zeros(0, dtype=torch.float64)
+            name = self.opened.name
+            return SampledField(points, normals, empty, empty, nothing, nothing, torch.zeros(0), 48_000.0, name=name)
         if not self._is_other_field(revision):
             before = self.current
             assert before.revision.field is not None
             found = resample(before.sampled, before.revision.field, field)
-            if found is not None:
-                return found
-            return sample(field, before.sampled.points, before.sampled.normals)
-        return self._first(field)
+            return sample(field, before.sampled.points, before.sampled.normals) if found is None else found
+        own = points_on_object(field.gain_field)
+        if not len(own):
+            return sample(field, *self._clickable())
+        sampled = SampledField.of(field, _thinned(own, MAX_POINTS))
+        return replace(sampled, points=(sampled.points.double() / length_of(field.gain_field)).float())
 
     def _is_other_field(self, revision: Revision) -> bool:
         """Whether a revision is of another field than the one shown before it, or of the first."""
         return not self._shown or self.current.revision.opening != revision.opening
 
-    def _first(self, field: SoundField) -> SampledField:
-        """Return the table of a field just opened, over its own points, or where it has none, over the object's."""
-        own = points_on_object(field.gain_field)
-        if len(own):
-            sampled = SampledField.of(field, _thinned(own, MAX_POINTS))
-            return replace(sampled, points=(sampled.points.double() / length_of(field.gain_field)).float())
-        points, normals = self._clickable()
-        return sample(field, points, normals)
-
-    def _without_field(self) -> SampledField:
-        points, normals = self._clickable()
-        nothing, empty = torch.zeros(len(points), 0), torch.zeros(0, dtype=torch.float64)
-        name = self.opened.name
-        return SampledField(points, normals, empty, empty, nothing, nothing, torch.zeros(0), 48_000.0, False, name)
-
     def _clickable(self) -> tuple[Float32[Tensor, "points 3"], Float32[Tensor, "points 3"]]:
-        """Return points of the object for a field without points. Raises StudioError without geometry."""
+        """Return points of the object, and normals, for a field without points. Raises StudioError without geometry."""
         path = find_object(self.opened)
         if path is not None and not is_gaussians(path):
             return _on_mesh(read_surface(path, meters=self.meters))
@@ -159,13 +158,8 @@ class Showcase:
         if not len(points):
             advice = f"give a mesh or Gaussians of {self.opened.name} by --object"
             raise StudioError.expected("its geometry", name="object", advice=advice)
-        points = _thinned(points.float(), _CLICKED)
+        points = _thinned(points.float(), _MAX_OBJECT_POINTS)
         return points, outward_normals(points)
-
-    @property
-    def meters(self) -> float:
-        """Meters in one unit of the object's mesh."""
-        return 1.0 if self.opened.object is not None else self.opened.settings.surface_meters
 
     def _strikes(self, field: SoundField | None) -> tuple[Impacts | None, tuple[str, ...]]:
         """Return the capture's impacts, each from its own onset, or the reason why they cannot be compared."""
@@ -178,18 +172,9 @@ class Showcase:
         except CaptureError as error:
             return None, (f"recorded impacts are not shown: {error}",)
         if impacts.sample_rate != field.sample_rate:
-            return None, (
-                f"recorded impacts are not shown: expected the field's {field.sample_rate:g} Hz, got "
-                f"{impacts.sample_rate:g} Hz",
-            )
+            found = f"expected the field's {field.sample_rate:g} Hz, got {impacts.sample_rate:g} Hz"
+            return None, (f"recorded impacts are not shown: {found}",)
         return impacts, ()
-
-    def _forget(self) -> None:
-        """Remove the files of revisions that no page reads any more."""
-        while len(self._shown) > _CACHED_REVISIONS:
-            _, old = self._shown.popitem(last=False)
-            if old.folder != self.object_folder:
-                shutil.rmtree(old.folder, ignore_errors=True)
 
 
 def _on_mesh(surface: Surface) -> tuple[Float32[Tensor, "points 3"], Float32[Tensor, "points 3"]]:
@@ -199,9 +184,9 @@ def _on_mesh(surface: Surface) -> tuple[Float32[Tensor, "points 3"], Float32[Ten
     """
     mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy())
     if not len(surface.faces) or not mesh.area > 0:
-        points = _thinned(surface.vertices, _CLICKED)
+        points = _thinned(surface.vertices, _MAX_OBJECT_POINTS)
         return points, outward_normals(points)
-    places, rows = trimesh.sample.sample_surface(mesh, _CLICKED, seed=0)
+    places, rows = trimesh.sample.sample_surface(mesh, _MAX_OBJECT_POINTS, seed=0)
     points, normals = torch.from_numpy(np.array(places)).float(), torch.from_numpy(mesh.face_normals[rows]).float()
     if not mesh.is_winding_consistent:
         return points, outward_normals(points)

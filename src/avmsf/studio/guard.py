@@ -6,7 +6,6 @@ other origins.
 """
 
 import secrets
-from pathlib import Path
 from urllib.parse import quote
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -20,15 +19,6 @@ from avmsf.studio.responses import RequestError, bad_request, response_to
 
 _FRAMES = {"frame-ancestors": ["'none'"]}
 """Directive that is valid only in a header."""
-NOTHING = policy_text({"default-src": ["'none'"], **_FRAMES})
-"""Policy of all responses that are not the page: they may run nothing if opened as a page."""
-
-
-def policy_of(page: str) -> str:
-    """Return the Content-Security-Policy of the page's HTML."""
-    return policy_text({**directives_of(page), **_FRAMES})
-
-
 NOTHING_HERE = "there is nothing at this address"
 """By this the page knows that its studio has moved: `server.js` has the same text."""
 MAX_UPLOAD_BYTES = 64 << 20
@@ -39,12 +29,18 @@ LOOPBACK = ("127.0.0.1", "localhost")
 """Names under which a browser may know this machine."""
 _HEADERS = {
     "cache-control": "no-store",
-    "content-security-policy": NOTHING,
+    # For all that is not the page: it may run nothing if opened as a page.
+    "content-security-policy": policy_text({"default-src": ["'none'"], **_FRAMES}),
     "cross-origin-resource-policy": "same-origin",
     # The token is in the address, and other sites that the page loads its libraries from must not learn it.
     "referrer-policy": "no-referrer",
     "x-content-type-options": "nosniff",
 }
+
+
+def policy_of(page: str) -> str:
+    """Return the Content-Security-Policy of the page's HTML."""
+    return policy_text({**directives_of(page), **_FRAMES})
 
 
 def new_token() -> str:
@@ -133,35 +129,19 @@ def too_large(largest: int) -> RequestError:
     return bad_request("request", wanted, got="more", advice=advice, status=413)
 
 
-def contained(folder: Path, name: str) -> Path:
-    """Return the file `name` in a folder. Raises RequestError (404) for no file, and for a link out of the folder."""
-    home = folder.resolve()
-    try:
-        path = (home / name).resolve(strict=True)
-        inside = path.is_relative_to(home) and path.is_file()
-    except (OSError, ValueError, RuntimeError) as error:
-        raise nothing_here() from error
-    if not inside:
-        raise nothing_here()
-    return path
-
-
 async def read_json_object(request: Request) -> dict[str, object]:
     """Return a request's JSON object. Raises RequestError for other content, and above `MAX_JSON_BYTES`."""
-    body = bytearray()
-    async for part in request.stream():
-        body += part
-        if len(body) > MAX_JSON_BYTES:
-            raise too_large(MAX_JSON_BYTES)
+    body = await request.body()
+    if len(body) > MAX_JSON_BYTES:
+        raise too_large(MAX_JSON_BYTES)
     try:
-        words = parse_json(body.decode())
+        values = parse_json(body.decode())
     except ValueError as error:
         got = f"other data ({str(error)[:100]})"
         raise bad_request("request", "a JSON object", got=got, advice="reload the page") from error
-    if not isinstance(words, dict):
-        kind = type(words).__name__
-        raise bad_request("request", "a JSON object", kind, advice="reload the page")
-    return words
+    if not isinstance(values, dict):
+        raise bad_request("request", "a JSON object", type(values).__name__, advice="reload the page")
+    return values
 
 
 def nothing_here() -> RequestError:

@@ -10,10 +10,10 @@ import json
 import secrets
 import sys
 import traceback
+from asyncio.subprocess import PIPE
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from functools import partial
 from threading import Lock
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar, get_args
 
 import anyio
 import anyio.to_thread
@@ -25,12 +25,10 @@ from avmsf.studio.responses import bad_request
 
 Event = dict[str, Any]
 Finish = Callable[[Event], Awaitable[Event]]
-CANCELLED = "cancelled"
-"""The stage of the last event of a job that somebody has stopped."""
-_STOPPED: Event = {"stage": CANCELLED, "words": "stopped"}
+_STOPPED: Event = {"stage": "cancelled", "words": "stopped"}
+"""The last event of a job that somebody has stopped."""
 WORKER = (sys.executable, "-m", "avmsf.studio.worker")
-_LINE = 1 << 22
-"""Bytes of one line, at most."""
+_MAX_LINE_BYTES = 1 << 22
 _GRACE = 3.0
 """Seconds that a process has to end once its standard input is closed."""
 _MAX_STDERR_CHARACTERS = 4000
@@ -54,7 +52,11 @@ class Job:
         """Run to the end; the last event has the outcome."""
         last, self._task = _STOPPED, asyncio.current_task()
         try:
-            last = await self._work()
+            if not self._cancelled:
+                last = await self._work()
+            if "result" in last:
+                self._finishing = True
+                last = await self.finish(last["result"])
         except AvmsfError as error:
             last = {"error": " ".join(str(error).split())}
         except asyncio.CancelledError:
@@ -83,26 +85,22 @@ class Job:
 
     async def listen(self, *, after: int = 0) -> AsyncIterator[tuple[int, Event]]:
         """Yield the events from number `after` on, counted from 0, until the last one."""
-        while True:
+        while not self.ended or after < len(self.events):
             async with self._changed_events:
-                while len(self.events) <= after and not self.ended:
-                    await self._changed_events.wait()
-                new = self.events[after:]
-            for event in new:
+                await self._changed_events.wait_for(lambda: self.ended or after < len(self.events))  # noqa: B023
+            for event in self.events[after:]:
                 yield after, event
                 after += 1
-            if self.ended and after >= len(self.events):
-                return
 
     async def _work(self) -> Event:
-        if self._cancelled:
-            return _STOPPED
-        pipe = asyncio.subprocess.PIPE
-        process = await asyncio.create_subprocess_exec(*self.command, stdin=pipe, stdout=pipe, stderr=pipe, limit=_LINE)
+        """Return the event with the worker's result, or with an error; its other events are published."""
+        process = await asyncio.create_subprocess_exec(
+            *self.command, stdin=PIPE, stdout=PIPE, stderr=PIPE, limit=_MAX_LINE_BYTES
+        )
         assert process.stdin is not None
         assert process.stdout is not None
         assert process.stderr is not None
-        said = asyncio.create_task(_tail_of(process.stderr))
+        stderr = asyncio.create_task(_tail_of(process.stderr))
         result: Event | None = None
         try:
             # A process that ended without reading its task may have said why.
@@ -110,12 +108,10 @@ class Job:
                 process.stdin.write(json.dumps(self.task).encode() + b"\n")
                 await process.stdin.drain()
             async for line in process.stdout:
-                event = _understand(line)
-                if event is None:
-                    continue
+                event = _parse_event(line)
                 if "result" in event or "error" in event:
                     result = event
-                else:
+                elif event:
                     await self._publish(event)
             await process.wait()
         finally:
@@ -126,20 +122,15 @@ class Job:
             except TimeoutError:
                 with contextlib.suppress(ProcessLookupError):
                     process.kill()
-            words, status = await said, await process.wait()
-        if result is None and status < 0:
-            print(printable(words), end="", file=sys.stderr)
-            return {
-                "error": f"{self.kind} was stopped by the system or crashed ({ending_of(status)}); close other "
-                "programs if memory is short, and start it again"
-            }
-        if result is None:
-            ending = words.strip().splitlines()[-1:] or ["no message"]
-            return {"error": f"{self.kind} ended with status {status} and no result: {ending[0]}"}
-        if "error" in result:
+            text, status = await stderr, await process.wait()
+        if result is not None:
             return result
-        self._finishing = True
-        return await self.finish(result["result"])
+        if status < 0:
+            print(printable(text), end="", file=sys.stderr)
+            cause = f"was stopped by the system or crashed ({ending_of(status)})"
+            return {"error": f"{self.kind} {cause}; close other programs if memory is short, and start it again"}
+        ending = text.strip().splitlines()[-1:] or ["no message"]
+        return {"error": f"{self.kind} ended with status {status} and no result: {ending[0]}"}
 
     async def _publish(self, event: Event, *, last: bool = False) -> None:
         async with self._changed_events:
@@ -196,60 +187,50 @@ class Jobs:
             await asyncio.gather(self._running, return_exceptions=True)
 
 
-def _understand(line: bytes) -> Event | None:
-    """Return the event of a line; None for the output of a library."""
+def _parse_event(line: bytes) -> Event:
+    """Return the event of a line; none for the output of a library."""
     try:
         event = json.loads(line)
     except ValueError:
-        return None
-    return event if isinstance(event, dict) else None
+        return {}
+    return event if isinstance(event, dict) else {}
 
 
 async def _tail_of(stream: asyncio.StreamReader) -> str:
-    kept = ""
+    tail = ""
     while part := await stream.read(1 << 16):
-        kept = (kept + part.decode(errors="replace"))[-_MAX_STDERR_CHARACTERS:]
-    return kept
+        tail = (tail + part.decode(errors="replace"))[-_MAX_STDERR_CHARACTERS:]
+    return tail
 
 
 Result = TypeVar("Result")
+Kind = Literal["compute", "prepare", "write", "read"]
+"""What a page waits for, what is not needed yet, and changes and reading of files."""
 
 
 class Threads:
-    """The threads of one server; each kind waits for its own, so that recordings are taken in while a search runs."""
+    """The threads of one server, one of each kind at a time, so that recordings are taken in while a search runs."""
 
     def __init__(self) -> None:
-        self._computing, self._preparing = anyio.CapacityLimiter(1), anyio.CapacityLimiter(1)
-        self._writing, self._reading = anyio.CapacityLimiter(1), anyio.CapacityLimiter(1)
-        self._busy, self._lock = 0, Lock()
+        self._limiters = {kind: anyio.CapacityLimiter(1) for kind in get_args(Kind)}
+        self._computing, self._lock = 0, Lock()
 
     @property
     def busy(self) -> bool:
-        """Whether a thread is computing, which cannot be interrupted."""
-        return self._busy > 0
+        """Whether a thread is computing, which cannot be interrupted and may outlive the server."""
+        return self._computing > 0
 
-    async def compute(self, act: Callable[..., Result], *arguments: Any) -> Result:
-        """Do what a page waits for, one edit or search after another."""
-        return await anyio.to_thread.run_sync(partial(self._counted, act, *arguments), limiter=self._computing)
+    async def run(self, kind: Kind, act: Callable[..., Result], *arguments: Any) -> Result:
+        """Call a function in a thread, after the others of its kind."""
+        computes = kind in ("compute", "prepare")
 
-    async def compute_ahead(self, act: Callable[[], Result]) -> Result:
-        """Compute in the background a result that is not needed yet."""
-        return await anyio.to_thread.run_sync(partial(self._counted, act), limiter=self._preparing)
-
-    async def write(self, act: Callable[..., Result], *arguments: Any) -> Result:
-        """Change files."""
-        return await anyio.to_thread.run_sync(partial(act, *arguments), limiter=self._writing)
-
-    async def read(self, act: Callable[..., Result], *arguments: Any) -> Result:
-        """Read files in a thread."""
-        return await anyio.to_thread.run_sync(partial(act, *arguments), limiter=self._reading)
-
-    def _counted(self, act: Callable[..., Result], *arguments: Any) -> Result:
-        """Do something that may outlive the server."""
-        with self._lock:
-            self._busy += 1
-        try:
-            return act(*arguments)
-        finally:
+        def counted() -> Result:
             with self._lock:
-                self._busy -= 1
+                self._computing += computes
+            try:
+                return act(*arguments)
+            finally:
+                with self._lock:
+                    self._computing -= computes
+
+        return await anyio.to_thread.run_sync(counted, limiter=self._limiters[kind])

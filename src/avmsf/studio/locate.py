@@ -11,7 +11,6 @@ from functools import cached_property
 from threading import Lock
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -31,6 +30,9 @@ from avmsf.studio.jobs import Threads
 from avmsf.studio.responses import FORESEEN_ERRORS
 from avmsf.studio.session import Revision, Session
 from avmsf.symmetry.symmetries import Symmetries
+
+_SETTLED = 0.5
+"""Seconds that a revision stays the last one before its tables are made: sliders are dragged."""
 
 
 class CachedSymmetries:
@@ -58,9 +60,9 @@ class Finder:
     """The page's points, on the object as the field has it now, meters."""
     length: float
     """Lengths on that object over those of the page's picture."""
-    cached_symmetries: "CachedSymmetries" = dataclasses.field(default_factory=lambda: CachedSymmetries())
+    cached_symmetries: CachedSymmetries
     """The symmetries of the object, whose search other revisions need not repeat."""
-    settings: CaptureSettings | None = None
+    settings: CaptureSettings | None
     """How the capture's recordings are read, where it is known."""
     _lock: Lock = dataclasses.field(default_factory=Lock, repr=False)
 
@@ -94,22 +96,8 @@ class Finder:
         for each in (values, values["cosine"], *values["equivalent_points"]):
             each["position"] = [value / self.length for value in each["position"]]
         values["credible_region"]["radius"] /= self.length
-        return {
-            "seconds": seconds,
-            "row": contact.most_probable,
-            "probability": packed(contact.probability),
-            "distance": packed(contact.distance),
-            **values,
-        }
-
-
-def packed(values: Float[Tensor, " points"]) -> str:
-    """Return values as the page unpacks them: base64 of float32, little endian."""
-    return base64.b64encode(values.detach().to(torch.float32).numpy().astype(np.dtype("<f4")).tobytes()).decode()
-
-
-_SETTLED = 0.5
-"""Seconds that a revision stays the last one before its tables are made: sliders are dragged."""
+        packed = {name: _packed(getattr(contact, name)) for name in ("probability", "distance")}
+        return {"seconds": seconds, "row": contact.most_probable, **packed, **values}
 
 
 class Searches:
@@ -125,13 +113,11 @@ class Searches:
         """Return the locator of a revision; its tables are computed at the first use."""
         if self._finder is None or self._finder[0] != revision.number:
             field = revision.require_field()
-            points = self.showcase.current.sampled.points.double() * length_of(field.gain_field)
+            length = length_of(field.gain_field)
+            points = (self.showcase.current.sampled.points.double() * length).float()
             settings = None if self.editor is None else self.editor.settings
-            cached_symmetries = self._symmetries[revision.opening]
-            self._finder = (
-                revision.number,
-                Finder(field, points.float(), length_of(field.gain_field), cached_symmetries, settings),
-            )
+            finder = Finder(field, points, length, self._symmetries[revision.opening], settings)
+            self._finder = (revision.number, finder)
         return self._finder[1]
 
     def prepare_ahead(self) -> None:
@@ -145,21 +131,26 @@ class Searches:
             self._ahead.cancel()
 
     async def _prepare(self) -> None:
-        # One task for all revisions: one that is cancelled would leave its thread running beside the next one's.
+        # One task for all revisions: one that is cancelled would leave its thread running while the next one's runs.
         prepared = None
         while (revision := self.session.current) is not prepared and revision.field is not None:
             await asyncio.sleep(_SETTLED)
             if self.session.current is revision:
                 try:
-                    await self.threads.compute_ahead(self.finder_of(revision).prepare)
+                    await self.threads.run("prepare", self.finder_of(revision).prepare)
                 except Exception as error:  # the next revision's tables are to be made all the same
                     _report(error)
                 prepared = revision
+
+
+def _packed(values: Float[Tensor, " points"]) -> str:
+    """Return values as the page unpacks them: base64 of float32, little endian."""
+    return base64.b64encode(values.detach().to(torch.float32).numpy().astype("<f4").tobytes()).decode()
 
 
 def _report(error: Exception) -> None:
     """Print why tables could not be made. A page that asks to locate on this revision gets the same error."""
     if not isinstance(error, (AvmsfError, *FORESEEN_ERRORS)):
         traceback.print_exception(error)
-    words = printable(" ".join(str(error).split()))
-    print(f"impacts cannot be located on this revision ({type(error).__name__}: {words})", file=sys.stderr)
+    message = printable(" ".join(str(error).split()))
+    print(f"impacts cannot be located on this revision ({type(error).__name__}: {message})", file=sys.stderr)

@@ -2,7 +2,7 @@
 
 import filecmp
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -61,11 +61,13 @@ def open_target(target: Path, *, object: Path | None = None, capture: Path | Non
         raise StudioError.expected(wanted, file=target, name="target", advice="check the path")
     if target.suffix.lower() in MESHES:
         return _open_mesh(target, object, capture)
-    kept = target.resolve().parent.name == CACHE
-    home = target.resolve().parent.parent if kept else target.resolve().parent
-    recordings = home if capture is None and kept and (home / TABLE).is_file() else capture
-    name = target.stem if recordings is None else recordings.resolve().name
-    return Opened(name, home, target.resolve(), None if recordings is None else recordings.resolve(), object)
+    home = target.resolve().parent
+    if home.name == CACHE:
+        home = home.parent
+        capture = home if capture is None and (home / TABLE).is_file() else capture
+    recordings = None if capture is None else capture.resolve()
+    name = target.stem if recordings is None else recordings.name
+    return Opened(name, home, target.resolve(), recordings, object)
 
 
 def find_object(opened: Opened) -> Path | None:
@@ -117,20 +119,17 @@ def _open_mesh(mesh: Path, object: Path | None, capture: Path | None) -> Opened:
     if capture is None and (mesh.stem == "surface" or mesh.name in SPLATS):
         return _open_folder(mesh.resolve().parent, object)
     folder = mesh.with_suffix("") if capture is None else capture
+    if folder.exists() and not folder.is_dir():
+        wanted, advice = "a capture folder or none", "name a folder by --capture"
+        raise StudioError.expected(wanted, got="a file", file=folder, name="capture", advice=advice)
     surface = folder / (SPLATS[0] if is_gaussians(mesh) else f"surface{mesh.suffix.lower()}")
     names = (*(f"surface{suffix}" for suffix in MESHES), *SPLATS)
     others = [folder / name for name in names if (folder / name).is_file()]
-    if folder.exists() and not folder.is_dir():
-        raise StudioError.expected(
-            "a capture folder or none", got="a file", file=folder, name="capture", advice="name a folder by --capture"
-        )
     if others and not (surface in others and _same(surface, mesh)):
-        advice = "open the folder, or name another by --capture"
-        wanted = "a capture of this mesh"
+        wanted, advice = "a capture of this mesh", "open the folder, or name another by --capture"
         raise StudioError.expected(wanted, others[0].name, file=folder, name="capture", advice=advice)
     if not others:
-        _copy(_named_by(mesh), folder)
-        copy_whole(mesh, surface, raising=StudioError)
+        _copy({**{folder / path.name: path for path in _named_by(mesh)}, surface: mesh})
     return _open_folder(folder, object)
 
 
@@ -142,24 +141,19 @@ def _named_by(mesh: Path) -> Iterator[Path]:
         material = mesh.parent / Path(name).name
         if material.is_file():
             yield material
-            for texture in _TEXTURES.findall(material.read_text(errors="replace")):
-                picture = mesh.parent / Path(texture).name
-                if picture.is_file():
-                    yield picture
+            names = _TEXTURES.findall(material.read_text(errors="replace"))
+            yield from (path for name in names if (path := mesh.parent / Path(name).name).is_file())
 
 
-def _copy(files: Iterable[Path], folder: Path) -> None:
-    """Copy files into a folder. Raises StudioError, before anything is written, where it has others of their names."""
-    lacking = {}
-    for path in files:
-        place = folder / path.name
-        if not (place.exists() or place.is_symlink()):
-            lacking[place] = path
-        elif not _same(place, path):
-            wanted, advice = f"no file, or the mesh's own {path.name}", "name another folder by --capture"
-            raise StudioError.expected(wanted, got="another one", file=place, name="capture", advice=advice)
-    for place, path in lacking.items():
-        copy_whole(path, place, raising=StudioError)
+def _copy(sources: Mapping[Path, Path]) -> None:
+    """Copy files to these paths. Raises StudioError, before anything is written, where others have these names."""
+    missing = {path: source for path, source in sources.items() if not (path.exists() or path.is_symlink())}
+    for path, source in sources.items():
+        if path not in missing and not _same(path, source):
+            wanted, advice = f"no file, or the mesh's own {source.name}", "name another folder by --capture"
+            raise StudioError.expected(wanted, got="another one", file=path, name="capture", advice=advice)
+    for path, source in missing.items():
+        copy_whole(source, path, raising=StudioError)
 
 
 def _same(one: Path, other: Path) -> bool:

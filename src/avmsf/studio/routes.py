@@ -4,8 +4,8 @@ import json
 import traceback
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
@@ -15,8 +15,8 @@ from starlette.routing import Route
 
 from avmsf.errors import AvmsfError, lacks_memory
 from avmsf.export.web import MEDIA_TYPES
-from avmsf.studio.capture import Contact
-from avmsf.studio.guard import contained, nothing_here, policy_of, read_json_object
+from avmsf.studio.capture import read_contact
+from avmsf.studio.guard import nothing_here, policy_of, read_json_object
 from avmsf.studio.responses import FORESEEN_ERRORS, Answer, error_response, response_to
 from avmsf.studio.studio import Studio, unknown_base
 
@@ -24,7 +24,6 @@ PAGE = Path(__file__).parent / "page"
 _SOUNDS = tuple(suffix for suffix, kind in MEDIA_TYPES.items() if kind.startswith("audio/"))
 _GONE = 499
 """Response to a page that has disconnected."""
-Handler = Callable[[Request], Awaitable[Response]]
 
 
 def make_app(studio: Studio) -> Starlette:
@@ -40,129 +39,81 @@ def make_app(studio: Studio) -> Starlette:
         finally:
             await studio.close()
 
-    async def show_page(request: Request) -> Response:
-        return HTMLResponse(html, headers=policy)
-
     calls = Calls(studio)
     routes = [
-        _get("/", show_page),
-        _get("/page/{path:path}", partial(_send_from, PAGE)),
-        _get("/manifest.json", calls.send_manifest),
-        _get("/revisions/{number:int}/{path}", calls.send_revision),
-        _get("/{path}", calls.send_shown),
-        _get("/strikes/{path}", calls.send_measured),
-        Route("/locate", calls.locate, methods=["POST"]),
-        Route("/edit", calls.edit, methods=["POST"]),
-        Route("/lead", calls.lead, methods=["POST"]),
-        Route("/undo", calls.undo, methods=["POST"]),
-        Route("/save", calls.save, methods=["POST"]),
-        Route("/capture/check", calls.check, methods=["POST"]),
-        Route("/capture/strikes", calls.add_impact, methods=["POST"]),
-        Route("/capture/strikes/{path:path}", calls.change_impact, methods=["GET", "PUT", "DELETE"]),
-        Route("/reconstruct", calls.reconstruct, methods=["POST"]),
-        Route("/object", calls.make_object, methods=["POST"]),
-        _get("/jobs/{job}/events", calls.send_job_events),
-        Route("/jobs/{job}", calls.cancel_job, methods=["DELETE"]),
+        _route("GET", "/", lambda request: HTMLResponse(html, headers=policy)),
+        _route("GET", "/page/{path:path}", lambda request: _file(PAGE, request)),
+        _route("GET", "/manifest.json", lambda request: studio.manifest()),
+        _route("GET", "/capture", _without_body(studio.capture)),
+        _route("GET", "/revisions/{number:int}/{path}", calls.send_revision),
+        _route("GET", "/{path}", calls.send_shown),
+        _route("GET", "/strikes/{path}", lambda request: _file(studio.showcase.object_folder / "strikes", request)),
+        _route("POST", "/locate", _with_body(studio.locate)),
+        _route("POST", "/edit", _with_json(studio.edit)),
+        _route("POST", "/lead", calls.lead),
+        _route("POST", "/undo", _with_json(studio.undo)),
+        _route("POST", "/save", _with_json(studio.save), status=201),
+        _route("POST", "/capture/check", _with_body(studio.check_recording)),
+        _route("POST", "/capture/strikes", calls.add_impact, status=201),
+        _route("GET", "/capture/strikes/{path:path}", calls.send_recording),
+        _route("PUT", "/capture/strikes/{path:path}", calls.redo_impact),
+        _route("DELETE", "/capture/strikes/{path:path}", calls.remove_impact),
+        _route("POST", "/reconstruct", _without_body(studio.reconstruct)),
+        _route("POST", "/object", _without_body(studio.make_object)),
+        _route("GET", "/jobs/{job}/events", calls.send_job_events),
+        _route("DELETE", "/jobs/{job}", calls.cancel_job),
     ]
-    app = Starlette(
-        routes=routes,
-        lifespan=lifespan,
-        exception_handlers={
-            AvmsfError: _answer_error,
-            HTTPException: _answer_unknown,
-            ClientDisconnect: _answer_nobody,
-            **dict.fromkeys(FORESEEN_ERRORS, _answer_foreseen),
-            Exception: _answer_broken,
-        },
-    )
+    kinds = (AvmsfError, HTTPException, ClientDisconnect, *FORESEEN_ERRORS, Exception)
+    app = Starlette(routes=routes, lifespan=lifespan, exception_handlers=dict.fromkeys(kinds, _answer_error))
     # It would lead to an address without the token.
     app.router.redirect_slashes = False
     return app
 
 
 class Calls:
-    """What the page can ask of a studio."""
+    """The requests whose values are in their address or their headers."""
 
     def __init__(self, studio: Studio) -> None:
         self.studio = studio
 
-    async def send_manifest(self, request: Request) -> Response:
-        """What is shown, and what the server can do."""
-        return Answer(self.studio.manifest())
-
-    async def send_revision(self, request: Request) -> Response:
+    def send_revision(self, request: Request) -> Response:
         """A file of a revision."""
         return _file(self.studio.showcase.files_of(request.path_params["number"]), request)
 
-    async def send_shown(self, request: Request) -> Response:
-        """The table of the current revision, or a file that shows the object; and what the capture holds."""
-        name = request.path_params["path"]
-        if name == "capture":
-            return Answer(await self.studio.capture())
+    def send_shown(self, request: Request) -> Response:
+        """The table of the current revision, or a file that shows the object."""
         showcase = self.studio.showcase
-        return _file(
-            showcase.object_folder if name.startswith(("object.", "surface.")) else showcase.current.folder, request
-        )
+        of_object = request.path_params["path"].startswith(("object.", "surface."))
+        return _file(showcase.object_folder if of_object else showcase.current.folder, request)
 
-    async def send_measured(self, request: Request) -> Response:
-        """The sound of a recorded impact, as the capture reads it."""
-        return _file(self.studio.showcase.object_folder / "strikes", request)
-
-    async def locate(self, request: Request) -> Response:
-        """Locate the impact of a recording."""
-        return Answer(await self.studio.locate(await request.body()))
-
-    async def edit(self, request: Request) -> Response:
-        """Change the field."""
-        done = await self.studio.edit(await read_json_object(request))
-        return Answer(done, 202 if "job" in done else 200)
-
-    async def lead(self, request: Request) -> Response:
+    async def lead(self, request: Request) -> Any:
         """Optimize the sound towards a recording."""
         base = request.query_params.get("base", "")
         if not (base.isascii() and base.isdigit() and len(base) < 10):
             raise unknown_base(base)
-        return Answer(await self.studio.lead(int(base), await request.body()), 202)
+        return await self.studio.lead(int(base), await request.body())
 
-    async def undo(self, request: Request) -> Response:
-        """Take a change back."""
-        return Answer(await self.studio.undo(await read_json_object(request)))
-
-    async def save(self, request: Request) -> Response:
-        """Write the field to a file."""
-        return Answer(await self.studio.save(await read_json_object(request)), 201)
-
-    async def check(self, request: Request) -> Response:
-        """Check a recording without saving it."""
-        content = await request.body()
-        return Answer(await self.studio.with_editor(lambda editor: editor.check(content)))
-
-    async def add_impact(self, request: Request) -> Response:
+    async def add_impact(self, request: Request) -> Any:
         """Add an impact to the capture."""
-        contact, content = Contact.read(request.query_params), await request.body()
-        return Answer(await self.studio.with_editor(lambda editor: editor.add(content, contact)), 201)
+        impact, content = read_contact(request.query_params), await request.body()
+        return await self.studio.with_editor(lambda editor: editor.add(content, impact))
 
-    async def change_impact(self, request: Request) -> Response:
-        """Send, redo or take out one of the capture's recordings."""
-        name = request.path_params["path"]
-        match = _expected(request)
-        if request.method == "DELETE":
-            await self.studio.with_editor(lambda editor: editor.remove(name, match=match))
-            return Answer({"removed": name})
-        if request.method == "PUT":
-            content = await request.body()
-            return Answer(await self.studio.with_editor(lambda editor: editor.redo(name, content, match=match)))
+    def send_recording(self, request: Request) -> Response:
+        """Send one of the capture's recordings."""
         return _file(self.studio.require_editor().folder, request, only=_SOUNDS)
 
-    async def reconstruct(self, request: Request) -> Response:
-        """Make a field of the capture."""
-        return Answer({"job": (await self.studio.reconstruct()).identifier}, 202)
+    async def redo_impact(self, request: Request) -> Any:
+        """Replace one of the capture's recordings."""
+        name, match, content = request.path_params["path"], _expected(request), await request.body()
+        return await self.studio.with_editor(lambda editor: editor.redo(name, content, match=match))
 
-    async def make_object(self, request: Request) -> Response:
-        """Make something to click of the capture's pictures, once more where that has failed."""
-        return Answer({"job": self.studio.make_object().identifier}, 202)
+    async def remove_impact(self, request: Request) -> Any:
+        """Remove an impact from the capture."""
+        name, match = request.path_params["path"], _expected(request)
+        await self.studio.with_editor(lambda editor: editor.remove(name, match=match))
+        return {"removed": name}
 
-    async def send_job_events(self, request: Request) -> Response:
+    def send_job_events(self, request: Request) -> Response:
         """The events of a job, as server-sent events; a page that reconnects gets the events that it has missed."""
         job = self.studio.jobs.named(request.path_params["job"])
         last = request.headers.get("last-event-id", "")
@@ -174,11 +125,11 @@ class Calls:
 
         return StreamingResponse(events(), media_type="text/event-stream")
 
-    async def cancel_job(self, request: Request) -> Response:
+    async def cancel_job(self, request: Request) -> Any:
         """Stop a job, and return whether it was stopped or had ended."""
         job = request.path_params["job"]
         stopped = await self.studio.jobs.named(job).cancel()
-        return Answer({"cancelled" if stopped else "ended": job})
+        return {"cancelled" if stopped else "ended": job}
 
 
 def _expected(request: Request) -> str | None:
@@ -187,47 +138,62 @@ def _expected(request: Request) -> str | None:
     return None if match == "*" else match
 
 
-def _get(path: str, handler: Handler) -> Route:
+def _route(method: str, path: str, act: Callable[[Request], Any], *, status: int = 200) -> Route:
+    """Return a route that answers with the response of `act`, or with JSON of its plain values."""
+
     async def answer(request: Request) -> Response:
-        return await handler(request)
+        done = act(request)
+        if isinstance(done, Awaitable):
+            done = await done
+        return done if isinstance(done, Response) else Answer(done, status)
 
-    return Route(path, answer, methods=["GET"])
+    return Route(path, answer, methods=[method])
 
 
-async def _send_from(folder: Path, request: Request) -> Response:
-    return _file(folder, request)
+def _with_json(act: Callable[[dict[str, Any]], Awaitable[Any]]) -> Callable[[Request], Awaitable[Any]]:
+    async def read(request: Request) -> Any:
+        return await act(await read_json_object(request))
+
+    return read
 
 
-def _file(folder: Path, request: Request, *, only: Sequence[str] = ()) -> Response:
-    """Return a file of a folder. Raises RequestError (404) for media types that the page does not use."""
-    path = contained(folder, request.path_params["path"])
-    kind = MEDIA_TYPES.get(path.suffix.lower())
-    hidden = any(part.startswith(".") for part in path.relative_to(folder.resolve()).parts)
-    if kind is None or hidden or (only and path.suffix.lower() not in only):
+def _with_body(act: Callable[[bytes], Awaitable[Any]]) -> Callable[[Request], Awaitable[Any]]:
+    async def read(request: Request) -> Any:
+        return await act(await request.body())
+
+    return read
+
+
+def _without_body(act: Callable[[], Awaitable[Any]]) -> Callable[[Request], Awaitable[Any]]:
+    return lambda request: act()
+
+
+def _file(folder: Path, request: Request, *, only: Sequence[str] = tuple(MEDIA_TYPES)) -> Response:
+    """Return a file of a folder.
+
+    Raises RequestError (404) for no file, a hidden one, a link out of the folder, and types that the page does not use.
+    """
+    home = folder.resolve()
+    try:
+        path = (home / request.path_params["path"]).resolve(strict=True)
+        inside = path.is_relative_to(home) and path.is_file()
+    except (OSError, ValueError, RuntimeError) as error:
+        raise nothing_here() from error
+    suffix = path.suffix.lower()
+    if not inside or suffix not in only or any(part.startswith(".") for part in path.relative_to(home).parts):
         raise nothing_here()
-    return FileResponse(path, media_type=kind)
+    return FileResponse(path, media_type=MEDIA_TYPES[suffix])
 
 
 async def _answer_error(request: Request, error: Exception) -> Response:
-    assert isinstance(error, AvmsfError)
-    return response_to(error)
-
-
-async def _answer_unknown(request: Request, error: Exception) -> Response:
-    assert isinstance(error, HTTPException)
-    return Answer({"error": f"{request.method}: nothing found at this address"}, error.status_code)
-
-
-async def _answer_nobody(request: Request, error: Exception) -> Response:
-    return Response(status_code=_GONE)
-
-
-async def _answer_foreseen(request: Request, error: Exception) -> Response:
-    return response_to(error_response(error))
-
-
-async def _answer_broken(request: Request, error: Exception) -> Response:
-    if lacks_memory(error):
+    """Answer each error by a sentence and a status: 500 only where it is the server's own fault."""
+    if isinstance(error, ClientDisconnect):
+        return Response(status_code=_GONE)
+    if isinstance(error, HTTPException):
+        return Answer({"error": f"{request.method}: nothing found at this address"}, error.status_code)
+    if isinstance(error, AvmsfError):
+        return response_to(error)
+    if isinstance(error, FORESEEN_ERRORS) or lacks_memory(error):
         return response_to(error_response(error))
     # The server's own word on it is hidden with all that it says of ordinary requests.
     traceback.print_exception(error)

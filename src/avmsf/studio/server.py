@@ -10,7 +10,7 @@ import webbrowser
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from types import FrameType
+from typing import Any
 
 import uvicorn
 from starlette.types import ASGIApp
@@ -24,23 +24,16 @@ from avmsf.studio.studio import Studio, StudioConfig
 PORT = 8634
 """Where the page is without --port, so that a browser remembers what this page may do, such as use the microphone."""
 _HOME = "127.0.0.1"
-_HANGING = 1
-"""Seconds that a running response may take when the server ends."""
+_MAX_CLOSING_SECONDS = 1
+"""How long a running response may take when the server ends."""
 
 
 class PageServer(uvicorn.Server):
     """Calls `announce` once the server responds."""
 
     def __init__(self, app: ASGIApp, announce: Callable[[], None]) -> None:
-        config = uvicorn.Config(
-            app,
-            ws="none",
-            log_level="critical",
-            access_log=False,
-            server_header=False,
-            timeout_graceful_shutdown=_HANGING,
-        )
-        super().__init__(config)
+        silent: Any = {"log_level": "critical", "access_log": False, "server_header": False}
+        super().__init__(uvicorn.Config(app, ws="none", timeout_graceful_shutdown=_MAX_CLOSING_SECONDS, **silent))
         self.announce = announce
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -77,14 +70,14 @@ def serve(
                     _open_browser(address, Path(folder))
 
         server = PageServer(guarded, announce)
-        before = signal.signal(signal.SIGTERM, _interrupt)
+        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
             # The server has ended in order before it passes Ctrl-C on.
             with suppress(KeyboardInterrupt):
                 server.run(sockets=[listener])
         finally:
             signal.signal(signal.SIGTERM, before)
-        return studio.busy
+        return studio.threads.busy
 
 
 def _temporary_folder() -> tempfile.TemporaryDirectory[str]:
@@ -107,26 +100,21 @@ def _open_browser(address: str, folder: Path) -> None:
 
 def _listening(port: int | None) -> socket.socket:
     """Return a socket bound on this machine. Raises StudioError for a port that is taken or forbidden."""
-    for number in (PORT, 0) if port is None else (port,):
-        listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        # Without it a port would stay taken for a minute after the server before.
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            listener.bind((_HOME, number))
-            listener.listen()
-            return listener
-        except OSError as error:
-            listener.close()
-            if error.errno == errno.EADDRINUSE and number == PORT and port is None:
-                continue
-            advice = "leave --port out, or give --port 0 for any free one"
-            got = f"{error.strerror!r} at {number}"
-            raise StudioError.expected("a free one", number, got=got, name="port", advice=advice) from error
-        except OverflowError as error:
-            listener.close()
-            raise StudioError.expected("0 to 65535", number, name="port", advice="leave --port out") from error
-    raise AssertionError("port 0 gives a free port")
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
+    number = PORT if port is None else port
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    # Without it a port would stay taken for a minute after the server before.
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((_HOME, number))
+        listener.listen()
+        return listener
+    except OverflowError as error:
+        listener.close()
+        raise StudioError.expected("0 to 65535", number, name="port", advice="leave --port out") from error
+    except OSError as error:
+        listener.close()
+        if error.errno == errno.EADDRINUSE and port is None:
+            return _listening(0)
+        advice = "leave --port out, or give --port 0 for any free one"
+        got = f"{error.strerror!r} at {number}"
+        raise StudioError.expected("a free one", number, got=got, name="port", advice=advice) from error

@@ -7,11 +7,12 @@ message. Revision numbers only increase; the number of an undone revision is not
 import os
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import RLock
 
-from avmsf._utils.files import way_out
+from avmsf._utils.files import unwritable
 from avmsf.errors import StudioError
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import save
@@ -19,13 +20,13 @@ from avmsf.studio.edit import REST, Sliders
 from avmsf.studio.responses import RequestError, bad_request
 
 SUFFIX = ".safetensors"
-_NAME = re.compile(r"[\w][\w .()+-]{0,99}")
+_NAME = re.compile(r"\w[\w .()+-]{0,99}(?<![. ])")
 _DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 """Names that are no files on Windows, where a capture may be opened next."""
-_LONGEST_NAME = 200
-"""Bytes: files' names have 255 at most, of which the ending and what a half-written file is called need some."""
+_MAX_NAME_BYTES = 200
+"""Files' names have 255 at most, of which the ending and what a half-written file is called need some."""
 _MAX_COPIES = 1000
-MOST_UNDONE = 100
+_MAX_UNDONE = 100
 """Maximum number of undo steps."""
 
 
@@ -85,18 +86,14 @@ class Session:
         """Set the sliders. Raises RequestError (409) if `base` is not the current revision, and the errors of edits."""
         with self._lock:
             self.check_current(base)
-            self._current.require_field()
-            ground = self._current.ground
-            assert ground is not None
-            field, remarks = sliders.apply(ground)
+            field, remarks = sliders.apply(self._current.ground or self._current.require_field())
             return self._remember(replace(self._current, sliders=sliders, field=field, remarks=tuple(remarks)))
 
     def lead(self, base: int, field: SoundField, remarks: tuple[str, ...]) -> Revision:
         """Take in what a descent has made of revision `base`; sliders are relative to it from then on."""
         with self._lock:
             self.check_current(base)
-            led = replace(self._current, ground=field, sliders=REST, field=field, remarks=remarks)
-            return self._remember(led)
+            return self._remember(replace(self._current, ground=field, sliders=REST, field=field, remarks=remarks))
 
     def undo(self, base: int) -> Revision:
         """Undo the last revision, under a new number. Raises RequestError (409) as `edit`, and if there is no other."""
@@ -129,32 +126,24 @@ class Session:
     def keep(self, field: SoundField, stem: str) -> Path:
         """Write a field that is not the current one to a new file of the folder: `stem`, with a number if it exists."""
         for name in (stem, *(f"{stem} {number}" for number in range(2, _MAX_COPIES))):
-            path = self.home / f"{name}{SUFFIX}"
-            try:
+            with suppress(RequestError):
+                path = self.home / f"{name}{SUFFIX}"
                 _write_new(field, path)
-            except RequestError:
-                continue
-            return path
+                return path
         wanted = f"fewer than {_MAX_COPIES} files called {stem}"
         raise StudioError.expected(wanted, got="more", file=self.home, name=stem, advice="move them away")
 
     def check_current(self, base: int) -> None:
         """Raise RequestError (409), with the current revision, if `base` is another one."""
         if base != self._current.number:
-            raise bad_request(
-                "base",
-                "the current field",
-                base,
-                got="an older one: another tab has changed it",
-                advice="nothing was overwritten; make the change again",
-                status=409,
-                revision=self._current.number,
-            )
+            now, got = self._current.number, "an older one: another tab has changed it"
+            advice = "nothing was overwritten; make the change again"
+            raise bad_request("base", "the current field", base, got=got, advice=advice, status=409, revision=now)
 
     def _remember(self, revision: Revision) -> Revision:
         before = self._current
         changed = self._advance(revision)
-        self._past = [*self._past, before][-MOST_UNDONE:]
+        self._past = [*self._past, before][-_MAX_UNDONE:]
         return changed
 
     def _advance(self, revision: Revision) -> Revision:
@@ -169,12 +158,10 @@ def _write_new(field: SoundField, path: Path) -> None:
     try:
         os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     except FileExistsError as error:
-        raise RequestError(
-            409, f"{path.name}: expected a new name, got an existing file; choose another name", file=path
-        ) from error
+        message = f"{path.name}: expected a new name, got an existing file; choose another name"
+        raise RequestError(409, message, file=path) from error
     except OSError as error:
-        advice = way_out(error) if path.parent.is_dir() else "restore the folder"
-        raise StudioError.expected("a writable path", error.strerror, file=path, advice=advice) from error
+        raise unwritable(path, error, raising=StudioError) from error
     try:
         save(field, path)
     except BaseException:
@@ -185,9 +172,9 @@ def _write_new(field: SoundField, path: Path) -> None:
 def file_name(name: str) -> str:
     """Return the file of a name that the user gave. Raises RequestError (400) for a name with a path."""
     stem = name.strip().removesuffix(SUFFIX)
-    if not _NAME.fullmatch(stem) or _DEVICES.fullmatch(stem) or stem.endswith((".", " ")):
+    if not _NAME.fullmatch(stem) or _DEVICES.fullmatch(stem):
         raise bad_request("name", "letters, digits, spaces, - and _, such as bowl in wood", name)
     size = len(stem.encode())
-    if size > _LONGEST_NAME:
-        raise bad_request("name", f"at most {_LONGEST_NAME} bytes", size, advice="choose a shorter one")
+    if size > _MAX_NAME_BYTES:
+        raise bad_request("name", f"at most {_MAX_NAME_BYTES} bytes", size, advice="choose a shorter one")
     return f"{stem}{SUFFIX}"

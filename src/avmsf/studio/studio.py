@@ -14,20 +14,17 @@ from avmsf.fem.material import MATERIALS
 from avmsf.field.store import load, save
 from avmsf.pipeline.config import Preset
 from avmsf.studio.capture import CaptureEditor, read_upload
-from avmsf.studio.edit import GuidedEditTarget, Sliders, text_model
+from avmsf.studio.edit import Sliders, read_prompt, text_model
 from avmsf.studio.files import Showcase
-from avmsf.studio.jobs import Event, Job, Jobs, Result, Threads
+from avmsf.studio.jobs import Event, Jobs, Result, Threads
 from avmsf.studio.locate import Searches
 from avmsf.studio.opening import Opened, find_object, shows_more
 from avmsf.studio.responses import NUMERIC_ERRORS, RequestError, bad_request, error_response
 from avmsf.studio.session import Revision, Session
 
-MODES = 128
-GUIDED_EDIT_STEPS = 150
-"""Steps of a descent in the page: half of the command line's, after which little changes."""
 _MAKING = "reconstruct the object from its images"
 """The kind of job that has something to click for its result."""
-_NAME = 50
+_MAX_STEM = 50
 """Characters of the opened name that are part of the name of a saved field."""
 
 
@@ -37,10 +34,10 @@ class StudioConfig:
 
     model: str | None = None
     """Folder or name of a Stable Audio pipeline for text edits; by default that in the hub's cache."""
-    modes: int = MODES
+    modes: int = 128
     """Maximum number of modes of a reconstruction."""
-    steps: int = GUIDED_EDIT_STEPS
-    """Steps of an optimization towards a recording or a text."""
+    steps: int = 150
+    """Steps towards a recording or a text: half of the command line's, after which little changes."""
     preset: Preset = "default"
     """Settings of a reconstruction."""
 
@@ -61,16 +58,11 @@ class Studio:
         self.searches = Searches(self.session, self.showcase, self.editor, self.threads)
         self.session.open(None if opened.field is None else load(opened.field))
 
-    @property
-    def busy(self) -> bool:
-        """Whether a thread is computing, which cannot be interrupted."""
-        return self.threads.busy
-
     async def begin(self) -> None:
         """Start what can be done ahead of time."""
         self.searches.prepare_ahead()
         if shows_more(self.opened):
-            self.make_object()
+            await self.make_object()
 
     async def close(self) -> None:
         """Stop what runs."""
@@ -84,52 +76,55 @@ class Studio:
 
     async def locate(self, content: bytes) -> dict[str, Any]:
         """Return the positions of a recording's impacts on the current revision. Raises LocationError, CaptureError."""
-        recording = await self.threads.read(read_upload, content)
+        recording = await self.threads.run("read", read_upload, content)
         revision = self.session.current
-        finder = self.searches.finder_of(revision)
-        impacts = await self._compute(finder.locate, recording)
+        impacts = await self._compute(self.searches.finder_of(revision).locate, recording)
         return {"revision": revision.number, "impacts": impacts}
 
-    async def edit(self, words: dict[str, Any]) -> dict[str, Any]:
-        """Set the sliders, or start to optimize the field towards a recording or a text. Raises the errors of edits."""
-        base = base_of(words)
-        if words.get("prompt") is not None:
-            return await self._lead(base, GuidedEditTarget.read(words, model=self.model))
-        sliders = Sliders.read(words, modes=len(self.session.current.require_field().bank))
+    async def edit(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Set the sliders, or start to optimize the field towards a text. Raises the errors of edits."""
+        base = base_of(request)
+        if request.get("prompt") is not None:
+            prompt = read_prompt(request, model=self.model)
+            return await self._lead(base, {"prompt": prompt, "model": self.model})
+        sliders = Sliders.read(request, modes=len(self.session.current.require_field().bank))
         return self._changed(await self._compute(self.session.edit, base, sliders))
 
     async def lead(self, base: int, content: bytes) -> dict[str, Any]:
         """Start to optimize the field towards a recording. Raises CaptureError for one that cannot be used."""
         self.session.check_current(base)
-        await self.threads.read(read_upload, content)
-        return await self._lead(base, GuidedEditTarget(like=content))
+        await self.threads.run("read", read_upload, content)
+        return await self._lead(base, {}, recording=content)
 
-    async def undo(self, words: dict[str, Any]) -> dict[str, Any]:
+    async def undo(self, request: dict[str, Any]) -> dict[str, Any]:
         """Go back by one revision."""
-        return self._changed(await self.threads.compute(self.session.undo, base_of(words)))
+        return self._changed(await self.threads.run("compute", self.session.undo, base_of(request)))
 
-    async def save(self, words: dict[str, Any]) -> dict[str, Any]:
+    async def save(self, request: dict[str, Any]) -> dict[str, Any]:
         """Write the field to a new file."""
-        name = words.get("name")
+        name = request.get("name")
         if not isinstance(name, str):
             raise bad_request("name", "the new file's name", name)
-        path, revision = await self.threads.compute(self.session.save, base_of(words), name)
+        path, revision = await self.threads.run("compute", self.session.save, base_of(request), name)
         return {"file": str(path), **self._changed(revision)}
 
     async def capture(self) -> dict[str, Any]:
         """Return the impacts of the capture, and the name of the file that shows its object."""
-        editor = self.require_editor()
-        visible = find_object(self.opened)
-        running = self.jobs.current
+        described = await self.threads.run("read", self.require_editor().describe)
+        visible, running = find_object(self.opened), self.jobs.current
         return {
-            **await self.threads.read(editor.describe),
+            **described,
             "object": None if visible is None else visible.name,
             "job": None if running is None else running.identifier,
         }
 
+    async def check_recording(self, content: bytes) -> dict[str, Any]:
+        """Return the report on a recording, which is not saved."""
+        return await self.with_editor(lambda editor: editor.check(content))
+
     async def with_editor(self, act: Callable[[CaptureEditor], Result]) -> Result:
         """Change the capture's impacts, one request after another. Raises RequestError (404) without a capture."""
-        return await self.threads.write(act, self.require_editor())
+        return await self.threads.run("write", act, self.require_editor())
 
     def require_editor(self) -> CaptureEditor:
         """Return the capture's impacts. Raises RequestError: 404 without a capture, 503 while its folder is missing."""
@@ -142,52 +137,57 @@ class Studio:
             raise bad_request("capture", "the capture folder", got="none", advice=advice, status=503, file=folder)
         return self.editor
 
-    async def reconstruct(self) -> Job:
+    async def reconstruct(self) -> dict[str, Any]:
         """Start to fit a field to the capture, which becomes the current one."""
         editor = self.require_editor()
-        if not await self.threads.read(editor.impacts):
+        if not await self.threads.run("read", editor.impacts):
             raise bad_request("recordings", "one or more", 0, advice="record impacts first", status=409)
         # One output is enough: the next job starts when this one's field is open.
         output = str(self.folder / "reconstructed")
         chosen = {"preset": self.config.preset, "modes": self.config.modes}
         task = {"task": "make_field", "folder": str(editor.folder), "output": output, **chosen}
-        return self.jobs.start("reconstruct", task, self._take_field)
+        return {"job": self.jobs.start("reconstruct", task, self._take_field).identifier}
 
-    def make_object(self) -> Job:
+    async def make_object(self) -> dict[str, Any]:
         """Begin to make Gaussians of the capture's pictures, to have something to click."""
         task = {"task": "make_object", "folder": str(self.require_editor().folder)}
-        return self.jobs.start(_MAKING, task, self._take_object)
+        return {"job": self.jobs.start(_MAKING, task, self._take_object).identifier}
 
-    async def _lead(self, base: int, wish: GuidedEditTarget) -> dict[str, Any]:
+    async def _lead(self, base: int, target: Event, *, recording: bytes | None = None) -> dict[str, Any]:
+        """Start to optimize the field towards the recording, or the prompt in `target`."""
         self.session.check_current(base)
         field = self.session.current.require_field()
         self.jobs.check_idle()
-        place = Path(tempfile.mkdtemp(prefix="lead-", dir=self.folder))
+        folder = Path(tempfile.mkdtemp(prefix="lead-", dir=self.folder))
+        task = {"task": "lead", "field": str(folder / "field"), "output": str(folder / "led"), **target}
         try:
-            task = wish.task(place, steps=self.config.steps, model=self.model)
-            await self.threads.compute(save, field, place / "field")
-            return {"job": self.jobs.start("guided edit", task, partial(self._take_led, base)).identifier}
+            if recording is not None:
+                (folder / "like.wav").write_bytes(recording)
+                task["recording"] = str(folder / "like.wav")
+            await self.threads.run("compute", save, field, folder / "field")
+            take = partial(self._take_led, base)
+            return {"job": self.jobs.start("guided edit", {**task, "steps": self.config.steps}, take).identifier}
         except BaseException:
-            shutil.rmtree(place, ignore_errors=True)
+            shutil.rmtree(folder, ignore_errors=True)
             raise
 
     async def _compute(self, act: Callable[..., Result], *arguments: Any) -> Result:
         """Compute with a user's values. Raises RequestError (422) if they give no result."""
         try:
-            return await self.threads.compute(act, *arguments)
+            return await self.threads.run("compute", act, *arguments)
         except NUMERIC_ERRORS as error:
             # A check of the values that would name the cause is missing.
             traceback.print_exception(error)
             raise error_response(error) from error
 
     async def _take_field(self, result: Event) -> Event:
-        revision = await self.threads.compute(lambda: self.session.open(load(result["output"])))
+        revision = await self.threads.run("compute", lambda: self.session.open(load(result["output"])))
         return {**result, **self._changed(revision)}
 
     async def _take_object(self, result: Event) -> Event:
         current = self.session.current
         if current.field is None:
-            current = await self.threads.compute(self.session.open, None)
+            current = await self.threads.run("compute", self.session.open, None)
         return {**result, **self._changed(current)}
 
     async def _take_led(self, base: int, result: Event) -> Event:
@@ -197,15 +197,13 @@ class Studio:
                 revision = self.session.lead(base, led, tuple(remarks(led.origin.report[EDITS][-1:], led)))
             except RequestError:
                 # Minutes of work; what the other tab has done since is not to be overwritten either.
-                kept = self.session.keep(led, f"{self.opened.name[:_NAME]} edited")
-                words = (
-                    f"the field was changed during the guided edit, whose result was saved to {kept}: open that file"
-                )
+                path = self.session.keep(led, f"{self.opened.name[:_MAX_STEM]} edited")
+                note = f"the field was changed during the guided edit, whose result was saved to {path}: open that file"
                 now = self.session.current
-                return {"file": str(kept), "revision": now.number, "remarks": [words, *now.remarks]}
+                return {"file": str(path), "revision": now.number, "remarks": [note, *now.remarks]}
             return {"revision": revision.number, "remarks": list(revision.remarks)}
 
-        done = await self.threads.compute(take)
+        done = await self.threads.run("compute", take)
         self.searches.prepare_ahead()
         return done
 
@@ -215,12 +213,10 @@ class Studio:
         return {"revision": revision.number, "remarks": list(revision.remarks)}
 
     def _live(self, revision: Revision) -> dict[str, Any]:
-        abilities = []
+        abilities = list[str]()
         field, running = revision.field, self.jobs.current
-        rows: list[int] = []
         if field is not None:
             abilities += ["locate", "edit", "save", "like", *(["words"] if self.model is not None else [])]
-            rows = field.audible.nonzero().flatten().tolist()
         if self.editor is not None:
             abilities += ["capture", "reconstruct"]
         return {
@@ -230,7 +226,7 @@ class Studio:
             "mode": "capture" if field is None else "field",
             "sliders": revision.sliders.to_json(),
             "remarks": [*self.showcase.current.remarks, *revision.remarks],
-            "rows": rows,
+            "rows": [] if field is None else field.audible.nonzero().flatten().tolist(),
             "materials": list(MATERIALS),
             "job": None if running is None else running.identifier,
             "jobKind": None if running is None else running.kind,
@@ -238,9 +234,9 @@ class Studio:
         }
 
 
-def base_of(words: dict[str, Any]) -> int:
+def base_of(request: dict[str, Any]) -> int:
     """Return the revision that a change is based on. Raises RequestError (400) if the request has none."""
-    base = words.get("base")
+    base = request.get("base")
     if not isinstance(base, int) or isinstance(base, bool):
         raise unknown_base(base)
     return base

@@ -36,7 +36,7 @@ from avmsf.pipeline.stages import StageFolder
 from avmsf.studio.capture import COMMAND
 
 Values = Mapping[str, Any]
-_RARELY = 10
+_EVENT_INTERVAL = 10
 """Steps of a fit between two progress events."""
 
 
@@ -45,6 +45,8 @@ class EventWriter:
 
     def __init__(self, stream: TextIO) -> None:
         self.stream = stream
+        self.listener = ProgressListener(self.log, self._stage_step)
+        """What the stages of a fit report to."""
 
     def write(self, event: Values) -> None:
         """Write one event."""
@@ -60,15 +62,6 @@ class EventWriter:
         stage, _, rest = words.partition(": ")
         self.step(stage, 0, 0, rest)
 
-    @property
-    def listener(self) -> ProgressListener:
-        """What the stages of a fit report to."""
-        return ProgressListener(self.log, self._stage_step)
-
-    def _stage_step(self, stage: str, done: int, total: int, words: str) -> None:
-        if done % _RARELY == 0 or done == total or stage == "features":
-            self.step(stage, done, total, words)
-
     def guided_edit(self, progress: GuidedEditProgress) -> None:
         """Send the progress of an edit's optimization."""
         words = f"loss {progress.loss:.3g}, pitch x {progress.pitch:.4g}"
@@ -76,9 +69,13 @@ class EventWriter:
         loss = progress.loss if math.isfinite(progress.loss) else None
         self.step("edit", progress.step, progress.steps, words, loss=loss, pitch=progress.pitch)
 
+    def _stage_step(self, stage: str, done: int, total: int, words: str) -> None:
+        if done % _EVENT_INTERVAL == 0 or done == total or stage == "features":
+            self.step(stage, done, total, words)
+
 
 def make_field(task: Values, events: EventWriter) -> Values:
-    """Reconstruct the capture `folder`, copy its field to `output`, and return the notes on it.
+    """Reconstruct the capture `folder`, copy its field to `output`, and return both files.
 
     The copy is the field of this reconstruction, even if another one replaces `field` meanwhile.
     """
@@ -90,11 +87,7 @@ def make_field(task: Values, events: EventWriter) -> Values:
     with stages.lock(COMMAND):
         made = fit_in_stages(capture, config, stages, listener=events.listener)
         copy_whole(made.field, Path(task["output"]))
-    return {
-        "field": str(made.field),
-        "output": task["output"],
-        "stages": [each.stage for each in made.stages if each.fresh],
-    }
+    return {"field": str(made.field), "output": task["output"]}
 
 
 def make_object(task: Values, events: EventWriter) -> Values:
@@ -122,10 +115,8 @@ def lead(task: Values, events: EventWriter) -> Values:
     return {"output": task["output"]}
 
 
-TASKS: Mapping[str, Callable[[Values, EventWriter], Values]] = {
-    "make_field": make_field,
-    "make_object": make_object,
-    "lead": lead,
+_TASKS: Mapping[str, Callable[[Values, EventWriter], Values]] = {
+    task.__name__: task for task in (make_field, make_object, lead)
 }
 
 
@@ -142,14 +133,12 @@ def main() -> int:
         warnings.simplefilter("always", CaptureWarning)
         warnings.showwarning = lambda message, *rest, **more: events.write({"stage": "note", "words": str(message)})
         try:
-            events.write({"result": TASKS[task["task"]](task, events)})
-        except AvmsfError as error:
-            events.write({"error": " ".join(str(error).split())})
-            return 2
+            events.write({"result": _TASKS[task["task"]](task, events)})
         except Exception as error:
-            if not lacks_memory(error):
+            if not (isinstance(error, AvmsfError) or lacks_memory(error)):
                 raise
-            events.write({"error": NO_MEMORY})
+            message = str(error) if isinstance(error, AvmsfError) else NO_MEMORY
+            events.write({"error": " ".join(message.split())})
             return 2
     return 0
 
