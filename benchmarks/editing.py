@@ -37,7 +37,7 @@ from avmsf.editing.reference import Reference
 from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import AvmsfError, AvmsfWarning, EvaluationError
 from avmsf.evaluation.clap import Clap
-from avmsf.evaluation.metrics import default_fft_sizes, relative_stft_error
+from avmsf.evaluation.metrics import relative_stft_error
 from avmsf.evaluation.results import write_json
 from avmsf.fem.material import material_named
 from avmsf.field.sound_field import SoundField
@@ -353,6 +353,6 @@ def spectral_distance(made: Edited, reference: Reference) -> float:
     sounds, wanted = (
         each.double() / level(each.double(), sample_rate=made.sample_rate)[:, None] for each in (made.sounds, clips)
     )
-    sizes = default_fft_sizes(made.sample_rate)
-    errors = [relative_stft_error(sounds, clip.expand_as(sounds), fft_sizes=sizes) for clip in wanted]
+    rate = made.sample_rate
+    errors = [relative_stft_error(sounds, clip.expand_as(sounds), sample_rate=rate) for clip in wanted]
     return float(torch.stack(errors).amin(dim=0).mean())

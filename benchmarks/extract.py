@@ -10,7 +10,7 @@ from torch import Tensor
 
 from avmsf.capture import Impacts
 from avmsf.errors import ExtractionError
-from avmsf.evaluation.metrics import default_fft_sizes, relative_stft_error
+from avmsf.evaluation.metrics import relative_stft_error
 from avmsf.evaluation.simple_methods import floor
 from avmsf.modal.extraction.extract import extract_modes, extract_sounds
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder, ShortTime
@@ -200,4 +200,4 @@ def _error(sound: Float[Tensor, " samples"], bank: ModalBank, sample_rate: float
     """Return the relative STFT error of one sound's best fit by the modes."""
     alone = Impacts(torch.zeros(1, 3), sound[None], sample_rate, ("clip",))
     fitted = floor(alone, bank)
-    return float(relative_stft_error(fitted, sound[None], fft_sizes=default_fft_sizes(sample_rate))[0])
+    return float(relative_stft_error(fitted, sound[None], sample_rate=sample_rate)[0])

@@ -10,9 +10,6 @@ import pytest
 
 from avmsf.cli.options.paths import ExistingField, InputError
 from avmsf.errors import SimulationError
-from avmsf.evaluation.methods import METHODS
-from avmsf.evaluation.protocols import PROTOCOLS
-from avmsf.evaluation.registry import METHOD_TITLES, PROTOCOL_NAMES
 from avmsf.fem.material import material_named
 from avmsf.gaussians.ply_header import NEEDED
 from avmsf.pipeline.config import CACHE, CACHED_FIELD
@@ -114,11 +111,6 @@ def test_no_refusal_loads_torch(place: Path) -> None:
     ran = subprocess.run(command, cwd=place, capture_output=True, text=True, timeout=120, check=True, env=os.environ)
     found = json.loads(ran.stdout)
     assert found == {words: [2, 1, False] for words in REFUSED}
-
-
-def test_names_are_those_of_the_methods_and_protocols() -> None:
-    assert tuple(METHODS) == tuple(METHOD_TITLES)
-    assert tuple(PROTOCOLS) == PROTOCOL_NAMES
 
 
 def test_the_field_that_a_folder_keeps_is_named(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from avmsf.evaluation import align_split, evaluate
 from avmsf.evaluation.cases import Case
 from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.methods import method_named
-from avmsf.evaluation.protocols import PROTOCOLS
+from avmsf.evaluation.registry import PROTOCOLS
 from avmsf.evaluation.runner import CaseRun, Evaluation, ObjectData
 from avmsf.evaluation.simple_methods import NearestRecording
 from avmsf.evaluation.splits import MetricSettings

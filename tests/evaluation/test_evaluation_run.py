@@ -20,7 +20,7 @@ from avmsf.evaluation.methods import method_named
 from avmsf.evaluation.modal_metrics import ModalRenderer, compare_modes, truth_at
 from avmsf.evaluation.objects import ObjectInputs, draw_other_recording
 from avmsf.evaluation.parallel import RunProgress, run_objects
-from avmsf.evaluation.protocols import PROTOCOLS
+from avmsf.evaluation.registry import PROTOCOLS
 from avmsf.evaluation.report import write_summary
 from avmsf.evaluation.results import ENCODER, ResultsFolder
 from avmsf.evaluation.runner import Evaluation

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,8 @@ from avmsf.baselines.diffsound.material_fit import DiffSoundConfig
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, FitError, SceneError
 from avmsf.evaluation.field_methods import PAPER_GRID, FieldMethod, Grid, random_modes
-from avmsf.evaluation.methods import METHODS, DiffSoundMethod, RecordedMethod, method_named
+from avmsf.evaluation.methods import RecordedMethod, diffsound, method_named
+from avmsf.evaluation.registry import METHODS
 from avmsf.evaluation.splits import split
 from avmsf.evaluation.task import Method, Renderer, Task, report_of
 from avmsf.features.feature_field import FeatureField
@@ -53,8 +54,9 @@ def with_fit(method: FieldMethod, config: FitConfig) -> FieldMethod:
 
 def tiny(method: Any) -> Any:
     """Return a method of the same kind that is fitted in a moment."""
-    if isinstance(method, DiffSoundMethod):
-        return replace(method, config=DiffSoundConfig(transport_steps=1, difference_steps=2, search=0))
+    if method.name.startswith("diffsound"):
+        config = DiffSoundConfig(transport_steps=1, difference_steps=2, search=0)
+        return replace(method, fit=partial(diffsound, config=config, weighted=method.name.endswith("weighted")))
     if isinstance(method, FieldMethod):
         if method.grid is not None:
             method = replace(method, grid=Grid((4, 8), (1e-2,), (2,), (1.0,), ("shared",)))
@@ -107,13 +109,14 @@ def parts() -> tuple[Impacts, Impacts]:
 
 @cache
 def made(name: str, seed: int = 0) -> Renderer:
-    return tiny(METHODS[name]).fit(plate_task(parts()[0], seed=seed))
+    return tiny(method_named(name)).fit(plate_task(parts()[0], seed=seed))
 
 
-every_method = pytest.mark.parametrize("name", METHODS)
+NAMES = [name for name, entry in METHODS.items() if not entry.path]
+every_method = pytest.mark.parametrize("name", NAMES)
 # To choose takes a fit of every kind for every contact left out.
 fitted_quickly = pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "field-auto" else name for name in METHODS]
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "field-auto" else name for name in NAMES]
 )
 
 
@@ -121,9 +124,9 @@ fitted_quickly = pytest.mark.parametrize(
 def test_a_sound_depends_on_its_contact_alone(name):
     _, test = parts()
     renderer = made(name)
-    assert isinstance(METHODS[name], Method)
+    assert isinstance(method_named(name), Method)
     assert isinstance(renderer, Renderer)
-    assert METHODS[name].name == name
+    assert method_named(name).name == name
     assert renderer.sample_rate == RATE
     together = renderer.render(test.contacts)
     assert together.shape == (len(test), SAMPLES)
@@ -139,7 +142,7 @@ def test_a_sound_depends_on_its_contact_alone(name):
 @fitted_quickly
 def test_a_seed_decides_all_chance(name):
     train, test = parts()
-    again = tiny(METHODS[name]).fit(plate_task(train)).render(test.contacts)
+    again = tiny(method_named(name)).fit(plate_task(train)).render(test.contacts)
     assert torch.equal(again, made(name).render(test.contacts))
 
 
@@ -148,7 +151,7 @@ def test_one_or_two_shots_are_enough(name):
     impacts = struck()
     for count in (1, 2):
         train = impacts.take(range(count))
-        renderer = tiny(METHODS[name]).fit(plate_task(train))
+        renderer = tiny(method_named(name)).fit(plate_task(train))
         sounds = renderer.render(impacts.contacts)
         assert sounds.shape == (COUNT, SAMPLES)
         assert bool(torch.isfinite(sounds).all())
@@ -160,7 +163,7 @@ def test_one_or_two_shots_are_enough(name):
 def test_the_order_of_training_rows_changes_nothing(name):
     train, test = parts()
     rows = torch.randperm(TRAIN, generator=torch.Generator().manual_seed(1)).tolist()
-    shuffled = METHODS[name].fit(plate_task(train.take(rows))).render(test.contacts)
+    shuffled = method_named(name).fit(plate_task(train.take(rows))).render(test.contacts)
     straight = made(name).render(test.contacts)
     assert torch.allclose(shuffled, straight, rtol=0, atol=1e-5 * float(straight.abs().max()))
 
@@ -207,7 +210,7 @@ def test_a_random_impact_is_the_strangers_everywhere():
     sounds = made("random-impact").render(test.contacts)
     assert torch.equal(sounds, torch.linspace(-1, 1, SAMPLES).expand(len(test), -1))
     with raises(EvaluationError, name="stranger"):
-        METHODS["random-impact"].fit(replace(plate_task(train), other_recording=no_stranger))
+        method_named("random-impact").fit(replace(plate_task(train), other_recording=no_stranger))
 
 
 def no_stranger():
@@ -224,14 +227,14 @@ def test_fields_read_what_their_names_say():
 
     task = replace(plate_task(train), features=features)
     for name in ("field", "field-positions", "field-unaligned", "field-no-residual", "field-no-initialization"):
-        tiny(METHODS[name]).fit(task)
+        tiny(method_named(name)).fit(task)
     assert asked == ["visual", "positions", "unaligned", "visual", "visual"]
 
     def blind(look):
         raise SceneError("no visual input", name=look)
 
     with raises(SceneError, name="visual"):
-        tiny(METHODS["field"]).fit(replace(task, features=blind))
+        tiny(method_named("field")).fit(replace(task, features=blind))
 
 
 def test_ablations_leave_out_what_their_names_say():
@@ -339,7 +342,7 @@ def test_a_grids_trials_do_not_learn_from_what_they_are_judged_by(monkeypatch):
 def test_a_field_of_few_points_has_no_more_regions():
     train, _ = parts()
     points = FeatureField.from_contacts(struck().contacts, count=6)
-    field = tiny(METHODS["field"]).fit(replace(plate_task(train), features=lambda look: points))
+    field = tiny(method_named("field")).fit(replace(plate_task(train), features=lambda look: points))
     assert isinstance(field, SoundField)
     assert field.gain_field.shape.clusters == len(points.points) < 8
 
@@ -356,7 +359,6 @@ def test_reports_say_what_was_used():
 
 
 def test_unknown_names_are_refused_with_the_known_ones(tmp_path):
-    assert method_named("knn3") is METHODS["knn3"]
     with raises(EvaluationError, name="method", value="spline-gain") as caught:
         method_named("spline-gain")
     assert str(caught.value).endswith("spline-gains?")
@@ -367,13 +369,13 @@ def test_unknown_names_are_refused_with_the_known_ones(tmp_path):
         with raises(EvaluationError, file=folder, name="method", value=name):
             method_named(name)
     method = method_named(f"recorded:{tmp_path}")
-    assert method == RecordedMethod(tmp_path)
+    assert method == RecordedMethod(f"recorded:{tmp_path}", tmp_path)
     assert method.name == f"recorded:{tmp_path}"
 
 
 def test_methods_are_told_apart_by_their_words():
     """A results folder remembers methods by these, so no address of an object may be in them."""
-    words = [repr(method) for method in METHODS.values()]
+    words = [repr(method_named(name)) for name in NAMES]
     assert len(set(words)) == len(words)
     assert not [word for word in words if " at 0x" in word]
 
@@ -407,9 +409,9 @@ def test_others_sounds_that_do_not_fit_are_refused_by_name(tmp_path):
     train, test = parts()
     task = plate_task(train)
     with raises(EvaluationError, file=tmp_path / "plate", name=None):
-        RecordedMethod(tmp_path).fit(task)
+        RecordedMethod("recorded", tmp_path).fit(task)
     write_sounds(tmp_path, test)
-    renderer = RecordedMethod(tmp_path).fit(task)
+    renderer = RecordedMethod("recorded", tmp_path).fit(task)
     with raises(EvaluationError, file=f"plate/{train.names[0]}.wav", name=train.names[0]):
         renderer.render(train.contacts[:1])
     with raises(EvaluationError, name="contacts", value=[1.0, 2.0, 3.0]):
@@ -431,7 +433,7 @@ def test_others_sounds_that_do_not_fit_are_refused_by_name(tmp_path):
 
 
 def test_a_digest_is_of_the_wavs_of_one_object(tmp_path: Path) -> None:
-    method = RecordedMethod(tmp_path)
+    method = RecordedMethod("recorded", tmp_path)
     paths = [tmp_path / name / "001.wav" for name in ("bowl", "mug")]
     for path in paths:
         path.parent.mkdir()

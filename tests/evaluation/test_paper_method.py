@@ -11,8 +11,8 @@ from avmsf.cli.evaluate import inputs_of, settled_lifts
 from avmsf.datasets import CaptureCollection
 from avmsf.errors import EvaluationError, SceneError
 from avmsf.evaluation.field_methods import NETWORK, FieldMethod
-from avmsf.evaluation.methods import METHODS
-from avmsf.evaluation.protocols import PROTOCOLS
+from avmsf.evaluation.methods import method_named
+from avmsf.evaluation.registry import PROTOCOLS
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.runner import Evaluation
 from avmsf.evaluation.splits import MetricSettings
@@ -31,7 +31,7 @@ from factories.raising import raises
     ("name", "damping"), [("paper", "shared"), ("paper-grid", "shared"), ("paper-per-contact", "per-contact")]
 )
 def test_the_method_is_the_preset_with_one_damping(name: str, damping: Any) -> None:
-    field: Any = METHODS[name]
+    field: Any = method_named(name)
     preset = PRESETS["paper"]
     assert field.pipeline == replace(preset, fit=replace(preset.fit, damping=damping))
     assert (field.visual_input, field.published) == ("paper", True)
@@ -92,13 +92,17 @@ def test_encoders_are_loaded_once_on_the_device_and_only_for_who_reads_them(monk
         return ImageDescriptors()
 
     monkeypatch.setattr(DinoEncoder, "load", load)
-    read = inputs_of([METHODS["knn3"], METHODS["white-noise"], METHODS["diffsound"]], PROTOCOLS["farthest"])
+
+    def read_by(protocol: str, *names: str) -> frozenset[Any]:
+        return inputs_of([method_named(name) for name in names], PROTOCOLS[protocol])
+
+    read = read_by("farthest", "knn3", "white-noise", "diffsound")
     assert settled_lifts(LiftConfig(), read, device="cpu")[0] == LiftConfig()
-    assert settled_lifts(LiftConfig(), inputs_of([METHODS["field-auto"]], PROTOCOLS["localize"]))[0] == LiftConfig()
+    assert settled_lifts(LiftConfig(), read_by("localize", "field-auto"))[0] == LiftConfig()
     assert loaded == []
     # Recordings are located at the points that features have.
-    assert inputs_of([METHODS["nearest"]], PROTOCOLS["localize"]) == {"surface"}
-    read = inputs_of([METHODS["field"], METHODS["field-auto"], METHODS["paper-grid"]], PROTOCOLS["farthest"])
+    assert read_by("localize", "nearest") == {"surface"}
+    read = read_by("farthest", "field", "field-auto", "paper-grid")
     assert read == {"visual", "surface", "paper"}
     assert settled_lifts(LiftConfig(), read, device="cpu")[0].encoder == DINO
     assert loaded == [(DINO, "cpu")]
@@ -107,7 +111,7 @@ def test_encoders_are_loaded_once_on_the_device_and_only_for_who_reads_them(monk
 def test_methods_without_features_share_results_with_any_encoder(tmp_path: Path) -> None:
     def begin(name: str, encoder: str | None) -> None:
         evaluation = Evaluation(
-            CaptureCollection(tmp_path), "plates", PROTOCOLS["farthest"], (METHODS[name],), PlateInputs(),
+            CaptureCollection(tmp_path), "plates", PROTOCOLS["farthest"], (method_named(name),), PlateInputs(),
             metric_settings=MetricSettings(cdpam=False), encoder=encoder,
         )  # fmt: skip
         evaluation.begin(ResultsFolder(tmp_path / "results"))

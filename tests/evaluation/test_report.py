@@ -16,15 +16,14 @@ from PIL import Image
 from test_evaluation_run import planned
 
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.methods import METHODS
-from avmsf.evaluation.page import StoredSound, draw_spectrogram, keep_sound, listening_gain
 from avmsf.evaluation.parallel import run_objects
-from avmsf.evaluation.protocols import PUBLISHED, published_ratios
-from avmsf.evaluation.registry import title_of
-from avmsf.evaluation.report import write_page, write_summary
-from avmsf.evaluation.report_tables import WARNING, Grid, Section, figure, markdown, sections
+from avmsf.evaluation.published import PUBLISHED, published_ratios
+from avmsf.evaluation.registry import METHODS
+from avmsf.evaluation.report import markdown, write_page, write_summary
+from avmsf.evaluation.report_tables import WARNING, Section, figure, sections
 from avmsf.evaluation.results import CaseRecord, ObjectRecord, Outcome, ResultsFolder, natural
-from avmsf.evaluation.summary import missing_of, object_figures, summarize
+from avmsf.evaluation.stored_sounds import StoredSound, draw_spectrogram, keep_sound, listening_gain
+from avmsf.evaluation.summary import missing_of, object_values, summarize
 from factories.plate_set import fill_plates
 from factories.raising import raises
 
@@ -68,8 +67,7 @@ def test_means_are_over_contacts_then_over_objects() -> None:
 def best_of(records: tuple[ObjectRecord, ...]) -> tuple[list[str], Section]:
     """Return the methods that the main table marks as best, and its section."""
     (part,) = [each for each in sections(records, IDENTITY) if each.title == "All methods"]
-    assert part.grid is not None
-    return [part.grid.rows[row][0] for row, _ in sorted(part.grid.best)], part
+    return [part.rows[row][0] for row, _ in sorted(part.best)], part
 
 
 def test_the_best_is_marked_among_methods_that_have_all_objects() -> None:
@@ -120,9 +118,9 @@ def test_parts_of_one_experiment_are_pooled_and_one_that_failed_spoils_all() -> 
         Outcome(f"all: {name}", "knn3", {"l1": (value,)}, {"mac": 0.5}) for name, value in (("u", 1.0), ("v", 5.0))
     ]
     whole = ObjectRecord("1", cases=parts, outcomes=tuple(outcomes))
-    assert object_figures(whole, "all") == {"knn3": {"l1": 3.0, "mac": 0.5}}
-    assert object_figures(replace(whole, outcomes=tuple(outcomes[:1])), "all") == {}
-    assert object_figures(whole.adding(Outcome("all: v", "knn3", failure="no")), "all") == {}
+    assert object_values(whole, "all") == {"knn3": {"l1": 3.0, "mac": 0.5}}
+    assert object_values(replace(whole, outcomes=tuple(outcomes[:1])), "all") == {}
+    assert object_values(whole.adding(Outcome("all: v", "knn3", failure="no")), "all") == {}
 
 
 def test_figures_of_which_more_is_better_have_no_ratio() -> None:
@@ -153,14 +151,13 @@ def test_tables_have_the_papers_rows_for_its_datasets_alone() -> None:
     assert WARNING in other
 
 
-def test_every_method_has_a_title_and_tables_give_it() -> None:
-    assert all(title_of(method) for method in METHODS)
-    assert f"paper: {title_of('paper')}" in markdown(sections(THREE, IDENTITY))
+def test_tables_give_the_titles_of_their_methods() -> None:
+    assert f"paper: {METHODS['paper'].title}" in markdown(sections(THREE, IDENTITY))
     # Also those that read a file or a folder.
     method = "sonicgauss:/some/folder"
     records = (record("1", {"knn3": (1.0, 1.0), method: (1.0, 1.0)}),)
     words = markdown(sections(records, {**IDENTITY, "methods": {"knn3": "", method: ""}}))
-    assert title_of("sonicgauss") in words
+    assert METHODS["sonicgauss"].title in words
 
 
 def test_the_papers_ratio_is_of_its_own_rows() -> None:
@@ -189,7 +186,7 @@ def test_figures_have_three_digits(value: float | None, words: str) -> None:
 
 
 def test_markdown_escapes_what_would_be_markup() -> None:
-    words = markdown([Section("a|b", ("x * y < z",), Grid(("a", "b"), (("p|q", "1"),), frozenset({(0, 1)})))])
+    words = markdown([Section("a|b", ("x * y < z",), ("a", "b"), (("p|q", "1"),), frozenset({(0, 1)}))])
     assert words == "# a\\|b\n\nx \\* y &lt; z\n\n| a | b |\n|---|---:|\n| p\\|q | **1** |\n"
 
 
@@ -291,7 +288,7 @@ def test_the_page_can_be_made_again_and_is_the_same(evaluated: Path) -> None:
 
 def test_the_page_stays_small(evaluated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = (evaluated / "report.html").read_text()
-    monkeypatch.setattr("avmsf.evaluation.page.LARGEST", len(whole) // 3)
+    monkeypatch.setattr("avmsf.evaluation.report.MAX_PAGE_CHARACTERS", len(whole) // 3)
     write_page(ResultsFolder(evaluated))
     smaller = (evaluated / "report.html").read_text()
     assert len(smaller) < len(whole) / 2

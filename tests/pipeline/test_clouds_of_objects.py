@@ -8,7 +8,7 @@ import torch
 from avmsf.datasets import CaptureCollection
 from avmsf.errors import SceneError
 from avmsf.evaluation.objects import ObjectInputs
-from avmsf.evaluation.protocols import PROTOCOLS
+from avmsf.evaluation.registry import PROTOCOLS
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.runner import Evaluation, run_object
 from avmsf.evaluation.simple_methods import NearestRecording

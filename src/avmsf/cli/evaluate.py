@@ -23,7 +23,8 @@ from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.methods import RecordedMethod, method_named
 from avmsf.evaluation.objects import SUBSETS, ObjectInputs, choose_objects, members
 from avmsf.evaluation.parallel import RunProgress, run_objects
-from avmsf.evaluation.protocols import PREDEFINED, PUBLISHED, SHOTS, EvaluationProtocol, protocol_named
+from avmsf.evaluation.published import PUBLISHED
+from avmsf.evaluation.registry import Protocol, protocol_named
 from avmsf.evaluation.report import PAGE, SUMMARY, TABLES, write_figures, write_page, write_summary
 from avmsf.evaluation.report_tables import Section
 from avmsf.evaluation.results import IDENTITY, ResultsFolder
@@ -34,7 +35,7 @@ from avmsf.modal.extraction.finders import finder_named
 from avmsf.pipeline.config import AUTO, PRESETS, LiftConfig, SceneConfig, TimeZero, ViewsConfig
 from avmsf.pipeline.features import choose_encoder, settled
 
-OPTIONS = {PREDEFINED: ("test",), SHOTS: ("counts", "starts")}
+OPTIONS = {"predefined": ("test",), "shots": ("counts", "starts")}
 """Options of one protocol alone."""
 _SHOWN = 5
 """Failures that are printed; the report lists all."""
@@ -92,20 +93,20 @@ def run(options: Options) -> int:
     if options.json:
         print_json({**summary, "results": str(folder)})
     next_step(f"open {shlex.quote(str(folder / PAGE))} in a browser")
-    next_command(f"avmsf evaluate {'farthest' if protocol.name == SHOTS else SHOTS}", options.data)
+    next_command(f"avmsf evaluate {'farthest' if protocol.name == 'shots' else 'shots'}", options.data)
     return 0
 
 
-def _protocol_of(options: Options) -> EvaluationProtocol:
+def _protocol_of(options: Options) -> Protocol:
     """Return the protocol with its own options, and print which of those that were given it does not use."""
     protocol, usual = protocol_named(options.protocol), Options(options.protocol, options.data)
     for owner, names in OPTIONS.items():
         unused = [f"--{name}" for name in names if getattr(options, name) != getattr(usual, name)]
         if unused and owner != protocol.name:
             say(f"note: {', '.join(unused)}: not used by {protocol.name}, only by {owner}")
-    if protocol.name == SHOTS:
-        return replace(protocol, choosing=Shots(options.counts, options.starts))
-    return replace(protocol, choosing=Predefined(words_of(options.test))) if protocol.name == PREDEFINED else protocol
+    if protocol.name == "shots":
+        return replace(protocol, cases=Shots(options.counts, options.starts))
+    return replace(protocol, cases=Predefined(words_of(options.test))) if protocol.name == "predefined" else protocol
 
 
 def _print_failures(failures: Sequence[Mapping[str, Any]], screen: Console) -> None:
@@ -121,7 +122,7 @@ def evaluation_of(
     options: Options,
     dataset: Dataset,
     title: str,
-    protocol: EvaluationProtocol,
+    protocol: Protocol,
     methods: tuple[Method, ...],
     folder: Path,
 ) -> Evaluation:
@@ -138,7 +139,7 @@ def evaluation_of(
     inputs = ObjectInputs(
         dataset, kept, replace(given, lift=lift), paper, options.geometry, body, device, seed=options.seed
     )
-    cdpam = not options.no_cdpam and "cdpam" in protocol.metrics
+    cdpam = not options.no_cdpam and not protocol.locating
     return Evaluation(
         dataset,
         title,
@@ -155,7 +156,7 @@ def evaluation_of(
     )
 
 
-def _note_subset(dataset: Dataset, protocol: EvaluationProtocol, objects: Sequence[str]) -> None:
+def _note_subset(dataset: Dataset, protocol: Protocol, objects: Sequence[str]) -> None:
     """Print which objects a protocol takes of a dataset, where it does not take all."""
     total = len(dataset.objects())
     if protocol.subset is not None and len(objects) < total:
@@ -215,7 +216,7 @@ def settled_lifts(
     return settled(lift, log=say, device=device) if set(inputs) - {"surface"} else lift, paper
 
 
-def inputs_of(methods: Sequence[Method], protocol: EvaluationProtocol) -> frozenset[VisualInput]:
+def inputs_of(methods: Sequence[Method], protocol: Protocol) -> frozenset[VisualInput]:
     """Return the features that an evaluation reads: those of its methods, and the points that locate recordings."""
     read = {method.visual_input for method in methods if isinstance(method, FieldMethod)}
     return frozenset(read | {"surface"} if protocol.locating else read)
@@ -230,7 +231,7 @@ def title_of(dataset: Dataset, folder: Path) -> str:
 
 
 def _print(part: Section, screen: Console) -> None:
-    if part.grid is not None:
+    if part.columns:
         # Standard errors, which are in the reports, would fold every cell of a narrow screen.
-        rows = [[cell.partition(" ±")[0] for cell in row] for row in part.grid.rows]
-        screen.print(table(part.title, part.grid.columns, rows))
+        rows = [[cell.partition(" ±")[0] for cell in row] for row in part.rows]
+        screen.print(table(part.title, part.columns, rows))

@@ -21,8 +21,9 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 from torch.nn.functional import conv1d, leaky_relu, normalize
 
+from avmsf.editing.clips import resampled
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.metrics import PerContact, resampled, validate, validate_sounds
+from avmsf.evaluation.metrics import PerContact, validate, validate_sounds
 
 Scaling = Literal["benchmark", "authors"]
 SAMPLE_RATE = 22050.0
@@ -117,7 +118,7 @@ class Cdpam:
         sample_rate: float,
         scaling: Scaling = "benchmark",
     ) -> PerContact:
-        """Return each contact's distance; sounds are fractions of full scale. Raises as `validate` and `resampled`."""
+        """Return each contact's distance; sounds are fractions of full scale. Raises as `validate` and `embed`."""
         validate(predicted, truth)
         embeddings = [self.embed(sounds, sample_rate=sample_rate, scaling=scaling) for sounds in (predicted, truth)]
         return (embeddings[0] - embeddings[1]).abs().sum(dim=1)
@@ -130,7 +131,7 @@ class Cdpam:
         Sounds [contacts, samples] are fractions of full scale. Raises EvaluationError for sounds that are empty or not
         finite, and for a rate that is not positive.
         """
-        validate_sounds(sounds)
+        validate_sounds(sounds, sample_rate=sample_rate, wanted=SAMPLE_RATE)
         rows = []
         for sound in sounds.detach().cpu().double():
             key = hashlib.sha256(f"{scaling} {float(sample_rate)!r} ".encode() + sound.numpy().tobytes()).hexdigest()

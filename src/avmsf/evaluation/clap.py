@@ -21,8 +21,9 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from avmsf._utils.hub import is_hub_name, why_not
+from avmsf.editing.clips import resampled
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.metrics import PerContact, resampled, validate_sounds
+from avmsf.evaluation.metrics import PerContact, validate_sounds
 
 DEFAULT: Final = "laion/clap-htsat-unfused"
 """The hub's name of the network that scores are taken with unless another is named."""
@@ -116,7 +117,7 @@ class Clap:
 
     def embed(self, sounds: Float[Tensor, "..."], *, sample_rate: float) -> Float64[Tensor, "contacts dim"]:
         """Return the sounds' embeddings, of length one."""
-        validate_sounds(sounds)
+        validate_sounds(sounds, sample_rate=sample_rate, wanted=self.sample_rate)
         silent = torch.nonzero(sounds.detach().abs().amax(dim=1) == 0).flatten()
         if len(silent):
             raise EvaluationError.expected("a sound", 0.0, got="silence", row=int(silent[0]), name="sounds")

@@ -12,7 +12,7 @@ from avmsf.capture.impacts import Impacts, rows_by_place
 from avmsf.errors import FitError
 from avmsf.evaluation.task import Task, VisualInput
 from avmsf.features.feature_field import FeatureField
-from avmsf.field.config import FitConfig
+from avmsf.field.config import FitConfig, GainModel
 from avmsf.field.fit import fit, held_out
 from avmsf.field.gains.estimator import estimator_for
 from avmsf.field.sound_field import SoundField
@@ -21,12 +21,10 @@ from avmsf.modal.extraction.finders import finder_named, lowest_frequency
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.modal.spectra import envelope
-from avmsf.pipeline.config import PipelineConfig
+from avmsf.pipeline.config import PRESETS, PipelineConfig
 
 NETWORK = PipelineConfig(gain_model="network")
 """The attention network with the quick settings of the fit."""
-
-
 _FEWEST_TO_VALIDATE = 6
 """Training places from which on a part of them is held out to choose settings by, as in `fit` itself."""
 _UNINFORMED_RATE = 0.03
@@ -145,6 +143,28 @@ class FieldMethod:
             "validation_envelope": errors,
             "chosen": {each.name: getattr(chosen, each.name) for each in fields(grid)},
         }
+
+
+def gaussian_process(name: str, *, model: GainModel) -> FieldMethod:
+    """Return a Gaussian process over all kernel families, or over one."""
+    return FieldMethod(name, PipelineConfig(gain_model=model), "surface")
+
+
+def quick_network(
+    name: str, *, visual_input: VisualInput = "visual", informed: bool = True, with_grid: bool = False, **fit: Any
+) -> FieldMethod:
+    """Return the attention network with the quick settings but for those of `fit`."""
+    pipeline = replace(NETWORK, fit=replace(NETWORK.fit, **fit))
+    return FieldMethod(name, pipeline, visual_input, informed=informed, grid=QUICK_GRID if with_grid else None)
+
+
+def paper_network(
+    name: str, *, visual_input: VisualInput = "paper", informed: bool = True, with_grid: bool = False, **fit: Any
+) -> FieldMethod:
+    """Return the preset `paper` with one of its two dampings, shared unless `fit` names the other."""
+    preset = PRESETS["paper"]
+    pipeline = replace(preset, fit=replace(preset.fit, **{"damping": "shared", **fit}))
+    return FieldMethod(name, pipeline, visual_input, True, informed, PAPER_GRID if with_grid else None)
 
 
 def _envelope_error(field: SoundField, held: Impacts) -> float:

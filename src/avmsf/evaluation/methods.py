@@ -1,11 +1,14 @@
-"""All methods by name; a method fits a renderer to an object's training recordings."""
+"""Methods other than fields; a method fits a renderer to an object's training recordings.
+
+Those that share modes have noise beside them, as the field has: without it all is silent between modes, and L1-log is
+lost.
+"""
 
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -16,12 +19,11 @@ from avmsf._utils.device import usable_device
 from avmsf.baselines.diffsound.material_fit import DiffSoundConfig
 from avmsf.baselines.diffsound.renderer import DiffSound, fit_diffsound
 from avmsf.baselines.sonicgauss.published import PublishedSonicGauss, fit_published, folder_digest
-from avmsf.baselines.sonicgauss.small import COMMAND, SmallWeights, fit_small
+from avmsf.baselines.sonicgauss.small import SmallWeights, fit_small
 from avmsf.baselines.sonicgauss.training import TunedRenderer
 from avmsf.capture.audio import read_recording
 from avmsf.errors import CaptureError, EvaluationError
-from avmsf.evaluation.field_methods import NETWORK, PAPER_GRID, QUICK_GRID, FieldMethod
-from avmsf.evaluation.registry import PUBLISHED, RECORDED, SMALL, expect_method, kind_of
+from avmsf.evaluation.registry import kind_of, method_entry, resolve
 from avmsf.evaluation.simple_methods import (
     MeanGains,
     MeanWaveform,
@@ -30,30 +32,106 @@ from avmsf.evaluation.simple_methods import (
     SplineGains,
     WhiteNoise,
 )
-from avmsf.evaluation.task import Method, Renderer, Task, VisualInput
+from avmsf.evaluation.task import Method, Renderer, Task
 from avmsf.fem.material import MATERIALS
-from avmsf.field.config import GainModel
-from avmsf.pipeline.config import PRESETS, PipelineConfig
+
+NEIGHBORS = 3
+"""Number of nearest recordings that are averaged (the paper's KNN), or all where there are fewer."""
 
 
 @dataclass(frozen=True)
-class DiffSoundMethod:
-    """A simulation whose material is fitted to the training recordings, from the dataset's material where it is known.
-
-    A material that is not in the table, such as metal, counts as not known.
-    """
+class FunctionMethod:
+    """A method that is a function of the task."""
 
     name: str
-    """What tables call it."""
-    weighted: bool = False
-    """Whether each mode has a weight of its own, fitted to the training recordings."""
-    config: DiffSoundConfig = field(default_factory=DiffSoundConfig)
+    """Name in tables."""
+    fit: Callable[[Task], Renderer] = field(repr=False)
+    """Makes the renderer from the task's training recordings. Raises AvmsfError where it cannot."""
+    weights: str = ""
+    """Digest of the weights that it starts from: results of other weights are not mixed."""
 
-    def fit(self, task: Task) -> DiffSound:
-        """Fit the material. Raises AvmsfError where the object has no body, or its recordings no modes."""
-        known = task.material if task.material in MATERIALS else None
-        config = self.config if known is None else replace(self.config, material=known)
-        return fit_diffsound(task.train, task.family(), task.modes(), config, weighted=self.weighted)
+
+def method_named(name: str) -> Method:
+    """Return the method of this name. Raises EvaluationError that lists the known ones, and for a missing path."""
+    entry, settings = method_entry(name), {}
+    if entry.path:
+        path = Path(name.partition(":")[2]).expanduser()
+        if not path.name or not (path.is_dir() if entry.path.startswith("a folder") else path.is_file()):
+            raise EvaluationError(
+                f"{name}: expected {entry.path} after `{kind_of(name)}:`, found none",
+                file=path if path.name else None,
+                name="method",
+                value=name,
+            )
+        settings = {"path": path}
+    made: Method
+    if entry.make:
+        made = resolve(entry.make)(name, **entry.settings, **settings)
+    else:
+        made = FunctionMethod(name, partial(resolve(entry.fit), **entry.settings))
+    return made
+
+
+def white_noise(task: Task) -> WhiteNoise:
+    """Return noise as loud as the training recordings (the paper's White Noise)."""
+    return WhiteNoise(task.train, seed=task.seed)
+
+
+def random_impact(task: Task) -> RandomImpact:
+    """Return a recording of another object (the paper's Random Impact)."""
+    return RandomImpact(task.other_recording(), task.train.sample_rate)
+
+
+def nearest_recording(task: Task) -> NearestRecording:
+    """Return the nearest training recording."""
+    return NearestRecording(task.train)
+
+
+def mean_waveform(task: Task, *, by_direction: bool = False) -> MeanWaveform:
+    """Return the mean of the nearest training recordings (the paper's KNN)."""
+    return MeanWaveform(task.train, min(NEIGHBORS, len(task.train)), by_direction)
+
+
+def mean_gains(task: Task) -> MeanGains:
+    """Return the shared modes with the mean of the nearest recordings' gains."""
+    count = min(NEIGHBORS, len(task.train))
+    return MeanGains(task.train, task.modes(), count=count, noise=True, seed=task.seed)
+
+
+def spline_gains(task: Task) -> SplineGains:
+    """Return the shared modes with gains by splines over the contacts."""
+    return SplineGains(task.train, task.modes(), noise=True, seed=task.seed)
+
+
+def diffsound(task: Task, *, weighted: bool = False, config: DiffSoundConfig | None = None) -> DiffSound:
+    """Fit the material of a simulation, from the dataset's material where it is in the table.
+
+    With `weighted` each mode has a weight of its own, fitted to the training recordings. Raises AvmsfError where the
+    object has no body, or its recordings no modes.
+    """
+    config = config or DiffSoundConfig()
+    if task.material in MATERIALS:
+        config = replace(config, material=task.material)
+    return fit_diffsound(task.train, task.family(), task.modes(), config, weighted=weighted)
+
+
+def sonicgauss(name: str, path: Path) -> FunctionMethod:
+    """Return the published architecture and weights in a folder, fine-tuned, on CUDA where there is a GPU."""
+
+    def fit(task: Task) -> TunedRenderer:
+        model = PublishedSonicGauss.load(path).to(usable_device(task.device, raising=EvaluationError))
+        return fit_published(model, task.gaussians(), task.train, seed=task.seed)
+
+    return FunctionMethod(name, fit, folder_digest(path))
+
+
+def sonicgauss_small(name: str, path: Path) -> FunctionMethod:
+    """Return the small generator of a file, trained from scratch on simulated objects, fine-tuned."""
+
+    def fit(task: Task) -> TunedRenderer:
+        return fit_small(SmallWeights.read(path), task.gaussians(), task.train, seed=task.seed)
+
+    return FunctionMethod(name, fit, hashlib.sha256(path.read_bytes()).hexdigest()[:16])
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,161 +215,26 @@ class Recorded:
         return f"a mono wav of {self.samples} samples at {self.sample_rate:g} Hz, as the recordings have"
 
 
-NEIGHBORS = 3
-"""Number of nearest recordings that are averaged (the paper's KNN), or all where there are fewer."""
-
-
-@dataclass(frozen=True)
-class Baseline:
-    """A method without settings."""
-
-    name: str
-    """Name in tables."""
-    make: Callable[[Task], Renderer] = field(repr=False)
-    """Makes the renderer from the task's training recordings."""
-    weights: str = ""
-    """Digest of the weights that it starts from: results of other weights are not mixed."""
-
-    def fit(self, task: Task) -> Renderer:
-        """Make the renderer. Raises AvmsfError where it cannot."""
-        return self.make(task)
-
-
 @dataclass(frozen=True)
 class RecordedMethod:
     """Another system, by its wav files: FOLDER/OBJECT/RECORDING.wav, as `Recorded` reads them."""
 
-    folder: Path
+    name: str
+    """`recorded:` and the folder."""
+    path: Path
     """Holds a folder of sounds for every object."""
-
-    @property
-    def name(self) -> str:
-        """`recorded:` and the folder."""
-        return f"{RECORDED}{self.folder}"
 
     def digest(self, name: str) -> str:
         """Return a digest of an object's wavs, which decide its figures."""
-        digest, folder = hashlib.sha256(), self.folder / name
-        for path in sorted(folder.rglob("*")):
-            if path.suffix.lower() == ".wav" and path.is_file():
-                digest.update(f"{path.relative_to(folder).as_posix()}\0{path.stat().st_size}\0".encode())
-                digest.update(path.read_bytes())
+        digest, folder = hashlib.sha256(), self.path / name
+        for file in sorted(folder.rglob("*")):
+            if file.suffix.lower() == ".wav" and file.is_file():
+                digest.update(f"{file.relative_to(folder).as_posix()}\0{file.stat().st_size}\0".encode())
+                digest.update(file.read_bytes())
         return digest.hexdigest()
 
     def fit(self, task: Task) -> Recorded:
         """Find the object's folder. Raises EvaluationError where there is none."""
         return Recorded(
-            self.folder / task.name, task.contacts, task.names, task.train.sample_rate, task.train.sounds.shape[1]
+            self.path / task.name, task.contacts, task.names, task.train.sample_rate, task.train.sounds.shape[1]
         )
-
-
-def _count(task: Task) -> int:
-    return min(NEIGHBORS, len(task.train))
-
-
-BASELINES = (
-    Baseline("white-noise", lambda task: WhiteNoise(task.train, seed=task.seed)),
-    Baseline("random-impact", lambda task: RandomImpact(task.other_recording(), task.train.sample_rate)),
-    Baseline("nearest", lambda task: NearestRecording(task.train)),
-    Baseline("knn3", lambda task: MeanWaveform(task.train, count=_count(task))),
-    Baseline("knn3-directions", lambda task: MeanWaveform(task.train, count=_count(task), by_direction=True)),
-    Baseline(
-        "knn-gains",
-        lambda task: MeanGains(task.train, task.modes(), count=_count(task), noise=True, seed=task.seed),
-    ),
-    Baseline("spline-gains", lambda task: SplineGains(task.train, task.modes(), noise=True, seed=task.seed)),
-)
-"""The paper's baselines that need nothing but data, then the strong ones that it leaves out. Those that share modes
-have noise beside them, as the field has: without it all is silent between modes, and L1-log is lost."""
-
-_PRESET = PRESETS["paper"]
-
-
-def _paper(name: str, visual_input: VisualInput = "paper", **fit: Any) -> FieldMethod:
-    """Return the preset `paper` with one of its two dampings, shared unless `fit` names the other."""
-    settings = {"damping": "shared", **fit}
-    return FieldMethod(name, replace(_PRESET, fit=replace(_PRESET.fit, **settings)), visual_input, published=True)
-
-
-def _quick(name: str, visual_input: VisualInput = "visual", **fit: Any) -> FieldMethod:
-    """Return the network with the quick settings but for those of `fit`."""
-    return FieldMethod(name, replace(NETWORK, fit=replace(NETWORK.fit, **fit)), visual_input)
-
-
-def _process(name: str, model: GainModel) -> FieldMethod:
-    """Return a Gaussian process over all kernel families, or over one."""
-    return FieldMethod(name, PipelineConfig(gain_model=model), "surface")
-
-
-FIELDS = (
-    _quick("field"),
-    _process("field-auto", "auto"),
-    _process("field-elastic", "elastic"),
-    _process("field-smooth", "smooth"),
-    _process("field-thin-plate", "thin-plate"),
-    _quick("field-positions", "positions"),
-    _quick("field-unaligned", "unaligned"),
-    # All steps end to end take long enough without two trials of dampings beforehand. The noise is
-    # trained, as measuring it needs the modes.
-    replace(_quick("field-no-initialization", damping="shared", noise_rate=0.1), informed=False),
-    _quick("field-no-residual", residual=False),
-    # The warm-up moves no damping, so there is nothing to choose between.
-    _quick("field-warmup", steps=0, damping="shared"),
-    _paper("paper"),
-    _paper("paper-positions", "paper-positions"),
-    replace(_paper("paper-no-initialization"), informed=False),
-    _paper("paper-unaligned", "paper-unaligned"),
-    _paper("paper-no-residual", residual=False),
-    _paper("paper-per-contact", damping="per-contact"),
-    replace(_quick("field-grid"), grid=QUICK_GRID),
-    replace(_paper("paper-grid"), grid=PAPER_GRID),
-)
-"""Configurations of the pipeline by name: the network with quick settings, other gains, ablations, the preset `paper`
-and its ablations, and choices from grids."""
-
-SIMULATIONS = (DiffSoundMethod("diffsound"), DiffSoundMethod("diffsound-weighted", weighted=True))
-"""Other systems, built from their publications."""
-
-METHODS: dict[str, Method] = {method.name: method for method in (*BASELINES, *SIMULATIONS, *FIELDS)}
-"""All methods but those that take a path, in the order of tables."""
-
-
-def method_named(name: str) -> Method:
-    """Return the method of this name. Raises EvaluationError that lists the known ones."""
-    if name in METHODS:
-        return METHODS[name]
-    expect_method(name)
-    kind = kind_of(name)
-    if kind == kind_of(PUBLISHED):
-        folder = _given(name, PUBLISHED, "a folder", "with the published weights")
-        return Baseline(f"{PUBLISHED}{folder}", partial(_published_sonicgauss, folder), folder_digest(folder))
-    if kind == kind_of(SMALL):
-        file = _given(name, SMALL, "a file", f"which this makes: {COMMAND}")
-        digest = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
-        return Baseline(f"{SMALL}{file}", partial(_small_sonicgauss, file), digest)
-    return RecordedMethod(_given(name, RECORDED, "a folder", "with a folder of wav files for every object"))
-
-
-def _published_sonicgauss(folder: Path, task: Task) -> TunedRenderer:
-    """Fine-tune the published architecture and weights, on CUDA where there is a GPU."""
-    model = PublishedSonicGauss.load(folder)
-    device = usable_device(task.device, raising=EvaluationError)
-    return fit_published(model.to(device), task.gaussians(), task.train, seed=task.seed)
-
-
-def _small_sonicgauss(file: Path, task: Task) -> TunedRenderer:
-    """Fine-tune the small generator, trained from scratch on simulated objects."""
-    return fit_small(SmallWeights.read(file), task.gaussians(), task.train, seed=task.seed)
-
-
-def _given(name: str, prefix: str, kind: Literal["a folder", "a file"], use: str) -> Path:
-    """Return the path in a method's name. Raises EvaluationError where nothing is there."""
-    path = Path(name.removeprefix(prefix)).expanduser()
-    if name in (prefix, prefix[:-1]) or not (path.is_dir() if kind == "a folder" else path.is_file()):
-        raise EvaluationError(
-            f"{name}: expected {kind} after `{prefix}`, {use}, found none",
-            file=path if path.name else None,
-            name="method",
-            value=name,
-        )
-    return path

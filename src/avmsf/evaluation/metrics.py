@@ -7,10 +7,10 @@ error. Every metric calls `validate` first, which raises EvaluationError with th
 
 - `relative_stft_error`: differences of STFT magnitudes in proportion to the truth's. Free of unit and level: 0 is
   perfect, 1 is silence. The measure that objects and methods are compared by here.
-- `spectrogram_distance` (L1), `log_mel_distance` (L1-log) and `envelope_distance` (ENV): the paper's three.
+- `spectrogram_distance` (L1), `log_mel_distance` (L1-log) and `envelope_distance` (ENV): the paper's three. Sizes in
+  samples are given at 44.1 and 48 kHz, by default the paper's, and go as `scaled_fft_size` at other rates.
 
 CDPAM is in `avmsf.evaluation.cdpam`; modes are compared with true ones in `avmsf.evaluation.modal_metrics`.
-`paper_distances` are the paper's three.
 """
 
 import math
@@ -20,7 +20,6 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from avmsf.editing import clips
 from avmsf.errors import EvaluationError
 from avmsf.modal.config import scaled_fft_size
 from avmsf.modal.spectra import envelope, htk_filters, log_mel, magnitude_stft
@@ -57,25 +56,17 @@ def validate(predicted: Sounds, truth: Sounds, *, names: Sequence[str] | None = 
         _expect_numbers(sounds, what, names)
 
 
-def validate_sounds(sounds: Sounds, *, what: str = "sounds") -> None:
-    """Raise EvaluationError unless the argument `what` is [contacts, samples], not empty, and finite throughout."""
-    _expect_rows(sounds, what)
-    _expect_numbers(sounds, what, None)
+def validate_sounds(sounds: Sounds, *, sample_rate: float, wanted: float) -> None:
+    """Raise EvaluationError unless `sounds` are [contacts, samples], not empty, finite, and can be resampled to a rate.
 
-
-def resampled(sounds: Float64[Tensor, "contacts samples"], *, sample_rate: float, wanted: float) -> Sounds:
-    """Return sounds at another sample rate (Hz), as `avmsf.editing.clips.resampled`.
-
-    Raises EvaluationError for a rate that is not a positive number, or less than a thousandth of the wanted one.
+    Rates in Hz; that of the sounds is a positive number, and a thousandth of the wanted one or more.
     """
+    _expect_rows(sounds, "sounds")
+    _expect_numbers(sounds, "sounds", None)
     if not (math.isfinite(sample_rate) and sample_rate >= 1e-3 * wanted):
-        raise EvaluationError(
-            f"expected a sample rate of {1e-3 * wanted:g} Hz or more to resample to {wanted:g} Hz, got "
-            f"{sample_rate:g} Hz",
-            name="sample_rate",
-            value=sample_rate,
+        raise EvaluationError.expected(
+            f"a rate of {1e-3 * wanted:g} Hz or more to resample to {wanted:g} Hz", sample_rate, name="sample_rate"
         )
-    return clips.resampled(sounds, sample_rate=sample_rate, wanted=wanted)
 
 
 def default_fft_sizes(sample_rate: float) -> tuple[int, ...]:
@@ -86,65 +77,25 @@ def default_fft_sizes(sample_rate: float) -> tuple[int, ...]:
     return tuple(scaled_fft_size(size, sample_rate=sample_rate) for size in (2048, 1024, 512, 256))
 
 
-def relative_stft_error(predicted: Sounds, truth: Sounds, *, fft_sizes: Sequence[int]) -> PerContact:
+def relative_stft_error(
+    predicted: Sounds, truth: Sounds, *, sample_rate: float, fft_sizes: Sequence[int] | None = None
+) -> PerContact:
     """Return the sums of absolute differences of STFT magnitudes, over the truth's sum, mean over FFT sizes.
 
-    Hann windows, hop a quarter of the FFT size, frames centered, silence beyond the ends. The truth's sum is the mean
-    over all contacts given, so that the mean of the result is the ratio of the sums over all contacts: loud impacts
-    weigh more than quiet ones. Raises EvaluationError where the truth is silent throughout.
+    FFT sizes in samples, by default `default_fft_sizes`. Hann windows, hop a quarter of the FFT size, frames centered,
+    silence beyond the ends. The truth's sum is the mean over all contacts given, so that the mean of the result is the
+    ratio of the sums over all contacts: loud impacts weigh more than quiet ones. Raises EvaluationError where the truth
+    is silent throughout.
     """
     validate(predicted, truth)
     error = torch.zeros(len(truth), dtype=torch.float64)
-    for size in fft_sizes:
+    sizes = default_fft_sizes(sample_rate) if fft_sizes is None else tuple(fft_sizes)
+    for size in sizes:
         difference, weight = _stft_sums(predicted, truth, fft_size=size, hop=max(1, size // 4))
         if weight.sum() == 0.0:
             raise EvaluationError.expected("sounds that are not all silent", 0.0, got="silence", name="truth")
         error += difference / weight.mean()
-    return error / len(fft_sizes)
-
-
-def spectrogram_distance(predicted: Sounds, truth: Sounds, *, fft_size: int, hop: int) -> PerContact:
-    """Return the mean absolute difference of the STFT magnitudes, in the sounds' unit (L1).
-
-    Magnitudes as `avmsf.modal.spectra` has them, unscaled; sizes in samples.
-    """
-    validate(predicted, truth)
-
-    def distance(a: Sounds, b: Sounds) -> PerContact:
-        spectra = [magnitude_stft(sounds, fft_size=fft_size, hop=hop) for sounds in (a, b)]
-        return (spectra[0] - spectra[1]).abs().mean(dim=(1, 2))
-
-    return _blockwise(distance, predicted, truth)
-
-
-def log_mel_distance(
-    predicted: Sounds,
-    truth: Sounds,
-    *,
-    sample_rate: float,
-    fft_size: int,
-    hop: int,
-    mel_count: int,
-    floor: float,
-) -> PerContact:
-    """Return the mean absolute difference of the natural logarithms of mel magnitudes, in nepers (L1-log).
-
-    HTK triangles of height one from 0 Hz to half the rate; magnitudes below `floor`, in the sounds' unit, count as
-    `floor`.
-    """
-    validate(predicted, truth)
-    filters = htk_filters(mel_count, fft_size=fft_size, sample_rate=sample_rate, lowest=0.0, highest=sample_rate / 2)
-
-    def mels(sounds: Float64[Tensor, "contacts samples"]) -> Float64[Tensor, "contacts mels frames"]:
-        return log_mel(sounds, filters, fft_size=fft_size, hop=hop, floor=floor)
-
-    return _blockwise(lambda a, b: (mels(a) - mels(b)).abs().mean(dim=(1, 2)), predicted, truth)
-
-
-def envelope_distance(predicted: Sounds, truth: Sounds) -> PerContact:
-    """Return the root mean square difference of the Hilbert envelopes over time, in the sounds' unit (ENV)."""
-    validate(predicted, truth)
-    return _blockwise(lambda a, b: (envelope(a) - envelope(b)).square().mean(dim=1).sqrt(), predicted, truth)
+    return error / len(sizes)
 
 
 PAPER_FFT_SIZE, PAPER_HOP, PAPER_MELS, PAPER_FLOOR = 1024, 256, 80, 1e-5
@@ -160,21 +111,56 @@ magnitudes; on squared magnitudes it would be 12 to 15. It remains an inference:
 not absolute values."""
 
 
-def paper_distances(predicted: Sounds, truth: Sounds, *, sample_rate: float) -> dict[str, PerContact]:
-    """Return the paper's `l1`, `l1_log` and `envelope` of every contact, at the sounds' own sample rate (Hz).
+def spectrogram_distance(
+    predicted: Sounds, truth: Sounds, *, sample_rate: float, fft_size: int = PAPER_FFT_SIZE, hop: int = PAPER_HOP
+) -> PerContact:
+    """Return the mean absolute difference of the STFT magnitudes, in the sounds' unit (L1).
 
-    At rates other than 44.1 and 48 kHz all three sizes go as `scaled_fft_size`, with 80 mel bands at most. Raises
-    EvaluationError as the metrics do.
+    Magnitudes as `avmsf.modal.spectra` has them, unscaled.
     """
-    fft_size, hop, mels = (
-        scaled_fft_size(size, sample_rate=sample_rate) for size in (PAPER_FFT_SIZE, PAPER_HOP, PAPER_MELS)
-    )
-    sizes = {"fft_size": fft_size, "hop": hop, "mel_count": min(PAPER_MELS, mels)}
-    return {
-        "l1": spectrogram_distance(predicted, truth, fft_size=fft_size, hop=hop),
-        "l1_log": log_mel_distance(predicted, truth, sample_rate=sample_rate, floor=PAPER_FLOOR, **sizes),
-        "envelope": envelope_distance(predicted, truth),
-    }
+    validate(predicted, truth)
+    size, step = (scaled_fft_size(each, sample_rate=sample_rate) for each in (fft_size, hop))
+
+    def distance(a: Sounds, b: Sounds) -> PerContact:
+        spectra = [magnitude_stft(sounds, fft_size=size, hop=step) for sounds in (a, b)]
+        return (spectra[0] - spectra[1]).abs().mean(dim=(1, 2))
+
+    return _blockwise(distance, predicted, truth)
+
+
+def log_mel_distance(
+    predicted: Sounds,
+    truth: Sounds,
+    *,
+    sample_rate: float,
+    fft_size: int = PAPER_FFT_SIZE,
+    hop: int = PAPER_HOP,
+    mel_count: int = PAPER_MELS,
+    floor: float = PAPER_FLOOR,
+) -> PerContact:
+    """Return the mean absolute difference of the natural logarithms of mel magnitudes, in nepers (L1-log).
+
+    HTK triangles of height one from 0 Hz to half the rate, `mel_count` of them at most; magnitudes below `floor`, in
+    the sounds' unit, count as `floor`.
+    """
+    validate(predicted, truth)
+    size, step, bands = (scaled_fft_size(each, sample_rate=sample_rate) for each in (fft_size, hop, mel_count))
+    bands = min(bands, mel_count)
+    filters = htk_filters(bands, fft_size=size, sample_rate=sample_rate, lowest=0.0, highest=sample_rate / 2)
+
+    def mels(sounds: Float64[Tensor, "contacts samples"]) -> Float64[Tensor, "contacts mels frames"]:
+        return log_mel(sounds, filters, fft_size=size, hop=step, floor=floor)
+
+    return _blockwise(lambda a, b: (mels(a) - mels(b)).abs().mean(dim=(1, 2)), predicted, truth)
+
+
+def envelope_distance(predicted: Sounds, truth: Sounds, *, sample_rate: float) -> PerContact:
+    """Return the root mean square difference of the Hilbert envelopes over time, in the sounds' unit (ENV).
+
+    The sample rate makes no difference.
+    """
+    validate(predicted, truth)
+    return _blockwise(lambda a, b: (envelope(a) - envelope(b)).square().mean(dim=1).sqrt(), predicted, truth)
 
 
 def _expect_rows(sounds: Sounds, what: str) -> None:

@@ -19,7 +19,7 @@ from avmsf.datasets.numbering import ABLATION, NON_SYMMETRIC
 from avmsf.editing.clips import resampled
 from avmsf.errors import AvmsfError, EvaluationError, SceneError
 from avmsf.evaluation.modal_metrics import simulated
-from avmsf.evaluation.protocols import EvaluationProtocol
+from avmsf.evaluation.registry import Protocol
 from avmsf.evaluation.task import VisualInput
 from avmsf.features.feature_field import FeatureField
 from avmsf.features.store import load_features
@@ -189,7 +189,7 @@ def members(dataset: Dataset) -> dict[str, frozenset[str]]:
     return {name: each for name, each in found.items() if each}
 
 
-def choose_objects(dataset: Dataset, protocol: EvaluationProtocol, asked: Sequence[str] = ()) -> tuple[str, ...]:
+def choose_objects(dataset: Dataset, protocol: Protocol, asked: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the objects that take part: those asked for, else the protocol's group, else all.
 
     Raises DatasetError for unknown ones, and EvaluationError where the protocol is about a group that the dataset does

@@ -1,93 +1,256 @@
-"""The names and titles of methods and protocols; importing this loads nothing that computes."""
+"""The tables of methods, protocols and metrics: a name, a title, and the import path of what makes it.
+
+A row is all that a new method or metric needs besides its function. Importing this module loads nothing that computes.
+"""
 
 import difflib
-from collections.abc import Iterable, Mapping
-from types import MappingProxyType
+import pkgutil
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
 
 from avmsf.errors import EvaluationError
 
-PROTOCOL_NAMES = (
-    "farthest",
-    "leave-one-out",
-    "closest",
-    "predefined",
-    "shots",
-    "views",
-    "ablation",
-    "non-symmetric",
-    "localize",
-    "grid",
-)
-METHOD_TITLES: Mapping[str, str] = MappingProxyType(
-    {
-        "white-noise": "Gaussian noise at the level of the training recordings",
-        "random-impact": "a recording of another object",
-        "nearest": "the nearest training recording",
-        "knn3": "mean waveform of the three nearest recordings (the paper's KNN)",
-        "knn3-directions": "mean waveform of the three nearest recordings, by position and impact direction",
-        "knn-gains": "modal gains averaged over the three nearest recordings",
-        "spline-gains": "modal gains by thin-plate splines",
-        "diffsound": "reimplementation of DiffSound, as in the paper",
-        "diffsound-weighted": "DiffSound with a fitted weight for each mode",
-        "field": "attention network, quick settings, visual features",
-        "field-auto": "Gaussian process over kernel families (the default of this package)",
-        "field-elastic": "Gaussian process on elastic mode shapes only",
-        "field-smooth": "Gaussian process on distances only",
-        "field-thin-plate": "Gaussian process of thin-plate splines only",
-        "field-positions": "attention network, quick settings, positions only",
-        "field-unaligned": "attention network, quick settings, without symmetry pooling",
-        "field-no-initialization": "attention network, quick settings, without extracted modes",
-        "field-no-residual": "attention network, quick settings, without residual noise",
-        "field-warmup": "attention network, quick settings, warm-up only",
-        "paper": "the paper's method with the preset `paper`, shared damping",
-        "paper-positions": "the paper's method without visual features",
-        "paper-no-initialization": "the paper's method without extracted modes",
-        "paper-unaligned": "the paper's method without symmetry pooling",
-        "paper-no-residual": "the paper's method without residual noise",
-        "paper-per-contact": "the paper's method with damping per contact",
-        "field-grid": "attention network, settings chosen from a small grid",
-        "paper-grid": "the paper's method with settings chosen from its lists",
-    }
-)
-"""Titles of all methods but those that take a path, by their names, in the order of tables."""
-PUBLISHED, SMALL, RECORDED = "sonicgauss:", "sonicgauss-small:", "recorded:"
-"""How the names of methods that take a path begin."""
-_PATH_TITLES = {
-    "sonicgauss": "SonicGauss with its published weights, trained on ObjectFolder Real, fine-tuned",
-    "recorded": "sounds of another system, from files",
-    "sonicgauss-small": "SonicGauss's objective at a small size, trained from scratch on simulated objects",
+if TYPE_CHECKING:
+    from avmsf.evaluation.cases import Choosing
+
+BASELINE = "knn3"
+"""The method that all others are compared with."""
+
+
+def resolve(path: str | Callable[..., Any]) -> Callable[..., Any]:
+    """Return the function or class at an import path below this package, such as `metrics:envelope_distance`."""
+    found: Callable[..., Any] = pkgutil.resolve_name(f"{__package__}.{path}") if isinstance(path, str) else path
+    return found
+
+
+@dataclass(frozen=True)
+class MetricEntry:
+    """One metric."""
+
+    heading: str
+    """Heading of its column; empty for one that `summary.json` alone has."""
+    function: str | Callable[..., Any] | None = None
+    """Function (predicted, truth, *, sample_rate) of sounds [contacts, samples] in one unit that returns a value for
+    each contact, or its import path; None for what is computed of something else than these."""
+    rising: bool = False
+    """Whether more is better; only metrics of which less is better have ratios."""
+
+
+METRICS: dict[str, MetricEntry] = {
+    "l1": MetricEntry("L1", "metrics:spectrogram_distance"),
+    "l1_log": MetricEntry("L1-log", "metrics:log_mel_distance"),
+    "envelope": MetricEntry("ENV", "metrics:envelope_distance"),
+    "cdpam": MetricEntry("CDPAM"),
+    "relative_stft": MetricEntry("relative STFT", "metrics:relative_stft_error"),
+    "mac": MetricEntry("MAC", rising=True),
+    "gain_error": MetricEntry("gain error"),
+    "rmed": MetricEntry("RMED"),
+    "rmed_posterior": MetricEntry("RMED, posterior"),
+    "found": MetricEntry("", rising=True),
 }
+"""All metrics that tables show or that need to be told apart, by name, in the order of columns."""
 
 
-def expect_protocol(name: str) -> None:
-    """Raise `EvaluationError`, which lists the known ones, for the name of no protocol."""
-    if name not in PROTOCOL_NAMES:
-        raise _unknown("protocol", name, PROTOCOL_NAMES)
+@dataclass(frozen=True)
+class MethodEntry:
+    """One method."""
+
+    title: str
+    """What reports call it."""
+    fit: str | Callable[..., Any] = ""
+    """Function (task, **settings) that returns a renderer, or its import path; empty for a method with `make`."""
+    make: str = ""
+    """Import path of what makes the method of its name and `settings`, where it is more than a function."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    path: str = ""
+    """The folder or file that it reads, for a method whose name goes on with `:` and a path."""
 
 
-def expect_method(name: str) -> None:
-    """Raise `EvaluationError`, which lists the known ones, for the name of no method."""
-    if name not in METHOD_TITLES and kind_of(name) not in _PATH_TITLES:
-        raise _unknown("method", name, METHOD_TITLES, f", {PUBLISHED}FOLDER, {SMALL}FILE and {RECORDED}FOLDER")
+def _made(make: str) -> Callable[..., MethodEntry]:
+    return lambda title, **settings: MethodEntry(title, make=f"field_methods:{make}", settings=settings)
 
 
-def _unknown(kind: str, name: str, known: Iterable[str], others: str = "") -> EvaluationError:
-    near = difflib.get_close_matches(name, known, n=1)
-    advice = f"; did you mean {near[0]}?" if near else ""
-    return EvaluationError(
-        f"expected a {kind} of {', '.join(known)}{others}, got {name!r}{advice}", name=kind, value=name
+_network, _process, _paper = _made("quick_network"), _made("gaussian_process"), _made("paper_network")
+METHODS: dict[str, MethodEntry] = {
+    "white-noise": MethodEntry("Gaussian noise at the level of the training recordings", "methods:white_noise"),
+    "random-impact": MethodEntry("a recording of another object", "methods:random_impact"),
+    "nearest": MethodEntry("the nearest training recording", "methods:nearest_recording"),
+    "knn3": MethodEntry("mean waveform of the three nearest recordings (the paper's KNN)", "methods:mean_waveform"),
+    "knn3-directions": MethodEntry(
+        "mean waveform of the three nearest recordings, by position and impact direction",
+        "methods:mean_waveform",
+        settings={"by_direction": True},
+    ),
+    "knn-gains": MethodEntry("modal gains averaged over the three nearest recordings", "methods:mean_gains"),
+    "spline-gains": MethodEntry("modal gains by thin-plate splines", "methods:spline_gains"),
+    "diffsound": MethodEntry("reimplementation of DiffSound, as in the paper", "methods:diffsound"),
+    "diffsound-weighted": MethodEntry(
+        "DiffSound with a fitted weight for each mode", "methods:diffsound", settings={"weighted": True}
+    ),
+    "field": _network("attention network, quick settings, visual features"),
+    "field-auto": _process("Gaussian process over kernel families (the default of this package)", model="auto"),
+    "field-elastic": _process("Gaussian process on elastic mode shapes only", model="elastic"),
+    "field-smooth": _process("Gaussian process on distances only", model="smooth"),
+    "field-thin-plate": _process("Gaussian process of thin-plate splines only", model="thin-plate"),
+    "field-positions": _network("attention network, quick settings, positions only", visual_input="positions"),
+    "field-unaligned": _network(
+        "attention network, quick settings, without symmetry pooling", visual_input="unaligned"
+    ),
+    # All steps end to end take long enough without two trials of dampings beforehand. The noise is trained, as
+    # measuring it needs the modes.
+    "field-no-initialization": _network(
+        "attention network, quick settings, without extracted modes",
+        informed=False,
+        damping="shared",
+        noise_rate=0.1,
+    ),
+    "field-no-residual": _network("attention network, quick settings, without residual noise", residual=False),
+    # The warm-up moves no damping, so there is nothing to choose between.
+    "field-warmup": _network("attention network, quick settings, warm-up only", steps=0, damping="shared"),
+    "paper": _paper("the paper's method with the preset `paper`, shared damping"),
+    "paper-positions": _paper("the paper's method without visual features", visual_input="paper-positions"),
+    "paper-no-initialization": _paper("the paper's method without extracted modes", informed=False),
+    "paper-unaligned": _paper("the paper's method without symmetry pooling", visual_input="paper-unaligned"),
+    "paper-no-residual": _paper("the paper's method without residual noise", residual=False),
+    "paper-per-contact": _paper("the paper's method with damping per contact", damping="per-contact"),
+    "field-grid": _network("attention network, settings chosen from a small grid", with_grid=True),
+    "paper-grid": _paper("the paper's method with settings chosen from its lists", with_grid=True),
+    "sonicgauss": MethodEntry(
+        "SonicGauss with its published weights, trained on ObjectFolder Real, fine-tuned",
+        make="methods:sonicgauss",
+        path="a folder with the published weights",
+    ),
+    "sonicgauss-small": MethodEntry(
+        "SonicGauss's objective at a small size, trained from scratch on simulated objects",
+        make="methods:sonicgauss_small",
+        path="a file, which python -m benchmarks baselines --parts sonicgauss-training --weights FILE makes",
+    ),
+    "recorded": MethodEntry(
+        "sounds of another system, from files",
+        make="methods:RecordedMethod",
+        path="a folder with a folder of wav files for every object",
+    ),
+}
+"""All methods by name, in the order of tables."""
+_TABLE = (
+    *("white-noise", "random-impact", "nearest", BASELINE, "knn3-directions", "knn-gains", "spline-gains"),
+    *("field", "field-elastic", "field-auto"),
+)
+_ABLATED = ("field-positions", "field-no-initialization", "field-unaligned", "field-no-residual")
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """One experiment of the paper: how contacts are split, and which methods and objects take part."""
+
+    name: str
+    """What the command line calls it."""
+    title: str
+    """What it does, in a sentence."""
+    cases: "str | Choosing" = "cases:Farthest"
+    """How each object's contacts are split, or the import path of a class of it."""
+    methods: tuple[str, ...] = _TABLE
+    """Names of the methods that take part unless others are asked for; the baseline is among them."""
+    subset: Literal["ablation", "non-symmetric"] | None = None
+    """The objects that take part unless others are asked for; None for all."""
+    required: bool = False
+    """Whether the subset is required; otherwise all objects of a dataset without such a subset take part."""
+    locating: bool = False
+    """Whether methods are evaluated by localizing the test recordings, not by their sounds."""
+
+    @property
+    def choosing(self) -> "Choosing":
+        """How each object's contacts are split."""
+        chosen: Choosing = resolve(self.cases)() if isinstance(self.cases, str) else self.cases
+        return chosen
+
+
+PROTOCOLS: dict[str, Protocol] = {
+    each.name: each
+    for each in (
+        Protocol("farthest", "Train on 20 % of the contacts, chosen by farthest-point sampling; test on the others."),
+        Protocol("leave-one-out", "Test on every contact once, after training on all others.", "cases:LeaveOneOut"),
+        Protocol(
+            "closest",
+            "Train on 20 % of the contacts, in one region; test on the others.",
+            "cases:Closest",
+            subset="ablation",
+        ),
+        Protocol(
+            "predefined",
+            "Test on the recordings that are named; train on those at other contacts.",
+            "cases:Predefined",
+        ),
+        Protocol(
+            "shots",
+            "Train on nested subsets of contacts by farthest-point sampling; test on those left by the largest.",
+            "cases:Shots",
+            subset="ablation",
+        ),
+        Protocol(
+            "views",
+            "Visual features from all views and from 12; train and test as in `farthest`.",
+            "cases:FewerViews",
+            (BASELINE, "field"),
+            subset="ablation",
+        ),
+        Protocol(
+            "ablation",
+            "Ablations of one part each: visual features, initialization, symmetry pooling, residual noise.",
+            methods=(BASELINE, "field", *_ABLATED),
+            subset="ablation",
+        ),
+        Protocol(
+            "non-symmetric",
+            "As `farthest`, on objects without rotational symmetry.",
+            subset="non-symmetric",
+            required=True,
+        ),
+        Protocol(
+            "localize",
+            "Train as in `farthest`; locate the test recordings, on objects without rotational symmetry.",
+            methods=("white-noise", "nearest", "diffsound", "field", "field-no-residual", "field-auto"),
+            subset="non-symmetric",
+            required=True,
+            locating=True,
+        ),
+        Protocol(
+            "grid",
+            "Choose the field's settings from a small grid on validation contacts (the paper's: `paper-grid`); "
+            "test as in `farthest`.",
+            methods=(BASELINE, "field", "field-grid"),
+            subset="ablation",
+        ),
     )
+}
+"""All experiments by name."""
+
+
+def protocol_named(name: str) -> Protocol:
+    """Return the protocol of this name. Raises EvaluationError that lists the known ones."""
+    if name not in PROTOCOLS:
+        raise _unknown("protocol", name, PROTOCOLS)
+    return PROTOCOLS[name]
+
+
+def method_entry(name: str) -> MethodEntry:
+    """Return the row of a method, with or without its path. Raises EvaluationError that lists the known ones."""
+    kind = kind_of(name)
+    if kind not in METHODS or (kind != name and not METHODS[kind].path):
+        raise _unknown("method", name, [f"{each}:PATH" if row.path else each for each, row in METHODS.items()])
+    return METHODS[kind]
 
 
 def expect_suited(method: str, protocol: str) -> None:
     """Raise `EvaluationError` for a method whose sounds cannot be those of the protocol's training recordings."""
-    if method.startswith(RECORDED) and protocol == "shots":
-        raise EvaluationError(
-            f"{method}: expected a protocol that tests each recording once, got {protocol}, which trains on several "
-            "sets of recordings, and the folder holds the sounds of one; choose farthest, closest, predefined or "
-            "leave-one-out",
+    if kind_of(method) == "recorded" and protocol == "shots":
+        raise EvaluationError.expected(
+            "a protocol that tests each recording once",
+            method,
+            got=f"{protocol}, which trains on several sets of recordings, and the folder holds the sounds of one",
             name="method",
-            value=method,
+            advice="choose farthest, closest, predefined or leave-one-out",
         )
 
 
@@ -96,7 +259,7 @@ def kind_of(method: str) -> str:
     return method.partition(":")[0]
 
 
-def title_of(method: str) -> str | None:
-    """Return what reports call a method of this name, with or without its path; None for an unknown one."""
-    kind = kind_of(method)
-    return METHOD_TITLES.get(kind, _PATH_TITLES.get(kind))
+def _unknown(kind: str, name: str, known: Iterable[str]) -> EvaluationError:
+    near = difflib.get_close_matches(name, known, n=1)
+    wanted, advice = f"one of {', '.join(known)}", f"did you mean {near[0]}?" if near else ""
+    return EvaluationError.expected(wanted, name, name=kind, advice=advice)

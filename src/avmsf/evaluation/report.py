@@ -1,28 +1,34 @@
-"""The files of a results folder: summary, times, tables, and page."""
+"""The files of a results folder: summary, times, and one report as Markdown and as a page that stands on its own."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
+from jinja2 import Environment, PackageLoader, select_autoescape
 from torch import Tensor
 
 from avmsf._utils.files import write_whole
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.localization import read_map
-from avmsf.evaluation.page import StoredSound, page, stored_contacts
-from avmsf.evaluation.report_tables import Section, markdown, sections
+from avmsf.evaluation.report_tables import Section, figure, sections
 from avmsf.evaluation.results import ObjectRecord, ResultsFolder, file_word, write_json
+from avmsf.evaluation.splits import spread
+from avmsf.evaluation.stored_sounds import RECORDED, StoredContact, StoredSound, draw_spectrogram, stored_contacts
 from avmsf.evaluation.summary import missing_of, summarize, times_of
+from avmsf.export.web import report_directives, with_policy
 from avmsf.plotting.contacts import draw_contact
 from avmsf.plotting.pictures import save_picture
-from avmsf.plotting.spectrograms import draw_method_spectrograms
+from avmsf.plotting.spectrograms import RANGE_DB, draw_method_spectrograms
 
 SUMMARY, TIMES, TABLES, PAGE = "summary.json", "times.json", "report.md", "report.html"
 """The files next to `protocol.json` and the folder `objects`."""
 FIGURES = "figures"
 """Folder of the spectrograms, one file for each object, or for each object and case, and of the heat maps."""
-_RECORDED = "recorded"
-"""Title of the first column."""
+MAX_PAGE_CHARACTERS = 13_000_000
+"""Of the page's pictures and sounds; further contacts are omitted."""
+MAX_PAGE_OBJECTS = 4
+"""Objects with sounds on the page, evenly spaced over all."""
 
 
 def write_summary(
@@ -48,8 +54,80 @@ def write_page(results: ResultsFolder) -> list[Section]:
     """Write `report.html`, and return its parts. Raises EvaluationError where a stored sound is missing."""
     records = results.records()
     parts = sections(records, results.identity())
-    _write_text(results.path / PAGE, page(parts, records, results.path))
+    opening, *others = parts
+    values = {"listening": _listening(records, results.path), "range_db": f"{RANGE_DB:g}", "is_text": _is_text}
+    whole = _render("report.html.jinja", opening=opening, parts=others, **values)
+    _write_text(results.path / PAGE, with_policy(whole, report_directives(whole)))
     return parts
+
+
+def markdown(parts: Sequence[Section]) -> str:
+    """Return the parts as one text: the first one's title above all, each table in pipes."""
+    return _render("report.md.jinja", parts=parts).rstrip() + "\n"
+
+
+def _render(template: str, **values: Any) -> str:
+    loader, escape = PackageLoader("avmsf.evaluation", ""), select_autoescape(("html.jinja",))
+    environment = Environment(loader=loader, autoescape=escape, trim_blocks=True)
+    environment.filters["markdown"] = _escaped
+    return environment.get_template(template).render(**values)
+
+
+def _escaped(words: str) -> str:
+    return words.replace("\\", "\\\\").replace("|", "\\|").replace("*", "\\*").replace("<", "&lt;")
+
+
+def _is_text(cell: str) -> bool:
+    return any(mark.isalpha() and mark != "e" for mark in cell)
+
+
+_Card = dict[str, str]
+"""One sound on the page: its `title`, `words` on it, and the addresses of its `picture` and its `sound`."""
+
+
+def _listening(records: Sequence[ObjectRecord], folder: Path) -> dict[str, list[tuple[str, list[_Card]]]]:
+    """Return the names of contacts and their sounds by the titles of their objects, as many as fit the page."""
+    found: dict[str, list[tuple[str, list[_Card]]]] = {}
+    size = 0
+    for contact in _contacts(records):
+        cards = list(_cards(contact, folder))
+        size += sum(len(card["picture"]) + len(card["sound"]) for card in cards)
+        if size > MAX_PAGE_CHARACTERS:
+            break
+        facts = contact.record
+        label = facts.name if facts.name in ("", facts.identifier) else f"{facts.identifier}: {facts.name}"
+        title = ", ".join(filter(None, (label or facts.identifier, facts.material)))
+        found.setdefault(title, []).append((contact.name, cards))
+    return found
+
+
+def _cards(contact: StoredContact, folder: Path) -> Iterator[_Card]:
+    recorded = StoredSound.read(folder / contact.recorded)
+    loudest, seconds = float(recorded.levels.max()), len(recorded.samples) / recorded.sample_rate
+
+    def card(title: str, words: str, sound: StoredSound) -> _Card:
+        picture = draw_spectrogram(sound, loudest=loudest)
+        return {"title": title, "words": words, "picture": picture, "sound": sound.address}
+
+    yield card(RECORDED, f"{seconds:.2g} s, {recorded.lowest:.0f} Hz to {recorded.sample_rate / 2:.0f} Hz", recorded)
+    several = len({case.label for case, _ in contact.made}) > 1
+    for case, outcome in contact.made:
+        row = case.test.index(contact.name)
+        scores = [
+            f"{heading} {figure(values[row])}"
+            for metric, heading in (("l1", "L1"), ("l1_log", "L1-log"), ("relative_stft", "relative STFT"))
+            if (values := outcome.values.get(metric)) is not None
+        ]
+        title = f"{outcome.method}, {case.label}" if several else outcome.method
+        yield card(title, ", ".join(scores), StoredSound.read(folder / outcome.sounds[contact.name]))
+
+
+def _contacts(records: Sequence[ObjectRecord]) -> Iterator[StoredContact]:
+    """Yield contacts with sounds: one of each object first, then a second one, and so on."""
+    stored = [record for record in records if any(case.sounds for case in record.cases)]
+    chosen = [list(stored_contacts(stored[row])) for row in spread(len(stored), MAX_PAGE_OBJECTS)]
+    for contacts in zip_longest(*chosen):
+        yield from filter(None, contacts)
 
 
 def write_figures(results: ResultsFolder) -> list[Path]:
@@ -75,7 +153,7 @@ def _write_spectrograms(record: ObjectRecord, folder: Path) -> list[Path]:
                 made = {
                     method: StoredSound.read(folder / sounds[contact.name]).samples for method, sounds in files.items()
                 }
-                rows[contact.name] = {_RECORDED: sound.samples, **made}
+                rows[contact.name] = {RECORDED: sound.samples, **made}
         if not rows:
             continue
         methods = list(dict.fromkeys(method for row in rows.values() for method in row))

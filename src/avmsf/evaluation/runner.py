@@ -25,10 +25,10 @@ from avmsf.evaluation.localization import located, write_map
 from avmsf.evaluation.methods import RecordedMethod
 from avmsf.evaluation.modal_metrics import truth_at, truth_from_first_sample, truth_of
 from avmsf.evaluation.objects import ObjectInputs, draw_other_recording
-from avmsf.evaluation.page import keep_sound, listening_gain
-from avmsf.evaluation.protocols import EvaluationProtocol
+from avmsf.evaluation.registry import Protocol
 from avmsf.evaluation.results import ENCODER, CaseRecord, ObjectRecord, Outcome, ResultsFolder, failure_of, file_word
 from avmsf.evaluation.splits import MetricSettings, Values, align_split, spread
+from avmsf.evaluation.stored_sounds import RECORDED, keep_sound, listening_gain
 from avmsf.evaluation.task import Method, Renderer, Task, expect_renderer, report_of
 from avmsf.modal.extraction.extract import extract_once
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder
@@ -42,7 +42,7 @@ class Evaluation:
     dataset: Dataset
     title: str
     """Name of the dataset in reports; one folder of results has one."""
-    protocol: EvaluationProtocol
+    protocol: Protocol
     methods: tuple[Method, ...]
     inputs: ObjectInputs
     seed: int = 0
@@ -99,8 +99,6 @@ def _plain(settings: Any) -> Any:
 
 MAX_STORED_SOUNDS = 3
 """Test contacts of an experiment whose sounds are kept to be listened to."""
-_RECORDED = "recorded"
-"""What the recordings' own files are called beside the methods'."""
 
 
 class _Recordings:
@@ -196,7 +194,7 @@ class CaseRun:
 
     def described(self, known: CaseRecord) -> CaseRecord:
         """Return the case's record with the recordings' files, and with what modes and features have taken so far."""
-        sounds = known.sounds or self._keep_sounds(_RECORDED, self.scored.test.sounds)
+        sounds = known.sounds or self._keep_sounds(RECORDED, self.scored.test.sounds)
         seconds, self.shared = known.shared_seconds + self.shared, 0.0
         return replace(known, sounds=sounds, shared_seconds=round(seconds, 4))
 

@@ -5,7 +5,7 @@ import random
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, Literal, TypeVar, cast
 
 import torch
@@ -19,8 +19,9 @@ from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, ExtractionError, FitError, PositionWarning
 from avmsf.evaluation.cases import Places
 from avmsf.evaluation.cdpam import Cdpam
-from avmsf.evaluation.metrics import PerContact, default_fft_sizes, paper_distances, relative_stft_error, validate
+from avmsf.evaluation.metrics import PerContact, validate
 from avmsf.evaluation.modal_metrics import ModalRenderer, compare_modes
+from avmsf.evaluation.registry import METRICS, resolve
 from avmsf.evaluation.task import Renderer, expect_renderer
 from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.points import farthest_points
@@ -184,16 +185,19 @@ def score(
 ) -> Scores:
     """Score sounds that were made otherwise than by a renderer, row for row of the impacts.
 
-    `relative_stft` with `fft_sizes` in samples, or else with `default_fft_sizes`, and the paper's metrics. Raises
-    EvaluationError for sounds that do not fit the impacts or are not finite, with the name of the impact, and
+    By all of `METRICS` that are functions of sounds; `relative_stft` with `fft_sizes` in samples where they are given.
+    Raises EvaluationError for sounds that do not fit the impacts or are not finite, with the name of the impact, and
     ArrayError for what are no numbers.
     """
     sounds = as_floats(sounds, "sounds")
     validate(sounds, impacts.sounds, names=impacts.names)
-    sizes = default_fft_sizes(impacts.sample_rate) if fft_sizes is None else tuple(fft_sizes)
-    values = {"relative_stft": relative_stft_error(sounds, impacts.sounds, fft_sizes=sizes)}
-    values |= paper_distances(sounds, impacts.sounds, sample_rate=impacts.sample_rate)
-    return Scores(names=impacts.names, values=values)
+    functions = {name: resolve(each.function) for name, each in METRICS.items() if each.function is not None}
+    if fft_sizes is not None:
+        functions["relative_stft"] = partial(functions["relative_stft"], fft_sizes=fft_sizes)
+    rate = impacts.sample_rate
+    return Scores(
+        impacts.names, {name: each(sounds, impacts.sounds, sample_rate=rate) for name, each in functions.items()}
+    )
 
 
 Values = dict[str, tuple[float | None, ...]]

@@ -12,13 +12,11 @@ from dataclasses import dataclass
 from statistics import fmean, geometric_mean, stdev
 from typing import Any
 
-from avmsf.evaluation.protocols import BASELINE
+from avmsf.evaluation.registry import BASELINE, METRICS
 from avmsf.evaluation.results import ObjectRecord, Outcome
 
-RISING = frozenset({"mac", "found"})
-"""Metrics of which more is better; all others are errors, and only they have ratios."""
-Table = Mapping[str, Mapping[str, Mapping[str, float]]]
-"""Figures by object, method and metric."""
+Values = Mapping[str, Mapping[str, Mapping[str, float]]]
+"""By object, method and metric."""
 
 
 @dataclass(frozen=True)
@@ -37,13 +35,18 @@ class Mean:
         return cls(fmean(values), error, len(values))
 
 
+def is_rising(metric: str) -> bool:
+    """Whether more of a metric is better; all others are errors, and only they have ratios."""
+    return metric in METRICS and METRICS[metric].rising
+
+
 def labels_of(records: Iterable[ObjectRecord]) -> tuple[str, ...]:
     """Return the experiments' labels, in the protocol's order; the first is the main one."""
     found = (tuple(dict.fromkeys(case.label for case in record.cases)) for record in records)
     return max(found, key=len, default=())
 
 
-def object_figures(record: ObjectRecord, label: str) -> dict[str, dict[str, float]]:
+def object_values(record: ObjectRecord, label: str) -> dict[str, dict[str, float]]:
     """Return an object's figures in one experiment by method and metric: means over its contacts.
 
     A method that failed in any of the experiment's parts has none.
@@ -64,13 +67,13 @@ def object_figures(record: ObjectRecord, label: str) -> dict[str, dict[str, floa
     return figures
 
 
-def figures_of(records: Iterable[ObjectRecord], label: str) -> dict[str, dict[str, dict[str, float]]]:
+def values_of(records: Iterable[ObjectRecord], label: str) -> dict[str, dict[str, dict[str, float]]]:
     """Return all objects' figures in one experiment; objects without any are left out."""
-    figures = {record.identifier: object_figures(record, label) for record in records}
+    figures = {record.identifier: object_values(record, label) for record in records}
     return {identifier: found for identifier, found in figures.items() if found}
 
 
-def means(table: Table) -> dict[str, dict[str, Mean]]:
+def means(table: Values) -> dict[str, dict[str, Mean]]:
     """Return the means over objects by method and metric."""
     found: dict[str, dict[str, list[float]]] = {}
     for figures in table.values():
@@ -80,7 +83,7 @@ def means(table: Table) -> dict[str, dict[str, Mean]]:
     return {method: {metric: Mean.of(each) for metric, each in values.items()} for method, values in found.items()}
 
 
-def ratios(table: Table, *, of_means: bool = False) -> dict[str, dict[str, float]]:
+def ratios(table: Values, *, of_means: bool = False) -> dict[str, dict[str, float]]:
     """Return the geometric means of the ratios to the baseline, object by object, or the ratios `of_means`."""
     found: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for figures in table.values():
@@ -89,7 +92,7 @@ def ratios(table: Table, *, of_means: bool = False) -> dict[str, dict[str, float
                 other = figures.get(BASELINE, {}).get(metric, 0.0)
                 if other > 0:
                     pairs = found.setdefault(method, {})
-                    if metric not in RISING:
+                    if not is_rising(metric):
                         pairs.setdefault(metric, []).append((own, other))
     return {
         method: {metric: _ratio(*zip(*each, strict=True), of_means=of_means) for metric, each in values.items()}
@@ -116,7 +119,7 @@ def summarize(
     names groups of objects whose means are told apart; `missing` are the results that are yet to be computed.
     """
     labels = labels_of(records)
-    tables = {label: figures_of(records, label) for label in labels}
+    tables = {label: values_of(records, label) for label in labels}
     main = tables[labels[0]] if labels else {}
     found = means(main)
     parts = {name: {each: main[each] for each in main if each in members} for name, members in (subsets or {}).items()}

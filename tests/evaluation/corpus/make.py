@@ -15,7 +15,7 @@ import torch
 
 from avmsf._utils.files import write_whole
 from avmsf.evaluation.cdpam import Cdpam
-from avmsf.evaluation.metrics import default_fft_sizes, paper_distances, relative_stft_error
+from avmsf.evaluation.registry import METRICS, resolve
 
 FOLDER = Path(__file__).parent
 RATES = {"bell": 44100, "wood": 16000, "bowl": 48000}
@@ -61,8 +61,11 @@ def read_sound(name: str) -> torch.Tensor:
 
 def scores_of(truth: torch.Tensor, predicted: torch.Tensor, rate: int, cdpam: Cdpam | None) -> dict[str, float]:
     """Return every metric, by the convention's and the metric's name; CDPAM in both scalings where it is given."""
-    figures = {"relative_stft": relative_stft_error(predicted, truth, fft_sizes=default_fft_sizes(float(rate)))}
-    figures |= {f"paper.{key}": v for key, v in paper_distances(predicted, truth, sample_rate=float(rate)).items()}
+    functions = {name: resolve(entry.function) for name, entry in METRICS.items() if entry.function is not None}
+    figures = {
+        name if name == "relative_stft" else f"paper.{name}": function(predicted, truth, sample_rate=float(rate))
+        for name, function in functions.items()
+    }
     for key, scaling in {} if cdpam is None else {"cdpam": "benchmark", "cdpam_scaled": "authors"}.items():
         figures[f"cdpam.{key}"] = cdpam.distance(predicted, truth, sample_rate=float(rate), scaling=scaling)
     return {key: float(values) for key, values in figures.items()}

@@ -12,7 +12,7 @@ from avmsf.cli.options.common import Flag, Printing
 from avmsf.cli.options.paths import CacheFolder, Existing, OutputFolder
 from avmsf.datasets.detect import detect_dataset
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.registry import expect_method, expect_protocol, expect_suited
+from avmsf.evaluation.registry import expect_suited, method_entry, protocol_named
 from avmsf.gaussians.config import SplatConfig
 from avmsf.modal.config import ExtractionMethod
 from avmsf.pipeline.config import BodyConfig, Geometry, LiftConfig, TimeZero
@@ -98,9 +98,9 @@ class Options(Printing):
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
-        expect_protocol(self.protocol)
+        protocol_named(self.protocol)
         for name in words_of(self.methods):
-            expect_method(name)
+            method_entry(name)
             expect_suited(name, self.protocol)
         if self.protocol == "predefined" and not self.test:
             raise EvaluationError.expected(

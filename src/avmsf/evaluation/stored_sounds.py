@@ -1,11 +1,10 @@
-"""A report as one self-contained page: tables, spectrograms, and sounds to play."""
+"""Sounds that are kept with the results, to be listened to and drawn."""
 
 import base64
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -19,13 +18,12 @@ from torch import Tensor
 
 from avmsf._utils.files import write_whole
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.report_tables import Section, figure, render
 from avmsf.evaluation.results import CaseRecord, ObjectRecord, Outcome
-from avmsf.evaluation.splits import spread
-from avmsf.export.web import report_directives, with_policy
 from avmsf.plotting.spectrograms import RANGE_DB, log_spectrogram
 from avmsf.plotting.style import SEQUENTIAL
 
+RECORDED = "recorded"
+"""What the recordings are called beside the methods."""
 _PEAK = 0.25
 """What recordings peak at, of full scale: louder sounds of a method have room above."""
 _LEAST_RATE = 8000.0
@@ -112,25 +110,6 @@ def draw_spectrogram(sound: StoredSound, *, loudest: float) -> str:
     return f"data:image/png;base64,{base64.b64encode(memory.getvalue()).decode()}"
 
 
-LARGEST = 13_000_000
-"""Maximum number of characters; further contacts are omitted."""
-OBJECTS = 4
-"""Objects with sounds on the page, evenly spaced over all."""
-
-
-def page(parts: Sequence[Section], records: Sequence[ObjectRecord], folder: Path) -> str:
-    """Return the complete page; sounds are read from the results' folder. Raises EvaluationError for a missing one."""
-    opening, *others = parts
-    listening = _listening(records, folder)
-    values = {"opening": opening, "parts": others, "listening": listening, "range_db": f"{RANGE_DB:g}"}
-    whole = render("report.html.jinja", **values, is_text=_is_text)
-    return with_policy(whole, report_directives(whole))
-
-
-def _is_text(cell: str) -> bool:
-    return any(mark.isalpha() and mark != "e" for mark in cell)
-
-
 @dataclass(frozen=True, eq=False)
 class StoredContact:
     """One test contact with stored sounds, and the predictions of all methods."""
@@ -141,14 +120,6 @@ class StoredContact:
     recorded: str
     """Its file."""
     made: tuple[tuple[CaseRecord, Outcome], ...]
-
-
-def _contacts(records: Sequence[ObjectRecord]) -> Iterator[StoredContact]:
-    """Yield contacts with sounds: one of each object first, then a second one, and so on."""
-    stored = [record for record in records if any(case.sounds for case in record.cases)]
-    chosen = [list(stored_contacts(stored[row])) for row in spread(len(stored), OBJECTS)]
-    for contacts in zip_longest(*chosen):
-        yield from filter(None, contacts)
 
 
 def stored_contacts(record: ObjectRecord) -> Iterator[StoredContact]:
@@ -162,44 +133,3 @@ def stored_contacts(record: ObjectRecord) -> Iterator[StoredContact]:
             if each.case == case.key and name in each.sounds
         )
         yield StoredContact(record, name, file, made)
-
-
-_Card = dict[str, str]
-"""One sound on the page: its `title`, `words` on it, and the addresses of its `picture` and its `sound`."""
-
-
-def _listening(records: Sequence[ObjectRecord], folder: Path) -> dict[str, list[tuple[str, list[_Card]]]]:
-    """Return the names of contacts and their sounds by the titles of their objects, as many as fit the page."""
-    found: dict[str, list[tuple[str, list[_Card]]]] = {}
-    size = 0
-    for contact in _contacts(records):
-        cards = list(_cards(contact, folder))
-        size += sum(len(card["picture"]) + len(card["sound"]) for card in cards)
-        if size > LARGEST:
-            break
-        facts = contact.record
-        label = facts.name if facts.name in ("", facts.identifier) else f"{facts.identifier}: {facts.name}"
-        title = ", ".join(filter(None, (label or facts.identifier, facts.material)))
-        found.setdefault(title, []).append((contact.name, cards))
-    return found
-
-
-def _cards(contact: StoredContact, folder: Path) -> Iterator[_Card]:
-    recorded = StoredSound.read(folder / contact.recorded)
-    loudest, seconds = float(recorded.levels.max()), len(recorded.samples) / recorded.sample_rate
-
-    def card(title: str, words: str, sound: StoredSound) -> _Card:
-        picture = draw_spectrogram(sound, loudest=loudest)
-        return {"title": title, "words": words, "picture": picture, "sound": sound.address}
-
-    yield card("recorded", f"{seconds:.2g} s, {recorded.lowest:.0f} Hz to {recorded.sample_rate / 2:.0f} Hz", recorded)
-    several = len({case.label for case, _ in contact.made}) > 1
-    for case, outcome in contact.made:
-        row = case.test.index(contact.name)
-        scores = [
-            f"{heading} {figure(values[row])}"
-            for metric, heading in (("l1", "L1"), ("l1_log", "L1-log"), ("relative_stft", "relative STFT"))
-            if (values := outcome.values.get(metric)) is not None
-        ]
-        title = f"{outcome.method}, {case.label}" if several else outcome.method
-        yield card(title, ", ".join(scores), StoredSound.read(folder / outcome.sounds[contact.name]))
