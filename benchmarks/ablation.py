@@ -21,7 +21,7 @@ from avmsf.fem.supports import supports_of
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import FAMILIES, POSITIONAL, MixtureEstimator
-from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.recipes import GainCase
 from avmsf.modal.extraction.extract import Extraction
@@ -181,7 +181,7 @@ def supports(options: Options) -> Report:
                 config = BodyConfig() if tried is None else BodyConfig(supports=tried)
                 bodies = None if tried is None else candidate_bodies(solid.surface, config, log=log)
                 model, _ = MixtureEstimator(bodies=bodies).fit(case)
-                error = float((model.at(points, ways).mean.real - exact).norm() / exact.norm())
+                error = float((model.predict(points, ways).mean.real - exact).norm() / exact.norm())
                 row += [error] if tried != "try" else [error, model.report["bodies"][0]["support"]]
                 figures[f"gains.supports.{kind}.{'free' if support is None else 'held'}.{tried}"] = error
             rows.append(row)

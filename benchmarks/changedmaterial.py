@@ -19,7 +19,7 @@ from avmsf.fem.material import CERAMIC, GLASS, IRON, PLASTIC, STEEL, WOOD, Mater
 from avmsf.fem.solid import Solid
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
-from avmsf.field.gains.model import MixtureGains, series_of
+from avmsf.field.gains.mixture_gains import MixtureGains, series_of
 from avmsf.field.gains.positional import Smooth
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save

@@ -20,8 +20,8 @@ from torch import Tensor
 
 from avmsf.capture import Impacts
 from avmsf.features.feature_field import FeatureField
-from avmsf.field.attention import AttentionGains
 from avmsf.field.config import PAPER, FitConfig
+from avmsf.field.gains.attention import AttentionGains
 from avmsf.field.losses import SpectralTarget
 from avmsf.field.training import Targets, TrainingRun, gain_scale
 from avmsf.gaussians.config import SplatConfig

@@ -18,12 +18,12 @@ from avmsf.features.feature_field import FeatureField
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import NOMINAL
 from avmsf.fem.shell import shell
-from avmsf.field.attention import AttentionGains
 from avmsf.field.config import AttentionShape
+from avmsf.field.gains.attention import AttentionGains
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
-from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save

@@ -22,7 +22,7 @@ from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import AvmsfError, CaptureWarning
 from avmsf.export.sampled_field import SampledField
 from avmsf.field.config import FitConfig
-from avmsf.field.scaled_gains import BodyGains
+from avmsf.field.gains.scaled import BodyGains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.gaussians.cloud import GaussianCloud

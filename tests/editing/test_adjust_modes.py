@@ -10,7 +10,7 @@ from avmsf.editing.material import change_material, guess_materials, infer_mater
 from avmsf.editing.modal_edit import adjust_modes, brightness_center
 from avmsf.errors import EditError
 from avmsf.fem.material import CERAMIC, WOOD
-from avmsf.field.scaled_gains import ScaledGains
+from avmsf.field.gains.scaled import ScaledGains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.modes import ModalBank

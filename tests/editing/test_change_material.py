@@ -65,7 +65,7 @@ def plate_field(material: Material, *, size: float = 1.0, highest: float = 3000.
 
 
 def gains_of(field: SoundField, contacts: torch.Tensor) -> torch.Tensor:
-    known = field.gain_field.at(contacts)
+    known = field.gain_field.predict(contacts)
     return torch.stack([known.mean, known.quadrature]).double()
 
 

@@ -14,7 +14,7 @@ from avmsf.editing.modal_edit import FieldAtContacts
 from avmsf.editing.reference import Reference, band_spectrum, gain_slope
 from avmsf.errors import AvmsfWarning, EditError
 from avmsf.fem.material import CERAMIC, WOOD
-from avmsf.field.gain_field import Gains
+from avmsf.field.gains.model import Gains
 from factories.raising import raises, warns
 from factories.ringing_field import RATE, SameGains, ringing_field, sound_of
 
@@ -202,8 +202,8 @@ class Ahead(SameGains):
 
     quadrature: torch.Tensor
 
-    def at(self, contacts, directions=None) -> Gains:
-        return Gains(self.gains.expand(len(contacts), -1), self.quadrature.expand(len(contacts), -1))
+    def predict(self, points, directions=None) -> Gains:
+        return Gains(self.gains.expand(len(points), -1), self.quadrature.expand(len(points), -1))
 
 
 def test_a_modes_size_does_not_depend_on_its_phase():

@@ -10,7 +10,7 @@ from avmsf.errors import ExportError
 from avmsf.export.bundle import make_bundle
 from avmsf.export.sampled_field import SampledField, outward_normals
 from avmsf.field.config import FitConfig
-from avmsf.field.scaled_gains import ScaledGains
+from avmsf.field.gains.scaled import ScaledGains
 from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
 from avmsf.modal.modes import ForcePulse, ModalBank
 from avmsf.modal.residual_noise import Residual

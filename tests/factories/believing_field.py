@@ -12,7 +12,7 @@ from avmsf.field.gains.elastic import PERTURBATIONS, RESIDUALS, WIDTHS, Elastic
 from avmsf.field.gains.family import KernelFamily, Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
-from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.modal.modes import ModalBank

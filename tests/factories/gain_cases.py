@@ -8,7 +8,7 @@ from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import KernelFamily, Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
-from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from factories.made_modes import sliding_plate
 

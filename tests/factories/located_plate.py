@@ -7,10 +7,10 @@ from typing import ClassVar
 
 import torch
 
-from avmsf.field.gain_field import Gains
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
-from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.gains.model import Gains
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.localization.contact_map import ContactMap
@@ -37,8 +37,8 @@ class TrueGains(Unsaved):
     highest: float = HIGHEST
     kind: ClassVar[str] = "true"
 
-    def at(self, contacts: torch.Tensor, directions: torch.Tensor | None = None) -> Gains:
-        gains = plate_modes(self.plate, contacts, highest=self.highest).gains.float()
+    def predict(self, points: torch.Tensor, directions: torch.Tensor | None = None) -> Gains:
+        gains = plate_modes(self.plate, points, highest=self.highest).gains.float()
         shape = gains.shape
         damping = None if self.factor is None else 1.0 + self.factor * torch.linspace(0, 1, shape[1]).expand(shape)
         return Gains(gains, 0.4 * gains.roll(1, 1) if self.turned else None, damping)

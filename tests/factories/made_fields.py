@@ -9,15 +9,15 @@ import torch
 
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.elastic_modes import ElasticModes
-from avmsf.field.attention import AttentionGains
 from avmsf.field.config import AttentionShape
-from avmsf.field.gain_field import GainField
+from avmsf.field.gains.attention import AttentionGains
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import KernelFamily, Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
-from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.gains.model import GainModel
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
-from avmsf.field.scaled_gains import BodyGains
+from avmsf.field.gains.scaled import BodyGains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
 from avmsf.modal.modes import ModalBank
@@ -118,7 +118,7 @@ def body() -> BodyGains:
     return BodyGains(places(150, seed=0).float(), modes)
 
 
-FIELDS: dict[str, Callable[[], GainField]] = {
+FIELDS: dict[str, Callable[[], GainModel]] = {
     "attention": cache(attention),
     "attention with dampings": cache(lambda: attention(spatial_damping=True)),
     "positional": cache(positional),
@@ -131,13 +131,13 @@ FIELDS: dict[str, Callable[[], GainField]] = {
 """All there are, by what tests call them; the same object at every call."""
 
 
-def sounding(gains: GainField) -> SoundField:
+def sounding(gains: GainModel) -> SoundField:
     """Return a field of the plate's modes with noise, a quarter of a second long."""
     phase = torch.zeros(len(BANK), dtype=torch.float64)
     return SoundField(BANK, gains, phase, Residual(torch.full((9,), 0.01)), 8000.0, 2000, Origin("plate"))
 
 
-def saved(gains: GainField, folder: Path) -> Path:
+def saved(gains: GainModel, folder: Path) -> Path:
     """Write the field of these gains, and return its path."""
     save(sounding(gains), folder / "plate.safetensors")
     return folder / "plate.safetensors"

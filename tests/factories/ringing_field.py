@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 import torch
 
-from avmsf.field.gain_field import GainField, Gains
+from avmsf.field.gains.model import GainModel, Gains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
@@ -17,7 +17,7 @@ GAINS = (1.0, -0.8, 0.9, 0.6, -0.7, 0.4)
 
 
 @dataclass(frozen=True, eq=False)
-class SameGains(GainField):
+class SameGains(GainModel):
     """Gains that do not depend on the place."""
 
     gains: torch.Tensor
@@ -28,8 +28,8 @@ class SameGains(GainField):
     def points(self) -> torch.Tensor:
         return torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
 
-    def at(self, contacts, directions=None) -> Gains:
-        return Gains(self.gains.expand(len(contacts), -1))
+    def predict(self, points, directions=None) -> Gains:
+        return Gains(self.gains.expand(len(points), -1))
 
     def record(self) -> dict[str, Any]:
         return {"modes": len(self.gains)}

@@ -13,14 +13,14 @@ from safetensors.torch import save_file
 
 from avmsf.capture import Impacts
 from avmsf.features.feature_field import FeatureField
-from avmsf.field.attention import AttentionGains, AttentionShape
-from avmsf.field.gain_field import GainField
+from avmsf.field.gains.attention import AttentionGains, AttentionShape
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.model import GainModel
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured, Visual
+from avmsf.field.gains.scaled import BodyGains, ScaledGains
 from avmsf.field.gains.symmetry import Symmetric
-from avmsf.field.scaled_gains import BodyGains, ScaledGains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.modal.extraction.alignment import align
 from avmsf.modal.modes import ModalBank
@@ -46,7 +46,7 @@ CONTACTS = on_sphere(8)
 ASKED = on_sphere(4)
 
 
-def mixture() -> GainField:
+def mixture() -> GainModel:
     """Return a model of all families."""
     sites, size = Sites(CONTACTS, -CONTACTS / RADIUS), 2 * RADIUS
     looks = torch.randn(len(POINTS), 4, generator=GENERATOR)
@@ -65,7 +65,7 @@ def mixture() -> GainField:
     return fit_mixture(families, measured, POINTS, directional=True)
 
 
-def attention() -> GainField:
+def attention() -> GainModel:
     return (
         AttentionGains(
             FeatureField.from_points(POINTS),
@@ -89,7 +89,7 @@ def fields() -> dict[str, SoundField]:
     noise = torch.linspace(1e-3, 1e-4, 9)
     sphere = breathing_sphere(RADIUS, 400.0, detail=1)
     modes = replace(sphere, frequency=BANK.frequency, shapes=sphere.shapes.repeat(1, 3, 1).float().double())
-    made: dict[str, GainField] = {"mixture": mixture(), "attention": attention(), "body": BodyGains(POINTS, modes)}
+    made: dict[str, GainModel] = {"mixture": mixture(), "attention": attention(), "body": BodyGains(POINTS, modes)}
     made["scaled"] = ScaledGains(made["mixture"], torch.tensor([2.0, -0.5, 0.0], dtype=torch.float64), 1.5)
     phase, origin = torch.tensor([0.0, 0.4, -1.2], dtype=torch.float64), Origin("sphere", names)
     whole = {

@@ -1,9 +1,9 @@
 """What gain fields of tests lack that only predict: an uncertainty, and a form in a file."""
 
-from avmsf.field.gain_field import GainField
+from avmsf.field.gains.model import GainModel
 
 
-class Unsaved(GainField):
+class Unsaved(GainModel):
     """A gain field without a posterior that is never kept in a file."""
 
     def record(self):

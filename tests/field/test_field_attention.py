@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from avmsf.features.feature_field import FeatureField
-from avmsf.field.attention import AttentionGains, encode
 from avmsf.field.config import AttentionShape
+from avmsf.field.gains.attention import AttentionGains, encode
 from avmsf.gaussians.points import cluster
 
 SHAPE = AttentionShape(clusters=5, bands=3, width=8, hidden=12, layers=2, feature_scale=4.0)
@@ -73,7 +73,7 @@ def paper_gains(net: AttentionGains, contact: torch.Tensor) -> tuple[list[float]
 def test_gains_are_the_papers_equations(bands, layers):
     net = network(replace(SHAPE, bands=bands, layers=layers))
     contacts = points(70)[60:]
-    gains = net.at(contacts)
+    gains = net.predict(contacts)
     expected = torch.tensor([paper_gains(net, contact)[0] for contact in contacts])
     # Float32 sums of a hundred products, relative to each mode's size.
     torch.testing.assert_close(
@@ -87,7 +87,7 @@ def test_attention_weighs_the_regions_and_its_weights_sum_to_one(monkeypatch):
     seen, softmax = [], torch.softmax
     monkeypatch.setattr(torch, "softmax", lambda *given, **named: seen.append(softmax(*given, **named)) or seen[-1])
     net, contacts = network(), points(70)[60:]
-    net.at(contacts)
+    net.predict(contacts)
     (weights,) = seen
     assert weights.shape == (10, SHAPE.clusters)
     torch.testing.assert_close(weights.sum(1), torch.ones(10), rtol=0, atol=1e-6)
@@ -100,7 +100,7 @@ def test_attention_weighs_the_regions_and_its_weights_sum_to_one(monkeypatch):
 def test_the_order_of_regions_does_not_matter():
     """Keys and values are a set; where the query reads the offsets in the same order, the gains stay."""
     net, order, contacts = network(), torch.tensor([3, 0, 4, 1, 2]), points(70)[60:]
-    before = net.at(contacts).mean
+    before = net.predict(contacts).mean
     each = 3 * (1 + 2 * SHAPE.bands)
     with torch.no_grad():
         net.centers.copy_(net.centers[order])
@@ -108,7 +108,7 @@ def test_the_order_of_regions_does_not_matter():
         blocks = net.query.weight[:, : 5 * each].unflatten(1, (5, each))[:, order]
         net.query.weight[:, : 5 * each] = blocks.flatten(1)
     # Other orders of float32 sums.
-    torch.testing.assert_close(net.at(contacts).mean, before, rtol=0, atol=1e-5)
+    torch.testing.assert_close(net.predict(contacts).mean, before, rtol=0, atol=1e-5)
 
 
 def test_contacts_at_one_point_have_identical_gains():
@@ -116,15 +116,15 @@ def test_contacts_at_one_point_have_identical_gains():
     net = network(field=field)
     nudge = torch.zeros(60, 3)
     nudge[:, 0] = 1e-6
-    assert torch.equal(net.at(points()).mean, net.at(points() + nudge).mean)
-    assert torch.equal(net.at(points()).mean, net.read(torch.arange(60)).mean)
+    assert torch.equal(net.predict(points()).mean, net.predict(points() + nudge).mean)
+    assert torch.equal(net.predict(points()).mean, net.read(torch.arange(60)).mean)
 
 
 def test_gains_do_not_depend_on_where_the_object_lies_or_on_how_large_it_is():
     moved = 3 * points() + torch.tensor([1.0, 2.0, 3.0])
     here, there = (network(field=FeatureField.from_points(each)) for each in (points(), moved))
     # Coordinates near 3 m in float32 are known to 2e-7 m, waves of 4 pi to thirty times that part of the size.
-    torch.testing.assert_close(there.at(moved).mean, here.at(points()).mean, rtol=0, atol=1e-4)
+    torch.testing.assert_close(there.predict(moved).mean, here.predict(points()).mean, rtol=0, atol=1e-4)
 
 
 def test_features_and_scales_in_float64_make_a_float32_network():
@@ -132,14 +132,14 @@ def test_features_and_scales_in_float64_make_a_float32_network():
     double = FeatureField(single.points.double(), single.features.double(), "test")
     net = AttentionGains(double, gain_scale=GAIN_SCALE.double(), shape=SHAPE, generator=torch.Generator())
     assert {each.dtype for each in net.state_dict().values()} == {torch.float32}
-    assert net.at(points()).mean.dtype == torch.float32
+    assert net.predict(points()).mean.dtype == torch.float32
 
 
 def test_damping_factors_start_at_one_and_are_positive():
     shape = replace(SHAPE, spatial_damping=True)
     fresh = AttentionGains(features(), gain_scale=GAIN_SCALE, shape=shape, generator=torch.Generator())
-    assert torch.equal(fresh.at(points()).damping, torch.ones(60, 4))
-    factors = network(shape).at(points()).damping.detach()
+    assert torch.equal(fresh.predict(points()).damping, torch.ones(60, 4))
+    factors = network(shape).predict(points()).damping.detach()
     assert float(factors.min()) > 0
     assert float(factors.std(0).min()) > 0
 
@@ -154,7 +154,7 @@ def test_the_generator_alone_decides_the_weights():
 
 
 def test_an_untrained_networks_gains_are_of_the_scale_it_was_given():
-    gains = network().at(points()).mean.detach()
+    gains = network().predict(points()).mean.detach()
     size = gains.square().mean(0).sqrt() / GAIN_SCALE.clamp_min(1e-3)
     assert float(size[2]) == 0
     assert bool((size[[0, 1, 3]] > 0.02).all())

@@ -9,7 +9,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
-from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.recipes import gain_case
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from factories.delayed_plate import ALIGNED, delays, distance, strikes, without_delays
@@ -48,7 +48,7 @@ def test_a_field_and_the_gains_it_is_checked_by_do_not_depend_on_delays(
     assert distance(*(each.gains(delayed[0].contacts) for each in fields)) < ALIGNED
     # Between the contacts other hypotheses may be the more probable ones, which differ by less than is known.
     apart = fields[0].gains(FEATURES.points) - fields[1].gains(FEATURES.points)
-    assert bool((apart.abs() < known[0].deviation(FEATURES.points)[..., 0]).all())
+    assert bool((apart.abs() < known[0].posterior(FEATURES.points).std[..., 0]).all())
     assert distance(*(torch.view_as_real(each.measured).flatten(1) for each in known)) < ALIGNED
 
 

@@ -1,4 +1,4 @@
-"""What holds of every gain field, whatever it is made of: the contract of `GainField`."""
+"""What holds of every gain field, whatever it is made of: the contract of `GainModel`."""
 
 import json
 from copy import deepcopy
@@ -13,11 +13,11 @@ from safetensors.torch import save as to_bytes
 
 from avmsf.errors import FieldFileError
 from avmsf.evaluation.task import Renderer
-from avmsf.field.attention import AttentionGains
-from avmsf.field.gain_field import GainField, Gains
-from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.attention import AttentionGains
+from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.gains.model import GainModel, Gains
 from avmsf.field.gains.refinement import RefinedGains
-from avmsf.field.scaled_gains import ScaledGains
+from avmsf.field.gains.scaled import ScaledGains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.residual_noise import Residual
@@ -46,14 +46,14 @@ REAL = ("attention", "attention with dampings", "scaled attention with dampings"
 """Fields without a quadrature and without a standard deviation."""
 
 
-def sound_field(gains: GainField, *, noise: float = 0.0) -> SoundField:
+def sound_field(gains: GainModel, *, noise: float = 0.0) -> SoundField:
     return SoundField(BANK, gains, PHASE, Residual(torch.full((9,), noise)), 8000.0, 600, Origin("plate"))
 
 
-def parts(field: GainField, contacts: torch.Tensor, directions: torch.Tensor | None = None) -> list[torch.Tensor]:
+def parts(field: GainModel, contacts: torch.Tensor, directions: torch.Tensor | None = None) -> list[torch.Tensor]:
     """Return all that a field knows at contacts."""
-    known = field.at(contacts, directions)
-    said = [known.mean, known.quadrature, known.damping, field.deviation(contacts, directions)]
+    known = field.predict(contacts, directions)
+    said = [known.mean, known.quadrature, known.damping, field.posterior(contacts, directions).std]
     return [each for each in said if each is not None]
 
 
@@ -75,19 +75,19 @@ def test_power_is_the_same_whatever_the_phase():
 @every_field
 def test_gains_are_a_number_a_contact_and_mode(name):
     field = ALL[name]()
-    assert isinstance(field, GainField)
+    assert isinstance(field, GainModel)
     for count in (7, 1, 0):
-        known = field.at(PLACES[:count], BLOWS[:count])
+        known = field.predict(PLACES[:count], BLOWS[:count])
         for each in (known.mean, known.quadrature, known.damping):
             assert each is None or (each.shape, each.dtype) == ((count, MODES), torch.float32)
-        deviation = field.deviation(PLACES[:count], BLOWS[:count])
+        deviation = field.posterior(PLACES[:count], BLOWS[:count]).std
         assert deviation is None or (deviation.shape, deviation.dtype) == ((count, MODES, 2), torch.float32)
     assert all(bool(torch.isfinite(each).all()) for each in parts(field, PLACES, BLOWS))
-    assert known.damping is None or float(field.at(PLACES).damping.min()) > 0
+    assert known.damping is None or float(field.predict(PLACES).damping.min()) > 0
     assert (deviation is None) == (name in REAL)
-    assert deviation is None or float(field.deviation(PLACES).min()) > 0
+    assert deviation is None or float(field.posterior(PLACES).std.min()) > 0
     # They vary over the object, or nothing below would be seen.
-    assert float(field.at(PLACES).mean.std(0).max()) > 0
+    assert float(field.predict(PLACES).mean.std(0).max()) > 0
 
 
 @every_field
@@ -117,12 +117,12 @@ def test_contacts_in_float32_and_float64_are_the_same_places(name):
 @every_field
 def test_an_impact_from_the_other_side_has_opposite_gains_or_its_direction_is_not_used(name):
     field = ALL[name]()
-    here, there = field.at(PLACES, BLOWS), field.at(PLACES, -BLOWS)
+    here, there = field.predict(PLACES, BLOWS), field.predict(PLACES, -BLOWS)
     sign = -1.0 if name in DIRECTIONAL else 1.0
     assert torch.equal(there.mean, sign * here.mean)
     if here.quadrature is not None:
         assert torch.equal(there.quadrature, sign * here.quadrature)
-    deviations = [field.deviation(PLACES, directions) for directions in (BLOWS, -BLOWS)]
+    deviations = [field.posterior(PLACES, directions).std for directions in (BLOWS, -BLOWS)]
     assert deviations == [None, None] or torch.equal(*deviations)
 
 
@@ -137,8 +137,8 @@ def test_without_a_direction_an_impact_goes_straight_into_the_body_or_as_its_nei
         assumed = field.training.directions[near]
     expect_close(parts(field, contacts), parts(field, contacts, assumed))
     expect_close(parts(field, contacts, torch.zeros(7, 3)), parts(field, contacts))
-    askew = field.at(contacts, BLOWS).mean
-    assert torch.equal(askew, field.at(contacts).mean) == (name not in DIRECTIONAL)
+    askew = field.predict(contacts, BLOWS).mean
+    assert torch.equal(askew, field.predict(contacts).mean) == (name not in DIRECTIONAL)
 
 
 @pytest.mark.parametrize("name", [name for name in FIELDS if name != "body"])

@@ -10,7 +10,7 @@ from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
-from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from factories.made_fields import BANK, DIAGONAL, blows, places, plate, struck
 
@@ -28,7 +28,7 @@ def fitted(sites: Sites, values: Tensor, body: ElasticModes | None = None, *, si
 
 
 def mean(model: MixtureGains, points: Tensor, directions: Tensor | None = None) -> Tensor:
-    known = model.at(points, directions)
+    known = model.predict(points, directions)
     assert known.quadrature is not None
     return torch.complex(known.mean.double(), known.quadrature.double())
 
@@ -52,7 +52,7 @@ def test_an_object_that_is_moved_turned_and_enlarged_has_the_same_gains(body):
     # Mode shapes are held in float32.
     found, expected = mean(elsewhere, moved(PLACES), BLOWS @ turn.T), mean(here, PLACES, BLOWS)
     expect_close(found, expected, within=1e-4)
-    deviations = elsewhere.deviation(moved(PLACES), BLOWS @ turn.T), here.deviation(PLACES, BLOWS)
+    deviations = elsewhere.posterior(moved(PLACES), BLOWS @ turn.T).std, here.posterior(PLACES, BLOWS).std
     expect_close(*deviations, within=1e-3)
 
 
@@ -73,7 +73,7 @@ def test_mode_shapes_predict_what_positions_cannot_and_know_how_well():
     errors = [mean(fitted(sites, values, body), PLACES, BLOWS) - truth for body in (plate(), None)]
     own, other = (float((each.abs().square().mean(0) / truth.abs().square().mean(0)).mean()) ** 0.5 for each in errors)
     assert own < 0.4 * other
-    deviation = fitted(sites, values, plate()).deviation(PLACES, BLOWS).double()
+    deviation = fitted(sites, values, plate()).posterior(PLACES, BLOWS).std.double()
     within = torch.view_as_real(errors[0]).abs() < 1.645 * deviation
     # Of draws from the model .9; shapes that are exact leave less unknown than the hypotheses allow for.
     assert float(within.double().mean()) > 0.85
@@ -98,4 +98,4 @@ def test_impacts_in_one_place_have_their_mean_there():
     assert model.place_count == 1
     expect_close(mean(model, sites.points, sites.directions), values, within=0.05)
     assert bool(mean(model, PLACES).isfinite().all())
-    assert bool(model.deviation(PLACES).isfinite().all())
+    assert bool(model.posterior(PLACES).std.isfinite().all())

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from avmsf.field.attention import AttentionGains
 from avmsf.field.config import AttentionShape, FitConfig
 from avmsf.field.fit import fit
+from avmsf.field.gains.attention import AttentionGains
 from avmsf.field.recipes import Attention, gain_case
 from avmsf.field.store import load, save
 from avmsf.field.training import Targets, TrainingRun

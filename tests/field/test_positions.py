@@ -2,8 +2,8 @@
 
 import torch
 
+from avmsf.field.gains.scaled import BodyGains, ScaledGains
 from avmsf.field.positions import off_surface, off_surface_gains, points_on_object
-from avmsf.field.scaled_gains import BodyGains, ScaledGains, surface_of
 from factories.believing_field import LENGTH, bar, bar_points
 from factories.made_fields import positional
 
@@ -39,10 +39,10 @@ def test_points_of_the_false_floor_are_no_contacts() -> None:
 
 def test_an_edited_body_is_scaled() -> None:
     large = ScaledGains(closed(), torch.ones(6, dtype=torch.float64), 2.0)
-    surface = surface_of(large)
+    surface = large.surface
     assert surface is not None
     assert float(surface.vertices[:, 0].max()) == 2.0 * float(torch.tensor(LENGTH))
     assert len(points_on_object(large)) == len(bar_points())
     ((_, distance),) = off_surface(torch.tensor([[0.4, 0.1, 2.0 * HEIGHT]]), large)
     assert abs(distance - 2.0 * HEIGHT) < 1e-6
-    assert surface_of(positional()) is None
+    assert positional().surface is None

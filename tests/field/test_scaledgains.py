@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from avmsf._utils.text import RecordError
-from avmsf.field.scaled_gains import ScaledGains
+from avmsf.field.gains.scaled import ScaledGains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.residual_noise import Residual
@@ -20,14 +20,14 @@ BLOWS = blows(PLACES, seed=9)
 def test_gains_and_deviations_are_the_inner_fields_times_the_factors(name):
     inner = FIELDS[name]()
     scaled = ScaledGains(inner, FACTORS)
-    before, after = (each.at(PLACES, BLOWS) for each in (inner, scaled))
+    before, after = (each.predict(PLACES, BLOWS) for each in (inner, scaled))
     # A float32 number times a factor is rounded once.
     torch.testing.assert_close(after.mean.double(), before.mean.double() * FACTORS, rtol=1e-7, atol=0)
     if before.quadrature is not None:
         torch.testing.assert_close(after.quadrature.double(), before.quadrature.double() * FACTORS, rtol=1e-7, atol=0)
     assert before.damping is None or torch.equal(before.damping, after.damping)
     assert (before.damping is None) == (after.damping is None)
-    deviations = [each.deviation(PLACES, BLOWS) for each in (inner, scaled)]
+    deviations = [each.posterior(PLACES, BLOWS).std for each in (inner, scaled)]
     assert deviations[0] is None or torch.allclose(
         deviations[1], deviations[0] * FACTORS.abs().float()[:, None], rtol=1e-6
     )
@@ -40,10 +40,10 @@ def test_on_a_larger_object_places_are_where_they_would_be_on_the_small_one(name
     large = ScaledGains(inner, torch.ones(5, dtype=torch.float64), 4.0)
     # Four is a power of two: lengths are not rounded.
     assert torch.equal(large.points, 4 * inner.points)
-    assert torch.equal(large.at(4 * PLACES, BLOWS).mean, inner.at(PLACES, BLOWS).mean)
-    deviations = large.deviation(4 * PLACES, BLOWS), inner.deviation(PLACES, BLOWS)
+    assert torch.equal(large.predict(4 * PLACES, BLOWS).mean, inner.predict(PLACES, BLOWS).mean)
+    deviations = large.posterior(4 * PLACES, BLOWS).std, inner.posterior(PLACES, BLOWS).std
     assert deviations == (None, None) or torch.equal(*deviations)
-    assert not torch.equal(large.at(PLACES, BLOWS).mean, inner.at(PLACES, BLOWS).mean)
+    assert not torch.equal(large.predict(PLACES, BLOWS).mean, inner.predict(PLACES, BLOWS).mean)
 
 
 def test_of_scaled_gains_the_factors_multiply_and_nothing_nests(tmp_path):
@@ -54,7 +54,7 @@ def test_of_scaled_gains_the_factors_multiply_and_nothing_nests(tmp_path):
     assert twice.length == 1.5
     save(SoundField(BANK, twice, torch.zeros(5).double(), Residual(torch.zeros(9)), 8e3, 9, Origin()), tmp_path / "one")
     loaded = load(tmp_path / "one").gain_field
-    assert torch.equal(loaded.at(PLACES).mean, twice.at(PLACES).mean)
+    assert torch.equal(loaded.predict(PLACES).mean, twice.predict(PLACES).mean)
     assert loaded.length == 1.5
     assert type(loaded.field) is type(inner)
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from avmsf.errors import ArrayError, FitError
 from avmsf.field.gains.elastic import REACH
-from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.recipes import SHARED, Attention, gain_case
 from avmsf.field.sound_field import SoundField
 from avmsf.field.suggest import suggest

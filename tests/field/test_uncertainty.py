@@ -9,15 +9,14 @@ from matplotlib.figure import Figure
 
 from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import FitError
-from avmsf.field.gains.model import MixtureGains
-from avmsf.field.scaled_gains import ScaledGains
+from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.gains.scaled import ScaledGains
 from avmsf.field.uncertainty import (
     coverage,
     fitted_mixture,
     has_posterior,
     relative_gain_std,
     spectrum_band,
-    std_of,
     training_contacts,
     unedited_mixture,
 )
@@ -52,11 +51,11 @@ def test_a_place_is_left_out_as_in_a_model_without_its_contacts() -> None:
     for row in range(7):
         rest = gains.without((contacts == contacts[row]).all(1))
         assert len(rest.contacts) == (5 if row in (0, 6) else 6)
-        known = rest.at(contacts[row : row + 1])
+        known = rest.predict(contacts[row : row + 1])
         mean = torch.stack([known.mean[0], known.quadrature[0]], dim=1).double()  # type: ignore[index]
         torch.testing.assert_close(torch.view_as_real(gains.leave_one_out()[row]), mean, rtol=1e-5, atol=1e-6)
         # Of a measured gain, whose noise counts as well.
-        variance = rest.deviation(contacts[row : row + 1])[0].double().square() + rest.noise().square()
+        variance = rest.posterior(contacts[row : row + 1]).std[0].double().square() + rest.noise().square()
         torch.testing.assert_close(scores[row], (values[row] - mean) / variance.sqrt(), rtol=1e-4, atol=1e-5)
 
 
@@ -109,7 +108,7 @@ def test_fields_judge_themselves_by_the_gains_that_were_measured(made) -> None:
     torch.testing.assert_close(judged.leave_one_out(), others.leave_one_out())
     torch.testing.assert_close(judged.standardized_errors(), others.standardized_errors())
     assert not torch.allclose(judged.leave_one_out(), gains.leave_one_out())
-    assert torch.equal(judged.at(contacts).mean, gains.at(contacts).mean)
+    assert torch.equal(judged.predict(contacts).mean, gains.predict(contacts).mean)
     taken = judged.take(torch.tensor([2, 0]))
     torch.testing.assert_close(taken.standardized_errors(), judged.standardized_errors()[:, [2, 0]])
 
@@ -131,7 +130,8 @@ def test_a_sound_without_doubt_has_its_own_spectrum(monkeypatch: pytest.MonkeyPa
     contacts = bar_contacts(6)
     gains = elastic_field(contacts, drawn_gains(contacts, seed=7))
     field = replace(sound_field(gains), residual=Residual(torch.zeros(9)))
-    monkeypatch.setattr(MixtureGains, "deviation", lambda known, sites, ways=None: torch.zeros(len(sites), 4, 2))
+    sure = replace(gains.predict(contacts[2:3]), std=torch.zeros(1, 4, 2))
+    monkeypatch.setattr(MixtureGains, "posterior", lambda known, sites, ways=None: sure)
     band = spectrum_band(field, contacts[2])
     power = torch.fft.rfft(field.render(contacts[2:3])[0].double()).abs().square()
     assert torch.allclose(band.lower_db, band.upper_db)
@@ -152,7 +152,7 @@ def test_bands_hold_what_the_gains_intervals_hold() -> None:
     lone = ModalBank(BANK.frequency[:1], BANK.damping[:1])
     field = replace(field, bank=lone, phase=field.phase[:1], gain_field=gains.take(torch.tensor([0])))
     far = torch.tensor([0.1, 0.0, 0.0])
-    known, spread = field.known(far[None]), field.gain_field.deviation(far[None])
+    known, spread = field.known(far[None]), field.gain_field.posterior(far[None]).std
     assert known.quadrature is not None
     assert spread is not None
     mean = torch.stack([known.mean, known.quadrature], dim=2)[0, 0].double()
@@ -181,8 +181,8 @@ def test_an_edited_field_is_as_sure_of_itself_as_before(made: type) -> None:
     factor = torch.tensor([2.0, 0.5, 8.0, 1.0], dtype=torch.float64)
     louder = replace(field, gain_field=ScaledGains(field.gain_field, factor, 2.0))
     assert torch.equal(training_contacts(louder), 2.0 * training_contacts(field))
-    known = std_of(field, others) * factor[:, None]
-    torch.testing.assert_close(std_of(louder, 2.0 * others), known, rtol=1e-6, atol=0)
+    known = field.gain_field.posterior(others).std * factor[:, None]
+    torch.testing.assert_close(louder.gain_field.posterior(2.0 * others).std.double(), known, rtol=1e-6, atol=0)
     heard = coverage(louder, 2.0 * others, values[12:] * factor[:, None])
     assert heard.plain == coverage(field, others, values[12:]).plain
     weights = ModalBank(BANK.frequency, BANK.damping / factor**2)

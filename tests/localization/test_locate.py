@@ -7,7 +7,7 @@ import torch
 
 from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import LocationError
-from avmsf.field.gain_field import Gains
+from avmsf.field.gains.model import Gains
 from avmsf.field.sound_field import Origin
 from avmsf.localization.likelihood import Force
 from avmsf.localization.locate import MIN_EXPLAINED, REJECT_ABOVE, assess_match, locate
@@ -86,8 +86,8 @@ def test_a_known_force_tells_places_apart_that_sound_alike():
         points: torch.Tensor
         kind: ClassVar[str] = "twice"
 
-        def at(self, contacts, directions=None):
-            return Gains((1.0 + contacts[:, :1].float()) * torch.linspace(1, 2, len(bank())))
+        def predict(self, points, directions=None):
+            return Gains((1.0 + points[:, :1].float()) * torch.linspace(1, 2, len(bank())))
 
     field = field_of(Twice(torch.tensor([[0.0, 0, 0], [1.0, 0, 0]])))
     locator, sound = Locator.of(field), field.render(torch.tensor([[1.0, 0, 0]]))[0]

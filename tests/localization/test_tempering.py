@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from avmsf.field.scaled_gains import ScaledGains
+from avmsf.field.gains.scaled import ScaledGains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.localization.locator import Locator
 from avmsf.localization.prediction import calibrate_tempering

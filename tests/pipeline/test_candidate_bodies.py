@@ -12,7 +12,7 @@ from avmsf.errors import FitError, SimulationError
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.candidate_bodies import NominalBodies, NominalBody
 from avmsf.fem.supports import Support
-from avmsf.field.config import FitConfig, GainModel
+from avmsf.field.config import FitConfig, GainModelName
 from avmsf.field.fit import fit
 from avmsf.field.gains.elastic import CandidateBodies
 from avmsf.field.gains.estimator import MixtureEstimator, estimator_for, gain_variance
@@ -239,7 +239,7 @@ def test_stated_settings_that_leave_no_body_are_refused(config: BodyConfig, name
     def make() -> CandidateBodies:
         return candidate_bodies(dome(), config)
 
-    models: tuple[GainModel, ...] = ("auto", "elastic")
+    models: tuple[GainModelName, ...] = ("auto", "elastic")
     for model in models:
         with raises(SimulationError, name=name, value=value):
             estimator_for(model, make)

@@ -13,7 +13,6 @@ from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import EditError, FieldFileError, SimulationError
 from avmsf.export.sampled_field import SampledField
 from avmsf.fem.material import CERAMIC, WOOD
-from avmsf.field.scaled_gains import length_of
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
 from avmsf.studio.edit import REST, Sliders
@@ -254,7 +253,7 @@ def test_the_table_of_an_edited_field_is_the_one_made_anew(kind: str) -> None:
     # The highest mode goes beyond half the sample rate, and the next one down is mute.
     words = {"size": 0.7, "material": {"from": "ceramic", "to": "ceramic"}, "decay": 0.5, "brightness": 2.0}
     after, _ = Sliders.read({**words, "pitch": 1.3, "modes": [{"mode": 3, "db": None}]}).apply(before)
-    assert length_of(after.gain_field) == 0.7
+    assert after.gain_field.length == 0.7
     found = resample(sampled, before, after)
     assert found is not None
     expected = SampledField.of(after, before.gain_field.points.double() * 0.7, normals)

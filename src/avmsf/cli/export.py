@@ -29,7 +29,6 @@ from avmsf.export.uff import write_universal
 from avmsf.export.web import write_webpage
 from avmsf.export.writing import Written, check_free, write_file
 from avmsf.field.positions import points_on_object
-from avmsf.field.scaled_gains import length_of, surface_of
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
 from avmsf.gaussians.cloud import GaussianCloud
@@ -131,11 +130,11 @@ def _object(field: SoundField, options: Options) -> tuple[Path | Surface | None,
         return options.object, METRES[options.object_unit]
     path, meters = _captured(options)
     if path is None:
-        body = surface_of(field.gain_field)
+        body = field.gain_field.surface
         if body is not None:
             return body, 1.0
         path, meters = _reconstructed(options), 1.0
-    length = length_of(field.gain_field)
+    length = field.gain_field.length
     if length == 1.0 or path is None:
         return path, meters
     if path.suffix.lower() == ".ply" and path.is_file() and holds_gaussians(path):
@@ -151,7 +150,7 @@ def _object(field: SoundField, options: Options) -> tuple[Path | Surface | None,
 
 
 def _note_size(field: SoundField, path: Path) -> None:
-    if (length := length_of(field.gain_field)) != 1.0:
+    if (length := field.gain_field.length) != 1.0:
         say(f"note: the field was edited to {length:g} times its size; {path} is not scaled and has to have it")
 
 
@@ -194,7 +193,7 @@ def _web(field: SoundField, options: Options) -> Written:
         options.output,
         object=source,
         meters=meters,
-        surface=None if isinstance(source, Surface) else surface_of(field.gain_field),
+        surface=None if isinstance(source, Surface) else field.gain_field.surface,
         strikes=_recordings(field, options.capture),
         limit=options.contacts or POINTS["web"],
         force=options.overwrite,

@@ -17,9 +17,9 @@ from avmsf.cli.options.paths import kind_of
 from avmsf.cli.printing import console, next_command, print_json, say
 from avmsf.cli.scores import body_warnings, outlier_words, quality_words, score_table, score_values
 from avmsf.evaluation.splits import evaluate
-from avmsf.field.attention import AttentionGains
 from avmsf.field.config import NETWORK
-from avmsf.field.scaled_gains import BodyGains, surface_of
+from avmsf.field.gains.attention import AttentionGains
+from avmsf.field.gains.scaled import BodyGains
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
 from avmsf.field.uncertainty import has_posterior, relative_gain_std, spectrum_band, training_contacts
@@ -143,7 +143,7 @@ def draw_field(
         pictures["spectrum"] = draw_band(
             spectrum_band(field, points[0]), title=f"{name}: one impact, with its uncertainty"
         )
-    surface = surface_of(field.gain_field)
+    surface = field.gain_field.surface
     if surface is not None:
         pictures["surface"] = draw_surface(surface, title=f"the body of {name}")
     for stem, picture in pictures.items():

@@ -12,8 +12,8 @@ from torch import Tensor
 from avmsf._utils.text import counted
 from avmsf.editing.clips import Sounds
 from avmsf.errors import EditError
-from avmsf.field.gain_field import Gains
-from avmsf.field.scaled_gains import ScaledGains, fitted_gains
+from avmsf.field.gains.model import Gains
+from avmsf.field.gains.scaled import ScaledGains
 from avmsf.field.sound_field import SoundField
 from avmsf.field.uncertainty import scale_of
 from avmsf.modal.modes import ModalBank
@@ -132,7 +132,7 @@ def brightness_center(field: SoundField, bank: ModalBank | None = None) -> float
     The geometric mean of the frequencies, those of `bank` where one is given, each counted by the mean square of its
     gains over the object as these were before any edit; so that edits do not move it, but as pitch does.
     """
-    gains = fitted_gains(field.gain_field)
+    gains = field.gain_field.fitted
     points = gains.points[:: max(1, math.ceil(len(gains.points) / _POINTS))]
     with torch.no_grad():
         known = gains.point_estimate(points)

@@ -12,7 +12,7 @@ from avmsf.capture.impacts import Impacts, rows_by_place
 from avmsf.errors import FitError
 from avmsf.evaluation.task import Task, VisualInput
 from avmsf.features.feature_field import FeatureField
-from avmsf.field.config import FitConfig, GainModel
+from avmsf.field.config import FitConfig, GainModelName
 from avmsf.field.fit import fit, held_out
 from avmsf.field.gains.estimator import estimator_for
 from avmsf.field.sound_field import SoundField
@@ -145,7 +145,7 @@ class FieldMethod:
         }
 
 
-def gaussian_process(name: str, *, model: GainModel) -> FieldMethod:
+def gaussian_process(name: str, *, model: GainModelName) -> FieldMethod:
     """Return a Gaussian process over all kernel families, or over one."""
     return FieldMethod(name, PipelineConfig(gain_model=model), "surface")
 

@@ -12,10 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf.errors import ExportError
-from avmsf.field.gain_field import GainField
-from avmsf.field.gains.model import MixtureGains
 from avmsf.field.positions import points_on_object
-from avmsf.field.scaled_gains import BodyGains, ScaledGains
 from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.neighborhoods import read_neighborhoods
 from avmsf.gaussians.points import farthest_points, nearest_points
@@ -87,7 +84,7 @@ class SampledField:
             places = places[rows]
             normals, directions = (None if each is None else each[rows] for each in (normals, directions))
         if normals is None:
-            normals = _known_normals(sound_field.gain_field, places)
+            normals = sound_field.gain_field.normals(places)
         if normals is None:
             normals = outward_normals(places)
         if directions is not None:
@@ -227,12 +224,6 @@ def _check_points(
         raise ExportError.expected(f"one for each of {len(places)} points", len(normals), name="normals")
     if limit is not None and limit < 1:
         raise ExportError.expected("1 point or more", limit, name="limit")
-
-
-def _known_normals(gain_field: GainField, places: Float[Tensor, "points 3"]) -> Float64[Tensor, "points 3"] | None:
-    if isinstance(gain_field, ScaledGains):
-        return _known_normals(gain_field.field, places.double() / gain_field.length)
-    return gain_field.normals(places) if isinstance(gain_field, MixtureGains | BodyGains) else None
 
 
 _NEIGHBORS = 12

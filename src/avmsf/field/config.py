@@ -9,7 +9,7 @@ from avmsf.errors import FitError
 from avmsf.modal.config import scaled_fft_size
 
 AUTO, NETWORK = "auto", "network"
-GainModel = Literal["auto", "network", "smooth", "thin-plate", "symmetry", "visual", "elastic"]
+GainModelName = Literal["auto", "network", "smooth", "thin-plate", "symmetry", "visual", "elastic"]
 """How gains vary over an object: see `avmsf.field.gains.estimator`."""
 
 _COUNTS = ("clusters", "width", "hidden", "interleave", "early")

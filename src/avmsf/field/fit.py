@@ -19,14 +19,14 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import AvmsfWarning, FieldFileError, FitError
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
-from avmsf.field.gain_field import GainField, TrainableGains
 from avmsf.field.gains.estimator import MixtureEstimator
+from avmsf.field.gains.model import GainModel
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.losses import spectral_loss
 from avmsf.field.quality import with_quality
 from avmsf.field.recipes import GainCase, GainRecipe, along_phase, fingerprint, gain_case
 from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
-from avmsf.field.training import Targets, TrainingRun
+from avmsf.field.training import Targets, TrainableGains, TrainingRun
 from avmsf.gaussians.points import farthest_points
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_gains
@@ -117,7 +117,7 @@ def fit(
     return with_quality(field, used, advise=features.on_surface)
 
 
-def _finished(network: TrainableGains, order: Int[Tensor, " modes"], bank: ModalBank, case: GainCase) -> GainField:
+def _finished(network: TrainableGains, order: Int[Tensor, " modes"], bank: ModalBank, case: GainCase) -> GainModel:
     """Return trained gains with their modes in this order, those of the Gaussian process with their measured noise."""
     if not isinstance(network, RefinedGains):
         return network.finished(order)

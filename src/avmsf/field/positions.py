@@ -9,8 +9,7 @@ from torch import Tensor
 
 from avmsf.capture.placement import TOLERANCE
 from avmsf.errors import PositionError
-from avmsf.field.gain_field import GainField
-from avmsf.field.scaled_gains import body_of, length_of
+from avmsf.field.gains.model import GainModel
 
 _FEW = 16
 """Positions up to which all distances take less time than a tree of the points."""
@@ -43,18 +42,17 @@ def expect_near(
         )
 
 
-def off_surface(positions: Float[Tensor, "contacts 3"], gains: GainField) -> list[tuple[int, float]]:
+def off_surface(positions: Float[Tensor, "contacts 3"], gains: GainModel) -> list[tuple[int, float]]:
     """Return the rows of positions that lie off the object of gains, and their distances from it, meters.
 
     The object is the surface of the gains' body, or without a body their points. Off it is what is farther than
     `TOLERANCE` of the diagonal of the points' box, and without a body farther than twice the greatest distance from a
     point to its neighbor.
     """
-    known, body = gains.points.detach().cpu().double(), body_of(gains)
+    known, body = gains.points.detach().cpu().double(), gains.body
     limit = TOLERANCE * float((known.amax(0) - known.amin(0)).norm())
     if body is not None:
-        length = length_of(gains)
-        distances = length * body.distances(positions.detach().cpu().double() / length)
+        distances = gains.length * body.distances(positions.detach().cpu().double() / gains.length)
     else:
         distances = _distances(positions, known)
         if bool((distances > limit).any()):
@@ -63,17 +61,17 @@ def off_surface(positions: Float[Tensor, "contacts 3"], gains: GainField) -> lis
     return [(row, float(distances[row])) for row in torch.nonzero(distances > limit).flatten().tolist()]
 
 
-def off_surface_gains(gains: GainField) -> str:
+def off_surface_gains(gains: GainModel) -> str:
     """Return a message on which gains a position off the object has.
 
     Mode shapes of a body are those of its nearest surface point; kernels of the position take the position itself.
     """
-    if body_of(gains) is None:
+    if gains.body is None:
         return "the gains there are extrapolated"
     return "its gains are about those of the nearest surface point"
 
 
-def points_on_object(gains: GainField) -> Float32[Tensor, "points 3"]:
+def points_on_object(gains: GainModel) -> Float32[Tensor, "points 3"]:
     """Return the points of gains that are not `off_surface`: a reconstruction may close a deep cavity of the body.
 
     All of them where that would be none.

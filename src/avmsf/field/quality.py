@@ -9,8 +9,8 @@ from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import FitError
-from avmsf.field.gain_field import Gains
-from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.gains.model import Gains
 from avmsf.field.losses import spectral_loss, spectral_target
 from avmsf.field.sound_field import FieldQuality, SoundField
 from avmsf.field.suggest import suggest

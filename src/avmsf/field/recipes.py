@@ -18,10 +18,9 @@ from avmsf._utils.caching import source_digest
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import FitError
 from avmsf.features.feature_field import FeatureField
-from avmsf.field.attention import AttentionGains
 from avmsf.field.config import FitConfig
-from avmsf.field.gain_field import TrainableGains
-from avmsf.field.training import gain_scale
+from avmsf.field.gains.attention import AttentionGains
+from avmsf.field.training import TrainableGains, gain_scale
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.finders import ShortTime
 from avmsf.modal.extraction.least_squares import fit_sine_gains

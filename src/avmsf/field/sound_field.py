@@ -15,11 +15,10 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import PositionWarning
 from avmsf.field.config import FitConfig
-from avmsf.field.gain_field import GainField, Gains
-from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.gains.model import GainModel, Gains
 from avmsf.field.positions import expect_near, off_surface, off_surface_gains
 from avmsf.field.probable_body import ProbableBody
-from avmsf.field.scaled_gains import fitted_gains, length_of
 from avmsf.modal.extraction.alignment import Alignment
 from avmsf.modal.modes import ForcePulse, ModalBank
 from avmsf.modal.residual_noise import Residual, low_fluctuation_noise, shape_noise
@@ -144,7 +143,7 @@ class SoundField:
 
     bank: ModalBank
     """Frequencies and dampings, shared by all contacts."""
-    gain_field: GainField
+    gain_field: GainModel
     """Gains at contacts, and the factors on the dampings where these vary."""
     phase: Float64[Tensor, " modes"]
     """How each mode starts, radians: mode k sounds as exp(-d t) sin(2 pi f t + phase). Zero in the paper."""
@@ -215,11 +214,10 @@ class SoundField:
         `directions` as in `render`. Raises FitError for a field without a posterior: of the attention network, of
         recordings in one place, or guessed without recordings.
         """
-        from avmsf.field.uncertainty import parts_of, std_of
+        from avmsf.field.uncertainty import posterior
 
-        contacts, ways = self._impacts(positions, directions)
-        std = std_of(self, contacts, ways).square().sum(2).sqrt()
-        return GainPosterior(self._amplitudes(parts_of(self, contacts, ways)), std)
+        mean, std = posterior(self, *self._impacts(positions, directions))
+        return GainPosterior(self._amplitudes(mean), std.square().sum(2).sqrt())
 
     def aligned(self, impacts: Impacts) -> Impacts:
         """Return recordings of the object with the starts that the field's sounds have."""
@@ -323,10 +321,10 @@ class SoundField:
         samples: int,
     ) -> Float[Tensor, "contacts samples"]:
         """Return the mean of what the nearest recordings have in addition to their modes; silence after their end."""
-        gains, recordings = fitted_gains(self.gain_field), self.residual.recordings
+        gains, recordings = self.gain_field.fitted, self.residual.recordings
         assert isinstance(gains, MixtureGains)
         assert recordings is not None
-        rows, signs = gains.nearest(gains.sites(contacts.double() / length_of(self.gain_field), directions))
+        rows, signs = gains.nearest(gains.sites(contacts.double() / self.gain_field.length, directions))
         found = (recordings[rows] * signs[..., None]).mean(1).float()[:, :samples]
         return torch.nn.functional.pad(found, (0, samples - found.shape[1]))
 

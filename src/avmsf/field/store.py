@@ -30,10 +30,10 @@ from avmsf.capture.audio import HIGHEST_RATE, LOWEST_RATE, MAX_PEAK, MAX_SAMPLES
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import FieldFileError
 from avmsf.field.config import FitConfig
-from avmsf.field.gain_field import GainField
+from avmsf.field.gains.model import GainModel
+from avmsf.field.gains.scaled import FITTED, ScaledGains
 from avmsf.field.header import ADVICE, FORMAT, KEY, UNREADABLE, WHAT, damaged, key_of, record_of_text, value_of
 from avmsf.field.probable_body import ProbableBody
-from avmsf.field.scaled_gains import FITTED, ScaledGains
 from avmsf.field.sound_field import SUPPORTING, FieldQuality, Origin, SoundField
 from avmsf.modal.extraction.alignment import Alignment
 from avmsf.modal.modes import ModalBank
@@ -43,7 +43,7 @@ _GAINS, _ALIGNMENT = "gains.", "alignment."
 _POSITIVE = ("bank.frequency", "bank.damping")
 _MAX = {"bank.frequency": 1e9, "bank.damping": 1e9, "residual.magnitude": MAX_PEAK}
 """Largest values: hertz and 1/s beyond any solid's modes, and noise as loud as the loudest recording."""
-_KINDS: dict[str, type[GainField]] = {**FITTED, ScaledGains.kind: ScaledGains}
+_KINDS: dict[str, type[GainModel]] = {**FITTED, ScaledGains.kind: ScaledGains}
 """The gain fields that a file may hold, by what it calls them."""
 _RENAMED_EDITS = {"recast": "change_material", "retune": "adjust_modes", "steer": "guided"}
 """Kinds of edits that earlier versions wrote, and what they are called now."""

@@ -14,10 +14,10 @@ from avmsf._utils.arrays import ArrayLike, as_vectors, short_repr
 from avmsf._utils.progress import working
 from avmsf.errors import FitError
 from avmsf.field.gains.family import Sites
-from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.hammer_access import HAMMER_DIAMETER, MeshAccess, PointAccess
 from avmsf.field.sound_field import SoundField
-from avmsf.field.uncertainty import energy_of, parts_of, unedited_mixture
+from avmsf.field.uncertainty import energy_of, unedited_mixture
 from avmsf.gaussians.points import farthest_points
 
 PLACES = 400
@@ -144,7 +144,7 @@ class _ExpectedError:
             self.variance = self.variance + weight * torch.diagonal(known.covariance)[: self.points].clamp_min(0.0)
             self.shared.append(weight * known.covariance[:, -self.candidates :])
             self.noise.append(weight * known.noise)
-        expected = float(energy_of(field, parts_of(field, points.float())).mean())
+        expected = float(energy_of(field, gains.predict(points.float()).parts).mean())
         self.energy = expected + float(self.variance.mean())
 
     def map(self) -> Float64[Tensor, " points"]:

@@ -14,7 +14,7 @@ from torch.optim.adamw import adamw
 from avmsf._utils.device import TRAINABLE, without_denormals
 from avmsf.capture.impacts import Impacts
 from avmsf.field.config import FitConfig
-from avmsf.field.gain_field import TrainableGains
+from avmsf.field.gains.model import GainModel, Gains
 from avmsf.field.losses import SpectralTarget, spectral_loss, spectral_target
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.modes import ModalBank
@@ -103,6 +103,31 @@ class AdamW:
             [[to.to(at.device, copy=True) for to, at in zip(*each, strict=True)] for each in zip(*group, strict=True)]
             for group in zip(moments, self.moments, strict=True)
         ]
+
+
+class TrainableGains(nn.Module):
+    """A gain model in training. Its matrices decay towards zero as the config asks for, other parameters do not."""
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """What it chose before the training, as plain values."""
+        return {}
+
+    def used_rows(self, contacts: int) -> list[int]:
+        """Return which of the contacts it was started from, as many as `contacts`, are to be trained on."""
+        return list(range(contacts))
+
+    def read(self, rows: Int[Tensor, " contacts"]) -> Gains:
+        """Return the gains at the contacts that `Targets.rows` stands for, differentiable in the parameters."""
+        raise NotImplementedError
+
+    def penalty(self) -> Float[Tensor, ""]:
+        """Return the negative log prior of the parameters, in the unit of the spectral loss."""
+        return torch.zeros(())
+
+    def finished(self, order: Int[Tensor, " modes"]) -> GainModel:
+        """Return the gain model as it is, with its modes in the given order."""
+        raise NotImplementedError
 
 
 class TrainingRun:

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from avmsf._utils.arrays import Seed, generator_of
 from avmsf.errors import FitError
-from avmsf.field.gains.model import MixtureGains
-from avmsf.field.scaled_gains import BodyGains, ScaledGains, fitted_gains
+from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.gains.scaled import BodyGains, ScaledGains
 from avmsf.field.sound_field import SoundField
 from avmsf.modal.modes import turned_like
 from avmsf.modal.synthesis import synthesize
@@ -80,7 +80,7 @@ def fitted_mixture(field: SoundField) -> MixtureGains:
 
     Raises FitError where its uncertainty is not known: for the attention network, and for contacts in a single place.
     """
-    gains = fitted_gains(field.gain_field)
+    gains = field.gain_field.fitted
     if isinstance(gains, BodyGains):
         raise FitError(
             "field: expected one fitted to recordings, got one computed without; record impacts and fit",
@@ -108,31 +108,24 @@ def scale_of(field: SoundField) -> Float64[Tensor, " modes"]:
 
 def training_contacts(field: SoundField) -> Float64[Tensor, "contacts 3"]:
     """Return the contacts that the gains were fitted to, meters, on the object as it is. Raises as `fitted_mixture`."""
-    fitted, gains = fitted_mixture(field), field.gain_field
-    return gains.contacts.double() if isinstance(gains, ScaledGains) else fitted.contacts
-
-
-def std_of(
-    field: SoundField, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
-) -> Float64[Tensor, "contacts modes 2"]:
-    """Return the posterior standard deviation of both parts of the gains. Raises as `fitted_mixture`."""
     fitted_mixture(field)
-    deviation = field.gain_field.deviation(contacts, directions)
-    assert deviation is not None
-    return deviation.double()
+    return field.gain_field.contacts
+
+
+def posterior(
+    field: SoundField, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+) -> tuple[Float64[Tensor, "contacts modes 2"], Float64[Tensor, "contacts modes 2"]]:
+    """Return the mean of both parts of the gains, and their standard deviation. Raises as `fitted_mixture`."""
+    fitted_mixture(field)
+    with torch.no_grad():
+        known = field.gain_field.posterior(contacts, directions)
+    assert known.std is not None
+    return known.parts, known.std.double()
 
 
 def energy_of(field: SoundField, gains: Float[Tensor, "contacts modes 2"]) -> Float64[Tensor, " contacts"]:
     """Return the energy of gains in two parts: the sum over audible modes of squares over four times the damping."""
     return (gains.double().square().sum(2) * field.audible / (4.0 * field.bank.damping.double())).sum(1)
-
-
-def parts_of(
-    field: SoundField, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
-) -> Float64[Tensor, "contacts modes 2"]:
-    """Return both parts of the mean gains."""
-    with torch.no_grad():
-        return field.gain_field.at(contacts, directions).parts
 
 
 def relative_gain_std(field: SoundField, points: Float[Tensor, "points 3"]) -> Float64[Tensor, " points"]:
@@ -143,8 +136,8 @@ def relative_gain_std(field: SoundField, points: Float[Tensor, "points 3"]) -> F
     """
     surface = field.gain_field.points
     step = max(1, len(surface) // _MAPPED)
-    energy = energy_of(field, parts_of(field, surface[::step])).mean()
-    variance = energy_of(field, std_of(field, points))
+    energy = energy_of(field, field.gain_field.predict(surface[::step]).parts).mean()
+    variance = energy_of(field, posterior(field, points)[1])
     return (variance / energy.clamp_min(torch.finfo(torch.float64).tiny)).sqrt()
 
 
@@ -164,7 +157,7 @@ def spectrum_band(
     """
     _expect_level(level)
     contacts, along = contact[None], None if direction is None else direction[None]
-    mean, spread = parts_of(field, contacts, along)[0], std_of(field, contacts, along)[0]
+    mean, spread = (each[0] for each in posterior(field, contacts, along))
     generator = generator_of(seed)
     drawn = mean + spread * torch.randn(_DRAWS, *mean.shape, generator=generator, dtype=torch.float64)
     spectra = torch.zeros(_DRAWS, field.samples // 2 + 1, dtype=torch.complex128)
@@ -208,9 +201,8 @@ def coverage(
             name="parts",
             value=list(parts.shape),
         )
-    deviation = std_of(field, contacts, directions)
+    predicted, deviation = posterior(field, contacts, directions)
     spread = (deviation.square() + scale * gains.noise().square()).sqrt()
-    predicted = parts_of(field, contacts, directions)
     parts = turned_like(parts, predicted)
     within = (parts - predicted).abs() <= NormalDist().inv_cdf(0.5 + level / 2.0) * spread
     energy = (

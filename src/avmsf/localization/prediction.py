@@ -12,8 +12,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avmsf.field.gains.model import MixtureGains
-from avmsf.field.scaled_gains import fitted_gains
+from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.sound_field import SoundField
 from avmsf.field.uncertainty import fitted_mixture, has_posterior, scale_of
 from avmsf.gaussians.points import farthest_points
@@ -65,12 +64,12 @@ def predict(
     for rows in torch.split(torch.arange(len(points)), _BATCH):
         place = points[rows], None if directions is None else directions[rows]
         with torch.no_grad():
-            known = sound_field.gain_field.at(*place)
-            deviation = None if factor is None else sound_field.gain_field.deviation(*place)
-        if factor is None or deviation is None:
+            gain_model = sound_field.gain_field
+            known = gain_model.predict(*place) if factor is None else gain_model.posterior(*place)
+        if factor is None or known.std is None:
             variances.append(torch.zeros(known.mean.shape))
         else:
-            variances.append((factor * deviation).square().sum(2).float())
+            variances.append((factor * known.std).square().sum(2).float())
         ahead = torch.zeros_like(known.mean) if known.quadrature is None else known.quadrature
         gains.append(torch.complex(known.mean.float(), ahead.float()) * rotated)
         if known.damping is not None:
@@ -114,7 +113,7 @@ _AREA_NEIGHBORS = 6
 
 def distinct_contacts(field: SoundField) -> int | None:
     """Return how many contacts in different places a field was fitted to; None where that is not known."""
-    gains = fitted_gains(field.gain_field)
+    gains = field.gain_field.fitted
     if isinstance(gains, MixtureGains):
         return gains.place_count
     return len(field.origin.trained_on) or None

@@ -10,7 +10,7 @@ from typing import Literal, get_args
 
 from avmsf._utils.text import changes_repr
 from avmsf.errors import FitError, SceneError, SimulationError
-from avmsf.field.config import PAPER, FitConfig, GainModel
+from avmsf.field.config import PAPER, FitConfig, GainModelName
 from avmsf.gaussians.config import SplatConfig
 from avmsf.modal.config import ExtractionMethod
 
@@ -150,7 +150,7 @@ class PipelineConfig:
 
     __repr__ = changes_repr
 
-    gain_model: GainModel = "auto"
+    gain_model: GainModelName = "auto"
     """How gains vary over the object."""
     body: BodyConfig = field(default_factory=BodyConfig)
     """How finite-element models are made of the object's shape."""
@@ -170,7 +170,7 @@ class PipelineConfig:
 
     def __post_init__(self) -> None:
         """Raise FitError for the name of no gain model or extraction method, and for no modes."""
-        for name, known in (("gain_model", GainModel), ("extraction", ExtractionMethod)):
+        for name, known in (("gain_model", GainModelName), ("extraction", ExtractionMethod)):
             value = getattr(self, name)
             if value not in get_args(known):
                 raise FitError.expected(f"one of {', '.join(get_args(known))}", value, name=name)

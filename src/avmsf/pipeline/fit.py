@@ -19,7 +19,7 @@ from avmsf.capture.together import find_surface
 from avmsf.errors import AvmsfError, FitError, SceneError
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.material import Material, material_named
-from avmsf.field.config import AUTO, NETWORK, GainModel
+from avmsf.field.config import AUTO, NETWORK, GainModelName
 from avmsf.field.fit import Progress
 from avmsf.field.fit import fit as fit_field
 from avmsf.field.gains.elastic import CandidateBodies, Elastic
@@ -73,7 +73,7 @@ class StagedFit:
 
 def fit(
     capture: Capture | Surface | str | Path,
-    gain_model: GainModel | None = None,
+    gain_model: GainModelName | None = None,
     *,
     material: Material | str | None = None,
     features: FeatureField | None = None,
@@ -292,7 +292,7 @@ def guess_in_stages(
 
 
 def _configured(
-    config: PipelineConfig, gain_model: GainModel | None, seed: int | None, device: str | None
+    config: PipelineConfig, gain_model: GainModelName | None, seed: int | None, device: str | None
 ) -> PipelineConfig:
     if gain_model is not None:
         config = replace(config, gain_model=gain_model)

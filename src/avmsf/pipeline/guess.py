@@ -20,7 +20,7 @@ from avmsf.fem.material import Material, material_named
 from avmsf.fem.mesh_filling import Shape
 from avmsf.fem.radiation import radiated_pressure
 from avmsf.field.config import FitConfig
-from avmsf.field.scaled_gains import BodyGains
+from avmsf.field.gains.scaled import BodyGains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.mesh.surface import Surface
 from avmsf.modal.modes import ModalBank

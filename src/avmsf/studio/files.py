@@ -23,7 +23,6 @@ from avmsf.export.formats import MAX_POINTS
 from avmsf.export.sampled_field import SampledField, outward_normals, supporting_columns
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.positions import points_on_object
-from avmsf.field.scaled_gains import fitted_gains, length_of, surface_of
 from avmsf.field.sound_field import SoundField
 from avmsf.field.uncertainty import scale_of
 from avmsf.gaussians.ply import read_splats
@@ -116,7 +115,7 @@ class Showcase:
         shown = find_object(self.opened)
         if field is None or (shown is not None and not is_gaussians(shown)):
             return find_reconstructed(self.opened)
-        return surface_of(fitted_gains(field.gain_field)) or find_reconstructed(self.opened)
+        return field.gain_field.fitted.surface or find_reconstructed(self.opened)
 
     def _sampled(self, revision: Revision) -> SampledField:
         """Return a revision's table: that of the one before, changed, where the field is the same."""
@@ -135,7 +134,7 @@ class Showcase:
         if not len(own):
             return sample(field, *self._clickable())
         sampled = SampledField.of(field, _thinned(own, MAX_POINTS))
-        return replace(sampled, points=(sampled.points.double() / length_of(field.gain_field)).float())
+        return replace(sampled, points=(sampled.points.double() / field.gain_field.length).float())
 
     def _is_other_field(self, revision: Revision) -> bool:
         """Whether a revision is of another field than the one shown before it, or of the first."""
@@ -203,7 +202,7 @@ def _thinned(points: Float[Tensor, "points 3"], most: int) -> Float[Tensor, "kep
 
 def sample(field: SoundField, points: Float[Tensor, "points 3"], normals: Float[Tensor, "points 3"]) -> SampledField:
     """Return the table of a field at points of the object that it was fitted to, meters."""
-    sampled = SampledField.of(field, points.double() * length_of(field.gain_field), normals)
+    sampled = SampledField.of(field, points.double() * field.gain_field.length, normals)
     return replace(sampled, points=points)
 
 
@@ -212,9 +211,7 @@ def resample(sampled: SampledField, before: SoundField, after: SoundField) -> Sa
 
     None if that is not possible: for another fitted field, another phase, or a mode that was inaudible or muted.
     """
-    if fitted_gains(before.gain_field) is not fitted_gains(after.gain_field) or not torch.equal(
-        before.phase, after.phase
-    ):
+    if before.gain_field.fitted is not after.gain_field.fitted or not torch.equal(before.phase, after.phase):
         return None
     old, new = scale_of(before), scale_of(after)
     if bool((after.audible & (~before.audible | ((old == 0) & (new != 0)))).any()):

@@ -19,7 +19,6 @@ from avmsf._utils.text import printable
 from avmsf.capture.audio import Recording
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import AvmsfError
-from avmsf.field.scaled_gains import length_of
 from avmsf.field.sound_field import SoundField
 from avmsf.localization.contact_map import LEVEL, ContactMap, enlarged, symmetries_of
 from avmsf.localization.locate import locate_impacts
@@ -113,7 +112,7 @@ class Searches:
         """Return the locator of a revision; its tables are computed at the first use."""
         if self._finder is None or self._finder[0] != revision.number:
             field = revision.require_field()
-            length = length_of(field.gain_field)
+            length = field.gain_field.length
             points = (self.showcase.current.sampled.points.double() * length).float()
             settings = None if self.editor is None else self.editor.settings
             finder = Finder(field, points, length, self._symmetries[revision.opening], settings)

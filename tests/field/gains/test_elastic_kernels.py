@@ -24,7 +24,7 @@ from avmsf.field.gains.elastic import (
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, hypotheses_of, weigh_factors
 from avmsf.field.gains.mixture import NOISE_SHARES, log_evidence
-from avmsf.field.gains.model import MixtureGains, series_of
+from avmsf.field.gains.mixture_gains import MixtureGains, series_of
 from factories.gain_cases import SIZE, families, impacts, measured, plate
 
 SHAPES = 6
@@ -44,7 +44,7 @@ def row_of(profile: int, shape: int, remainder: int) -> int:
 def error_elsewhere(model: MixtureGains) -> torch.Tensor:
     """Return each mode's error at new places over its size there."""
     asked = impacts(60, seed=5)
-    gains = model.at(asked.points, asked.directions)
+    gains = model.predict(asked.points, asked.directions)
     true = measured(asked, noise=0.0).values
     error = torch.complex(gains.mean, gains.quadrature) - true
     return (error.abs().square().mean(0) / true.abs().square().mean(0)).sqrt()

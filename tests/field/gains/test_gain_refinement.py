@@ -34,7 +34,7 @@ def read(gains: RefinedGains, rows: torch.Tensor = USED) -> torch.Tensor:
 
 
 def mean_at_contacts(gains) -> torch.Tensor:
-    found = gains.at(gains.contacts, gains.training.directions)
+    found = gains.predict(gains.contacts, gains.training.directions)
     return torch.complex(found.mean.double(), found.quadrature.double())
 
 
@@ -73,7 +73,7 @@ def test_finished_is_the_model_of_the_moved_values_in_another_order():
     expected = model().with_values(refined(0.01).finished(torch.arange(MODES)).values).take(ORDER)
     assert torch.equal(finished.values, expected.values)
     assert torch.equal(
-        finished.at(asked.points, asked.directions).mean, expected.at(asked.points, asked.directions).mean
+        finished.predict(asked.points, asked.directions).mean, expected.predict(asked.points, asked.directions).mean
     )
     assert not finished.mixture.values.requires_grad
 

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from avmsf.capture.impacts import SAME_PLACE, places_of
-from avmsf.field.gains import model as module
+from avmsf.field.gains import mixture_gains as module
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import fit_mixture
 from avmsf.field.gains.mixture import NOISE_SHARES
-from avmsf.field.gains.model import MixtureGains, series_of
+from avmsf.field.gains.mixture_gains import MixtureGains, series_of
 from factories.gain_cases import draw, families, impacts, measured, model
 
 ASKED = impacts(9, seed=5)
@@ -19,12 +19,12 @@ MODES = 5
 
 
 def gains_at(given: MixtureGains, sites: Sites = ASKED) -> torch.Tensor:
-    found = given.at(sites.points, sites.directions)
+    found = given.predict(sites.points, sites.directions)
     return torch.complex(found.mean.double(), found.quadrature.double())
 
 
 def deviation_at(given: MixtureGains, sites: Sites = ASKED) -> torch.Tensor:
-    return given.deviation(sites.points, sites.directions).double()
+    return given.posterior(sites.points, sites.directions).std.double()
 
 
 def joint_kernels(given: MixtureGains) -> torch.Tensor:
@@ -49,7 +49,7 @@ def dense(given: MixtureGains, kernel: torch.Tensor, share: int, series: int) ->
 def test_hypotheses_of_opposite_signs_do_not_cancel_in_the_estimate():
     """The estimate has the sign of the mean and at least its magnitude; with one hypothesis it is the mean."""
     given = model(elastic=True)
-    mean, estimate = given.at(ASKED.points, ASKED.directions), given.point_estimate(ASKED.points, ASKED.directions)
+    mean, estimate = given.predict(ASKED.points, ASKED.directions), given.point_estimate(ASKED.points, ASKED.directions)
     for one, other in ((mean.mean, estimate.mean), (mean.quadrature, estimate.quadrature)):
         assert torch.equal(one.sign(), other.sign())
         assert bool((other.abs() >= one.abs() * (1 - 1e-5)).all())
@@ -57,7 +57,7 @@ def test_hypotheses_of_opposite_signs_do_not_cancel_in_the_estimate():
     best = given.mixture.weights.flatten(0, 1)
     single = torch.zeros_like(best).scatter_(0, best.argmax(0, keepdim=True), 1.0).reshape(given.mixture.weights.shape)
     sure = replace(given, mixture=replace(given.mixture, weights=single))
-    both = sure.at(ASKED.points, ASKED.directions), sure.point_estimate(ASKED.points, ASKED.directions)
+    both = sure.predict(ASKED.points, ASKED.directions), sure.point_estimate(ASKED.points, ASKED.directions)
     assert torch.allclose(both[0].parts, both[1].parts, rtol=1e-5, atol=1e-7)
 
 
@@ -331,7 +331,7 @@ def test_a_model_comes_back_from_its_tensors_to_the_last_bit(elastic):
     assert torch.equal(gains_at(back), gains_at(given))
     assert torch.equal(deviation_at(back), deviation_at(given))
     assert torch.equal(back.point_estimate(ASKED.points).parts, given.point_estimate(ASKED.points).parts)
-    assert torch.equal(back.at(ASKED.points).mean, given.at(ASKED.points).mean)
+    assert torch.equal(back.predict(ASKED.points).mean, given.predict(ASKED.points).mean)
     assert torch.equal(back.leave_one_out(), given.leave_one_out())
     assert torch.equal(back.standardized_errors(), given.standardized_errors())
     pairs = zip(*(each.covariances(ASKED.points, None) for each in (back, given)), strict=True)

@@ -12,7 +12,7 @@ from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.labels import better_order, two_levels
 from avmsf.field.gains.mixture import NOISE_SHARES
-from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.outliers import (
     WIDE_NOISE_SHARES,
     Credibility,

@@ -8,7 +8,7 @@ import torch
 from avmsf.field.gains import symmetry
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
-from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.symmetry.characters import groups_of
@@ -112,7 +112,7 @@ def test_gains_on_the_other_side_are_those_of_the_mirrored_contact_with_the_mode
     model = fit(of(X), known, torch.cat([values, sign * values[:3]]))
     beyond = reflected(near).take(torch.arange(3, 6))
     here = near.take(torch.arange(3, 6))
-    there, own = (model.at(each.points, each.directions).mean for each in (beyond, here))
+    there, own = (model.predict(each.points, each.directions).mean for each in (beyond, here))
     assert float(own.abs().max()) > 0.1
     torch.testing.assert_close(there, sign * own)
 
@@ -127,8 +127,8 @@ def test_predictions_move_with_the_object() -> None:
         return Sites(sites.points @ turn.T + shift, sites.directions @ turn.T)
 
     there = of(mirror(turn @ X.normal, turn @ CENTER + shift), mirror(turn @ Y.normal, turn @ CENTER + shift))
-    first = fit(of(X, Y), known, values).at(places.points, places.directions)
-    second = fit(there, moved(known), values).at(moved(places).points, moved(places).directions)
+    first = fit(of(X, Y), known, values).predict(places.points, places.directions)
+    second = fit(there, moved(known), values).predict(moved(places).points, moved(places).directions)
     torch.testing.assert_close(first.mean, second.mean, atol=1e-4, rtol=1e-3)
 
 
@@ -144,7 +144,7 @@ def test_a_model_that_was_saved_says_the_same() -> None:
     }
     read = MixtureGains.restore(model.record(), tensors)
     torch.testing.assert_close(
-        read.at(places.points, places.directions).mean, model.at(places.points, places.directions).mean
+        read.predict(places.points, places.directions).mean, model.predict(places.points, places.directions).mean
     )
 
 

@@ -4,7 +4,7 @@ import torch
 
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
-from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.positional import Unstructured, Visual
 
 SIZE = 1.0
@@ -47,7 +47,7 @@ def test_places_that_look_alike_share_gains() -> None:
     known = sites(points[:20:2].double())
     values = features[:20:2, :1].to(torch.complex128) * torch.tensor([1.0, 2.0j], dtype=torch.complex128)
     far = points[20::2].double()
-    predicted = fit(known, values).at(far)
+    predicted = fit(known, values).predict(far)
     torch.testing.assert_close(predicted.mean[:, 0], values[:, 0].real.float(), atol=0.1, rtol=0.0)
     torch.testing.assert_close(predicted.quadrature[:, 1], values[:, 1].imag.float(), atol=0.2, rtol=0.0)
 
@@ -69,4 +69,4 @@ def test_a_model_that_was_saved_says_the_same() -> None:
         name: (each.shape, each.dtype) for name, each in tensors.items()
     }
     read = MixtureGains.restore(model.record(), tensors)
-    torch.testing.assert_close(read.at(points).mean, model.at(points).mean)
+    torch.testing.assert_close(read.predict(points).mean, model.predict(points).mean)

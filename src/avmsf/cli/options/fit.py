@@ -14,7 +14,7 @@ from avmsf.cli.options.common import Flag, Printing, option_of, parse_options, p
 from avmsf.cli.options.paths import CacheFolder, Existing, NewFile, PlotsFolder, SettingsFile
 from avmsf.errors import EvaluationError, FitError
 from avmsf.fem.material import material_named
-from avmsf.field.config import FitConfig, GainModel
+from avmsf.field.config import FitConfig, GainModelName
 from avmsf.gaussians.config import SplatConfig
 from avmsf.modal.config import ExtractionMethod
 from avmsf.pipeline.config import (
@@ -86,7 +86,7 @@ class Options(Printing):
     where the gain model reads features."""
     without_shape: Flag = False
     """Fit to the positions of the contacts alone, whatever shows the object's shape."""
-    gain_model: GainModel = "auto"
+    gain_model: GainModelName = "auto"
     """How gains vary over the object. auto: a Gaussian process over all kernel families, weighted by evidence; the
     elastic family needs a shape. network: the paper's attention network on image features. The others: a Gaussian
     process over one family, for study; symmetry needs a shape, visual image features."""

@@ -22,13 +22,13 @@ from avmsf.fem.material import largest_factor
 from avmsf.fem.supports import FREE, FREE_PRIOR
 from avmsf.fem.thickness import search_thickness
 from avmsf.fem.updating import update
-from avmsf.field.config import AUTO, NETWORK, GainModel
+from avmsf.field.config import AUTO, NETWORK, GainModelName
 from avmsf.field.gains.elastic import CandidateBodies, Elastic
 from avmsf.field.gains.family import KernelFamily, Sites, sites_along
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, matched, total_evidence
 from avmsf.field.gains.labels import better_order, two_levels
 from avmsf.field.gains.mixture import NOISE_SHARES
-from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.outliers import Fit, Judgment, assess_contacts, predicts_better
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.refinement import RefinedGains
@@ -209,7 +209,7 @@ class MixtureEstimator(GainRecipe):
 
 
 def estimator_for(
-    name: GainModel,
+    name: GainModelName,
     bodies: Callable[[], CandidateBodies],
     *,
     symmetries: Callable[[], Symmetries | None] = lambda: None,

@@ -43,7 +43,7 @@ from avmsf.capture.impacts import places_of
 from avmsf.field.gains.family import KernelFamily, Sites
 from avmsf.field.gains.fitting import MeasuredGains
 from avmsf.field.gains.mixture import NOISE_SHARES
-from avmsf.field.gains.model import MixtureGains, series_of
+from avmsf.field.gains.mixture_gains import MixtureGains, series_of
 
 WIDE_NOISE_SHARES = (*NOISE_SHARES, 0.1, 0.3, 1.0, 3.0)
 """A wrong label may look like noise: the hypotheses that contacts are judged by have to allow for it."""

@@ -6,8 +6,9 @@ import torch
 from jaxtyping import Complex128, Float, Float32, Float64, Int
 from torch import Tensor, nn
 
-from avmsf.field.gain_field import Gains, TrainableGains
-from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.gains.model import Gains
+from avmsf.field.training import TrainableGains
 from avmsf.modal.modes import ModalBank, turned_like
 
 _STEP = 200.0

@@ -13,7 +13,8 @@ from torch import Tensor, nn
 from avmsf._utils.text import RecordError, count_of, like, record_of
 from avmsf.features.feature_field import FeatureField, Regions
 from avmsf.field.config import AttentionShape
-from avmsf.field.gain_field import GainField, Gains, TrainableGains
+from avmsf.field.gains.model import GainModel, Gains
+from avmsf.field.training import TrainableGains
 
 _MAX_LAYERS = 64
 """Hidden layers, or bands of frequency, of a network in a file: thirty times those of the paper's. Each takes time
@@ -21,7 +22,7 @@ to build before it can be compared with the file's tensors."""
 _EXAMPLE = AttentionShape(clusters=1, bands=0, width=1, hidden=1, layers=0, feature_scale=1.0)
 
 
-class AttentionGains(TrainableGains, GainField):
+class AttentionGains(TrainableGains, GainModel):
     """Gains from a contact's own feature and from attention over the object's regions (paper, eqs. 7-11).
 
     Holds the points it looks contacts up in, so that a saved network needs nothing else.
@@ -100,12 +101,14 @@ class AttentionGains(TrainableGains, GainField):
                     layer.weight.copy_(layer.weight[modes])
                     layer.bias.copy_(layer.bias[modes])
 
-    def at(self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None) -> Gains:
+    def predict(
+        self, points: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Gains:
         """Return the gains at the contacts, for any direction, and the factors where dampings vary."""
-        return self.read(self.feature_field.nearest(contacts))
+        return self.read(self.feature_field.nearest(points))
 
     def read(self, rows: Int[Tensor, " contacts"]) -> Gains:
-        """Return what `at` does for the points of the given rows; differentiable in the network's parameters."""
+        """Return what `predict` does for the points of the given rows; differentiable in the network's parameters."""
         feature = self.features[rows] * self.shape.feature_scale
         # The object's size as a tensor, since a number of it would wait for the device.
         half_diagonal = torch.dist(*self.points.aminmax(dim=0)) / 2

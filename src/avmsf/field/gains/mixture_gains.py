@@ -1,0 +1,455 @@
+"""The gain model: kernel families weighed by evidence, and their predictions anywhere on the object."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import accumulate
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Bool, Complex128, Float, Float32, Float64, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from avmsf._utils.arrays import short_repr
+from avmsf._utils.text import RecordError, count_of, like
+from avmsf.capture.impacts import places_of
+from avmsf.fem.elastic_modes import ElasticModes
+from avmsf.fem.elastic_store import mode_sizes, mode_skeleton, mode_tensors, restored_modes
+from avmsf.field.gains.elastic import Elastic
+from avmsf.field.gains.family import Family, KernelFamily, Sites, nearest_sites, sites_along
+from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture, Predictions
+from avmsf.field.gains.model import GainModel, Gains
+from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured, Visual
+from avmsf.field.gains.symmetry import Symmetric
+from avmsf.symmetry.characters import Group
+
+NEIGHBORS = 3
+"""Nearest recordings that are averaged, as in the paper's baseline."""
+_MEMORY = 16_000_000
+"""Covariances between places and contacts that are held at once, over all kernels."""
+_FORM_ENTRIES = 16_000_000
+"""Largest number of entries of one family's matrices for the variance, which are kept: 128 MB."""
+_PRODUCTS = 64
+"""Sites whose products of factors are held at once."""
+_POSITIONAL: dict[str, type[KernelFamily]] = {each.kind: each for each in (Unstructured, Smooth, ThinPlate)}
+_OF_OBJECT = {Elastic.kind: "bodies", Symmetric.kind: "symmetries", Visual.kind: "features"}
+"""Families that know something of the object, and the entry of the record with its size."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceCovariance:
+    """The posterior of one mode's gains at some places."""
+
+    covariance: Float64[Tensor, "places places"]
+    """Between the gains at places, summed over their two parts."""
+    noise: float
+    """Variance of the noise of one more measured gain, likewise."""
+
+
+@dataclass(frozen=True, eq=False)
+class MixtureGains(GainModel):
+    """Gains as a Gaussian process over several kernel families, each kernel weighed by its evidence."""
+
+    __repr__ = short_repr
+
+    points: Float32[Tensor, "points 3"]
+    """Points of the object's surface, object frame, meters."""
+    training: Sites
+    """The impacts that the gains are known at."""
+    families: tuple[KernelFamily, ...]
+    """At least one."""
+    kept: tuple[Int[Tensor, " _kept"], ...]
+    """Rows of each family's kernels that have a weight."""
+    mixture: KernelMixture
+    """Of the kept kernels in this order; its series are the real parts of all modes' gains, then the imaginary ones."""
+    directional: bool
+    """Whether directions of impacts are known, or a body says which way its surface faces."""
+    spread_share: float = 0.0
+    """How much of the deviation within hypotheses the magnitudes of rendered gains take into account, 0 to 1."""
+    measured: Complex128[Tensor, "contacts modes"] | None = None
+    """The gains of the field's own modes in the recordings, by which the model judges itself; None for `values`."""
+    report: dict[str, Any] = field(default_factory=dict)
+    """What the fit found, as plain values; not saved."""
+
+    kind: ClassVar[str] = "mixture"
+
+    @property
+    def contacts(self) -> Float64[Tensor, "contacts 3"]:
+        """Their places, meters."""
+        return self.training.points
+
+    @property
+    def values(self) -> Complex128[Tensor, "contacts modes"]:
+        """The gains there."""
+        return _complex(self.mixture.values)
+
+    @property
+    def place_count(self) -> int:
+        """How many separate places the contacts are in."""
+        return int(self.places.max()) + 1
+
+    @property
+    def places(self) -> Int[Tensor, " contacts"]:
+        """Number of each contact's place, from 0 on."""
+        return places_of(self.contacts)
+
+    def sites(
+        self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Sites:
+        """Return impacts; without a direction, or with one of length zero, they go straight into the body.
+
+        Where there is no body they go as the nearest training impact does. Where the model knows nothing of directions,
+        all are alike.
+        """
+        return sites_along(contacts.double(), directions if self.directional else None, self._straight)
+
+    def nearest(
+        self, sites: Sites, others: Int[Tensor, " sites"] | None = None
+    ) -> tuple[Int[Tensor, "sites near"], Float64[Tensor, "sites near"]]:
+        """Return the rows of the three nearest training impacts and the sign of each, by `nearest_sites`.
+
+        `others` is the place number of each site, whose own training impacts are left out.
+        """
+        own = None if others is None else others[:, None] == self.places
+        return nearest_sites(sites, self.training, size=self.families[0].size, count=NEIGHBORS, excluded=own)
+
+    @property
+    def body(self) -> ElasticModes | None:
+        """The elastic modes of the first body that the gains know, which gives the surface; None without one.
+
+        Predictions are means over all bodies, whose surfaces are alike but for the resolution of their elements.
+        """
+        return next((each.modes for each in self._of(Elastic)), None)
+
+    def predict(
+        self, points: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Gains:
+        """Return the mean gains of impacts, see `sites`."""
+        return _gains(self._mean(self.sites(points, directions)))
+
+    def point_estimate(
+        self, points: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Gains:
+        """Return the mean magnitudes of the gains, as far as `spread_share` goes, with the signs of the mean gains."""
+        sites = self.sites(points, directions)
+        magnitudes = [self._magnitude(some) for some in self._batches(sites)]
+        return _gains(torch.cat(magnitudes).copysign(self._mean(sites)))
+
+    def posterior(
+        self, points: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Gains:
+        """Return the mean gains with the standard deviation of both parts, without the noise of a measurement."""
+        sites = self.sites(points, directions)
+        std = torch.cat([self._std(some) for some in self._batches(sites)])
+        return replace(_gains(self._mean(sites)), std=_parts(std).float())
+
+    def noise(self) -> Float64[Tensor, "modes 2"]:
+        """Return the standard deviation of the noise in both parts of a measured gain."""
+        return _parts(self.mixture.standard_error()[None])[0]
+
+    def smoother(self) -> Float64[Tensor, "modes 2 contacts contacts"]:
+        """Return the matrices by which the mean at the contacts is linear in the gains there."""
+        found = self.mixture.smoother()
+        return found.reshape(2, -1, *found.shape[1:]).transpose(0, 1)
+
+    def leave_one_out(self) -> Complex128[Tensor, "contacts modes"]:
+        """Return the gains at each contact as the measured ones at all other places predict them."""
+        return _complex(self._left_out.mean)
+
+    def left_out_estimate(self, share: float) -> Gains:
+        """Return `point_estimate` at each contact from the measured gains at all other places, for a spread share."""
+        left = self._left_out
+        return _gains(left.of_means.lerp(left.magnitude, share).copysign(left.mean))
+
+    def standardized_errors(self) -> Float64[Tensor, "contacts modes 2"]:
+        """Return the leave-one-place-out errors of the measured gains over their predicted standard deviations.
+
+        NaN for parts of modes without any gains.
+        """
+        left, measured = self._left_out, self.values if self.measured is None else self.measured
+        scores = (series_of(measured) - left.mean) / left.deviation
+        power = self.mixture.values.square().sum(0)
+        return _parts(torch.where(power > 0, scores, torch.nan))
+
+    def covariances(
+        self, contacts: Float64[Tensor, "places 3"], directions: Float64[Tensor, "places 3"] | None
+    ) -> Iterator[PlaceCovariance]:
+        """Yield the posterior of each mode's gains at places, by the mode's most probable hypothesis."""
+        sites, count = self.sites(contacts, directions), len(self.contacts)
+        modes = self.mixture.values.shape[1] // 2
+        energy = self.mixture.values.square().sum(0)
+        both = (self.mixture.weights * energy).reshape(*self.mixture.weights.shape[:2], 2, modes).sum(2)
+        best = both.flatten(0, 1).argmax(0)
+        scale = self.mixture.quadratic.reshape(*self.mixture.weights.shape[:2], 2, modes).sum(2) / count
+        rows, shares = best // len(self.mixture.noise_shares), best % len(self.mixture.noise_shares)
+        kernels = self._kernels_between(sites, sites, rows), self._kernels_between(sites, self.training, rows)
+        for mode, (row, share) in enumerate(zip(rows.tolist(), shares.tolist(), strict=True)):
+            own, cross = (each[row] for each in kernels)
+            noise = float(self.mixture.noise_variance[share, mode])
+            known = self.mixture.kernels[row] + noise * torch.eye(count, dtype=torch.float64)
+            half = torch.linalg.solve_triangular(torch.linalg.cholesky(known), cross.T, upper=False)
+            size = float(scale[row, share, mode])
+            yield PlaceCovariance(size * (own - half.T @ half), size * noise)
+
+    def with_values(self, values: Complex128[Tensor, "contacts modes"]) -> "MixtureGains":
+        """Return the model of other gains at the same contacts, its hypotheses weighed as before."""
+        return replace(self, mixture=self.mixture.with_values(series_of(values)))
+
+    def with_measured(self, measured: Complex128[Tensor, "contacts modes"]) -> "MixtureGains":
+        """Return the same model, which judges itself by these gains."""
+        return replace(self, measured=measured)
+
+    def take(self, modes: Int[Tensor, " modes"]) -> "MixtureGains":
+        """Return the model of some modes, in the given order."""
+        series = torch.cat([modes, modes + self.mixture.values.shape[1] // 2])
+        measured = None if self.measured is None else self.measured[:, modes]
+        return replace(self, mixture=self.mixture.take(series), measured=measured)
+
+    def without(self, contacts: Bool[Tensor, " contacts"]) -> "MixtureGains":
+        """Return the model without some contacts, its hypotheses weighed as before."""
+        kept = torch.nonzero(~contacts).flatten()
+        measured = None if self.measured is None else self.measured[kept]
+        training, mixture = self.training.take(kept), self.mixture.at_contacts(kept)
+        return replace(self, training=training, mixture=mixture, measured=measured)
+
+    def shares(self) -> Float64[Tensor, "families modes"]:
+        """Return the posterior probability of each family: mean over both parts of each mode, by their energy."""
+        power = self.mixture.values.square().sum(0).reshape(2, -1).clamp_min(torch.finfo(torch.float64).tiny)
+        rows = torch.split(self.mixture.weights.sum(1), [len(each) for each in self.kept])
+        return torch.stack([(each.sum(0).reshape(2, -1) * power / power.sum(0)).sum(0) for each in rows])
+
+    def record(self) -> dict[str, Any]:
+        """Return the sizes and the families' names."""
+        contacts, modes = self.values.shape
+        return {
+            "points": len(self.points),
+            "contacts": contacts,
+            "modes": modes,
+            "directional": self.directional,
+            "spread_share": self.spread_share,
+            "families": [family.kind for family in self.families],
+            "kernels": [len(each) for each in self.kept],
+            "bodies": [mode_sizes(family.modes) for family in self._of(Elastic)],
+            "symmetries": [[list(group.characters.shape) for group in family.groups] for family in self._of(Symmetric)],
+            "features": [family.features.shape[1] for family in self._of(Visual)],
+        }
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the contacts, the gains there, the weights, and what families know of the object."""
+        named = {
+            "points": self.points,
+            "contacts": self.training.points,
+            "directions": self.training.directions,
+            "object_size": torch.tensor([family.size for family in self.families], dtype=torch.float64),
+            "values": torch.view_as_real(self.values),
+            "measured": torch.view_as_real(self.values if self.measured is None else self.measured),
+            "noise_floor": self.mixture.floor,
+            "kernels": torch.cat(self.kept),
+            "weights": self.mixture.weights,
+        }
+        for family in self._of(Visual):
+            named["features"] = family.features
+        for row, group in enumerate(group for family in self._of(Symmetric) for group in family.groups):
+            named |= {f"groups.{row}.{name}": getattr(group, name) for name in ("motions", "characters")}
+        for row, modes in enumerate(family.modes for family in self._of(Elastic)):
+            named |= {f"bodies.{row}.{name}": each for name, each in mode_tensors(modes).items()}
+        return named
+
+    @classmethod
+    def skeleton(cls, record: Mapping[str, Any]) -> dict[str, Tensor]:
+        """Return tensors like those of a model of these sizes."""
+        points, contacts, modes = (count_of(record[name], name) for name in ("points", "contacts", "modes"))
+        families, bodies = (like(record[name], [], name) for name in ("families", "bodies"))
+        kept = [count_of(each, "kernels") for each in like(record["kernels"], [], "kernels")]
+        unknown = sorted(set(families) - {*_POSITIONAL, *_OF_OBJECT})
+        if unknown or len(families) != len(kept):
+            raise RecordError.expected(
+                f"{len(kept)} of {', '.join((*_POSITIONAL, *_OF_OBJECT))}", families, name="families"
+            )
+        for kind, name in _OF_OBJECT.items():
+            given = len(like(record[name], [], name))
+            if given != families.count(kind) or (kind != Elastic.kind and given > 1):
+                wanted = families.count(kind)
+                raise RecordError(f"{name}: expected {wanted} as in families, got {given}", name=name, value=given)
+        like(record["directional"], True, "directional")
+        if not 0.0 <= like(record.get("spread_share", 0.0), 0.0, "spread_share") <= 1.0:
+            raise RecordError.expected("0 to 1", record["spread_share"], name="spread_share")
+        single, double, integer = torch.float32, torch.float64, torch.int64
+        sizes: dict[str, tuple[torch.dtype, *tuple[int, ...]]] = {
+            "points": (single, points, 3),
+            "contacts": (double, contacts, 3),
+            "directions": (double, contacts, 3),
+            "object_size": (double, len(families)),
+            "values": (double, contacts, modes, 2),
+            "measured": (double, contacts, modes, 2),
+            "noise_floor": (double, 2 * modes),
+            "kernels": (integer, sum(kept)),
+            "weights": (double, sum(kept), len(NOISE_SHARES), 2 * modes),
+        }
+        for dim in record["features"]:
+            sizes["features"] = (single, points, count_of(dim, "features"))
+        for row, (characters, order) in enumerate(group for family in record["symmetries"] for group in family):
+            sizes[f"groups.{row}.motions"] = (double, count_of(order, "motions"), 3, 4)
+            sizes[f"groups.{row}.characters"] = (double, count_of(characters, "characters"), order)
+        found = {name: torch.empty(*size, dtype=dtype, device="meta") for name, (dtype, *size) in sizes.items()}
+        for row, body in enumerate(bodies):
+            found |= {f"bodies.{row}.{name}": each for name, each in mode_skeleton(body).items()}
+        return found
+
+    @classmethod
+    def restore(cls, record: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> "MixtureGains":
+        """Return the model."""
+        training = Sites(tensors["contacts"], tensors["directions"])
+        _expect_sound(tensors)
+        bodies = iter([restored_modes(tensors, f"bodies.{row}.") for row in range(len(record["bodies"]))])
+
+        def family_of(kind: str, size: float) -> KernelFamily:
+            if kind == Elastic.kind:
+                return Elastic(training, size, next(bodies))
+            if kind == Symmetric.kind:
+                rows = range(len(record["symmetries"][0]))
+                groups = [Group(tensors[f"groups.{row}.motions"], tensors[f"groups.{row}.characters"]) for row in rows]
+                return Symmetric(training, size, groups, directional=record["directional"])
+            if kind == Visual.kind:
+                return Visual(training, size, tensors["points"], tensors["features"])
+            return _POSITIONAL[kind](training, size)
+
+        sizes = tensors["object_size"].tolist()
+        families = tuple(family_of(kind, size) for kind, size in zip(record["families"], sizes, strict=True))
+        kept = torch.split(tensors["kernels"], record["kernels"])
+        for family, rows in zip(families, kept, strict=True):
+            _expect_rows(rows, len(family.shares), f"kept {family.kind} kernels")
+        kernels = torch.cat([family.kernels()[rows] for family, rows in zip(families, kept, strict=True)])
+        values, measured = (torch.view_as_complex(tensors[name].contiguous()) for name in ("values", "measured"))
+        mixture = KernelMixture(kernels, series_of(values), tensors["noise_floor"], tensors["weights"])
+        # Files of earlier versions have none: their fields were chosen with each hypothesis's mean alone.
+        share = record.get("spread_share", 0.0)
+        return cls(tensors["points"], training, families, tuple(kept), mixture, record["directional"], share, measured)
+
+    def _of(self, kind: type[Family]) -> list[Family]:
+        """Return the families of a kind."""
+        return [each for each in self.families if isinstance(each, kind)]
+
+    def _straight(self, points: Float64[Tensor, "points 3"]) -> Float64[Tensor, "points 3"]:
+        """Return directions straight into the body, or without one those of the nearest training impacts."""
+        outward = self.normals(points) if self.directional else None
+        if outward is not None:
+            return -outward
+        near = cKDTree(self.contacts.numpy()).query(points.numpy())[1]
+        return self.training.directions[torch.from_numpy(near)]
+
+    @cached_property
+    def _coefficients(self) -> list[Float64[Tensor, "_basis contacts series"]]:
+        solved = torch.split(self.mixture.solve(), [len(each) for each in self.kept])
+        rows = zip(self.families, self.kept, solved, strict=True)
+        return [family.coefficients(kept, each) for family, kept, each in rows]
+
+    @cached_property
+    def _left_out(self) -> Predictions:
+        """Of the measured gains: those that were refined end to end have seen the recordings that are left out."""
+        mixture = self.mixture if self.measured is None else self.mixture.with_values(series_of(self.measured))
+        return mixture.leave_out(self.places)
+
+    def _std(self, sites: Sites) -> Float64[Tensor, "sites series"]:
+        own, first, explained = [], 0, torch.zeros(len(sites), self.mixture.values.shape[1], dtype=torch.float64)
+        for family, kept, forms in zip(self.families, self.kept, self._forms, strict=True):
+            own.append(family.own(sites, kept))
+            if forms is None:
+                explained += self.mixture.explained(family.between(sites, self.training, kept), first)
+            else:
+                factors = family.factors(sites, self.training)
+                # Products of two factors, each pair once: half of what the matrices times the factors would take.
+                first_of, second_of = torch.triu_indices(factors.shape[1], factors.shape[1])
+                parts = torch.split(factors, _PRODUCTS)
+                explained += torch.cat([(part[:, first_of] * part[:, second_of]) @ forms for part in parts])
+            first += len(kept)
+        return self.mixture.spread(torch.cat(own), self._mean(sites), explained)
+
+    @cached_property
+    def _forms(self) -> list[Float64[Tensor, "_pairs series"] | None]:
+        """`KernelMixture.explained_forms` of each family: by pairs of factors, those of two different ones doubled.
+
+        None for a family that has fewer kernels than factors, or whose matrices would exceed `_FORM_ENTRIES`: its
+        covariances with the training impacts, kernel by kernel, are cheaper.
+        """
+        firsts = accumulate(map(len, self.kept), initial=0)
+        return [self._form(*each) for each in zip(self.families, self.kept, firsts, strict=False)]
+
+    def _form(
+        self, family: KernelFamily, kept: Int[Tensor, " kept"], first: int
+    ) -> Float64[Tensor, "pairs series"] | None:
+        count = family.loadings(self.training, kept[:1]).shape[2]
+        if count >= len(kept) or self.mixture.values.shape[1] * count**2 > _FORM_ENTRIES:
+            return None
+        kernels = range(first, first + len(kept))
+        forms = self.mixture.explained_forms(kernels, lambda rows: family.loadings(self.training, kept[rows]))
+        row, column = torch.triu_indices(count, count)
+        return (forms[:, row, column] * torch.where(row == column, 1.0, 2.0)).T.contiguous()
+
+    def _mean(self, sites: Sites) -> Float64[Tensor, "sites series"]:
+        pairs = zip(self.families, self._coefficients, strict=True)
+        means = [family.mean(sites, self.training, coefficients) for family, coefficients in pairs]
+        return torch.stack(means).sum(0)
+
+    def _magnitude(self, sites: Sites) -> Float64[Tensor, "sites series"]:
+        pairs = list(zip(self.families, self.kept, strict=True))
+        cross = torch.cat([family.between(sites, self.training, kept) for family, kept in pairs])
+        own = torch.cat([family.own(sites, kept) for family, kept in pairs])
+        return self.mixture.mean_magnitude(cross, own, self.spread_share)
+
+    def _batches(self, sites: Sites) -> Iterator[Sites]:
+        """Yield the sites in batches whose covariances fit the memory; one, without any, where there are none."""
+        size = max(1, _MEMORY // (len(self.mixture.kernels) * len(self.contacts)))
+        for rows in torch.split(torch.arange(len(sites)), size):
+            yield sites.take(rows)
+
+    def _kernels_between(
+        self, sites: Sites, others: Sites, rows: Int[Tensor, " rows"]
+    ) -> dict[int, Float64[Tensor, "sites others"]]:
+        """Return the kept kernels of some rows between two sets of impacts, by row; each family's all at once."""
+        found: dict[int, Float64[Tensor, "sites others"]] = {}
+        first = 0
+        for family, kept in zip(self.families, self.kept, strict=True):
+            used = torch.unique(rows[(rows >= first) & (rows < first + len(kept))])
+            if len(used):
+                between = family.between(sites, others, kept[used - first])
+                found.update(zip(used.tolist(), between, strict=True))
+            first += len(kept)
+        return found
+
+
+def _expect_sound(tensors: Mapping[str, Tensor]) -> None:
+    """Raise RecordError for values that no fit leaves: they would fail only when gains are asked for."""
+    if not bool((tensors["object_size"] > 0).all()):
+        least = float(tensors["object_size"].min())
+        raise RecordError(f"object_size: expected values above 0, got {least:g}", name="object_size", value=least)
+    for name in ("weights", "noise_floor"):
+        if not bool((tensors[name] >= 0).all()):
+            least = float(tensors[name].min())
+            raise RecordError(f"{name}: expected values of 0 or more, got {least:g}", name=name, value=least)
+
+
+def _expect_rows(rows: Int[Tensor, "*rows"], count: int, name: str) -> None:
+    if rows.numel() and not 0 <= int(rows.min()) <= int(rows.max()) < count:
+        found = (int(rows.min()), int(rows.max()))
+        raise RecordError(f"{name}: expected 0 to {count - 1}, got {found[0]} to {found[1]}", name=name, value=found)
+
+
+def series_of(values: Complex128[Tensor, "contacts modes"]) -> Float64[Tensor, "contacts series"]:
+    """Return the series of complex gains: the real parts of all modes, then the imaginary parts."""
+    return torch.cat([values.real, values.imag], dim=1)
+
+
+def _complex(series: Float64[Tensor, "contacts series"]) -> Complex128[Tensor, "contacts modes"]:
+    real, imaginary = series.chunk(2, dim=1)
+    return torch.complex(real, imaginary)
+
+
+def _gains(series: Float64[Tensor, "contacts series"]) -> Gains:
+    real, imaginary = series.float().chunk(2, dim=1)
+    return Gains(real, imaginary)
+
+
+def _parts(series: Float64[Tensor, "contacts series"]) -> Float64[Tensor, "contacts modes 2"]:
+    return torch.stack(series.chunk(2, dim=1), dim=2)

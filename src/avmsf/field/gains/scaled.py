@@ -1,0 +1,175 @@
+"""Gains of what nobody recorded: of a body's mode shapes alone, and of an edited object."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float, Float32, Float64
+from torch import Tensor
+
+from avmsf._utils.arrays import short_repr
+from avmsf._utils.text import RecordError, count_of, like
+from avmsf.fem.elastic_modes import ElasticModes
+from avmsf.fem.elastic_store import mode_sizes, mode_skeleton, mode_tensors, restored_modes
+from avmsf.field.gains.attention import AttentionGains
+from avmsf.field.gains.family import sites_along
+from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.gains.model import GainModel, Gains
+
+_BODY, _FITTED = "body.", "fitted."
+"""What names of the tensors of a body and of a fitted model begin with."""
+
+
+@dataclass(frozen=True, eq=False)
+class BodyGains(GainModel):
+    """Gains that are the components of mode shapes along the impacts."""
+
+    __repr__ = short_repr
+
+    points: Float32[Tensor, "points 3"]
+    """Points of the object's surface, object frame, meters."""
+    modes: ElasticModes
+    """Each shape times the amplitude that a unit of it gives the sound."""
+
+    kind: ClassVar[str] = "body"
+
+    @property
+    def body(self) -> ElasticModes:
+        """The modes."""
+        return self.modes
+
+    def predict(
+        self, points: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Gains:
+        """Return the gains; without a direction impacts go straight into the body."""
+        sites = sites_along(points.double(), directions, lambda unknown: -self.modes.normals(unknown))
+        return Gains(self.modes.gains(sites.points, sites.directions).float())
+
+    def record(self) -> dict[str, Any]:
+        """Return the sizes."""
+        sizes = mode_sizes(self.modes)
+        return {"points": len(self.points), "modes": sizes.pop("shapes"), **sizes}
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the points and the modes."""
+        return {"points": self.points, **_named(_BODY, mode_tensors(self.modes))}
+
+    @classmethod
+    def skeleton(cls, record: Mapping[str, Any]) -> dict[str, Tensor]:
+        """Return tensors like those of a body of these sizes."""
+        points = torch.empty(count_of(record["points"], "points"), 3, device="meta")
+        return {"points": points, **_named(_BODY, mode_skeleton({**record, "shapes": record["modes"]}))}
+
+    @classmethod
+    def restore(cls, record: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> "BodyGains":
+        """Return the gains."""
+        return cls(tensors["points"], restored_modes(tensors, _BODY))
+
+
+FITTED: dict[str, type[GainModel]] = {each.kind: each for each in (AttentionGains, MixtureGains, BodyGains)}
+"""The gain models beneath all edits, fitted to recordings or guessed, by what a file calls them."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScaledGains(GainModel):
+    """Gains that differ from fitted ones by a factor a mode, so that their ratio between places is the same.
+
+    Of gains that are scaled already only the factors change: what is held are always fitted ones.
+    """
+
+    __repr__ = short_repr
+
+    field: GainModel
+    """The gains as they were fitted."""
+    scale: Float64[Tensor, " modes"]
+    """Factors on the gains of each mode; 0 mutes one."""
+    length: float = 1.0
+    """Lengths on this object over those on the fitted one: contacts are divided by it."""
+    points: Float32[Tensor, "points 3"] = dataclasses.field(init=False)
+    """Points of the object's surface, object frame, meters."""
+
+    kind: ClassVar[str] = "scaled"
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.length < math.inf:
+            raise ValueError(f"length is {self.length}")
+        inner = self.field
+        if isinstance(inner, ScaledGains):
+            object.__setattr__(self, "field", inner.field)
+            object.__setattr__(self, "scale", inner.scale * self.scale)
+            object.__setattr__(self, "length", inner.length * self.length)
+        object.__setattr__(self, "points", (self.field.points.double() * self.length).float())
+
+    @property
+    def fitted(self) -> GainModel:
+        """The gains as they were fitted."""
+        return self.field
+
+    @property
+    def body(self) -> ElasticModes | None:
+        """The fitted gains' body."""
+        return self.field.body
+
+    @property
+    def contacts(self) -> Float64[Tensor, "contacts 3"]:
+        """The fitted gains' contacts, where they are on this object."""
+        return self.field.contacts * self.length
+
+    def predict(
+        self, points: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Gains:
+        """Return the scaled gains; the factors on the dampings are the fitted ones."""
+        return self._scaled(self.field.predict(points.double() / self.length, directions))
+
+    def point_estimate(
+        self, points: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Gains:
+        """Return the fitted gains' estimate, scaled likewise."""
+        return self._scaled(self.field.point_estimate(points.double() / self.length, directions))
+
+    def posterior(
+        self, points: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Gains:
+        """Return the fitted gains' posterior, scaled likewise."""
+        return self._scaled(self.field.posterior(points.double() / self.length, directions))
+
+    def record(self) -> dict[str, Any]:
+        """Return the fitted gains' record, what a file calls these, and the length."""
+        return {**self.field.record(), "fitted_kind": self.field.kind, "size_factor": self.length}
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the factors and the fitted gains' tensors."""
+        return {"mode_factors": self.scale, **_named(_FITTED, self.field.tensors())}
+
+    @classmethod
+    def skeleton(cls, record: Mapping[str, Any]) -> dict[str, Tensor]:
+        """Return tensors like those of gains of these sizes."""
+        if not 0.0 < like(record["size_factor"], 1.0, "size_factor") < math.inf:
+            raise RecordError.expected("a number above 0", record["size_factor"], name="size_factor")
+        kind = like(record["fitted_kind"], "", "fitted_kind")
+        if kind not in FITTED:
+            raise RecordError(
+                f"fitted_kind: expected {', '.join(FITTED)}, got {kind!r}", name="fitted_kind", value=kind
+            )
+        scale = torch.empty(count_of(record["modes"], "modes"), dtype=torch.float64, device="meta")
+        return {"mode_factors": scale, **_named(_FITTED, FITTED[kind].skeleton(record))}
+
+    @classmethod
+    def restore(cls, record: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> "ScaledGains":
+        """Return the gains."""
+        inner = {name.removeprefix(_FITTED): each for name, each in tensors.items() if name.startswith(_FITTED)}
+        fitted = FITTED[record["fitted_kind"]].restore(record, inner)
+        return cls(fitted, tensors["mode_factors"], float(record["size_factor"]))
+
+    def _scaled(self, known: Gains) -> Gains:
+        mean = (known.mean.double() * self.scale).float()
+        quadrature = None if known.quadrature is None else (known.quadrature.double() * self.scale).float()
+        std = None if known.std is None else (known.std.double() * self.scale.abs()[:, None]).float()
+        return replace(known, mean=mean, quadrature=quadrature, std=std)
+
+
+def _named(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {prefix + name: each for name, each in tensors.items()}
