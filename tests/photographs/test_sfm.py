@@ -155,19 +155,17 @@ def test_the_same_seed_gives_the_same_bytes_and_masks_count(taken: tuple[View, .
 def pretend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str) -> None:
     """Let another script do the worker's part."""
     path = tmp_path / "pretended.py"
-    path.write_text("import json, os, pathlib, subprocess, sys, time\n" + textwrap.dedent(script))
+    path.write_text("import json, os, pathlib, sys, time\n" + textwrap.dedent(script))
     monkeypatch.setattr("avmsf.photographs.sfm.WORKER", path)
 
 
 def write_models(*groups: tuple[str, ...]) -> str:
     return f"""
-        folder = pathlib.Path(json.loads(pathlib.Path(sys.argv[1]).read_text())["folder"])
-        models = []
-        for number, names in enumerate({groups!r}):
+        folder, groups = pathlib.Path(sys.argv[1]).parent, dict(enumerate({groups!r}))
+        for number, names in groups.items():
             (folder / "models" / str(number)).mkdir(parents=True)
             (folder / "models" / str(number) / "names").write_text(" ".join(names))
-            models.append(dict(number=number, names=names))
-        (folder / "result.json").write_text(json.dumps(models))
+        (folder / "result.json").write_text(json.dumps(groups))
     """
 
 
@@ -261,16 +259,8 @@ def test_time_and_interruption_end_the_worker(tmp_path: Path, monkeypatch: pytes
 
 def test_the_worker_ends_when_its_parent_does(taken: tuple[View, ...], tmp_path: Path) -> None:
     fill(tmp_path / "images", taken)
-    job = {
-        "folder": str(tmp_path),
-        "names": sorted(path.name for path in (tmp_path / "images").iterdir()),
-        "true_names": {},
-        "masks": False,
-        "seed": 0,
-        "features": 8192,
-        "threads": 1,
-        "exhaustive": True,
-    }
+    names = sorted(path.name for path in (tmp_path / "images").iterdir())
+    job = {"names": dict(zip(names, names, strict=True)), "seed": 0, "features": 8192, "threads": 1}
     (tmp_path / "job.json").write_text(json.dumps(job))
     command = [sys.executable, "-P", str(WORKER), str(tmp_path / "job.json")]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as worker:
@@ -283,20 +273,12 @@ def test_the_worker_ends_when_its_parent_does(taken: tuple[View, ...], tmp_path:
     assert not (tmp_path / "result.json").exists()
 
 
-def test_only_what_cannot_be_written_is_called_unwritable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_and_a_process_that_the_system_refuses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = pictures(tmp_path / "cup", "abc")
     (tmp_path / "file").write_text("")
     with raises(CaptureError, file="sfm") as caught:
         estimate_cameras(folder / "images", tmp_path / "file" / "sfm")
     assert "writable" in str(caught.value)
-
-    def gone(*_: object, **__: object) -> None:
-        raise FileNotFoundError(2, "No such file or directory", str(folder / "images/b.png"))
-
-    monkeypatch.setattr("avmsf.photographs.sfm._stage_image", gone)
-    with raises(CaptureError, file="b.png"):
-        estimate_cameras(folder / "images", folder)
-    monkeypatch.undo()
 
     def full(*_: object, **__: object) -> None:
         raise BlockingIOError(11, "Resource temporarily unavailable")

@@ -9,7 +9,6 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -25,10 +24,8 @@ from avmsf.photographs.shots import mask_names
 WORKER = Path(__file__).with_name("sfm_worker.py")
 MIN_IMAGES = 3
 """Fewest images with which cameras can be estimated."""
-MIN_REGISTERED = 0.5
+MIN_REGISTERED_RATIO = 0.5
 """Part of the images that must get a camera."""
-MAX_ALL_PAIRS = 150
-"""Images up to which every pair is matched; of more, each with the next ones in the order of their names."""
 
 
 def estimate_cameras(
@@ -56,42 +53,9 @@ def estimate_cameras(
     """
     images, output = Path(images), Path(output)
     model, begun = output / "sparse" / "0", temporary_path(output / "sfm")
-    _check_job(images, model, timeout=timeout)
-    try:
-        begun.mkdir(parents=True)
-        names, lost = _stage_images(images, begun)
-        job = {
-            "folder": str(begun.resolve()),
-            "names": list(names),
-            "true_names": names,
-            "masks": (begun / "masks").is_dir(),
-            "exhaustive": len(names) <= MAX_ALL_PAIRS,
-            "seed": seed or 0,
-            "features": features,
-            "threads": threads,
-        }
-        (begun / "job.json").write_text(json.dumps(job), encoding="utf-8")
-        found = _run_worker(begun, timeout=timeout)
-        everything = sorted([*names.values(), *lost])
-        _refuse_few(found, everything, images=images)
-        model.parent.mkdir(exist_ok=True)
-        os.rename(begun / "models" / str(found[0]["number"]), model)
-    except OSError as error:
-        if error.filename is not None and Path(error.filename).is_relative_to(images):
-            raise CaptureError.expected("a readable file", error.strerror, file=error.filename) from error
-        raise unwritable(output, error, raising=CaptureError) from error
-    finally:
-        shutil.rmtree(begun, ignore_errors=True)
-    for remark in _remarks(found, lost, everything):
-        warnings.warn(remark.about(images), stacklevel=2)
-    return model
-
-
-def _check_job(images: Path, model: Path, *, timeout: float) -> None:
     if importlib.util.find_spec("pycolmap") is None:
-        raise CaptureError.expected(
-            "the package for photographs without cameras", name="pycolmap", advice="pip install 'avmsf[sfm]'"
-        )
+        advice = "pip install 'avmsf[sfm]'"
+        raise CaptureError.expected("the package for photographs without cameras", name="pycolmap", advice=advice)
     if not timeout > 0:
         raise CaptureError.expected("a time above 0 s", timeout, name="timeout")
     if not images.is_dir():
@@ -99,15 +63,33 @@ def _check_job(images: Path, model: Path, *, timeout: float) -> None:
     if model.exists():
         advice = "remove it to estimate them again"
         raise CaptureError.expected("no cameras", got="existing ones", file=model, advice=advice)
+    try:
+        begun.mkdir(parents=True)
+        names, unreadable = _stage_images(images, begun)
+        job = {"names": names, "seed": seed or 0, "features": features, "threads": threads}
+        (begun / "job.json").write_text(json.dumps(job), encoding="utf-8")
+        registered = _run_worker(begun, timeout=timeout)
+        largest = max(registered, key=lambda number: len(registered[number]), default="")
+        groups = [registered.pop(largest, []), *registered.values()]
+        remarks = _check_groups(groups, unreadable, sorted([*names.values(), *unreadable]), images)
+        model.parent.mkdir(exist_ok=True)
+        os.rename(begun / "models" / largest, model)
+    except OSError as error:
+        raise unwritable(output, error, raising=CaptureError) from error
+    finally:
+        shutil.rmtree(begun, ignore_errors=True)
+    for remark in remarks:
+        warnings.warn(remark.about(images), stacklevel=2)
+    return model
 
 
 def _stage_images(images: Path, begun: Path) -> tuple[dict[str, str], list[str]]:
     """Put links to the images and their masks where COLMAP expects them.
 
-    Returns the images' names there with their true ones, and the names of those that cannot be read. Raises
+    Returns the images' names by those that they have there, and the names of those that cannot be read. Raises
     CaptureError for too few images, and for images of different sizes.
     """
-    names, lost, sizes = {}, [], {}
+    names, unreadable, sizes = {}, [], {}
     for path in pictures_in(images, deep=True):
         name = path.relative_to(images).as_posix()
         try:
@@ -115,13 +97,15 @@ def _stage_images(images: Path, begun: Path) -> tuple[dict[str, str], list[str]]
         except PictureSizeError:
             raise
         except CaptureError:
-            lost.append(name)
+            unreadable.append(name)
             continue
-        staged = _stage_image(path, picture, name, begun)
+        # COLMAP reads no WebP.
+        staged = f"{name}.png" if path.suffix.lower() == ".webp" else name
         names[staged], sizes[name] = name, picture.size
+        _stage_image(path, picture, begun / "images" / staged)
         _stage_mask(images, picture, name, begun / "masks" / f"{staged}.png")
     if len(names) < MIN_IMAGES:
-        unread = f" and {len(lost)} that cannot be read: {listed(lost, most=8)}" if lost else ""
+        unread = f" and {len(unreadable)} that cannot be read: {listed(unreadable, most=8)}" if unreadable else ""
         wanted, got = f"at least {MIN_IMAGES} photographs ({', '.join(PICTURE_SUFFIXES)})", f"{len(names)}{unread}"
         raise CaptureError.expected(wanted, len(names), got=got, file=images, name="photographs")
     usual = max(sizes.values(), key=list(sizes.values()).count)
@@ -130,23 +114,19 @@ def _stage_images(images: Path, begun: Path) -> tuple[dict[str, str], list[str]]
         got = f"most of {usual[0]} x {usual[1]} pixels, but not {listed(odd, most=8)}"
         wanted, advice = "photographs of one size", "give photographs of one camera in one orientation"
         raise CaptureError.expected(wanted, odd, got=got, file=images, name="sizes", advice=advice)
-    return names, lost
+    return names, unreadable
 
 
-def _stage_image(path: Path, picture: Picture, name: str, begun: Path) -> str:
-    """Put one image in the job's folder and return its name there."""
-    webp = path.suffix.lower() == ".webp"
-    name += ".png" if webp else ""
-    staged = begun / "images" / name
+def _stage_image(path: Path, picture: Picture, staged: Path) -> None:
+    """Link or write one image under the name that it is given."""
     staged.parent.mkdir(parents=True, exist_ok=True)
-    if webp:
+    if staged.suffix != path.suffix:
         cv2.imwrite(str(staged), picture.color[..., ::-1])
-        return name
+        return
     try:
         staged.symlink_to(path.resolve())
     except OSError:  # file systems without links
         shutil.copyfile(path, staged)
-    return name
 
 
 def _stage_mask(images: Path, picture: Picture, name: str, staged: Path) -> None:
@@ -161,14 +141,14 @@ def _stage_mask(images: Path, picture: Picture, name: str, staged: Path) -> None
     cv2.imwrite(str(staged), np.where(mask >= 128, 255, 0).astype(np.uint8))
 
 
-def _run_worker(begun: Path, *, timeout: float) -> list[dict[str, Any]]:
-    """Return the worker's models, the largest first; raises CaptureError where it fails or takes too long."""
+def _run_worker(begun: Path, *, timeout: float) -> dict[str, list[str]]:
+    """Return the names of the images in each of the worker's models; raises CaptureError where it fails."""
     log, result = begun / "worker.log", begun / "result.json"
     # -P keeps this folder, whose modules have common names, from where the worker looks for libraries.
     command = [sys.executable, "-P", str(WORKER), str(begun / "job.json")]
     with open(log, "wb") as output:
         try:
-            worker = start_child(command, stdout=output, stderr=subprocess.STDOUT)
+            worker = start_child(command, stdout=output, stderr=output)
         except OSError as error:
             wanted = "a process for structure from motion"
             raise CaptureError.expected(wanted, error.strerror, name="starting") from error
@@ -183,54 +163,49 @@ def _run_worker(begun: Path, *, timeout: float) -> list[dict[str, Any]]:
     if worker.returncode != 0 or not result.is_file():
         (stage, lines), ending = _stage_and_lines(log), ending_of(worker.returncode)
         advice = "where memory ran out, give smaller photographs; " if ending == "SIGKILL" else ""
-        wanted = "structure from motion to end without an error"
         advice += f"its last output:\n{lines}"
+        wanted = "structure from motion to end without an error"
         raise CaptureError.expected(wanted, ending, got=ending, name=stage, advice=advice)
-    models = json.loads(result.read_text(encoding="utf-8"))
-    return sorted(models, key=lambda model: -len(model["names"]))
+    registered: dict[str, list[str]] = json.loads(result.read_text(encoding="utf-8"))
+    return registered
 
 
 def _stage_and_lines(log: Path, count: int = 6) -> tuple[str, str]:
     """Return the stage that the worker came to, and its last lines."""
-    stage, lines = "starting", list[str]()
-    for line in filter(str.strip, log.read_text(encoding="utf-8", errors="replace").splitlines()):
-        if line.startswith("stage "):
-            stage = line.removeprefix("stage ")
-        else:
-            lines.append(f"  {line[:200]}")
-    return stage, "\n".join(lines[-count:])
+    lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+    stages = [line.removeprefix("stage ") for line in lines if line.startswith("stage ")]
+    output = [f"  {line[:200]}" for line in lines if not line.startswith("stage ")]
+    return stages[-1] if stages else "starting", "\n".join(output[-count:])
 
 
-def _refuse_few(models: Sequence[dict[str, Any]], everything: Sequence[str], *, images: Path) -> None:
-    registered = models[0]["names"] if models else []
-    if len(registered) >= max(MIN_IMAGES, MIN_REGISTERED * len(everything)):
-        return
-    lacking = [name for name in everything if name not in registered]
-    apart = f" in {len(models)} groups that could not be joined" if len(models) > 1 else ""
-    got = f"{len(registered)} of {len(everything)}{apart}, none for {listed(lacking)}"
-    advice = "take sharp photographs 10 to 15 degrees apart, with a patterned, fixed ground in view"
-    wanted = "cameras of most photographs"
-    raise CaptureError.expected(wanted, lacking, got=got, file=images, name="cameras", advice=advice)
+def _check_groups(
+    groups: Sequence[Sequence[str]], unreadable: Sequence[str], everything: Sequence[str], images: Path
+) -> list[Remark]:
+    """Return remarks on images that cannot be read, that form groups apart, and that got no camera.
 
-
-def _remarks(models: Sequence[dict[str, Any]], lost: Sequence[str], everything: Sequence[str]) -> list[Remark]:
-    """Return a remark each on images that cannot be read, that form groups apart, and that got no camera."""
+    `groups` are the images of each model, the largest first. Raises CaptureError where that has less than half of all.
+    """
+    largest = set(groups[0])
+    if len(largest) < max(MIN_IMAGES, MIN_REGISTERED_RATIO * len(everything)):
+        lacking = [name for name in everything if name not in largest]
+        apart = f" in {len(groups)} groups that could not be joined" if len(groups) > 1 else ""
+        got = f"{len(largest)} of {len(everything)}{apart}, none for {listed(lacking)}"
+        advice = "take sharp photographs 10 to 15 degrees apart, with a patterned, fixed ground in view"
+        wanted = "cameras of most photographs"
+        raise CaptureError.expected(wanted, lacking, got=got, file=images, name="cameras", advice=advice)
     remarks = []
-    if lost:
-        message = f"{counted(len(lost), 'image')} not used, as they cannot be read: {listed(lost, most=8)}"
-        remarks.append(Remark(message, name="unreadable images", value=lost))
+    if unreadable:
+        message = f"{counted(len(unreadable), 'image')} not used, as they cannot be read: {listed(unreadable, most=8)}"
+        remarks.append(Remark(message, name="unreadable images", value=unreadable))
     # Groups overlap: an image may belong to several that could not be joined.
-    kept = set(models[0]["names"])
-    others = [[name for name in model["names"] if name not in kept] for model in models[1:]]
-    others = [names for names in others if names]
+    others = [apart for group in groups[1:] if (apart := [name for name in group if name not in largest])]
     if others:
-        groups = "; ".join(listed(names, most=8) for names in others)
         message = (
-            f"the photographs form {len(models)} groups that could not be joined; only the largest, of {len(kept)} "
-            f"images, is used, without {groups}"
+            f"the photographs form {len(groups)} groups that could not be joined; only the largest, of {len(largest)} "
+            f"images, is used, without {'; '.join(listed(names, most=8) for names in others)}"
         )
         remarks.append(Remark(message, name="groups", value=others))
-    named = kept.union(lost, *others)
+    named = largest.union(unreadable, *others)
     unseen = [name for name in everything if name not in named]
     if unseen:
         message = f"no camera was found for {counted(len(unseen), 'image')}: {listed(unseen, most=8)}"

@@ -10,70 +10,72 @@ import sys
 import threading
 from pathlib import Path
 
-LONGEST = 1600
-"""Pixels of the longer side on which features are sought."""
+MAX_SIDE_PIXELS = 1600
+"""Longer side of the images on which features are sought."""
+MAX_ALL_PAIRS = 150
+"""Images up to which every pair is matched; of more, each with the next ones in the order of their names."""
 
 
-def main(job_path: str) -> None:
-    """Find the cameras of the job's images; models go to numbered folders, their image names to `result.json`."""
-    threading.Thread(target=_die_with_parent, daemon=True).start()
-    job = json.loads(Path(job_path).read_text(encoding="utf-8"))
+def main(job_path: Path) -> None:
+    """Find the cameras of the images beside a job; models go to numbered folders, their image names to `result.json`.
+
+    The job holds `names` (the true ones by those of the files), `features`, `seed` and `threads`.
+    """
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    job, folder = json.loads(job_path.read_text(encoding="utf-8")), job_path.parent
     import pycolmap
 
-    folder = Path(job["folder"])
-    database, images = folder / "database.db", folder / "images"
-    pycolmap.set_random_seed(job["seed"])
-    _say("features")
+    names, seed, threads = job["names"], job["seed"], job["threads"]
+    database, images, masks, models = (folder / name for name in ("database.db", "images", "masks", "models"))
+    pycolmap.set_random_seed(seed)
+    _log_stage("features")
     reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
-    if job["masks"]:
-        reader.mask_path = str(folder / "masks")
-    extraction = pycolmap.FeatureExtractionOptions(num_threads=job["threads"], max_image_size=LONGEST)
+    if masks.is_dir():
+        reader.mask_path = str(masks)
+    extraction = pycolmap.FeatureExtractionOptions(num_threads=threads, max_image_size=MAX_SIDE_PIXELS)
     extraction.sift.max_num_features = job["features"]
     pycolmap.extract_features(
         database,
         images,
-        image_names=job["names"],
+        image_names=list(names),
         camera_mode=pycolmap.CameraMode.SINGLE,
         reader_options=reader,
         extraction_options=extraction,
         device=pycolmap.Device.cpu,
     )
-    _say("matches")
-    matching = pycolmap.FeatureMatchingOptions(num_threads=job["threads"])
+    _log_stage("matches")
+    matching = pycolmap.FeatureMatchingOptions(num_threads=threads)
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = job["seed"]
-    match = pycolmap.match_exhaustive if job["exhaustive"] else pycolmap.match_sequential
+    verification.ransac.random_seed = seed
+    match = pycolmap.match_exhaustive if len(names) <= MAX_ALL_PAIRS else pycolmap.match_sequential
     match(database, matching_options=matching, verification_options=verification, device=pycolmap.Device.cpu)
-    _say("cameras")
-    (folder / "models").mkdir()
-    options = pycolmap.IncrementalPipelineOptions(num_threads=job["threads"], random_seed=job["seed"], min_model_size=3)
-    options.mapper.random_seed = options.triangulation.random_seed = job["seed"]
-    found = pycolmap.incremental_mapping(database, images, folder / "models", options=options)
-    models = []
-    for number, model in sorted(found.items()):
-        # COLMAP reads no WebP: such images stand under another name in the job's folder.
+    _log_stage("cameras")
+    models.mkdir()
+    options = pycolmap.IncrementalPipelineOptions(num_threads=threads, random_seed=seed, min_model_size=3)
+    options.mapper.random_seed = options.triangulation.random_seed = seed
+    registered = {}
+    for number, model in sorted(pycolmap.incremental_mapping(database, images, models, options=options).items()):
         for image in model.images.values():
-            image.name = job["true_names"].get(image.name, image.name)
-        model.write(folder / "models" / str(number))
+            image.name = names.get(image.name, image.name)
+        model.write(models / str(number))
         # An image that a model merely knows of has no pose in it.
-        names = sorted(image.name for image in model.images.values() if image.has_pose)
-        models.append({"number": number, "names": names})
-    (folder / "result.json").write_text(json.dumps(models), encoding="utf-8")
+        registered[number] = sorted(image.name for image in model.images.values() if image.has_pose)
+    (folder / "result.json").write_text(json.dumps(registered), encoding="utf-8")
 
 
-def _say(stage: str) -> None:
+def _log_stage(stage: str) -> None:
     """Write a line by which the parent knows how far the work is."""
     print(f"stage {stage}", flush=True)
 
 
-def _die_with_parent() -> None:
+def _end_with_parent() -> None:
     """End the process when the parent's end of the pipe closes, however the parent ended."""
     os.read(sys.stdin.fileno(), 1)
     os._exit(1)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(Path(sys.argv[1]))
     sys.stdout.flush()
     # All is written: nothing is gained by taking apart libraries that may fail at it.
     os._exit(0)
