@@ -20,8 +20,7 @@ from avmsf.cli import main
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
 from avmsf.mesh.surface import surface_points
-from avmsf.photographs.folder import find_shots, write_views
-from avmsf.photographs.shots import without_camera
+from avmsf.photographs.folder import read_camera_file, write_views
 from avmsf.pipeline.visuals import VisualInputs, inputs
 from factories.capture_folder import fill
 from factories.plate_capture import fill_plate
@@ -74,8 +73,7 @@ def test_images_of_a_cache_are_no_photographs(tmp_path: Path) -> None:
     write_transforms(tmp_path, frames(ring(4)))
     write_image(tmp_path / "images" / ".avmsf" / "motion" / "view_000.png")
     assert pictures_in(tmp_path / "images", deep=True) == [tmp_path / "images" / f"{name}.png" for name in "abcd"]
-    _, shots = find_shots(tmp_path)
-    assert without_camera(shots.shots, tmp_path) == []
+    assert read_camera_file(tmp_path).without_camera() == []
 
 
 def test_an_alpha_channel_is_the_mask_of_its_photograph_alone(tmp_path: Path) -> None:

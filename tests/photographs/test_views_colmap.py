@@ -12,7 +12,7 @@ import torch
 from avmsf.errors import CaptureError
 from avmsf.photographs import read_sparse_points, read_views
 from avmsf.photographs.cameras import View
-from avmsf.photographs.colmap import MODELS, read_cameras, read_colmap
+from avmsf.photographs.colmap import MODELS, read_colmap, read_lenses
 from factories.raising import raises
 from factories.views_folder import (
     HEIGHT,
@@ -139,7 +139,7 @@ LAYOUTS = {
 def test_camera_models(tmp_path: Path, name: str) -> None:
     parameters, focal, distortion = LAYOUTS[name]
     write_colmap_text(tmp_path, ring(3), NAMES[:3], (name, parameters))
-    lens = read_colmap(tmp_path, tmp_path / "images").shots[0].lens_of(1, 1)
+    lens = read_colmap(tmp_path, tmp_path).photographs[0].lens_of(1, 1)
     assert (lens.width, lens.height, lens.principal) == (WIDTH, HEIGHT, (19.0, 16.0))
     assert lens.focal == focal
     assert lens.distortion == pytest.approx(distortion)
@@ -179,7 +179,7 @@ def test_truncated_binary_files_are_named_wherever_they_end(tmp_path: Path, file
 def test_what_is_no_readable_file_is_named(tmp_path: Path, name: str) -> None:
     (tmp_path / name).mkdir()
     with raises(CaptureError, file=name, value="Is a directory"):
-        read_cameras(tmp_path / name)
+        read_lenses(tmp_path / name)
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,7 @@ from PIL import Image
 
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.photographs import read_views
-from avmsf.photographs.images import MAX_PIXELS, PictureSizeError, read_mask, read_picture
-from avmsf.photographs.shots import MAX_SHOTS
+from avmsf.photographs.images import MAX_PIXELS, ImageSizeError, read_image, read_mask, size_of
 from factories.raising import raises, warns
 from factories.views_folder import HEIGHT, WIDTH, frames, ring, write_image, write_transforms
 
@@ -35,9 +34,9 @@ def folder_of(folder: Path, image: np.ndarray | None = None, **settings: object)
 @pytest.mark.parametrize(("suffix", "tolerance"), [(".png", 0), (".jpg", 12), (".webp", 12)])
 def test_channels_are_red_green_blue(tmp_path: Path, suffix: str, tolerance: int) -> None:
     Image.fromarray(RAMP).save(tmp_path / f"a{suffix}", quality=95)
-    picture = read_picture(tmp_path / f"a{suffix}")
-    assert np.abs(picture.color.astype(int) - RAMP).max() <= tolerance
-    assert picture.mask is None
+    image = read_image(tmp_path / f"a{suffix}")
+    assert image.shape == RAMP.shape
+    assert np.abs(image.astype(int) - RAMP).max() <= tolerance
 
 
 def test_gray_and_sixteen_bits_show_the_same(tmp_path: Path) -> None:
@@ -47,9 +46,9 @@ def test_gray_and_sixteen_bits_show_the_same(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "16.png"), gray.astype(np.uint16) * 257 + 128)
     cv2.imwrite(str(tmp_path / "color.png"), RAMP[..., ::-1].astype(np.uint16) * 257 - 128)
     for name in ("8", "16"):
-        color = read_picture(tmp_path / f"{name}.png").color
+        color = read_image(tmp_path / f"{name}.png")
         assert np.array_equal(color, np.repeat(gray[..., None], 3, axis=2))
-    assert np.array_equal(read_picture(tmp_path / "color.png").color, RAMP)
+    assert np.array_equal(read_image(tmp_path / "color.png"), RAMP)
 
 
 def test_alpha_is_the_mask_and_lays_the_object_before_black(tmp_path: Path) -> None:
@@ -68,12 +67,11 @@ def test_alpha_is_the_mask_and_lays_the_object_before_black(tmp_path: Path) -> N
 def test_gray_with_alpha_and_opaque_alpha(tmp_path: Path) -> None:
     alpha = np.where(np.arange(WIDTH) < 9, 255, 0).astype(np.uint8) * np.ones((HEIGHT, 1), dtype=np.uint8)
     Image.fromarray(np.dstack([RAMP[..., 0], alpha]), "LA").save(tmp_path / "gray.png")
-    picture = read_picture(tmp_path / "gray.png")
-    assert picture.mask is not None
-    assert np.array_equal(picture.mask, alpha)
-    assert np.array_equal(picture.color[:, :9, 1], RAMP[:, :9, 0])
+    image = read_image(tmp_path / "gray.png")
+    assert np.array_equal(image[..., 3], alpha)
+    assert np.array_equal(image[:, :9, 1], RAMP[:, :9, 0])
     write_image(tmp_path / "opaque.png", np.dstack([RAMP, np.full_like(alpha, 255)]))
-    assert read_picture(tmp_path / "opaque.png").mask is None
+    assert read_image(tmp_path / "opaque.png").shape[2] == 3
 
 
 def test_masks_of_zeros_and_ones_colors_or_alpha(tmp_path: Path) -> None:
@@ -156,7 +154,7 @@ def test_a_truncated_jpeg_is_corrupt(tmp_path: Path) -> None:
     content = (tmp_path / "a.jpg").read_bytes()
     (tmp_path / "a.jpg").write_bytes(content[: len(content) * 2 // 3])
     with raises(CaptureError, file="a.jpg", name="bytes", value=len(content) * 2 // 3):
-        read_picture(tmp_path / "a.jpg")
+        read_image(tmp_path / "a.jpg")
 
 
 def test_images_without_cameras_are_named(tmp_path: Path) -> None:
@@ -233,13 +231,13 @@ def black_png(width: int, height: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", data) + chunk(b"IEND", b"")
 
 
-@pytest.mark.parametrize("read", [read_picture, read_mask])
+@pytest.mark.parametrize("read", [read_image, read_mask])
 def test_a_picture_of_too_many_pixels_is_never_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read) -> None:
     path = tmp_path / "bomb.png"
     path.write_bytes(black_png(30_016, 30_016))
     decoded = []
     monkeypatch.setattr(cv2, "imdecode", lambda *_: decoded.append(path))
-    with raises(PictureSizeError, file="bomb.png", value=30_016**2):
+    with raises(ImageSizeError, file="bomb.png", value=30_016**2):
         read(path)
     assert not decoded
 
@@ -249,7 +247,7 @@ def test_the_largest_sensors_pictures_are_not_refused(tmp_path: Path, monkeypatc
     path = tmp_path / "large.png"
     path.write_bytes(black_png(16_320, 12_240))
     monkeypatch.setattr(cv2, "imdecode", lambda *_: np.zeros((3, 4, 3), np.uint8))
-    assert read_picture(path).size == (4, 3)
+    assert size_of(read_image(path)) == (4, 3)
 
 
 def test_a_bomb_among_views_is_named(tmp_path: Path) -> None:
@@ -259,12 +257,12 @@ def test_a_bomb_among_views_is_named(tmp_path: Path) -> None:
     for number in range(3):
         (tmp_path / f"{number}.png").write_bytes(black_png(8, 8))
     (tmp_path / "1.png").write_bytes(black_png(30_016, 30_016))
-    with raises(PictureSizeError, file="1.png"):
+    with raises(ImageSizeError, file="1.png"):
         read_views(tmp_path)
 
 
-def test_too_many_frames_are_refused_before_their_poses(tmp_path: Path) -> None:
-    frames = [{"file_path": "0.png", "transform_matrix": "not looked at"}] * (MAX_SHOTS + 1)
-    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 5.0, "frames": frames}))
-    with raises(CaptureError, file="transforms.json", name="photographs", value=MAX_SHOTS + 1):
+def test_too_many_photographs_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("avmsf.photographs.photograph.MAX_PHOTOGRAPHS", 3)
+    write_transforms(tmp_path, frames(ring(4)))
+    with raises(CaptureError, file="transforms.json", name="photographs", value=4):
         read_views(tmp_path)

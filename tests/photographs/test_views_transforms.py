@@ -107,7 +107,9 @@ def test_coefficients_go_where_opencv_has_them(tmp_path: Path) -> None:
     rows[1]["camera_model"] = "OPENCV_FISHEYE"
     rows[1]["k4"] = 0.4
     write_transforms(tmp_path, rows, k1=0.1, k2=0.2, k3=0.3, p1=0.01, p2=0.02)
-    perspective, fisheye = (shot.lens_of(1, 1) for shot in read_transforms(tmp_path / "transforms.json").shots[:2])
+    perspective, fisheye = (
+        each.lens_of(1, 1) for each in read_transforms(tmp_path / "transforms.json").photographs[:2]
+    )
     assert perspective.distortion == (0.1, 0.2, 0.01, 0.02, 0.3)
     assert fisheye.distortion == (0.1, 0.2, 0.3, 0.4)
     assert (perspective.fisheye, fisheye.fisheye) == (False, True)

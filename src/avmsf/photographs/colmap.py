@@ -1,7 +1,7 @@
 """COLMAP's sparse models: cameras, images and points, in text or binary, whichever lies in the folder."""
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -11,97 +11,68 @@ from scipy.spatial.transform import Rotation
 
 from avmsf.errors import CaptureError, Location
 from avmsf.photographs.lenses import Lens
-from avmsf.photographs.shots import Shot, Shots, refuse_many
+from avmsf.photographs.photograph import CameraFile, Photograph
 
 PLACES = ("sparse/0", "sparse", ".")
-_Row = TypeVar("_Row")
+_Record = TypeVar("_Record")
+_Image = tuple[str, int, list[float]]
+"""Name, number of the camera, and the rotation of the world into it (a quaternion w, x, y, z) with the translation."""
+_Point = tuple[tuple[float, float, float], tuple[int, int, int]]
+"""Position and color."""
 
 
-class _Model(NamedTuple):
-    """How a camera model's parameters are laid out: focal lengths, then cx cy, then these coefficients."""
+class CameraModel(NamedTuple):
+    """How a camera model's parameters are laid out: focal lengths, then cx cy, then coefficients."""
 
-    number: int
-    """COLMAP's, in binary files."""
     focals: int
-    coefficients: tuple[int, ...] = ()
-    """Where each parameter after cx cy goes: 0-3 in k1 k2 p1 p2 of a perspective lens, in k1 k2 k3 k4 of a fisheye."""
+    coefficients: int = 0
+    """How many of k1 k2 p1 p2 of a perspective lens, or of k1 k2 k3 k4 of a fisheye."""
     fisheye: bool = False
-
-    @property
-    def parameters(self) -> int:
-        return self.focals + 2 + len(self.coefficients)
 
 
 MODELS = {
-    "SIMPLE_PINHOLE": _Model(0, 1),
-    "PINHOLE": _Model(1, 2),
-    "SIMPLE_RADIAL": _Model(2, 1, (0,)),
-    "RADIAL": _Model(3, 1, (0, 1)),
-    "OPENCV": _Model(4, 2, (0, 1, 2, 3)),
-    "OPENCV_FISHEYE": _Model(5, 2, (0, 1, 2, 3), fisheye=True),
-    "SIMPLE_RADIAL_FISHEYE": _Model(8, 1, (0,), fisheye=True),
-    "RADIAL_FISHEYE": _Model(9, 1, (0, 1), fisheye=True),
+    "SIMPLE_PINHOLE": CameraModel(1),
+    "PINHOLE": CameraModel(2),
+    "SIMPLE_RADIAL": CameraModel(1, 1),
+    "RADIAL": CameraModel(1, 2),
+    "OPENCV": CameraModel(2, 4),
+    "OPENCV_FISHEYE": CameraModel(2, 4, fisheye=True),
+    "SIMPLE_RADIAL_FISHEYE": CameraModel(1, 1, fisheye=True),
+    "RADIAL_FISHEYE": CameraModel(1, 2, fisheye=True),
 }
-_BINARY_MODELS = {model.number: (name, model.parameters) for name, model in MODELS.items()} | {
-    6: ("FULL_OPENCV", 12),
-    7: ("FOV", 5),
-    10: ("THIN_PRISM_FISHEYE", 12),
-    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
-}
-"""Names and numbers of parameters by COLMAP's number, also of models that are then refused by name."""
-_UNDISTORT = "undistort the images first (colmap image_undistorter)"
-
-
-class _Camera(NamedTuple):
-    number: int
-    model: str
-    width: int
-    height: int
-    parameters: tuple[float, ...]
-
-
-class _Image(NamedTuple):
-    """One registered image."""
-
-    name: str
-    camera: int
-    pose: tuple[float, ...]
-    """The rotation of the world into its camera as a quaternion w, x, y, z of any length, then the translation."""
-
-
-_Point = tuple[tuple[float, ...], tuple[int, ...]]
-"""Position and color."""
+_OTHERS = {6: "FULL_OPENCV", 7: "FOV", 10: "THIN_PRISM_FISHEYE", 11: "RAD_TAN_THIN_PRISM_FISHEYE"}
+_BINARY_MODELS = dict(zip((0, 1, 2, 3, 4, 5, 8, 9), MODELS, strict=True)) | _OTHERS
+"""Names by COLMAP's numbers in binary files, also of models that are refused."""
 
 
 def find_model(folder: Path) -> Path | None:
     """Return the folder that holds a model's cameras and images, the first of the usual ones; None without any."""
-    return next((folder / place for place in PLACES if _suffix(folder / place) is not None), None)
+    return next((folder / place for place in PLACES if _parts(folder / place, "cameras", "images")), None)
 
 
-def _suffix(model: Path) -> str | None:
-    """Return the ending of a model's files, binary where both forms are there; None without cameras and images."""
-    both = ("cameras", "images")
-    return next((end for end in (".bin", ".txt") if all((model / f"{name}{end}").is_file() for name in both)), None)
-
-
-def read_colmap(model: Path, images: Path) -> Shots:
-    """Read the model's shots, whose image files lie in `images`; binary where both forms are there.
+def read_colmap(model: Path, folder: Path) -> CameraFile:
+    """Read a model of the photographs in a folder's `images/`, or itself; binary where both forms are there.
 
     Raises CaptureError for a truncated or malformed file, a camera that an image names and the model lacks, and
     camera models without a pinhole behind OpenCV's distortion.
     """
-    suffix = _suffix(model) or ".txt"
-    cameras_file, file = model / f"cameras{suffix}", model / f"images{suffix}"
-    cameras, records = read_cameras(cameras_file), _read_images(file)
-    refuse_many(len(records), file)
-    lenses = {each.number: _lens(each, Location(cameras_file, item=f"camera {each.number}")) for each in cameras}
-    return Shots(model, tuple(_shot(record, lenses, file, images) for record in records))
+    cameras, images = _parts(model, "cameras", "images")
+    lenses, photographs = read_lenses(cameras), []
+    source = folder / "images" if (folder / "images").is_dir() else folder
+    for name, camera, pose in _read_images(images):
+        lens, where = lenses.get(camera), Location(images, item=f"image {name}")
+        if lens is None:
+            known = f"expected a camera of the model ({', '.join(map(str, lenses))}), got camera {camera}"
+            raise where.error(f"{known}; export all parts of the model together", name=name, value=camera)
+        path, world_to_camera = name.replace("\\", "/"), _world_to_camera(pose, name, where)
+        photographs.append(Photograph(path, source / path, world_to_camera, lambda *_, lens=lens: lens))
+    return CameraFile(model, folder, tuple(photographs))
 
 
 def read_points(model: Path) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the model's points [points, 3] and their colors [points, 3] in 8 bits; None where it has no points."""
-    path = next((path for end in (".bin", ".txt") if (path := model / f"points3D{end}").is_file()), None)
-    found = _read_points(path) if path else []
+    parts = _parts(model, "points3D")
+    found = _read_points(parts[0]) if parts else []
     if not found:
         return None
     points = np.array([point for point, _ in found], dtype=np.float64)
@@ -109,41 +80,92 @@ def read_points(model: Path) -> tuple[np.ndarray, np.ndarray] | None:
     if not finite.all():
         row = int(finite.argmin())
         wanted, advice = "finite coordinates", "run the reconstruction again"
-        raise CaptureError.expected(wanted, points[row].tolist(), file=path, row=row, advice=advice)
+        raise CaptureError.expected(wanted, points[row].tolist(), file=parts[0], row=row, advice=advice)
     return points, np.array([color for _, color in found], dtype=np.uint8)
 
 
-def _lens(record: _Camera, where: Location) -> Lens:
-    model = MODELS.get(record.model)
-    if model is None:
-        message = f"expected a camera model among {', '.join(MODELS)}, got {record.model}; {_UNDISTORT}"
-        raise where.error(message, name=where.item, value=record.model)
-    count = len(record.parameters)
-    if count != model.parameters:
-        message = f"expected {model.parameters} parameters of {record.model}, got {count}"
-        raise where.error(message, name=where.item, value=count)
-    cx, cy, *rest = record.parameters[model.focals :]
-    distortion = [0.0] * (4 if model.fisheye else 5)
-    for index, value in zip(model.coefficients, rest, strict=True):
-        distortion[index] = value
-    focal = (record.parameters[0], record.parameters[model.focals - 1])
-    return Lens(focal, (cx, cy), record.width, record.height, tuple(distortion), model.fisheye, where)
+def read_lenses(path: Path) -> dict[int, Lens]:
+    """Return the lenses of cameras.txt or cameras.bin by the cameras' numbers.
+
+    Raises CaptureError where it cannot be read, with the line that is malformed, and for other camera models.
+    """
+    if path.suffix == ".txt":
+        cameras = _parse_lines(path, _camera)
+        return {number: _lens(path, number, name, size, values) for number, name, size, values in cameras}
+    reader, lenses = _Reader(path), {}
+    for _ in range(*reader.take("Q")):
+        number, model, width, height = reader.take("IiQQ")
+        name = _BINARY_MODELS.get(model, model)
+        focals, coefficients, _ = _model(path, number, name)
+        lenses[number] = _lens(path, number, name, (width, height), reader.take(f"{focals + 2 + coefficients}d"))
+    return lenses
 
 
-def _shot(record: _Image, lenses: dict[int, Lens], file: Path, images: Path) -> Shot:
-    lens, where = lenses.get(record.camera), Location(file, item=f"image {record.name}")
-    if lens is None:
-        known = f"expected a camera of the model ({', '.join(map(str, lenses))}), got camera {record.camera}"
-        raise where.error(f"{known}; export all parts of the model together", name=record.name, value=record.camera)
-    values = np.array(record.pose)
+def _parts(model: Path, *names: str) -> list[Path]:
+    """Return the files of a model, binary where both forms are there; none unless all of them are there."""
+    forms = ([model / f"{name}{suffix}" for name in names] for suffix in (".bin", ".txt"))
+    return next((files for files in forms if all(file.is_file() for file in files)), [])
+
+
+def _model(path: Path, number: int, name: str | int) -> CameraModel:
+    if name not in MODELS:
+        where, known = Location(path, item=f"camera {number}"), ", ".join(MODELS)
+        message = f"expected a camera model among {known}, got {name}; undistort the images first"
+        raise where.error(f"{message} (colmap image_undistorter)", name=where.item, value=name)
+    return MODELS[str(name)]
+
+
+def _lens(path: Path, number: int, name: str, size: tuple[int, int], parameters: Sequence[float]) -> Lens:
+    (focals, count, fisheye), where = _model(path, number, name), Location(path, item=f"camera {number}")
+    if len(parameters) != focals + 2 + count:
+        message = f"expected {focals + 2 + count} parameters of {name}, got {len(parameters)}"
+        raise where.error(message, name=where.item, value=len(parameters))
+    cx, cy, *coefficients = parameters[focals:]
+    distortion = (*coefficients, *[0.0] * ((4 if fisheye else 5) - count))
+    return Lens((parameters[0], parameters[focals - 1]), (cx, cy), *size, distortion, fisheye, where)
+
+
+def _world_to_camera(pose: Sequence[float], name: str, where: Location) -> torch.Tensor:
+    """Return the pose of a quaternion w, x, y, z of any length and a translation."""
+    values = np.array(pose)
     if not np.isfinite(values).all() or np.linalg.norm(values[:4]) < 1e-6:
-        message = f"expected a rotation's quaternion and a translation, got {record.pose}; run the mapper again"
-        raise where.error(message, name=record.name, value=record.pose)
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat(values[[1, 2, 3, 0]]).as_matrix()
-    pose[:3, 3] = values[4:]
-    name = record.name.replace("\\", "/")
-    return Shot(name, images / name, torch.from_numpy(pose), lambda _width, _height: lens)
+        message = f"expected a rotation's quaternion and a translation, got {pose}; run the mapper again"
+        raise where.error(message, name=name, value=pose)
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_quat(values[[1, 2, 3, 0]]).as_matrix()
+    matrix[:3, 3] = values[4:]
+    return torch.from_numpy(matrix)
+
+
+def _read_images(path: Path) -> list[_Image]:
+    images = []
+    if path.suffix == ".bin":
+        reader = _Reader(path)
+        for _ in range(*reader.take("Q")):
+            _, *pose, camera = reader.take("I7dI")
+            images.append((reader.text(), camera, pose))
+            reader.take(f"{24 * reader.take('Q')[0]}x")
+        return images
+    # A line of features, often an empty one, follows each image's.
+    features_next = False
+    for row, line in _lines(path):
+        if features_next:
+            _parse(path, row, line, _features)
+        elif line:
+            images.append(_parse(path, row, line, _image))
+        features_next = bool(line) and not features_next
+    return images
+
+
+def _read_points(path: Path) -> list[_Point]:
+    if path.suffix == ".txt":
+        return _parse_lines(path, _point)
+    reader, points = _Reader(path), []
+    for _ in range(*reader.take("Q")):
+        _, x, y, z, red, green, blue, _, track = reader.take("Q3d3BdQ")
+        points.append(((x, y, z), (red, green, blue)))
+        reader.take(f"{8 * track}x")
+    return points
 
 
 class _Reader:
@@ -174,60 +196,9 @@ class _Reader:
         return self.content[start:end].decode("utf-8", errors="replace")
 
     def _short(self) -> CaptureError:
-        size = len(self.content)
+        size, wanted = len(self.content), "a complete binary COLMAP file"
         got = f"one that ends after {size} bytes inside a record"
-        return CaptureError.expected(
-            "a complete binary COLMAP file", size, got=got, file=self.path, advice="copy it again"
-        )
-
-
-def read_cameras(path: Path) -> list[_Camera]:
-    """Read cameras.txt or cameras.bin.
-
-    Raises CaptureError where it cannot be read, with the line that is malformed, and for an unknown camera model.
-    """
-    if path.suffix == ".txt":
-        return [_parsed(path, row, line, _camera) for row, line in _lines(path) if line]
-    reader, records = _Reader(path), []
-    for _ in range(*reader.take("Q")):
-        number, model, width, height = reader.take("IiQQ")
-        if model not in _BINARY_MODELS:
-            where, message = Location(path, item=f"camera {number}"), "expected a known camera model, got number"
-            raise where.error(f"{message} {model}; {_UNDISTORT}", name=where.item, value=model)
-        name, parameters = _BINARY_MODELS[model]
-        records.append(_Camera(number, name, width, height, reader.take(f"{parameters}d")))
-    return records
-
-
-def _read_images(path: Path) -> list[_Image]:
-    records = []
-    if path.suffix == ".bin":
-        reader = _Reader(path)
-        for _ in range(*reader.take("Q")):
-            _, *pose, camera = reader.take("I7dI")
-            records.append(_Image(reader.text(), camera, tuple(pose)))
-            reader.take(f"{24 * reader.take('Q')[0]}x")
-        return records
-    # Two rows an image.
-    features_next = False
-    for row, line in _lines(path):
-        if features_next:
-            _parsed(path, row, line, _features)
-        elif line:
-            records.append(_parsed(path, row, line, _image))
-        features_next = bool(line) and not features_next
-    return records
-
-
-def _read_points(path: Path) -> list[_Point]:
-    if path.suffix == ".txt":
-        return [_parsed(path, row, line, _point) for row, line in _lines(path) if line]
-    reader, points = _Reader(path), list[_Point]()
-    for _ in range(*reader.take("Q")):
-        _, x, y, z, red, green, blue, _, track = reader.take("Q3d3BdQ")
-        points.append(((x, y, z), (red, green, blue)))
-        reader.take(f"{8 * track}x")
-    return points
+        return CaptureError.expected(wanted, size, got=got, file=self.path, advice="copy it again")
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -247,25 +218,27 @@ def _unreadable(path: Path, error: OSError | UnicodeDecodeError) -> CaptureError
     return CaptureError.expected("a readable file", reason, file=path, advice=advice)
 
 
-def _parsed(path: Path, row: int, line: str, parse: Callable[[str], _Row]) -> _Row:
+def _parse_lines(path: Path, parse: Callable[[str], _Record]) -> list[_Record]:
+    return [_parse(path, row, line, parse) for row, line in _lines(path) if line]
+
+
+def _parse(path: Path, row: int, line: str, parse: Callable[[str], _Record]) -> _Record:
     try:
         return parse(line)
     except (ValueError, IndexError, OverflowError) as error:
-        wanted = "a row as COLMAP writes it"
-        raise CaptureError.expected(
-            wanted, line, got=repr(line[:80]), file=path, row=row, advice="export the model again"
-        ) from error
+        wanted, got, advice = "a row as COLMAP writes it", repr(line[:80]), "export the model again"
+        raise CaptureError.expected(wanted, line, got=got, file=path, row=row, advice=advice) from error
 
 
-def _camera(line: str) -> _Camera:
+def _camera(line: str) -> tuple[int, str, tuple[int, int], list[float]]:
     number, model, width, height, *parameters = line.split()
-    return _Camera(int(number), model, int(width), int(height), tuple(map(float, parameters)))
+    return int(number), model, (int(width), int(height)), list(map(float, parameters))
 
 
 def _image(line: str) -> _Image:
     # The name comes last and may hold blanks.
     _, *pose, camera, name = line.split(maxsplit=9)
-    return _Image(name, int(camera), tuple(map(float, pose)))
+    return name, int(camera), list(map(float, pose))
 
 
 def _features(line: str) -> None:

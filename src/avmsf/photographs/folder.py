@@ -3,8 +3,7 @@
 import json
 import math
 import warnings
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -22,7 +21,7 @@ from avmsf.mesh.io import load_parts
 from avmsf.photographs.cameras import Camera, View, nearest_to_lines
 from avmsf.photographs.colmap import PLACES, find_model, read_colmap, read_points
 from avmsf.photographs.nerf_json import OPENCV_FROM_OPENGL, load_record, read_transforms
-from avmsf.photographs.shots import Shot, Shots, read_view, summarize, without_camera
+from avmsf.photographs.photograph import CameraFile, Findings, read_view, summarize
 
 MIN_VIEWS = 3
 _NO_CAMERAS = "neither: photographs without cameras need structure from motion first"
@@ -46,68 +45,55 @@ def read_views(
         raise CaptureError.expected("at least 1 pixel", longest, name="longest")
     if not (math.isfinite(meters) and meters > 0):
         raise CaptureError.expected("the length of the cameras' unit in meters", meters, name="meters")
-    base, found = find_shots(Path(folder))
-    shots = sorted(found.shots, key=lambda shot: shot.name)
-    repeated = sorted({one.name for one, other in pairwise(shots) if one.name == other.name})
+    cameras = read_camera_file(Path(folder))
+    photographs = sorted(cameras.photographs, key=lambda each: each.name)
+    repeated = sorted({one.name for one, other in pairwise(photographs) if one.name == other.name})
     if repeated:
-        several, advice = f"several for {listed(repeated)}", "remove all but one"
-        raise CaptureError.expected(
-            "one camera for each image", repeated, got=several, file=found.origin, name=repeated[0], advice=advice
-        )
-    remarks, findings = list(found.remarks), defaultdict[str, list[str]](list)
-    unused = without_camera(shots, base)
+        wanted, got, advice = "one camera for each image", f"several for {listed(repeated)}", "remove all but one"
+        raise CaptureError.expected(wanted, repeated, got=got, file=cameras.path, name=repeated[0], advice=advice)
+    remarks, findings = list(cameras.remarks), Findings(list)
+    unused = cameras.without_camera()
     if unused:
         message = f"{counted(len(unused), 'image')} not used, without a camera: {listed(unused)}"
         remarks.append(Remark(message, name="cameras", value=unused))
     if max_views is not None:
-        shots = shots[:: max(1, -(-len(shots) // max_views))]
-    found_views = (read_view(shot, base, longest, meters, findings) for shot in shots)
-    views = [view for view in found_views if view is not None]
+        photographs = photographs[:: max(1, -(-len(photographs) // max_views))]
+    read = (read_view(each, cameras.folder, longest, meters, findings) for each in photographs)
+    views = [view for view in read if view is not None]
+    if photographs and len(findings.get("empty masks", ())) == len(photographs):
+        wanted, got = "masks with 255 on the object and 0 elsewhere", f"{len(photographs)} without an object"
+        raise CaptureError.expected(wanted, 0, got=got, file=cameras.path, name="masks")
     remarks += summarize(findings)
     if len(views) < MIN_VIEWS:
-        raise _too_few(views, shots, findings, remarks, found.origin)
+        reasons = "".join(f"; {remark.message}" for remark in remarks)
+        place = f" (expected {photographs[0].image} and so on)" if "missing images" in findings else ""
+        got = f"{len(views)} of {len(photographs)} that can be used{reasons}{place}"
+        raise CaptureError.expected(f"at least {MIN_VIEWS} views", len(views), got=got, file=cameras.path, name="views")
     for remark in remarks + check_cameras([view.camera for view in views]):
-        warnings.warn(remark.about(found.origin), stacklevel=2)
+        warnings.warn(remark.about(cameras.path), stacklevel=2)
     return tuple(views)
 
 
-def find_shots(folder: Path) -> tuple[Path, Shots]:
-    """Return the folder that paths count from, and the shots of the camera file in it.
+def read_camera_file(folder: Path) -> CameraFile:
+    """Return what the camera file in a folder names, or the JSON file given in its place.
 
     Raises CaptureError where there is none.
     """
     if folder.suffix.lower() == ".json" and not folder.is_dir():
         if not folder.is_file():
             raise CaptureError.expected("a camera file", file=folder)
-        return folder.parent, read_transforms(folder)
+        return read_transforms(folder)
     if not folder.is_dir():
         raise CaptureError.expected("a folder", file=folder)
     if (folder / "transforms.json").is_file():
-        return folder, read_transforms(folder / "transforms.json")
+        return read_transforms(folder / "transforms.json")
     model = find_model(folder)
-    if model is None:
-        others = sorted(path.name for path in folder.glob("*.json"))
-        found = f"{listed(others)}; give the path of one of these" if others else _NO_CAMERAS
-        wanted = f"transforms.json, or COLMAP's cameras and images (.bin or .txt) in {', '.join(PLACES)}"
-        raise CaptureError.expected(wanted, others, got=found, file=folder)
-    images = folder / "images"
-    return folder, read_colmap(model, images if images.is_dir() else folder)
-
-
-def _too_few(
-    views: Sequence[View],
-    shots: Sequence[Shot],
-    findings: Mapping[str, Sequence[str]],
-    remarks: Sequence[Remark],
-    origin: Path,
-) -> CaptureError:
-    if shots and len(findings.get("empty masks", ())) == len(shots):
-        wanted, got = "masks with 255 on the object and 0 elsewhere", f"{len(shots)} without an object"
-        return CaptureError.expected(wanted, 0, got=got, file=origin, name="masks")
-    reasons = "".join(f"; {remark.message}" for remark in remarks)
-    place = f" (expected {shots[0].image} and so on)" if "missing images" in findings else ""
-    got = f"{len(views)} of {len(shots)} that can be used{reasons}{place}"
-    return CaptureError.expected(f"at least {MIN_VIEWS} views", len(views), got=got, file=origin, name="views")
+    if model is not None:
+        return read_colmap(model, folder)
+    others = sorted(path.name for path in folder.glob("*.json"))
+    got = f"{listed(others)}; give the path of one of these" if others else _NO_CAMERAS
+    wanted = f"transforms.json, or COLMAP's cameras and images (.bin or .txt) in {', '.join(PLACES)}"
+    raise CaptureError.expected(wanted, others, got=got, file=folder)
 
 
 def check_cameras(cameras: Sequence[Camera]) -> list[Remark]:

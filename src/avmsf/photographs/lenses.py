@@ -1,4 +1,4 @@
-"""Lenses as files describe them, with distortion, and pictures made straight."""
+"""Lenses as files describe them, with distortion, and images as pinholes would have taken them."""
 
 import math
 from dataclasses import dataclass, replace
@@ -6,17 +6,16 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from avmsf.errors import Location
 from avmsf.photographs.cameras import Camera
-from avmsf.photographs.images import Picture
 
-# A lens is judged on this many points along each side of the image that it would give.
-_GRID = 33
-# A straightened picture takes in at most this many times the width and height that the lens has in its middle.
-_WIDEST = 2.0
+_GRID_POINTS = 33
+"""Points along each side of a pinhole's image at which a lens is tested."""
+_MAX_FIELD_RATIO = 2.0
+"""Width and height that a pinhole takes in over those that the lens has in its middle, at most."""
 _ANY_CAMERA = Location(None, item="the camera")
 
 
@@ -60,7 +59,7 @@ class Lens:
         return not self.fisheye and not any(self.distortion)
 
     def resized(self, width: int, height: int) -> "Lens":
-        """Return the lens of the same picture with another number of pixels."""
+        """Return the lens of the same image with another number of pixels."""
         same = self.camera(torch.eye(4)).resized(width, height)
         return replace(self, focal=same.focal, principal=same.principal, width=width, height=height)
 
@@ -69,8 +68,10 @@ class Lens:
         return Camera(world_to_camera.to(torch.float64), self.focal, self.principal, self.width, self.height)
 
 
-def straighten(picture: Picture, lens: Lens) -> tuple[Picture, Lens]:
-    """Return the picture as a pinhole would have taken it, mask included, and that pinhole.
+def straighten(
+    pixels: UInt8[np.ndarray, "height width channels"], lens: Lens
+) -> tuple[UInt8[np.ndarray, "height width channels"], Lens]:
+    """Return an image, mask included, as a pinhole would have taken it, and that pinhole.
 
     It has the size and the principal point of the original. Its focal length is the smallest at which every pixel
     still shows something, so that nothing black is made up at the edges: a part of the outermost pixels may be lost,
@@ -78,20 +79,15 @@ def straighten(picture: Picture, lens: Lens) -> tuple[Picture, Lens]:
     Raises CaptureError where the distortion folds the image over, as coefficients of another model do.
     """
     if lens.straight:
-        return picture, replace(lens, distortion=())
+        return pixels, replace(lens, distortion=())
     pinhole = _widest_pinhole(lens)
     across, down = _sources(lens, pinhole, (pinhole.width, pinhole.height))
-
-    def look_up(pixels: np.ndarray) -> np.ndarray:
-        return cv2.remap(pixels, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-
-    mask = None if picture.mask is None else look_up(picture.mask)
-    return Picture(look_up(picture.color), mask), pinhole
+    return cv2.remap(pixels, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), pinhole
 
 
 def _widest_pinhole(lens: Lens) -> Lens:
     """Return the pinhole of smallest focal length, by bisection, whose every pixel lies in the lens's image."""
-    narrow, wide = 4.0, 1 / _WIDEST
+    narrow, wide = 4.0, 1 / _MAX_FIELD_RATIO
     if not _covers(lens, narrow):
         message = f"expected an invertible distortion, got {lens.distortion}; check the camera model (fisheye: "
         message += f"{lens.fisheye}) and the order of its coefficients"
@@ -111,8 +107,8 @@ def _pinhole(lens: Lens, zoom: float) -> Lens:
 def _covers(lens: Lens, zoom: float) -> bool:
     """Whether a pinhole with `zoom` times the focal length sees only what the lens sees, and sees it unfolded."""
     # One step more on each side than the image has, so that slopes are central differences up to its corners.
-    steps = (max(lens.width - 1, 1) / (_GRID - 1), max(lens.height - 1, 1) / (_GRID - 1))
-    across, down = _sources(lens, _pinhole(lens, zoom), (_GRID + 2, _GRID + 2), steps=steps, margin=1)
+    steps = (max(lens.width - 1, 1) / (_GRID_POINTS - 1), max(lens.height - 1, 1) / (_GRID_POINTS - 1))
+    across, down = _sources(lens, _pinhole(lens, zoom), (_GRID_POINTS + 2, _GRID_POINTS + 2), steps=steps, margin=1)
     (across_y, across_x), (down_y, down_x) = np.gradient(across), np.gradient(down)
     unfolded = across_x * down_y - across_y * down_x > 0
     inside = (across >= -1e-3) & (across <= lens.width - 1 + 1e-3) & (down >= -1e-3) & (down <= lens.height - 1 + 1e-3)

@@ -17,19 +17,18 @@ from avmsf.capture.filenames import PICTURE_SUFFIXES
 from avmsf.capture.placement import Mistake
 from avmsf.errors import CaptureError, Location, Remark
 from avmsf.photographs.lenses import Lens
-from avmsf.photographs.shots import Shot, Shots, refuse_many
+from avmsf.photographs.photograph import CameraFile, Photograph
 
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Axes of cameras: y and z the other way; its own inverse."""
-FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
-
-# Poses written with four digits and rotations that drifted by rounding pass; shears and scales do not.
 MAX_SCALE_DEVIATION = 1e-3
+"""Of a rotation: poses written with four digits, or that drifted by rounding, pass; shears and scales do not."""
 
 
-def read_transforms(path: Path) -> Shots:
-    """Read the shots of a transforms.json; paths in it count from its folder.
+def read_transforms(path: Path) -> CameraFile:
+    """Read the photographs of a transforms.json; paths in it count from its folder.
 
     Poses are camera to world with OpenGL's axes; intrinsics stand at the top or in each frame. Raises CaptureError
     where the file is not JSON, lacks something, or holds a pose or a camera model that cannot be used.
@@ -39,9 +38,8 @@ def read_transforms(path: Path) -> Shots:
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         wanted, kind = "a list 'frames', each with file_path and transform_matrix", type(frames).__name__
         raise CaptureError.expected(wanted, kind, got=kind, file=path, name="frames")
-    refuse_many(len(frames), path)
     common = {key: value for key, value in record.items() if key != "frames"}
-    shots, scaled = [], []
+    photographs, scaled = [], []
     for row, frame in enumerate(frames):
         file = _text(frame, "file_path", Location(path, row, f"frame {row}"))
         where = Location(path, row, f"frame {row} ({file})")
@@ -52,39 +50,12 @@ def read_transforms(path: Path) -> Shots:
             scaled.append(f"{name} ({scale:.4g})")
         settings = ChainMap(frame, common)
         mask = path.parent / _text(frame, "mask_path", where) if frame.get("mask_path") else None
-        _camera_model(settings, where)
+        _is_fisheye(settings, where)
         world_to_camera = torch.from_numpy(np.linalg.inv(pose @ OPENCV_FROM_OPENGL))
-        shots.append(Shot(name, image, world_to_camera, partial(_lens, settings, where), mask))
+        photographs.append(Photograph(name, image, world_to_camera, partial(_lens, settings, where), mask))
     message = f"poses have a scaled rotation; the scale was removed: {listed(scaled)}"
-    return Shots(path, tuple(shots), (Remark(message, name="transform_matrix", value=scaled),) if scaled else ())
-
-
-def stated_moves(folder: Path, *, meters: float = 1.0) -> list[Mistake]:
-    """Return how nerfstudio says that it moved an object, in transforms.json or beside it; none where it does not.
-
-    A place x became scale * (transform x), in units of so many `meters`. What cannot be read is passed over.
-    """
-    found = []
-    for name, keys in (
-        ("transforms.json", ("applied_transform", "applied_scale")),
-        ("dataparser_transforms.json", ("transform", "scale")),
-    ):
-        try:
-            record = read_json(folder / name)
-            matrix = np.array(record.get(keys[0], np.eye(4)), dtype=np.float64)[:3].reshape(3, 4)
-            scale = float(record.get(keys[1], 1.0))
-        except (OSError, ValueError, TypeError, AttributeError):
-            continue
-        stretch = float(np.linalg.det(matrix[:, :3])) ** (1 / 3) if np.linalg.det(matrix[:, :3]) > 0 else math.nan
-        factor, shift = scale * stretch * meters, torch.from_numpy(scale * meters * matrix[:, 3])
-        if (
-            0 < factor < math.inf
-            and np.isfinite(matrix).all()
-            and not (factor == 1 and np.allclose(matrix, np.eye(4)[:3]))
-        ):
-            words = ", ".join(f"{key} = {np.round(record[key], 4).tolist()}" for key in keys if key in record)
-            found.append(Mistake(factor, torch.from_numpy(matrix[:, :3] / stretch), shift, stated=f"{name} ({words})"))
-    return found
+    remarks = (Remark(message, name="transform_matrix", value=scaled),) if scaled else ()
+    return CameraFile(path, path.parent, tuple(photographs), remarks)
 
 
 def load_record(path: Path) -> dict[str, Any]:
@@ -99,14 +70,39 @@ def load_record(path: Path) -> dict[str, Any]:
     return record
 
 
+def stated_moves(folder: Path, *, meters: float = 1.0) -> list[Mistake]:
+    """Return how nerfstudio says that it moved an object, in transforms.json or beside it; none where it does not.
+
+    A position x became scale * (transform x), in units of so many `meters`. What cannot be read is passed over.
+    """
+    found = []
+    for name, keys in (
+        ("transforms.json", ("applied_transform", "applied_scale")),
+        ("dataparser_transforms.json", ("transform", "scale")),
+    ):
+        try:
+            record = read_json(folder / name)
+            matrix = np.array(record.get(keys[0], np.eye(4)), dtype=np.float64)[:3].reshape(3, 4)
+            scale = float(record.get(keys[1], 1.0))
+        except (OSError, ValueError, TypeError, AttributeError):
+            continue
+        determinant = float(np.linalg.det(matrix[:, :3]))
+        stretch = determinant ** (1 / 3) if determinant > 0 else math.nan
+        factor, shift = scale * stretch * meters, torch.from_numpy(scale * meters * matrix[:, 3])
+        moved = factor != 1 or not np.allclose(matrix, np.eye(4)[:3])
+        if 0 < factor < math.inf and np.isfinite(matrix).all() and moved:
+            words = ", ".join(f"{key} = {np.round(record[key], 4).tolist()}" for key in keys if key in record)
+            found.append(Mistake(factor, torch.from_numpy(matrix[:, :3] / stretch), shift, stated=f"{name} ({words})"))
+    return found
+
+
 def _lens(settings: Mapping[str, Any], where: Location, image_width: int, image_height: int) -> Lens:
     """Return a frame's lens; the image's size is used where the file has none."""
-    fisheye = _camera_model(settings, where) in FISHEYE
+    fisheye = _is_fisheye(settings, where)
     sized = "w" in settings and "h" in settings
     width = int(_number(settings, "w", where)) if sized else image_width
     height = int(_number(settings, "h", where)) if sized else image_height
-    across = _focal(settings, "x", width, where)
-    down = _focal(settings, "y", height, where)
+    across, down = _focal(settings, "x", width, where), _focal(settings, "y", height, where)
     if across is None and down is None:
         raise where.error("expected fl_x or camera_angle_x, in the frame or at the top of the file", name="fl_x")
     # With one focal length alone, pixels are square.
@@ -132,36 +128,20 @@ def _focal(settings: Mapping[str, Any], axis: str, pixels: int, where: Location)
     return pixels / 2 / math.tan(angle / 2)
 
 
-def _camera_model(settings: Mapping[str, Any], where: Location) -> str:
-    """Return the name of the frame's camera model; raises CaptureError unless it is perspective or fisheye."""
-    fallback = "OPENCV_FISHEYE" if settings.get("is_fisheye") else "OPENCV"
-    name = str(settings.get("camera_model") or fallback).upper()
+def _is_fisheye(settings: Mapping[str, Any], where: Location) -> bool:
+    """Whether the frame's camera model is fisheye; raises CaptureError unless it is that or perspective."""
+    name = str(settings.get("camera_model") or (FISHEYE if settings.get("is_fisheye") else PERSPECTIVE)[0]).upper()
     if name not in PERSPECTIVE + FISHEYE:
         known = ", ".join(PERSPECTIVE + FISHEYE)
         message = f"expected a camera model among {known}, got {name}; undistort the images first"
         raise where.error(message, name="camera_model", value=name)
-    return name
-
-
-def _matrix(frame: dict[str, Any], where: Location) -> np.ndarray:
-    key = "transform_matrix"
-    written = frame.get(key)
-    try:
-        matrix = np.array(written, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise where.error(f"expected {key} as 4 rows of 4 numbers ({error})", name=key, value=written) from error
-    if written is None or matrix.shape not in ((4, 4), (3, 4)):
-        got = "none" if written is None else f"the shape {matrix.shape}"
-        message = f"expected {key}, the camera-to-world pose, as 4 rows of 4 numbers, got {got}"
-        raise where.error(message, name=key, value=written)
-    return matrix
+    return name in FISHEYE
 
 
 def _number(settings: Mapping[str, Any], key: str, where: Location, fallback: float | None = None) -> float:
     value = settings.get(key, fallback)
     # A whole number of a JSON file may be larger than any float.
-    known = not isinstance(value, bool) and isinstance(value, int | float) and abs(value) <= sys.float_info.max
-    if value is None or not known:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
         raise where.error(f"expected a finite number as {key}, got {value!r}", name=key, value=value)
     return float(value)
 
@@ -184,34 +164,46 @@ def _with_suffix(path: Path) -> Path:
 def _name(file: str, image: Path) -> str:
     """Return the image's path without a leading `./`, `../` or `images/`, with its suffix."""
     stem = PurePosixPath(file)
-    parts = [part for part in stem.parts[:-1] if part not in (".", "..", "/")]
     if stem.is_absolute() or Path(file).is_absolute():
-        parts = []
-    if parts and parts[0] == "images":
-        parts = parts[1:]
-    return "/".join([*parts, image.name])
+        return image.name
+    parts = [part for part in stem.parts[:-1] if part not in (".", "..")]
+    return "/".join([*(parts[1:] if parts[:1] == ["images"] else parts), image.name])
+
+
+def _matrix(frame: dict[str, Any], where: Location) -> Float[np.ndarray, "rows 4"]:
+    """Return a frame's pose, of 4 rows, or 3 without the last."""
+    key = "transform_matrix"
+    written = frame.get(key)
+    try:
+        matrix = np.array(written, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise where.error(f"expected {key} as 4 rows of 4 numbers ({error})", name=key, value=written) from error
+    if written is None or matrix.shape not in ((4, 4), (3, 4)):
+        got = "none" if written is None else f"the shape {matrix.shape}"
+        message = f"expected {key}, the camera-to-world pose, as 4 rows of 4 numbers, got {got}"
+        raise where.error(message, name=key, value=written)
+    return matrix
 
 
 def _rigid(matrix: Float[np.ndarray, "rows 4"], where: Location) -> tuple[Float[np.ndarray, "4 4"], float]:
     """Return a camera-to-world matrix made exactly rigid, and the scale that its rotation had.
 
-    `matrix` is 4 x 4, or 3 x 4 without the last row. A scale that is the same along all axes does not move the camera
-    and is removed; the caller warns of it. Raises CaptureError, at `where`, for anything else that is not a rotation
-    with a position.
+    A scale that is the same along all axes does not move the camera and is removed; the caller warns of it. Raises
+    CaptureError, at `where`, for anything else that is not a rotation with a position.
     """
 
-    def refused(message: str, value: Any) -> CaptureError:
+    def error(message: str, value: Any) -> CaptureError:
         return where.error(message, name="transform_matrix", value=value)
 
     if not np.isfinite(matrix).all():
         value = float(matrix[~np.isfinite(matrix)][0])
-        raise refused(f"expected a finite pose, got {value}; estimate this camera again", value)
+        raise error(f"expected a finite pose, got {value}; estimate this camera again", value)
     if len(matrix) == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
         row = matrix[3].tolist()
-        raise refused(f"expected 0 0 0 1 as the pose's last row, got {row}; perhaps the matrix is transposed", row)
+        raise error(f"expected 0 0 0 1 as the pose's last row, got {row}; perhaps the matrix is transposed", row)
     determinant = float(np.linalg.det(matrix[:3, :3]))
     if determinant < -1e-12:
-        raise refused(
+        raise error(
             f"expected a pose with right-handed axes, got determinant {determinant:.3g}. transforms.json has OpenGL's "
             "axes: x right, y up, z backward. With y up and z forward (Unity, DirectX), negate the third column; with "
             "x right, y down and z forward (OpenCV), negate the second and the third",
@@ -221,10 +213,8 @@ def _rigid(matrix: Float[np.ndarray, "rows 4"], where: Location) -> tuple[Float[
     scale = float(stretches.mean())
     if scale < 1e-9 or np.abs(stretches / scale - 1).max() > MAX_SCALE_DEVIATION:
         scales = ", ".join(f"{stretch:.4g}" for stretch in stretches)
-        raise refused(
-            f"expected a rotation in the pose, got a matrix with the scales {scales} along its axes; remove the scales",
-            stretches.tolist(),
-        )
+        message = f"expected a rotation in the pose, got a matrix with the scales {scales} along its axes"
+        raise error(f"{message}; remove the scales", stretches.tolist())
     rigid = np.eye(4)
     rigid[:3, :3], rigid[:3, 3] = left @ right, matrix[:3, 3]
     return rigid, scale

@@ -18,8 +18,8 @@ from avmsf._utils.processes import end_child, ending_of, start_child
 from avmsf._utils.text import counted, listed
 from avmsf.capture.filenames import PICTURE_SUFFIXES, pictures_in
 from avmsf.errors import CaptureError, Remark
-from avmsf.photographs.images import Picture, PictureSizeError, read_mask, read_picture
-from avmsf.photographs.shots import mask_names
+from avmsf.photographs.images import ImageSizeError, read_image, read_mask, size_of
+from avmsf.photographs.photograph import mask_paths
 
 WORKER = Path(__file__).with_name("sfm_worker.py")
 MIN_IMAGES = 3
@@ -93,17 +93,17 @@ def _stage_images(images: Path, begun: Path) -> tuple[dict[str, str], list[str]]
     for path in pictures_in(images, deep=True):
         name = path.relative_to(images).as_posix()
         try:
-            picture = read_picture(path)
-        except PictureSizeError:
+            pixels = read_image(path)
+        except ImageSizeError:
             raise
         except CaptureError:
             unreadable.append(name)
             continue
         # COLMAP reads no WebP.
         staged = f"{name}.png" if path.suffix.lower() == ".webp" else name
-        names[staged], sizes[name] = name, picture.size
-        _stage_image(path, picture, begun / "images" / staged)
-        _stage_mask(images, picture, name, begun / "masks" / f"{staged}.png")
+        names[staged], sizes[name] = name, size_of(pixels)
+        _stage_image(path, pixels, begun / "images" / staged)
+        _stage_mask(images, pixels, name, begun / "masks" / f"{staged}.png")
     if len(names) < MIN_IMAGES:
         unread = f" and {len(unreadable)} that cannot be read: {listed(unreadable, most=8)}" if unreadable else ""
         wanted, got = f"at least {MIN_IMAGES} photographs ({', '.join(PICTURE_SUFFIXES)})", f"{len(names)}{unread}"
@@ -117,11 +117,11 @@ def _stage_images(images: Path, begun: Path) -> tuple[dict[str, str], list[str]]
     return names, unreadable
 
 
-def _stage_image(path: Path, picture: Picture, staged: Path) -> None:
+def _stage_image(path: Path, pixels: np.ndarray, staged: Path) -> None:
     """Link or write one image under the name that it is given."""
     staged.parent.mkdir(parents=True, exist_ok=True)
     if staged.suffix != path.suffix:
-        cv2.imwrite(str(staged), picture.color[..., ::-1])
+        cv2.imwrite(str(staged), pixels[..., 2::-1])
         return
     try:
         staged.symlink_to(path.resolve())
@@ -129,14 +129,14 @@ def _stage_image(path: Path, picture: Picture, staged: Path) -> None:
         shutil.copyfile(path, staged)
 
 
-def _stage_mask(images: Path, picture: Picture, name: str, staged: Path) -> None:
+def _stage_mask(images: Path, pixels: np.ndarray, name: str, staged: Path) -> None:
     """Write the image's mask, where it has one, as COLMAP reads it."""
-    path = next((place for place in mask_names(name, images.parent) if place.is_file()), None)
-    mask = picture.mask if picture.mask is not None or path is None else read_mask(path)
-    if mask is None:
+    path = next((path for path in mask_paths(name, images.parent) if path.is_file()), None)
+    if pixels.shape[2] == 3 and path is None:
         return
-    if mask.shape[::-1] != picture.size:
-        mask = cv2.resize(mask, picture.size, interpolation=cv2.INTER_NEAREST)
+    mask = pixels[..., 3] if path is None or pixels.shape[2] == 4 else read_mask(path)
+    if size_of(mask) != size_of(pixels):
+        mask = cv2.resize(mask, size_of(pixels), interpolation=cv2.INTER_NEAREST)
     staged.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(staged), np.where(mask >= 128, 255, 0).astype(np.uint8))
 
@@ -198,7 +198,7 @@ def _check_groups(
         message = f"{counted(len(unreadable), 'image')} not used, as they cannot be read: {listed(unreadable, most=8)}"
         remarks.append(Remark(message, name="unreadable images", value=unreadable))
     # Groups overlap: an image may belong to several that could not be joined.
-    others = [apart for group in groups[1:] if (apart := [name for name in group if name not in largest])]
+    others = [rest for group in groups[1:] if (rest := [name for name in group if name not in largest])]
     if others:
         message = (
             f"the photographs form {len(groups)} groups that could not be joined; only the largest, of {len(largest)} "

@@ -18,10 +18,10 @@ from avmsf.capture.together import find_surface
 from avmsf.errors import AvmsfError, AvmsfWarning, CaptureError, CaptureWarning, FitError, SceneError
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh.surface import surface_points
-from avmsf.photographs.folder import find_shots, read_views
+from avmsf.photographs.folder import read_camera_file, read_views
 from avmsf.photographs.nerf_json import stated_moves
+from avmsf.photographs.photograph import mask_paths
 from avmsf.photographs.segmentation import find_foreground
-from avmsf.photographs.shots import mask_names
 from avmsf.pipeline.frame_check import LONGEST, MAX_VIEWS, check_outlines, expect_contacts_in_views, expect_on_object
 from avmsf.pipeline.scene import scaled, without_far
 from avmsf.pipeline.sources import find_source, find_splats
@@ -167,17 +167,17 @@ def _photographs(
     """
     if kind == "cameras":
         try:
-            _, found = find_shots(folder)
+            found = read_camera_file(folder)
         except CaptureError as error:
             problems.append(str(error))
             return _photographs(folder, "photographs", problems)
-        missing = [shot.name for shot in found.shots if not shot.image.is_file()]
+        missing = [each.name for each in found.photographs if not each.image.is_file()]
         if missing:
             lacks = counted(len(missing), "missing photograph")
-            problems.append(f"{found.origin.name}: {lacks}, {listed(missing)}; copy them there")
-        present = {shot.name: shot.image for shot in found.shots if shot.image.is_file()}
-        origin = "COLMAP's" if found.origin == folder else found.origin.relative_to(folder).as_posix()
-        return present, origin, {shot.name: shot.mask for shot in found.shots if shot.mask is not None}
+            problems.append(f"{found.path.name}: {lacks}, {listed(missing)}; copy them there")
+        present = {each.name: each.image for each in found.photographs if each.image.is_file()}
+        origin = "COLMAP's" if found.path == folder else found.path.relative_to(folder).as_posix()
+        return present, origin, {each.name: each.mask for each in found.photographs if each.mask is not None}
     images = folder / "images"
     if images.is_dir():
         return {path.relative_to(images).as_posix(): path for path in pictures_in(images, deep=True)}, None, {}
@@ -187,7 +187,7 @@ def _photographs(
 
 def _masked(folder: Path, names: dict[str, Path], masks: dict[str, Path], problems: list[str]) -> int:
     """Return how many photographs have a mask; add to `problems` masks of no photograph, and masks that are missing."""
-    places = {name: [*mask_names(name, folder), *([masks[name]] if name in masks else [])] for name in names}
+    places = {name: [*mask_paths(name, folder), *([masks[name]] if name in masks else [])] for name in names}
     known = {path for each in places.values() for path in each}
     unmatched = [path for path in pictures_in(folder / "masks", deep=True) if path not in known]
     if unmatched:
