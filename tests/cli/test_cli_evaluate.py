@@ -9,9 +9,9 @@ import pytest
 from avmsf.cli.evaluate import run
 from avmsf.cli.options.evaluate import Options
 from avmsf.errors import AvmsfError, EvaluationError, FitError
+from avmsf.evaluation.case_run import Evaluation
 from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.results import ResultsFolder
-from avmsf.evaluation.runner import Evaluation
 from avmsf.evaluation.task import Task
 from avmsf.modal.extraction.finders import ShortTime
 from avmsf.simulate.recipe import ABLATED

@@ -12,11 +12,11 @@ from avmsf.capture.impacts import Impacts
 from avmsf.datasets.dataset import ObjectFacts
 from avmsf.errors import EvaluationError
 from avmsf.evaluation import align_split, evaluate
+from avmsf.evaluation.case_run import CaseRun, Evaluation, ObjectData
 from avmsf.evaluation.cases import Case
 from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.methods import method_named
 from avmsf.evaluation.registry import PROTOCOLS
-from avmsf.evaluation.runner import CaseRun, Evaluation, ObjectData
 from avmsf.evaluation.simple_methods import NearestRecording
 from avmsf.evaluation.splits import MetricSettings
 from avmsf.evaluation.task import Task

@@ -16,14 +16,14 @@ import torch
 from avmsf.capture import read_capture
 from avmsf.datasets import CaptureCollection
 from avmsf.errors import AvmsfError, EvaluationError, FitError
+from avmsf.evaluation.case_run import Evaluation
 from avmsf.evaluation.methods import method_named
 from avmsf.evaluation.modal_metrics import ModalRenderer, compare_modes, truth_at
 from avmsf.evaluation.objects import ObjectInputs, draw_other_recording
-from avmsf.evaluation.parallel import RunProgress, run_objects
 from avmsf.evaluation.registry import PROTOCOLS
 from avmsf.evaluation.report import write_summary
 from avmsf.evaluation.results import ENCODER, ResultsFolder
-from avmsf.evaluation.runner import Evaluation
+from avmsf.evaluation.runner import Progress, run_objects
 from avmsf.evaluation.simple_methods import NearestRecording
 from avmsf.evaluation.splits import MetricSettings, split, spread
 from avmsf.evaluation.task import Method, Renderer, Task
@@ -237,7 +237,7 @@ def test_results_of_different_evaluations_are_not_mixed(
     changed = replace(Counting([]), name="knn3")
     with raises(EvaluationError, file=results.path, name="knn3", value=held["methods"]["knn3"]):
         run_objects(planned(plates, changed), ("a",), results)
-    monkeypatch.setattr("avmsf.evaluation.runner.source_digest", lambda module: "of other code")
+    monkeypatch.setattr("avmsf.evaluation.case_run.source_digest", lambda module: "of other code")
     with raises(EvaluationError, file=results.path, name="source", value=held["source"]):
         run_objects(planned(plates, "knn3"), ("a",), results)
     assert (tmp_path / "results" / "objects" / "a.json").read_bytes() == before
@@ -369,7 +369,7 @@ for _ in range(5):
     read, write = os.pipe()
     child = os.fork()
     if child == 0:
-        evaluate_plates(Path(sys.argv[2]), Path(sys.argv[3]), lambda progress: os.write(write, b"."))
+        evaluate_plates(Path(sys.argv[2]), Path(sys.argv[3]), lambda *progress: os.write(write, b"."))
         os._exit(0)
     os.close(write)
     for _ in range(chance.randint(3, 12)):
@@ -383,7 +383,7 @@ for _ in range(5):
 """Begins an evaluation five times, and kills it at a random moment after it has begun a random number of methods."""
 
 
-def evaluate_plates(data: Path, results: Path, progress: Callable[[RunProgress], None] = lambda event: None) -> None:
+def evaluate_plates(data: Path, results: Path, progress: Progress = lambda *event: None) -> None:
     evaluation = planned(data, protocol="leave-one-out")
     run_objects(evaluation, evaluation.dataset.objects(), ResultsFolder(results), progress=progress)
     summed(results)
@@ -410,7 +410,7 @@ def test_killed_five_times_it_comes_to_the_same_summary(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_many_at_a_time_come_to_the_same_figures(plates: Path, tmp_path: Path) -> None:
     pytest.importorskip("ray")
-    heard: list[RunProgress] = []
+    heard: list[int] = []
     evaluation = planned(plates, *CHEAP, "spline-gains")
     # Workers find what the package holds, and not what lies beside the tests.
     dataset, kept = evaluation.dataset, tmp_path / "features"
@@ -418,8 +418,8 @@ def test_many_at_a_time_come_to_the_same_figures(plates: Path, tmp_path: Path) -
     objects = evaluation.dataset.objects()
     run_objects(evaluation, objects, ResultsFolder(tmp_path / "one"))
     many = ResultsFolder(tmp_path / "many")
-    run_objects(evaluation, objects, many, workers=2, progress=heard.append)
-    assert [each.done for each in heard] == [0, 1, 2, 3]
+    run_objects(evaluation, objects, many, workers=2, progress=lambda message, done, total: heard.append(done))
+    assert heard == [0, 1, 2, 3]
     one, other = summed(tmp_path / "one"), summed(tmp_path / "many")
     for method, figures in one["methods"].items():
         assert other["methods"][method] == pytest.approx(figures, rel=1e-6)

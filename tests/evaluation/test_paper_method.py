@@ -10,11 +10,11 @@ import torch
 from avmsf.cli.evaluate import inputs_of, settled_lifts
 from avmsf.datasets import CaptureCollection
 from avmsf.errors import EvaluationError, SceneError
+from avmsf.evaluation.case_run import Evaluation
 from avmsf.evaluation.field_methods import NETWORK, FieldMethod
 from avmsf.evaluation.methods import method_named
 from avmsf.evaluation.registry import PROTOCOLS
 from avmsf.evaluation.results import ResultsFolder
-from avmsf.evaluation.runner import Evaluation
 from avmsf.evaluation.splits import MetricSettings
 from avmsf.evaluation.task import Task
 from avmsf.features.descriptors import ImageDescriptors

@@ -16,12 +16,12 @@ from PIL import Image
 from test_evaluation_run import planned
 
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.parallel import run_objects
 from avmsf.evaluation.published import PUBLISHED, published_ratios
 from avmsf.evaluation.registry import METHODS
 from avmsf.evaluation.report import markdown, write_page, write_summary
 from avmsf.evaluation.report_tables import WARNING, Section, figure, sections
 from avmsf.evaluation.results import CaseRecord, ObjectRecord, Outcome, ResultsFolder, natural
+from avmsf.evaluation.runner import run_objects
 from avmsf.evaluation.stored_sounds import StoredSound, draw_spectrogram, keep_sound, listening_gain
 from avmsf.evaluation.summary import missing_of, object_values, summarize
 from factories.plate_set import fill_plates

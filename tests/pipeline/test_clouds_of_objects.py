@@ -7,10 +7,11 @@ import torch
 
 from avmsf.datasets import CaptureCollection
 from avmsf.errors import SceneError
+from avmsf.evaluation.case_run import Evaluation
 from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.registry import PROTOCOLS
 from avmsf.evaluation.results import ResultsFolder
-from avmsf.evaluation.runner import Evaluation, run_object
+from avmsf.evaluation.runner import run_object
 from avmsf.evaluation.simple_methods import NearestRecording
 from avmsf.evaluation.splits import MetricSettings
 from avmsf.evaluation.task import Task

@@ -18,17 +18,17 @@ from avmsf.cli.progress import ProgressBar
 from avmsf.datasets import CaptureCollection, open_dataset
 from avmsf.datasets.dataset import Dataset
 from avmsf.errors import EvaluationError
+from avmsf.evaluation.case_run import Evaluation
 from avmsf.evaluation.cases import Predefined, Shots
 from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.methods import RecordedMethod, method_named
 from avmsf.evaluation.objects import SUBSETS, ObjectInputs, choose_objects, members
-from avmsf.evaluation.parallel import RunProgress, run_objects
 from avmsf.evaluation.published import PUBLISHED
 from avmsf.evaluation.registry import Protocol, protocol_named
 from avmsf.evaluation.report import PAGE, SUMMARY, TABLES, write_figures, write_page, write_summary
 from avmsf.evaluation.report_tables import Section
 from avmsf.evaluation.results import IDENTITY, ResultsFolder
-from avmsf.evaluation.runner import Evaluation
+from avmsf.evaluation.runner import run_objects
 from avmsf.evaluation.splits import MetricSettings
 from avmsf.evaluation.task import Method, VisualInput
 from avmsf.modal.extraction.finders import finder_named
@@ -191,10 +191,10 @@ def run_shown(
     """Run an evaluation under a progress bar, and call `after_each` after each object."""
     with ProgressBar() as bar:
 
-        def show(progress: RunProgress) -> None:
-            if progress.done > bar.done:
+        def show(message: str, done: int, total: int) -> None:
+            if done > bar.done:
                 after_each()
-            bar.objects(progress.words, progress.done, progress.total)
+            bar.objects(message, done, total)
 
         run_objects(evaluation, objects, results, workers=workers, address=address, progress=show)
 

@@ -1,283 +1,69 @@
-"""Running an evaluation: all methods in all cases of an object, each result stored at once."""
+"""Running an evaluation: all methods on one object after the other, or on several at a time by ray.
 
-import hashlib
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+Each result is stored at once; what has results already is not computed again.
+"""
+
+import os
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, is_dataclass, replace
-from functools import partial
-from importlib.metadata import version
-from pathlib import Path
+from dataclasses import replace
+from types import ModuleType
 from typing import Any
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
-from avmsf._utils.caching import Given, Result, once, source_digest
 from avmsf._utils.device import one_thread
 from avmsf.capture.impacts import Impacts
-from avmsf.datasets.dataset import Dataset
 from avmsf.errors import AvmsfError, EvaluationError
+from avmsf.evaluation.case_run import CaseRun, Evaluation, ObjectData
 from avmsf.evaluation.cases import Case
-from avmsf.evaluation.field_methods import FieldMethod
-from avmsf.evaluation.localization import located, write_map
 from avmsf.evaluation.methods import RecordedMethod
-from avmsf.evaluation.modal_metrics import truth_at, truth_from_first_sample, truth_of
-from avmsf.evaluation.objects import ObjectInputs, draw_other_recording
-from avmsf.evaluation.registry import Protocol
-from avmsf.evaluation.results import ENCODER, CaseRecord, ObjectRecord, Outcome, ResultsFolder, failure_of, file_word
-from avmsf.evaluation.splits import MetricSettings, Values, align_split, spread
-from avmsf.evaluation.stored_sounds import RECORDED, keep_sound, listening_gain
-from avmsf.evaluation.task import Method, Renderer, Task, expect_renderer, report_of
-from avmsf.modal.extraction.extract import extract_once
-from avmsf.modal.extraction.finders import HighResolution, ModeFinder
-from avmsf.simulate.ground_truth import Truth
+from avmsf.evaluation.results import CaseRecord, ObjectRecord, ResultsFolder, failure_of
+
+Progress = Callable[[str, int, int], None]
+"""Gets what has begun or ended, the number of finished objects, and of all."""
 
 
-@dataclass(frozen=True, eq=False)
-class Evaluation:
-    """Data set, protocol, methods and settings of an evaluation."""
+def run_objects(
+    evaluation: Evaluation,
+    identifiers: Sequence[str],
+    results: ResultsFolder,
+    *,
+    workers: int = 1,
+    address: str | None = None,
+    progress: Progress = lambda message, done, total: None,
+) -> None:
+    """Evaluate all methods on the objects, except those with stored results.
 
-    dataset: Dataset
-    title: str
-    """Name of the dataset in reports; one folder of results has one."""
-    protocol: Protocol
-    methods: tuple[Method, ...]
-    inputs: ObjectInputs
-    seed: int = 0
-    """Random seed of the methods."""
-    metric_settings: MetricSettings = field(default_factory=MetricSettings)
-    finder: ModeFinder = field(default_factory=HighResolution)
-    """Extraction of modes, once per case."""
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of the features, as plain values."""
-    device: str | None = None
-    """Device that methods train on, with the same result up to rounding; None for a GPU where there is one."""
-    encoder: str | None = None
-    """Encoder that `auto` in the settings stands for; None where the settings name it, or no method reads features."""
-    time_zero: str | None = None
-    """Start of the dataset's sounds, `onset` or `peak`, on which all methods are scored; None for the dataset's own."""
-    own_starts: Dataset | None = None
-    """The same dataset with its own starts, for fields that are not of the paper's configuration; None where all
-    methods are fitted to the sounds that they are scored on."""
+    `workers` is the number of parallel objects on this computer, `address` a ray cluster's or `auto`; its computers
+    must see data and results under the same paths. With one worker and no address, ray is not needed. Each object is
+    computed on one thread, so that values do not depend on the number of workers. Raises as `Evaluation.begin` and
+    `run_object`, and EvaluationError where ray is needed and not installed.
+    """
+    if workers < 1:
+        raise EvaluationError.expected("1 worker or more", workers, name="workers")
+    if address is not None or workers > 1:
+        ray = _ray()
+        evaluation.begin(results)
+        with _cluster(ray, workers, address):
+            _run_remotely(ray, evaluation, identifiers, results, progress)
+        return
+    evaluation.begin(results)
+    total = len(identifiers)
+    for done, identifier in enumerate(identifiers):
 
-    def begin(self, results: ResultsFolder) -> None:
-        """Take a folder for this evaluation's results.
+        def log(message: str, done: int = done) -> None:
+            progress(message, done, total)
 
-        Raises EvaluationError where the folder holds other ones, and where a metric's package is not installed.
-        """
-        if not self.protocol.locating:
-            self.metric_settings.prepare()
-        identity = {
-            "version": version("avmsf"),
-            "source": [source_digest(__name__), source_digest("avmsf.evaluation.methods")],
-            "protocol": self.protocol.name,
-            "choosing": repr(self.protocol.choosing),
-            "dataset": self.title,
-            "seed": self.seed,
-            "time_zero": self.time_zero,
-            "metrics": _plain(self.metric_settings),
-            "modes": _plain(self.finder),
-            "settings": dict(self.settings),
-        }
-        results.begin(identity, {method.name: self._described(method) for method in self.methods})
-
-    def _described(self, method: Method) -> str:
-        """Return what tells a method apart from another of its name. Methods that read no features share any folder."""
-        read = self.encoder is not None and isinstance(method, FieldMethod) and method.visual_input != "surface"
-        return f"{method!r}{ENCODER}{self.encoder}" if read else repr(method)
-
-
-def _plain(settings: Any) -> Any:
-    """Return settings as plain values, those of a dataclass by their names, with the name of its class as `kind`."""
-    if not is_dataclass(settings):
-        return settings
-    values = {each.name: _plain(getattr(settings, each.name)) for each in fields(settings)}
-    return {"kind": type(settings).__name__, **values}
-
-
-MAX_STORED_SOUNDS = 3
-"""Test contacts of an experiment whose sounds are kept to be listened to."""
-
-
-class _Recordings:
-    """A case's recordings from one kind of start, aligned when first asked for, and their modes, kept in a file."""
-
-    def __init__(self, impacts: Impacts, case: Case, finder: ModeFinder, path: Path) -> None:
-        self.train, self.test = impacts.take(case.train), impacts.take(case.test)
-        self.modes = once(lambda: extract_once(self.train, finder, path))
-
-    def align(self) -> None:
-        """Give all recordings the starts that the training ones have in common."""
-        self.train, self.test = align_split(self.train, self.test, modes=self.modes)
-
-
-class ObjectData:
-    """What all cases of an object share, each made once; so is the error of what cannot be made."""
-
-    def __init__(self, evaluation: Evaluation, identifier: str) -> None:
-        """Read an object. Raises AvmsfError, OSError or ValueError where it is damaged."""
-        dataset, inputs = evaluation.dataset, evaluation.inputs
-        capture = dataset.capture(identifier)
-        surface = capture.surface
-        self.identifier = identifier
-        self.impacts = capture.impacts
-        """Recordings on which all methods are scored."""
-        self.own_starts = None if evaluation.own_starts is None else evaluation.own_starts.capture(identifier).impacts
-        """Where `impacts` start at their peaks, the same recordings with the dataset's own starts, for fields that are
-        not of the paper's configuration: from its peak a recording's modes have phases of its own, which hide the
-        signs of the gains, and which the truth of all does not have."""
-        truth = None if evaluation.time_zero == "peak" else truth_of(dataset, identifier)
-        self.digest = digest_of(self.impacts, truth)
-        if truth is not None:
-            truth = truth_from_first_sample(truth_at(truth, self.impacts.names), self.impacts)
-        self.truth, self.facts = truth, dataset.facts(identifier)
-        self.vertices = None if surface is None or not len(surface.faces) else surface.vertices
-        self.features = once(partial(inputs.features, identifier))
-        self.bodies = once(partial(inputs.bodies, identifier))
-        self.family = once(partial(inputs.family, identifier))
-        self.gaussians = once(partial(inputs.cloud, identifier))
-        self.other_recording = once(
-            partial(draw_other_recording, dataset, identifier, self.impacts, seed=evaluation.seed)
-        )
-
-
-class CaseRun:
-    """Runs methods in one case, with modes that are found once and kept in a file."""
-
-    def __init__(
-        self, evaluation: Evaluation, data: ObjectData, case: Case, *, folder: Path, number: int, stores_sounds: bool
-    ) -> None:
-        """Prepare the `number`-th case of an object; with `stores_sounds`, some of its sounds go into `folder`."""
-        self.evaluation, self.data, self.case, self.folder = evaluation, data, case, folder
-        self.place = f"{data.identifier}/{number:02d}"
-        path, finder = folder / "modes" / f"{self.place}.safetensors", evaluation.finder
-        self.scored = self.own = _Recordings(data.impacts, case, finder, path)
-        if data.own_starts is not None:
-            self.own = _Recordings(
-                data.own_starts, case, finder, path.with_name(f"{number:02d} own starts.safetensors")
-            )
-        self.truth = None if data.truth is None else truth_at(data.truth, self.scored.test.names)
-        self.features = partial(data.features, views=case.views)
-        self.stored_rows = spread(len(case.test), MAX_STORED_SOUNDS) if stores_sounds else []
-        self.shared = 0.0
-
-    def outcome(self, method: Method) -> Outcome:
-        """Return what a method comes to; whatever it raises, but for an interruption, is its failure."""
-        begun, shared = time.perf_counter(), self.shared
-        recordings = self.own if isinstance(method, FieldMethod) and not method.published else self.scored
-        try:
-            for each in (self.scored, recordings):
-                with self._sharing():
-                    each.align()
-            renderer = expect_renderer(method.fit(self._task(recordings)))
-            fit_seconds = time.perf_counter() - begun - (self.shared - shared)
-            begun = time.perf_counter()
-            with torch.no_grad():
-                sounds = renderer.render(recordings.test.contacts, directions=recordings.test.directions)
-            render_seconds = time.perf_counter() - begun
-            values, figures, maps = self._values(method, recordings, renderer, sounds)
-        except Exception as error:  # A fault in one method must not cost the others their hours.
-            return Outcome(self.case.key, method.name, failure=failure_of(error))
-        return Outcome(
-            self.case.key,
-            method.name,
-            values,
-            figures,
-            round(fit_seconds, 4),
-            round(render_seconds, 4),
-            self._keep_sounds(method.name, sounds),
-            report_of(renderer),
-            maps,
-        )
-
-    def described(self, known: CaseRecord) -> CaseRecord:
-        """Return the case's record with the recordings' files, and with what modes and features have taken so far."""
-        sounds = known.sounds or self._keep_sounds(RECORDED, self.scored.test.sounds)
-        seconds, self.shared = known.shared_seconds + self.shared, 0.0
-        return replace(known, sounds=sounds, shared_seconds=round(seconds, 4))
-
-    def _values(
-        self, method: Method, recordings: _Recordings, renderer: Renderer, sounds: Float[Tensor, "contacts samples"]
-    ) -> tuple[Values, dict[str, float | None], dict[str, str]]:
-        """Return the metrics, the figures, and the files of contacts' maps by the names of their recordings."""
-        if not self.evaluation.protocol.locating:
-            loudest = float(self.data.impacts.sounds.abs().max())
-            settings = self.evaluation.metric_settings
-            return *settings.values(renderer, sounds, self.scored.test, self.truth, loudest=loudest), {}
-        points = self._shared(self.features)("surface").points
-        published = isinstance(method, FieldMethod) and method.published
-        found = located(
-            renderer,
-            recordings.train,
-            recordings.test,
-            points,
-            vertices=self.data.vertices,
-            published=published,
-            map_rows=self.stored_rows,
-        )
-        maps = {}
-        for row, each in found.maps.items():
-            file = f"maps/{self.place}/{row:03d} {file_word(method.name)}.safetensors"
-            write_map(self.folder / file, each, truth=recordings.test.contacts[row])
-            maps[recordings.test.names[row]] = file
-        return dict(found.errors), {}, maps
-
-    def _task(self, recordings: _Recordings) -> Task:
-        return Task(
-            name=self.data.identifier,
-            train=recordings.train,
-            contacts=self.data.impacts.contacts,
-            names=self.data.impacts.names,
-            seed=self.evaluation.seed,
-            modes=self._shared(recordings.modes),
-            features=self._shared(self.features),
-            bodies=self._shared(self.data.bodies),
-            other_recording=self._shared(self.data.other_recording),
-            family=self._shared(self.data.family),
-            gaussians=self._shared(partial(self.data.gaussians, self.case.views)),
-            material=self.data.facts.material,
-            device=self.evaluation.device,
-        )
-
-    def _shared(self, make: Callable[Given, Result]) -> Callable[Given, Result]:
-        def made(*given: Given.args, **named: Given.kwargs) -> Result:
-            with self._sharing():
-                return make(*given, **named)
-
-        return made
-
-    @contextmanager
-    def _sharing(self) -> Iterator[None]:
-        """Count the time to no method: whichever asks first would seem the slowest."""
-        begun = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.shared += time.perf_counter() - begun
-
-    def _keep_sounds(self, name: str, sounds: Float[Tensor, "contacts samples"]) -> dict[str, str]:
-        """Write the sounds to listen to, and return their files by the names of their recordings."""
-        kept = {}
-        word = file_word(name)
-        for row in self.stored_rows:
-            file = f"sounds/{self.place}/{row:03d} {word}.flac"
-            test = self.scored.test
-            keep_sound(
-                self.folder / file, sounds[row], sample_rate=test.sample_rate, gain=listening_gain(test.sounds[row])
-            )
-            kept[test.names[row]] = file
-        return kept
+        run_object(evaluation, identifier, results, log)
+        progress(f"{identifier}: done", done + 1, total)
 
 
 def run_object(
     evaluation: Evaluation, identifier: str, results: ResultsFolder, log: Callable[[str], None] = lambda message: None
 ) -> None:
-    """Evaluate all methods on one object, except those with stored results; each result is stored at once.
+    """Evaluate all methods on one object, on one thread, except those with stored results.
 
-    On one thread. Failures of an object or a method are stored as their results. `log` is called with a message for
-    each method that begins. Raises EvaluationError where stored results are of other recordings.
+    Failures of an object or a method are stored as their results. `log` is called with a message for each method that
+    begins. Raises EvaluationError where stored results are of other recordings.
     """
     with one_thread():
         record = results.read(identifier) or ObjectRecord(identifier)
@@ -287,68 +73,123 @@ def run_object(
         except (AvmsfError, OSError, ValueError) as error:  # A damaged object must not cost the others their hours.
             results.write(replace(record, failure=failure_of(error)))
             return
-        record = _described(_of_same_recordings(record, data.digest, evaluation, results), data, cases)
+        record = _begun(record, data, cases, evaluation, results)
         results.write(record)
         firsts = {case.label: case.key for case in reversed(cases)}
         for number, case in enumerate(cases, 1):
             stores_sounds = firsts[case.label] == case.key
             run = CaseRun(evaluation, data, case, folder=results.path, number=number, stores_sounds=stores_sounds)
-            record = _run_case(run, record, results, log)
+            for method in evaluation.methods:
+                digest = method.digest(identifier) if isinstance(method, RecordedMethod) else ""
+                if record.done(case.key, method.name, digest):
+                    continue
+                log(f"{identifier}: {case.key}, {method.name}")
+                outcome = replace(run.outcome(method), digest=digest)
+                described = tuple(run.described(each) if each.key == case.key else each for each in record.cases)
+                record = replace(record, cases=described).adding(outcome)
+                results.write(record)
 
 
-def _of_same_recordings(
-    record: ObjectRecord, digest: str, evaluation: Evaluation, results: ResultsFolder
+def _begun(
+    record: ObjectRecord, data: ObjectData, cases: Sequence[Case], evaluation: Evaluation, results: ResultsFolder
 ) -> ObjectRecord:
-    """Return an object's record, empty where it has no values; raise EvaluationError for other recordings' values."""
-    if record.digest != digest and all(each.failure is not None for each in record.outcomes):
+    """Return an object's record with its cases and all else that is known; refuse values of other recordings."""
+    if record.digest != data.digest and all(each.failure is not None for each in record.outcomes):
         record = ObjectRecord(record.identifier)
-    if record.digest not in ("", digest):
-        raise EvaluationError(
-            f"{results.path}: expected results of the recordings of {record.identifier} in {evaluation.title}, got "
-            "those of others; choose another --output",
+    if record.digest not in ("", data.digest):
+        raise EvaluationError.expected(
+            f"results of the recordings of {record.identifier} in {evaluation.title}",
+            record.digest,
+            got="those of others",
             file=results.path,
             name=record.identifier,
-            value=record.digest,
+            advice="choose another --output",
         )
-    return replace(record, digest=digest)
-
-
-def _described(record: ObjectRecord, data: ObjectData, cases: Sequence[Case]) -> ObjectRecord:
-    """Return an object's record with what is known of it now, and with its cases."""
-    known, impacts = {case.key: case for case in record.cases}, data.impacts
+    known = {case.key: case for case in record.cases}
     return replace(
         record,
+        digest=data.digest,
         name=data.facts.name,
         material=data.facts.material,
-        sample_rate=impacts.sample_rate,
-        cases=tuple(known.get(case.key) or _named(case, impacts) for case in cases),
+        sample_rate=data.impacts.sample_rate,
+        cases=tuple(known.get(case.key) or _named(case, data.impacts) for case in cases),
         failure=None,
     )
-
-
-def digest_of(impacts: Impacts, truth: Truth | None) -> str:
-    """Return a digest of all that figures depend on of an object's recordings and truth."""
-    digest = hashlib.sha256(impacts.digest().encode())
-    for tensor in () if truth is None else (truth.frequency, truth.damping, truth.gains, truth.quadrature):
-        digest.update(tensor.contiguous().numpy().tobytes())
-    return digest.hexdigest()
-
-
-def _run_case(run: CaseRun, record: ObjectRecord, results: ResultsFolder, log: Callable[[str], None]) -> ObjectRecord:
-    """Run the methods that have no figures in a case, and return the object's record with them."""
-    key = run.case.key
-    for method in run.evaluation.methods:
-        digest = method.digest(run.data.identifier) if isinstance(method, RecordedMethod) else ""
-        if record.done(key, method.name, digest):
-            continue
-        log(f"{key}, {method.name}")
-        outcome = replace(run.outcome(method), digest=digest)
-        cases = tuple(run.described(case) if case.key == key else case for case in record.cases)
-        record = replace(record, cases=cases).adding(outcome)
-        results.write(record)
-    return record
 
 
 def _named(case: Case, impacts: Impacts) -> CaseRecord:
     train, test = (tuple(impacts.names[row] for row in rows) for rows in (case.train, case.test))
     return CaseRecord(case.key, case.label, train, test)
+
+
+def _run_remotely(
+    ray: ModuleType,
+    evaluation: Evaluation,
+    identifiers: Sequence[str],
+    results: ResultsFolder,
+    progress: Progress,
+) -> None:
+    # max_retries: a worker that was killed for memory would be killed again.
+    remote, shared = ray.remote(num_cpus=1, max_retries=0)(run_object), ray.put(evaluation)
+    pending: dict[Any, str] = {remote.remote(shared, identifier, results): identifier for identifier in identifiers}
+    progress(f"{len(pending)} objects on ray", 0, len(identifiers))
+    try:
+        while pending:
+            # A time limit lets Ctrl-C through.
+            ready, _ = ray.wait(list(pending), num_returns=1, timeout=1.0)
+            for reference in ready:
+                identifier = pending.pop(reference)
+                try:
+                    ray.get(reference)
+                except ray.exceptions.RayError as error:
+                    cause = getattr(error, "cause", None)
+                    if isinstance(cause, Exception) and not isinstance(cause, ray.exceptions.RayError):
+                        raise cause from None
+                    raise EvaluationError.expected(
+                        "a worker process that finishes",
+                        got=f"one that ended early ({str(error).splitlines()[0]})",
+                        name=identifier,
+                        advice="run the command again, with fewer --workers if memory ran out",
+                    ) from error
+                progress(f"{identifier}: done", len(identifiers) - len(pending), len(identifiers))
+    finally:
+        for reference in pending:
+            ray.cancel(reference, force=True)
+
+
+@contextmanager
+def _cluster(ray: ModuleType, workers: int, address: str | None) -> Iterator[None]:
+    settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
+    if address is None:
+        settings |= {"num_cpus": workers, "include_dashboard": False, "address": "local"}
+    else:
+        settings["address"] = address
+    try:
+        ray.init(**settings)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        wanted, advice = "a cluster to connect to", "check that it runs and has this address"
+        if address is None:
+            wanted, advice = "ray to start on this computer", "use --workers 1, which needs no ray"
+        reason = " ".join(str(error).split())
+        raise EvaluationError.expected(wanted, address, got=reason, name="ray", advice=advice) from error
+    try:
+        yield
+    finally:
+        ray.shutdown()
+
+
+def _ray() -> ModuleType:
+    # One computer needs no authentication, and no usage is reported.
+    for name, value in {
+        "RAY_AUTH_MODE": "disabled",
+        "RAY_USAGE_STATS_ENABLED": "0",
+        "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    }.items():
+        os.environ.setdefault(name, value)
+    try:
+        import ray
+    except ImportError as error:
+        raise EvaluationError.expected(
+            "an installed package", name="ray", advice="pip install 'avmsf[scale]', or omit --workers and --ray"
+        ) from error
+    return ray
