@@ -15,10 +15,9 @@ from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestReco
 from avmsf.evaluation.splits import Scores, evaluate, score, split
 from avmsf.evaluation.task import Renderer
 from avmsf.features.feature_field import FeatureField
-from avmsf.fem.candidate_bodies import nominal_bodies
+from avmsf.fem.candidate_bodies import SurfaceBodies
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
-from avmsf.field.gains.elastic import CandidateBodies
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import Attention
 from avmsf.field.sound_field import SoundField
@@ -73,8 +72,7 @@ Figures = dict[str, float]
 def filled_estimator(surface: Surface, options: Options) -> MixtureEstimator:
     """Return the gain models' estimator for an object with this surface: a filled body, coarse for a quick look."""
     shapes, dofs = (12, 20_000) if options.quick_look else (60, 40_000)
-    bodies = nominal_bodies(surface, walls=[None], count=shapes, dofs=dofs)
-    return MixtureEstimator(bodies=CandidateBodies(bodies))
+    return MixtureEstimator(bodies=SurfaceBodies(surface, thicknesses=[None], count=shapes, dofs=dofs))
 
 
 def measure(options: Options) -> Report:

@@ -216,7 +216,7 @@ def _speed(options: Options) -> Report:
     case.fit(MixtureEstimator(bodies=bodies), quick=options.quick_look)
     seconds = {"example_fit_s": time.perf_counter() - start}
     contacts, modes = (20, 12) if options.quick_look else (200, 128)
-    large = _large_case(bodies.bodies.bodies[0].elastic, contacts, modes)
+    large = _large_case(bodies.bodies[0].elastic, contacts, modes)
     start = time.perf_counter()
     MixtureEstimator(bodies=bodies).fit(large)
     seconds["large_fit_s"] = time.perf_counter() - start

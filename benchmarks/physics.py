@@ -14,7 +14,7 @@ import torch
 
 from avmsf.capture import read_capture, write_capture
 from avmsf.evaluation.splits import evaluate, split
-from avmsf.fem.candidate_bodies import nominal_bodies
+from avmsf.fem.candidate_bodies import SurfaceBodies
 from avmsf.fem.material import NOMINAL, material_named
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
@@ -156,7 +156,7 @@ def _frequencies(options: Options) -> Report:
         dofs = 3000 if options.quick_look else 40_000
         heard: list[str] = []
         begun = processor_seconds()
-        made = nominal_bodies(true.surface, walls=[None], count=COMPARED, dofs=dofs, log=heard.append)
+        made = SurfaceBodies(true.surface, thicknesses=[None], count=COMPARED, dofs=dofs, log=heard.append)
         taken, material = processor_seconds() - begun, material_named(recipe.material)
         speed = (material.young / material.density * NOMINAL.density / NOMINAL.young) ** 0.5
         error = made.bodies[0].elastic.frequency * speed / true.elastic.frequency - 1.0

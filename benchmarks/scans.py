@@ -10,7 +10,7 @@ import torch
 import avmsf
 from avmsf.capture import Capture, Impacts
 from avmsf.errors import SimulationError
-from avmsf.fem.candidate_bodies import nominal_bodies
+from avmsf.fem.candidate_bodies import SurfaceBodies
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.material import NOMINAL
 from avmsf.fem.solid import Solid
@@ -119,7 +119,7 @@ def _measured(surface: Surface, true: ElasticModes | None) -> list[str | float]:
 
 
 def _body(surface: Surface, dofs: int, hear: Callable[[str], None]) -> ElasticModes:
-    return nominal_bodies(surface, walls=[None], count=LOWEST, dofs=dofs, log=hear).bodies[0].elastic
+    return SurfaceBodies(surface, thicknesses=[None], count=LOWEST, dofs=dofs, log=hear).bodies[0].elastic
 
 
 def _fitted(surface: Surface, true: ElasticModes) -> float:

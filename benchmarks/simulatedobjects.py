@@ -17,12 +17,11 @@ from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
 from avmsf.features.feature_field import FeatureField
-from avmsf.fem.candidate_bodies import NominalBodies, NominalBody
+from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody
 from avmsf.fem.damping import damped, rayleigh
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.material import MATERIALS, Material
 from avmsf.fem.radiation import radiated
-from avmsf.field.gains.elastic import CandidateBodies
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.gaussians.points import farthest_points
 from avmsf.modal.extraction.extract import Extraction
@@ -105,8 +104,7 @@ class SolvedShape:
         # Regression over shapes needs some doubt: as much as noise 60 dB below the sounds would give.
         level = torch.full((17,), 1e-3 * float(sounds.square().mean().sqrt()))
         modes = Extraction(bank, -amplitudes.imag.float(), Residual(level), amplitudes.real.float())
-        bodies = NominalBodies((NominalBody(None, elastic),), {})
-        recipe = MixtureEstimator(bodies=CandidateBodies(bodies))
+        recipe = MixtureEstimator(bodies=CandidateBodies([CandidateBody(None, elastic)]))
         features = partial(FeatureField.from_points, elastic.nodes[self._spread])
         return KnownObject(f"{self.kind}-{material.name}", material.name, impacts, modes, recipe, features)
 

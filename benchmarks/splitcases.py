@@ -10,9 +10,9 @@ from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.errors import CaptureWarning
 from avmsf.evaluation.splits import evaluate, split
 from avmsf.features.feature_field import FeatureField
+from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
-from avmsf.field.gains.elastic import CandidateBodies
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import along_phase
 from avmsf.field.sound_field import SoundField

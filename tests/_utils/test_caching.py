@@ -34,7 +34,7 @@ def test_bodies_are_used_where_they_cannot_be_kept_and_the_cause_is_told_once(tm
     surface = Surface(torch.from_numpy(ball.vertices).float(), torch.from_numpy(ball.faces).long())
     blocked = a_file(tmp_path / "bodies")
     with warns(AvmsfWarning, file=blocked, value="File exists"):
-        [body] = candidate_bodies(surface, BodyConfig(wall=0.0, shapes=6, dofs=1200), cache=blocked).bodies.bodies
+        [body] = candidate_bodies(surface, BodyConfig(wall=0.0, shapes=6, dofs=1200), cache=blocked).bodies
     assert len(body.elastic) == 6
     # A second warning would be an error here.
     candidate_bodies(surface, BodyConfig(wall=0.0, shapes=6, dofs=1600), cache=blocked)

@@ -21,14 +21,13 @@ from avmsf.evaluation.splits import split
 from avmsf.evaluation.task import Method, Renderer, Task, report_of
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.body_family import BodyFamily
-from avmsf.fem.candidate_bodies import NominalBodies, NominalBody
+from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.isotropic import isotropic_modes
 from avmsf.fem.material import NOMINAL
 from avmsf.fem.shell import shell
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
-from avmsf.field.gains.elastic import CandidateBodies
 from avmsf.field.recipes import Attention
 from avmsf.field.sound_field import SoundField
 from avmsf.mesh.surface import Surface
@@ -75,7 +74,7 @@ def plate_bodies() -> CandidateBodies:
     faces = torch.cat([torch.stack([a, b, c], dim=1), torch.stack([a, c, d], dim=1)])
     sheet = Surface(torch.stack([x.flatten(), y.flatten(), torch.zeros(25)], dim=1), faces)
     solid = shell(sheet, thickness=PLATE.thickness, detail=0.15)
-    return CandidateBodies(NominalBodies((NominalBody(PLATE.thickness, elastic_modes(solid, NOMINAL, count=12)),), {}))
+    return CandidateBodies([CandidateBody(PLATE.thickness, elastic_modes(solid, NOMINAL, count=12))])
 
 
 @cache

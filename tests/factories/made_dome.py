@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from avmsf.features.feature_field import FeatureField
-from avmsf.fem.candidate_bodies import NominalBody
+from avmsf.fem.candidate_bodies import CandidateBody
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.material import NOMINAL
 from avmsf.fem.shell import shell
@@ -30,9 +30,9 @@ def dome() -> Surface:
 
 
 @cache
-def bodies() -> tuple[NominalBody, ...]:
+def bodies() -> tuple[CandidateBody, ...]:
     return tuple(
-        NominalBody(wall, elastic_modes(shell(dome(), thickness=wall, detail=0.09), NOMINAL, count=24))
+        CandidateBody(wall, elastic_modes(shell(dome(), thickness=wall, detail=0.09), NOMINAL, count=24))
         for wall in WALLS
     )
 

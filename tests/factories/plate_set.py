@@ -11,7 +11,7 @@ from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.task import VisualInput
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.body_family import BodyFamily
-from avmsf.field.gains.elastic import CandidateBodies
+from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.mesh import Surface
 from avmsf.simulate.ground_truth import TRUTH, Truth, write_truth

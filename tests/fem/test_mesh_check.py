@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from avmsf.errors import SimulationError
 from avmsf.fem import mesh_check
-from avmsf.fem.candidate_bodies import nominal_bodies
+from avmsf.fem.candidate_bodies import SurfaceBodies
 from avmsf.fem.mesh_check import ROUGH, CheckedSurface, checked, denoised, roughness, simplified, thinned
 from avmsf.fem.skin import Skin
 from avmsf.fem.tetrahedra import fill
@@ -170,7 +170,7 @@ def test_a_dense_mesh_vibrates_as_a_coarse_one_of_the_same_shape(
     limit(monkeypatch, 6000)
     messages: list[str] = []
     found, known = (
-        nominal_bodies(surface_in(skin), walls=[0.002], count=4, dofs=8000, log=messages.append).bodies[0].elastic
+        SurfaceBodies(surface_in(skin), thicknesses=[0.002], count=4, dofs=8000, log=messages.append).bodies[0].elastic
         for skin in (dense, coarse)
     )
     assert f"{len(dense.faces)} triangles" in messages[0]

@@ -9,9 +9,9 @@ import torch
 import trimesh
 
 from avmsf.errors import SimulationError
+from avmsf.fem import body_meshes as nominalsolid
 from avmsf.fem import candidate_bodies as nominal
-from avmsf.fem import mesh_filling as nominalsolid
-from avmsf.fem.candidate_bodies import BodyMaker, NominalBody, nominal_bodies
+from avmsf.fem.candidate_bodies import CandidateBody, SurfaceBodies
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import NOMINAL
 from avmsf.mesh.surface import Surface, read_surface
@@ -30,12 +30,19 @@ def sheet(sides: tuple[int, int] = (12, 9), size: tuple[float, float] = (0.24, 0
     return Surface(torch.from_numpy(points).float(), torch.from_numpy(faces))
 
 
+def computed(surface: Surface, **settings: object) -> SurfaceBodies:
+    """Return the bodies of a surface, which are there now."""
+    bodies = SurfaceBodies(surface, **settings)  # type: ignore[arg-type]
+    assert bodies.bodies
+    return bodies
+
+
 def ball(radius: float = 0.05) -> Surface:
     return surface_of(trimesh.creation.icosphere(subdivisions=3, radius=radius))
 
 
 def test_a_sheet_with_a_wall_vibrates_as_the_plate_it_is():
-    bodies = nominal_bodies(sheet(), walls=[0.004], count=12, dofs=6000).bodies
+    bodies = computed(sheet(), thicknesses=[0.004], count=12, dofs=6000).bodies
     assert [body.name for body in bodies] == ["wall of 4 mm"]
     assert bodies[0].fine
     found, plate = bodies[0].elastic, elastic_modes(block((0.24, 0.17, 0.004), (12, 9, 1)), NOMINAL, count=12)
@@ -49,19 +56,19 @@ def test_a_sheet_with_a_wall_vibrates_as_the_plate_it_is():
 
 def test_walls_of_a_sheet_are_tried_coarsely_and_the_chosen_one_made_fine(monkeypatch: pytest.MonkeyPatch):
     messages: list[str] = []
-    monkeypatch.setattr(nominal, "TRIAL", 1500)
-    found = nominal_bodies(sheet(), count=6, dofs=4000, log=messages.append)
-    assert [body.wall for body in found.bodies] == pytest.approx(
-        [part * math.hypot(0.24, 0.17) for part in nominal.WALLS]
+    monkeypatch.setattr(nominal, "COARSE_DOFS", 1500)
+    found = computed(sheet(), count=6, dofs=4000, log=messages.append)
+    assert [body.thickness for body in found.bodies] == pytest.approx(
+        [part * math.hypot(0.24, 0.17) for part in nominal.THICKNESS_RATIOS]
     )
     assert not any(body.fine for body in found.bodies)
     assert any("42 open edges" in message for message in messages)
     assert "42 open edges" in found.refused[None]
     body = found.bodies[1]
-    fine = BodyMaker(sheet(), count=6, dofs=4000).refine(body)
+    fine = SurfaceBodies(sheet(), count=6, dofs=4000).refined(body)
     assert fine.fine
-    assert fine.wall == body.wall
-    assert BodyMaker(sheet()).refine(fine) is fine
+    assert fine.thickness == body.thickness
+    assert SurfaceBodies(sheet()).refined(fine) is fine
     assert len(fine.elastic.nodes) > 2 * len(body.elastic.nodes)
     # Triangles of the coarse one are a sixth of the sheet long: against a regular mesh it is 3 and 6 % too high.
     assert float((fine.elastic.frequency / body.elastic.frequency - 1).abs()[:2].max()) < 0.07
@@ -71,18 +78,18 @@ def test_walls_of_a_sheet_are_tried_coarsely_and_the_chosen_one_made_fine(monkey
 def test_what_a_ball_encloses_vibrates_as_lambs_sphere_does_and_is_kept(tmp_path: Path):
     messages: list[str] = []
     inwards = Surface(ball().vertices, ball().faces.flip(1))
-    found = nominal_bodies(inwards, walls=[None], count=20, dofs=10000, cache=tmp_path, log=messages.append).bodies[0]
+    found = computed(inwards, thicknesses=[None], count=20, dofs=10000, cache=tmp_path, log=messages.append).bodies[0]
     assert any(f"{len(inwards.faces)} of {len(inwards.faces)} triangles" in message for message in messages)
     # Lamb: the torsional oscillation of degree 2, whose wave number times radius is 2.501, belongs to five modes.
     shear = math.sqrt(NOMINAL.young / (2 * (1 + NOMINAL.poisson)) / NOMINAL.density)
     # Fillings by other seeds differ by 2 % in frequency at this size.
     assert found.elastic.frequency[:5].numpy() == pytest.approx(2.501 * shear / (2 * math.pi * 0.05), rel=0.04)
     kept = sorted(tmp_path.iterdir())
-    again = nominal_bodies(inwards, walls=[None], count=20, dofs=10000, cache=tmp_path).bodies[0]
+    again = computed(inwards, thicknesses=[None], count=20, dofs=10000, cache=tmp_path).bodies[0]
     assert torch.equal(again.elastic.shapes, found.elastic.shapes)
     assert sorted(tmp_path.iterdir()) == kept
     moved = Surface(inwards.vertices + 0.001, inwards.faces)
-    nominal_bodies(moved, walls=[None], count=20, dofs=10000, cache=tmp_path)
+    computed(moved, thicknesses=[None], count=20, dofs=10000, cache=tmp_path)
     assert len(sorted(tmp_path.iterdir())) == 2
 
 
@@ -92,8 +99,8 @@ def test_both_sides_of_a_wall_are_filled_and_given_no_wall():
     inner.invert()
     messages: list[str] = []
     both = surface_of(trimesh.util.concatenate([outer, inner]))
-    found = nominal_bodies(both, count=8, dofs=8000, log=messages.append)
-    assert [body.wall for body in found.bodies] == [None]
+    found = computed(both, count=8, dofs=8000, log=messages.append)
+    assert [body.thickness for body in found.bodies] == [None]
     # One line for all walls that are too thick, another for the surface's two parts.
     assert sum("not tried" in message for message in messages) == 2
     # A hollow ball, not a massive one.
@@ -106,7 +113,7 @@ def test_both_sides_of_a_wall_are_filled_and_given_no_wall():
 
 def test_boxes_that_overlap_are_one_body():
     one, other = trimesh.creation.box((0.3, 0.05, 0.02)), trimesh.creation.box((0.05, 0.2, 0.015))
-    found = nominal_bodies(surface_of(trimesh.util.concatenate([one, other])), walls=[None, 0.001], count=6, dofs=6000)
+    found = computed(surface_of(trimesh.util.concatenate([one, other])), thicknesses=[None, 0.001], count=6, dofs=6000)
     assert [body.name for body in found.bodies] == ["solid body"]
     volume = 0.3 * 0.05 * 0.02 + (0.2 - 0.05) * 0.05 * 0.015
     assert found.bodies[0].elastic.mass == pytest.approx(NOMINAL.density * volume, rel=0.05)
@@ -116,7 +123,7 @@ def test_boxes_that_overlap_are_one_body():
 @pytest.mark.slow
 def test_the_aircraft_is_filled(shared: Path):
     surface = read_surface(shared / "aircraft_response/surface.obj")
-    found = nominal_bodies(surface, count=6, dofs=12_000)
+    found = computed(surface, count=6, dofs=12_000)
     assert [body.name for body in found.bodies] == ["solid body"]
     # Its wings bend first, far below all else: as metal plates of 8 mm over 1.5 m do.
     assert 10 < float(found.bodies[0].elastic.frequency[0]) < 20
@@ -127,7 +134,7 @@ def test_parts_that_do_not_touch_are_refused_with_all_reasons():
     other.apply_translation((0.3, 0.0, 0.0))
     apart = surface_of(trimesh.util.concatenate([one, other]))
     with raises(SimulationError, name="surface") as caught:
-        nominal_bodies(apart, walls=[None, 0.001], count=6, dofs=3000)
+        computed(apart, thicknesses=[None, 0.001], count=6, dofs=3000)
     filled, walled = caught.value.value
     for name, reason in (("solid body", filled), ("wall of 1 mm", walled)):
         assert reason.startswith(f"{name}: ")
@@ -136,13 +143,13 @@ def test_parts_that_do_not_touch_are_refused_with_all_reasons():
 
 def test_a_wall_thicker_than_the_object_is_refused():
     with raises(SimulationError, name="surface") as caught:
-        nominal_bodies(sheet(), walls=[0.2])
+        computed(sheet(), thicknesses=[0.2])
     [reason] = caught.value.value
     assert reason.startswith("wall of 200 mm: ")
     assert "170 mm" in reason
     assert "200 mm" in reason
     with raises(SimulationError, name="surface") as caught:
-        nominal_bodies(ball(), walls=[0.04])
+        computed(ball(), thicknesses=[0.04])
     [reason] = caught.value.value
     assert reason.startswith("wall of 40 mm: thickness: ")
 
@@ -150,18 +157,18 @@ def test_a_wall_thicker_than_the_object_is_refused():
 def test_points_alone_have_no_body():
     cloud = Surface(ball().vertices, torch.zeros((0, 3), dtype=torch.int64))
     with raises(SimulationError, name="faces", value=0) as caught:
-        nominal_bodies(cloud)
+        computed(cloud)
     assert "642" in str(caught.value)
 
 
 def test_a_mesh_too_large_for_the_memory_is_refused_with_the_size_that_fits(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 2 * 377e6)
     with raises(SimulationError, name="memory") as caught:
-        nominal_bodies(sheet(), walls=[0.004], dofs=80_000)
+        computed(sheet(), thicknesses=[0.004], dofs=80_000)
     [reason] = caught.value.value
     assert all(number in reason for number in ("80000", "1.6 GB", "40000"))
     monkeypatch.setattr(nominalsolid, "_free_memory", lambda: None)
-    assert nominal_bodies(sheet(), walls=[0.004], count=4, dofs=2000).bodies
+    assert computed(sheet(), thicknesses=[0.004], count=4, dofs=2000).bodies
 
 
 @pytest.mark.parametrize(
@@ -169,29 +176,29 @@ def test_a_mesh_too_large_for_the_memory_is_refused_with_the_size_that_fits(monk
     [
         ({"count": 0}, None, 0),
         ({"dofs": 10}, None, 10),
-        ({"walls": []}, None, []),
-        ({"walls": [None, -0.001]}, 1, -0.001),
-        ({"walls": [math.nan]}, 0, math.nan),
+        ({"thicknesses": []}, None, []),
+        ({"thicknesses": [None, -0.001]}, 1, -0.001),
+        ({"thicknesses": [math.nan]}, 0, math.nan),
     ],
 )
 def test_settings_that_make_no_sense_are_named(settings: dict, row: int | None, value: object):
     [name] = settings
     with raises(SimulationError, name=name, row=row, value=pytest.approx(value, nan_ok=True)):
-        nominal_bodies(sheet(), **settings)
+        computed(sheet(), **settings)
 
 
 @pytest.fixture(scope="module")
-def coarse() -> NominalBody:
-    elastic = nominal_bodies(sheet(), walls=[0.004], count=4, dofs=2000).bodies[0].elastic
-    return NominalBody(0.004, elastic, fine=False)
+def coarse() -> CandidateBody:
+    elastic = computed(sheet(), thicknesses=[0.004], count=4, dofs=2000).bodies[0].elastic
+    return CandidateBody(0.004, elastic, fine=False)
 
 
 def test_a_body_stays_coarse_where_a_finer_one_does_not_fit_into_the_memory(
-    monkeypatch: pytest.MonkeyPatch, coarse: NominalBody
+    monkeypatch: pytest.MonkeyPatch, coarse: CandidateBody
 ):
     monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 1e9)
     messages: list[str] = []
-    assert BodyMaker(sheet(), count=4, dofs=400_000, log=messages.append).refine(coarse) is coarse
+    assert SurfaceBodies(sheet(), count=4, dofs=400_000, log=messages.append).refined(coarse) is coarse
     assert messages[-1].startswith("wall of 4 mm: ")
     assert "400000" in messages[-1]
 
@@ -200,14 +207,14 @@ def test_a_body_stays_coarse_where_a_finer_one_does_not_fit_into_the_memory(
     ("error", "reason"), [(MemoryError(), "1500 (--body.dofs)"), (SimulationError("badly shaped"), "badly shaped")]
 )
 def test_a_body_stays_coarse_where_a_finer_one_fails(
-    monkeypatch: pytest.MonkeyPatch, coarse: NominalBody, error: Exception, reason: str
+    monkeypatch: pytest.MonkeyPatch, coarse: CandidateBody, error: Exception, reason: str
 ):
     def fail(*solid: object, **settings: object) -> None:
         raise error
 
     monkeypatch.setattr(nominal, "elastic_modes", fail)
     messages: list[str] = []
-    assert BodyMaker(sheet(), count=4, dofs=3000, log=messages.append).refine(coarse) is coarse
+    assert SurfaceBodies(sheet(), count=4, dofs=3000, log=messages.append).refined(coarse) is coarse
     assert messages[-1].startswith("wall of 4 mm: ")
     assert reason in messages[-1]
 
@@ -224,9 +231,9 @@ def test_the_only_body_that_is_left_stays_in_use_where_it_cannot_be_made_finer(m
         return made(solid, *material, count=count, **kept)  # type: ignore[arg-type]
 
     monkeypatch.setattr(nominal, "elastic_modes", fail)
-    monkeypatch.setattr(nominal, "TRIAL", 2000)
-    found = nominal_bodies(sheet(), walls=[0.004, 0.012], count=4, dofs=4000, log=messages.append)
-    assert [(body.wall, body.fine) for body in found.bodies] == [(0.004, False)]
+    monkeypatch.setattr(nominal, "COARSE_DOFS", 2000)
+    found = computed(sheet(), thicknesses=[0.004, 0.012], count=4, dofs=4000, log=messages.append)
+    assert [(body.thickness, body.fine) for body in found.bodies] == [(0.004, False)]
     assert any(message.startswith("wall of 4 mm: ") and "2000 (--body.dofs)" in message for message in messages)
     assert list(found.refused) == [0.012]
 
@@ -235,14 +242,14 @@ def test_the_memory_is_asked_for_what_is_computed_and_for_nothing_that_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     walls, settings = [0.004, 0.006], {"count": 4, "dofs": 80_000, "cache": tmp_path}
-    monkeypatch.setattr(nominal, "TRIAL", 2000)
+    monkeypatch.setattr(nominal, "COARSE_DOFS", 2000)
     # Enough for the few degrees of freedom that two bodies are compared with.
     monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 377e6)
-    found = nominal_bodies(sheet(), walls=walls, **settings)
-    assert [body.wall for body in found.bodies] == walls
+    found = computed(sheet(), thicknesses=walls, **settings)
+    assert [body.thickness for body in found.bodies] == walls
     monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 0.0)
-    again = nominal_bodies(sheet(), walls=walls, **settings)
+    again = computed(sheet(), thicknesses=walls, **settings)
     assert torch.equal(again.bodies[1].elastic.shapes, found.bodies[1].elastic.shapes)
     with raises(SimulationError, name="memory") as caught:
-        nominal_bodies(sheet(), walls=[0.005, 0.007], **settings)
+        computed(sheet(), thicknesses=[0.005, 0.007], **settings)
     assert all("got 0 GB" in reason for reason in caught.value.value)

@@ -8,18 +8,18 @@ from functools import partial
 import numpy as np
 import pytest
 
-from avmsf.fem.candidate_bodies import NominalBody
+from avmsf.fem.candidate_bodies import CandidateBody
 from avmsf.fem.material import DISCREPANCY, MATERIALS, NOMINAL, largest_factor
 from avmsf.fem.thickness import search_thickness
 from factories.made_dome import bodies
 
 
-def evidence(known: Sequence[NominalBody], *, of: Callable[[float], float], filled: float) -> list[float]:
-    return [filled if body.wall is None else of(math.log(body.wall)) for body in known]
+def evidence(known: Sequence[CandidateBody], *, of: Callable[[float], float], filled: float) -> list[float]:
+    return [filled if body.thickness is None else of(math.log(body.thickness)) for body in known]
 
 
-def walled(wall: float | None) -> NominalBody:
-    return replace(bodies()[0], wall=wall)
+def walled(wall: float | None) -> CandidateBody:
+    return replace(bodies()[0], thickness=wall)
 
 
 GRID = (0.001, 0.0016, 0.0025, 0.004, 0.0063)
@@ -35,8 +35,8 @@ def test_the_posterior_of_a_normal_evidence_is_normal_with_the_variance_of_shape
     assert thickness.median == pytest.approx(true, rel=0.03)
     both = math.hypot(deviation, 0.2)
     assert math.log(thickness.high / thickness.low) == pytest.approx(2 * 1.645 * both, rel=0.15)
-    assert all(body.wall is not None for body in found)
-    assert min(abs(math.log(body.wall / true)) for body in found if body.wall) < 0.04
+    assert all(body.thickness is not None for body in found)
+    assert min(abs(math.log(body.thickness / true)) for body in found if body.thickness) < 0.04
 
 
 def test_a_maximum_between_distant_walls_is_found() -> None:
@@ -46,13 +46,13 @@ def test_a_maximum_between_distant_walls_is_found() -> None:
     skewed = partial(evidence, of=lambda log: float(np.interp(log, steps, table)), filled=-148.0)
     grid = (0.000625, 0.001383, 0.003061, 0.006775, 0.014997)
     found, _ = search_thickness([walled(each) for each in (None, *grid)], skewed, walled)
-    assert found[0].wall == pytest.approx(0.0042, rel=0.08)
+    assert found[0].thickness == pytest.approx(0.0042, rel=0.08)
 
 
 def test_thicker_walls_than_the_views_allow_are_not_tried() -> None:
     asked: list[float] = []
 
-    def wall(thickness: float) -> NominalBody:
+    def wall(thickness: float) -> CandidateBody:
         asked.append(thickness)
         return walled(thickness)
 
@@ -74,7 +74,7 @@ def test_walls_thinner_than_the_first_ones_are_found() -> None:
 def test_walls_are_not_made_ever_thinner() -> None:
     asked: list[float] = []
 
-    def wall(thickness: float) -> NominalBody:
+    def wall(thickness: float) -> CandidateBody:
         asked.append(thickness)
         return walled(thickness)
 
@@ -89,7 +89,7 @@ def test_no_thickness_is_looked_for_where_the_filled_body_is_the_most_probable()
         [walled(each) for each in (None, *GRID)], flat, lambda wall: pytest.fail("made")
     )
     assert thickness is None
-    assert [body.wall for body in found] == [None]
+    assert [body.thickness for body in found] == [None]
 
 
 def test_other_thicknesses_are_tried_where_a_body_cannot_be_had() -> None:

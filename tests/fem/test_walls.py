@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from avmsf.errors import SimulationError
-from avmsf.fem.candidate_bodies import nominal_bodies
+from avmsf.fem.body_meshes import count_dofs, filled_solid
+from avmsf.fem.candidate_bodies import SurfaceBodies
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.material import NOMINAL, STEEL
 from avmsf.fem.mesh_check import checked
-from avmsf.fem.mesh_filling import count_dofs, filled_solid
 from avmsf.fem.skin import Skin
 from avmsf.fem.walls import wall_of
 from avmsf.mesh.surface import Surface
@@ -112,7 +112,7 @@ def test_lumps_and_walls_with_handles_are_not_filled_by_prisms(kind: str):
 
 def test_a_plate_of_twelve_triangles_has_leissas_frequencies():
     side, thickness = 0.2, 0.002
-    body = nominal_bodies(box(side, side, thickness), walls=[None], count=3, dofs=12_000).bodies[0]
+    body = SurfaceBodies(box(side, side, thickness), thicknesses=[None], count=3, dofs=12_000).bodies[0]
     rigidity = NOMINAL.young * thickness**3 / (12 * (1 - NOMINAL.poisson**2))
     found = 2 * math.pi * body.elastic.frequency * side**2 * math.sqrt(NOMINAL.density * thickness / rigidity)
     assert found.tolist() == pytest.approx([13.489, 19.789, 24.432], rel=0.01)
@@ -129,12 +129,12 @@ def test_a_body_of_too_coarse_elements_is_made_finer_and_its_error_told(monkeypa
         asked: list[int] = []
         messages: list[str] = []
 
-        def found(maker: object, wall: float | None, dofs: int, **others: object) -> ElasticModes:
+        def found(maker: object, thickness: float | None, *, dofs: int = 40_000, **others: object) -> ElasticModes:
             asked.append(dofs)
             return modes(dofs, error)
 
-        monkeypatch.setattr("avmsf.fem.candidate_bodies.BodyMaker._modes", found)
-        nominal_bodies(box(0.1, 0.1, 0.1), walls=[None], count=8, dofs=40_000, log=messages.append)
+        monkeypatch.setattr("avmsf.fem.candidate_bodies.SurfaceBodies.modes", found)
+        assert SurfaceBodies(box(0.1, 0.1, 0.1), thicknesses=[None], count=8, dofs=40_000, log=messages.append).bodies
         return asked, messages
 
     assert max(made(0.03)[0]) == 40_000

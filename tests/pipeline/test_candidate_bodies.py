@@ -1,7 +1,7 @@
 """Bodies behind a surface as hypotheses of the gain model: what they predict, and which of them is made finer."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cache
 
 import pytest
@@ -10,11 +10,10 @@ import torch
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import FitError, SimulationError
 from avmsf.features.feature_field import FeatureField
-from avmsf.fem.candidate_bodies import NominalBodies, NominalBody
+from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody, Supports
 from avmsf.fem.supports import Support
 from avmsf.field.config import FitConfig, GainModelName
 from avmsf.field.fit import fit
-from avmsf.field.gains.elastic import CandidateBodies
 from avmsf.field.gains.estimator import MixtureEstimator, estimator_for, gain_variance
 from avmsf.field.recipes import GainCase, gain_case
 from avmsf.mesh.surface import Surface
@@ -32,21 +31,28 @@ RATE, SAMPLES, LEVEL = 12000.0, 2400, 0.01
 CONFIG = FitConfig(warmup_steps=0, steps=6, fft_sizes=(1024, 256), early=1024, damping="shared")
 
 
-def estimator(*known: NominalBody, finer: "Finer | None" = None, kinds: tuple[str, ...] = ()) -> MixtureEstimator:
-    """Return the estimator of these bodies, or of all the dome's."""
-    candidates = CandidateBodies(NominalBodies(known or bodies(), {}), finer)
-    return MixtureEstimator(kinds, candidates) if kinds else MixtureEstimator(bodies=candidates)
+class Asked(CandidateBodies):
+    """Makes bodies finer in name alone, a known body into the free one held, and remembers which were asked for."""
 
+    def __init__(self, *known: CandidateBody, held: CandidateBody | None = None, supports: Supports = "free") -> None:
+        super().__init__(known or bodies())
+        self.supports, self.held = supports, held
+        self.asked: list[CandidateBody] = []
 
-@dataclass
-class Finer:
-    """Makes bodies finer in name alone, and remembers which."""
-
-    asked: list[NominalBody] = field(default_factory=list)
-
-    def __call__(self, body: NominalBody) -> NominalBody:
+    def refined(self, body: CandidateBody) -> CandidateBody:
         self.asked.append(body)
         return replace(body, fine=True)
+
+    def supported(self, body: CandidateBody) -> tuple[CandidateBody, ...]:
+        self.asked.append(body)
+        assert self.held is not None
+        return body, replace(self.held, support=Support("held at its lowest face"))
+
+
+def estimator(*known: CandidateBody, kinds: tuple[str, ...] = ()) -> MixtureEstimator:
+    """Return the estimator of these bodies, or of all the dome's."""
+    candidates = CandidateBodies(known or bodies())
+    return MixtureEstimator(kinds, candidates) if kinds else MixtureEstimator(bodies=candidates)
 
 
 def features() -> FeatureField:
@@ -108,65 +114,52 @@ def test_the_true_wall_and_its_stiffness_are_the_most_probable() -> None:
 
 
 def test_the_most_probable_body_alone_is_made_finer_and_not_its_namesake() -> None:
-    finer = Finer()
     # Both are walls of 4 mm by name; the wrong one comes first.
     bad, good = (
-        replace(body, wall=wall, fine=False) for body, wall in zip(bodies()[:2], (0.00404, 0.00396), strict=True)
+        replace(body, thickness=wall, fine=False) for body, wall in zip(bodies()[:2], (0.00404, 0.00396), strict=True)
     )
     assert bad.name == good.name
-    first, second = estimator(bad, good, finer=finer).start(case(), "shared").report["bodies"]
-    assert finer.asked == [good]
+    candidates = Asked(bad, good)
+    first, second = MixtureEstimator(bodies=candidates).start(case(), "shared").report["bodies"]
+    assert candidates.asked == [good]
     assert (first["wall_thickness"], first["refined"]) == (0.00396, True)
     assert (second["wall_thickness"], second["refined"]) == (0.00404, False)
 
 
-@dataclass
-class Held:
-    """Returns a known body as the free one held."""
-
-    body: NominalBody
-    asked: list[NominalBody] = field(default_factory=list)
-
-    def __call__(self, body: NominalBody) -> tuple[NominalBody, ...]:
-        self.asked.append(body)
-        return body, replace(self.body, support=Support("held at its lowest face"))
-
-
 @pytest.mark.parametrize("free", [0, 1])
 def test_a_held_body_is_named_if_it_is_more_probable_than_the_free_one(free: int) -> None:
-    held = Held(bodies()[1 - free])
-    candidates = CandidateBodies(NominalBodies((bodies()[free],), {}), None, held, always_hold=True)
+    candidates = Asked(bodies()[free], held=bodies()[1 - free], supports="try")
     [found] = MixtureEstimator(bodies=candidates).start(case(), "shared").report["bodies"]
-    assert held.asked == [bodies()[free]]
+    assert candidates.asked == [bodies()[free]]
     assert found["support"] == ("free" if free else "held at its lowest face")
     assert found["body"] == bodies()[1].name + ("" if free else ", held at its lowest face")
 
 
 def test_supports_are_not_tried_where_the_free_body_predicts_the_gains() -> None:
-    held = Held(bodies()[0])
-    candidates = CandidateBodies(NominalBodies((bodies()[1],), {}), None, held)
+    candidates = Asked(bodies()[1], held=bodies()[0], supports="auto")
     assert MixtureEstimator(bodies=candidates).start(case(), "shared").report["credibility"]["credible"]
-    assert not held.asked
-    MixtureEstimator(bodies=replace(candidates, always_hold=True)).start(case(), "shared")
-    assert held.asked
+    assert not candidates.asked
+    candidates.supports = "try"
+    MixtureEstimator(bodies=candidates).start(case(), "shared")
+    assert candidates.asked
 
 
 def test_a_fine_body_is_not_computed_again() -> None:
-    finer = Finer()
-    estimator(finer=finer).start(case(), "shared")
-    assert finer.asked == []
+    candidates = Asked()
+    MixtureEstimator(bodies=candidates).start(case(), "shared")
+    assert candidates.asked == []
 
 
 def test_estimators_of_other_bodies_or_elements_have_other_digests() -> None:
     assert estimator().digest() == estimator().digest()
-    candidates = CandidateBodies(NominalBodies(bodies(), {}), Finer())
-    finer = (MixtureEstimator(bodies=replace(candidates, dofs=each)) for each in (20_000, 40_000))
-    made = (estimator(), estimator(*bodies()[:2]), *finer)
+    finer = [CandidateBodies(bodies()) for _ in range(2)]
+    finer[0].dofs, finer[1].dofs = 20_000, 40_000
+    made = (estimator(), estimator(*bodies()[:2]), *(MixtureEstimator(bodies=each) for each in finer))
     assert len({each.digest() for each in made}) == len(made)
 
 
 def test_reasons_against_other_bodies_are_reported() -> None:
-    known = CandidateBodies(NominalBodies(bodies()[1:2], {None: "the mesh is open"}))
+    known = CandidateBodies(bodies()[1:2], {None: "the mesh is open"})
     report = MixtureEstimator(bodies=known).start(case(), "shared").report
     assert report["unavailable"] == {"solid body": "the mesh is open"}
 
@@ -192,7 +185,7 @@ def test_the_variance_by_noise_is_the_scatter_of_least_squares_gains() -> None:
         assert float(gain_variance(made)) == pytest.approx(scatter, rel=0.1)
 
 
-def moved_body(move: Callable[[torch.Tensor], torch.Tensor]) -> NominalBody:
+def moved_body(move: Callable[[torch.Tensor], torch.Tensor]) -> CandidateBody:
     """Return the true wall's body with its surface elsewhere."""
     body = bodies()[1]
     return replace(body, elastic=replace(body.elastic, nodes=move(body.elastic.nodes)))
@@ -247,7 +240,7 @@ def test_stated_settings_that_leave_no_body_are_refused(config: BodyConfig, name
 
 
 def test_a_stated_wall_is_not_blamed_for_too_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("avmsf.fem.mesh_filling._free_memory", lambda: 1000.0)
+    monkeypatch.setattr("avmsf.fem.body_meshes._free_memory", lambda: 1000.0)
     with raises(SimulationError, name="memory"):
         candidate_bodies(dome(), BodyConfig(wall=0.004))
 

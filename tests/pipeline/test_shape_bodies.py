@@ -8,7 +8,7 @@ import torch
 import trimesh
 
 from avmsf.errors import SceneError
-from avmsf.fem.candidate_bodies import BodyMaker, nominal_bodies
+from avmsf.fem.candidate_bodies import SurfaceBodies
 from avmsf.mesh.level_set import difference
 from avmsf.mesh.surface import Surface
 from avmsf.pipeline.bodies import candidate_bodies
@@ -45,9 +45,9 @@ class Cup:
 
 @pytest.mark.slow
 def test_walls_cover_the_range_and_thicker_ones_are_stiffer() -> None:
-    filled, *walls = nominal_bodies(Cup(), count=6, dofs=4000).bodies
-    assert filled.wall is None
-    assert [body.wall for body in walls] == pytest.approx([0.006 * 3 ** (step / 4) for step in range(5)])
+    filled, *walls = SurfaceBodies(Cup(), count=6, dofs=4000).bodies
+    assert filled.thickness is None
+    assert [body.thickness for body in walls] == pytest.approx([0.006 * 3 ** (step / 4) for step in range(5)])
     lowest = [float(body.elastic.frequency[0]) for body in walls]
     assert lowest == sorted(lowest)
     # Of panels that bend, frequencies go with the thickness, 1.32 here; panels between thicker walls are
@@ -56,25 +56,25 @@ def test_walls_cover_the_range_and_thicker_ones_are_stiffer() -> None:
 
 
 def test_walls_that_cannot_be_had_are_left_out() -> None:
-    found = nominal_bodies(Cup(most=0.01), count=4, dofs=2000)
-    assert all(body.wall is None or body.wall <= 0.01 for body in found.bodies)
+    found = SurfaceBodies(Cup(most=0.01), count=4, dofs=2000)
+    assert all(body.thickness is None or body.thickness <= 0.01 for body in found.bodies)
     # Tetrahedra are random, and may miss a thin wall.
     assert len([wall for wall in found.refused if wall is not None and wall > 0.01]) == 3
-    assert BodyMaker(Cup(most=0.01), count=4, dofs=2000).thicken(0.011) is None
+    assert SurfaceBodies(Cup(most=0.01), count=4, dofs=2000).with_thickness(0.011) is None
 
 
 @pytest.mark.slow
 def test_the_thickness_is_searched_for_unless_it_is_known_or_there_is_no_cavity() -> None:
     config = BodyConfig(shapes=6, dofs=4000)
     searched = candidate_bodies(Cup(), config)
-    assert searched.thicken is not None
-    body = searched.thicken(0.007)
+    assert searched.searches_thickness
+    body = searched.with_thickness(0.007)
     assert body is not None
-    assert body.wall == 0.007
+    assert body.thickness == 0.007
     known = candidate_bodies(Cup(), BodyConfig(wall=0.005, shapes=6, dofs=4000))
-    assert (known.thicken, [each.wall for each in known.bodies.bodies]) == (None, [0.005])
+    assert (known.searches_thickness, [each.thickness for each in known.bodies]) == (False, [0.005])
     solid = candidate_bodies(Cup(thickness_range=None), config)
-    assert (solid.thicken, [each.wall for each in solid.bodies.bodies]) == (None, [None])
+    assert (solid.searches_thickness, [each.thickness for each in solid.bodies]) == (False, [None])
 
 
 @pytest.mark.slow
@@ -83,7 +83,7 @@ def test_bodies_of_a_shape_are_read_again_and_those_of_another_shape_are_not(tmp
 
     def frequency(shape: Cup) -> torch.Tensor:
         said.clear()
-        made = nominal_bodies(shape, walls=[0.009], count=6, dofs=2000, cache=tmp_path, log=said.append)
+        made = SurfaceBodies(shape, thicknesses=[0.009], count=6, dofs=2000, cache=tmp_path, log=said.append)
         return made.bodies[0].elastic.frequency
 
     def computed() -> int:

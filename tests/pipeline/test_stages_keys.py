@@ -5,6 +5,7 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import ModuleType
 from typing import Any
 
@@ -16,9 +17,9 @@ from avmsf.capture import read_capture
 from avmsf.editing import guided
 from avmsf.errors import CaptureError, SimulationError
 from avmsf.fem import candidate_bodies as nominal
+from avmsf.fem.candidate_bodies import CandidateBodies, SurfaceBodies
 from avmsf.field import recipes
 from avmsf.field.config import FitConfig
-from avmsf.field.gains.elastic import CandidateBodies
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import fingerprint, gain_case
 from avmsf.field.store import load
@@ -60,9 +61,12 @@ def test_other_code_makes_a_stage_again(tmp_path: Path, monkeypatch: pytest.Monk
     assert not folder.keep("cloud.ply", {}, write).fresh
 
 
-def body_key() -> Path | None:
-    surface = Surface(torch.eye(3), torch.tensor([[0, 1, 2]]))
-    return nominal.BodyMaker(surface, count=6, cache=Path("bodies"), log=print)._kept(None, 1200, perturbed=False)
+def body_key() -> set[str]:
+    """Return the names of the cached files of the bodies of a triangle with a wall."""
+    with TemporaryDirectory() as folder:
+        surface = Surface(torch.eye(3), torch.tensor([[0, 1, 2]]))
+        SurfaceBodies(surface, count=2, dofs=1000, cache=Path(folder)).modes(0.01)
+        return {each.name for each in Path(folder).iterdir()}
 
 
 def fit_key() -> str:

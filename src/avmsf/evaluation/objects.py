@@ -24,7 +24,7 @@ from avmsf.evaluation.task import VisualInput
 from avmsf.features.feature_field import FeatureField
 from avmsf.features.store import load_features
 from avmsf.fem.body_family import BodyFamily, body_family
-from avmsf.field.gains.elastic import CandidateBodies
+from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh.surface import Surface

@@ -13,7 +13,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.body_family import BodyFamily
-from avmsf.field.gains.elastic import CandidateBodies
+from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.modal.extraction.extract import Extraction
 

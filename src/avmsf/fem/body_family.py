@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -11,15 +12,14 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from avmsf.errors import SimulationError
-from avmsf.fem.candidate_bodies import WALL_TRIAL, WALLS
+from avmsf.fem.body_meshes import BodyMeshes, Shape
+from avmsf.fem.candidate_bodies import COARSE_WALL_DOFS, THICKNESS_RATIOS
 from avmsf.fem.isotropic import IsotropicModes, isotropic_modes
-from avmsf.fem.mesh_check import CheckedSurface, checked
-from avmsf.fem.mesh_filling import Shape, filled_solid, wall_solids, walled_solid
 from avmsf.fem.solid import Solid
-from avmsf.fem.walls import Wall, wall_of
+from avmsf.fem.walls import wall_of
 from avmsf.mesh.surface import Surface
 
-DOFS = WALL_TRIAL
+DOFS = COARSE_WALL_DOFS
 """Degrees of freedom of each wall, about: prisms along walls of a pot and a tube are 1 % too stiff in frequency."""
 SOLID_DOFS = 40_000
 """Of a solid body, about: tetrahedra lock where they fill thin parts."""
@@ -104,47 +104,20 @@ def body_family(
     Walls have about `dofs` degrees of freedom, a solid body `solid_dofs`.
 
     A closed mesh that shows both sides of one wall has walls of `_SCALES` times its thickness behind its larger side;
-    another closed mesh is solid. An open mesh has walls of `WALLS` times its size. A shape from photographs has walls
-    all over its range of thickness, or is solid where it has no cavity.
+    another closed mesh is solid. An open mesh has walls of `THICKNESS_RATIOS` times its size. A shape from photographs
+    has walls all over its range of thickness, or is solid where it has no cavity.
 
     Raises SimulationError for points without triangles, and where no body can be made, with the reason.
     """
-    report = log or (lambda words: None)
-    if not isinstance(surface, Surface):
-        return _of_shape(surface, count, dofs, solid_dofs, report)
-    found = checked(surface, log=report)
-    if found.lids > _HOLES:
-        make = wall_solids(found, dofs)
-        thicknesses = [part * found.skin.size for part in WALLS if part * found.skin.size < found.width]
-        return _of_walls(make, thicknesses, count, report)
-    wall = wall_of(found.skin)
-    scaled = None if wall is None else _scaled(wall, dofs)
-    if wall is None or scaled is None:
-        return _solid_body(found, count, solid_dofs, report)
-    mean = wall.thickness
-    return _of_walls(lambda thickness: scaled(thickness / mean), [mean * scale for scale in _SCALES], count, report)
-
-
-def _of_shape(shape: Shape, count: int, dofs: int, solid_dofs: int, log: Callable[[str], None]) -> BodyFamily:
-    between = shape.thickness_range
-    if between is None:
-        return _solid_body(checked(shape.as_seen(), log=log), count, solid_dofs, log)
-    make = partial(walled_solid, shape, dofs=dofs, log=log)
-    return _of_walls(make, np.geomspace(*between, _THICKNESSES).tolist(), count, log)
-
-
-def _solid_body(found: CheckedSurface, count: int, dofs: int, log: Callable[[str], None]) -> BodyFamily:
-    log("dividing the body into tetrahedra")
-    return BodyFamily((isotropic_modes(filled_solid(found, dofs), count=count),), ())
-
-
-def _of_walls(
-    make: Callable[[float], Solid], thicknesses: list[float], count: int, log: Callable[[str], None]
-) -> BodyFamily:
-    """Return the bodies of those thicknesses, meters, that can be made."""
+    report = log or (lambda message: None)
+    meshes = BodyMeshes(surface, log=report)
+    thicknesses, make = _walls(meshes, dofs)
+    if make is None:
+        report("dividing the body into tetrahedra")
+        return BodyFamily((isotropic_modes(meshes.solid(None, solid_dofs), count=count),), ())
     made, reasons = {}, []
     for thickness in thicknesses:
-        log(f"elastic modes of a wall of {1000 * thickness:.2g} mm")
+        report(f"elastic modes of a wall of {1000 * thickness:.2g} mm")
         try:
             made[thickness] = isotropic_modes(make(thickness), count=count)
         except SimulationError as error:
@@ -158,15 +131,24 @@ def _of_walls(
     return BodyFamily(tuple(made.values()), tuple(made), make)
 
 
-def _scaled(wall: Wall, dofs: int) -> Callable[[float], Solid] | None:
-    """Return what makes a wall of a factor times its thickness; None where prisms do not fill the mesh."""
-    length = wall.length(dofs)
-    for tried in (length, _FINER * length):
-        try:
-            return wall.solids(tried)
-        except SimulationError:
-            continue
-    return None
+def _walls(meshes: BodyMeshes, dofs: int) -> tuple[list[float], Callable[[float], Solid] | None]:
+    """Return the thicknesses of walls to compute, meters, and what makes them; nothing for a solid body."""
+    if meshes.shape is not None:
+        between = meshes.shape.thickness_range
+        if between is None:
+            return [], None
+        return np.geomspace(*between, _THICKNESSES).tolist(), partial(meshes.solid, dofs=dofs)
+    found = meshes.checked
+    if found.lids > _HOLES:
+        thicknesses = [ratio * found.skin.size for ratio in THICKNESS_RATIOS]
+        return [each for each in thicknesses if each < found.width], meshes.walls(dofs)
+    wall = wall_of(found.skin)
+    if wall is not None:
+        length = wall.length(dofs)
+        for tried in (length, _FINER * length):
+            with suppress(SimulationError):
+                return [wall.thickness * scale for scale in _SCALES], wall.solids(tried)
+    return [], None
 
 
 def _cubic(

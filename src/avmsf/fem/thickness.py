@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from avmsf.fem.candidate_bodies import NominalBody
+from avmsf.fem.candidate_bodies import CandidateBody
 from avmsf.fem.material import DISCREPANCY
 
 _RESOLUTION = 0.06
@@ -45,10 +45,10 @@ class ThicknessPosterior:
 
 
 def search_thickness(
-    bodies: Sequence[NominalBody],
-    evidence: Callable[[Sequence[NominalBody]], Sequence[float]],
-    with_wall: Callable[[float], NominalBody | None],
-) -> tuple[list[NominalBody], ThicknessPosterior | None]:
+    bodies: Sequence[CandidateBody],
+    evidence: Callable[[Sequence[CandidateBody]], Sequence[float]],
+    with_wall: Callable[[float], CandidateBody | None],
+) -> tuple[list[CandidateBody], ThicknessPosterior | None]:
     """Return the bodies that are not improbable, the most probable one first, and the posterior of the thickness.
 
     `evidence` has the log evidence of the gains with each body by itself, nats. `with_wall` computes a body with a wall
@@ -59,7 +59,7 @@ def search_thickness(
     thinnest = min((math.log(wall) for wall, _ in _walls(found)), default=0.0) - _BELOW
     for _ in range(_MOST):
         walls = _walls(found)
-        if len(walls) < 2 or max(found, key=found.__getitem__).wall is None:
+        if len(walls) < 2 or max(found, key=found.__getitem__).thickness is None:
             break
         known, values = np.log([wall for wall, _ in walls]), np.array([each for _, each in walls])
         wall = _next(known, values, np.log(failed), thinnest=thinnest)
@@ -73,12 +73,12 @@ def search_thickness(
     best = max(found, key=found.__getitem__)
     likely = sorted((body for body, each in found.items() if each > found[best] - _UNLIKELY), key=found.__getitem__)
     walls = _walls(found)
-    return likely[::-1], None if best.wall is None or len(walls) < 2 else _posterior(walls)
+    return likely[::-1], None if best.thickness is None or len(walls) < 2 else _posterior(walls)
 
 
-def _walls(found: dict[NominalBody, float]) -> list[tuple[float, float]]:
+def _walls(found: dict[CandidateBody, float]) -> list[tuple[float, float]]:
     """Return the thicknesses, from thin to thick, and their log evidence."""
-    return sorted((body.wall, each) for body, each in found.items() if body.wall is not None)
+    return sorted((body.thickness, each) for body, each in found.items() if body.thickness is not None)
 
 
 def _next(places: np.ndarray, values: np.ndarray, failed: np.ndarray, *, thinnest: float) -> float | None:

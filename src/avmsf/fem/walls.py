@@ -89,29 +89,29 @@ class Wall:
 
         Raises SimulationError where they do not fill the mesh.
         """
-        return self.solids(length)(1.0)
+        return self.solids(length)(self.thickness)
 
     def solids(self, length: float) -> Callable[[float], Solid]:
-        """Return what makes such prisms with the wall's thickness times a factor, behind the larger side.
+        """Return what makes such prisms of another mean thickness, meters, behind the larger side.
 
-        Raises SimulationError where those of the factor 1 do not fill the mesh; what it returns does where prisms fold.
+        Raises SimulationError where those of the mesh's do not fill it; what it returns does where prisms fold.
         """
         coarse = self.sheet.remeshed(length)
         thickness = np.full(len(coarse.points), self.thickness) if self.even else self._thickness_at(coarse)
 
-        def scaled(factor: float) -> Solid:
+        def scaled(mean: float) -> Solid:
             assert thickness is not None
-            solid = prisms(coarse, factor * thickness, layers=self._layers(length))
+            solid = prisms(coarse, mean / self.thickness * thickness, layers=self._layers(length))
             if solid is None:
                 raise SimulationError(
                     "expected a wall thinner than the mesh's radius of curvature, got "
-                    f"{1000 * factor * self.thickness:.2g} mm; use a thinner one",
+                    f"{1000 * mean:.2g} mm; use a thinner one",
                     name="thickness",
-                    value=factor * self.thickness,
+                    value=mean,
                 )
             return solid
 
-        if thickness is None or not self._fills(scaled(1.0)):
+        if thickness is None or not self._fills(scaled(self.thickness)):
             raise SimulationError(
                 f"expected prisms that fill the mesh, got gaps with prisms of {1000 * length:.2g} mm; make them finer",
                 name="length",

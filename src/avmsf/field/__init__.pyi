@@ -1,7 +1,6 @@
 from .config import PAPER as PAPER
 from .config import FitConfig as FitConfig
 from .config import GainModelName as GainModelName
-from .gains.elastic import CandidateBodies as CandidateBodies
 from .gains.estimator import MixtureEstimator as MixtureEstimator
 from .recipes import Attention as Attention
 from .sound_field import FieldQuality as FieldQuality

@@ -9,9 +9,8 @@ import torch
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.placement import expect_placed
 from avmsf.errors import SimulationError
-from avmsf.fem.candidate_bodies import BodyMaker
-from avmsf.fem.mesh_filling import Shape
-from avmsf.field.gains.elastic import CandidateBodies
+from avmsf.fem.body_meshes import Shape
+from avmsf.fem.candidate_bodies import CandidateBodies, SurfaceBodies
 from avmsf.mesh.surface import Surface, surface_points
 from avmsf.pipeline.config import BodyConfig
 
@@ -33,19 +32,18 @@ def candidate_bodies(
     if impacts is not None:
         seen = surface if isinstance(surface, Surface) else surface.as_seen()
         expect_placed(impacts.contacts, surface_points(seen), names=impacts.names)
-    walls = None if config.wall is None else [config.wall or None]
     try:
-        maker = BodyMaker(surface, count=config.shapes, dofs=config.dofs, cache=cache, log=log)
-        bodies = maker.nominal(walls)
+        bodies = SurfaceBodies(
+            surface, thicknesses=None if config.wall is None else [config.wall or None], supports=config.supports,
+            count=config.shapes, dofs=config.dofs, cache=cache, log=log,
+        )  # fmt: skip
+        # What cannot be had shows now.
+        _ = bodies.bodies
     except SimulationError as error:
         if config.wall is None or error.name != "surface":
             raise
         raise wall_error(surface, config.wall, error) from error
-    several = config.wall is None and sum(body.wall is not None for body in bodies.bodies) > 1
-    thicken = maker.thicken if several else None
-    hold = None if config.supports == "free" else maker.hold
-    refine = None if len(bodies.bodies) == 1 and hold is None else maker.refine
-    return CandidateBodies(bodies, refine, hold, config.supports == "try", thicken, config.dofs)
+    return bodies
 
 
 def wall_error(surface: Surface | Shape, wall: float, error: SimulationError) -> SimulationError:

@@ -18,11 +18,12 @@ from avmsf.capture.settings import settings_of
 from avmsf.capture.together import find_surface
 from avmsf.errors import AvmsfError, FitError, SceneError
 from avmsf.features.feature_field import FeatureField
+from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.fem.material import Material, material_named
 from avmsf.field.config import AUTO, NETWORK, GainModelName
 from avmsf.field.fit import Progress
 from avmsf.field.fit import fit as fit_field
-from avmsf.field.gains.elastic import CandidateBodies, Elastic
+from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import estimator_for
 from avmsf.field.gains.positional import Visual
 from avmsf.field.sound_field import SoundField

@@ -13,11 +13,11 @@ from avmsf.capture.table import TABLE, read_cells
 from avmsf.capture.together import NARROWEST, WIDEST
 from avmsf.errors import FitError, SimulationError
 from avmsf.features.feature_field import FeatureField
-from avmsf.fem.candidate_bodies import NominalBody, nominal_bodies
+from avmsf.fem.body_meshes import Shape
+from avmsf.fem.candidate_bodies import CandidateBody, SurfaceBodies
 from avmsf.fem.damping import damped, rayleigh
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.material import Material, material_named
-from avmsf.fem.mesh_filling import Shape
 from avmsf.fem.radiation import radiated_pressure
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.scaled import BodyGains
@@ -130,7 +130,7 @@ def _body(
     count: int,
     cache: Path | None,
     log: Callable[[str], None] | None,
-) -> NominalBody:
+) -> CandidateBody:
     between = None if isinstance(surface, Surface) else surface.thickness_range
     if between is not None and config.wall is None:
         low, high = (1000 * each for each in between)
@@ -141,10 +141,10 @@ def _body(
             value=between,
         )
     try:
-        found = nominal_bodies(
-            surface, walls=[config.wall or None], count=count, dofs=config.dofs, material=material, cache=cache,
+        return SurfaceBodies(
+            surface, thicknesses=[config.wall or None], count=count, dofs=config.dofs, material=material, cache=cache,
             log=log,
-        )  # fmt: skip
+        ).bodies[0]  # fmt: skip
     except SimulationError as error:
         if config.wall and error.name == "surface":
             raise wall_error(surface, config.wall, error) from error
@@ -156,7 +156,6 @@ def _body(
             name="wall",
             value=error.value,
         ) from error
-    return found.bodies[0]
 
 
 def _pulse(elastic: ElasticModes, poles: Complex128[Tensor, " modes"]) -> Float64[Tensor, " modes"]:

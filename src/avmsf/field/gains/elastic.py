@@ -17,10 +17,8 @@ and the others have any of these: so the strongest modes together tell how exact
 one or two impacts these tell which shape each mode is.
 """
 
-import hashlib
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -28,7 +26,6 @@ import torch
 from jaxtyping import Float64, Int
 from torch import Tensor
 
-from avmsf.fem.candidate_bodies import NominalBodies, NominalBody
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.field.gains.family import KernelFamily, Sites, scaled, squared_exponential
 
@@ -257,32 +254,3 @@ def frequency_log_prior(largest: float = math.inf) -> Float64[Tensor, " pairs"]:
     ]
     density = torch.logsumexp(torch.stack(terms), dim=0).masked_fill(largest < FACTORS, -torch.inf)
     return density.repeat_interleave(len(FREQUENCY_ERRORS))
-
-
-@dataclass(frozen=True, eq=False)
-class CandidateBodies:
-    """Bodies of which each is a hypothesis."""
-
-    bodies: NominalBodies
-    """Coarse ones where there are several."""
-    refine: Callable[[NominalBody], NominalBody] | None = None
-    """Returns a body with finer elements, or itself where it is fine already or that fails."""
-    hold: Callable[[NominalBody], Sequence[NominalBody]] | None = None
-    """Returns a free body and, of the same elements, with each support; nothing where they cannot be computed."""
-    always_hold: bool = False
-    """Whether that is tried even if the free body's evidence is good."""
-    thicken: Callable[[float], NominalBody | None] | None = None
-    """Returns the body with a wall of a thickness in meters, None where that fails; None: no thickness is searched."""
-
-    dofs: int = 0
-    """Degrees of freedom of bodies that are computed more finely, about; for the digest."""
-
-    def digest(self) -> str:
-        """Return a digest of the bodies."""
-        makers = [each is not None for each in (self.refine, self.hold, self.thicken)]
-        digest = hashlib.sha256(f"{makers} {self.always_hold} {self.dofs}".encode())
-        for body in self.bodies.bodies:
-            digest.update(body.name.encode())
-            for tensor in (body.elastic.frequency, body.elastic.nodes, body.elastic.shapes):
-                digest.update(tensor.contiguous().numpy().tobytes())
-        return digest.hexdigest()

@@ -16,14 +16,14 @@ from avmsf.capture.placement import expect_placed
 from avmsf.capture.table import TABLE
 from avmsf.errors import AvmsfError, FitError
 from avmsf.features.feature_field import GEOMETRY, FeatureField
-from avmsf.fem.candidate_bodies import NominalBody, body_name
+from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody, body_name
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.material import largest_factor
 from avmsf.fem.supports import FREE, FREE_PRIOR
 from avmsf.fem.thickness import search_thickness
 from avmsf.fem.updating import update
 from avmsf.field.config import AUTO, NETWORK, GainModelName
-from avmsf.field.gains.elastic import CandidateBodies, Elastic
+from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import KernelFamily, Sites, sites_along
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, matched, total_evidence
 from avmsf.field.gains.labels import better_order, two_levels
@@ -113,14 +113,14 @@ class MixtureEstimator(GainRecipe):
         directional = bool(bodies) or (given is not None and bool(given.any()))
         groups = () if bodies or self.symmetries is None else groups_of(self.symmetries)
         self._expect_inputs(case, groups)
-        hold = None if self.bodies is None else self.bodies.hold
-        thicken = None if self.bodies is None else self.bodies.thicken
+        candidates, supported = self.bodies, False
+        searched = candidates is not None and candidates.searches_thickness
         # Of a wall that is too thin, shapes of high modes may fit as well as those of the right one.
-        largest = math.inf if thicken is None else largest_factor(searched=True)
+        largest = largest_factor(searched=True) if searched else math.inf
         fit = _Fit(case, self.kinds, _sites(case, bodies), directional, groups, largest)
         thickness = None
-        if thicken is not None and bodies:
-            bodies, thickness = search_thickness(bodies, partial(fit.evidence, every), thicken)
+        if candidates is not None and searched and bodies:
+            bodies, thickness = search_thickness(bodies, partial(fit.evidence, every), candidates.with_thickness)
         while True:
             families = fit.families(every, bodies)
             model = fit(every, families)
@@ -131,10 +131,10 @@ class MixtureEstimator(GainRecipe):
                 bodies[best] = fine
                 continue
             judgment, used = _assessed(fit, model, None if best is None else bodies[best]), every
-            if best is None or hold is None or not self._may_be_held(judgment):
+            if best is None or candidates is None or supported or not self._may_be_held(judgment):
                 break
-            rows = _without(every, judgment)
-            held, hold = _more_probable(fit, rows, hold(bodies[best])), None
+            rows, supported = _without(every, judgment), True
+            held = _more_probable(fit, rows, candidates.supported(bodies[best]))
             if held is None:
                 break
             # All modes have the support in common, so free bodies are no hypotheses any more.
@@ -172,11 +172,9 @@ class MixtureEstimator(GainRecipe):
                 value=GEOMETRY,
             )
 
-    def _usable_bodies(self, case: GainCase) -> tuple[list[NominalBody], dict[str, str]]:
+    def _usable_bodies(self, case: GainCase) -> tuple[list[CandidateBody], dict[str, str]]:
         """Return the bodies that the contacts lie on, and why there are none."""
-        missing = (
-            {body_name(wall): reason for wall, reason in self.bodies.bodies.refused.items()} if self.bodies else {}
-        )
+        missing = {body_name(each): reason for each, reason in self.bodies.refused.items()} if self.bodies else {}
         if Elastic.kind not in self.kinds:
             return [], {}
         if self.bodies is None:
@@ -187,24 +185,26 @@ class MixtureEstimator(GainRecipe):
                 )
             return [], {Elastic.kind: self.missing} if self.missing else {}
         try:
-            expect_placed(case.train.contacts, self.bodies.bodies.bodies[0].elastic.points, names=case.train.names)
+            expect_placed(case.train.contacts, self.bodies.bodies[0].elastic.points, names=case.train.names)
         except FitError as error:
             if self.name == Elastic.kind:
                 raise
             return [], {Elastic.kind: str(error)}
-        return list(self.bodies.bodies.bodies), missing
+        return list(self.bodies.bodies), missing
 
     def _may_be_held(self, judgment: Judgment) -> bool:
         """Return whether supports are tried: where they are asked for, or the free body predicts little."""
+        if self.bodies is None or self.bodies.supports == "free":
+            return False
         found = judgment.credibility
         little = found is not None and found.with_body - found.without_body < _PREDICTS
-        return self.bodies is not None and (self.bodies.always_hold or little)
+        return self.bodies.supports == "try" or little
 
-    def _refined(self, body: NominalBody) -> NominalBody | None:
+    def _refined(self, body: CandidateBody) -> CandidateBody | None:
         """Return a body with finer elements; None where it has been computed as finely as it can."""
-        if self.bodies is None or self.bodies.refine is None or body.fine:
+        if self.bodies is None or body.fine:
             return None
-        fine = self.bodies.refine(body)
+        fine = self.bodies.refined(body)
         return None if fine is body else fine
 
 
@@ -271,7 +271,7 @@ class _Fit:
         """Contacts at which orders and levels are compared, as recorded."""
         return farthest_points(self.sites.points, min(_UPDATED, len(self.sites))).sort().values
 
-    def families(self, rows: Int[Tensor, " rows"], bodies: Sequence[NominalBody]) -> list[KernelFamily]:
+    def families(self, rows: Int[Tensor, " rows"], bodies: Sequence[CandidateBody]) -> list[KernelFamily]:
         """Return the families of these contacts; the elastic ones come last, in the order of the bodies."""
         sites, size = self.sites.take(rows), 2.0 * self.case.features.half_diagonal
         found: list[KernelFamily] = [Unstructured(sites, size)]
@@ -293,7 +293,7 @@ class _Fit:
         points = self.case.features.points
         return fit_mixture(families, self.at(rows), points, directional=self.directional, noise_shares=noise_shares)
 
-    def evidence(self, rows: Int[Tensor, " rows"], bodies: Sequence[NominalBody]) -> list[float]:
+    def evidence(self, rows: Int[Tensor, " rows"], bodies: Sequence[CandidateBody]) -> list[float]:
         """Return the log evidence of the gains of some contacts with each body by itself."""
         sites, size = self.sites.take(rows), 2.0 * self.case.features.half_diagonal
         measured = self.at(rows)
@@ -301,7 +301,7 @@ class _Fit:
         elastic = (WeighedFamily.of(self.elastic(sites, size, each.elastic), measured, NOISE_SHARES) for each in bodies)
         return [total_evidence([*others, each], measured) for each in elastic]
 
-    def updated(self, rows: Int[Tensor, " rows"], body: NominalBody) -> NominalBody | None:
+    def updated(self, rows: Int[Tensor, " rows"], body: CandidateBody) -> CandidateBody | None:
         """Return the body with its stiffness and density updated; None where that has no higher evidence."""
         if body.elastic.perturbations is None:
             return None
@@ -332,7 +332,7 @@ def gain_variance(case: GainCase) -> Float64[Tensor, " modes"]:
     return 2.0 * noise / (case.train.sample_rate * envelope)
 
 
-def _sites(case: GainCase, bodies: Sequence[NominalBody]) -> Sites:
+def _sites(case: GainCase, bodies: Sequence[CandidateBody]) -> Sites:
     """Return the training impacts; unknown directions go straight into the body.
 
     Without a body they are that of the nearest impact whose direction is known, or all alike where none is.
@@ -351,11 +351,11 @@ def _sites(case: GainCase, bodies: Sequence[NominalBody]) -> Sites:
     return sites_along(points, given, otherwise)
 
 
-def _assessed(fit: _Fit, model: MixtureGains, body: NominalBody | None) -> Judgment:
+def _assessed(fit: _Fit, model: MixtureGains, body: CandidateBody | None) -> Judgment:
     """Return what contradicts the other contacts; the body is the most probable one."""
     points = model.points[farthest_points(model.points, min(_PLACES, len(model.points)))]
 
-    def fitted(bodies: list[NominalBody]) -> Fit:
+    def fitted(bodies: list[CandidateBody]) -> Fit:
         return lambda rows, noise_shares: fit(rows, fit.families(rows, bodies), noise_shares)
 
     elastic = None if body is None else fitted([body])
@@ -378,7 +378,7 @@ def _two_levels(fit: _Fit) -> str | None:
     )
 
 
-def _better_order(fit: _Fit, bodies: Sequence[NominalBody]) -> str | None:
+def _better_order(fit: _Fit, bodies: Sequence[CandidateBody]) -> str | None:
     """Return in which order the recordings agree with the contacts far better, and what to change; None for none."""
     names, rows = fit.case.train.names, fit.compared
     points, directional = fit.case.features.points, fit.directional
@@ -398,7 +398,7 @@ def _without(rows: Int[Tensor, " rows"], judgment: Judgment) -> Int[Tensor, " ke
     return torch.tensor([row for row in rows.tolist() if row not in {each.row for each in judgment.outliers}])
 
 
-def _more_probable(fit: _Fit, rows: Int[Tensor, " rows"], bodies: Sequence[NominalBody]) -> NominalBody | None:
+def _more_probable(fit: _Fit, rows: Int[Tensor, " rows"], bodies: Sequence[CandidateBody]) -> CandidateBody | None:
     """Return the most probable held body by the evidence of all modes, or None where the first, free, is the best.
 
     Where both bodies are far from the object, evidence between them means little: the held one also has to predict
@@ -422,13 +422,13 @@ def _body_weights(model: MixtureGains, families: Sequence[KernelFamily], measure
 
 
 def _report(
-    bodies: Sequence[NominalBody], families: Sequence[KernelFamily], weights: Sequence[float], missing: dict[str, str]
+    bodies: Sequence[CandidateBody], families: Sequence[KernelFamily], weights: Sequence[float], missing: dict[str, str]
 ) -> dict[str, Any]:
     elastic = [each for each in families if isinstance(each, Elastic)]
     found = [
         {
             "body": body.name,
-            "wall_thickness": body.wall,
+            "wall_thickness": body.thickness,
             "support": FREE if body.support is None else body.support.name,
             "updating_nats": body.updated,
             "refined": body.fine,

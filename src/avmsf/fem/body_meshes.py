@@ -1,15 +1,18 @@
-"""A checked surface as tetrahedra of a wanted number: what it encloses, or its wall."""
+"""Tetrahedra of a wanted number: of what a surface encloses, or of a wall behind it."""
 
 import contextlib
 import math
 from collections.abc import Callable, Iterator
+from functools import cached_property
 from operator import itemgetter
 from pathlib import Path
+from threading import Lock
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 
+from avmsf._utils.caching import once
 from avmsf.errors import SceneError, SimulationError
 from avmsf.fem.elements import SecondOrder
 from avmsf.fem.mesh_check import CheckedSurface, checked, simplified
@@ -20,7 +23,7 @@ from avmsf.fem.tetrahedra import fill
 from avmsf.fem.walls import wall_of
 from avmsf.mesh.surface import Surface
 
-FEWEST = 1000
+MIN_DOFS = 1000
 """Degrees of freedom below which no body has 20 modes worth the name."""
 _OVER, _UNDER = 1.2, 0.65
 """Degrees of freedom over those wanted, from `_UNDER` to `_OVER`, that end the search."""
@@ -77,24 +80,90 @@ class Shape(Protocol):
         ...
 
 
-def expect_memory(dofs: int) -> None:
-    """Raise SimulationError where the modes of a mesh with so many degrees of freedom do not fit into memory."""
-    free = _free_memory()
-    peak, measured, power = _PEAK
-    needed = _CAUTION * peak * (dofs / measured) ** power
-    if free is not None and needed > free:
-        fitting = int(measured * (free / (_CAUTION * peak)) ** (1.0 / power)) // 1000 * 1000
-        raise SimulationError(
-            f"expected about {needed / 1e9:.2g} GB of free memory for {dofs} degrees of freedom, got "
-            f"{free / 1e9:.2g} GB; use {max(fitting, FEWEST)} (--body.dofs), or close other programs",
-            name="memory",
-            value=free,
-        )
-
-
 def count_dofs(solid: Solid) -> int:
     """Return the number of displacements at the nodes of second-order elements."""
     return 3 * len(SecondOrder.of(solid).nodes)
+
+
+class BodyMeshes:
+    """Makes the tetrahedra of the bodies that one surface, or one shape, may hide; what all of them need is made once.
+
+    `log` is called with what was repaired in the surface, and with what is missing of it.
+    """
+
+    def __init__(self, surface: Surface | Shape, *, log: Callable[[str], None]) -> None:
+        self.shape = None if isinstance(surface, Surface) else surface
+        self.seen = surface if isinstance(surface, Surface) else surface.as_seen()
+        """What was seen of the object, both sides of walls included."""
+        self._log, self._walls, self._remeshing = log, once(self._make_walls), Lock()
+
+    @cached_property
+    def checked(self) -> CheckedSurface:
+        """The surface, repaired. Raises SimulationError as `mesh_check.checked`."""
+        return checked(self.seen, log=self._log)
+
+    def expect_possible(self, thickness: float | None, *, guessed: bool) -> None:
+        """Raise SimulationError where a body is out of the question before tetrahedra are made.
+
+        A `guessed` wall is so in a surface that holds little more than the wall would.
+        """
+        if thickness is None:
+            self.checked.expect_filling()
+        elif thickness >= self.checked.width:
+            raise SimulationError(
+                f"expected a wall thinner than the object's width of {millimeters(self.checked.width, 3)}, got "
+                f"{millimeters(thickness, 3)}; give a thinner wall",
+                name="wall",
+                value=thickness,
+            )
+        elif guessed and self.shape is None:
+            self.checked.expect_hollow(thickness)
+
+    def solid(self, thickness: float | None, dofs: int) -> Solid:
+        """Return about so many degrees of freedom of a wall of a thickness, meters, or of all that is enclosed (None).
+
+        Raises SimulationError where that cannot be made.
+        """
+        if thickness is None:
+            return filled_solid(self.checked, dofs)
+        if self.shape is None:
+            return self.walls(dofs)(thickness)
+        try:
+            surface = self.shape.shell(thickness, faces=round(0.5 * TRIANGLES * dofs))
+        except SceneError as error:
+            raise SimulationError(str(error), **error.attributes) from error
+        return filled_solid(checked(surface, log=self._log), dofs, wall=thickness)
+
+    def walls(self, dofs: int) -> Callable[[float], Solid]:
+        """Return what makes a wall of a thickness, meters, inwards of the surface, which is remeshed once for all.
+
+        Raises SimulationError for several parts and for triangles that face different ways; what it returns does as
+        `shell` does.
+        """
+        # Threads that make several walls wait for the skin that all of them follow.
+        with self._remeshing:
+            return self._walls(dofs)
+
+    def _make_walls(self, dofs: int) -> Callable[[float], Solid]:
+        sheet = self.checked.sheet()
+        length = 1.2 * math.sqrt(_SHELL * float(sheet.areas.sum()) / dofs)
+        skin = sheet
+        for _ in range(_TRIES):
+            skin = sheet.remeshed(length)
+            part = _SHELL * len(skin.points) / dofs
+            if _UNDER <= part <= 1.0:
+                break
+            length *= math.sqrt(part / 0.85)
+        surface = _surface(skin)
+        first = length / skin.size
+        return lambda thickness: _near(
+            lambda detail: shell(surface, thickness=thickness, detail=detail), dofs, first=first
+        )
+
+
+def millimeters(meters: float, digits: int) -> str:
+    """Return a length with so many significant digits and no exponent."""
+    return f"{float(f'{1000 * meters:.{digits}g}'):g} mm"
 
 
 def filled_solid(checked: CheckedSurface, dofs: int, *, wall: float | None = None) -> Solid:
@@ -120,41 +189,6 @@ def filled_solid(checked: CheckedSurface, dofs: int, *, wall: float | None = Non
         return fill(_surface(skin), detail=detail, timeout=_FILLING_SECONDS)
 
     return _near(filled, dofs, first=first)
-
-
-def walled_solid(shape: Shape, thickness: float, dofs: int, *, log: Callable[[str], None]) -> Solid:
-    """Return the elements of a wall of a shape, meters thick. Raises SimulationError where it cannot be made."""
-    try:
-        surface = shape.shell(thickness, faces=round(0.5 * TRIANGLES * dofs))
-    except SceneError as error:
-        raise SimulationError(str(error), **error.attributes) from error
-    return filled_solid(checked(surface, log=log), dofs, wall=thickness)
-
-
-def wall_solids(checked: CheckedSurface, dofs: int) -> Callable[[float], Solid]:
-    """Return what makes a wall of a thickness, meters, with about so many degrees of freedom inwards of a surface.
-
-    The skin is remeshed once for all thicknesses. Raises SimulationError for several parts and for triangles that
-    face different ways; what it returns does as `shell` does.
-    """
-    sheet = checked.sheet()
-    length = 1.2 * math.sqrt(_SHELL * float(sheet.areas.sum()) / dofs)
-    skin = sheet
-    for _ in range(_TRIES):
-        skin = sheet.remeshed(length)
-        part = _SHELL * len(skin.points) / dofs
-        if _UNDER <= part <= 1.0:
-            break
-        length *= math.sqrt(part / 0.85)
-    surface = _surface(skin)
-
-    def walled(thickness: float) -> Solid:
-        def made(detail: float) -> Solid:
-            return shell(surface, thickness=thickness, detail=detail)
-
-        return _near(made, dofs, first=length / skin.size)
-
-    return walled
 
 
 def _near(make: Callable[[float], Solid], dofs: int, *, first: float, most: float = _OVER) -> Solid:
@@ -222,6 +256,21 @@ def _filling_detail(checked: CheckedSurface, dofs: int) -> float:
 
 def _surface(skin: Skin) -> Surface:
     return Surface(torch.from_numpy(skin.points).float(), torch.from_numpy(skin.faces))
+
+
+def expect_memory(dofs: int) -> None:
+    """Raise SimulationError where the modes of a mesh with so many degrees of freedom do not fit into memory."""
+    free = _free_memory()
+    peak, measured, power = _PEAK
+    needed = _CAUTION * peak * (dofs / measured) ** power
+    if free is not None and needed > free:
+        fitting = int(measured * (free / (_CAUTION * peak)) ** (1.0 / power)) // 1000 * 1000
+        raise SimulationError(
+            f"expected about {needed / 1e9:.2g} GB of free memory for {dofs} degrees of freedom, got "
+            f"{free / 1e9:.2g} GB; use {max(fitting, MIN_DOFS)} (--body.dofs), or close other programs",
+            name="memory",
+            value=free,
+        )
 
 
 def _free_memory() -> float | None:
