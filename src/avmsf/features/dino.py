@@ -47,15 +47,11 @@ class DinoEncoder:
         if longest is not None and longest < 1:
             raise SceneError.expected("the pixels of the longer side, such as 518", longest, name="longest")
         self.model, self.name, self.longest = model.eval().requires_grad_(False), name, longest
-        self._mean, self._deviation = torch.tensor(mean), torch.tensor(deviation)
+        self._mean, self._deviation = (torch.tensor(each)[:, None, None] for each in (mean, deviation))
 
     @classmethod
     def load(
-        cls,
-        source: str | Path,
-        *,
-        longest: int | None = 518,
-        device: str | torch.device = "cpu",
+        cls, source: str | Path, *, longest: int | None = 518, device: str | torch.device = "cpu"
     ) -> "DinoEncoder":
         """Load a model of the hub (one of `MODELS`), or a folder with config.json and model.safetensors.
 
@@ -63,9 +59,13 @@ class DinoEncoder:
         rounds the factors of the first layer to TF32. Raises SceneError where transformers is missing, where the model
         is neither here nor to be downloaded, and for a folder that holds another model or a part of one.
         """
-        folder, name = _model_folder(source)
-        model = _load_model(folder, torch.device(device))
-        mean, deviation = _constants(folder / _PREPROCESSOR)
+        folder, name = Path(source).expanduser(), str(source)
+        if folder.is_dir():
+            name = f"DINOv2 from the folder {folder.resolve().name}"
+        else:
+            folder = _download(name)
+        model = _load_model(folder).to(device)
+        mean, deviation = _read_normalization(folder / _PREPROCESSOR)
         return cls(model, name=name, longest=longest, mean=mean, deviation=deviation)
 
     def describe(
@@ -73,26 +73,22 @@ class DinoEncoder:
     ) -> Float[Tensor, "dim rows columns"]:
         """Return the patches' features, float32, on a grid that covers the image evenly."""
         color = unit_image(image).permute(2, 0, 1)
-        height, width = self._size(color.shape[1], color.shape[2])
+        height, width = color.shape[1:]
+        if self.longest is not None:
+            factor = self.longest / max(height, width)
+            height, width = max(1, round(height * factor)), max(1, round(width * factor))
         color = functional.interpolate(
             color[None], (height, width), mode="bicubic", align_corners=False, antialias=True
         ).clamp(0.0, 1.0)
-        color = (color - self._mean.to(color)[:, None, None]) / self._deviation.to(color)[:, None, None]
+        color = (color - self._mean.to(color)) / self._deviation.to(color)
         patch = int(self.model.config.patch_size)  # type: ignore[union-attr,arg-type]
         rows, columns = -(-height // patch), -(-width // patch)
         color = functional.pad(color, (0, columns * patch - width, 0, rows * patch - height), mode="replicate")
-        weights = next(self.model.parameters())
         with torch.no_grad():
-            tokens = self.model(pixel_values=color.to(weights)).last_hidden_state[0].float()
-        tokens = tokens[len(tokens) - rows * columns :].T.reshape(-1, rows, columns)
+            states = self.model(pixel_values=color.to(next(self.model.parameters()))).last_hidden_state[0].float()
+        tokens = states[len(states) - rows * columns :].T.reshape(-1, rows, columns)
         down, across = _interpolation(height, patch).to(tokens), _interpolation(width, patch).to(tokens)
         return (down @ tokens @ across.T).to(image.device)
-
-    def _size(self, height: int, width: int) -> tuple[int, int]:
-        if self.longest is None:
-            return height, width
-        factor = self.longest / max(height, width)
-        return max(1, round(height * factor)), max(1, round(width * factor))
 
 
 def _interpolation(length: int, patch: int) -> Float[Tensor, "cells patches"]:
@@ -106,22 +102,19 @@ def _interpolation(length: int, patch: int) -> Float[Tensor, "cells patches"]:
     return (1 - (places[:, None] - torch.arange(count)).abs()).clamp(min=0.0)
 
 
-def _model_folder(source: str | Path) -> tuple[Path, str]:
-    """Return the folder that holds a model, downloaded where that is needed, and the name of its features."""
-    folder, name = Path(source).expanduser(), str(source)
-    if folder.is_dir():
-        return folder, f"DINOv2 from the folder {folder.resolve().name}"
+def _download(name: str) -> Path:
+    """Return the folder in the hub's cache that holds a model of this name, downloaded where it is not there."""
     if name not in MODELS:
         wanted, got = f"a folder with {_CONFIG} and {_WEIGHTS}, or one of {', '.join(MODELS)}", "no such folder"
-        raise SceneError.expected(wanted, name, got=got, name="encoder", file=folder, advice="check the path")
-    _transformers()
+        raise SceneError.expected(wanted, name, got=got, name="encoder", file=name, advice="check the path")
+    _model_classes()
     from huggingface_hub import snapshot_download, try_to_load_from_cache
 
     cached = [try_to_load_from_cache(name, file) for file in _FILES]
     if all(isinstance(path, str) for path in cached):
-        return Path(str(cached[0])).parent, name
+        return Path(str(cached[0])).parent
     try:
-        return Path(snapshot_download(name, allow_patterns=list(_FILES), etag_timeout=HUB_SECONDS)), name
+        return Path(snapshot_download(name, allow_patterns=list(_FILES), etag_timeout=HUB_SECONDS))
     except Exception as error:  # the hub's client raises whatever the network beneath it does
         got = f"none: they could not be downloaded ({why_not(error)})"
         advice = (
@@ -131,56 +124,50 @@ def _model_folder(source: str | Path) -> tuple[Path, str]:
         raise SceneError.expected(f"the weights of {name}", name, got=got, name="encoder", advice=advice) from error
 
 
-def _load_model(folder: Path, device: torch.device) -> nn.Module:
-    transformers = _transformers()
-    lacking = [name for name in (_CONFIG, _WEIGHTS) if not (folder / name).is_file()]
+def _load_model(folder: Path) -> nn.Module:
+    classes, weights = _model_classes(), folder / _WEIGHTS
     advice = f"copy {', '.join(_FILES)} of one model such as {MODELS[0]} there"
-    if lacking:
-        got = f"no {' and no '.join(lacking)}"
-        raise SceneError.expected("a DINOv2 model", got=got, file=folder, name=lacking[0], advice=advice)
+    for name in (_CONFIG, _WEIGHTS):
+        if not (folder / name).is_file():
+            raise SceneError.expected("a DINOv2 model", got=f"no {name}", file=folder, name=name, advice=advice)
     kind = read_settings(folder / _CONFIG, raising=SceneError).get("model_type")
-    classes = {"dinov2": "Dinov2Model", "dinov2_with_registers": "Dinov2WithRegistersModel"}
     if kind not in classes:
-        raise SceneError.expected(
-            f"a model of type {' or '.join(classes)}", kind, file=folder / _CONFIG, name="model_type"
-        )
+        wanted = f"a model of type {' or '.join(classes)}"
+        raise SceneError.expected(wanted, kind, file=folder / _CONFIG, name="model_type")
     try:
-        model, report = getattr(transformers, classes[kind]).from_pretrained(
+        model, report = classes[kind].from_pretrained(
             folder, local_files_only=True, use_safetensors=True, dtype=torch.float32, output_loading_info=True
         )
     except Exception as error:  # whatever is wrong with the file, transformers and safetensors have their own errors
         got = f"a file that cannot be loaded ({error})"
-        raise SceneError.expected("the model's weights", got=got, file=folder / _WEIGHTS, advice=advice) from error
+        raise SceneError.expected("the model's weights", got=got, file=weights, advice=advice) from error
     # The mask token is for training alone. Any other weight would be left random.
     missing = sorted(name for name in report["missing_keys"] if not name.endswith("mask_token"))
     if missing:
-        got = f"{len(missing)} fewer, without {missing[0]}"
-        raise SceneError.expected(
-            "all of the model's weights", len(missing), got=got, file=folder / _WEIGHTS, name=missing[0], advice=advice
-        )
-    return model.to(device)
+        wanted, got = "all of the model's weights", f"{len(missing)} fewer, without {missing[0]}"
+        raise SceneError.expected(wanted, len(missing), got=got, file=weights, name=missing[0], advice=advice)
+    return model
 
 
-def _constants(path: Path) -> tuple[Sequence[float], Sequence[float]]:
+def _read_normalization(path: Path) -> tuple[Sequence[float], Sequence[float]]:
     """Return the mean and standard deviation of colors in a preprocessor's file, ImageNet's without one."""
-    if not path.is_file():
-        return IMAGENET_MEAN, IMAGENET_DEVIATION
-    record = read_settings(path, raising=SceneError)
-    found = record.get("image_mean", list(IMAGENET_MEAN)), record.get("image_std", list(IMAGENET_DEVIATION))
-    numbers = [number for each in found if isinstance(each, list) and len(each) == 3 for number in each]
-    if len(numbers) != 6 or not all(isinstance(each, float | int) for each in numbers):
-        raise SceneError.expected(
-            "image_mean and image_std of three numbers", found, file=path, name="image_mean", advice="copy it again"
-        )
+    record = read_settings(path, raising=SceneError) if path.is_file() else {}
+    found = record.get("image_mean", IMAGENET_MEAN), record.get("image_std", IMAGENET_DEVIATION)
+    for each in found:
+        if not (
+            isinstance(each, Sequence) and len(each) == 3 and all(isinstance(value, float | int) for value in each)
+        ):
+            wanted = "image_mean and image_std of three numbers"
+            raise SceneError.expected(wanted, found, file=path, name="image_mean", advice="copy it again")
     return found
 
 
-def _transformers() -> Any:
+def _model_classes() -> dict[str, Any]:
+    """Return the classes of transformers by the type of model in their settings."""
     try:
-        import transformers
-        from transformers import Dinov2Model, Dinov2WithRegistersModel  # noqa: F401
+        from transformers import Dinov2Model, Dinov2WithRegistersModel
     except (ImportError, RuntimeError) as error:  # RuntimeError: one of its own optional packages is broken
         wanted, got = "the package transformers for DINOv2", f"an import error ({error})"
         advice = "pip install 'avmsf[vision]', or use --lift.encoder descriptors"
         raise SceneError.expected(wanted, got=got, name="transformers", advice=advice) from error
-    return transformers
+    return {"dinov2": Dinov2Model, "dinov2_with_registers": Dinov2WithRegistersModel}
