@@ -20,7 +20,7 @@ from avmsf.gaussians.fit import SplatProgress, splat
 from avmsf.gaussians.rasterizer.devices import choose_rasterizer
 from avmsf.gaussians.rasterizer.protocol import Rasterizer
 from avmsf.gaussians.ssim import psnr, ssim
-from avmsf.gaussians.targets import Photograph
+from avmsf.gaussians.targets import pyramid
 from avmsf.photographs import find_foreground, read_views
 from avmsf.photographs.cameras import View
 from avmsf.symmetry.find import find_symmetries
@@ -119,8 +119,7 @@ def _fit(*, quick_look: bool) -> dict[str, Any]:
 
 
 def _small(view: View) -> View:
-    photograph = Photograph.of(view, halvings=2)
-    return View(view.name, photograph.images[-1], photograph.cameras[-1], photograph.masks[-1])
+    return pyramid(view, halvings=2)[-1]
 
 
 def _convention(options: Options, found: dict[str, Any]) -> str:

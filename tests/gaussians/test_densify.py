@@ -4,9 +4,9 @@ from dataclasses import replace
 import torch
 from scipy.spatial.transform import Rotation
 
-from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.cloud import GaussianCloud, rotation_matrices
 from avmsf.gaussians.config import SplatConfig
-from avmsf.gaussians.densify import Density, rotation_matrices
+from avmsf.gaussians.densify import Density
 
 CONFIG = SplatConfig(growth=1.0, large=0.01, least_opacity=0.1, gaussians=10_000)
 HALF_DIAGONAL = 1.0

@@ -7,14 +7,13 @@ import pytest
 import torch
 
 from avmsf.errors import AvmsfWarning, CaptureWarning, SceneError
-from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.cloud import GaussianCloud, rotation_matrices
 from avmsf.gaussians.config import SplatConfig
-from avmsf.gaussians.densify import rotation_matrices
 from avmsf.gaussians.fit import SplatProgress, splat
 from avmsf.gaussians.initialize import StartPoints, photographed_colors, starting_cloud
 from avmsf.gaussians.rasterizer.devices import NumbaRasterizer
 from avmsf.gaussians.ssim import psnr
-from avmsf.gaussians.targets import choose_background, prepare_photographs
+from avmsf.gaussians.targets import choose_background, comparable_views, pyramid
 from avmsf.photographs.cameras import View
 from factories.ball_views import MIDDLE, RADIUS, ball_color, ball_view, ball_views
 from factories.raising import raises, warns
@@ -158,25 +157,25 @@ def test_views_that_cannot_be_compared_are_passed_over() -> None:
     background = choose_background(views, replace(QUICK, background="random"))
     bare = replace(views[1], mask=None)
     with warns(CaptureWarning, name="masks", value=["01.png"]):
-        kept = prepare_photographs([empty, bare, *views[2:]], background, halvings=1)
+        kept = comparable_views([empty, bare, *views[2:]], background)
     assert [each.name for each in kept] == ["02.png", "03.png", "04.png", "05.png"]
     with raises(SceneError, name="views", value=2):
-        prepare_photographs(views[:2], choose_background(views, QUICK), halvings=0)
+        comparable_views(views[:2], choose_background(views, QUICK))
 
 
 def test_halved_photographs_are_means_that_the_halved_camera_sees() -> None:
     view = ball_view(ball_views(3, size=65)[1].camera)
-    photograph = prepare_photographs([view] * 3, choose_background([view], QUICK), halvings=2)[0]
-    assert [(camera.width, camera.height) for camera in photograph.cameras] == [(65, 65), (32, 32), (16, 16)]
-    mean = photograph.images[0].double().mean()
-    assert all(float(image.double().mean() - mean) == pytest.approx(0.0, abs=1.0) for image in photograph.images)
+    levels = pyramid(view, halvings=2)
+    assert [(level.camera.width, level.camera.height) for level in levels] == [(65, 65), (32, 32), (16, 16)]
+    mean = view.image.double().mean()
+    assert all(float(level.image.double().mean() - mean) == pytest.approx(0.0, abs=1.0) for level in levels)
     even = ball_view(ball_views(2)[1].camera)
-    small = prepare_photographs([even] * 3, choose_background([even], QUICK), halvings=1)[0].images[1]
+    small = pyramid(even, halvings=1)[1].image
     blocks = even.image.reshape(32, 2, 32, 2, 3).double().mean((1, 3))
     # Rounded to a level.
     assert float((small - blocks).abs().max()) <= 0.5
     point = torch.tensor([MIDDLE])
-    full, small = (photograph.cameras[level].project(point)[0] / photograph.cameras[level].width for level in (0, 2))
+    full, small = (levels[place].camera.project(point)[0] / levels[place].camera.width for place in (0, 2))
     torch.testing.assert_close(full, small)
 
 

@@ -59,3 +59,14 @@ class GaussianCloud:
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> "GaussianCloud":
         return GaussianCloud(*(change(getattr(self, each.name)) for each in fields(self)))
+
+
+def rotation_matrices(quaternions: Float[Tensor, "points 4"]) -> Float[Tensor, "points 3 3"]:
+    """Return the rotations of quaternions w, x, y, z of any length but zero."""
+    w, x, y, z = (quaternions / quaternions.norm(dim=1, keepdim=True)).unbind(1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)

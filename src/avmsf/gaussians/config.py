@@ -7,12 +7,12 @@ from typing import Literal
 from avmsf._utils.text import changes_repr
 from avmsf.errors import SceneError
 
-_LEAST = {"steps": 1, "start_points": 100, "gaussians": 100, "densify_every": 1}
+_MINIMA = {"steps": 1, "start_points": 100, "gaussians": 100, "densify_every": 1} | dict.fromkeys(
+    ("halvings", "growth", "large", "seed", "dissimilarity_weight", "mask_weight", "flat_weight"), 0
+)
 _POSITIVE = ("start_scale", "start_flatness")
 """Settings above zero, as all learning rates are."""
-_NOT_NEGATIVE = ("halvings", "growth", "large", "seed")
-"""Settings from zero on, as all weights are."""
-_PARTS = ("coarse_until", "degree_every", "densify_from", "densify_until", "least_opacity", "wrong_masks")
+_FRACTIONS = ("coarse_until", "degree_every", "densify_from", "densify_until", "least_opacity", "wrong_masks")
 
 
 @dataclass(frozen=True)
@@ -88,27 +88,21 @@ class SplatConfig:
 
     def __post_init__(self) -> None:
         for name in (each.name for each in fields(self)):
-            value, least = getattr(self, name), _LEAST.get(name, 0)
-            if name in _LEAST or name in _NOT_NEGATIVE or name.endswith("_weight"):
-                if not least <= value < math.inf:
-                    raise _unexpected(name, value, f"{least} or more")
-            elif name in _POSITIVE or name.endswith("_rate"):
-                if not 0 < value < math.inf:
-                    raise _unexpected(name, value, "more than 0")
-            elif name in _PARTS and not 0 <= value <= 1:
-                raise _unexpected(name, value, "0 to 1")
+            value = getattr(self, name)
+            if name in _MINIMA and not _MINIMA[name] <= value < math.inf:
+                raise SceneError.expected(f"{_MINIMA[name]} or more", value, name=name)
+            if (name in _POSITIVE or name.endswith("_rate")) and not 0 < value < math.inf:
+                raise SceneError.expected("more than 0", value, name=name)
+            if name in _FRACTIONS and not 0 <= value <= 1:
+                raise SceneError.expected("0 to 1", value, name=name)
         if self.degree not in (0, 1, 2, 3):
-            raise _unexpected("degree", self.degree, "0, 1, 2 or 3")
+            raise SceneError.expected("0, 1, 2 or 3", self.degree, name="degree")
         if self.seed >= 2**63:
-            raise _unexpected("seed", self.seed, "less than 2^63")
+            raise SceneError.expected("less than 2^63", self.seed, name="seed")
         if not 0 < self.start_opacity < 1:
-            raise _unexpected("start_opacity", self.start_opacity, "more than 0 and less than 1")
+            raise SceneError.expected("more than 0 and less than 1", self.start_opacity, name="start_opacity")
         if isinstance(self.background, str):
             if self.background not in ("found", "random"):
-                raise _unexpected("background", self.background, "found, random or three numbers")
+                raise SceneError.expected("found, random or three numbers", self.background, name="background")
         elif not all(0 <= value <= 1 for value in self.background):
-            raise _unexpected("background", self.background, "red, green and blue from 0 to 1")
-
-
-def _unexpected(name: str, value: object, expected: str) -> SceneError:
-    return SceneError(f"{name}: expected {expected}, got {value!r}", name=name, value=value)
+            raise SceneError.expected("red, green and blue from 0 to 1", self.background, name="background")

@@ -6,13 +6,12 @@ split into two smaller ones drawn from its own density. One that is almost trans
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.cloud import GaussianCloud, rotation_matrices
 from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.rasterizer.protocol import Rendering
 from avmsf.photographs.cameras import Camera
@@ -35,11 +34,7 @@ class Density:
     @classmethod
     def zeros(cls, cloud: GaussianCloud) -> "Density":
         """Return what is known of Gaussians at first."""
-        return cls(torch.zeros_like(cloud.logit_opacities), torch.zeros_like(cloud.logit_opacities))
-
-    def state(self) -> dict[str, Any]:
-        """Return the tensors by name."""
-        return {"gradient": self.gradient, "views": self.views}
+        return cls(*cloud.logit_opacities.new_zeros(2, len(cloud)))
 
     def add_view(self, rendering: Rendering, camera: Camera) -> None:
         """Add one view's gradient, after the backward pass."""
@@ -75,14 +70,3 @@ def _split(cloud: GaussianCloud, *, generator: torch.Generator) -> GaussianCloud
     centers = twice.centers + (rotation_matrices(twice.rotations) @ offsets[..., None])[..., 0]
     scales = twice.log_scales - math.log(_SHRINK)
     return GaussianCloud(centers, twice.rotations, scales, twice.logit_opacities, twice.harmonics)
-
-
-def rotation_matrices(quaternions: Float[Tensor, "points 4"]) -> Float[Tensor, "points 3 3"]:
-    """Return the rotations of quaternions w, x, y, z of any length but zero."""
-    w, x, y, z = (quaternions / quaternions.norm(dim=1, keepdim=True)).unbind(1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)

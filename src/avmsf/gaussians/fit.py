@@ -5,13 +5,13 @@ import importlib.util
 import math
 import time
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from avmsf._utils.device import steps_between_losses
@@ -25,7 +25,7 @@ from avmsf.gaussians.prune import keep_object
 from avmsf.gaussians.rasterizer.devices import choose_rasterizer
 from avmsf.gaussians.rasterizer.protocol import Rasterizer, Rendering
 from avmsf.gaussians.ssim import psnr, ssim
-from avmsf.gaussians.targets import Photograph, choose_background, prepare_photographs
+from avmsf.gaussians.targets import choose_background, comparable_views, pyramid
 from avmsf.gaussians.visual_hull import visual_hull
 from avmsf.photographs.cameras import View
 
@@ -33,8 +33,6 @@ _MIN_PROGRESS_STEPS = 10
 """Least number of steps between reports of progress."""
 _CHECKPOINT_SECONDS = 30.0
 _CHECKPOINT_VERSION = 2
-_GROUPS = ("centers", "rotations", "log_scales", "logit_opacities", "colors", "shades")
-"""Parameters with a rate of their own; colors are the harmonics of degree 0, shades those above."""
 _BETAS, _EPSILON = (0.9, 0.999), 1e-15
 """Adam's, as in 3DGS."""
 
@@ -85,9 +83,9 @@ def splat(
     config = SplatConfig() if config is None else config
     device = _device(device, rasterizer)
     rasterizer = choose_rasterizer(device) if rasterizer is None else rasterizer
-    began = time.monotonic()
+    began = saved_at = time.monotonic()
     background = choose_background(views, config)
-    photographs = prepare_photographs(views, background, halvings=config.halvings)
+    photographs = comparable_views(views, background)
     cloud = starting_cloud(
         _hull_points(views, config) if start is None else start,
         degree=config.degree,
@@ -96,47 +94,36 @@ def splat(
         flatness=config.start_flatness,
     )
     run = _Run(cloud.to(device), photographs, background, config, rasterizer=rasterizer)
-    saved = None if checkpoint is None else _Checkpoint(Path(checkpoint), _fingerprint(views, cloud, config))
-    if saved is not None:
-        saved.resume(run)
+    identity = {"view, initial point or setting": _fingerprint(views, cloud, config)}
+    if checkpoint is not None:
+        state = read_checkpoint(Path(checkpoint), identity, what="fit of Gaussians", raising=SceneError)
+        if state is not None:
+            run.resume(state["run"])
     try:
         while run.step < config.steps:
-            loss, rendering, target = run.train_step()
-            last, every = run.step == config.steps, max(_MIN_PROGRESS_STEPS, run.losses_every)
-            if progress is not None and (last or run.step % every == 0):
-                likeness = psnr(rendering.color, target.image)
-                elapsed = time.monotonic() - began
-                progress(SplatProgress(run.step, config.steps, float(loss), likeness, elapsed, run.cloud))
-            if saved is not None and (last or time.monotonic() - saved.at > _CHECKPOINT_SECONDS):
-                saved.save(run)
+            loss, rendered, photograph = run.train_step()
+            last, now = run.step == config.steps, time.monotonic()
+            if progress is not None and (last or run.step % max(_MIN_PROGRESS_STEPS, run.losses_every) == 0):
+                likeness = psnr(rendered, photograph)
+                progress(SplatProgress(run.step, config.steps, float(loss), likeness, now - began, run.cloud))
+            if checkpoint is not None and (last or now - saved_at > _CHECKPOINT_SECONDS):
+                _save(run, Path(checkpoint), identity)
+                saved_at = time.monotonic()
     except KeyboardInterrupt:
         # During a step's changes, only the state saved before it is consistent.
-        if saved is not None and run.whole:
-            saved.save(run)
+        if checkpoint is not None and run.whole:
+            _save(run, Path(checkpoint), identity)
         raise
     return keep_object(run.cloud, views, rasterizer=rasterizer).to("cpu")
 
 
-class _Checkpoint:
-    """Where a run's state is saved, and what it belongs to."""
-
-    def __init__(self, path: Path, fingerprint: str) -> None:
-        self.path, self.at = path, time.monotonic()
-        self.identity = {"view, initial point or setting": fingerprint}
-
-    def resume(self, run: "_Run") -> None:
-        state = read_checkpoint(self.path, self.identity, what="fit of Gaussians", raising=SceneError)
-        if state is not None:
-            run.resume(state["run"])
-
-    def save(self, run: "_Run") -> None:
-        try:
-            write_checkpoint(self.path, {"run": run.state()}, self.identity, raising=SceneError)
-        except SceneError as error:
-            # A full disk costs the checkpoint, not the run.
-            message = f"the fit of the Gaussians continues without a new checkpoint: {error}"
-            warnings.warn(AvmsfWarning(message, file=error.file, value=error.value), stacklevel=3)
-        self.at = time.monotonic()
+def _save(run: "_Run", path: Path, identity: Mapping[str, str]) -> None:
+    try:
+        write_checkpoint(path, {"run": run.state()}, identity, raising=SceneError)
+    except SceneError as error:
+        # A full disk costs the checkpoint, not the run.
+        message = f"the fit of the Gaussians continues without a new checkpoint: {error}"
+        warnings.warn(AvmsfWarning(message, file=error.file, value=error.value), stacklevel=3)
 
 
 def _fingerprint(views: Sequence[View], cloud: GaussianCloud, config: SplatConfig) -> str:
@@ -165,33 +152,25 @@ def _device(device: torch.device | str | None, rasterizer: Rasterizer | None) ->
     return torch.device("cuda" if usable and rasterizer is None else "cpu")
 
 
-@dataclass(frozen=True, eq=False)
-class _Target:
-    """What one rendering is compared with."""
-
-    image: Float[Tensor, "height width 3"]
-    coverage: Float[Tensor, "height width"] | None
-    background: Float[Tensor, " 3"]
-
-
 class _Run:
     """One run: parameters, optimizer, schedules and what one step does."""
 
     def __init__(
         self,
         cloud: GaussianCloud,
-        photographs: Sequence[Photograph],
+        photographs: Sequence[View],
         background: Float[Tensor, " 3"] | None,
         config: SplatConfig,
         *,
         rasterizer: Rasterizer,
     ) -> None:
         device = cloud.centers.device
-        self.photographs = [each.to(device) for each in photographs]
+        self.photographs = [
+            [_on_device(level, device) for level in pyramid(view, halvings=config.halvings)] for view in photographs
+        ]
         self.background = None if background is None else background.to(device)
         self.config, self.rasterizer, self.losses_every = config, rasterizer, steps_between_losses(device)
-        spread = cloud.centers.amax(0) - cloud.centers.amin(0)
-        self.half_diagonal = 0.5 * float(spread.norm())
+        self.half_diagonal = 0.5 * float((cloud.centers.amax(0) - cloud.centers.amin(0)).norm())
         self.parameters = {name: value.clone() for name, value in _named(cloud).items()}
         self.moments = {
             name: (torch.zeros_like(value), torch.zeros_like(value)) for name, value in self.parameters.items()
@@ -207,51 +186,55 @@ class _Run:
         """The Gaussians as they are now; they change with the next step."""
         return self._cloud(self.parameters, self.config.degree)
 
-    def train_step(self) -> tuple[Float[Tensor, ""], Rendering, _Target]:
-        """Take one step; return the loss before it, and what was compared.
+    def train_step(self) -> tuple[Float[Tensor, ""], Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]:
+        """Take one step; return the loss before it, the image rendered, and the one that it was compared with.
 
         Raises `SceneError` where the loss is no finite number, on a graphics card some steps later.
         """
-        photograph, level = self.photographs[self._next_view()], self._level()
-        target = self._target(photograph, level)
+        config, done = self.config, self.step + 1
+        view = self._next_view()
+        photograph, background = self._compose(view)
         leaves = {name: value.detach().requires_grad_() for name, value in self.parameters.items()}
         cloud = self._cloud(leaves, self._degree())
-        rendering = self.rasterizer(cloud, photograph.cameras[level], background=target.background)
-        growing = self.step < self.config.densify_until * self.config.steps
+        rendering = self.rasterizer(cloud, view.camera, background=background)
+        growing = self.step < config.densify_until * config.steps
         if growing:
             rendering.screen.retain_grad()
-        loss = self.loss(rendering, target)
-        if self.config.flat_weight > 0:
-            # The smallest axis lies across the surface, as soon as the photographs know a surface.
-            thickness = cloud.log_scales.amin(1).exp().mean()
-            loss = loss + self.config.flat_weight / self.half_diagonal * thickness
+        loss = self._loss(cloud, rendering, photograph, view.coverage)
         loss.backward()  # type: ignore[no-untyped-call]
         # Before densification too, to which there would seem to be no Gaussians.
-        done = self.step + 1
-        if done == self.config.steps or not done % self.losses_every or not done % self.config.densify_every:
-            self._expect_finite(float(loss.detach()))
+        if done == config.steps or not done % self.losses_every or not done % config.densify_every:
+            value = float(loss.detach())
+            if not math.isfinite(value):
+                advice = "lower center_rate, scale_rate and opacity_rate"
+                raise SceneError.expected("a finite number", value, row=self.step, name="loss", advice=advice)
         self.whole = False
         if growing:
-            self.density.add_view(rendering, photograph.cameras[level])
+            self.density.add_view(rendering, view.camera)
         self._adam_step({name: leaf.grad for name, leaf in leaves.items()})
-        self.step += 1
+        self.step = done
         self._densify_and_prune()
         self.whole = True
-        return loss.detach(), rendering, target
+        return loss.detach(), rendering.color, photograph
 
-    def _expect_finite(self, loss: float) -> None:
-        if not math.isfinite(loss):
-            advice = "lower center_rate, scale_rate and opacity_rate"
-            raise SceneError.expected("a finite number", loss, row=self.step, name="loss", advice=advice)
-
-    def loss(self, rendering: Rendering, target: _Target) -> Float[Tensor, ""]:
-        """Return the mixture of absolute difference, 1 - SSIM and the mask's error (3DGS, eq. 7, and the mask's)."""
-        part = self.config.dissimilarity_weight
-        loss = (1.0 - part) * (rendering.color - target.image).abs().mean()
+    def _loss(
+        self,
+        cloud: GaussianCloud,
+        rendering: Rendering,
+        photograph: Float[Tensor, "height width 3"],
+        coverage: Float[Tensor, "height width"] | None,
+    ) -> Float[Tensor, ""]:
+        """Return the absolute difference and 1 - SSIM (3DGS, eq. 7), the mask's error and the mean thickness."""
+        config, part = self.config, self.config.dissimilarity_weight
+        loss = (1.0 - part) * (rendering.color - photograph).abs().mean()
         if part > 0:
-            loss = loss + part * (1.0 - ssim(rendering.color, target.image))
-        if target.coverage is not None and self.config.mask_weight > 0:
-            loss = loss + self.config.mask_weight * (rendering.alpha - target.coverage).abs().mean()
+            loss = loss + part * (1.0 - ssim(rendering.color, photograph))
+        if coverage is not None and config.mask_weight > 0:
+            loss = loss + config.mask_weight * (rendering.alpha - coverage).abs().mean()
+        if config.flat_weight > 0:
+            # The smallest axis lies across the surface, as soon as the photographs know a surface.
+            thickness = cloud.log_scales.amin(1).exp().mean()
+            loss = loss + config.flat_weight / self.half_diagonal * thickness
         return loss
 
     def state(self) -> dict[str, Any]:
@@ -261,7 +244,7 @@ class _Run:
             "moments": {name: list(pair) for name, pair in self.moments.items()},
             "generator": self.generator.get_state(),
             "queue": self.queue,
-            "density": self.density.state(),
+            "density": dict(vars(self.density)),
             "step": self.step,
         }
 
@@ -281,35 +264,30 @@ class _Run:
             values["centers"], values["rotations"], values["log_scales"], values["logit_opacities"], harmonics
         )
 
-    def _next_view(self) -> int:
-        """Draw the next view, each once before any comes again."""
+    def _next_view(self) -> View:
+        """Draw the next view, each once before any comes again, halved as often as it is due at this step."""
         if not self.queue:
             self.queue = torch.randperm(len(self.photographs), generator=self.generator).tolist()
-        return self.queue.pop()
+        levels, until, halvings = self.photographs[self.queue.pop()], self.config.coarse_until, self.config.halvings
+        if self._fraction() >= until:
+            return levels[0]
+        return levels[min(halvings, math.ceil(halvings * (1.0 - self._fraction() / until)))]
 
     def _fraction(self) -> float:
         return self.step / self.config.steps
-
-    def _level(self) -> int:
-        """Return how often the images are halved now."""
-        if self._fraction() >= self.config.coarse_until:
-            return 0
-        spans = math.ceil(self.config.halvings * (1.0 - self._fraction() / self.config.coarse_until))
-        return min(self.config.halvings, spans)
 
     def _degree(self) -> int:
         every = self.config.degree_every
         return self.config.degree if every <= 0 else min(self.config.degree, int(self._fraction() / every))
 
-    def _target(self, photograph: Photograph, level: int) -> _Target:
-        mask = photograph.masks[level]
-        image = photograph.images[level].float() / 255
-        coverage = None if mask is None else mask.float() / 255
+    def _compose(self, view: View) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, " 3"]]:
+        """Return a photograph, and the background to render: the one color, or another one, put into both."""
         if self.background is not None:
-            return _Target(image, coverage, self.background)
+            return view.color, self.background
+        coverage = view.coverage
         assert coverage is not None
-        background = torch.rand(3, generator=self.generator).to(image, non_blocking=True)
-        return _Target(torch.lerp(background.expand_as(image), image, coverage[..., None]), coverage, background)
+        background = torch.rand(3, generator=self.generator).to(coverage, non_blocking=True)
+        return torch.lerp(background.expand_as(view.image), view.color, coverage[..., None]), background
 
     def _rates(self) -> dict[str, float]:
         config, part = self.config, self._fraction()
@@ -341,23 +319,22 @@ class _Run:
     def _densify_and_prune(self) -> None:
         """Add and remove Gaussians where that is due."""
         config, step = self.config, self.step
-        first, last = config.densify_from * config.steps, config.densify_until * config.steps
-        if first <= step <= last and step % config.densify_every == 0:
-            rows, fresh = self.density.densify(self.cloud, config, self.half_diagonal, generator=self.generator)
-            self._rebuild(rows, fresh)
-        elif step > last and step % config.densify_every == 0:
-            transparent = self.cloud.opacities < config.least_opacity
-            if bool(transparent.any()):
-                self._rebuild(torch.nonzero(~transparent)[:, 0], None)
+        if step % config.densify_every:
+            return
+        cloud = self.cloud
+        if step > config.densify_until * config.steps:
+            rows = torch.nonzero(cloud.opacities >= config.least_opacity)[:, 0]
+            if len(rows) < len(cloud):
+                self._rebuild(rows, cloud.take(rows[:0]))
+        elif step >= config.densify_from * config.steps:
+            self._rebuild(*self.density.densify(cloud, config, self.half_diagonal, generator=self.generator))
 
-    def _rebuild(self, rows: Tensor, fresh: GaussianCloud | None) -> None:
+    def _rebuild(self, rows: Int[Tensor, " kept"], added: GaussianCloud) -> None:
         """Keep the given rows, then add new Gaussians, about which the optimizer knows nothing yet."""
-        added = {} if fresh is None else _named(fresh)
-        for name in _GROUPS:
-            more = added.get(name, self.parameters[name][:0])
-            self.parameters[name] = torch.cat([self.parameters[name][rows], more])
+        for name, fresh in _named(added).items():
+            blank = torch.zeros_like(fresh)
+            self.parameters[name] = torch.cat([self.parameters[name][rows], fresh])
             first, second = self.moments[name]
-            blank = torch.zeros_like(more)
             self.moments[name] = (torch.cat([first[rows], blank]), torch.cat([second[rows], blank]))
         count = len(self.parameters["centers"])
         if count < 4:
@@ -367,6 +344,7 @@ class _Run:
 
 
 def _named(cloud: GaussianCloud) -> dict[str, Tensor]:
+    """Return the parameters with rates of their own; colors are the harmonics of degree 0, shades those above."""
     return {
         "centers": cloud.centers,
         "rotations": cloud.rotations,
@@ -375,3 +353,7 @@ def _named(cloud: GaussianCloud) -> dict[str, Tensor]:
         "colors": cloud.harmonics[:, :1],
         "shades": cloud.harmonics[:, 1:],
     }
+
+
+def _on_device(view: View, device: torch.device) -> View:
+    return replace(view, image=view.image.to(device), mask=None if view.mask is None else view.mask.to(device))

@@ -1,6 +1,6 @@
 """Which Gaussians are the object: not faint, not beside the masks, not afloat, not huge, not hidden inside."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import cv2
@@ -39,20 +39,24 @@ def keep_object(
     Those go whose opacity is less than `least_opacity`; whose center is outside of the masks in more than
     `wrong_fraction` of the views that have it in their image; whose scale is that of the object; whose neighbors are
     far away; and, with a `rasterizer`, those that in no view color as much as `least_weight` pixels in sum, because
-    others hide them.
-    Raises `SceneError` where nothing remains.
+    others hide them. Raises `SceneError` where nothing remains.
     """
-    cloud = cloud.detach()
-    rows = torch.nonzero(cloud.opacities >= least_opacity)[:, 0]
-    rows = rows[masks_agree(cloud.centers[rows], views, wrong_fraction=wrong_fraction)]
-    _expect_some(rows, cloud)
-    rows = rows[_sized(cloud.take(rows))]
+    tests: list[Callable[[GaussianCloud], Bool[Tensor, " points"]]] = [
+        lambda cloud: cloud.opacities >= least_opacity,
+        lambda cloud: masks_agree(cloud.centers, views, wrong_fraction=wrong_fraction),
+        _is_smaller_than_object,
+    ]
     if rasterizer is not None:
-        rows = rows[blended_weight(cloud.take(rows), views, rasterizer=rasterizer) >= least_weight]
-    _expect_some(rows, cloud)
-    rows = rows[_close(cloud.centers[rows])]
-    _expect_some(rows, cloud)
-    return cloud.take(rows)
+        tests.append(lambda cloud: blended_weight(cloud, views, rasterizer=rasterizer) >= least_weight)
+    tests.append(_is_near_others)
+    kept = cloud.detach()
+    for test in tests:
+        kept = kept.take(test(kept))
+        if not len(kept):
+            advice = "check that masks, cameras and Gaussians belong together and that not all are almost transparent"
+            got = f"none of {len(cloud)}"
+            raise SceneError.expected("some on the object", 0, got=got, name="gaussians", advice=advice)
+    return kept
 
 
 def masks_agree(
@@ -98,22 +102,16 @@ def blended_weight(cloud: GaussianCloud, views: Sequence[View], *, rasterizer: R
     return largest
 
 
-def _sized(cloud: GaussianCloud) -> Bool[Tensor, " points"]:
+def _is_smaller_than_object(cloud: GaussianCloud) -> Bool[Tensor, " points"]:
     places = cloud.centers
     low, high = torch.quantile(places[:: max(1, len(places) // 100_000)], places.new_tensor([0.01, 0.99]), dim=0)
     return cloud.log_scales.amax(1).exp() <= _OVERSIZE * float((high - low).norm())
 
 
-def _close(points: Float[Tensor, "points 3"]) -> Bool[Tensor, " points"]:
-    places = points.double().cpu().numpy()
+def _is_near_others(cloud: GaussianCloud) -> Bool[Tensor, " points"]:
+    places = cloud.centers.double().cpu().numpy()
     count = min(_NEIGHBORS, len(places) - 1)
     if count < 1:
-        return torch.ones(len(points), dtype=torch.bool, device=points.device)
+        return torch.ones_like(cloud.logit_opacities, dtype=torch.bool)
     distance = cKDTree(places).query(places, k=np.arange(2, count + 2))[0].mean(1)
-    return torch.from_numpy(distance <= _AFLOAT * np.median(distance)).to(points.device)
-
-
-def _expect_some(rows: Tensor, cloud: GaussianCloud) -> None:
-    if not len(rows):
-        advice = "check that masks, cameras and Gaussians belong together and that not all are almost transparent"
-        raise SceneError.expected("some on the object", 0, got=f"none of {len(cloud)}", name="gaussians", advice=advice)
+    return torch.from_numpy(distance <= _AFLOAT * np.median(distance)).to(cloud.centers.device)

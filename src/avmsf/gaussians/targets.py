@@ -2,48 +2,30 @@
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.errors import CaptureWarning, SceneError
 from avmsf.gaussians.config import SplatConfig
-from avmsf.photographs.cameras import Camera, View
+from avmsf.photographs.cameras import View
 
 _PLAIN_STEP, _PLAIN_PART = 24, 0.9
 """A background is plain where this part of its pixels lies within so many levels of 255 of the median color."""
 
 
-@dataclass(frozen=True, eq=False)
-class Photograph:
-    """One view at full size and at each halving."""
-
-    name: str
-    cameras: tuple[Camera, ...]
-    images: tuple[UInt8[Tensor, "_height _width 3"], ...]
-    masks: tuple[UInt8[Tensor, "_height _width"] | None, ...]
-
-    @classmethod
-    def of(cls, view: View, *, halvings: int) -> "Photograph":
-        """Halve a view `halvings` times, each pixel the mean of the four that it covers."""
-        cameras, images, masks = [view.camera], [view.image], [view.mask]
-        for _ in range(halvings):
-            last = cameras[-1]
-            size = (max(1, round(last.width / 2)), max(1, round(last.height / 2)))
-            cameras.append(last.resized(*size))
-            images.append(_halved(images[-1], size))
-            mask = masks[-1]
-            masks.append(None if mask is None else _halved(mask, size))
-        return cls(view.name, tuple(cameras), tuple(images), tuple(masks))
-
-    def to(self, device: torch.device) -> "Photograph":
-        """Return the photograph with its images and masks on a device."""
-        masks = tuple(None if mask is None else mask.to(device) for mask in self.masks)
-        return replace(self, images=tuple(image.to(device) for image in self.images), masks=masks)
+def pyramid(view: View, *, halvings: int) -> list[View]:
+    """Return a view at full size and after each halving, of which every pixel is the mean of the four it covers."""
+    levels = [view]
+    for _ in range(halvings):
+        last = levels[-1]
+        size = max(1, round(last.camera.width / 2)), max(1, round(last.camera.height / 2))
+        mask = None if last.mask is None else _resized(last.mask, size)
+        levels.append(View(view.name, _resized(last.image, size), last.camera.resized(*size), mask))
+    return levels
 
 
 def choose_background(views: Sequence[View], config: SplatConfig) -> Float[Tensor, " 3"] | None:
@@ -70,10 +52,8 @@ def choose_background(views: Sequence[View], config: SplatConfig) -> Float[Tenso
     return torch.from_numpy(color / 255.0).float() if plain or not masked else None
 
 
-def prepare_photographs(
-    views: Sequence[View], background: Float[Tensor, " 3"] | None, *, halvings: int
-) -> list[Photograph]:
-    """Return the views that can be compared: all, or before random colors those with a mask.
+def comparable_views(views: Sequence[View], background: Float[Tensor, " 3"] | None) -> list[View]:
+    """Return the views that renderings can be compared with: all, or before random colors those with a mask.
 
     A mask without the object says nothing of its shape: its view is left out. `visual_hull` warns of it. Raises
     SceneError where fewer than 3 views are left.
@@ -88,7 +68,7 @@ def prepare_photographs(
     if len(kept) < 3:
         got = f"{len(kept)} of {len(views)} that can be used"
         raise SceneError.expected("3 or more", len(kept), got=got, name="views", advice="give more")
-    return [Photograph.of(view, halvings=halvings) for view in kept]
+    return kept
 
 
 def _outside(view: View) -> np.ndarray:
@@ -101,5 +81,5 @@ def _outside(view: View) -> np.ndarray:
     return image[surely][::17]
 
 
-def _halved(image: Tensor, size: tuple[int, int]) -> Tensor:
+def _resized(image: Tensor, size: tuple[int, int]) -> Tensor:
     return torch.from_numpy(cv2.resize(image.numpy(), size, interpolation=cv2.INTER_AREA))

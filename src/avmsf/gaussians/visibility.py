@@ -13,8 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from avmsf.errors import SceneError
-from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.densify import rotation_matrices
+from avmsf.gaussians.cloud import GaussianCloud, rotation_matrices
 from avmsf.gaussians.rasterizer.protocol import Rasterizer
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh
