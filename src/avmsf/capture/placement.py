@@ -1,4 +1,9 @@
-"""Whether contacts lie on the object's surface, and where they do not, the similarity that brings them onto it."""
+"""Whether contacts lie on the object's surface, and where they do not, the similarity that brings them onto it.
+
+Candidates are ratios of usual units or any scale, all 48 signed permutations of the axes, and a shift; what is not
+discrete is fitted by iterated closest points (Besl and McKay, 1992). They are compared by description length (Rissanen,
+1978): nats of the parameters and of the distances that are left.
+"""
 
 import itertools
 import math
@@ -10,6 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from avmsf.errors import CaptureError, FitError
@@ -20,36 +26,49 @@ TOLERANCE = 0.05
 
 On the aircraft, measured by hand against a nominal surface, the farthest of 74 contacts lies .004 off.
 """
-SPREAD = 0.05
-"""Diagonal of the contacts over the object's, below which their unit must be another."""
-OTHER_SIZE = 0.25
-"""Logarithm of a scale beyond which it is another object's: what materials cannot explain either."""
 WRONG_ROWS = 0.1
 """Part of the contacts up to which those that lie off count as single mistakes, not as one made with all of them."""
-LEAST_CLOSE = 5
-"""Contacts on the surface from which on their small spread alone shows another unit, as for axes."""
-LEAST_SPREAD = 0.4
-"""Diagonal of the contacts over the object's that the undoing of a mistake must leave: what is shrunk enough fits
-anywhere."""
-RESOLUTION = 1 / 200
-"""Distance over the diagonal below which contacts lie equally well: points are no surface, nor contacts exact."""
-ODDS = 3.0
-"""Nats of a contact that is a mistake of its own, as one of twenty is."""
-MOST_CONTACTS = 200
-"""As many, and as many points as `MOST_POINTS`, are compared, evenly taken from all, in search for the similarity."""
 UNITS = {1e-3: "mm", 1e-2: "cm", 0.0254: "inches", 0.3048: "feet"}
-_IDENTITY = torch.eye(3, dtype=torch.float64)
 FACTORS = (1.0, *(power for size in (1000.0, 100.0, 10.0, 25.4, 0.0254, 0.3048) for power in (size, 1 / size)))
+_IDENTITY, _ORIGIN = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class _Bounds:
+    """Bounds of the comparison; lengths are over the object's diagonal."""
+
+    spot: float = 0.05
+    """Diagonal of the contacts below which their unit must be another."""
+    min_spot_contacts: int = 5
+    """Contacts on the surface from which on their small spread alone shows another unit."""
+    least_spread: float = 0.4
+    """Diagonal of the contacts that another unit must leave: what is shrunk enough fits anywhere."""
+    resolution: float = 1 / 200
+    """Distance below which contacts lie equally well: points are no surface, nor contacts exact."""
+    log_size: float = 0.25
+    """Logarithm of a scale beyond which it is another object's: what materials cannot explain either."""
+    outlier_nats: float = 3.0
+    """Nats of a contact that is a mistake of its own, as one of twenty is."""
+    min_axes: int = 5
+    min_fitted: int = 8
+    """Contacts from which on axes are tried, and scales and shifts are fitted: fewer fit much by chance."""
+    max_contacts: int = 200
+    """Contacts, evenly taken from all, that the search compares."""
+    max_starts: int = 24
+    max_steps: int = 60
+
+
+_BOUNDS = _Bounds()
 
 
 @dataclass(frozen=True, eq=False)
 class Mistake:
     """What may have been done to all contacts, by how it is undone: x becomes `factor` * `axes` x + `shift`."""
 
-    factor: float
-    axes: Float[Tensor, "3 3"]
+    factor: float = 1.0
+    axes: Float[Tensor, "3 3"] = _IDENTITY
     """A permutation with signs; float64."""
-    shift: Float[Tensor, " 3"]
+    shift: Float[Tensor, " 3"] = _ORIGIN
     """Meters; float64."""
     distance: float = 0.0
     """Meters within which nine of ten contacts lie off the surface once it is undone."""
@@ -80,23 +99,22 @@ class Mistake:
         within = f"they lie within {_length(self.distance)} of it"
         if self.stated:
             return f"{within} once moved as {self.stated} says that the object was: give both in one frame"
-        steps, questions, unit, moved = [], [], self.unit, bool(self.shift.any())
+        steps, questions, moved = [], [], bool(self.shift.any())
         if self.factor != 1:
-            ratio = self.factor if self.factor > 1 else 1 / self.factor
-            steps.append(f"{'multiplied' if self.factor > 1 else 'divided'} by {ratio:.4g}")
-            whose = "their unit" if self.factor < 1 else "the surface's unit"
-            questions.append(f"is {whose} {unit}?" if unit else "are they and the surface of one scale?")
+            larger = self.factor > 1
+            steps.append(f"{'multiplied' if larger else 'divided'} by {max(self.factor, 1 / self.factor):.4g}")
+            whose = "the surface's unit" if larger else "their unit"
+            questions.append(f"is {whose} {self.unit}?" if self.unit else "are they and the surface of one scale?")
         if self.turned:
-            steps.append(f"with (x, y, z) taken as {_written(self.axes)}")
+            steps.append(f"with (x, y, z) taken as {_axis_names(self.axes)}")
             upright = "upside down?" if float(self.axes[2, 2]) < -0.9 else "does another axis point up?"
             questions.append("are the axes mirrored?" if float(torch.linalg.det(self.axes)) < 0 else upright)
         if moved:
             steps.append(f"moved by ({', '.join(f'{value:.3g}' for value in self.shift.tolist())}) m")
             questions.append("do the origins differ?")
-        undone = ", ".join(steps) + "," * (len(steps) > 1)
-        if self.factor != 1 and unit is None and moved:
+        if self.factor != 1 and self.unit is None and moved:
             questions = ["are they in another frame?"]
-        return f"{undone} {within}: {' '.join(questions)}"
+        return f"{', '.join(steps)}{',' * (len(steps) > 1)} {within}: {' '.join(questions)}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,15 +132,26 @@ class Placement:
     mistake: Mistake | None = None
     """What would explain contacts off the surface; None where they lie on it, or nothing simple explains them."""
 
+    @cached_property
+    def off(self) -> tuple[int, ...]:
+        """Rows of the contacts off the surface, the farthest first."""
+        rows = torch.argsort(self.distances, descending=True)
+        return tuple(row for row in rows.tolist() if float(self.distances[row]) > self.tolerance)
+
     @property
-    def on_surface(self) -> bool:
-        """Whether all contacts lie on the surface and nothing says that they were meant elsewhere."""
-        return not self.off and not self.shrunken and self.mistake is None
+    def mostly_off(self) -> bool:
+        """Whether more contacts lie off the surface than are single mistakes."""
+        return len(self.off) > max(1, WRONG_ROWS * len(self.distances))
 
     @property
     def shrunken(self) -> bool:
         """Whether the contacts lie in a spot so small that their unit must be another."""
-        return 0 < self.spread < SPREAD * self.diagonal
+        return 0 < self.spread < _BOUNDS.spot * self.diagonal
+
+    @property
+    def on_surface(self) -> bool:
+        """Whether all contacts lie on the surface and nothing says that they were meant elsewhere."""
+        return not self.off and not self.shrunken and self.mistake is None
 
     @property
     def other_unit(self) -> bool:
@@ -131,44 +160,34 @@ class Placement:
         Where they lie on it already, as first impacts near the middle of a plate do, only many that are very close
         together say so.
         """
-        if self.mistake is None or self.mistake.unit is None:
-            return False
-        return self.mostly_off or (self.shrunken and len(self.distances) >= LEAST_CLOSE)
+        many = self.mostly_off or (self.shrunken and len(self.distances) >= _BOUNDS.min_spot_contacts)
+        return self.mistake is not None and self.mistake.unit is not None and many
 
     @property
     def misplaced(self) -> bool:
         """Whether no shape can be used as it lies: turned, mirrored, of another size, or with most contacts off."""
         mistake = self.mistake
-        if mistake is not None and (mistake.turned or self.mostly_off or abs(math.log(mistake.factor)) > OTHER_SIZE):
+        if mistake is not None and (
+            mistake.turned or self.mostly_off or abs(math.log(mistake.factor)) > _BOUNDS.log_size
+        ):
             return True
         return float(self.distances.median()) > self.tolerance
-
-    @property
-    def mostly_off(self) -> bool:
-        """Whether more contacts lie off the surface than are single mistakes."""
-        return len(self.off) > max(1, WRONG_ROWS * len(self.distances))
-
-    @cached_property
-    def off(self) -> tuple[int, ...]:
-        """Rows of the contacts off the surface, the farthest first."""
-        rows = torch.argsort(self.distances, descending=True)
-        return tuple(row for row in rows.tolist() if float(self.distances[row]) > self.tolerance)
 
     def describe(self, names: Sequence[str] = (), *, what: str = "surface") -> str:
         """Return a message on the contacts off `what` there is, by these names or else by indices; "" for none."""
         if self.on_surface:
             return ""
+        found = f"the contacts lie within {_length(self.spread)} on an object {_length(self.diagonal)} across"
         if self.off or not self.shrunken:
             farthest = float(self.distances.max())
             few = self.mistake is None and 2 * len(self.off) < len(self.distances) and not self.shrunken
             which = f"{len(self.off)} of {len(self.distances)} contacts lie" if few else "the contacts lie"
-            relative = _ratio(farthest / self.diagonal)
+            ratio = farthest / self.diagonal
+            relative = f"{ratio:.0f}" if ratio >= 100 else f"{ratio:.2g}"
             found = f"{which} up to {_length(farthest)} ({relative} object diagonals) off the {what}"
             if few:
                 shown = ", ".join(names[row] if names else f"row {row}" for row in self.off[:8])
                 return f"{found}, the others on it; check {shown}{', …' * (len(self.off) > 8)}"
-        else:
-            found = f"the contacts lie within {_length(self.spread)} on an object {_length(self.diagonal)} across"
         if self.mistake is not None:
             return f"{found}; {self.mistake}"
         if not self.off:
@@ -185,16 +204,14 @@ def check_placement(
 ) -> Placement:
     """Measure how far contacts lie from a surface given by its points, and seek the similarity that explains them best.
 
-    Tried are what files have `stated`, the ratios of usual units and any scale, all 48 signed permutations of the axes,
-    and a shift. Each has the nats of its parameters and of how far each contact is off (`_Search`); the least is
-    reported unless it leaves the contacts where they are. Few contacts fit much by chance: axes are tried from five on,
-    what is fitted from eight. Raises CaptureError where there are no contacts, or points without an extent.
+    Tried is what files have `stated` too. The similarity of the least description length is reported unless that leaves
+    the contacts where they are. Raises CaptureError where there are no contacts, or points without an extent.
     """
     places, cloud = contacts.double().numpy(), points.double().numpy()
     for name, values in (("contacts", places), ("points", cloud)):
         if not len(values) or not np.isfinite(values).all():
             raise CaptureError.expected(f"{name} with finite coordinates", len(values), name=name)
-    diagonal = _diagonal(cloud)
+    diagonal = float(np.linalg.norm(np.ptp(cloud, axis=0)))
     if not diagonal > 0:
         got = f"{len(cloud)} at one position"
         raise CaptureError.expected("points of an object with an extent", diagonal, got=got, name="points")
@@ -205,10 +222,10 @@ def check_placement(
     placement = Placement(
         distances=torch.from_numpy(tree.query(places)[0]),
         diagonal=diagonal,
-        spread=_diagonal(places),
+        spread=float(np.linalg.norm(np.ptp(places, axis=0))),
         tolerance=max(TOLERANCE * diagonal, 2 * spacing),
     )
-    search = _Search(tree, _some(places, MOST_CONTACTS), placement, floor=spacing)
+    search = _Search(tree, _some(places, _BOUNDS.max_contacts), placement, spacing=spacing)
     return replace(placement, mistake=search.find(stated))
 
 
@@ -235,152 +252,117 @@ def expect_placed(
 
 
 class _Search:
-    """Similarities compared by description length: nats of the parameters, and of the distances that they leave.
+    """The similarity of the least description length."""
 
-    A distance d, or the least that counts where it is less, costs d^2 / (2 s^2) + log(s / scale), as with normal errors
-    of a standard deviation s that is chosen for each similarity, or that of a contact which is a mistake of its own and
-    lies anywhere. The scale makes what is shrunk no better than what it was. A parameter fitted to n contacts costs
-    log(n).
-    """
+    def __init__(self, tree: cKDTree, contacts: np.ndarray, placement: Placement, *, spacing: float) -> None:
+        self.tree, self.contacts, self.placement = tree, torch.from_numpy(contacts), placement
+        self.resolution = max(spacing, _BOUNDS.resolution * placement.diagonal)
+        widest = max(2 * self.resolution, float(placement.distances.max()))
+        steps = math.ceil(math.log(widest / self.resolution, 1.5)) + 1
+        self.deviations = np.geomspace(self.resolution, widest, steps)[:, None]
 
-    def __init__(self, tree: cKDTree, contacts: np.ndarray, placement: Placement, *, floor: float) -> None:
-        self.tree, self.contacts, self.placement = tree, contacts, placement
-        self.cloud = np.asarray(tree.data)
-        self.middle = (self.cloud.min(axis=0) + self.cloud.max(axis=0)) / 2
-        self.floor = max(floor, RESOLUTION * placement.diagonal)
-        widest = max(2 * self.floor, float(placement.distances.max()))
-        steps = math.ceil(math.log(widest / self.floor, 1.5)) + 1
-        self.deviations = np.geomspace(self.floor, widest, steps)[:, None]
-        self.parameter = math.log(len(contacts))
-
-    def find(self, stated: Sequence[Mistake] = ()) -> Mistake | None:
-        """Return the similarity of the least description length; None where that changes nothing.
+    def find(self, stated: Sequence[Mistake]) -> Mistake | None:
+        """Return the best similarity; None where that changes nothing.
 
         What is `stated` goes first where it leaves most contacts near: what is fitted to few contacts and coarse points
         describes these better by chance.
         """
-        present, least = self._nats(_UNCHANGED), len(self.contacts) * (math.log(self.floor) + 0.5)
-        if present - least < 1:
+        present, tolerance = self.nats(Mistake()), self.placement.tolerance
+        if present - len(self.contacts) * (math.log(self.resolution) + 0.5) < 1:
             return None
         for each in stated:
-            near, far = np.quantile(self._distances(each), (0.5, 0.9)).tolist()
-            if near <= self.placement.tolerance and math.log(2) + self._nats(each) < present:
+            near, far = np.quantile(self.distances(each), (0.5, 0.9)).tolist()
+            if near <= tolerance and math.log(2) + self.nats(each) < present:
                 return replace(each, distance=far)
-        found = [(code + self._nats(each), each) for code, each in self._unmoved()]
-        if len(self.contacts) >= 8:
-            found += self._fitted()
-        for nats, each in sorted(found, key=lambda pair: pair[0]):
-            far = float(np.quantile(self._distances(each), 0.9))
-            spread = each.factor * self.placement.spread or math.inf
+        starts = sorted(self.starts(), key=lambda start: start[0] + self.nats(start[1]))[: _BOUNDS.max_starts]
+        fitted = [(code, self.fit(start, scaled, shifted)) for code, start, scaled, shifted in starts]
+        for nats, each in sorted(((code + self.nats(each), each) for code, each in fitted), key=lambda pair: pair[0]):
+            far = float(np.quantile(self.distances(each), 0.9))
             # Beside the size that the contacts have by then: what is shrunk comes nearer to anything.
-            if nats < present and far <= min(max(self.floor, 0.5 * self.placement.tolerance), TOLERANCE * spread):
+            spread = each.factor * self.placement.spread or math.inf
+            if nats < present and far <= min(max(self.resolution, 0.5 * tolerance), TOLERANCE * spread):
                 return replace(each, distance=far)
         return None
 
-    def _distances(self, mistake: Mistake) -> Float[np.ndarray, " contacts"]:
-        return self.tree.query(mistake.undo(torch.from_numpy(self.contacts)).numpy())[0]
+    def distances(self, mistake: Mistake) -> Float[np.ndarray, " contacts"]:
+        return self.tree.query(mistake.undo(self.contacts).numpy())[0]
 
-    def _nats(self, mistake: Mistake) -> float:
+    def nats(self, mistake: Mistake) -> float:
+        """Return the nats of the distances that a similarity leaves.
+
+        Each is normal, with a standard deviation chosen for the similarity, or the contact is a mistake of its own and
+        lies anywhere. Distances over the scale make what is shrunk no better than what it was.
+        """
         if not mistake.factor > 0:
             return math.inf
-        distances = self._distances(mistake)
+        distances = np.maximum(self.distances(mistake), self.resolution)
         spread, diagonal = mistake.factor * self.placement.spread, self.placement.diagonal
-        squares = np.square(np.maximum(distances, self.floor) / self.deviations)
-        near = squares / 2 + np.log(self.deviations / min(mistake.factor, 1.0))
-        anywhere = math.log(max(diagonal, self.placement.spread)) + ODDS
+        near = np.square(distances / self.deviations) / 2 + np.log(self.deviations / min(mistake.factor, 1.0))
+        anywhere = math.log(max(diagonal, self.placement.spread)) + _BOUNDS.outlier_nats
         # Contacts within a spot of an object are as unlikely as the spot is small.
-        spot = max(0.0, math.log(SPREAD * diagonal / spread)) if spread else 0.0
+        spot = max(0.0, math.log(_BOUNDS.spot * diagonal / spread)) if spread else 0.0
         return float(np.minimum(near, anywhere).sum(axis=1).min()) + len(distances) * spot
 
-    def _unmoved(self) -> Iterator[tuple[float, Mistake]]:
-        """Yield the ratios of units that give contacts of about the object's size, with all axes."""
-        spread, diagonal = self.placement.spread, self.placement.diagonal
+    def starts(self) -> Iterator[tuple[float, Mistake, bool, bool]]:
+        """Yield similarities, the nats of their parameters, and whether their scale and their shift are fitted."""
+        spread, diagonal, count = self.placement.spread, self.placement.diagonal, len(self.contacts)
         # What is symmetric but for errors of this size does not show which way it lies.
-        off = float(self.placement.distances.max()) > self.placement.tolerance / 2
-        turning = len(self.contacts) >= 5 and off
-        for factor in FACTORS:
-            if spread and factor != 1 and not LEAST_SPREAD * diagonal <= factor * spread <= 1.2 * diagonal:
-                continue
-            unit = 0.0 if factor == 1 else math.log(len(FACTORS))
-            # Nothing in meters takes two mistakes.
-            if factor != 1 and not any(math.isclose(min(factor, 1 / factor), each) for each in UNITS):
-                unit *= 2
-            for code, axes in _ways() if turning else _ways()[:1]:
-                yield unit + code, replace(_UNCHANGED, factor=factor, axes=axes)
+        turning = count >= _BOUNDS.min_axes and float(self.placement.distances.max()) > self.placement.tolerance / 2
+        ratio, least = diagonal / spread if spread else 1.0, _BOUNDS.least_spread * diagonal
+        scales = [
+            (each, False) for each in FACTORS if each == 1 or not spread or least <= each * spread <= 1.2 * diagonal
+        ]
+        scales += [(each, True) for each in (1.0, 0.8 * ratio, ratio)]
+        free = (False, True) if count >= _BOUNDS.min_fitted else (False,)
+        for rarity, axes in _axes() if turning else [(0.0, _IDENTITY)]:
+            for (factor, scaled), shifted in itertools.product(scales, free):
+                if scaled and len(free) == 1:
+                    continue
+                start = Mistake(factor, axes)
+                # Nothing in meters takes two units.
+                units = 0 if factor == 1 and not scaled else 1 if start.unit and not scaled else 2
+                code = rarity + units * math.log(len(FACTORS)) + (3 * shifted + scaled) * math.log(count)
+                yield code, self.centered(start) if shifted else start, scaled, shifted
 
-    def _fitted(self) -> list[tuple[float, Mistake]]:
-        """Return what iterated closest points make of the likeliest, with a shift, a scale, and a turn."""
-        scale = self.placement.diagonal / (self.placement.spread or math.inf)
-        tried = []
-        for code, each in self._unmoved():
-            tried.append((code, self._centered(each), False, True))
-            if each.factor == 1 and scale:
-                code += 2 * math.log(len(FACTORS)) + self.parameter
-                for factor in (1.0, 0.8 * scale, scale):
-                    start = replace(each, factor=factor)
-                    tried += [(code, start, True, False), (code, self._centered(start), True, True)]
-        tried.sort(key=lambda start: start[0] + self._nats(start[1]))
-        found = []
-        for code, start, scaled, shifted in tried[:24]:
-            fitted = self._closest(start, scaled=scaled, shifted=shifted)
-            found.append((code + 3 * self.parameter * shifted + self._nats(fitted), fitted))
-        return found
+    def centered(self, mistake: Mistake) -> Mistake:
+        """Return the mistake with the shift that brings the middle of the contacts' box to that of the object's."""
+        boxes = np.asarray(self.tree.data), mistake.undo(self.contacts).numpy()
+        middle, own = ((box.min(axis=0) + box.max(axis=0)) / 2 for box in boxes)
+        return replace(mistake, shift=torch.from_numpy(middle - own))
 
-    def _centered(self, mistake: Mistake) -> Mistake:
-        places = mistake.undo(torch.from_numpy(self.contacts)).numpy()
-        middle = (places.min(axis=0) + places.max(axis=0)) / 2
-        return replace(mistake, shift=mistake.shift + torch.from_numpy(self.middle - middle))
-
-    def _closest(self, start: Mistake, *, scaled: bool, shifted: bool) -> Mistake:
+    def fit(self, start: Mistake, scaled: bool, shifted: bool) -> Mistake:
         """Return the mistake with the scale and the shift that iterated closest points find from a start."""
-        found, source = start, torch.from_numpy(self.contacts) @ start.axes.T
-        old = source.mean(0) if shifted else torch.zeros(3, dtype=torch.float64)
+        found, source = start, self.contacts @ start.axes.T
+        old = source.mean(0) if shifted else _ORIGIN
         size = float((source - old).square().sum())
-        for _ in range(60):
+        for _ in range(_BOUNDS.max_steps if scaled or shifted else 0):
             nearest = self.tree.query((found.factor * source + found.shift).numpy())[1]
-            target = torch.from_numpy(self.cloud[nearest])
+            target = torch.from_numpy(self.tree.data[nearest])
             new = target.mean(0) if shifted else old
             factor = float(((source - old) * (target - new)).sum()) / size if scaled and size else found.factor
-            found = replace(found, factor=factor, shift=new - factor * old)
+            last, found = found, replace(found, factor=factor, shift=new - factor * old)
+            if factor == last.factor and torch.equal(found.shift, last.shift):
+                break
         return found
 
 
-_UNCHANGED = Mistake(1.0, _IDENTITY, torch.zeros(3, dtype=torch.float64))
+def _axes() -> list[tuple[float, Float[Tensor, "3 3"]]]:
+    """Return the 48 signed permutations, each with the nats of its rarity: none, y-up for z-up, turns, mirrors."""
+    turns = torch.from_numpy(Rotation.create_group("O").as_matrix().round()) + 0.0
+    # A quarter turn about x takes y to z.
+    rarities = [1 if turn.trace() == 3 else 4 if turn[0, 0] == 1 and turn.trace() == 1 else 24 for turn in turns]
+    found = [(math.log(rarity), turn) for rarity, turn in zip(rarities, turns, strict=True)]
+    return found + [(math.log(48), 0.0 - turn) for turn in turns]
 
 
-def _ways() -> list[tuple[float, Tensor]]:
-    """Return the 48 signed permutations, with the nats of its rarity: none, y-up for z-up, turns, mirrors."""
-    ways = []
-    for order in itertools.permutations(range(3)):
-        for signs in itertools.product((1.0, -1.0), repeat=3):
-            axes = torch.diag(torch.tensor(signs, dtype=torch.float64)) @ _IDENTITY[list(order)]
-            rarity = 48 if float(torch.linalg.det(axes)) < 0 else 6 if order == (0, 1, 2) else 24
-            if (order, signs) == ((0, 1, 2), (1, 1, 1)):
-                rarity = 1
-            elif (order, signs) in (((0, 2, 1), (1, -1, 1)), ((0, 2, 1), (1, 1, -1))):
-                rarity = 4
-            ways.append((math.log(rarity), axes))
-    return sorted(ways, key=lambda way: way[0])
-
-
-def _written(axes: Tensor) -> str:
-    rows = [int(row.abs().argmax()) for row in axes]
-    return f"({', '.join(('-' if axes[row, name] < 0 else '') + 'xyz'[name] for row, name in enumerate(rows))})"
+def _axis_names(axes: Float[Tensor, "3 3"]) -> str:
+    columns = axes.abs().argmax(1).tolist()
+    return f"({', '.join('-' * bool(axes[row, name] < 0) + 'xyz'[name] for row, name in enumerate(columns))})"
 
 
 def _some(places: np.ndarray, most: int) -> np.ndarray:
     return places[:: -(-len(places) // most)]
 
 
-def _diagonal(places: np.ndarray) -> float:
-    return float(np.linalg.norm(places.max(axis=0) - places.min(axis=0)))
-
-
-def _ratio(value: float) -> str:
-    return f"{value:.0f}" if value >= 100 else f"{value:.2g}"
-
-
 def _length(meters: float) -> str:
-    if meters < 0.01:
-        return f"{meters * 1e3:.2g} mm"
-    return f"{meters:.3g} m"
+    return f"{meters * 1e3:.2g} mm" if meters < 0.01 else f"{meters:.3g} m"
