@@ -199,6 +199,13 @@ def test_a_copy_of_a_recording_is_named_with_its_source(tmp_path: Path) -> None:
     assert problem.startswith("c.wav: the same sound as b.wav")
 
 
+def test_recordings_that_differ_past_the_cut_are_no_copies(tmp_path: Path) -> None:
+    sound = ring(1.0, seed=2)
+    later = sound + np.where(np.arange(len(sound)) == 6000, 1e-3, 0.0)
+    folder = fill(tmp_path, replace={"b.wav": sound, "c.wav": later}, settings="seconds = 0.1")
+    assert check(folder).problems == ()
+
+
 @pytest.mark.parametrize("offset", [0.01, -0.1, 4.0])
 def test_a_constant_offset_of_the_recorder_changes_nothing(tmp_path: Path, offset: float) -> None:
     rows = [f"{name}.wav,{row / 10},0,0" for row, name in enumerate("abcdef")]

@@ -1,10 +1,10 @@
 from .audio import Recording as Recording
 from .audio import read_recording as read_recording
 from .folder import Capture as Capture
+from .folder import CaptureReport as CaptureReport
+from .folder import check as check
 from .folder import read_capture as read_capture
 from .folder import write_capture as write_capture
 from .impacts import Impacts as Impacts
 from .measure import RecordingReport as RecordingReport
-from .preprocess import CaptureReport as CaptureReport
-from .preprocess import check as check
 from .settings import CaptureSettings as CaptureSettings

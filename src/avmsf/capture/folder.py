@@ -1,21 +1,45 @@
-"""A capture folder: `impacts.csv`, its wav files, perhaps `capture.toml` and a surface; read and written whole."""
+"""A capture folder: `impacts.csv`, its wav files, perhaps `capture.toml` and a surface; read, checked and written."""
 
 import csv
 import warnings
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 import torch
 
 from avmsf._utils.files import new_folder
-from avmsf.capture.audio import wav_bytes
+from avmsf._utils.text import counted, listed
+from avmsf.capture.audio import read_recording, wav_bytes
+from avmsf.capture.checks import check_contacts, check_surface, find_surface
+from avmsf.capture.filenames import number_key
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.measure import RecordingReport, shared_problems, shortened
-from avmsf.capture.preprocess import preprocess
+from avmsf.capture.preprocess import Issues, RecordedImpact, check_levels, preprocess
 from avmsf.capture.settings import SETTINGS, CaptureSettings, settings_of
-from avmsf.capture.table import DIRECTION, FORCE, REQUIRED, TABLE, in_folder
+from avmsf.capture.table import (
+    DIRECTION,
+    FARTHEST,
+    FORCE,
+    REQUIRED,
+    TABLE,
+    Strike,
+    fitting_units,
+    in_folder,
+    is_missing,
+    parse_row,
+    read_rows,
+    refuse_missing,
+    refuse_repeated_files,
+)
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.mesh.surface import Surface, write_surface
+
+UNCUT = "all recordings start with the impact, as impulse responses do, and are not cut"
+TEXT_ORDER = (
+    f"the rows of {TABLE} have the files in the order of text (1, 10, 2), not of numbers (1, 2, 10): make sure that "
+    "the contacts are in this order, too"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +63,20 @@ class Capture:
         write_capture(self, folder)
 
 
+@dataclass(frozen=True)
+class CaptureReport:
+    """What `check` found, in plain values: `dataclasses.asdict` gives what JSON holds."""
+
+    readable: bool
+    """Whether `read_capture` would read this folder (perhaps with warnings)."""
+    recordings: tuple[RecordingReport, ...]
+    """One for each row of impacts.csv, in its order."""
+    problems: tuple[str, ...]
+    """What is wrong with the folder, its table, its surface, or the recordings together."""
+    remarks: tuple[str, ...] = ()
+    """Notes on the recordings together that are no problems."""
+
+
 def read_capture(folder: str | Path, settings: CaptureSettings | None = None) -> Capture:
     """Read a capture folder; `settings`, where given, take the place of the folder's `capture.toml`.
 
@@ -49,14 +87,108 @@ def read_capture(folder: str | Path, settings: CaptureSettings | None = None) ->
     first input that cannot be used, and warns with `CaptureWarning` of what is usable but probably wrong; `check` lists
     everything.
     """
-    folder = Path(folder)
+    folder, issues = Path(folder), Issues()
     with in_folder(folder):
         settings = settings or settings_of(folder)
-        found = preprocess(folder, settings)
-    assert found.impacts is not None
-    for remark in found.warnings + _summary(list(found.reports.values()), folder):
-        warnings.warn(remark, stacklevel=2)
-    return Capture(settings.name or folder.resolve().name, found.impacts, found.surface, settings, folder)
+        impacts, surface = _walk(folder, settings, issues)
+    assert impacts is not None
+    if wrong := [report for report in issues.reports if report.problems]:
+        found = f"{len(wrong)} of {len(issues.reports)} recordings {'looks' if len(wrong) == 1 else 'look'} wrong"
+        message = f"{found}: {shortened(shared_problems(wrong))}. `avmsf check {folder}` shows all"
+        issues.warnings.append(CaptureWarning(message, file=folder, value=[report.file for report in wrong]))
+    for warning in issues.warnings:
+        warnings.warn(warning, stacklevel=2)
+    return Capture(settings.name or folder.resolve().name, impacts, surface, settings, folder)
+
+
+def check(folder: str | Path, settings: CaptureSettings | None = None) -> CaptureReport:
+    """Check a capture folder as `read_capture` would and report on every recording; raises nothing for bad input."""
+    folder, issues = Path(folder), Issues(collect=True)
+    try:
+        settings = settings or settings_of(folder)
+        _walk(folder, settings, issues)
+    except CaptureError as error:
+        return CaptureReport(False, (), (str(error),))
+    failed = [RecordingReport(file, line, False, (str(error),)) for file, line, error in issues.failures]
+    far = [(line, error.value) for _, line, error in issues.failures if error.name == "unit"]
+    if len(far) > 1:
+        # One message for all, with which they are listed together.
+        largest = max(abs(value) for _, written in far for value in written)
+        message = (
+            f"expected a contact within {FARTHEST:g} m of the origin, got coordinates of up to {largest:g} "
+            f"(unit = {settings.unit!r}): {fitting_units(largest)}"
+        )
+        failed = [replace(each, problems=(message,)) if each.line in dict(far) else each for each in failed]
+    reports = sorted([*issues.reports, *failed], key=lambda report: report.line)
+    remarks = []
+    if issues.uncut:
+        reports = [each if each.onset_seconds is None else replace(each, onset_seconds=0.0) for each in reports]
+        remarks.append(UNCUT)
+    names = [report.file for report in reports]
+    if names == sorted(names) != sorted(names, key=number_key):
+        remarks.append(TEXT_ORDER)
+    problems = [*map(str, issues.errors), *map(str, issues.warnings), *_copies(issues), *_unlisted(folder, names)]
+    return CaptureReport(not issues.errors and not failed, tuple(reports), tuple(problems), tuple(remarks))
+
+
+def _walk(folder: Path, settings: CaptureSettings, issues: Issues) -> tuple[Impacts | None, Surface | None]:
+    """Return the impacts and the part of the surface that they lie on; add to what is wrong."""
+    rows, warned = read_rows(folder)
+    issues.warnings += warned
+    strikes = []
+    for row in rows:
+        with issues.keep(row.cells["file"], row.line):
+            strikes.append(parse_row(row, settings))
+    with issues.keep():
+        refuse_repeated_files(strikes)
+    with issues.keep():
+        refuse_missing(folder, strikes)
+    issues.warnings += check_contacts(strikes, settings)
+    surface = None
+    with issues.keep():
+        surface = find_surface(folder, settings)
+        if surface is not None and strikes:
+            surface, warned = check_surface(strikes, surface, settings=settings)
+            issues.warnings += warned
+    impacts, _ = preprocess(_recordings(folder, strikes, issues), settings, issues)
+    with issues.keep():
+        issues.warnings += check_levels(issues.sounds)
+    return impacts, surface
+
+
+def _recordings(folder: Path, strikes: Sequence[Strike], issues: Issues) -> Iterator[RecordedImpact]:
+    advice = f"copy it there, or remove its row from {TABLE}"
+    for each in strikes:
+        recording = None
+        with issues.keep(each.file, each.line):
+            # Reading would name similar files, for which it compares up to a thousand names.
+            if is_missing(folder / each.file):
+                raise CaptureError.expected("a sound file", file=each.file)
+            recording = read_recording(folder / each.file, each.file, advice=advice)
+        if recording is not None:
+            yield RecordedImpact(
+                each.file, recording, each.contact, each.direction, newtons=each.newtons, line=each.line
+            )
+
+
+def _copies(issues: Issues) -> list[str]:
+    """Return a sentence for each sound that is another one's copy."""
+    first, sentences = dict[tuple[bytes, float], str](), []
+    for file, sound in issues.sounds.items():
+        original = first.setdefault(sound, file)
+        if original != file:
+            advice = "copy the right file, or remove its row"
+            sentences.append(f"{file}: the same sound as {original}, to the last bit: {advice}")
+    return sentences
+
+
+def _unlisted(folder: Path, listed_names: Sequence[str]) -> list[str]:
+    """Return a sentence on wav files without a row; hidden ones, such as what the studio has removed, are left out."""
+    names = (path.relative_to(folder) for path in folder.rglob("*.wav"))
+    found = {name.as_posix() for name in names if not any(part.startswith(".") for part in name.parts)}
+    unlisted = sorted(found - set(listed_names))
+    verb = "has" if len(unlisted) == 1 else "have"
+    return [f"{counted(len(unlisted), 'wav file')} {verb} no row in {TABLE}: {listed(unlisted)}"] if unlisted else []
 
 
 def write_capture(capture: Capture, folder: str | Path, *, onsets_within: float | None = None) -> None:
@@ -130,12 +262,3 @@ def _whole_rate(sample_rate: float) -> tuple[int, float]:
     nearest = max(1, round(sample_rate))
     rate = next(rate for rate in range(nearest, 2 * nearest + 64) if rate * (sample_rate / rate) == sample_rate)
     return rate, sample_rate / rate
-
-
-def _summary(reports: list[RecordingReport], folder: Path) -> list[CaptureWarning]:
-    wrong = [report for report in reports if report.problems]
-    if not wrong:
-        return []
-    found = f"{len(wrong)} of {len(reports)} recordings {'looks' if len(wrong) == 1 else 'look'} wrong"
-    message = f"{found}: {shortened(shared_problems(wrong))}. `avmsf check {folder}` shows all"
-    return [CaptureWarning(message, file=folder, value=[report.file for report in wrong])]

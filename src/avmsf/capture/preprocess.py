@@ -1,47 +1,26 @@
-"""From recordings to impacts of one rate and length, and from a capture folder, with a report of what is wrong in it.
+"""From the recordings of one object to impacts of one rate and length, with a report of what is wrong with them.
 
 Where the sounds start in their files is decided for all recordings of a capture together.
 """
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
-from torch import Tensor
+from jaxtyping import Float64
 
-from avmsf._utils.text import counted, listed
-from avmsf.capture.audio import read_recording
-from avmsf.capture.filenames import number_key
+from avmsf._utils.text import counted
+from avmsf.capture.audio import Recording
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.measure import RecordingReport, measure
-from avmsf.capture.prepare import MIN_MARGIN, Prepared, margin_length, prepare
-from avmsf.capture.settings import CaptureSettings, settings_of
-from avmsf.capture.table import (
-    FARTHEST,
-    TABLE,
-    Row,
-    Strike,
-    fitting_units,
-    is_missing,
-    parse_row,
-    read_rows,
-    refuse_missing,
-    refuse_repeated_files,
-)
-from avmsf.capture.together import check_contacts, check_levels, check_surface, common_length, common_rate, find_surface
+from avmsf.capture.prepare import MIN_MARGIN, Prepared, margin_length, prepare, shortest_allowed
+from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError, CaptureWarning
-from avmsf.mesh.surface import Surface, contacted_part
 
-UNCUT = "all recordings start with the impact, as impulse responses do, and are not cut"
-TEXT_ORDER = (
-    f"the rows of {TABLE} have the files in the order of text (1, 10, 2), not of numbers (1, 2, 10): make sure that "
-    "the contacts are in this order, too"
-)
 START_LEVEL = 10**-2.0
 """Share of the largest mean square in the first 20 ms that a response must have at its start: -20 dB, the
 level (a tenth of the peak) from which `find_onset` counts a swing as the impact's. Impulse responses reach 0 to -3 dB
@@ -49,6 +28,149 @@ level (a tenth of the peak) from which `find_onset` counts a swing as the impact
 MAX_START_SECONDS = 0.001
 """By when `find_onset` must see every recording that starts with the impact. Where modes cancel at first it takes up to
 .3 ms (a plate of 43 modes at 96 kHz) and 5 samples (the aircraft at 400 Hz); delays of 1 ms are found on alignment."""
+USUAL_RANGE_DB = 80.0
+"""Level between a recording and the median beyond which its scale is doubtful: a contact near the nodes of most modes
+takes 40 dB, a soft impact 30."""
+MIN_EQUAL_PEAKS, SAME_PEAK_DB = 4, 0.05
+"""Recordings, and how far their peaks may differ, that were scaled to one peak: struck ones differ by decibels."""
+USUAL_GAP_DB = 12.0
+"""Level between the loudest recording and the next beyond which its scale is doubtful, of six recordings or more: 24
+measured and simulated captures have at most 7. One recording at ten times its level outweighs all others in a fit."""
+MAX_RANGE_DB = 140.0
+"""Level between the loudest and the faintest recording beyond which the faintest is less than the rounding of the
+loudest in float32 (144 dB), in which they are fitted."""
+
+Vector = Sequence[float] | Float64[np.ndarray, " 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedImpact:
+    """One recording, with what is known of the impact."""
+
+    name: str
+    """What the capture calls it; messages on the sound alone have the recording's own name."""
+    recording: Recording
+    contact: Vector
+    """Object frame, meters."""
+    direction: Vector | None = None
+    """Unit vector along which the hammer moved, where it is known."""
+    newtons: float | None = None
+    """Peak force, where it is known by other means than a channel of the recording."""
+    gain_db: float = 0.0
+    """By how much the recorder made the sound louder, which is divided out."""
+    line: int = 0
+    """Line of impacts.csv."""
+
+
+@dataclass
+class Issues:
+    """What is wrong with a capture's recordings, and what was measured in them."""
+
+    collect: bool = False
+    """Whether errors are collected, and recordings that have one left out; else the first is raised."""
+    errors: list[CaptureError] = field(default_factory=list)
+    """Of the capture as a whole."""
+    failures: list[tuple[str, int, CaptureError]] = field(default_factory=list)
+    """Names and lines of the recordings that cannot be used, with their errors."""
+    warnings: list[CaptureWarning] = field(default_factory=list)
+    reports: list[RecordingReport] = field(default_factory=list)
+    """On the recordings that can be used."""
+    sounds: dict[str, tuple[bytes, float]] = field(default_factory=dict)
+    """Digest and peak of each of these from its impact to the file's end, by its name."""
+    uncut: bool = False
+    """Whether all recordings start with the impact, and are not cut."""
+
+    @contextmanager
+    def keep(self, name: str | None = None, line: int = 0) -> Iterator[None]:
+        """Collect or raise an error of one recording, or without a name of all."""
+        try:
+            yield
+        except CaptureError as error:
+            if not self.collect:
+                raise
+            if name is None:
+                self.errors.append(error)
+            else:
+                self.failures.append((name, line, error))
+
+
+def preprocess(
+    recordings: Iterable[RecordedImpact],
+    settings: CaptureSettings,
+    issues: Issues | None = None,
+    *,
+    measured: bool = True,
+) -> tuple[Impacts | None, Issues]:
+    """Return the impacts of recordings, their sounds cut to one length from their starts on, and what is wrong.
+
+    The recordings may be read as they are asked for: only what is used stays in memory. Recordings that all start with
+    the impact are used whole. Without `align`, or from the peaks on, nothing will be moved later, so that `before` and
+    `after` are None. Computed sounds, not `measured`, are not searched for clipping, noise and second impacts. Issues
+    are added to those given. Raises `CaptureError` as `prepare`, and where sample rates differ or the settings ask for
+    too little, unless `issues` collect; then the impacts are None where none can be made.
+    """
+    issues = Issues() if issues is None else issues
+    used = []
+    for each in recordings:
+        with issues.keep(each.name, each.line):
+            prepared = prepare(each.recording, settings, newtons=each.newtons)
+            if measured:
+                issues.reports.append(measure(each.recording, prepared, settings=settings, line=each.line))
+            issues.sounds[each.name] = hashlib.sha256(prepared.sound.tobytes()).digest(), prepared.peak
+            sound = _shorten(prepared, settings, gain=10 ** (-each.gain_db / 20))
+            used.append((each.name, each.contact, each.direction, sound))
+    if used:
+        with issues.keep():
+            return _join(*zip(*used, strict=True), settings=settings, issues=issues), issues
+    return None, issues
+
+
+def _shorten(prepared: Prepared, settings: CaptureSettings, *, gain: float) -> Prepared:
+    """Return a recording times a gain in float32, with no more of it than can be used, so that many fit in memory."""
+    most = round(settings.kept_seconds(prepared.rate) * prepared.rate) + margin_length(prepared.rate)
+    sound, before = ((gain * part).astype(np.float32) for part in (prepared.sound[:most], prepared.before))
+    return replace(prepared, sound=sound, before=before)
+
+
+def _join(
+    names: Sequence[str],
+    contacts: Sequence[Vector],
+    directions: Sequence[Vector | None],
+    sounds: Sequence[Prepared],
+    *,
+    settings: CaptureSettings,
+    issues: Issues,
+) -> Impacts:
+    rate = common_rate([each.rate for each in sounds], names)
+    issues.uncut = (
+        settings.align and not settings.from_peaks and settings.force_channel is None and start_with_impact(sounds)
+    )
+    if issues.uncut:
+        sounds = [
+            replace(each, sound=np.concatenate([each.before, each.sound]), before=each.before[:0]) for each in sounds
+        ]
+    length = _common_length([len(each.sound) for each in sounds], names, rate=rate, settings=settings, issues=issues)
+    before = after = None
+    if settings.align and not settings.from_peaks:
+        size = margin_length(rate)
+        before = torch.full((len(sounds), size), torch.nan)
+        after = before.clone()
+        for row, each in enumerate(sounds):
+            rest = each.sound[length : length + size]
+            before[row, size - len(each.before) :] = torch.from_numpy(each.before)
+            after[row, : len(rest)] = torch.from_numpy(rest)
+    forces = [each.newtons for each in sounds]
+    known = not any(each is None for each in directions)
+    return Impacts(
+        contacts=torch.from_numpy(np.array(contacts, dtype=np.float64)),
+        sounds=torch.from_numpy(np.stack([each.sound[:length] for each in sounds])),
+        sample_rate=rate * settings.playback_speed,
+        names=tuple(names),
+        directions=torch.from_numpy(np.array(directions, dtype=np.float32)) if known else None,
+        forces=None if None in forces else torch.tensor(forces, dtype=torch.float32),
+        before=before,
+        after=after,
+    )
 
 
 def latest_start(rate: float) -> int:
@@ -82,228 +204,77 @@ def start_with_impact(recordings: Sequence[Prepared]) -> bool:
     return bool(mean[:first].max() >= START_LEVEL * mean.max())
 
 
-def are_uncut(recordings: Sequence[Prepared], settings: CaptureSettings) -> bool:
-    """Return whether the recordings of a capture are taken from their files' first sample on, though `align` is set.
-
-    A force channel, `align = false` and `time_zero = "peak"` say where the sounds start.
-    """
-    return (
-        settings.align and not settings.from_peaks and settings.force_channel is None and start_with_impact(recordings)
-    )
-
-
-def shorten(prepared: Prepared, settings: CaptureSettings) -> Prepared:
-    """Return a recording in float32 with no more of it than `build_impacts` can use, so that many fit in memory."""
-    most = round(settings.kept_seconds(prepared.rate) * prepared.rate) + margin_length(prepared.rate)
-    sound, before = (part.astype(np.float32) for part in (prepared.sound[:most], prepared.before))
-    return replace(prepared, sound=sound, before=before)
-
-
-def build_impacts(
-    recordings: Sequence[Prepared],
-    contacts: Float64[Tensor, "contacts 3"],
-    *,
-    names: Sequence[str],
-    settings: CaptureSettings,
-    directions: Float[Tensor, "contacts 3"] | None = None,
-) -> tuple[Impacts, list[CaptureWarning]]:
-    """Return the impacts, their sounds from their starts on cut to one length, and warnings of what shortens them.
-
-    Recordings that all start with the impact (`are_uncut`) are used whole. Without `align`, or from the peaks on,
-    nothing will be moved later, so that `before` and `after` are None. Raises `CaptureError` where sample rates differ,
-    and as `common_length`.
-    """
-    rate = common_rate([each.rate for each in recordings], names)
-    if are_uncut(recordings, settings):
-        recordings = [
-            replace(each, sound=np.concatenate([each.before, each.sound]), before=each.before[:0])
-            for each in recordings
+def common_rate(rates: Sequence[float], names: Sequence[str]) -> float:
+    """Return the one sample rate of the files, Hz; `CaptureError` where they differ."""
+    counts = Counter(rates).most_common()
+    if len(counts) > 1:
+        found = [
+            f"{rate:g} Hz ({counted(count, 'file')}, {names[list(rates).index(rate)]} the first)"
+            for rate, count in counts
         ]
-    length, remarks = common_length([len(each.sound) for each in recordings], names, rate=rate, settings=settings)
-    before = after = None
-    if settings.align and not settings.from_peaks:
-        size = margin_length(rate)
-        before = torch.full((len(recordings), size), torch.nan)
-        after = before.clone()
-        for row, each in enumerate(recordings):
-            rest = each.sound[length : length + size].astype(np.float32)
-            before[row, size - len(each.before) :] = torch.from_numpy(each.before.astype(np.float32))
-            after[row, : len(rest)] = torch.from_numpy(rest)
-    forces = [each.newtons for each in recordings]
-    impacts = Impacts(
-        contacts=contacts,
-        sounds=torch.from_numpy(np.stack([each.sound[:length] for each in recordings]).astype(np.float32)),
-        sample_rate=rate * settings.playback_speed,
-        names=tuple(names),
-        directions=directions,
-        forces=None if None in forces else torch.tensor(forces, dtype=torch.float32),
-        before=before,
-        after=after,
-    )
-    return impacts, remarks
+        wanted, advice = "recordings of one sample rate", "nothing is resampled, so convert them to one rate"
+        raise CaptureError.expected(
+            wanted, [rate for rate, _ in counts], got=", ".join(found), name="sample_rate", advice=advice
+        )
+    return rates[0]
 
 
-@dataclass
-class Preprocessed:
-    """What could be read of a capture folder, and what is wrong with it."""
-
-    rows: list[Row]
-    warnings: list[CaptureWarning]
-    collect: bool
-    """Whether errors are kept, and not raised."""
-    errors: list[CaptureError] = field(default_factory=list)
-    row_errors: dict[int, CaptureError] = field(default_factory=dict)
-    """Errors of single recordings, by their lines in the table."""
-    strikes: dict[int, Strike] = field(default_factory=dict)
-    """The rows that can be parsed, by their lines."""
-    reports: dict[int, RecordingReport] = field(default_factory=dict)
-    """On the recordings that can be read, by their lines."""
-    sounds: dict[int, Prepared] = field(default_factory=dict)
-    """These recordings, as far as they are used."""
-    surface: Surface | None = None
-    """The part of it that the contacts lie on."""
-    impacts: Impacts | None = None
-
-    @contextmanager
-    def keep(self, line: int | None = None) -> Iterator[None]:
-        """Keep an error, of the capture or of one row of its table, or raise it."""
-        try:
-            yield
-        except CaptureError as error:
-            if not self.collect:
-                raise
-            if line is None:
-                self.errors.append(error)
-            else:
-                self.row_errors[line] = error
+def _common_length(
+    lengths: Sequence[int], names: Sequence[str], *, rate: float, settings: CaptureSettings, issues: Issues
+) -> int:
+    """Return the length of all sounds in samples: `kept_seconds`, or all of the shortest; warn where one cuts all."""
+    seconds = settings.kept_seconds(rate)
+    asked, least, shortest = round(seconds * rate), shortest_allowed(rate), min(lengths)
+    if asked < least:
+        wanted, got = f"at least {least} samples at {rate:g} Hz", f"{asked} ({seconds:g} s)"
+        raise CaptureError.expected(wanted, seconds, got=got, name="seconds", advice="increase it in capture.toml")
+    usual = min(asked, int(np.median(lengths)))
+    if shortest < 0.9 * usual:
+        name = names[list(lengths).index(shortest)]
+        message = (
+            f"{name}: {shortest / rate:.3g} s after its onset, most recordings have {usual / rate:.3g} s; all sounds "
+            "are cut to this length; record it again or remove its row"
+        )
+        issues.warnings.append(CaptureWarning(message, file=name, value=shortest / rate))
+    return min(asked, shortest)
 
 
-def preprocess(folder: Path, settings: CaptureSettings, *, collect: bool = False) -> Preprocessed:
-    """Read a capture folder; what is wrong with it is raised, or with `collect` kept.
+def check_levels(sounds: dict[str, tuple[bytes, float]]) -> list[CaptureWarning]:
+    """Return a warning where one of `Issues.sounds` is far louder or fainter than the others, or all peaks are one.
 
-    Raises `CaptureError` for a table that cannot be read in any case.
+    Raises `CaptureError` where the loudest is more than `MAX_RANGE_DB` above the faintest.
     """
-    found = Preprocessed(*read_rows(folder), collect)
-    for row in found.rows:
-        with found.keep(row.line):
-            found.strikes[row.line] = parse_row(row, settings)
-    strikes = list(found.strikes.values())
-    if strikes:
-        with found.keep():
-            refuse_repeated_files(strikes)
-        with found.keep():
-            refuse_missing(folder, strikes)
-        found.warnings += check_contacts(strikes, settings)
-    with found.keep():
-        found.surface = find_surface(folder, settings)
-        if found.surface is not None and strikes:
-            found.warnings += check_surface(strikes, found.surface, settings=settings)
-            contacts = torch.tensor([strike.contact for strike in strikes])
-            found.surface, _ = contacted_part(found.surface, contacts)
-    for line, strike in found.strikes.items():
-        with found.keep(line):
-            # Reading would name similar files, for which it compares up to a thousand names.
-            if is_missing(folder / strike.file):
-                raise CaptureError.expected("a sound file", file=strike.file)
-            advice = f"copy it there, or remove its row from {TABLE}"
-            recording = read_recording(folder / strike.file, strike.file, advice=advice)
-            prepared = prepare(recording, settings, newtons=strike.newtons)
-            found.reports[line] = measure(recording, prepared, settings=settings, line=line)
-            found.sounds[line] = shorten(prepared, settings)
-    _join(found, settings)
-    return found
-
-
-def _join(found: Preprocessed, settings: CaptureSettings) -> None:
-    """Make impacts of the recordings that can be read, and compare them."""
-    strikes, sounds = [found.strikes[line] for line in found.sounds], list(found.sounds.values())
     if not sounds:
-        return
-    names, directions = [strike.file for strike in strikes], [strike.direction for strike in strikes]
-    with found.keep():
-        found.warnings += check_levels([sound.peak for sound in sounds], names)
-    with found.keep():
-        found.impacts, warned = build_impacts(
-            sounds,
-            torch.tensor([strike.contact for strike in strikes], dtype=torch.float64),
-            names=names,
-            settings=settings,
-            directions=None if None in directions else torch.tensor(directions, dtype=torch.float32),
-        )
-        found.warnings += warned
-
-
-@dataclass(frozen=True)
-class CaptureReport:
-    """What `check` found, in plain values: `dataclasses.asdict` gives what JSON holds."""
-
-    readable: bool
-    """Whether `read_capture` would read this folder (perhaps with warnings)."""
-    recordings: tuple[RecordingReport, ...]
-    """One for each row of impacts.csv, in its order."""
-    problems: tuple[str, ...]
-    """What is wrong with the folder, its table, its surface, or the recordings together."""
-    remarks: tuple[str, ...] = ()
-    """Notes on the recordings together that are no problems."""
-
-
-def check(folder: str | Path, settings: CaptureSettings | None = None) -> CaptureReport:
-    """Check a capture folder as `read_capture` would and report on every recording; raises nothing for bad input."""
-    folder = Path(folder)
-    try:
-        settings = settings or settings_of(folder)
-        found = preprocess(folder, settings, collect=True)
-    except CaptureError as error:
-        return CaptureReport(False, (), (str(error),))
-    reports = [found.reports.get(row.line) or _unreadable(row, found) for row in found.rows]
-    far = [error for error in found.row_errors.values() if error.name == "unit"]
-    if len(far) > 1:
-        # One message for all, with which they are listed together.
-        largest = max(abs(value) for error in far for value in error.value)
-        words = (
-            f"expected a contact within {FARTHEST:g} m of the origin, got coordinates of up to {largest:g} "
-            f"(unit = {settings.unit!r}): {fitting_units(largest)}"
-        )
-        lines = [line for line, error in found.row_errors.items() if error in far]
-        reports = [replace(each, problems=(words,)) if each.line in lines else each for each in reports]
-    sounds = list(found.sounds.values())
-    comparable = len(sounds) > 1 and len({each.rate for each in sounds}) == 1
-    remarks = []
-    if comparable and are_uncut(sounds, settings):
-        reports = [each if each.onset_seconds is None else replace(each, onset_seconds=0.0) for each in reports]
-        remarks.append(UNCUT)
-    names = [report.file for report in reports]
-    if names == sorted(names) != sorted(names, key=number_key):
-        remarks.append(TEXT_ORDER)
-    readable = not found.errors and all(report.readable for report in reports)
-    problems = [*map(str, found.errors), *map(str, found.warnings), *_copies(found), *_unlisted(folder, set(names))]
-    return CaptureReport(readable, tuple(reports), tuple(problems), tuple(remarks))
-
-
-def _unreadable(row: Row, found: Preprocessed) -> RecordingReport:
-    strike = found.strikes.get(row.line)
-    file = row.cells["file"] if strike is None else strike.file
-    return RecordingReport(file=file, line=row.line, readable=False, problems=(str(found.row_errors[row.line]),))
-
-
-def _copies(found: Preprocessed) -> list[str]:
-    """Return a sentence for each sound that is another one's copy."""
-    first, sentences = dict[bytes, str](), []
-    for line, sound in found.sounds.items():
-        file = found.strikes[line].file
-        original = first.setdefault(hashlib.sha256(sound.sound.tobytes()).digest(), file)
-        if original != file:
-            advice = "copy the right file, or remove its row"
-            sentences.append(f"{file}: the same sound as {original}, to the last bit: {advice}")
-    return sentences
-
-
-def _unlisted(folder: Path, named: set[str]) -> list[str]:
-    """Return a sentence on wav files without a row; hidden ones, such as what the studio has removed, are left out."""
-    names = (path.relative_to(folder) for path in folder.rglob("*.wav"))
-    found = sorted(name.as_posix() for name in names if not any(part.startswith(".") for part in name.parts))
-    unlisted = [name for name in found if name not in named]
-    if not unlisted:
         return []
-    lack = f"{counted(len(unlisted), 'wav file')} {'has' if len(unlisted) == 1 else 'have'} no row in {TABLE}"
-    return [f"{lack}: {listed(unlisted)}"]
+    names, peaks = list(sounds), [peak for _, peak in sounds.values()]
+    levels = 20 * np.log10(np.asarray(peaks))
+    away = levels - np.median(levels)
+    worst, loudest, extent = int(np.abs(away).argmax()), int(levels.argmax()), float(np.ptp(levels))
+    above = levels[loudest] - np.sort(levels)[-2] if len(levels) >= 6 else 0.0
+    found = f"peak, {peaks[worst]:.3g}, is {away[worst]:+.0f} dB from that of most recordings ({np.median(peaks):.3g})"
+    row = worst
+    if extent > MAX_RANGE_DB:
+        raise CaptureError(
+            f"{names[worst]}: its {found}; expected at most {MAX_RANGE_DB:g} dB between the loudest and the faintest, "
+            f"got {extent:.0f}; export it at the scale of the others, or remove its row",
+            file=names[worst],
+            name="peak",
+            value=peaks[worst],
+        )
+    if len(levels) >= MIN_EQUAL_PEAKS and extent < SAME_PEAK_DB:
+        row = 0
+        message = (
+            f"all {len(levels)} recordings have the same peak, {peaks[0]:.3g}: expected the levels as recorded, got "
+            "each scaled to one peak, which loses how strong the modes are at each contact; export them unscaled"
+        )
+    elif above > USUAL_GAP_DB:
+        row = loudest
+        message = (
+            f"{names[row]}: its peak, {peaks[row]:.3g}, is {above:.0f} dB above that of the next loudest recording; "
+            f"expected at most {USUAL_GAP_DB:g} dB; check its gain, its scale and its force"
+        )
+    elif abs(away[worst]) > USUAL_RANGE_DB:
+        message = f"{names[worst]}: its {found}; expected at most {USUAL_RANGE_DB:g} dB; check its scale and its force"
+    else:
+        return []
+    return [CaptureWarning(message, file=names[row], name="peak", value=peaks[row])]

@@ -7,7 +7,7 @@ docs/decisions/reading-recordings.md has the measurements behind the limits.
 import json
 import os
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,34 +20,33 @@ from torch import Tensor
 from avmsf._utils.files import unwritable
 from avmsf._utils.text import read_toml
 from avmsf.capture.audio import Recording, read_recording
+from avmsf.capture.checks import NARROWEST, WIDEST, find_surface, fitting_units_of
 from avmsf.capture.measure import HIGHEST_NOISE_DB, decibels, noise_level
 from avmsf.capture.onset import SECONDS_BEFORE, find_onset, find_pulse
 from avmsf.capture.placement import check_placement
 from avmsf.capture.prepare import prepare, remove_rumble
 from avmsf.capture.settings import METRES, SETTINGS, CaptureSettings, settings_of
-from avmsf.capture.table import Row, Strike, parse_row, read_rows
-from avmsf.capture.together import NARROWEST, WIDEST, find_surface, fitting_units_of
+from avmsf.capture.table import Row, Strike, read_rows, valid_rows
 from avmsf.errors import CaptureError
 from avmsf.mesh.surface import surface_points
 
 MIN_PUSH_SHARE = 0.5
 """Share of its energy that a hammer's channel has within its push and one width on either side: most of it. The
 aircraft's hammer channel has .92 and more, its accelerometers .24 and less."""
-CANDIDATES_HZ = (20.0, 40.0)
+CUTOFFS_HZ = (20.0, 40.0)
 """The lower limit of hearing, and an octave above it, where only a large structure rings."""
-MIN_NOISE_RATIO = 10**0.6
-"""Ratio by which a highpass must lower the power of the noise: 6 dB, half its amplitude."""
-MAX_RUMBLE_RISE = 10**0.6
-"""Ratio of power below the highpass after the impact to that before it, above which the object itself rings there:
-6 dB. The power of a few periods of noise scatters by 3."""
+MIN_FALL = 10**0.6
+"""Ratio by which a highpass must lower the power of the noise: 6 dB, half its amplitude. Likewise the power below the
+highpass after the impact over that before it, above which the object itself rings there: a few periods of noise scatter
+by 3."""
 MIN_NOISE_SHARE = 1e-6
 """Mean square of noise against the squared peak, -60 dB, below which it does not hide the decay over its T60."""
 MIN_AUDIO_RATE_HZ = 16_000.0
 """Sample rate from which on recordings are of sound: slower ones are of structures that vibrate below 20 Hz."""
 MAX_LOW_SHARE = 0.1
-"""Share of the energy after the impacts, below the lowest candidate, above which it is no sound of the object."""
+"""Share of the energy after the impacts, below the lowest cutoff, above which it is no sound of the object."""
 MIN_LEAD_SECONDS = 0.1
-"""Two periods of the lowest candidate: less than that before an impact does not show rumble."""
+"""Two periods of the lowest cutoff: less than that before an impact does not show rumble."""
 
 
 @dataclass(frozen=True)
@@ -82,17 +81,18 @@ def propose_settings(
         rows = read_rows(folder)[0]
     except (CaptureError, OSError, ValueError):
         return ()
-    defaults = vars(CaptureSettings())
+    defaults, found = vars(CaptureSettings()), list[Proposal]()
     chosen |= {key for key, value in vars(settings).items() if value != defaults[key]}
-    proposals: list[Proposal] = [] if chosen & {"unit", "surface_unit"} else _units(folder, rows, settings, factor)
-    units: dict[str, Any] = {each.key: each.value for each in proposals}
-    strikes = list(_strikes(rows, replace(settings, **units)))
-    if not chosen & {"force_channel", "response_channel"}:
-        proposals += choose_channels([channel_figures(recording) for _, recording in _recordings(folder, strikes)])
-    found: dict[str, Any] = {each.key: each.value for each in proposals}
-    settings = replace(settings, **found)
-    highpass = None if "highpass" in chosen else propose_highpass(_recordings(folder, strikes), settings)
-    return tuple(proposals if highpass is None else [*proposals, highpass])
+    steps: list[tuple[set[str], Callable[[CaptureSettings], list[Proposal]]]] = [
+        ({"unit", "surface_unit"}, lambda changed: _units(folder, rows, changed, factor)),
+        ({"force_channel", "response_channel"}, lambda changed: _channels(_recordings(folder, rows, changed))),
+        ({"highpass"}, lambda changed: _highpass(_recordings(folder, rows, changed), changed)),
+    ]
+    for keys, propose in steps:
+        if not chosen & keys:
+            values: dict[str, Any] = {each.key: each.value for each in found}
+            found += propose(replace(settings, **values))
+    return tuple(found)
 
 
 def write_settings(folder: str | Path, proposals: Sequence[Proposal]) -> Path:
@@ -105,9 +105,8 @@ def write_settings(folder: str | Path, proposals: Sequence[Proposal]) -> Path:
         with open(path, "x", encoding="utf-8") as file:
             file.write(settings_text(proposals))
     except FileExistsError as error:
-        raise CaptureError(
-            f"{path}: expected no such file, got an existing one; add the proposed lines to it by hand", file=path
-        ) from error
+        advice = "add the proposed lines to it by hand"
+        raise CaptureError.expected("no such file", got="an existing one", file=path, advice=advice) from error
     except OSError as error:
         raise unwritable(path, error, raising=CaptureError) from error
     return path
@@ -115,125 +114,18 @@ def write_settings(folder: str | Path, proposals: Sequence[Proposal]) -> Path:
 
 def settings_text(proposals: Sequence[Proposal]) -> str:
     """Return the text of a `capture.toml` with these settings, each below its reason."""
-    head = (
-        "# Proposed by `avmsf check --write-settings` from the folder's files; change or remove what does not suit.\n"
-    )
-    reasons = (textwrap.wrap(each.reason, 100, initial_indent="# ", subsequent_indent="# ") for each in proposals)
-    parts = ("\n".join([*reason, each.line, ""]) for reason, each in zip(reasons, proposals, strict=True))
-    return "\n".join([head, *parts])
-
-
-def choose_channels(figures: Sequence[Float64[np.ndarray, "2 channels"]]) -> list[Proposal]:
-    """Return which channel is the hammer's and which the sound's, from each recording's `channel_figures`.
-
-    A hammer's channel holds one short push in every recording. Of several sounds beside it, the one that stands highest
-    above its noise; without a hammer only where the others hold no clear impact (`HIGHEST_NOISE_DB`), for a
-    channel of several pushes is no sound.
-    """
-    counts = {each.shape[1] for each in figures}
-    if len(counts) != 1 or counts == {1}:
-        return []
-    shares, above = np.stack(figures, axis=1)
-    proposals, sounds = [], list(range(shares.shape[1]))
-    hammers = np.flatnonzero(shares.min(axis=0) >= MIN_PUSH_SHARE)
-    if len(hammers) == 1:
-        hammer = int(hammers[0])
-        sounds.remove(hammer)
-        proposals.append(
-            Proposal(
-                "force_channel",
-                hammer + 1,
-                f"Channel {hammer + 1} is a hammer's: in every recording one short pulse holds at least "
-                f"{shares[:, hammer].min():.0%} of its energy, in the others at most {shares[:, sounds].max():.0%}. "
-                "Where it is not in newtons, write force_scale as well.",
-            )
-        )
-    levels = np.median(above, axis=0)[sounds]
-    best = int(np.argmax(levels))
-    if len(sounds) > 1 and (proposals or (np.delete(levels, best) < -HIGHEST_NOISE_DB).all()):
-        shown = ", ".join(f"{row + 1}: {level:.0f} dB" for row, level in zip(sounds, levels, strict=True))
-        proposals.append(
-            Proposal(
-                "response_channel",
-                sounds[best] + 1,
-                f"Of the channels that can be the sound, {sounds[best] + 1} has the highest level above its noise "
-                f"({shown}). Another one can be chosen.",
-            )
-        )
-    return proposals
-
-
-def channel_figures(recording: Recording) -> Float64[np.ndarray, "2 channels"]:
-    """Return for each channel the share of its energy in its first push, and its peak's level above its noise, dB."""
-    if len(recording.channels) == 1:
-        return np.zeros((2, 1))
-    return np.array([(_push_share(row), _above_noise(row, recording.sample_rate)) for row in recording.channels]).T
-
-
-def propose_highpass(recordings: Iterable[tuple[Strike, Recording]], settings: CaptureSettings) -> Proposal | None:
-    """Propose the lowest candidate that removes most of the noise and nothing of the object's.
-
-    Or the lowest where most of what follows the impacts lies below it, as of a sensor that settles. Recordings that
-    cannot be prepared are passed over; those of different rates, which are refused as a capture, show nothing.
-    """
-    rates, durations, noise, low = set(), [], [], []
-    for strike, recording in recordings:
-        try:
-            prepared = prepare(recording, settings, newtons=strike.newtons)
-        except CaptureError:
-            continue
-        rate, onset = recording.sample_rate, prepared.onset
-        rates.add(rate)
-        durations.append(recording.duration)
-        response = recording.response(settings.response_channel, force_channel=settings.force_channel)
-        if prepared.pulse is None and recording.duration * CANDIDATES_HZ[0] >= 1.0:
-            # Sway and drift as loud as the impact hide its onset.
-            onset = find_onset(remove_rumble(response, CANDIDATES_HZ[0], recording), sample_rate=rate)
-        lead = response[: max(0, onset - round(SECONDS_BEFORE * rate))]
-        later = response[onset : onset + round(settings.kept_seconds(rate) * rate)]
-        if len(lead) >= MIN_LEAD_SECONDS * rate:
-            powers = np.array([_powers_below(signal, rate) for signal in (lead, later)])
-            noise.append(powers / float(np.abs(response).max()) ** 2)
-        # Digital silence, as after a click at the start, has no rumble.
-        lowest, *_, power = _powers_below(later, rate)
-        low.append(lowest / power if power else 0.0)
-    if len(rates) != 1 or len(durations) < 2 or settings.highpass > 0.0:
-        return None
-    if min(rates) >= MIN_AUDIO_RATE_HZ and (share := float(np.median(low))) > MAX_LOW_SHARE:
-        return Proposal(
-            "highpass",
-            CANDIDATES_HZ[0],
-            f"{share:.0%} of the energy after the impacts lies below {CANDIDATES_HZ[0]:g} Hz: drift, sway or a "
-            "sensor that settles. Leave it out if the object itself vibrates there.",
-        )
-    if len(noise) < len(durations) / 2:
-        return None
-    (*below, total), (*later, _) = np.mean(noise, axis=0)
-    if total < MIN_NOISE_SHARE:
-        return None
-    chosen, left = None, total
-    for cutoff, under, after in zip(CANDIDATES_HZ, below, later, strict=True):
-        rest = max(total - under, 1e-12 * total)
-        impossible = cutoff * min(durations) < 1.0 or after > MAX_RUMBLE_RISE * under
-        if impossible or left / rest < MIN_NOISE_RATIO:
-            continue
-        chosen, left = cutoff, rest
-    if chosen is None:
-        return None
-    return Proposal(
-        "highpass",
-        chosen,
-        f"Before the impacts, an offset or rumble below {chosen:g} Hz is most of the noise: without it, noise is "
-        f"{10 * np.log10(total / left):.0f} dB lower. The object does not vibrate there: the power below "
-        f"{chosen:g} Hz does not rise at the impact.",
-    )
+    advice = "change or remove what does not suit"
+    parts = [f"# Proposed by `avmsf check --write-settings` from the folder's files; {advice}.\n"]
+    for each in proposals:
+        reason = textwrap.wrap(each.reason, 100, initial_indent="# ", subsequent_indent="# ")
+        parts.append("\n".join([*reason, each.line, ""]))
+    return "\n".join(parts)
 
 
 def contacts_of(rows: Sequence[Row], settings: CaptureSettings) -> Float64[Tensor, "contacts 3"]:
     """Return the contacts of all rows that can be read, meters, also those too far from the origin for the unit."""
-    strikes = _strikes(rows, replace(settings, unit="mm"))
-    contacts = torch.tensor([each.contact for each in strikes], dtype=torch.float64).reshape(-1, 3)
-    return contacts * settings.meters / METRES["mm"]
+    contacts = [each.contact for each in valid_rows(rows, replace(settings, unit="mm"))]
+    return torch.tensor(contacts, dtype=torch.float64).reshape(-1, 3) * settings.meters / METRES["mm"]
 
 
 def unit_named(meters: float) -> str | None:
@@ -241,7 +133,7 @@ def unit_named(meters: float) -> str | None:
     return next((unit for unit, length in METRES.items() if abs(length / meters - 1) < 1e-6), None)
 
 
-def _units(folder: Path, rows: Sequence[Row], settings: CaptureSettings, factor: float | None = None) -> list[Proposal]:
+def _units(folder: Path, rows: Sequence[Row], settings: CaptureSettings, factor: float | None) -> list[Proposal]:
     """Return the units in which contacts lie on the object, where the present ones cannot be meant."""
     try:
         surface = find_surface(folder, settings)
@@ -266,16 +158,116 @@ def _units(folder: Path, rows: Sequence[Row], settings: CaptureSettings, factor:
     return [Proposal(key, unit, reason) for key, unit in units.items()]
 
 
-def _strikes(rows: Sequence[Row], settings: CaptureSettings) -> Iterator[Strike]:
-    for row in rows:
+def _channels(recordings: Iterator[tuple[Strike, Recording]]) -> list[Proposal]:
+    """Return which channel is the hammer's and which the sound's.
+
+    A hammer's channel holds one short push in every recording. Of several sounds beside it, the one that stands highest
+    above its noise; without a hammer only where the others hold no clear impact (`HIGHEST_NOISE_DB`), for a
+    channel of several pushes is no sound.
+    """
+    figures = []
+    for _, recording in recordings:
+        if len(recording.channels) == 1:
+            return []
+        figures.append([_push_and_level(each, recording.sample_rate) for each in recording.channels])
+    if len({len(each) for each in figures}) != 1:
+        return []
+    shares, above = np.array(figures).transpose(2, 0, 1)
+    proposals, sounds = [], list(range(shares.shape[1]))
+    hammers = np.flatnonzero(shares.min(axis=0) >= MIN_PUSH_SHARE)
+    if len(hammers) == 1:
+        hammer = int(hammers[0])
+        sounds.remove(hammer)
+        reason = (
+            f"Channel {hammer + 1} is a hammer's: in every recording one short pulse holds at least "
+            f"{shares[:, hammer].min():.0%} of its energy, in the others at most {shares[:, sounds].max():.0%}. "
+            "Where it is not in newtons, write force_scale as well."
+        )
+        proposals.append(Proposal("force_channel", hammer + 1, reason))
+    levels = np.median(above, axis=0)[sounds]
+    best = int(np.argmax(levels))
+    if len(sounds) > 1 and (proposals or (np.delete(levels, best) < -HIGHEST_NOISE_DB).all()):
+        shown = ", ".join(f"{row + 1}: {level:.0f} dB" for row, level in zip(sounds, levels, strict=True))
+        reason = (
+            f"Of the channels that can be the sound, {sounds[best] + 1} has the highest level above its noise "
+            f"({shown}). Another one can be chosen."
+        )
+        proposals.append(Proposal("response_channel", sounds[best] + 1, reason))
+    return proposals
+
+
+def _push_and_level(channel: Float64[np.ndarray, " frames"], rate: float) -> tuple[float, float]:
+    """Return the share of a channel's energy within its first push, and its peak over its noise, dB; 0 for silence."""
+    if np.ptp(channel) == 0:
+        return 0.0, 0.0
+    pulse = find_pulse(channel)
+    power, width = np.square(channel - pulse.rest), pulse.stop - pulse.start
+    share = float(power[max(0, pulse.start - width) : pulse.stop + width].sum() / power.sum())
+    noise = noise_level(channel, find_onset(channel, sample_rate=rate), rate)
+    return share, -decibels(noise / float(np.abs(channel).max()))
+
+
+def _highpass(recordings: Iterator[tuple[Strike, Recording]], settings: CaptureSettings) -> list[Proposal]:
+    """Return the lowest cutoff that removes most of the noise and nothing of the object's.
+
+    Or the lowest where most of what follows the impacts lies below it, as of a sensor that settles. Recordings that
+    cannot be prepared are passed over; those of different rates, which are refused as a capture, show nothing.
+    """
+    rates, durations, noise, low = set(), [], [], []
+    for strike, recording in recordings:
         try:
-            yield parse_row(row, settings)
+            prepared = prepare(recording, settings, newtons=strike.newtons)
         except CaptureError:
             continue
+        rate, onset = recording.sample_rate, prepared.onset
+        rates.add(rate)
+        durations.append(recording.duration)
+        response = recording.response(settings.response_channel, force_channel=settings.force_channel)
+        if prepared.pulse is None and recording.duration * CUTOFFS_HZ[0] >= 1.0:
+            # Sway and drift as loud as the impact hide its onset.
+            onset = find_onset(remove_rumble(response, CUTOFFS_HZ[0], recording), sample_rate=rate)
+        lead = response[: max(0, onset - round(SECONDS_BEFORE * rate))]
+        later = _powers_below(response[onset : onset + round(settings.kept_seconds(rate) * rate)], rate)
+        if len(lead) >= MIN_LEAD_SECONDS * rate:
+            noise.append(np.array([_powers_below(lead, rate), later]) / float(np.abs(response).max()) ** 2)
+        # Digital silence, as after a click at the start, has no rumble.
+        low.append(later[0] / later[-1] if later[-1] else 0.0)
+    if len(rates) != 1 or len(durations) < 2:
+        return []
+    if min(rates) >= MIN_AUDIO_RATE_HZ and (share := float(np.median(low))) > MAX_LOW_SHARE:
+        reason = (
+            f"{share:.0%} of the energy after the impacts lies below {CUTOFFS_HZ[0]:g} Hz: drift, sway or a "
+            "sensor that settles. Leave it out if the object itself vibrates there."
+        )
+        return [Proposal("highpass", CUTOFFS_HZ[0], reason)]
+    if len(noise) < len(durations) / 2:
+        return []
+    (*below, total), (*after, _) = np.mean(noise, axis=0)
+    left, chosen = total, None
+    for cutoff, lower, later_lower in zip(CUTOFFS_HZ, below, after, strict=True):
+        rest = max(total - lower, 1e-12 * total)
+        if cutoff * min(durations) >= 1.0 and later_lower <= MIN_FALL * lower and left / rest >= MIN_FALL:
+            chosen, left = cutoff, rest
+    if chosen is None or total < MIN_NOISE_SHARE:
+        return []
+    reason = (
+        f"Before the impacts, an offset or rumble below {chosen:g} Hz is most of the noise: without it, noise is "
+        f"{10 * np.log10(total / left):.0f} dB lower. The object does not vibrate there: the power below "
+        f"{chosen:g} Hz does not rise at the impact."
+    )
+    return [Proposal("highpass", chosen, reason)]
 
 
-def _recordings(folder: Path, strikes: Sequence[Strike]) -> Iterator[tuple[Strike, Recording]]:
-    for strike in strikes:
+def _powers_below(signal: Float64[np.ndarray, " samples"], rate: float) -> Float64[np.ndarray, " limits"]:
+    """Return the mean squares of what lies below each of `CUTOFFS_HZ`, and of all."""
+    power = np.abs(np.fft.rfft(signal) / len(signal)) ** 2
+    power[1 : (len(signal) + 1) // 2] *= 2.0
+    frequency = np.fft.rfftfreq(len(signal), 1.0 / rate)
+    return np.array([power[frequency < limit].sum() for limit in (*CUTOFFS_HZ, np.inf)])
+
+
+def _recordings(folder: Path, rows: Sequence[Row], settings: CaptureSettings) -> Iterator[tuple[Strike, Recording]]:
+    for strike in valid_rows(rows, settings):
         # The error would name similar files, for which it compares up to a thousand names.
         if not os.path.exists(folder / strike.file):
             continue
@@ -283,29 +275,3 @@ def _recordings(folder: Path, strikes: Sequence[Strike]) -> Iterator[tuple[Strik
             yield strike, read_recording(folder / strike.file, strike.file)
         except CaptureError:
             continue
-
-
-def _push_share(channel: Float64[np.ndarray, " frames"]) -> float:
-    """Return the share of a channel's energy that lies within its first push and one width on either side."""
-    if np.ptp(channel) == 0:
-        return 0.0
-    pulse = find_pulse(channel)
-    power = np.square(channel - pulse.rest)
-    width = pulse.stop - pulse.start
-    return float(power[max(0, pulse.start - width) : pulse.stop + width].sum() / power.sum())
-
-
-def _above_noise(channel: Float64[np.ndarray, " frames"], rate: float) -> float:
-    """Return the level of a channel's peak above its noise, dB; 0 for a silent one."""
-    if np.ptp(channel) == 0:
-        return 0.0
-    noise = noise_level(channel, find_onset(channel, sample_rate=rate), rate)
-    return -decibels(noise / float(np.abs(channel).max()))
-
-
-def _powers_below(signal: Float64[np.ndarray, " samples"], rate: float) -> Float64[np.ndarray, " limits"]:
-    """Return the mean squares of what lies below each of `CANDIDATES_HZ`, and of all."""
-    power = np.abs(np.fft.rfft(signal) / len(signal)) ** 2
-    power[1 : (len(signal) + 1) // 2] *= 2.0
-    frequency = np.fft.rfftfreq(len(signal), 1.0 / rate)
-    return np.array([power[frequency < limit].sum() for limit in (*CANDIDATES_HZ, np.inf)])

@@ -6,8 +6,8 @@ import io
 import math
 import re
 import unicodedata
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path, PurePosixPath
@@ -162,6 +162,13 @@ def parse_row(row: Row, settings: CaptureSettings) -> Strike:
     return Strike(_inside(row.cells["file"], where), row.line, (contact[0], contact[1], contact[2]), direction, newtons)
 
 
+def valid_rows(rows: Iterable[Row], settings: CaptureSettings) -> Iterator[Strike]:
+    """Yield the rows that can be parsed."""
+    for row in rows:
+        with suppress(CaptureError):
+            yield parse_row(row, settings)
+
+
 @contextmanager
 def in_folder(folder: Path) -> Iterator[None]:
     """Name the folder in a `CaptureError` whose files are named as in the folder."""
@@ -245,27 +252,25 @@ def fitting_units(written: float) -> str:
 
 
 def _check_header(header: Sequence[str], path: Path) -> list[CaptureWarning]:
-    def refused(wanted: str, got: Sequence[str], name: str, value: Sequence[str], advice: str = "") -> CaptureError:
-        shown = f"only {', '.join(got)}"
-        return CaptureError.expected(wanted, list(value), got=shown, file=path, name=name, advice=advice)
-
+    known = (*REQUIRED, *DIRECTION, FORCE)
     missing = [name for name in REQUIRED if name not in header]
+    directions = [name for name in DIRECTION if name in header]
+    double = sorted({name for name in header if name in known and header.count(name) > 1})
     if missing:
         numbers = "vertex numbers have to become positions: " if any("vert" in name for name in header) else ""
-        raise refused(f"the columns {', '.join(missing)}", header, missing[0], header, numbers + HOW_TO_WRITE)
-    directions = [name for name in DIRECTION if name in header]
+        wanted, name, advice = f"the columns {', '.join(missing)}", missing[0], numbers + HOW_TO_WRITE
+        raise CaptureError.expected(
+            wanted, list(header), got=f"only {', '.join(header)}", file=path, name=name, advice=advice
+        )
     if 0 < len(directions) < 3:
-        absent = next(name for name in DIRECTION if name not in header)
-        raise refused("all of nx, ny, nz or none", directions, absent, directions)
-    known = (*REQUIRED, *DIRECTION, FORCE)
-    double = sorted({name for name in header if name in known and header.count(name) > 1})
+        absent, got = next(name for name in DIRECTION if name not in header), f"only {', '.join(directions)}"
+        raise CaptureError.expected("all of nx, ny, nz or none", directions, got=got, file=path, name=absent)
     if double:
         got = f"more than one {', '.join(double)}"
         raise CaptureError.expected("different names of columns", list(header), got=got, file=path, name=double[0])
     extra = [name or "(no name)" for name in header if name not in known]
-    if not extra:
-        return []
-    return [CaptureWarning(f"{path}: columns that are not used: {', '.join(extra)}", file=path, value=extra)]
+    unused = CaptureWarning(f"{path}: columns that are not used: {', '.join(extra)}", file=path, value=extra)
+    return [unused] if extra else []
 
 
 def _number(row: Row, name: str) -> float:

@@ -14,8 +14,8 @@ from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf._utils.files import copy_whole, write_whole
 from avmsf._utils.text import counted
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
+from avmsf.capture.checks import expect_one_unit, find_surface
 from avmsf.capture.table import TABLE, in_folder, parse_row, read_rows
-from avmsf.capture.together import expect_one_unit, find_surface
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
 from avmsf.cli.heartbeat import doing

@@ -7,9 +7,9 @@ import soundfile
 
 from avmsf.capture.filenames import find_surface_file, shows_object
 from avmsf.capture.folder import Capture, read_capture
+from avmsf.capture.preprocess import common_rate
 from avmsf.capture.settings import settings_of
 from avmsf.capture.table import TABLE, read_strikes
-from avmsf.capture.together import common_rate
 from avmsf.datasets.dataset import Dataset, DatasetReport, ObjectFacts, ObjectReport, VisualSource
 from avmsf.datasets.detect import detect_dataset
 from avmsf.datasets.numbering import in_order, refuse_unknown

@@ -13,9 +13,10 @@ import numpy as np
 
 from avmsf._utils.text import parse_json, read_text
 from avmsf.capture.audio import Recording, read_recording
+from avmsf.capture.checks import find_surface
 from avmsf.capture.folder import Capture
+from avmsf.capture.preprocess import RecordedImpact
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.together import find_surface
 from avmsf.datasets.dataset import DatasetReport, ObjectFacts, ObjectReport, VisualSource
 from avmsf.datasets.numbering import (
     REALIMPACT_NAMES,
@@ -26,7 +27,7 @@ from avmsf.datasets.numbering import (
     refuse_unknown,
     shared_remarks,
 )
-from avmsf.datasets.recordings import DatasetRecording, build_capture, check_wav, refuse_few
+from avmsf.datasets.recordings import build_capture, check_wav, refuse_few
 from avmsf.errors import CaptureError, DatasetError
 
 SAMPLE_RATE_HZ = 48_000.0
@@ -207,14 +208,14 @@ class ObjectFolderRaw:
             wrong.append(f"{shown}: expected contact coordinates{files and f' in {files}'}, got none")
         return wrong, newtons, gain_db
 
-    def _recordings(self, identifier: str, entries: list[_Entry]) -> Iterator[DatasetRecording]:
+    def _recordings(self, identifier: str, entries: list[_Entry]) -> Iterator[RecordedImpact]:
         usual = _usual_gain(entries) or 0.0
         for entry in entries:
             force, sound = (read_recording(entry.folder / name) for name in ("Force.wav", "mic.wav"))
             frames = min(force.frames, sound.frames)
             channels = np.stack([force.channels[0, :frames], sound.channels[0, :frames]])
             name = f"{identifier}/audio/{entry.contact}/mic.wav"
-            yield DatasetRecording(
+            yield RecordedImpact(
                 name=f"{entry.contact}.wav",
                 recording=Recording(name, channels, sound.sample_rate, sound.subtype),
                 contact=np.array(self._contacts[identifier, entry.contact]),

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from avmsf.capture.audio import Recording
 from avmsf.capture.folder import Capture
+from avmsf.capture.preprocess import RecordedImpact
 from avmsf.capture.settings import CaptureSettings
 from avmsf.datasets.dataset import DatasetReport, ObjectFacts, ObjectReport, VisualSource
 from avmsf.datasets.numbering import (
@@ -22,7 +23,7 @@ from avmsf.datasets.numbering import (
     refuse_unknown,
     shared_remarks,
 )
-from avmsf.datasets.recordings import DatasetRecording, build_capture
+from avmsf.datasets.recordings import build_capture
 from avmsf.errors import CaptureError, DatasetError
 from avmsf.mesh.surface import Surface, read_surface
 
@@ -152,7 +153,7 @@ class RealImpact:
 
     def _recordings(
         self, identifier: str, rows: list[int], *, vertices: np.ndarray, positions: np.ndarray
-    ) -> Iterator[DatasetRecording]:
+    ) -> Iterator[RecordedImpact]:
         sounds = self._array(identifier, SOUNDS)
         for row in rows:
             name = f"{identifier}/{FOLDER}/{SOUNDS}, row {row}"
@@ -162,7 +163,7 @@ class RealImpact:
                 advice = f"unpack {identifier}.zip again"
                 raise DatasetError.expected("finite samples", got=got, file=file, row=row, advice=advice)
             recording = Recording(name, sound[None], SAMPLE_RATE_HZ, "FLOAT")
-            yield DatasetRecording(f"vertex_{vertices[row]}.wav", recording, positions[row])
+            yield RecordedImpact(f"vertex_{vertices[row]}.wav", recording, positions[row])
 
     def _report(self, identifier: str) -> ObjectReport:
         folder = self.folder / identifier / FOLDER

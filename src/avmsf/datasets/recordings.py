@@ -2,21 +2,15 @@
 
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import soundfile
-import torch
-from jaxtyping import Float64
 
-from avmsf.capture.audio import Recording
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.measure import measure, shared_problems, shortened
+from avmsf.capture.measure import shared_problems, shortened
 from avmsf.capture.placement import check_placement
-from avmsf.capture.prepare import Prepared, prepare
-from avmsf.capture.preprocess import build_impacts, shorten
+from avmsf.capture.preprocess import Issues, RecordedImpact, preprocess
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError, CaptureWarning, DatasetError
 from avmsf.mesh.surface import Surface, surface_points
@@ -24,23 +18,8 @@ from avmsf.mesh.surface import Surface, surface_points
 MIN_RECORDINGS = 2
 
 
-@dataclass(frozen=True, eq=False)
-class DatasetRecording:
-    """One recording of a dataset, with what is known of the impact."""
-
-    name: str
-    """What the capture calls it."""
-    recording: Recording
-    contact: Float64[np.ndarray, " 3"]
-    """Object frame, meters."""
-    newtons: float | None = None
-    """Peak force, where it is known."""
-    gain_db: float = 0.0
-    """By how much the recorder made the sound louder, which is divided out."""
-
-
 def build_capture(
-    recordings: Iterable[DatasetRecording],
+    recordings: Iterable[RecordedImpact],
     *,
     name: str,
     origin: str,
@@ -57,30 +36,18 @@ def build_capture(
     noise and second impacts. Raises DatasetError, which names the `origin`, where fewer than two recordings
     remain or they do not fit together, and where contacts and surface count different units.
     """
-    kept: list[tuple[str, np.ndarray, Prepared]] = []
-    reports, remarks = [], list(remarks)
     try:
-        for each in recordings:
-            try:
-                prepared = prepare(each.recording, settings, newtons=each.newtons)
-            except CaptureError as error:
-                remarks.append(f"left out: {error}")
-                continue
-            if recorded:
-                # Clipping shows only before the amplifier's gain is divided out.
-                reports.append(measure(each.recording, prepared, settings=settings, line=len(kept) + 1))
-            gain = 10 ** (-each.gain_db / 20)
-            prepared = replace(prepared, sound=prepared.sound * gain, before=prepared.before * gain)
-            kept.append((each.name, each.contact, shorten(prepared, settings)))
-        remarks += shared_problems(reports)
-        refuse_few(len(kept), origin=origin, reasons=remarks)
-        names, contacts, parts = zip(*kept, strict=True)
-        impacts, warned = build_impacts(
-            parts, torch.from_numpy(np.stack(contacts).astype(np.float64)), names=names, settings=settings
-        )
+        impacts, issues = preprocess(recordings, settings, Issues(collect=True), measured=recorded)
+        remarks = [*remarks, *(f"left out: {error}" for _, _, error in issues.failures)]
+        remarks += shared_problems(issues.reports)
+        refuse_few(len(issues.sounds), origin=origin, reasons=remarks)
+        for error in issues.errors:
+            raise error
     except CaptureError as error:
         raise DatasetError(f"{origin}: {error}", **error.attributes) from error
-    remarks += [str(each) for each in warned] + _repeated(impacts) + _misplaced(impacts, surface, origin=origin)
+    assert impacts is not None
+    remarks += map(str, issues.warnings)
+    remarks += _repeated(impacts) + _misplaced(impacts, surface, origin=origin)
     if remarks:
         message = f"{origin}: {shortened(remarks)}"
         warnings.warn(CaptureWarning(message, name=origin, value=tuple(remarks)), stacklevel=3)

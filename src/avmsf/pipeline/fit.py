@@ -14,8 +14,8 @@ from avmsf._utils.caching import once
 from avmsf._utils.progress import is_live, repeated
 from avmsf._utils.text import counted
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
+from avmsf.capture.checks import find_surface
 from avmsf.capture.settings import settings_of
-from avmsf.capture.together import find_surface
 from avmsf.errors import AvmsfError, FitError, SceneError
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.candidate_bodies import CandidateBodies

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
+from avmsf.capture.checks import NARROWEST, WIDEST
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.table import TABLE, read_cells
-from avmsf.capture.together import NARROWEST, WIDEST
 from avmsf.errors import FitError, SimulationError
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.body_meshes import Shape

@@ -8,13 +8,13 @@ from pathlib import Path
 from PIL import Image
 
 from avmsf._utils.text import counted, listed
+from avmsf.capture.checks import find_surface
 from avmsf.capture.filenames import find_surface_file, pictures_in, unused_files
 from avmsf.capture.folder import Capture
 from avmsf.capture.placement import expect_placed
 from avmsf.capture.proposals import contacts_of
 from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.table import read_rows
-from avmsf.capture.together import find_surface
 from avmsf.errors import AvmsfError, AvmsfWarning, CaptureError, CaptureWarning, FitError, SceneError
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh.surface import surface_points

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from avmsf.capture.audio import Recording
 from avmsf.capture.folder import Capture
-from avmsf.capture.prepare import prepare
-from avmsf.capture.preprocess import build_impacts, shorten
+from avmsf.capture.preprocess import RecordedImpact, preprocess
 from avmsf.capture.settings import CaptureSettings
 from avmsf.fem.damping import Vibration, damped
 from avmsf.fem.elastic_modes import ElasticModes
@@ -252,17 +251,21 @@ def _captured(
         normalize="done",
         align=bool((truth.starts != 0.0).any()),
     )
-    prepared = []
-    for file, force, sound in zip(truth.names, forces.tolist(), recordings, strict=True):
-        recording = Recording(file, sound.double().numpy()[None], rate, "FLOAT")
-        prepared.append(shorten(prepare(recording, settings, newtons=force), settings))
-    impacts, _ = build_impacts(
-        prepared,
-        strikes.written_places,
-        names=truth.names,
-        settings=settings,
-        directions=strikes.written_directions.float(),
+    impacts_recorded = (
+        RecordedImpact(
+            file, Recording(file, sound.double().numpy()[None], rate, "FLOAT"), place, direction, newtons=force
+        )
+        for file, sound, place, direction, force in zip(
+            truth.names,
+            recordings,
+            strikes.written_places.numpy(),
+            strikes.written_directions.numpy(),
+            forces.tolist(),
+            strict=True,
+        )
     )
+    impacts, _ = preprocess(impacts_recorded, settings, measured=False)
+    assert impacts is not None
     return Capture(name, impacts, surface, settings)
 
 

@@ -25,9 +25,9 @@ from avmsf._utils.files import copy_whole, write_whole
 from avmsf._utils.processes import write_lock
 from avmsf._utils.text import counted
 from avmsf.capture.audio import Recording, SoundBytes, decode_recording, read_recording, wav_bytes
+from avmsf.capture.folder import check
 from avmsf.capture.measure import RecordingReport, measure
 from avmsf.capture.prepare import prepare
-from avmsf.capture.preprocess import check
 from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.table import (
     DIRECTION,

@@ -1,0 +1,121 @@
+"""Whether the contacts of a table fit one another and the object's surface, and in which units they would."""
+
+import itertools
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from avmsf.capture.filenames import find_surface_file
+from avmsf.capture.placement import Placement, check_placement
+from avmsf.capture.settings import METRES, CaptureSettings
+from avmsf.capture.table import TABLE, Strike, fitting_units, read_rows, valid_rows
+from avmsf.errors import CaptureError, CaptureWarning
+from avmsf.mesh.surface import Surface, contacted_part, read_surface, surface_points
+
+NARROWEST, WIDEST = 1e-3, 10.0
+"""Meters across below or beyond which contacts are more likely in another unit."""
+USUAL_SIZE = 0.24
+"""Meters across of an object whose impacts are recorded: the median of the 20 simulated objects (.14 to .55)."""
+
+
+def check_contacts(strikes: Sequence[Strike], settings: CaptureSettings) -> list[CaptureWarning]:
+    """Return warnings of repeated contacts, and of contacts that together look like another unit's."""
+    remarks = []
+    places = defaultdict(list)
+    for strike in strikes:
+        # Impacts along other directions are no repetitions.
+        label = (*strike.contact, *(strike.direction or ()))
+        places[tuple(round(value, 6) for value in label)].append(strike.line)
+    repeated = [lines for lines in places.values() if len(lines) > 1]
+    if repeated:
+        shown = "; ".join(", ".join(map(str, lines)) for lines in repeated[:5])
+        more = " and more" * (len(repeated) > 5)
+        message = f"{TABLE}: rows at the same contact: {shown}{more}; used as repeated impacts"
+        remarks.append(CaptureWarning(message, file=TABLE, row=repeated[0][1], value=repeated))
+    across = float(np.linalg.norm(np.ptp([strike.contact for strike in strikes], axis=0))) if strikes else 0.0
+    if across > WIDEST or 0 < across < NARROWEST:
+        size = f"{across:.3g} m apart" if across > WIDEST else f"within {across * 1e3:.2g} mm"
+        message = (
+            f"{TABLE}: the contacts lie {size} (unit = {settings.unit!r}); if that is wrong, "
+            f"{fitting_units(across / settings.meters)}"
+        )
+        remarks.append(CaptureWarning(message, file=TABLE, name="unit", value=across))
+    return remarks
+
+
+def check_surface(
+    strikes: Sequence[Strike], surface: Surface, *, settings: CaptureSettings
+) -> tuple[Surface, list[CaptureWarning]]:
+    """Return the part of a surface that the contacts lie on, and a warning of contacts off it.
+
+    `CaptureError` where surface and contacts are in different units, and where a contact lies farther off than the
+    surface is large.
+    """
+    contacts = torch.tensor([strike.contact for strike in strikes], dtype=torch.float64)
+    surface, areas = contacted_part(surface, contacts)
+    if areas:
+        sizes = " and ".join(f"{1e4 * area:.3g} cm2" for area in areas[1:3])
+        message = f"the contacts lie on a part of {1e4 * areas[0]:.3g} cm2; larger ones ({sizes}) are left out"
+        return surface, [CaptureWarning(message, name="surface", value=areas)]
+    placement = check_placement(contacts, surface_points(surface))
+    if placement.on_surface:
+        return surface, []
+    lines = [f'{key} = "{value}"' for key, value in fitting_units_of(placement, settings).items()]
+    advice = f" If so, write {' and '.join(lines)} in capture.toml" if lines else ""
+    found = placement.describe([f"row {strike.line}" for strike in strikes]) + advice
+    farthest = float(placement.distances.max())
+    if placement.other_unit:
+        message = f"{TABLE}: expected contacts and surface in one unit; {found}"
+        raise CaptureError(message, file=TABLE, name="unit", value=farthest)
+    worst = strikes[int(placement.distances.argmax())].line
+    if farthest > placement.diagonal:
+        got = f"one {farthest:.3g} m off it, more than its extent of {placement.diagonal:.3g} m: {found}"
+        wanted = "a contact on the surface"
+        raise CaptureError.expected(wanted, farthest, got=got, file=TABLE, row=worst, name="surface")
+    return surface, [CaptureWarning(f"{TABLE}: {found}", file=TABLE, row=worst, name="surface", value=farthest)]
+
+
+def expect_one_unit(folder: Path, settings: CaptureSettings) -> None:
+    """Raise `CaptureError` where a folder's surface and the contacts of its table are in different units.
+
+    For callers that read only the surface. Rows, and tables, that cannot be read are skipped.
+    """
+    strikes = list[Strike]()
+    with suppress(CaptureError):
+        strikes += valid_rows(read_rows(folder)[0], settings)
+    surface = find_surface(folder, settings) if strikes else None
+    if surface is not None:
+        check_surface(strikes, surface, settings=settings)
+
+
+def fitting_units_of(placement: Placement, settings: CaptureSettings) -> dict[str, str]:
+    """Return the settings `unit` and `surface_unit` to change so that contacts and surface fit, as far as units do it.
+
+    Where both count one unit, the surface's size says which: the one that gives an object of `NARROWEST` to `WIDEST`,
+    the present one if it does, else the one that comes nearest to `USUAL_SIZE`. Empty where nothing is to change, or
+    no units explain what is wrong.
+    """
+    mistake = placement.mistake
+    if placement.mostly_off if mistake is None else not mistake.unit_only:
+        return {}
+    ratio = settings.meters * (1.0 if mistake is None else mistake.factor) / settings.surface_meters
+    ranked = list[tuple[bool, bool, float, dict[str, str]]]()
+    for unit, surface_unit in itertools.product(METRES, repeat=2):
+        if math.isclose(METRES[unit] / METRES[surface_unit], ratio, rel_tol=1e-6):
+            changes = {} if unit == settings.unit else {"unit": unit}
+            changes |= {} if surface_unit == (settings.surface_unit or unit) else {"surface_unit": surface_unit}
+            size = placement.diagonal * METRES[surface_unit] / settings.surface_meters
+            unusual = not NARROWEST <= size <= WIDEST
+            ranked.append((unusual, bool(changes), abs(math.log(size / USUAL_SIZE)), changes))
+    return min(ranked, key=lambda each: each[:3])[3] if ranked else {}
+
+
+def find_surface(folder: Path, settings: CaptureSettings) -> Surface | None:
+    """Read what `find_surface_file` finds; None where it finds nothing."""
+    path = find_surface_file(folder, settings)
+    return None if path is None else read_surface(path, meters=settings.surface_meters)
