@@ -1,10 +1,11 @@
 """Texts of others are read whole, or refused by `ValueError`, whatever they hold."""
 
+import math
 from pathlib import Path
 
 import pytest
 
-from avmsf._utils.text import MAX_TOML_BYTES, parse_json, read_json, read_text, read_toml
+from avmsf._utils.text import MAX_TOML_BYTES, format_number, parse_json, read_json, read_text, read_toml
 
 
 def test_line_ends_and_marks_do_not_matter(tmp_path: Path) -> None:
@@ -41,3 +42,19 @@ def test_json_and_toml_have_bounded_depth(tmp_path: Path) -> None:
     (tmp_path / "x.toml").write_text("#" * (MAX_TOML_BYTES + 1))
     with pytest.raises(ValueError):
         read_toml(tmp_path / "x.toml")
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (None, "–"),
+        (math.nan, "–"),
+        (0.0, "0"),
+        (0.01234, "0.0123"),
+        (1.53e-4, "1.53e-04"),
+        (8.5, "8.50"),
+        (1234.5, "1234"),
+    ],
+)
+def test_numbers_have_three_significant_digits(value: float | None, words: str) -> None:
+    assert format_number(value) == words

@@ -19,7 +19,7 @@ from avmsf.errors import EvaluationError
 from avmsf.evaluation.published import PUBLISHED, published_ratios
 from avmsf.evaluation.registry import METHODS
 from avmsf.evaluation.report import markdown, write_page, write_summary
-from avmsf.evaluation.report_tables import WARNING, Section, figure, sections
+from avmsf.evaluation.report_tables import WARNING, Section, sections
 from avmsf.evaluation.results import CaseRecord, ObjectRecord, Outcome, ResultsFolder, natural
 from avmsf.evaluation.runner import run_objects
 from avmsf.evaluation.stored_sounds import StoredSound, draw_spectrogram, keep_sound, listening_gain
@@ -167,22 +167,6 @@ def test_the_papers_ratio_is_of_its_own_rows() -> None:
     assert set(published_ratios("non-symmetric")) == {"ObjectFolder Real"}
     assert published_ratios("closest")["RealImpact"]["paper"]["l1"] == pytest.approx(21 / 26)
     assert sum(map(len, PUBLISHED.values())) == 41
-
-
-@pytest.mark.parametrize(
-    ("value", "words"),
-    [
-        (None, "–"),
-        (math.nan, "–"),
-        (0.0, "0"),
-        (0.01234, "0.0123"),
-        (1.53e-4, "1.53e-04"),
-        (8.5, "8.50"),
-        (1234.5, "1234"),
-    ],
-)
-def test_figures_have_three_digits(value: float | None, words: str) -> None:
-    assert figure(value) == words
 
 
 def test_markdown_escapes_what_would_be_markup() -> None:

@@ -6,6 +6,7 @@ each reader gives its own error with the file's name.
 
 import io
 import json
+import math
 import sys
 import tomllib
 from collections.abc import Sequence
@@ -46,6 +47,15 @@ def printable(text: str) -> str:
 def counted(number: int, thing: str) -> str:
     """Return a number with its noun, whose plural ends in s: "1 file", "2 files"."""
     return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
+
+
+def format_number(value: float | None, digits: int = 3) -> str:
+    """Return a number with so many significant digits; a dash for None and for what is not finite."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    if value == 0 or not 1e-3 <= abs(value) < 1e6:
+        return f"{value:.{digits - 1}e}" if value else "0"
+    return f"{value:.{max(0, digits - 1 - math.floor(math.log10(abs(value))))}f}"
 
 
 def listed(names: Sequence[str], *, most: int = 5) -> str:

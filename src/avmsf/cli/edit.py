@@ -12,7 +12,7 @@ from rich.table import Table
 from torch import Tensor
 
 from avmsf._utils.files import write_whole
-from avmsf._utils.text import counted, read_json
+from avmsf._utils.text import counted, format_number, read_json
 from avmsf.capture.settings import METRES
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.contacts import contacts_at, refuse_far
@@ -28,7 +28,7 @@ from avmsf.cli.options.edit import (
     ModeOptions,
     Options,
 )
-from avmsf.cli.printing import console, decimals, figure, next_command, print_json, say, table
+from avmsf.cli.printing import console, decimals, next_command, print_json, say, table
 from avmsf.cli.progress import ProgressBar
 from avmsf.cli.writing import Level, write_sound
 from avmsf.editing.distillation import DecoderDistillation
@@ -114,8 +114,8 @@ def run(options: Options) -> int:
     seconds, ringing = new.samples / new.sample_rate, _longest(after)
     if ringing > max(seconds, _longest(before)):
         screen.print(
-            f"note: the longest T60 is {figure(ringing)} s and rendered sounds last {figure(seconds)} s; render and "
-            f"export with --seconds {math.ceil(10 * ringing) / 10:g}",
+            f"note: the longest T60 is {format_number(ringing)} s and rendered sounds last {format_number(seconds)} s; "
+            f"render and export with --seconds {math.ceil(10 * ringing) / 10:g}",
             soft_wrap=True,
         )
     if options.change.size != 1.0:
@@ -198,7 +198,7 @@ def _guided(options: GuideOptions, field: SoundField, *, output: Path, old: Mate
         def progress(reached: GuidedEditProgress) -> None:
             if curve is not None:
                 curve.add(reached)
-            message = f"loss {figure(reached.loss)}, pitch x {figure(reached.pitch, 4)}"
+            message = f"loss {format_number(reached.loss)}, pitch x {format_number(reached.pitch, 4)}"
             if reached.preview is not None:
                 factor = _PREVIEW.factor(reached.preview[None])
                 write_sound(preview, factor * reached.preview, sample_rate=field.sample_rate, coding="float32")
@@ -364,10 +364,10 @@ def _table(before: ModeLevels, after: ModeLevels) -> Table:
     rows = _rows(before, after)
     cells = [
         [
-            figure(row["frequency_before"], 5),
-            figure(row["frequency_after"], 5),
-            figure(row["t60_before"]),
-            figure(row["t60_after"]),
+            format_number(row["frequency_before"], 5),
+            format_number(row["frequency_after"], 5),
+            format_number(row["t60_before"]),
+            format_number(row["t60_after"]),
             _change(row),
         ]
         for row in (rows[place] for place in listed)

@@ -8,14 +8,14 @@ from typing import Any
 
 import torch
 
-from avmsf._utils.text import counted
+from avmsf._utils.text import counted, format_number
 from avmsf.capture.filenames import find_surface_file
 from avmsf.capture.folder import read_capture
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import METRES, settings_of
 from avmsf.cli.contacts import given_contacts, note_off, refuse_far
 from avmsf.cli.options.export import Options, unused_options
-from avmsf.cli.printing import figure, next_step, print_result, say
+from avmsf.cli.printing import next_step, print_result, say
 from avmsf.editing.modal_edit import EDITS
 from avmsf.errors import ExportError
 from avmsf.export.faust import contacts_path, fitted, write_faust
@@ -51,8 +51,8 @@ def run(options: Options) -> int:
         say(f"note: {remark}")
     if written.error:
         say(
-            f"note: waveforms differ from the field's by up to {figure(100 * written.error, 2)} % of its loudest "
-            f"sample, magnitude spectra by {figure(written.spectrum_error_db, 2)} dB on average"
+            f"note: waveforms differ from the field's by up to {format_number(100 * written.error, 2)} % of its "
+            f"loudest sample, magnitude spectra by {format_number(written.spectrum_error_db, 2)} dB on average"
         )
     largest = max(written.sizes, key=lambda path: written.sizes[path])
     files = f"{len(written.sizes)} files, the largest {largest.name}" if len(written.sizes) > 1 else "one file"

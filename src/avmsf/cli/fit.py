@@ -12,7 +12,7 @@ from rich.console import Console
 
 from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf._utils.files import copy_whole, write_whole
-from avmsf._utils.text import counted
+from avmsf._utils.text import counted, format_number
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.capture.checks import expect_one_unit, find_surface
 from avmsf.capture.table import TABLE, in_folder, parse_row, read_rows
@@ -21,7 +21,7 @@ from avmsf.cli.alignment import describe_alignment
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.checks import OutputError, read_settings
 from avmsf.cli.options.fit import Options
-from avmsf.cli.printing import console, figure, next_command, next_step, print_json, print_result, say, table
+from avmsf.cli.printing import console, next_command, next_step, print_json, print_result, say, table
 from avmsf.cli.progress import ProgressBar
 from avmsf.cli.scores import (
     advice_on_labels,
@@ -105,7 +105,7 @@ def _fit(options: Options, settings: CaptureSettings) -> None:
         say(f"not trained on: {shown}")
     if made.report:
         screen.print(features_words(made.report), soft_wrap=True)
-    rows = [[each.stage, figure(each.seconds), "computed" if each.fresh else "cached"] for each in made.stages]
+    rows = [[each.stage, format_number(each.seconds), "computed" if each.fresh else "cached"] for each in made.stages]
     screen.print(table("stages", ["stage", "seconds", "source"], rows))
     print_fitted(screen, fitted, train, test, scores, path)
     if made.surface is not None:

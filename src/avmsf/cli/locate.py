@@ -12,13 +12,14 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from avmsf._utils.text import format_number
 from avmsf.capture import CaptureSettings
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.settings import METRES
 from avmsf.cli.contacts import Contacts, read_contacts, refuse_far, rows_of
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.locate import RECORDING, Options
-from avmsf.cli.printing import console, figure, next_command, print_json, say
+from avmsf.cli.printing import console, next_command, print_json, say
 from avmsf.errors import AvmsfError, LocationError
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
@@ -197,8 +198,8 @@ def _words(values: dict[str, Any]) -> str:
     chance = f", with {100 * values['position_probability']:.0f} %" if values["multimodal"] else ""
     lines = [
         f"{values['recording']}{when}: impact at ({where}) m{chance}; {100 * region['probability']:g} % within "
-        f"{figure(1000 * region['radius'], 2)} mm, {figure(100 * region['surface_fraction'], 2)} % of the surface; an "
-        f"impact there explains {100 * values['explained_energy']:.0f} % of the sound"
+        f"{format_number(1000 * region['radius'], 2)} mm, {format_number(100 * region['surface_fraction'], 2)} % of "
+        f"the surface; an impact there explains {100 * values['explained_energy']:.0f} % of the sound"
     ]
     if "rmed" in values:
         error, share = 1000 * values["error"], 100 * values["rmed_posterior"]

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf._utils.text import counted
-from avmsf.cli.printing import decimals, figure, table
+from avmsf._utils.text import counted, format_number
+from avmsf.cli.printing import decimals, table
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.quality import ModeQuality
 from avmsf.modal.modes import ModalBank
@@ -102,12 +102,12 @@ def mode_table(title: str, rows: Sequence[ModeRow], quality: Mapping[int, Qualit
     columns += [] if quality is None else ["energy", "phase", "orders", "left out"]
     cells = []
     for row in rows:
-        frequency, damping = decimals(row.frequency_hertz, 2), figure(row.damping_per_second)
-        cell = [str(row.number), frequency, damping, figure(row.t60_seconds), decimals(row.level_db, 1)]
+        frequency, damping = decimals(row.frequency_hertz, 2), format_number(row.damping_per_second)
+        cell = [str(row.number), frequency, damping, format_number(row.t60_seconds), decimals(row.level_db, 1)]
         if quality is not None:
             how = quality[row.number]
-            cell[1] += f" ± {figure(how.frequency_spread_hertz, 2)}"
-            cell[2] += f" ± {figure(how.damping_spread_per_second, 2)}"
+            cell[1] += f" ± {format_number(how.frequency_spread_hertz, 2)}"
+            cell[2] += f" ± {format_number(how.damping_spread_per_second, 2)}"
             cell += [f"{100 * how.energy_share:.2f} %", decimals(how.phase_coherence, 2)]
             cell += [f"{100 * how.stable_orders:.0f} %", f"{100 * how.explained_left_out:.0f} %"]
         cells.append(cell)

@@ -56,16 +56,6 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, 
     return drawn
 
 
-def figure(value: float | None, digits: int = 3) -> str:
-    """Return a number with so many significant digits and no exponent where none is needed; a dash for None."""
-    if value is None or not math.isfinite(value):
-        return "–"
-    if value == 0 or not 1e-4 <= abs(value) < 1e6:
-        return f"{value:.{digits}g}"
-    decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
-    return f"{value:.{decimals}f}"
-
-
 def decimals(value: float | int | None, places: int) -> str:
     """Return a number with so many decimals; a dash for None."""
     return "–" if value is None else f"{value:.{places}f}"

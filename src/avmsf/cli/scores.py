@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from rich.table import Table
 
-from avmsf._utils.text import counted
+from avmsf._utils.text import counted, format_number
 from avmsf.capture import Impacts
 from avmsf.capture.impacts import places_of
 from avmsf.cli.heartbeat import verbosity
-from avmsf.cli.printing import figure, table
+from avmsf.cli.printing import table
 from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor
 from avmsf.evaluation.splits import Scores, evaluate, score
 from avmsf.evaluation.task import Renderer
@@ -102,7 +102,11 @@ def score_table(title: str, scores: Mapping[str, Scores]) -> Table:
         mean, error = each.mean(), each.standard_error()
         first, *others = HEADINGS
         rows.append(
-            [method, f"{figure(mean[first])} ± {figure(error[first], 1)}", *(figure(mean[metric]) for metric in others)]
+            [
+                method,
+                f"{format_number(mean[first])} ± {format_number(error[first], 1)}",
+                *(format_number(mean[metric]) for metric in others),
+            ]
         )
     return table(title, ["", *HEADINGS.values()], rows)
 

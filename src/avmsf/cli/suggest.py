@@ -8,11 +8,11 @@ from typing import Any
 
 from rich.console import Console
 
-from avmsf._utils.text import counted
+from avmsf._utils.text import counted, format_number
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.suggest import PICTURE, TABLE, Options
-from avmsf.cli.printing import console, figure, next_command, print_json, say, table
+from avmsf.cli.printing import console, next_command, print_json, say, table
 from avmsf.cli.writing import write_text
 from avmsf.field.store import load
 from avmsf.field.suggest import Suggestions, suggest
@@ -78,7 +78,7 @@ def run(options: Options) -> int:
 
 def _print_table(found: Suggestions, rows: Sequence[dict[str, Any]], screen: Console) -> None:
     """Print the suggested contacts with their errors, and how many positions were left out."""
-    title = f"where to record next: uncertainty of the gains now {figure(found.before)}"
+    title = f"where to record next: uncertainty of the gains now {format_number(found.before)}"
     headings = {"order": "", "x": "x (m)", "y": "y (m)", "z": "z (m)", "error_after": "after"}
     columns = [headings.get(name, name) for name in rows[0]]
     cells = [[_cell(value) for value in row.values()] for row in rows]

@@ -9,9 +9,10 @@ from jinja2 import Environment, PackageLoader, select_autoescape
 from torch import Tensor
 
 from avmsf._utils.files import write_whole
+from avmsf._utils.text import format_number
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.localization import read_map
-from avmsf.evaluation.report_tables import Section, figure, sections
+from avmsf.evaluation.report_tables import Section, sections
 from avmsf.evaluation.results import ObjectRecord, ResultsFolder, file_word, write_json
 from avmsf.evaluation.splits import spread
 from avmsf.evaluation.stored_sounds import RECORDED, StoredContact, StoredSound, draw_spectrogram, stored_contacts
@@ -114,7 +115,7 @@ def _cards(contact: StoredContact, folder: Path) -> Iterator[_Card]:
     for case, outcome in contact.made:
         row = case.test.index(contact.name)
         scores = [
-            f"{heading} {figure(values[row])}"
+            f"{heading} {format_number(values[row])}"
             for metric, heading in (("l1", "L1"), ("l1_log", "L1-log"), ("relative_stft", "relative STFT"))
             if (values := outcome.values.get(metric)) is not None
         ]

@@ -1,13 +1,12 @@
 """The content of a report: titles, paragraphs and tables of text."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from statistics import fmean
 from typing import Any
 
-from avmsf._utils.text import counted
+from avmsf._utils.text import counted, format_number
 from avmsf.evaluation.published import COMPUTATION, PUBLISHED, published_ratios
 from avmsf.evaluation.registry import BASELINE, METHODS, METRICS, PROTOCOLS, kind_of
 from avmsf.evaluation.results import ObjectRecord
@@ -17,7 +16,7 @@ WARNING = (
     "The paper describes its metrics in words only. The convention used here is inferred from its rows for white "
     "noise. Compare ratios to KNN with the paper's, not absolute values."
 )
-_DASH = "–"
+_DASH = format_number(None)
 
 
 @dataclass(frozen=True)
@@ -50,15 +49,6 @@ def sections(
         if len(report.tables) > 1:
             parts += [report.case_table(metric) for metric in report.shown]
     return [*parts, report.times(), report.failures()]
-
-
-def figure(value: float | None, digits: int = 3) -> str:
-    """Return a number with so many significant digits; a dash for None or NaN."""
-    if value is None or not math.isfinite(value):
-        return _DASH
-    if value == 0 or not 1e-3 <= abs(value) < 1e6:
-        return f"{value:.{digits - 1}e}" if value else "0"
-    return f"{value:.{max(0, digits - 1 - math.floor(math.log10(abs(value))))}f}"
 
 
 @dataclass(frozen=True)
@@ -145,7 +135,7 @@ class _Report:
         ]
         paper = PUBLISHED.get(self.experiment, ())
         rows += [
-            (f"paper: {row.title}", *(figure(row.values.get(metric)) for metric in self.shown), _DASH)
+            (f"paper: {row.title}", *(format_number(row.values.get(metric)) for metric in self.shown), _DASH)
             for row in paper
             if row.label in (None, self.label)
         ]
@@ -167,11 +157,13 @@ class _Report:
     def ratio_table(self) -> Section:
         found, (dataset, protocol) = ratios(self.main), self.experiment
         falling = [metric for metric in self.shown if any(metric in values for values in found.values())]
-        rows = [(method, *(figure(values.get(metric)) for metric in falling)) for method, values in found.items()]
+        rows = [
+            (method, *(format_number(values.get(metric)) for metric in falling)) for method, values in found.items()
+        ]
         for source, methods in published_ratios(protocol).items():
             if self.experiment not in PUBLISHED or dataset.startswith(source):
                 rows += [
-                    (f"paper, {source}: {method}", *(figure(values.get(metric)) for metric in falling))
+                    (f"paper, {source}: {method}", *(format_number(values.get(metric)) for metric in falling))
                     for method, values in methods.items()
                     if method in map(kind_of, found)
                 ]
@@ -194,7 +186,7 @@ class _Report:
         for title in dict.fromkeys(row.title for row in paper):
             own = {row.label: row.values.get(metric) for row in paper if row.title == title}
             if any(own.get(label) is not None for label in found):
-                rows.append((f"paper: {title}", *(figure(own.get(label)) for label in found)))
+                rows.append((f"paper: {title}", *(format_number(own.get(label)) for label in found)))
         return Section(f"{METRICS[metric].heading} by case", (), ("method", *found), tuple(rows))
 
     def times(self) -> Section:
@@ -202,14 +194,16 @@ class _Report:
         for method in self.identity["methods"]:
             found = [each["methods"][method] for each in times if method in each["methods"]]
             if found:
-                rows.append((method, *(figure(fmean(each[name] for each in found)) for name in ("fit", "render"))))
+                rows.append(
+                    (method, *(format_number(fmean(each[name] for each in found)) for name in ("fit", "render")))
+                )
         if times:
-            rows.append(("shared: modes and features", figure(fmean(each["shared"] for each in times)), _DASH))
+            rows.append(("shared: modes and features", format_number(fmean(each["shared"] for each in times)), _DASH))
         words = (
             "Seconds on one thread, mean over objects, sum over a protocol's cases, without the computation of metrics."
         )
         if self.experiment in PUBLISHED:
-            rows += [(f"paper: {title}", *map(figure, seconds)) for title, seconds in COMPUTATION.items()]
+            rows += [(f"paper: {title}", *map(format_number, seconds)) for title, seconds in COMPUTATION.items()]
             words += " Rows that begin with “paper:” are the paper's: one training and one sound on an A5000 GPU."
         return Section("Time per object", (words,), ("method", "fit", "render the test contacts"), tuple(rows))
 
@@ -264,5 +258,5 @@ def _span(counts: Sequence[int]) -> str:
 def _mean(mean: Mean | None) -> str:
     if mean is None:
         return _DASH
-    text = figure(mean.mean)
-    return text if mean.standard_error is None else f"{text} ± {figure(mean.standard_error, 2)}"
+    text = format_number(mean.mean)
+    return text if mean.standard_error is None else f"{text} ± {format_number(mean.standard_error, 2)}"
