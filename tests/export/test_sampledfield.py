@@ -83,7 +83,6 @@ def test_given_points_and_normals_are_kept():
     torch.testing.assert_close(table.normals, normals / 2)
     assert table.name == "plate"
     assert table.per_newton
-    assert table.origin["trained_on"] == ["a.wav"]
 
 
 def test_fewer_points_are_spread_out_and_are_the_fields_own():

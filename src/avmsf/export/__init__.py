@@ -1,4 +1,20 @@
-"""Sound fields for other tools: web page, glTF, Faust, sample sets, UFF, the paper's demo layout."""
+"""Sound fields for other tools.
+
+In goes a `SoundField`, or its table at points of the surface; out come files that other programs read, and notes on
+what their format cannot represent (`Written`). All formats but the web page start from a `SampledField`: frequencies,
+dampings, and a sine and a cosine amplitude of each mode at each point, of which `SampledField.render` is the reference
+that every file is compared with.
+
+- `write_webpage`, `make_bundle`: the studio's page with one field, as a folder or a single file.
+- `write_gltf`: the object and its modes in the draft extension KHR_audio_rigid_bodies.
+- `write_faust`: a bank of resonators as a Faust program.
+- `write_grid`: wav files of chosen contacts and forces, with a table and an SFZ instrument.
+- `write_universal`: nodes, mode shapes and frequency response functions in the universal file format (UFF).
+- `write_demo`: the layout of the paper's web demo.
+
+`avmsf.write` chooses the writer by a file's ending. Files and folders are written atomically, and replaced only with
+`force=True`. Start reading at `sampled_field`, then `one_phase` for formats with real amplitudes only, then any writer.
+"""
 
 import lazy_loader
 

@@ -8,6 +8,7 @@ field's unit.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,9 @@ from avmsf.capture.audio import wav_bytes
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExportError
 from avmsf.export.formats import MAX_POINTS
-from avmsf.export.geometry import ObjectFile, read_object
+from avmsf.export.geometry import read_object
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import Written, no_modes, pack, write_folder
+from avmsf.export.writing import Written, no_modes, pack, write_files, write_folder
 from avmsf.field.positions import points_on_object
 from avmsf.field.sound_field import SoundField
 from avmsf.mesh.surface import Surface
@@ -44,7 +45,7 @@ class Bundle:
 
     def write(self, folder: str | Path, *, force: bool = False) -> Written:
         """Write a folder, atomically. Raises `ExportError` for one that is not empty, unless `force` is set."""
-        sizes = write_folder(Path(folder), lambda path: write_files(self.files, path), dict(self.manifest), force=force)
+        sizes = write_folder(Path(folder), partial(write_files, self.files), dict(self.manifest), force=force)
         return Written(sizes, self.remarks)
 
 
@@ -75,26 +76,32 @@ def make_bundle(
         remarks = (f"{len(sampled):,} of the field's {count:,} contacts are exported, spread evenly",)
     if len(sampled.frequency) == 0 and not mute:
         raise no_modes()
-    shown = read_object(object, sampled.points, meters=meters)
+    shown, other = read_object(object, sampled.points, meters=meters), read_object(surface, sampled.points)
     content, places = pack(_tensors(sampled))
-    tensors = {name: {"file": "field.bin", **place} for name, place in places.items()}
     files = {"field.bin": content}
     if shown.name is not None:
         files[shown.name] = shown.content
-    other = read_object(surface, sampled.points)
     if other.kind == "mesh":
         files[SURFACE] = other.content
     records, sounds = _strikes(strikes, sampled)
-    manifest = _manifest(sampled, tensors, shown, records)
-    manifest["surface"] = {"kind": "mesh", "file": SURFACE} if SURFACE in files else None
+    manifest = {
+        "format": FORMAT,
+        "package": version("avmsf"),
+        "name": sampled.name,
+        "sampleRate": sampled.sample_rate,
+        "samples": sampled.samples,
+        "perNewton": sampled.per_newton,
+        "modes": len(sampled.frequency),
+        "supporting": list(sampled.supporting),
+        "points": len(sampled),
+        "damping": "shared" if sampled.shared_damping else "perContact",
+        "tensors": {name: {"file": "field.bin", **place} for name, place in places.items()},
+        "object": {"kind": shown.kind, "file": shown.name},
+        "strikes": records,
+        "live": None,
+        "surface": {"kind": "mesh", "file": SURFACE} if SURFACE in files else None,
+    }
     return Bundle(manifest, {**files, **sounds}, remarks + shown.remarks + other.remarks)
-
-
-def write_files(files: Mapping[str, bytes], folder: Path) -> None:
-    """Write each file under its relative path."""
-    for name, content in files.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(content)
 
 
 def _tensors(field: SampledField) -> dict[str, Shaped[np.ndarray, "..."]]:
@@ -116,37 +123,9 @@ def _strikes(strikes: Impacts | None, field: SampledField) -> tuple[list[dict[st
     if strikes.sample_rate != field.sample_rate:
         wanted, advice = f"the field's {field.sample_rate:g} Hz", "name the capture that the field was fitted to"
         raise ExportError.expected(wanted, strikes.sample_rate, name="strikes", advice=advice)
-    records, files = [], {}
-    for row, name in enumerate(strikes.names):
-        path = f"strikes/{row + 1:03d}.wav"
-        files[path] = wav_bytes(strikes.sounds[row].numpy(), round(field.sample_rate))
-        records.append(
-            {
-                "name": name,
-                "contact": strikes.contacts[row].tolist(),
-                "direction": None if strikes.directions is None else strikes.directions[row].tolist(),
-                "sound": path,
-            }
-        )
-    return records, files
-
-
-def _manifest(
-    field: SampledField, tensors: dict[str, Any], shown: ObjectFile, strikes: list[dict[str, Any]]
-) -> dict[str, Any]:
-    return {
-        "format": FORMAT,
-        "package": version("avmsf"),
-        "name": field.name,
-        "sampleRate": field.sample_rate,
-        "samples": field.samples,
-        "perNewton": field.per_newton,
-        "modes": len(field.frequency),
-        "supporting": list(field.supporting),
-        "points": len(field),
-        "damping": "shared" if field.shared_damping else "perContact",
-        "tensors": tensors,
-        "object": {"kind": shown.kind, "file": shown.name},
-        "strikes": strikes,
-        "live": None,
-    }
+    paths = [f"strikes/{row + 1:03d}.wav" for row in range(len(strikes.names))]
+    directions = [None] * len(paths) if strikes.directions is None else strikes.directions.tolist()
+    values = zip(strikes.names, strikes.contacts.tolist(), directions, paths, strict=True)
+    records = [dict(zip(("name", "contact", "direction", "sound"), each, strict=True)) for each in values]
+    rate = round(field.sample_rate)
+    return records, {path: wav_bytes(sound.numpy(), rate) for path, sound in zip(paths, strikes.sounds, strict=True)}

@@ -16,7 +16,7 @@ from avmsf.export.formats import FAUST_SUFFIXES
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.writing import Written, check_free, check_suffix, generator, write_file
 
-_FEWEST = 16
+_MIN_POINTS = 16
 """Number of points below which the noise is left out so that more points fit."""
 _ROW = 8
 """Numbers in one line."""
@@ -44,9 +44,12 @@ def write_faust(field: SampledField, path: str | Path, *, noise: bool = True, fo
         remarks.append("the noise restarts with every impact")
     elif field.noise.any():
         remarks.append("the residual noise is left out")
-    table, contacts = contacts_path(path), _contacts(field).encode()
+    rows = (
+        ",".join([str(row), *(f"{value:.9g}" for value in point)]) for row, point in enumerate(field.points.tolist())
+    )
+    table, contacts = contacts_path(path), "\n".join(["contact,x,y,z", *rows, ""])
     check_free(table, force=force)
-    sizes = write_file(path, text.encode(), force=force) | write_file(table, contacts, force=force)
+    sizes = write_file(path, text.encode(), force=force) | write_file(table, contacts.encode(), force=force)
     return Written(sizes, tuple(remarks))
 
 
@@ -55,28 +58,17 @@ def contacts_path(path: Path) -> Path:
     return path.with_suffix(".contacts.csv")
 
 
-def _contacts(field: SampledField) -> str:
-    rows = (
-        ",".join([str(row), *(f"{value:.9g}" for value in point)]) for row, point in enumerate(field.points.tolist())
-    )
-    return "\n".join(["contact,x,y,z", *rows, ""])
-
-
 def fitted(field: SampledField, *, noise: bool = True) -> tuple[SampledField, bool]:
     """Return the field at as many points as Faust compiles in reasonable time, and whether the noise is included.
 
     The noise is left out if it is so long that few points would fit.
     """
-    sounding = noise and bool(field.noise.any())
-    if sounding and _fitting(field, noise=True) < min(_FEWEST, len(field)):
-        sounding = False
-    most = max(1, _fitting(field, noise=sounding))
-    return (field if len(field) <= most else field.take(field.spread(most))), sounding
-
-
-def _fitting(field: SampledField, *, noise: bool) -> int:
-    """Return how many points fit into `MAX_NUMBERS`."""
-    return (MAX_NUMBERS - noise * field.samples) // max(1, _numbers_at_a_point(field))
+    at_a_point = max(1, _numbers_at_a_point(field))
+    most = (MAX_NUMBERS - field.samples) // at_a_point
+    with_noise = noise and bool(field.noise.any()) and most >= min(_MIN_POINTS, len(field))
+    if not with_noise:
+        most = MAX_NUMBERS // at_a_point
+    return (field if len(field) <= most else field.take(field.spread(max(1, most)))), with_noise
 
 
 def _numbers_at_a_point(field: SampledField) -> int:
@@ -92,13 +84,10 @@ def faust_library(field: SampledField, *, noise: bool) -> str:
     numbers = points * _numbers_at_a_point(field) + noise * field.samples
     if numbers > MAX_NUMBERS:
         samples = f", {field.samples} samples of noise" if noise else ""
-        raise ExportError.expected(
-            f"at most {MAX_NUMBERS}, which Faust compiles in seconds",
-            numbers,
-            got=f"{numbers} ({points} points, {modes} modes{samples})",
-            name="numbers",
-            advice="ask for fewer points, or leave the noise out",
-        )
+        wanted = f"at most {MAX_NUMBERS}, which Faust compiles in seconds"
+        got = f"{numbers} ({points} points, {modes} modes{samples})"
+        advice = "ask for fewer points, or leave the noise out"
+        raise ExportError.expected(wanted, numbers, got=got, name="numbers", advice=advice)
     name = re.sub(r'["\\\x00-\x1f]', "", field.name) or "object"
     parts = [
         f"// {name}: {modes} modes at {points} points, as exported by {generator()}",

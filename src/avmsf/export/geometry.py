@@ -27,6 +27,8 @@ MAX_FACES = 200_000
 """Triangles that a browser displays and picks quickly; larger meshes are reduced."""
 _MAX_SIZE_RATIO = 3.0
 """Ratio of the sizes of object and field above which their units differ."""
+_SURFACE = "the surface"
+"""What messages call an object that was not read from a file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,19 +53,33 @@ def read_object(
     """
     if source is None:
         return ObjectFile("points")
+    path = None if isinstance(source, Surface) else source
     if isinstance(source, Surface):
         mesh = trimesh.Trimesh(source.vertices.numpy(), source.faces.numpy(), process=False)
-        return _shown(trimesh.Scene([mesh]), points, None, most)
-    check_readable(source)
-    if source.suffix.lower() == ".ply" and holds_gaussians(source):
-        check_fits(read_splats(source).centers.numpy(), points, source)
-        return ObjectFile("gaussians", "object.ply", source.read_bytes())
-    scene = load_mesh(source, raising=ExportError)
-    scene.apply_scale(meters)  # type: ignore[no-untyped-call]
-    return _shown(scene, points, source, most)
+        scene = trimesh.Scene([mesh])
+    else:
+        _check_readable(source)
+        if source.suffix.lower() == ".ply" and holds_gaussians(source):
+            _check_fits(read_splats(source).centers.numpy(), points, source)
+            return ObjectFile("gaussians", "object.ply", source.read_bytes())
+        scene = load_mesh(source, raising=ExportError)
+        scene.apply_scale(meters)  # type: ignore[no-untyped-call]
+    meshes = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    if not meshes:
+        return ObjectFile("points", remarks=(f"{path or _SURFACE} has no triangles: the field's points are shown",))
+    _check_fits(np.concatenate([np.asarray(mesh.vertices, dtype=np.float64) for mesh in meshes]), points, path)
+    remarks: tuple[str, ...] = ()
+    faces = sum(len(mesh.faces) for mesh in meshes)
+    if faces > most:
+        scene = trimesh.Scene([_reduced(mesh, most / faces) for mesh in meshes])
+        left = sum(len(mesh.faces) for mesh in scene.geometry.values())
+        remarks = (f"{_too_fine(path, faces, left)}, without its textures",)
+    content = scene.export(file_type="glb")  # type: ignore[no-untyped-call]
+    assert isinstance(content, bytes)
+    return ObjectFile("mesh", "object.glb", content, remarks)
 
 
-def check_readable(path: Path) -> None:
+def _check_readable(path: Path) -> None:
     """Raise `ExportError` where there is no such file, or one too large to be read: `load_mesh` bounds meshes alone."""
     if not path.is_file():
         raise ExportError.expected("a mesh or a .ply of Gaussians", file=path, advice="check the name")
@@ -80,29 +96,11 @@ def holds_gaussians(path: Path) -> bool:
     return b"scale_0" in header and b"rot_0" in header
 
 
-def _shown(scene: trimesh.Scene, points: Float[Tensor, "points 3"], path: Path | None, most: int) -> ObjectFile:
-    what = path or "the surface"
-    meshes = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-    faces = sum(len(mesh.faces) for mesh in meshes)
-    if not meshes:
-        return ObjectFile("points", remarks=(f"{what} has no triangles: the field's points are shown",))
-    places = np.concatenate([np.asarray(mesh.vertices, dtype=np.float64) for mesh in meshes])
-    check_fits(places, points, path)
-    if faces <= most:
-        return ObjectFile("mesh", "object.glb", _as_glb(scene))
-    smaller = trimesh.Scene([reduced(mesh, most / faces) for mesh in meshes])
-    left = sum(len(mesh.faces) for mesh in smaller.geometry.values())
-    remark = f"{what} has {faces:,} triangles, too many for a browser: {left:,} are shown, without its textures"
-    return ObjectFile("mesh", "object.glb", _as_glb(smaller), (remark,))
+def _too_fine(path: Path | None, faces: int, left: int) -> str:
+    return f"{path or _SURFACE} has {faces:,} triangles, too many for a browser: {left:,} are shown"
 
 
-def _as_glb(scene: trimesh.Scene) -> bytes:
-    content = scene.export(file_type="glb")  # type: ignore[no-untyped-call]
-    assert isinstance(content, bytes)
-    return content
-
-
-def reduced(mesh: trimesh.Trimesh, share: float) -> trimesh.Trimesh:
+def _reduced(mesh: trimesh.Trimesh, share: float) -> trimesh.Trimesh:
     """Return a mesh of such a share of the triangles, with vertex colors but no textures."""
     # Faces without shared corners cannot be merged, and many files have no others.
     merged = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
@@ -118,30 +116,21 @@ def reduced(mesh: trimesh.Trimesh, share: float) -> trimesh.Trimesh:
     return small
 
 
-def check_fits(places: Float[np.ndarray, "places 3"], points: Float[Tensor, "points 3"], path: Path | None) -> None:
+def _check_fits(places: Float[np.ndarray, "places 3"], points: Float[Tensor, "points 3"], path: Path | None) -> None:
     """Raise `ExportError` for an object, read from `path`, of another size or position than the field."""
-    own = points.double().numpy()
+    own, file = points.double().numpy(), path or _SURFACE
     size, expected = np.ptp(places, axis=0), np.ptp(own, axis=0)
-    ratio = float(np.linalg.norm(size) / max(float(np.linalg.norm(expected)), 1e-12))
+    length = float(np.linalg.norm(expected))
+    ratio = float(np.linalg.norm(size) / max(length, 1e-12))
     apart = float(np.linalg.norm(places.min(axis=0) + size / 2 - own.min(axis=0) - expected / 2))
     if not 1 / _MAX_SIZE_RATIO < ratio < _MAX_SIZE_RATIO:
-        raise ExportError.expected(
-            f"an object of the field's size, {np.linalg.norm(expected):.3g} m",
-            ratio,
-            got=f"{ratio:.4g} times this",
-            file=path or "the surface",
-            name="size",
-            advice="give the unit of its coordinates, or name the field's object",
-        )
-    if apart > float(np.linalg.norm(expected)):
-        raise ExportError.expected(
-            "the object at the field's points",
-            apart,
-            got=f"its center {apart:.3g} m away",
-            file=path or "the surface",
-            name="center",
-            advice="name a file in the frame of the capture",
-        )
+        wanted, got = f"an object of the field's size, {length:.3g} m", f"{ratio:.4g} times this"
+        advice = "give the unit of its coordinates, or name the field's object"
+        raise ExportError.expected(wanted, ratio, got=got, file=file, name="size", advice=advice)
+    if apart > length:
+        wanted, got = "the object at the field's points", f"its center {apart:.3g} m away"
+        advice = "name a file in the frame of the capture"
+        raise ExportError.expected(wanted, apart, got=got, file=file, name="center", advice=advice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,22 +181,22 @@ def read_display_geometry(
     if isinstance(source, Surface):
         path, mesh = None, TexturedMesh.build(source.vertices, source.faces)
     else:
-        check_readable(source)
+        _check_readable(source)
         path, mesh = source, read_textured_mesh(source, meters=meters)
-    check_fits(mesh.vertices.double().numpy(), sampled.points, path)
+    _check_fits(mesh.vertices.double().numpy(), sampled.points, path)
     faces = len(mesh.faces)
     if faces <= MAX_FACES:
         return DisplayGeometry.of_mesh(mesh), ()
     corners = mesh.vertices[mesh.faces].reshape(-1, 3).numpy()
     painted = (255.0 * _corner_colors(mesh)).round().byte().reshape(-1, 3).numpy()
     solid = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), vertex_colors=painted, process=False)
-    small = reduced(solid, MAX_FACES / faces)
+    small = _reduced(solid, MAX_FACES / faces)
     assert isinstance(small.visual, ColorVisuals)
     corner_rows = torch.from_numpy(np.array(small.faces, dtype=np.int64))
     shown = torch.from_numpy(np.array(small.visual.vertex_colors[:, :3], dtype=np.float32)) / 255.0
     vertices = torch.from_numpy(np.array(small.vertices)).float()
-    remark = f"{path or 'the surface'} has {faces:,} triangles, too many for a browser: {len(corner_rows):,} are shown"
-    return DisplayGeometry.of_mesh(TexturedMesh.build(vertices, corner_rows, colors=shown[corner_rows])), (remark,)
+    geometry = DisplayGeometry.of_mesh(TexturedMesh.build(vertices, corner_rows, colors=shown[corner_rows]))
+    return geometry, (_too_fine(path, faces, len(corner_rows)),)
 
 
 def _corner_colors(mesh: TexturedMesh) -> Float[Tensor, "faces 3 3"]:

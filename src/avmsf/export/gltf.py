@@ -58,10 +58,9 @@ def write_gltf(
     damping = shared_dampings(sampled)
     order = importance(sampled, damping)
     gains = signed_amplitudes(sampled)
-    content = _glb(_document(sampled, geometry or DisplayGeometry.of_points(sampled), up, order, gains, damping))
-    sizes = write_file(path, content, force=force)
-    error = approximation_error(sampled, sine=gains, cosine=None, damping=damping)
-    return Written(sizes, _remarks(sampled), error.waveform, error.spectrum_db)
+    document, arrays = _document(sampled, geometry or DisplayGeometry.of_points(sampled), up, order, gains, damping)
+    sizes = write_file(path, _glb(document, arrays), force=force)
+    return Written(sizes, _remarks(sampled), *approximation_error(sampled, sine=gains, damping=damping))
 
 
 @dataclass
@@ -124,20 +123,14 @@ def _document(
         primitive["indices"] = buffer.add(geometry.faces.reshape(-1).numpy(), target=_INDICES)
     shade = 1.0 if geometry.colors is not None else float(_linear(torch.tensor(_GRAY)))
     surface = {"baseColorFactor": [shade] * 3 + [1.0], "metallicFactor": 0.0, "roughnessFactor": 0.6}
+    sounds = {"modalModel": 0}
     document = {
         "asset": {"version": "2.0", "generator": generator()},
         "extensionsUsed": [EXTENSION],
         "extensions": {EXTENSION: {"modalModels": [model]}},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [
-            {
-                "name": model["name"],
-                "mesh": 0,
-                "rotation": list(_TURNS[up]),
-                "extensions": {EXTENSION: {"modalModel": 0}},
-            }
-        ],
+        "nodes": [{"name": model["name"], "mesh": 0, "rotation": list(_TURNS[up]), "extensions": {EXTENSION: sounds}}],
         "meshes": [{"name": model["name"], "primitives": [primitive]}],
         "materials": [{"pbrMetallicRoughness": surface, "doubleSided": True}],
         "accessors": buffer.accessors,
@@ -166,11 +159,11 @@ def _extras(sampled: SampledField, order: Int[Tensor, " modes"], buffer: _Buffer
     return {"avmsf": extras}
 
 
-def _glb(document: tuple[Mapping[str, Any], bytes]) -> bytes:
+def _glb(document: Mapping[str, Any], content: bytes) -> bytes:
     """Return the container: a header and two chunks, padded to multiples of four bytes."""
-    text = json.dumps(document[0], separators=(",", ":"), allow_nan=False).encode()
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
-    content = document[1] + b"\0" * (-len(document[1]) % 4)
+    content += b"\0" * (-len(content) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(content), b"BIN\0") + content
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 

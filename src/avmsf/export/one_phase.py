@@ -1,7 +1,6 @@
 """Real signed amplitudes, for formats in which all modes have one phase."""
 
 import math
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float32, Float64, Int
@@ -18,16 +17,6 @@ _WINDOW_SECONDS = 0.04
 """Window of the short-time spectra, seconds: about the temporal resolution of hearing."""
 _MIN_MAGNITUDE_RATIO = 1e-3
 """Magnitude relative to the largest below which spectra are not compared: -60 dB."""
-
-
-@dataclass(frozen=True)
-class ApproximationError:
-    """Difference between an export's sounds and the field's, at a few points."""
-
-    waveform: float
-    """Largest difference of samples, relative to the largest sample."""
-    spectrum_db: float
-    """Mean difference of short-time magnitude spectra, dB, weighted by the field's energy."""
 
 
 def signed_amplitudes(field: SampledField) -> Float32[Tensor, "points modes"]:
@@ -55,11 +44,15 @@ def shared_dampings(field: SampledField) -> Float64[Tensor, " modes"]:
 def approximation_error(
     field: SampledField,
     *,
-    sine: Float32[Tensor, "points modes"] | None,
-    cosine: Float32[Tensor, "points modes"] | None,
+    sine: Float32[Tensor, "points modes"] | None = None,
+    cosine: Float32[Tensor, "points modes"] | None = None,
     damping: Float64[Tensor, "*points modes"],
-) -> ApproximationError:
-    """Return the difference between these modes, without noise, and the field at a few points."""
+) -> tuple[float, float]:
+    """Return how far these modes, without noise, are from the field at a few points.
+
+    The largest difference of samples, relative to the largest sample; and the mean difference of short-time magnitude
+    spectra, dB, weighted by the field's energy.
+    """
     rows = field.spread(_COMPARED_POINTS)
     zero = torch.zeros(len(rows), len(field.frequency))
     rendered = synthesize(
@@ -71,29 +64,17 @@ def approximation_error(
         quadrature=zero if cosine is None else cosine[rows],
     )
     reference = field.render(rows)
-    return ApproximationError(
-        _relative(rendered, reference), _spectrum_difference_db(rendered, reference, field.sample_rate)
-    )
+    peak = float(reference.abs().max())
+    if peak == 0:
+        return 0.0, 0.0
+    size = max(4, 2 ** round(math.log2(_WINDOW_SECONDS * field.sample_rate)))
+    found, expected = (magnitude_stft(each, fft_size=size, hop=size // 4) for each in (rendered, reference))
+    floor, energy = _MIN_MAGNITUDE_RATIO * float(expected.max()), expected.square()
+    difference = 20.0 * torch.log10((found + floor) / (expected + floor)).abs()
+    return float((rendered - reference).abs().max()) / peak, float((energy * difference).sum() / energy.sum())
 
 
 def importance(field: SampledField, damping: Float64[Tensor, " modes"]) -> Int[Tensor, " modes"]:
     """Return the modes' rows, sorted by descending energy over all contacts."""
     energy = (field.sine.double().square() + field.cosine.double().square()).sum(0) / damping
     return torch.argsort(energy, descending=True, stable=True)
-
-
-def _relative(rendered: Tensor, reference: Tensor) -> float:
-    peak = float(reference.abs().max())
-    return float((rendered - reference).abs().max()) / peak if peak > 0 else 0.0
-
-
-def _spectrum_difference_db(
-    rendered: Float32[Tensor, "contacts samples"], reference: Float32[Tensor, "contacts samples"], sample_rate: float
-) -> float:
-    size = max(4, 2 ** round(math.log2(_WINDOW_SECONDS * sample_rate)))
-    found, expected = (magnitude_stft(each, fft_size=size, hop=size // 4) for each in (rendered, reference))
-    floor, energy = _MIN_MAGNITUDE_RATIO * float(expected.max()), expected.square()
-    if floor == 0:
-        return 0.0
-    apart = 20.0 * torch.log10((found + floor) / (expected + floor)).abs()
-    return float((energy * apart).sum() / energy.sum())

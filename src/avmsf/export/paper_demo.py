@@ -8,7 +8,6 @@ float32, dampings [M] or [N, M] in 1/s. The demo's player starts every mode as a
 
 import json
 import shutil
-from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -43,8 +42,11 @@ def write_demo(
     variants of the same Gaussians stay in the folder. Raises `ExportError`, also where it holds variants of others, and
     without a `cloud` `SceneError` for fewer than four points.
     """
-    folder = Path(folder)
-    shown = _discs(field) if cloud is None else cloud
+    folder, shown = Path(folder), cloud
+    if shown is None:
+        # A flat gray Gaussian at each point, tangent to the surface, as wide as the distance between points.
+        start = StartPoints(field.points, torch.full_like(field.points, 0.7), field.normals)
+        shown = starting_cloud(start, degree=0, scale=0.6, opacity=0.95, flatness=0.1)
     if len(shown) != len(field):
         wanted, advice = f"one for each of {len(field)} points", "sample the field at the Gaussians' centers"
         raise ExportError.expected(wanted, len(shown), name="cloud", advice=advice)
@@ -52,9 +54,10 @@ def write_demo(
         raise ExportError.expected("a name that a folder can have", variant, name="variant", advice="use letters")
     gains = _gains(field, precision)
     picking, places = _picking(field, shown)
-    modal, tensors = _modal(field, gains)
+    frequency, damping = (array.numpy().astype("<f4") for array in (field.frequency, field.damping))
+    modal, tensors = pack({"frequencies": frequency, "gains": gains, "dampings": damping})
     others = sorted({path.parent.name for path in folder.glob(f"*/{MODAL}")} - {variant})
-    if others and _content(folder / PICKING) != picking:
+    if others and not ((folder / PICKING).is_file() and (folder / PICKING).read_bytes() == picking):
         wanted = "a free name, or variants of the same Gaussians,"
         raise ExportError.expected(wanted, others, file=folder, advice="choose another folder")
 
@@ -63,9 +66,15 @@ def write_demo(
         write_splats(shown, place / SCENE)
         (place / variant).mkdir()
         (place / variant / MODAL).write_bytes(modal)
-        sound = {"generator": generator(), "file": MODAL, "modes": len(field.frequency)}
-        sound |= {"duration": field.samples / field.sample_rate, "sampleRate": field.sample_rate}
-        sound |= {"phase": "cosine", "arrays": tensors}
+        sound = {
+            "generator": generator(),
+            "file": MODAL,
+            "modes": len(field.frequency),
+            "duration": field.samples / field.sample_rate,
+            "sampleRate": field.sample_rate,
+            "phase": "cosine",
+            "arrays": tensors,
+        }
         (place / variant / MANIFEST).write_text(json.dumps(sound, indent=1) + "\n")
         for other in others:
             shutil.copytree(folder / other, place / other)
@@ -73,14 +82,12 @@ def write_demo(
     manifest = {"name": field.name, "count": len(field), "file": PICKING, "arrays": places, "scene": SCENE}
     sizes = write_folder(folder, fill, {**manifest, "variants": sorted([variant, *others])}, force=force)
     written = torch.from_numpy(gains.astype(np.float32))
-    error = approximation_error(field, sine=None, cosine=written, damping=field.damping)
-    return Written(sizes, tuple(_remarks(field, others)), error.waveform, error.spectrum_db)
-
-
-def _discs(field: SampledField) -> GaussianCloud:
-    """Return a flat gray Gaussian at each point, tangent to the surface, as wide as the distance between points."""
-    start = StartPoints(field.points, torch.full_like(field.points, 0.7), field.normals)
-    return starting_cloud(start, degree=0, scale=0.6, opacity=0.95, flatness=0.1)
+    remarks = ["every mode starts as a cosine in the demo, with the field's level"]
+    if field.noise.any():
+        remarks.append("the residual noise is left out, since the demo has none")
+    if others:
+        remarks.append(f"the folder's other variants are unchanged: {', '.join(others)}")
+    return Written(sizes, tuple(remarks), *approximation_error(field, cosine=written, damping=field.damping))
 
 
 def _gains(field: SampledField, precision: Precision) -> Float[np.ndarray, "points modes"]:
@@ -104,27 +111,3 @@ def _picking(field: SampledField, shown: GaussianCloud) -> tuple[bytes, dict[str
         "opacities": shown.opacities,
     }
     return pack({name: array.numpy().astype("<f4") for name, array in arrays.items()})
-
-
-def _modal(field: SampledField, gains: Float[np.ndarray, "points modes"]) -> tuple[bytes, dict[str, dict[str, Any]]]:
-    """Return the content of `modal.bin`, and where its arrays are."""
-    frequency, damping = (array.numpy().astype("<f4") for array in (field.frequency, field.damping))
-    return pack({"frequencies": frequency, "gains": gains, "dampings": damping})
-
-
-def _remarks(field: SampledField, others: Collection[str]) -> list[str]:
-    """Return notes on the sound, and on the folder's other variants."""
-    remarks = ["every mode starts as a cosine in the demo, with the field's level"]
-    if field.noise.any():
-        remarks.append("the residual noise is left out, since the demo has none")
-    if others:
-        remarks.append(f"the folder's other variants are unchanged: {', '.join(others)}")
-    return remarks
-
-
-def _content(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise ExportError.expected("a readable file", reason, file=path, advice="choose another folder") from error

@@ -1,7 +1,6 @@
 """A sound field sampled at points of the surface: all that other programs need to synthesize impacts there."""
 
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -55,8 +54,6 @@ class SampledField:
     """Whether forces are in newtons; otherwise force 1 is that of an average recorded impact."""
     name: str = ""
     """Name of the object."""
-    origin: dict[str, Any] = field(default_factory=dict)
-    """Provenance of the field, as plain values."""
     supporting: tuple[int, ...] = ()
     """Columns of the modes' tensors that are supporting poles, see `SoundField.is_mode`."""
 
@@ -102,7 +99,6 @@ class SampledField:
             cosines.append((mean * ahead + quadrature * along)[:, audible].float())
         damping = sound_field.bank.damping[audible]
         factors = [part.damping[:, audible] for part in known if part.damping is not None]
-        origin = sound_field.origin
         return cls(
             places.detach(),
             torch.nn.functional.normalize(normals.float(), dim=1),
@@ -112,13 +108,8 @@ class SampledField:
             torch.cat(cosines),
             sound_field.noise().float(),
             sound_field.sample_rate,
-            origin.per_newton,
-            origin.capture,
-            {
-                "capture": origin.capture,
-                "trained_on": list(origin.trained_on),
-                "gain_field": sound_field.gain_field.kind,
-            },
+            sound_field.origin.per_newton,
+            sound_field.origin.capture,
             supporting_columns(sound_field),
         )
 
@@ -241,46 +232,31 @@ def outward_normals(points: Float[Tensor, "points 3"]) -> Float32[Tensor, "point
     """
     places = points.detach().double().cpu().numpy()
     if len(places) <= _NEIGHBORS:
-        return torch.from_numpy(_away(places)).float()
+        offsets = places - places.mean(axis=0)
+        length = np.linalg.norm(offsets, axis=1, keepdims=True)
+        away = np.where(length > 0, offsets / np.maximum(length, np.finfo(float).tiny), [0.0, 0.0, 1.0])
+        return torch.from_numpy(away).float()
     normals = read_neighborhoods(places, count=_NEIGHBORS).normals
     _, rows = cKDTree(places).query(places, k=_NEIGHBORS + 1)
     tails, heads = np.repeat(np.arange(len(places)), _NEIGHBORS), rows[:, 1:].reshape(-1)
     # Not zero for equal normals: a sparse graph has no edges of weight zero.
     bend = 1.0 - np.abs(np.einsum("nd,nd->n", normals[tails], normals[heads])) + 1e-9
-    edges = (np.minimum(tails, heads), np.maximum(tails, heads))
-    _, first = np.unique(np.stack(edges, axis=1), axis=0, return_index=True)
-    tree = minimum_spanning_tree(
-        coo_matrix((bend[first], (edges[0][first], edges[1][first])), shape=(len(places),) * 2).tocsr()
-    )
+    edges = np.stack([np.minimum(tails, heads), np.maximum(tails, heads)], axis=1)
+    edges, first = np.unique(edges, axis=0, return_index=True)
+    tree = minimum_spanning_tree(coo_matrix((bend[first], edges.T), shape=(len(places),) * 2).tocsr())
     count, part = connected_components(tree, directed=False)
-    views = _sphere(_VIEWS)
+    # Evenly distributed directions: a Fibonacci spiral on the sphere.
+    height = 1 - (2 * np.arange(_VIEWS) + 1) / _VIEWS
+    turn = np.pi * (3 - np.sqrt(5)) * np.arange(_VIEWS)
+    across = np.sqrt(1 - height**2)
+    views = np.stack([across * np.cos(turn), across * np.sin(turn), height], axis=1)
     for number in range(count):
         members = np.flatnonzero(part == number)
-        normals[members] = _propagated(tree, normals, int(members[0]))[members]
+        order, parents = breadth_first_order(tree, members[0], directed=False)
+        for row in order[1:]:
+            if normals[row] @ normals[parents[row]] < 0:
+                normals[row] *= -1.0
         outermost = members[np.argmax(places[members] @ views.T, axis=0)]
         if np.einsum("vd,vd->", normals[outermost], views) < 0:
             normals[members] *= -1.0
     return torch.from_numpy(normals).float()
-
-
-def _propagated(tree: object, normals: Float[np.ndarray, "points 3"], start: int) -> Float[np.ndarray, "points 3"]:
-    rotated = normals.copy()
-    order, parents = breadth_first_order(tree, start, directed=False)
-    for row in order[1:]:
-        if rotated[row] @ rotated[parents[row]] < 0:
-            rotated[row] *= -1.0
-    return rotated
-
-
-def _away(places: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
-    offsets = places - places.mean(axis=0)
-    length = np.linalg.norm(offsets, axis=1, keepdims=True)
-    return np.where(length > 0, offsets / np.maximum(length, np.finfo(float).tiny), [0.0, 0.0, 1.0])
-
-
-def _sphere(count: int) -> Float[np.ndarray, "views 3"]:
-    """Return evenly distributed directions: a Fibonacci spiral on the sphere."""
-    height = 1 - (2 * np.arange(count) + 1) / count
-    turn = np.pi * (3 - np.sqrt(5)) * np.arange(count)
-    across = np.sqrt(1 - height**2)
-    return np.stack([across * np.cos(turn), across * np.sin(turn), height], axis=1)

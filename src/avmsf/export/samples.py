@@ -3,8 +3,9 @@
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,14 +16,15 @@ from torch import Tensor
 from avmsf.capture.audio import wav_bytes
 from avmsf.errors import ExportError
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import Written, write_folder
+from avmsf.export.writing import Written, write_files, write_folder
 from avmsf.modal.config import PulseShape
 from avmsf.modal.modes import ForcePulse
 
 TABLE, INSTRUMENT, SOUNDS = "samples.csv", "instrument.sfz", "sounds"
-_WHERE = ("x", "y", "z", "nx", "ny", "nz")
-_HOW = ("force", "contact_time", "midi_note", "velocity_low", "velocity_high")
-COLUMNS = ("file", *_WHERE, *_HOW, "seconds", "peak_db", "contact")
+COLUMNS = (
+    *("file", "x", "y", "z", "nx", "ny", "nz", "force", "contact_time", "midi_note", "velocity_low", "velocity_high"),
+    *("seconds", "peak_db", "contact"),
+)
 HIGHEST_NOTE = 127
 LOWEST_NOTE = 36
 """MIDI note of the first contact: C2, where drum maps begin."""
@@ -82,60 +84,47 @@ def write_grid(field: SampledField, folder: str | Path, grid: Grid | None = None
     _check(grid)
     rate = round(field.sample_rate)
     if rate != field.sample_rate or rate < 1:
-        raise ExportError.expected(
-            "whole hertz for wav files", field.sample_rate, got=f"{field.sample_rate:g} Hz", name="sample_rate"
-        )
+        got = f"{field.sample_rate:g} Hz"
+        raise ExportError.expected("whole hertz for wav files", field.sample_rate, got=got, name="sample_rate")
     rows = torch.arange(len(field)) if len(field) <= grid.contacts else field.spread(grid.contacts)
     samples = field.samples if grid.seconds is None else max(1, round(grid.seconds * rate))
-    pulses = [ForcePulse(layer.contact_time, layer.shape) for layer in grid.layers]
-    sounds = [
-        field.render(rows, force=layer.force, samples=samples, pulse=pulse, noise=grid.noise)
-        for layer, pulse in zip(grid.layers, pulses, strict=True)
-    ]
-    layers, sounds = _soft_to_loud(grid.layers, sounds)
-    peak = max(float(each.abs().max()) for each in sounds)
+    rendered = []
+    for layer in grid.layers:
+        pulse = ForcePulse(layer.contact_time, layer.shape)
+        sounds = field.render(rows, force=layer.force, samples=samples, pulse=pulse, noise=grid.noise)
+        rendered.append((layer, sounds))
+    # From soft to loud; equally loud ones stay in order.
+    rendered.sort(key=lambda each: float(each[1].double().square().sum()))
+    layers = [layer for layer, _ in rendered]
+    peak = max(float(sounds.abs().max()) for _, sounds in rendered)
     scale = 10 ** (grid.level_db / 20) / peak if peak > 0 else 1.0
     # From 1 on: a note of velocity 0 is the end of one. No range is empty, as there are no more layers than velocities.
     edges = np.linspace(1, HIGHEST_NOTE + 1, len(layers) + 1).round().astype(int)
-    amplitudes = np.stack([each.double().square().mean(1).sqrt().numpy() for each in sounds])
-    records, curves = [], []
+    amplitudes = np.stack([sounds.double().square().mean(1).sqrt().numpy() for _, sounds in rendered])
+    files, records, curves = dict[str, bytes](), list[dict[str, object]](), list[str]()
     for place, row in enumerate(rows.tolist()):
         curves += _curves(amplitudes[:, place], edges)
-        for number, layer in enumerate(layers):
-            sound = scale * sounds[number][place]
-            where = [f"{value:.9g}" for value in (*field.points[row].tolist(), *field.normals[row].tolist())]
-            range_ = (int(edges[number]), int(edges[number + 1]) - 1)
+        where = [f"{value:.9g}" for value in (*field.points[row].tolist(), *field.normals[row].tolist())]
+        for number, (layer, sounds) in enumerate(rendered):
+            sound = scale * sounds[place]
             loudest = float(sound.abs().max())
-            note = LOWEST_NOTE + place
             name = f"{SOUNDS}/{place + 1:03d}-{number + 1}.wav"
+            files[name] = _wav(sound, rate)
             level = f"{20 * math.log10(loudest):.2f}" if loudest > 0 else "-inf"
-            impact = [f"{layer.force:g}", f"{layer.contact_time:g}", note, *range_, f"{samples / rate:.6g}", level, row]
-            records.append((sound, [name, *where, *impact]))
-
-    def fill(place: Path) -> None:
-        (place / SOUNDS).mkdir()
-        for sound, record in records:
-            (place / str(record[0])).write_bytes(_wav(sound, rate))
-        (place / TABLE).write_text(_table([record for _, record in records]))
-        (place / INSTRUMENT).write_text(_instrument(field.name, [record for _, record in records], curves))
-
+            range_ = (int(edges[number]), int(edges[number + 1]) - 1)
+            how = (f"{layer.force:g}", f"{layer.contact_time:g}", LOWEST_NOTE + place, *range_)
+            record = (name, *where, *how, f"{samples / rate:.6g}", level, row)
+            records.append(dict(zip(COLUMNS, record, strict=True)))
+    files[TABLE] = _table(records).encode()
+    files[INSTRUMENT] = _instrument(field.name, records, curves).encode()
     manifest = {"name": field.name, "sampleRate": rate, "scale": scale, "perNewton": field.per_newton}
     manifest["pulses"] = [layer.shape for layer in layers]
-    sizes = write_folder(Path(folder), fill, manifest, force=force)
+    sizes = write_folder(Path(folder), partial(write_files, files), manifest, force=force)
     remarks = [f"all sounds are scaled by {scale:.4g}, so that the loudest reaches {grid.level_db:g} dB"]
-    if layers != grid.layers:
+    if layers != list(grid.layers):
         named = ", ".join(f"{layer.force:g} ({layer.contact_time:g} s)" for layer in layers)
         remarks.append(f"layers are sorted from soft to loud: force (contact time) {named}")
     return Written(sizes, tuple(remarks))
-
-
-def _soft_to_loud(
-    layers: tuple[Layer, ...], sounds: list[Float32[Tensor, "contacts samples"]]
-) -> tuple[tuple[Layer, ...], list[Float32[Tensor, "contacts samples"]]]:
-    """Return the layers and their sounds sorted by their energy at all contacts; equal ones stay in order."""
-    energies = [float(each.double().square().sum()) for each in sounds]
-    order = sorted(range(len(layers)), key=energies.__getitem__)
-    return tuple(layers[number] for number in order), [sounds[number] for number in order]
 
 
 def _check(grid: Grid) -> None:
@@ -161,10 +150,10 @@ def _wav(sound: Float32[Tensor, " samples"], rate: int) -> bytes:
     return wav_bytes(sound.numpy(), rate)
 
 
-def _table(records: Sequence[Sequence[object]]) -> str:
+def _table(records: Sequence[Mapping[str, object]]) -> str:
     memory = io.StringIO()
-    writer = csv.writer(memory, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    writer = csv.DictWriter(memory, COLUMNS, lineterminator="\n")
+    writer.writeheader()
     writer.writerows(records)
     return memory.getvalue()
 
@@ -191,15 +180,15 @@ def _curves(amplitude: Float64[np.ndarray, " layers"], edges: Int[np.ndarray, " 
     return curves
 
 
-def _instrument(name: str, records: Sequence[Sequence[object]], curves: Sequence[str]) -> str:
+def _instrument(name: str, records: Sequence[Mapping[str, object]], curves: Sequence[str]) -> str:
     """Return an SFZ instrument that plays each contact at its note and each layer at its velocities by its curve."""
     lines = [f"// {name or 'object'}, as exported by avmsf", "<global> loop_mode=one_shot amp_veltrack=100"]
-    regions = [dict(zip(COLUMNS, record, strict=True)) for record in records]
-    for low, high in sorted({(int(str(each["velocity_low"])), int(str(each["velocity_high"]))) for each in regions}):
+    ranges = dict.fromkeys((record["velocity_low"], record["velocity_high"]) for record in records)
+    for low, high in ranges:
         lines.append(f"<group> lovel={low} hivel={high}")
         lines += [
-            f"<region> sample={each['file']} key={each['midi_note']} {curve}"
-            for each, curve in zip(regions, curves, strict=True)
-            if each["velocity_low"] == low
+            f"<region> sample={record['file']} key={record['midi_note']} {curve}"
+            for record, curve in zip(records, curves, strict=True)
+            if record["velocity_low"] == low
         ]
     return "\n".join(lines) + "\n"

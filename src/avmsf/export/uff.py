@@ -67,10 +67,8 @@ def write_universal(field: SampledField, path: str | Path, *, functions: int = 1
         remarks.append("the residual noise is left out")
     leaning = math.degrees(math.acos(min(1.0, float(field.normals[rows].abs().amax(1).min())))) if len(rows) else 0.0
     if leaning > _STRAIGHT:
-        remarks.append(
-            "response functions are of impacts against the normal; their reference direction is the nearest axis, up "
-            f"to {leaning:.0f} degrees off"
-        )
+        axis = f"their reference direction is the nearest axis, up to {leaning:.0f} degrees off"
+        remarks.append(f"response functions are of impacts against the normal; {axis}")
     return Written(write_file(path, content, force=force), tuple(remarks))
 
 
@@ -94,18 +92,18 @@ def response(
     turning = 2 * math.pi * field.frequency.numpy()
     sine, cosine = field.sine[row].double().numpy(), field.cosine[row].double().numpy()
     total = np.zeros(len(frequencies), dtype=np.complex128)
-    for k in range(len(turning)):
-        shifted = 2j * math.pi * frequencies + damping[k]
-        total += (sine[k] * turning[k] + cosine[k] * shifted) / (shifted**2 + turning[k] ** 2)
+    for a, b, omega, rate in zip(sine, cosine, turning, damping, strict=True):
+        shifted = 2j * math.pi * frequencies + rate
+        total += (a * omega + b * shifted) / (shifted**2 + omega**2)
     return total
 
 
 def _header(field: SampledField) -> dict[str, Any]:
-    words = {"model_name": field.name[:80] or "object", "description": "modal sound field", "program": generator()}
-    times = dict.fromkeys(("date_db_created", "time_db_created", "date_db_saved", "time_db_saved"), "")
     # No times, so that the same field gives the same file.
-    versions = {"version_db1": 0, "version_db2": 0, "file_type": 0}
-    return {"type": 151, "db_app": "avmsf", "date_db_written": "", "time_db_written": "", **words, **times, **versions}
+    moments = ("db_created", "db_saved", "db_written")
+    times = {f"{kind}_{moment}": "" for moment in moments for kind in ("date", "time")}
+    words = {"model_name": field.name[:80] or "object", "description": "modal sound field", "program": generator()}
+    return {"type": 151, "db_app": "avmsf", **words, **times, "version_db1": 0, "version_db2": 0, "file_type": 0}
 
 
 def _units() -> dict[str, Any]:
@@ -114,17 +112,10 @@ def _units() -> dict[str, Any]:
 
 
 def _nodes(field: SampledField) -> dict[str, Any]:
-    places = field.points.double().numpy()
     zeros = np.zeros(len(field), dtype=int)
-    along = {"x": places[:, 0], "y": places[:, 1], "z": places[:, 2]}
-    return {
-        "type": 2411,
-        "node_nums": np.arange(1, len(field) + 1),
-        "def_cs": zeros,
-        "disp_cs": zeros,
-        "color": zeros,
-        **along,
-    }
+    places = dict(zip("xyz", field.points.double().numpy().T, strict=True))
+    systems = dict.fromkeys(("def_cs", "disp_cs", "color"), zeros)
+    return {"type": 2411, "node_nums": np.arange(1, len(field) + 1), **systems, **places}
 
 
 def _mode(field: SampledField, mode: int, damping: Float64[Tensor, " modes"]) -> dict[str, Any]:
@@ -142,9 +133,10 @@ def _mode(field: SampledField, mode: int, damping: Float64[Tensor, " modes"]) ->
         "mode_n": mode + 1,
         "node_nums": np.arange(1, len(field) + 1),
     }
+    sine, cosine = (part[:, mode].double().numpy() for part in (field.sine, field.cosine))
     if field.cosine.any():
         # sine sin + cosine cos = 2 Re(residue exp(i w t)).
-        values = 0.5 * (field.cosine[:, mode].double().numpy() - 1j * field.sine[:, mode].double().numpy())
+        values = 0.5 * (cosine - 1j * sine)
         kind = {
             "analysis_type": _COMPLEX_MODE,
             "id3": "residues: sound = 2 Re sum shape exp(eig t)",
@@ -153,7 +145,7 @@ def _mode(field: SampledField, mode: int, damping: Float64[Tensor, " modes"]) ->
             "modal_b": 0.0 + 0.0j,
         }
     else:
-        values = field.sine[:, mode].double().numpy()
+        values = sine
         undamped = math.hypot(frequency, rate / (2 * math.pi))
         kind = {
             "analysis_type": _NORMAL_MODE,

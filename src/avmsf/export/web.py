@@ -14,19 +14,18 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping, Sequence
+from functools import partial
 from html import escape
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExportError
-from avmsf.export.bundle import Bundle, make_bundle, write_files
-from avmsf.export.formats import MAX_POINTS, PAGE_SUFFIXES
+from avmsf.export.bundle import Bundle, make_bundle
+from avmsf.export.formats import PAGE_SUFFIXES
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import Written, generator, write_file, write_folder
+from avmsf.export.writing import Written, generator, write_file, write_files, write_folder
 from avmsf.field.sound_field import SoundField
-from avmsf.mesh.surface import Surface
 
 IMPORT_MAP = re.compile(r'(<script type="importmap"[^>]*>)(.*?)(</script>)', re.DOTALL)
 """The import map, which has the addresses of three and spark."""
@@ -56,28 +55,20 @@ MEDIA_TYPES = {
 
 
 def write_webpage(
-    field: SoundField | SampledField,
-    output: str | Path,
-    *,
-    object: Path | Surface | None = None,
-    meters: float = 1.0,
-    surface: Path | Surface | None = None,
-    strikes: Impacts | None = None,
-    limit: int = MAX_POINTS,
-    force: bool = False,
+    field: SoundField | SampledField, output: str | Path, *, force: bool = False, **options: Any
 ) -> Written:
     """Write a page that plays the field: one file if `output` ends in .html, otherwise a folder.
 
-    The arguments are those of `make_bundle`, whose errors are raised. What exists is replaced only with `force`.
+    `options` are those of `make_bundle`, whose errors are raised: `object`, `surface` and `strikes` to show, `limit` of
+    contacts. What exists is replaced only with `force`.
     """
-    output = Path(output)
-    bundle = make_bundle(field, object=object, meters=meters, surface=surface, strikes=strikes, limit=limit)
+    output, bundle = Path(output), make_bundle(field, **options)
     if output.suffix.lower() in PAGE_SUFFIXES:
         return Written(write_file(output, single_file(bundle).encode(), force=force), bundle.remarks)
     content = {**_needed(page_files(), bundle), **bundle.files}
     html = _titled(content["index.html"].decode(), bundle)
     content["index.html"] = with_policy(html, directives_of(html)).encode()
-    sizes = write_folder(output, lambda place: write_files(content, place), dict(bundle.manifest), force=force)
+    sizes = write_folder(output, partial(write_files, content), dict(bundle.manifest), force=force)
     return Written(sizes, bundle.remarks)
 
 
@@ -105,13 +96,11 @@ def single_file(bundle: Bundle, page: Mapping[str, bytes] | None = None) -> str:
     html = _STYLE.sub(lambda found: f"<style>\n{page[f'page/{found[1]}'].decode()}</style>", html)
     carried = {"manifest.json": json.dumps(bundle.manifest).encode(), "page/bank.js": page["page/bank.js"]}
     inlined = {name: _carried(name, content) for name, content in {**carried, **bundle.files}.items()}
-    begin = (
-        f"<script>globalThis.avmsfInlined = {json.dumps(inlined)};</script>\n"
-        '<script type="module">import "avmsf/{name}";</script>'
-    )
+    data = f"<script>globalThis.avmsfInlined = {json.dumps(inlined)};</script>\n"
     # The generator at the beginning is how a later export recognizes the file.
     html = html.replace("<!doctype html>\n", f"<!doctype html>\n<!-- {generator()} -->\n", 1)
-    html = _once(_START, html, lambda found: begin.replace("{name}", found[1]), "script that starts the page")
+    begin = '<script type="module">import "avmsf/{}";</script>'
+    html = _once(_START, html, lambda found: data + begin.format(found[1]), "script that starts the page")
     return with_policy(html, directives_of(html, single=True))
 
 
@@ -161,53 +150,49 @@ _REMOTE = re.compile(r"https://[\w.-]+")
 _HEAD = re.compile(r'(<head>\s*)?<meta charset="[^"]*"\s*/?>|<head>')
 
 
-def directives_of(page: str, *, single: bool = False) -> dict[str, list[str]]:
+def directives_of(page: str, *, single: bool = False) -> dict[str, str]:
     """Return what the studio's page may load, whose inline scripts and styles are known by their content.
 
     A page that is `single` carries its modules and its audio worklet as data: addresses.
     """
     scripts = _INLINE_SCRIPT.findall(page)
     remote = sorted({address for each in scripts for address in _REMOTE.findall(each)})
-    carried = ["data:"] if single else []
+    own = ["'self'", "'wasm-unsafe-eval'", *(["data:"] if single else [])]
     return {
-        "default-src": ["'none'"],
+        "default-src": "'none'",
         # Spark computes in WebAssembly.
-        "script-src": ["'self'", "'wasm-unsafe-eval'", *carried, *_hashes(scripts), *remote],
-        "style-src": ["'self'", *_hashes(_INLINE_STYLE.findall(page))],
+        "script-src": " ".join([*own, *_hashes(scripts), *remote]),
+        "style-src": " ".join(["'self'", *_hashes(_INLINE_STYLE.findall(page))]),
         # Spark carries its worker and its WebAssembly within itself, and textures of a mesh become blobs.
-        "worker-src": ["'self'", "blob:"],
-        "connect-src": ["'self'", "blob:", "data:"],
-        "img-src": ["'self'", "blob:", "data:"],
-        "media-src": ["'self'", "blob:"],
-        "base-uri": ["'none'"],
-        "form-action": ["'none'"],
+        "worker-src": "'self' blob:",
+        **dict.fromkeys(("connect-src", "img-src"), "'self' blob: data:"),
+        "media-src": "'self' blob:",
+        **dict.fromkeys(("base-uri", "form-action"), "'none'"),
     }
 
 
-def report_directives(page: str) -> dict[str, list[str]]:
+def report_directives(page: str) -> dict[str, str]:
     """Return what a report may load: its own script and style, and the pictures and sounds that it carries."""
     return {
-        "default-src": ["'none'"],
-        "script-src": _hashes(_INLINE_SCRIPT.findall(page)),
-        "style-src": _hashes(_INLINE_STYLE.findall(page)),
-        "img-src": ["data:"],
-        "media-src": ["data:"],
-        "base-uri": ["'none'"],
-        "form-action": ["'none'"],
+        "default-src": "'none'",
+        "script-src": " ".join(_hashes(_INLINE_SCRIPT.findall(page))),
+        "style-src": " ".join(_hashes(_INLINE_STYLE.findall(page))),
+        **dict.fromkeys(("img-src", "media-src"), "data:"),
+        **dict.fromkeys(("base-uri", "form-action"), "'none'"),
     }
 
 
-def policy_text(directives: Mapping[str, Sequence[str]]) -> str:
+def policy_text(directives: Mapping[str, str]) -> str:
     """Return directives as a header or a meta element has them."""
-    return "; ".join(" ".join([name, *sources]) for name, sources in directives.items())
+    return "; ".join(f"{name} {sources}" for name, sources in directives.items())
 
 
-def with_policy(page: str, directives: Mapping[str, Sequence[str]]) -> str:
+def with_policy(page: str, directives: Mapping[str, str]) -> str:
     """Return the page with its policy at the beginning of its head. Raises ExportError for a page without a head."""
     meta = f'<meta http-equiv="Content-Security-Policy" content="{escape(policy_text(directives))}">'
     changed, count = _HEAD.subn(lambda found: f"{found[0]}\n{meta}", page, count=1)
     if not count:
-        raise ExportError("index.html: expected a head, got none; install avmsf again", file="index.html", name="head")
+        raise ExportError.expected("a head", file="index.html", name="head", advice="install avmsf again")
     return changed
 
 

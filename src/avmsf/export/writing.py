@@ -44,21 +44,15 @@ def generator() -> str:
 def check_suffix(path: Path, endings: Sequence[str]) -> None:
     """Raise `ExportError` for a file's name that has none of these endings, dots included."""
     if path.suffix.lower() not in endings:
-        raise ExportError.expected(
-            f"a name that ends in {' or '.join(endings)}",
-            path.suffix,
-            got=path.suffix or "no ending",
-            file=path,
-            name="suffix",
-            advice=f"name it {path.stem if path.suffix[1:].isalpha() else path.name}{endings[0]}",
-        )
+        wanted, got = f"a name that ends in {' or '.join(endings)}", path.suffix or "no ending"
+        advice = f"name it {path.stem if path.suffix[1:].isalpha() else path.name}{endings[0]}"
+        raise ExportError.expected(wanted, path.suffix, got=got, file=path, name="suffix", advice=advice)
 
 
 def no_modes(path: Path | None = None) -> ExportError:
     """Return the error for a field without a mode below half the sample rate."""
-    return ExportError.expected(
-        "1 or more below half the sample rate", 0, got="none", file=path, name="modes", advice="fit the field again"
-    )
+    wanted = "1 or more below half the sample rate"
+    return ExportError.expected(wanted, 0, got="none", file=path, name="modes", advice="fit the field again")
 
 
 def pack(arrays: Mapping[str, Shaped[np.ndarray, "..."]]) -> tuple[bytes, dict[str, dict[str, Any]]]:
@@ -83,14 +77,17 @@ def check_free(path: Path, *, folder: bool = False, force: bool = False) -> None
     if not path.exists():
         return
     if path.is_dir() != folder:
-        wanted, found = ("folder", "file") if folder else ("file", "folder")
-        raise ExportError.expected(
-            f"a free name, or a {wanted}", found, got=f"a {found}", file=path, advice="choose another name"
-        )
-    if not force and not (folder and not any(path.iterdir())):
-        found = "a folder with files" if folder else "a file"
-        advice = "choose another, or add --overwrite to replace it"
-        raise ExportError.expected("a free name", found, got=found, file=path, name="--overwrite", advice=advice)
+        wanted, other = ("folder", "file") if folder else ("file", "folder")
+        advice = "choose another name"
+        raise ExportError.expected(f"a free name, or a {wanted}", other, got=f"a {other}", file=path, advice=advice)
+    found = _files_in(path) if folder else [path.name]
+    wanted, advice = "a free name", "choose another, or add --overwrite to replace it"
+    if force:
+        wanted, advice = "a folder with the files of an export alone", "choose another folder, or remove its files"
+        found = sorted(set(found) - _exported(path)) if folder else []
+    if found:
+        got = f"{found[0]} in it" if folder else "a file"
+        raise ExportError.expected(wanted, found, got=got, file=path, name="--overwrite", advice=advice)
 
 
 def write_folder(
@@ -102,8 +99,6 @@ def write_folder(
     the files of an export and no others.
     """
     check_free(folder, folder=True, force=force)
-    if folder.exists() and any(folder.iterdir()):
-        _check_export(folder)
     # What a link leads to is replaced, and the link stays.
     with new_folder(folder.resolve(), raising=ExportError, replace=force) as place:
         fill(place)
@@ -113,23 +108,20 @@ def write_folder(
         return {folder / name: (place / name).stat().st_size for name in names}
 
 
-def _check_export(folder: Path) -> None:
-    """Raise `ExportError` for a folder with other files than those that its manifest, written here, lists."""
+def write_files(files: Mapping[str, bytes], folder: Path) -> None:
+    """Write each file under its relative path."""
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
+
+
+def _exported(folder: Path) -> set[str]:
+    """Return the files that a folder's manifest, written here, lists."""
     try:
         manifest = read_json(folder / MANIFEST)
-        exported = set(manifest["files"]) if str(manifest["generator"]).startswith("avmsf ") else set()
+        return set(manifest["files"]) if str(manifest["generator"]).startswith("avmsf ") else set()
     except (OSError, ValueError, KeyError, TypeError):
-        exported = set()
-    others = [name for name in _files_in(folder) if name not in exported]
-    if others:
-        raise ExportError.expected(
-            "a folder with the files of an export alone",
-            others,
-            got=f"{others[0]} in it",
-            file=folder,
-            name="--overwrite",
-            advice="choose another folder, or remove its files",
-        )
+        return set()
 
 
 def _files_in(folder: Path) -> list[str]:

@@ -17,7 +17,7 @@ from avmsf._utils.text import parse_json
 from avmsf.export.web import directives_of, policy_text
 from avmsf.studio.responses import RequestError, bad_request, response_to
 
-_FRAMES = {"frame-ancestors": ["'none'"]}
+_FRAMES = {"frame-ancestors": "'none'"}
 """Directive that is valid only in a header."""
 NOTHING_HERE = "there is nothing at this address"
 """By this the page knows that its studio has moved: `server.js` has the same text."""
@@ -30,7 +30,7 @@ LOOPBACK = ("127.0.0.1", "localhost")
 _HEADERS = {
     "cache-control": "no-store",
     # For all that is not the page: it may run nothing if opened as a page.
-    "content-security-policy": policy_text({"default-src": ["'none'"], **_FRAMES}),
+    "content-security-policy": policy_text({"default-src": "'none'", **_FRAMES}),
     "cross-origin-resource-policy": "same-origin",
     # The token is in the address, and other sites that the page loads its libraries from must not learn it.
     "referrer-policy": "no-referrer",
