@@ -17,10 +17,9 @@ from avmsf.fem.damping import rayleigh
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.material import CERAMIC, GLASS, IRON, PLASTIC, STEEL, WOOD, Material
 from avmsf.fem.solid import Solid
-from avmsf.field.gains.family import Sites
+from avmsf.field.gains.kernels import Sites, Smooth
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
 from avmsf.field.gains.mixture_gains import MixtureGains, series_of
-from avmsf.field.gains.positional import Smooth
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
 from avmsf.modal.modes import ModalBank

@@ -21,10 +21,9 @@ from avmsf.fem.shell import shell
 from avmsf.field.config import AttentionShape
 from avmsf.field.gains.attention import AttentionGains
 from avmsf.field.gains.elastic import Elastic
-from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.kernels import Sites, Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.mixture_gains import MixtureGains
-from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
 from avmsf.gaussians.cloud import GaussianCloud

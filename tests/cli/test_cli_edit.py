@@ -21,7 +21,7 @@ from avmsf.editing.modal_edit import EDITS, adjust_modes
 from avmsf.editing.reference import Reference
 from avmsf.errors import AvmsfError, EditError
 from avmsf.fem.material import CERAMIC, GLASS, STEEL, WOOD
-from avmsf.field.gains.family import Sites
+from avmsf.field.gains.kernels import Sites
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.modes import ModalBank

@@ -22,7 +22,7 @@ from avmsf.errors import EditError, SimulationError
 from avmsf.fem.damping import rayleigh
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import CERAMIC, GLASS, NOMINAL, PLASTIC, STEEL, WOOD, Material
-from avmsf.field.gains.positional import Smooth
+from avmsf.field.gains.kernels import Smooth
 from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual

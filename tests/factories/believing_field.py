@@ -9,11 +9,10 @@ from torch import Tensor
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.material import NOMINAL
 from avmsf.field.gains.elastic import PERTURBATIONS, RESIDUALS, WIDTHS, Elastic
-from avmsf.field.gains.family import KernelFamily, Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.kernels import KernelFamily, Sites, Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
 from avmsf.field.gains.mixture_gains import MixtureGains
-from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual

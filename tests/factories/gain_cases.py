@@ -6,10 +6,9 @@ import torch
 
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.field.gains.elastic import Elastic
-from avmsf.field.gains.family import KernelFamily, Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.kernels import KernelFamily, Sites, Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.mixture_gains import MixtureGains
-from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from factories.made_modes import sliding_plate
 
 SIDES = (0.24, 0.17, 0.004)

@@ -7,11 +7,10 @@ from typing import ClassVar
 
 import torch
 
-from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.kernels import Sites, Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import Gains
-from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.localization.contact_map import ContactMap
 from avmsf.localization.locator import Locator

@@ -12,11 +12,10 @@ from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.field.config import AttentionShape
 from avmsf.field.gains.attention import AttentionGains
 from avmsf.field.gains.elastic import Elastic
-from avmsf.field.gains.family import KernelFamily, Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.kernels import KernelFamily, Sites, Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import GainModel
-from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.scaled import BodyGains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save

@@ -15,10 +15,9 @@ from avmsf.capture import Impacts
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.gains.attention import AttentionGains, AttentionShape
 from avmsf.field.gains.elastic import Elastic
-from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.kernels import Sites, Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.model import GainModel
-from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.scaled import BodyGains, ScaledGains
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.sound_field import Origin, SoundField

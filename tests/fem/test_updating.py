@@ -14,10 +14,9 @@ from avmsf.fem.perturbation import smooth_fields
 from avmsf.fem.solid import Solid
 from avmsf.fem.updating import DENSITY, STIFFNESS, Matched, update
 from avmsf.field.gains.elastic import Elastic
-from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, matched
+from avmsf.field.gains.kernels import Sites, Smooth, Unstructured
 from avmsf.field.gains.mixture import NOISE_SHARES
-from avmsf.field.gains.positional import Smooth, Unstructured
 from oracles.block import block
 
 MODES = 14

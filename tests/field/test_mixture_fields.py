@@ -8,10 +8,9 @@ from torch import Tensor
 
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.field.gains.elastic import Elastic
-from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.kernels import Sites, Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.mixture_gains import MixtureGains
-from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from factories.made_fields import BANK, DIAGONAL, blows, places, plate, struck
 
 PLACES = places(60, seed=8)

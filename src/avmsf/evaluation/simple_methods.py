@@ -20,8 +20,7 @@ from torch.nn.functional import normalize
 
 from avmsf.capture.impacts import Impacts, places_of
 from avmsf.errors import EvaluationError
-from avmsf.field.gains.family import Sites, nearest_sites
-from avmsf.field.gains.positional import Axes
+from avmsf.field.gains.kernels import Axes, Sites, nearest_sites
 from avmsf.field.recipes import orientation_signs
 from avmsf.gaussians.points import nearest_points
 from avmsf.modal.extraction.extract import Extraction

@@ -13,7 +13,7 @@ from torch import Tensor
 from avmsf._utils.arrays import ArrayLike, as_vectors, short_repr
 from avmsf._utils.progress import working
 from avmsf.errors import FitError
-from avmsf.field.gains.family import Sites
+from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.hammer_access import HAMMER_DIAMETER, MeshAccess, PointAccess
 from avmsf.field.sound_field import SoundField

@@ -25,7 +25,7 @@ from avmsf.field.fit import Progress
 from avmsf.field.fit import fit as fit_field
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import estimator_for
-from avmsf.field.gains.positional import Visual
+from avmsf.field.gains.kernels import Visual
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
 from avmsf.mesh import Surface

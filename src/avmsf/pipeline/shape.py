@@ -17,7 +17,7 @@ from avmsf.errors import SceneError
 from avmsf.features.feature_field import FeatureField
 from avmsf.features.store import load_features, read_report
 from avmsf.field.config import AUTO, NETWORK
-from avmsf.field.gains.positional import Visual
+from avmsf.field.gains.kernels import Visual
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh import Surface
 from avmsf.mesh.closest_point import ClosestPoints

@@ -21,8 +21,8 @@ from avmsf.field.gains.elastic import (
     Elastic,
     frequency_log_prior,
 )
-from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, hypotheses_of, weigh_factors
+from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture import NOISE_SHARES, log_evidence
 from avmsf.field.gains.mixture_gains import MixtureGains, series_of
 from factories.gain_cases import SIZE, families, impacts, measured, plate

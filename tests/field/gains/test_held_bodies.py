@@ -11,10 +11,9 @@ from avmsf.fem.elements import SecondOrder
 from avmsf.fem.material import NOMINAL, STEEL
 from avmsf.fem.supports import FREE, supports_of
 from avmsf.field.gains.elastic import Elastic
-from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, total_evidence
+from avmsf.field.gains.kernels import Sites, Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.mixture import NOISE_SHARES
-from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from factories.gain_cases import draw
 from oracles.block import block
 

@@ -8,9 +8,8 @@ import torch
 from scipy.interpolate import RBFInterpolator
 
 from avmsf.field.gains.elastic import Elastic
-from avmsf.field.gains.family import KernelFamily, Sites
+from avmsf.field.gains.kernels import KernelFamily, Sites, Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
-from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from factories.gain_cases import POSITIONAL, SIZE, draw, impacts, plate
 
 KINDS = [*POSITIONAL, Elastic]

@@ -8,8 +8,8 @@ import torch
 
 from avmsf.capture.impacts import SAME_PLACE, places_of
 from avmsf.field.gains import mixture_gains as module
-from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import fit_mixture
+from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.mixture_gains import MixtureGains, series_of
 from factories.gain_cases import draw, families, impacts, measured, model

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float64, Int
 from torch import Tensor
 
-from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.kernels import Sites, Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.labels import better_order, two_levels
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.mixture_gains import MixtureGains
@@ -23,7 +23,6 @@ from avmsf.field.gains.outliers import (
     predicts_better,
     set_aside,
 )
-from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from factories.gain_cases import draw
 
 CONTACTS, MODES = 20, 12

@@ -6,10 +6,9 @@ import pytest
 import torch
 
 from avmsf.field.gains import symmetry
-from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.kernels import Sites, Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.mixture_gains import MixtureGains
-from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.symmetry.characters import groups_of
 from avmsf.symmetry.symmetries import MirrorSymmetry, RotationalSymmetry, Symmetries

@@ -2,10 +2,9 @@
 
 import torch
 
-from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.kernels import Sites, Unstructured, Visual
 from avmsf.field.gains.mixture_gains import MixtureGains
-from avmsf.field.gains.positional import Unstructured, Visual
 
 SIZE = 1.0
 

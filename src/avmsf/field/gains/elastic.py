@@ -27,7 +27,7 @@ from jaxtyping import Float64, Int
 from torch import Tensor
 
 from avmsf.fem.elastic_modes import ElasticModes
-from avmsf.field.gains.family import KernelFamily, Sites, scaled, squared_exponential
+from avmsf.field.gains.kernels import KernelFamily, Sites, scaled, squared_exponential
 
 PERTURBATIONS = (0.003, 0.01, 0.03, 0.1, 0.3)
 """Relative perturbations tau of stiffness and mass."""

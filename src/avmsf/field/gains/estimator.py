@@ -24,13 +24,12 @@ from avmsf.fem.thickness import search_thickness
 from avmsf.fem.updating import update
 from avmsf.field.config import AUTO, NETWORK, GainModelName
 from avmsf.field.gains.elastic import Elastic
-from avmsf.field.gains.family import KernelFamily, Sites, sites_along
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, matched, total_evidence
+from avmsf.field.gains.kernels import KernelFamily, Sites, Smooth, ThinPlate, Unstructured, Visual, sites_along
 from avmsf.field.gains.labels import better_order, two_levels
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.outliers import Fit, Judgment, assess_contacts, predicts_better
-from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.recipes import Attention, GainCase, GainRecipe

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from avmsf.fem.updating import Matched
 from avmsf.field.gains.elastic import Elastic, frequency_log_prior
-from avmsf.field.gains.family import KernelFamily
+from avmsf.field.gains.kernels import KernelFamily
 from avmsf.field.gains.mixture import NOISE_SHARES, Hypotheses, KernelMixture, active_series, log_evidence, log_joint
 from avmsf.field.gains.mixture_gains import MixtureGains, series_of
 

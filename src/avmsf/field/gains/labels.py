@@ -25,8 +25,8 @@ from torch import Tensor
 
 from avmsf._utils.text import counted
 from avmsf.capture.filenames import number_key
-from avmsf.field.gains.family import KernelFamily
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, total_evidence
+from avmsf.field.gains.kernels import KernelFamily
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.outliers import CHANCE, WIDE_NOISE_SHARES, PredictiveRatios
 

@@ -17,10 +17,19 @@ from avmsf.capture.impacts import places_of
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.elastic_store import mode_sizes, mode_skeleton, mode_tensors, restored_modes
 from avmsf.field.gains.elastic import Elastic
-from avmsf.field.gains.family import Family, KernelFamily, Sites, nearest_sites, sites_along
+from avmsf.field.gains.kernels import (
+    Family,
+    KernelFamily,
+    Sites,
+    Smooth,
+    ThinPlate,
+    Unstructured,
+    Visual,
+    nearest_sites,
+    sites_along,
+)
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture, Predictions
 from avmsf.field.gains.model import GainModel, Gains
-from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.symmetry.characters import Group
 

@@ -40,8 +40,8 @@ from jaxtyping import Complex128, Float, Float64, Int
 from torch import Tensor
 
 from avmsf.capture.impacts import places_of
-from avmsf.field.gains.family import KernelFamily, Sites
 from avmsf.field.gains.fitting import MeasuredGains
+from avmsf.field.gains.kernels import KernelFamily, Sites
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.mixture_gains import MixtureGains, series_of
 

@@ -15,7 +15,7 @@ from avmsf._utils.text import RecordError, count_of, like
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.elastic_store import mode_sizes, mode_skeleton, mode_tensors, restored_modes
 from avmsf.field.gains.attention import AttentionGains
-from avmsf.field.gains.family import sites_along
+from avmsf.field.gains.kernels import sites_along
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import GainModel, Gains
 

@@ -18,8 +18,7 @@ import torch
 from jaxtyping import Float64, Int
 from torch import Tensor
 
-from avmsf.field.gains.family import KernelFamily, Sites
-from avmsf.field.gains.positional import ThinPlate
+from avmsf.field.gains.kernels import KernelFamily, Sites, ThinPlate
 from avmsf.symmetry.characters import Group
 
 RESIDUALS = (0.1, 0.3)
