@@ -19,11 +19,11 @@ from avmsf.fem.elements import SecondOrder
 from avmsf.fem.material import CERAMIC, STEEL
 from avmsf.fem.supports import supports_of
 from avmsf.field.config import FitConfig
+from avmsf.field.gains.data import GainData
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import FAMILIES, POSITIONAL, MixtureEstimator
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.symmetry import Symmetric
-from avmsf.field.recipes import GainCase
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
@@ -180,7 +180,7 @@ def supports(options: Options) -> Report:
             for tried in ("free", "auto", "try", None):
                 config = BodyConfig() if tried is None else BodyConfig(supports=tried)
                 bodies = None if tried is None else candidate_bodies(solid.surface, config, log=log)
-                model, _ = MixtureEstimator(bodies=bodies).fit(case)
+                model, _ = MixtureEstimator(bodies=bodies).solve(case)
                 error = float((model.predict(points, ways).mean.real - exact).norm() / exact.norm())
                 row += [error] if tried != "try" else [error, model.report["bodies"][0]["support"]]
                 figures[f"gains.supports.{kind}.{'free' if support is None else 'held'}.{tried}"] = error
@@ -190,7 +190,7 @@ def supports(options: Options) -> Report:
     return Report(tables=(Table("relative error of gains at 200 contacts, 12 known", columns, rows),), figures=figures)
 
 
-def _gains_of(true: ElasticModes) -> tuple[GainCase, Float64[Tensor, "others 3"], Float64[Tensor, "others 3"]]:
+def _gains_of(true: ElasticModes) -> tuple[GainData, Float64[Tensor, "others 3"], Float64[Tensor, "others 3"]]:
     """Return gains at 12 contacts with errors of place, direction and force, and 200 other contacts with directions."""
     generator = torch.Generator().manual_seed(0)
 
@@ -211,4 +211,4 @@ def _gains_of(true: ElasticModes) -> tuple[GainCase, Float64[Tensor, "others 3"]
     found = Extraction(bank, gains, Residual(torch.zeros(1025)), torch.zeros_like(gains))
     phase = torch.zeros(len(true), dtype=torch.float64)
     features = FeatureField.from_points(true.nodes.float())
-    return GainCase(impacts, features, found, phase, gains, FitConfig()), others, ways[12:]
+    return GainData(impacts, features, found, phase, gains, FitConfig()), others, ways[12:]

@@ -22,8 +22,9 @@ from avmsf.evaluation.splits import evaluate, split
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
+from avmsf.field.gains.attention import Attention
 from avmsf.field.gains.estimator import MixtureEstimator
-from avmsf.field.recipes import Attention, GainRecipe
+from avmsf.field.trainer import GainEstimator
 from avmsf.modal.extraction.alignment import Alignment, align, coherence, strongest_modes
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.extraction.quality import measure_quality
@@ -169,7 +170,7 @@ def _jitter_with(options: Options, cache: Path) -> Report:
     silence = torch.zeros(len(plate), 2 * margin_length(plate.sample_rate))
     body = BodyConfig(dofs=3000) if options.quick_look else BodyConfig()
     mug = MixtureEstimator(bodies=candidate_bodies(capture.surface, body, impacts=capture.impacts, cache=cache))
-    cases: dict[str, tuple[Impacts, FeatureField, GainRecipe]] = {
+    cases: dict[str, tuple[Impacts, FeatureField, GainEstimator]] = {
         "mug": (_wide(EXAMPLE_FOLDER, truth.starts), surface_features(capture), mug),
         "plate": (
             replace(plate, before=silence, after=silence),
@@ -398,8 +399,8 @@ def _bowl(name: str) -> tuple[Impacts, Impacts]:
     return final, replace(final, before=before, after=after)
 
 
-def _methods(capture: Capture, options: Options) -> dict[str, Callable[[], GainRecipe]]:
-    made: dict[str, Callable[[], GainRecipe]] = {"no_body": MixtureEstimator}
+def _methods(capture: Capture, options: Options) -> dict[str, Callable[[], GainEstimator]]:
+    made: dict[str, Callable[[], GainEstimator]] = {"no_body": MixtureEstimator}
     if capture.surface is not None:
         estimator = filled_estimator(capture.surface, options)
         made["auto"] = lambda: estimator
@@ -407,7 +408,7 @@ def _methods(capture: Capture, options: Options) -> dict[str, Callable[[], GainR
 
 
 def _error(
-    impacts: Impacts, capture: Capture, count: int, start: int, make: Callable[[], GainRecipe], options: Options
+    impacts: Impacts, capture: Capture, count: int, start: int, make: Callable[[], GainEstimator], options: Options
 ) -> float:
     train, test = split(impacts, count, start=start)
     modes = extract_modes(train)

@@ -16,9 +16,10 @@ from avmsf.errors import EvaluationError
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import fit
+from avmsf.field.gains.attention import Attention
 from avmsf.field.gains.estimator import MixtureEstimator
-from avmsf.field.recipes import Attention, GainRecipe
 from avmsf.field.sound_field import SoundField
+from avmsf.field.trainer import GainEstimator
 from avmsf.modal.extraction.extract import Extraction, extract_modes, extract_sounds
 from avmsf.modal.extraction.finders import ShortTime
 from avmsf.modal.modes import ModalBank
@@ -57,7 +58,7 @@ class KnownObject:
     impacts: Impacts
     modes: Extraction
     """True or extracted, row for row of the impacts."""
-    recipe: GainRecipe = field(default_factory=MixtureEstimator)
+    recipe: GainEstimator = field(default_factory=MixtureEstimator)
     """The gain model of its field."""
     features: Callable[[], FeatureField] | None = None
     """Makes the points of its surface with what the gain model reads; the contacts alone where nothing is known."""

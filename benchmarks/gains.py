@@ -20,10 +20,10 @@ from avmsf.evaluation.splits import evaluate, score, split
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.field.config import FitConfig
+from avmsf.field.gains.data import GainData
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import FAMILIES, MixtureEstimator
 from avmsf.field.gains.symmetry import Symmetric
-from avmsf.field.recipes import GainCase
 from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.points import farthest_points
 from avmsf.localization.locator import Locator
@@ -218,7 +218,7 @@ def _speed(options: Options) -> Report:
     contacts, modes = (20, 12) if options.quick_look else (200, 128)
     large = _large_case(bodies.bodies[0].elastic, contacts, modes)
     start = time.perf_counter()
-    MixtureEstimator(bodies=bodies).fit(large)
+    MixtureEstimator(bodies=bodies).solve(large)
     seconds["large_fit_s"] = time.perf_counter() - start
     rows: list[list[str | float]] = [
         [f"fit of the example, 12 contacts, {len(case.modes.bank)} modes", seconds["example_fit_s"]]
@@ -228,7 +228,7 @@ def _speed(options: Options) -> Report:
     return Report(tables=(Table("seconds with elastic modes at hand", ("work", "seconds"), rows),), figures=figures)
 
 
-def _large_case(elastic: ElasticModes, contacts: int, modes: int) -> GainCase:
+def _large_case(elastic: ElasticModes, contacts: int, modes: int) -> GainData:
     """Return gains of random mixtures of neighboring mode shapes at random places of a body, with 3 % of noise."""
     generator = torch.Generator().manual_seed(0)
     points = elastic.nodes[torch.randperm(len(elastic.nodes), generator=generator)[:contacts]]
@@ -246,7 +246,7 @@ def _large_case(elastic: ElasticModes, contacts: int, modes: int) -> GainCase:
     quadrature = 0.02 * gains * torch.randn(gains.shape, generator=generator, dtype=torch.float64)
     found = Extraction(bank, gains, Residual(torch.zeros(1025)), quadrature)
     phase = torch.zeros(modes, dtype=torch.float64)
-    return GainCase(impacts, FeatureField.from_points(elastic.nodes.float()), found, phase, gains, FitConfig())
+    return GainData(impacts, FeatureField.from_points(elastic.nodes.float()), found, phase, gains, FitConfig())
 
 
 def _modal_error(field: SoundField, test: Impacts, truth: Truth) -> float:

@@ -16,7 +16,8 @@ from avmsf.evaluation.simple_methods import MeanWaveform
 from avmsf.evaluation.splits import evaluate, split
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import PAPER, FitConfig
-from avmsf.field.recipes import SHARED, Attention, gain_case
+from avmsf.field.gains.attention import Attention
+from avmsf.field.gains.data import gain_data
 from avmsf.field.training import Targets, TrainingRun
 from avmsf.modal.extraction.extract import extract_sounds
 from avmsf.modal.extraction.finders import ShortTime
@@ -107,12 +108,9 @@ def _curve(
 ) -> Iterator[tuple[int, float]]:
     """Yield steps and the error at held-out contacts."""
     modes = extract_sounds(train.sounds, sample_rate=train.sample_rate, method=ShortTime())
-    case, network = gain_case(train, features, modes, config), Attention()
-    run = TrainingRun(
-        network.start(case, SHARED), case.modes, gains=case.gains, phase=case.phase, sample_rate=train.sample_rate,
-        samples=train.sounds.shape[1], config=config,
-    )  # fmt: skip
-    targets = Targets.of(case.train, case.gains, network.rows(case), config)
+    data = gain_data(train, features, modes, config)
+    network, rows = Attention().start(data)
+    run, targets = TrainingRun(network, data), Targets.of(data, rows)
     end = config.warmup_steps + config.steps
     while True:
         if run.step % EVERY == 0 or run.step == end:

@@ -19,9 +19,10 @@ from avmsf.capture import Impacts
 from avmsf.evaluation.splits import evaluate, split
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import PAPER, FitConfig
-from avmsf.field.fit import Progress, fit
-from avmsf.field.recipes import Attention
+from avmsf.field.fit import fit
+from avmsf.field.gains.attention import Attention
 from avmsf.field.sound_field import SoundField
+from avmsf.field.trainer import Progress
 from avmsf.field.training import Targets, TrainingRun
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from benchmarks.material import IMPULSE, STRUCK, shared_data

@@ -13,8 +13,8 @@ from avmsf.features.feature_field import FeatureField
 from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
+from avmsf.field.gains.data import along_phase
 from avmsf.field.gains.estimator import MixtureEstimator
-from avmsf.field.recipes import along_phase
 from avmsf.field.sound_field import SoundField
 from avmsf.field.uncertainty import coverage
 from avmsf.mesh import Surface

@@ -21,9 +21,10 @@ from torch import Tensor
 from avmsf.capture import Impacts
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import PAPER, FitConfig
-from avmsf.field.gains.attention import AttentionGains
+from avmsf.field.gains.attention import Attention
+from avmsf.field.gains.data import GainData
 from avmsf.field.losses import SpectralTarget
-from avmsf.field.training import Targets, TrainingRun, gain_scale
+from avmsf.field.training import Targets, TrainingRun
 from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.fit import SplatProgress, splat
 from avmsf.modal.extraction.extract import Extraction
@@ -106,24 +107,11 @@ def start(
     device: str = "cpu",
 ) -> tuple[TrainingRun, Targets]:
     """Return a run before its first step, and what it is to be fitted to."""
-    gains = fit_sine_gains(impacts.sounds, modes.bank, sample_rate=impacts.sample_rate).to(device)
-    network = AttentionGains(
-        features,
-        gain_scale=gain_scale(gains).cpu(),
-        shape=replace(config.shape, spatial_damping=spatial_damping),
-        generator=torch.Generator().manual_seed(config.seed),
-    )
-    samples = impacts.sounds.shape[1]
-    run = kind(
-        network,
-        modes,
-        gains=gains,
-        phase=torch.zeros_like(modes.bank.frequency),
-        sample_rate=impacts.sample_rate,
-        samples=samples,
-        config=config,
-    )
-    return run, Targets.of(impacts, gains, features.nearest(impacts.contacts), config)
+    gains = fit_sine_gains(impacts.sounds, modes.bank, sample_rate=impacts.sample_rate)
+    config = replace(config, damping="per-contact" if spatial_damping else "shared")
+    data = GainData(impacts, features, modes, torch.zeros_like(modes.bank.frequency), gains, config)
+    network, rows = Attention().start(data)
+    return kind(network, data, device), Targets.of(data, rows, device)
 
 
 def pass_warmup(run: TrainingRun, targets: Targets) -> None:

@@ -28,7 +28,7 @@ from avmsf.fem.material import NOMINAL
 from avmsf.fem.shell import shell
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
-from avmsf.field.recipes import Attention
+from avmsf.field.gains.attention import Attention
 from avmsf.field.sound_field import SoundField
 from avmsf.mesh.surface import Surface
 from avmsf.modal.extraction.extract import Extraction

@@ -12,9 +12,10 @@ import torch
 from avmsf._utils.state import write_checkpoint
 from avmsf.errors import AvmsfWarning, FieldFileError, FitError
 from avmsf.field.config import FitConfig
-from avmsf.field.fit import Progress, fit
-from avmsf.field.recipes import Attention
+from avmsf.field.fit import fit
+from avmsf.field.gains.attention import Attention
 from avmsf.field.sound_field import SoundField
+from avmsf.field.trainer import Progress
 from avmsf.field.training import AdamW, TrainingRun
 from factories.plate_field import QUICK, plate_extraction, plate_features, plate_impacts
 from factories.raising import raises, warns
@@ -149,7 +150,7 @@ def test_a_look_that_was_cut_off_is_taken_again(tmp_path, monkeypatch):
 
 def test_the_state_is_kept_while_the_fit_runs(tmp_path, monkeypatch):
     """A fit that is killed leaves a checkpoint behind as well, from the last time that one was due."""
-    monkeypatch.setattr("avmsf.field.fit._CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("avmsf.field.trainer._CHECKPOINT_SECONDS", 0.0)
     checkpoint, copies = tmp_path / "fit.checkpoint", {}
 
     def copy(progress: Progress) -> None:
@@ -164,9 +165,9 @@ def test_the_state_is_kept_while_the_fit_runs(tmp_path, monkeypatch):
 
 
 def test_a_fit_that_diverged_between_two_reads_of_the_loss_leaves_no_checkpoint(tmp_path, monkeypatch):
-    monkeypatch.setattr("avmsf.field.fit._CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("avmsf.field.trainer._CHECKPOINT_SECONDS", 0.0)
     # As on a GPU.
-    monkeypatch.setattr("avmsf.field.fit.steps_between_losses", lambda device: 100)
+    monkeypatch.setattr("avmsf.field.trainer.steps_between_losses", lambda device: 100)
     with raises(FitError, name=STAGES[0]):
         fitted(tmp_path / "state", config=replace(CONFIG, warmup_steps=0, learning_rate=1e30))
     kept = torch.load(tmp_path / "state", weights_only=True) if (tmp_path / "state").exists() else None
@@ -187,7 +188,7 @@ def test_a_full_disk_costs_the_checkpoint_and_not_the_fit(tmp_path, monkeypatch)
     def full(path: Path, *arguments: object, **named: object) -> None:
         raise FieldFileError(f"{path}: no space", file=path, value="No space left on device")
 
-    monkeypatch.setattr("avmsf.field.fit.write_checkpoint", full)
+    monkeypatch.setattr("avmsf.field.trainer.write_checkpoint", full)
     with warns(AvmsfWarning, file="fit.checkpoint", value="No space left on device"):
         expect_same(fitted(tmp_path / "fit.checkpoint"), uninterrupted())
 

@@ -2,7 +2,7 @@
 
 import torch
 
-from avmsf.field.recipes import orientation_signs
+from avmsf.field.gains.data import orientation_signs
 
 
 def _row(count: int) -> torch.Tensor:

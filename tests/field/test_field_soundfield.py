@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from avmsf.field.fit import fit
-from avmsf.field.recipes import Attention
+from avmsf.field.gains.attention import Attention
 from avmsf.field.sound_field import SoundField
 from avmsf.modal.residual_noise import shape_noise
 from factories.plate_field import PLATE, QUICK, RATE, plate_extraction, plate_features, plate_impacts

@@ -23,8 +23,8 @@ from safetensors.torch import save as to_bytes
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import FieldFileError
 from avmsf.field.fit import fit
+from avmsf.field.gains.attention import Attention
 from avmsf.field.header import FORMAT
-from avmsf.field.recipes import Attention
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
 from factories.plate_field import PLATE, QUICK, plate_extraction, plate_features, plate_impacts

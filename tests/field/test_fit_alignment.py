@@ -9,8 +9,8 @@ from avmsf.capture.impacts import Impacts
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
+from avmsf.field.gains.data import gain_data
 from avmsf.field.gains.mixture_gains import MixtureGains
-from avmsf.field.recipes import gain_case
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from factories.delayed_plate import ALIGNED, delays, distance, strikes, without_delays
 
@@ -34,7 +34,7 @@ def exact(delayed: tuple[Impacts, Extraction]) -> tuple[Impacts, Extraction]:
 def test_gains_to_spread_do_not_depend_on_delays(
     delayed: tuple[Impacts, Extraction], exact: tuple[Impacts, Extraction]
 ) -> None:
-    cases = [gain_case(train, FEATURES, modes, CONFIG) for train, modes in (delayed, exact)]
+    cases = [gain_data(train, FEATURES, modes, CONFIG) for train, modes in (delayed, exact)]
     assert distance(*(each.train.sounds for each in cases)) < ALIGNED
     assert distance(*(each.gains for each in cases)) < ALIGNED
 
@@ -60,10 +60,10 @@ def test_recordings_in_double_precision_are_recognized_by_their_alignment(delaye
     modes = extract_modes(double)
     assert modes.alignment is not None
     aligned = double.delayed(modes.alignment.delays).sounds.float()
-    assert torch.equal(gain_case(double, FEATURES, modes, CONFIG).train.sounds, aligned)
+    assert torch.equal(gain_data(double, FEATURES, modes, CONFIG).train.sounds, aligned)
 
 
 def test_aligned_recordings_are_not_delayed_again(delayed: tuple[Impacts, Extraction]) -> None:
     train, modes = delayed
     aligned = modes.aligned(train)
-    assert torch.equal(gain_case(aligned, FEATURES, modes, CONFIG).train.sounds, aligned.sounds)
+    assert torch.equal(gain_data(aligned, FEATURES, modes, CONFIG).train.sounds, aligned.sounds)

@@ -12,9 +12,11 @@ from avmsf.cli import main
 from avmsf.errors import FitError
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import fit
+from avmsf.field.gains.attention import Attention
+from avmsf.field.gains.data import gain_data
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.losses import SpectralTarget
-from avmsf.field.recipes import Attention, GainRecipe, gain_case
+from avmsf.field.trainer import GainEstimator
 from avmsf.field.training import Targets, TrainingRun
 from avmsf.pipeline.config import PipelineConfig
 from avmsf.pipeline.record import with_record
@@ -38,26 +40,17 @@ def on_meta(value: object) -> object:
     return value
 
 
-def started(recipe: GainRecipe, config: FitConfig, device: str) -> tuple[TrainingRun, Targets]:
+def started(recipe: GainEstimator, config: FitConfig, device: str) -> tuple[TrainingRun, Targets]:
     """Return a run before its first step, and what it is fitted to, on a device."""
     impacts = plate_impacts(6, seconds=0.1)
-    case = gain_case(impacts, plate_features(60), plate_extraction(impacts), replace(config, clusters=4))
-    run = TrainingRun(
-        recipe.start(case, config.damping),
-        case.modes,
-        gains=case.gains.to(device),
-        phase=case.phase,
-        sample_rate=impacts.sample_rate,
-        samples=impacts.sounds.shape[1],
-        config=case.config,
-    )
-    gains = case.gains.to("cpu" if device == "meta" else device)
-    targets = Targets.of(case.train, gains, recipe.rows(case), case.config)
-    return run, on_meta(targets) if device == "meta" else targets
+    data = gain_data(impacts, plate_features(60), plate_extraction(impacts), replace(config, clusters=4))
+    gains, rows = recipe.start(data)
+    targets = Targets.of(data, rows, "cpu" if device == "meta" else device)
+    return TrainingRun(gains, data, device), on_meta(targets) if device == "meta" else targets
 
 
 @pytest.mark.parametrize("recipe", [Attention(), MixtureEstimator()], ids=["network", "mixture"])
-def test_every_tensor_of_a_training_step_is_on_the_device_of_the_gains(recipe: GainRecipe) -> None:
+def test_every_tensor_of_a_training_step_is_on_the_device_of_the_gains(recipe: GainEstimator) -> None:
     run, targets = started(recipe, CONFIG, "meta")
     # Torch refuses to compute with tensors of two devices.
     loss = run.spectral_loss(targets)
@@ -85,7 +78,7 @@ class Launches(TorchDispatchMode):
 
 
 @pytest.mark.parametrize("recipe", [Attention(), MixtureEstimator()], ids=["network", "mixture"])
-def test_a_step_of_the_papers_training_has_few_launches_and_waits_for_none(recipe: GainRecipe) -> None:
+def test_a_step_of_the_papers_training_has_few_launches_and_waits_for_none(recipe: GainEstimator) -> None:
     # On the device `meta`, where chunks are a card's and no tensor has a value to wait for.
     run, targets = started(recipe, SHARED_PAPER, "meta")
     run.step = PAPER.warmup_steps
@@ -98,7 +91,7 @@ def test_a_step_of_the_papers_training_has_few_launches_and_waits_for_none(recip
 # What torch says whenever this mode is set.
 @pytest.mark.filterwarnings("ignore:Synchronization debug mode")
 @pytest.mark.parametrize("recipe", [Attention(), MixtureEstimator()], ids=["network", "mixture"])
-def test_a_step_on_a_gpu_waits_for_nothing_and_is_repeatable(recipe: GainRecipe) -> None:
+def test_a_step_on_a_gpu_waits_for_nothing_and_is_repeatable(recipe: GainEstimator) -> None:
     results = []
     for _ in range(2):
         run, targets = started(recipe, SHARED_PAPER, "cuda")
@@ -138,14 +131,14 @@ def test_the_cpu_is_as_good_as_no_choice() -> None:
 
 @pytest.mark.skipif(not CUDA, reason="needs a CUDA GPU")
 @pytest.mark.parametrize("recipe", [Attention(), MixtureEstimator()], ids=["network", "mixture"])
-def test_a_gpu_gives_the_same_field_up_to_rounding(recipe: GainRecipe) -> None:
+def test_a_gpu_gives_the_same_field_up_to_rounding(recipe: GainEstimator) -> None:
     contacts = plate_impacts(6, seconds=0.1).contacts
     one, other = (fitted(device, recipe).render(contacts) for device in ("cpu", "cuda"))
     # Rounding of float32, grown over a few steps.
     torch.testing.assert_close(one, other, rtol=0, atol=1e-3 * float(one.abs().max()))
 
 
-def fitted(device: str | None, recipe: GainRecipe | None = None):
+def fitted(device: str | None, recipe: GainEstimator | None = None):
     impacts = plate_impacts(6, seconds=0.1)
     recipe = Attention() if recipe is None else recipe
     config = replace(CONFIG, clusters=4)

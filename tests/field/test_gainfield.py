@@ -144,11 +144,7 @@ def test_without_a_direction_an_impact_goes_straight_into_the_body_or_as_its_nei
 @pytest.mark.parametrize("name", [name for name in FIELDS if name != "body"])
 def test_modes_put_in_another_order_are_the_same_modes(name):
     order, field = torch.tensor([2, 4, 0, 3, 1]), FIELDS[name]()
-    if isinstance(field, AttentionGains):
-        trainable = deepcopy(field)
-    else:
-        count = len(field.contacts)
-        trainable = RefinedGains(field, BANK, used=torch.arange(count), training=count)
+    trainable = deepcopy(field) if isinstance(field, AttentionGains) else RefinedGains(field, BANK)
     moved = trainable.finished(order)
     expect_close(parts(moved, PLACES, BLOWS), [each[:, order] for each in parts(field, PLACES, BLOWS)])
     assert moved.record() == field.record()

@@ -7,8 +7,8 @@ import torch
 
 from avmsf.field.config import AttentionShape, FitConfig
 from avmsf.field.fit import fit
-from avmsf.field.gains.attention import AttentionGains
-from avmsf.field.recipes import Attention, gain_case
+from avmsf.field.gains.attention import Attention, AttentionGains
+from avmsf.field.gains.data import gain_data
 from avmsf.field.store import load, save
 from avmsf.field.training import Targets, TrainingRun
 from avmsf.modal.residual_noise import noise_power
@@ -20,18 +20,9 @@ SHORT = replace(QUICK, warmup_steps=2, steps=2)
 
 def start(config: FitConfig) -> tuple[TrainingRun, Targets]:
     impacts = plate_impacts()
-    case = gain_case(impacts, plate_features(), plate_extraction(impacts), config)
-    recipe = Attention()
-    run = TrainingRun(
-        recipe.start(case, "shared"),
-        case.modes,
-        gains=case.gains,
-        phase=case.phase,
-        sample_rate=impacts.sample_rate,
-        samples=impacts.sounds.shape[1],
-        config=config,
-    )
-    return run, Targets.of(case.train, case.gains, recipe.rows(case), config)
+    data = gain_data(impacts, plate_features(), plate_extraction(impacts), config)
+    network, rows = Attention().start(data)
+    return TrainingRun(network, data), Targets.of(data, rows)
 
 
 def warmup_loss(config: FitConfig, offset: torch.Tensor) -> float:
@@ -80,8 +71,8 @@ def test_regressed_gains_are_the_warm_ups_aim_without_signs() -> None:
     impacts = plate_impacts()
     turned = replace(impacts, directions=torch.tensor([[0.0, 0.0, 1.0]] * len(impacts)))
     turned.directions[::2] *= -1
-    case = gain_case(turned, plate_features(), plate_extraction(impacts), replace(SHORT, warmup_gains="regression"))
-    signed = gain_case(turned, plate_features(), plate_extraction(impacts), SHORT)
+    case = gain_data(turned, plate_features(), plate_extraction(impacts), replace(SHORT, warmup_gains="regression"))
+    signed = gain_data(turned, plate_features(), plate_extraction(impacts), SHORT)
     assert float(case.gains.min()) >= 0
     assert float(signed.gains.min()) < 0
     # Modes that are far apart have the modulus of their bin, of a steady sine's two thirds at most.
@@ -93,11 +84,11 @@ def test_regressed_gains_are_the_warm_ups_aim_without_signs() -> None:
 def test_the_residual_may_start_from_the_quietest_segments() -> None:
     impacts, modes = plate_impacts(), plate_extraction(plate_impacts())
     bins = len(modes.residual.magnitude)
-    case = gain_case(impacts, plate_features(), modes, replace(SHORT, residual_start="quietest"))
+    case = gain_data(impacts, plate_features(), modes, replace(SHORT, residual_start="quietest"))
     expected = noise_power(impacts.sounds.float(), bins=bins).mean(0).sqrt()
     assert torch.equal(case.modes.residual.magnitude, expected)
     assert torch.equal(
-        gain_case(impacts, plate_features(), modes, SHORT).modes.residual.magnitude, modes.residual.magnitude
+        gain_data(impacts, plate_features(), modes, SHORT).modes.residual.magnitude, modes.residual.magnitude
     )
 
 

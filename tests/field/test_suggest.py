@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from avmsf.errors import ArrayError, FitError
+from avmsf.field.gains.attention import Attention
+from avmsf.field.gains.data import gain_data
 from avmsf.field.gains.elastic import REACH
 from avmsf.field.gains.mixture_gains import MixtureGains
-from avmsf.field.recipes import SHARED, Attention, gain_case
 from avmsf.field.sound_field import SoundField
 from avmsf.field.suggest import suggest
 from avmsf.field.uncertainty import relative_gain_std
@@ -132,7 +133,7 @@ def test_what_is_not_known_of_places_has_no_negative_variance(made: type, count:
 def test_gains_of_unknown_uncertainty_are_refused() -> None:
     impacts = plate_impacts()
     modes = plate_extraction(impacts)
-    network = Attention().start(gain_case(impacts, plate_features(), modes, QUICK), SHARED)
+    network, _ = Attention().start(gain_data(impacts, plate_features(), modes, QUICK))
     field = replace(sound_field(network.finished(torch.arange(len(modes.bank)))), bank=modes.bank)
     with raises(FitError, name="field", value="attention"):
         suggest(field)

@@ -7,8 +7,8 @@ import torch
 
 from avmsf.capture.impacts import rows_by_place
 from avmsf.features.feature_field import FeatureField
-from avmsf.field.fit import fit, held_out
-from avmsf.field.recipes import Attention
+from avmsf.field.fit import fit
+from avmsf.field.gains.attention import Attention, held_out
 from avmsf.gaussians.points import farthest_points
 from factories.plate_field import QUICK, plate_extraction, plate_impacts
 

@@ -14,8 +14,8 @@ from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody, Supports
 from avmsf.fem.supports import Support
 from avmsf.field.config import FitConfig, GainModelName
 from avmsf.field.fit import fit
-from avmsf.field.gains.estimator import MixtureEstimator, estimator_for, gain_variance
-from avmsf.field.recipes import GainCase, gain_case
+from avmsf.field.gains.data import GainData, gain_data, gain_variance
+from avmsf.field.gains.estimator import MixtureEstimator, estimator_for
 from avmsf.mesh.surface import Surface
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
@@ -85,9 +85,9 @@ def recorded(count: int, seed: int = 0) -> tuple[Impacts, Extraction]:
     return impacts, Extraction(bank, found, residual, torch.zeros_like(found))
 
 
-def case(count: int = 12, **changes: torch.Tensor | None) -> GainCase:
+def case(count: int = 12, **changes: torch.Tensor | None) -> GainData:
     impacts, modes = recorded(count)
-    return gain_case(replace(impacts, **changes), features(), modes, CONFIG)
+    return gain_data(replace(impacts, **changes), features(), modes, CONFIG)
 
 
 @pytest.mark.slow
@@ -106,7 +106,7 @@ def test_bodies_halve_the_error_between_impacts() -> None:
 
 
 def test_the_true_wall_and_its_stiffness_are_the_most_probable() -> None:
-    first, *others = estimator().start(case(), "shared").report["bodies"]
+    first, *others = estimator().solve(case())[0].report["bodies"]
     assert first["body"] == bodies()[1].name
     # Factors of the grid are 5 % apart.
     assert first["frequency_factor"] == pytest.approx(STIFFER, rel=0.06)
@@ -120,7 +120,7 @@ def test_the_most_probable_body_alone_is_made_finer_and_not_its_namesake() -> No
     )
     assert bad.name == good.name
     candidates = Asked(bad, good)
-    first, second = MixtureEstimator(bodies=candidates).start(case(), "shared").report["bodies"]
+    first, second = MixtureEstimator(bodies=candidates).solve(case())[0].report["bodies"]
     assert candidates.asked == [good]
     assert (first["wall_thickness"], first["refined"]) == (0.00396, True)
     assert (second["wall_thickness"], second["refined"]) == (0.00404, False)
@@ -129,7 +129,7 @@ def test_the_most_probable_body_alone_is_made_finer_and_not_its_namesake() -> No
 @pytest.mark.parametrize("free", [0, 1])
 def test_a_held_body_is_named_if_it_is_more_probable_than_the_free_one(free: int) -> None:
     candidates = Asked(bodies()[free], held=bodies()[1 - free], supports="try")
-    [found] = MixtureEstimator(bodies=candidates).start(case(), "shared").report["bodies"]
+    [found] = MixtureEstimator(bodies=candidates).solve(case())[0].report["bodies"]
     assert candidates.asked == [bodies()[free]]
     assert found["support"] == ("free" if free else "held at its lowest face")
     assert found["body"] == bodies()[1].name + ("" if free else ", held at its lowest face")
@@ -137,16 +137,16 @@ def test_a_held_body_is_named_if_it_is_more_probable_than_the_free_one(free: int
 
 def test_supports_are_not_tried_where_the_free_body_predicts_the_gains() -> None:
     candidates = Asked(bodies()[1], held=bodies()[0], supports="auto")
-    assert MixtureEstimator(bodies=candidates).start(case(), "shared").report["credibility"]["credible"]
+    assert MixtureEstimator(bodies=candidates).solve(case())[0].report["credibility"]["credible"]
     assert not candidates.asked
     candidates.supports = "try"
-    MixtureEstimator(bodies=candidates).start(case(), "shared")
+    MixtureEstimator(bodies=candidates).solve(case())
     assert candidates.asked
 
 
 def test_a_fine_body_is_not_computed_again() -> None:
     candidates = Asked()
-    MixtureEstimator(bodies=candidates).start(case(), "shared")
+    MixtureEstimator(bodies=candidates).solve(case())
     assert candidates.asked == []
 
 
@@ -160,13 +160,13 @@ def test_estimators_of_other_bodies_or_elements_have_other_digests() -> None:
 
 def test_reasons_against_other_bodies_are_reported() -> None:
     known = CandidateBodies(bodies()[1:2], {None: "the mesh is open"})
-    report = MixtureEstimator(bodies=known).start(case(), "shared").report
+    report = MixtureEstimator(bodies=known).solve(case())[0].report
     assert report["unavailable"] == {"solid body": "the mesh is open"}
 
 
 @pytest.mark.parametrize("directions", [None, torch.zeros(12, 3)], ids=["no directions", "directions of length zero"])
 def test_impacts_of_unknown_direction_go_straight_into_the_body(directions: torch.Tensor | None) -> None:
-    found = estimator().start(case(directions=directions), "shared").model.training.directions
+    found = estimator().solve(case(directions=directions))[0].training.directions
     straight = -truth(WALLS[1]).normals(recorded(12)[0].contacts)
     assert float((found * straight).sum(1).min()) > 0.99
 
@@ -180,7 +180,7 @@ def test_the_variance_by_noise_is_the_scatter_of_least_squares_gains() -> None:
     for frequency, damping in ((800.0, 3.0), (2500.0, 60.0)):
         bank = ModalBank(still + frequency, still + damping)
         modes = Extraction(bank, gains, Residual(torch.full((65,), LEVEL)), gains)
-        made = GainCase(impacts, features(), modes, still, gains, CONFIG)
+        made = GainData(impacts, features(), modes, still, gains, CONFIG)
         scatter = float(fit_sine_gains(noise, bank, sample_rate=RATE).double().square().mean())
         assert float(gain_variance(made)) == pytest.approx(scatter, rel=0.1)
 
@@ -202,10 +202,10 @@ ELSEWHERE: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
 @pytest.mark.parametrize("remedy", ELSEWHERE)
 def test_a_body_that_the_contacts_do_not_lie_on_takes_no_part_and_the_remedy_is_told(remedy: str) -> None:
     body = moved_body(ELSEWHERE[remedy])
-    report = estimator(body).start(case(), "shared").report
+    report = estimator(body).solve(case())[0].report
     assert report["bodies"] == []
     with raises(FitError, name="contacts") as caught:
-        estimator(body, kinds=("elastic",)).start(case(), "shared")
+        estimator(body, kinds=("elastic",)).solve(case())
     assert report["unavailable"]["elastic"] == str(caught.value)
     assert remedy in str(caught.value)
 
@@ -220,7 +220,7 @@ def test_bodies_take_part_despite_rough_surfaces_thick_glue_and_a_wrong_row(coun
     above = contacts + 0.03 * size * torch.tensor([0.0, 0.0, 1.0])
     above[-1] += 0.5 * size
     for body, each in ((rough, contacts), (bodies()[1], above)):
-        assert estimator(body).start(case(count, contacts=each), "shared").report["bodies"]
+        assert estimator(body).solve(case(count, contacts=each))[0].report["bodies"]
 
 
 @pytest.mark.parametrize(

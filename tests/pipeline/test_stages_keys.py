@@ -18,10 +18,11 @@ from avmsf.editing import guided
 from avmsf.errors import CaptureError, SimulationError
 from avmsf.fem import candidate_bodies as nominal
 from avmsf.fem.candidate_bodies import CandidateBodies, SurfaceBodies
-from avmsf.field import recipes
+from avmsf.field import fit as field_fit
 from avmsf.field.config import FitConfig
+from avmsf.field.fit import fingerprint
+from avmsf.field.gains.data import gain_data
 from avmsf.field.gains.estimator import MixtureEstimator
-from avmsf.field.recipes import fingerprint, gain_case
 from avmsf.field.store import load
 from avmsf.mesh.surface import Surface
 from avmsf.pipeline import stages
@@ -71,7 +72,7 @@ def body_key() -> set[str]:
 
 def fit_key() -> str:
     impacts = plate_impacts(6, seconds=0.1)
-    case = gain_case(impacts, plate_features(60), plate_extraction(impacts), FitConfig())
+    case = gain_data(impacts, plate_features(60), plate_extraction(impacts), FitConfig())
     return fingerprint(case, MixtureEstimator())
 
 
@@ -85,7 +86,7 @@ def edit_key() -> dict[str, str]:
     [
         (recipe, lambda: recipe.ObjectRecipe().elastic_values()),
         (nominal, body_key),
-        (recipes, fit_key),
+        (field_fit, fit_key),
         (guided, edit_key),
     ],
     ids=["elastic modes", "body", "fit", "edit"],

@@ -13,7 +13,8 @@ from avmsf.errors import FitError
 from avmsf.evaluation.task import Task, VisualInput
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig, GainModelName
-from avmsf.field.fit import fit, held_out
+from avmsf.field.fit import fit
+from avmsf.field.gains.attention import held_out
 from avmsf.field.gains.estimator import estimator_for
 from avmsf.field.sound_field import SoundField
 from avmsf.modal.extraction.extract import Extraction, extract_sounds

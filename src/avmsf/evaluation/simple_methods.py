@@ -20,8 +20,8 @@ from torch.nn.functional import normalize
 
 from avmsf.capture.impacts import Impacts, places_of
 from avmsf.errors import EvaluationError
+from avmsf.field.gains.data import orientation_signs
 from avmsf.field.gains.kernels import Axes, Sites, nearest_sites
-from avmsf.field.recipes import orientation_signs
 from avmsf.gaussians.points import nearest_points
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_gains, fit_sine_gains

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.optim.adamw import adamw
 
 from avmsf._utils.device import TRAINABLE, without_denormals
-from avmsf.capture.impacts import Impacts
 from avmsf.field.config import FitConfig
-from avmsf.field.gains.model import GainModel, Gains
+from avmsf.field.gains.data import GainData
+from avmsf.field.gains.model import Gains
 from avmsf.field.losses import SpectralTarget, spectral_loss, spectral_target
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.modes import ModalBank
@@ -27,30 +27,25 @@ class Targets:
     """Recordings as the losses compare them: their gains, and their spectra, whole and at the beginning."""
 
     rows: Int[Tensor, " contacts"]
-    """What the gain field reads for the contacts: rows of its points, or of what it was fitted to."""
+    """What the gains read for the contacts."""
     gains: Float[Tensor, "contacts modes"]
     """Extracted gains, the warm-up's aim."""
     whole: SpectralTarget
     early: SpectralTarget
 
     @classmethod
-    def of(
-        cls,
-        impacts: Impacts,
-        gains: Float[Tensor, "contacts modes"],
-        rows: Int[Tensor, " contacts"],
-        config: FitConfig,
-    ) -> "Targets":
-        """Prepare recordings with the config's resolutions, on the device of `gains`."""
-        sizes, hops, length = config.resolutions(impacts.sample_rate)
-        sounds = impacts.sounds.to(gains.device)
+    def of(cls, data: GainData, rows: Int[Tensor, " contacts"], device: torch.device | str = "cpu") -> "Targets":
+        """Prepare recordings with the config's resolutions, on a device."""
+        config = data.config
+        sizes, hops, length = config.resolutions(data.train.sample_rate)
+        sounds = data.train.sounds.to(device)
         whole = spectral_target(sounds, fft_sizes=sizes, hops=hops)
         early = spectral_target(sounds, fft_sizes=sizes, hops=hops, samples=length)
         if config.spectral_norm == "common":
             mean = sum(float(each.sum()) for each in whole.norms) / len(sizes)
             norms = [tuple(np.full_like(each, mean / len(each)) for each in of.norms) for of in (whole, early)]
             whole, early = replace(whole, norms=norms[0]), replace(early, norms=norms[1])
-        return cls(rows.to(gains.device), gains, whole, early)
+        return cls(rows.to(device), data.gains.to(device), whole, early)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,16 +101,7 @@ class AdamW:
 
 
 class TrainableGains(nn.Module):
-    """A gain model in training. Its matrices decay towards zero as the config asks for, other parameters do not."""
-
-    @property
-    def report(self) -> dict[str, Any]:
-        """What it chose before the training, as plain values."""
-        return {}
-
-    def used_rows(self, contacts: int) -> list[int]:
-        """Return which of the contacts it was started from, as many as `contacts`, are to be trained on."""
-        return list(range(contacts))
+    """Gains in training. Matrices decay towards zero as the config asks for, other parameters do not."""
 
     def read(self, rows: Int[Tensor, " contacts"]) -> Gains:
         """Return the gains at the contacts that `Targets.rows` stands for, differentiable in the parameters."""
@@ -125,40 +111,26 @@ class TrainableGains(nn.Module):
         """Return the negative log prior of the parameters, in the unit of the spectral loss."""
         return torch.zeros(())
 
-    def finished(self, order: Int[Tensor, " modes"]) -> GainModel:
-        """Return the gain model as it is, with its modes in the given order."""
-        raise NotImplementedError
-
 
 class TrainingRun:
-    """Parameters on their way: a gain field, small corrections to the bank and residual, and their optimizers.
+    """Parameters on their way: gains, small corrections to the bank and residual, and their optimizers.
 
     The corrections are measured in what the recordings resolve: frequencies in their modes' widths, dampings and noise
     magnitudes as logarithms. So one learning rate serves all, and dampings and magnitudes stay positive. All tensors
-    are on one device, that of `gains`; a step waits for none of them.
+    are on one device; a step waits for none of them.
     """
 
-    def __init__(
-        self,
-        network: TrainableGains,
-        modes: Extraction,
-        *,
-        gains: Float[Tensor, "contacts modes"],
-        phase: Float64[Tensor, " modes"],
-        sample_rate: float,
-        samples: int,
-        config: FitConfig,
-    ) -> None:
-        device = gains.device
-        self.network, self.config, self.phase = network.to(device), config, phase.to(device)
-        self.sample_rate, self.samples = sample_rate, samples
-        self.start = _on(modes, device)
-        self.weight = _mode_weight(self.start.bank, gains, config)
+    def __init__(self, network: TrainableGains, data: GainData, device: torch.device | str = "cpu") -> None:
+        device, config = torch.device(device), data.config
+        self.network, self.config, self.phase = network.to(device), config, data.phase.to(device)
+        self.sample_rate, self.samples = data.train.sample_rate, data.train.sounds.shape[1]
+        self.start = _on(data.modes, device)
+        self.weight = _mode_weight(self.start.bank, data.gains.to(device), config)
         bank = self.start.bank
-        self.width = torch.clamp(bank.damping / (2 * math.pi), min=sample_rate / samples)
+        self.width = torch.clamp(bank.damping / (2 * math.pi), min=self.sample_rate / self.samples)
         # A correction beyond half the mode's own frequency would mean that another mode is sought.
-        self.bounds = bank.frequency / 2, torch.clamp(bank.frequency * 1.5, max=0.499 * sample_rate)
-        count, bins = len(bank), len(modes.residual.magnitude)
+        self.bounds = bank.frequency / 2, torch.clamp(bank.frequency * 1.5, max=0.499 * self.sample_rate)
+        count, bins = len(bank), len(data.modes.residual.magnitude)
         self.shift = nn.Parameter(torch.zeros(count, dtype=torch.float64, device=device))
         self.decay = nn.Parameter(torch.zeros(count, dtype=torch.float64, device=device))
         self.noise = nn.Parameter(torch.zeros(bins, device=device))
@@ -184,6 +156,17 @@ class TrainingRun:
         """The modes as they stand."""
         moved = torch.clamp(self.start.bank.frequency + self.width * self.shift, *self.bounds)
         return ModalBank(moved, self.start.bank.damping * torch.exp(self.decay))
+
+    @property
+    def order(self) -> Int[Tensor, " modes"]:
+        """The modes by frequency: close ones may have passed one another on the way."""
+        return torch.argsort(self.bank.frequency.detach())
+
+    @property
+    def trained(self) -> ModalBank:
+        """The modes as they stand, in this order, without gradients."""
+        bank, order = self.bank, self.order
+        return ModalBank(bank.frequency.detach()[order], bank.damping.detach()[order])
 
     @property
     def finite(self) -> bool:
@@ -298,9 +281,3 @@ def _mode_weight(bank: ModalBank, gains: Float[Tensor, "contacts modes"], config
     energy = (torch.ones_like(bank.damping) if equal else 1 / (4 * bank.damping)).to(gains.dtype)
     total = (gains.square().mean(0) * energy).sum()
     return energy / total.clamp_min(torch.finfo(gains.dtype).tiny)
-
-
-def gain_scale(gains: Float[Tensor, "contacts modes"]) -> Float[Tensor, " modes"]:
-    """Return each mode's root mean square gain, never zero: the size that the network's output is measured in."""
-    scale = gains.square().mean(0).sqrt()
-    return scale.clamp_min(float(scale.max()) * 1e-6 + torch.finfo(gains.dtype).tiny)

@@ -187,7 +187,7 @@ def coverage(
 ) -> Coverage:
     """Return which part of the gains measured at other contacts lies in the interval of this level.
 
-    `parts` as `GainCase.parts`: amplitudes along each of the field's modes' phases and a quarter of a period ahead, of
+    `parts`: amplitudes along each of the field's modes' phases and a quarter of a period ahead, of
     each mode up to a phase that all contacts share, of each contact up to their common sign where the field knows no
     directions of impacts. The interval is normal, with the posterior standard deviation of a measured gain, so it holds
     the scatter of an impact as well. Raises as `fitted_mixture`, and FitError for gains of other modes.

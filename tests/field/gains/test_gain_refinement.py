@@ -9,15 +9,14 @@ from avmsf.field.gains.refinement import RefinedGains
 from avmsf.modal.modes import ModalBank
 from factories.gain_cases import draw, impacts, model
 
-CONTACTS, MODES, RECORDINGS = 14, 5, 17
-USED = torch.tensor([3, 0, 16, 5, 4, 6, 7, 8, 9, 10, 11, 12, 13, 14])
+CONTACTS, MODES = 14, 5
 ORDER = torch.tensor([2, 4, 0])
 DAMPING = torch.tensor([12.0, 15.0, 30.0, 22.0, 60.0], dtype=torch.float64)
 
 
 def refined(shift: float = 0.0) -> RefinedGains:
     bank = ModalBank(torch.linspace(400.0, 3000.0, MODES, dtype=torch.float64), DAMPING)
-    gains = RefinedGains(model(), bank, used=USED, training=RECORDINGS)
+    gains = RefinedGains(model(), bank)
     with torch.no_grad():
         gains.shift += shift * direction()
     return gains
@@ -28,8 +27,8 @@ def direction() -> torch.Tensor:
     return draw(CONTACTS, MODES, 2, seed=4).float()
 
 
-def read(gains: RefinedGains, rows: torch.Tensor = USED) -> torch.Tensor:
-    found = gains.read(rows)
+def read(gains: RefinedGains) -> torch.Tensor:
+    found = gains.read(torch.arange(CONTACTS))
     return torch.complex(found.mean.double(), found.quadrature.double()).detach()
 
 
@@ -42,12 +41,6 @@ def test_gains_start_as_the_models_mean_at_the_contacts():
     assert torch.allclose(read(refined()), mean_at_contacts(model()), rtol=1e-4, atol=1e-4)
     assert torch.equal(refined().finished(torch.arange(MODES)).values, model().values)
     assert float(refined().penalty().detach()) == 0.0
-
-
-def test_rows_are_those_of_the_recordings():
-    rows = torch.tensor([16, 3, 16, 14])
-    assert refined(0.01).used_rows(RECORDINGS) == USED.tolist()
-    assert torch.equal(read(refined(0.01), rows), read(refined(0.01))[[2, 0, 2, 13]])
 
 
 def test_a_shift_reads_as_the_model_of_the_moved_values():
@@ -95,8 +88,6 @@ def test_the_finished_model_is_judged_by_the_measured_gains_of_its_recordings():
     gains = refined(0.01)
     finished = gains.finished(ORDER)
     turn = torch.exp(1j * torch.tensor([0.3, -2.0, 1.0], dtype=torch.float64))
-    measured = torch.view_as_complex(draw(RECORDINGS, len(ORDER), 2, seed=12))
-    measured[USED] = finished.values * turn
-    judged = gains.finished_with(ORDER, measured)
+    judged = gains.finished(ORDER, finished.values * turn)
     assert torch.equal(judged.values, finished.values)
     assert torch.allclose(judged.measured, finished.values, rtol=1e-9)

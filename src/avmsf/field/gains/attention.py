@@ -1,8 +1,8 @@
-"""How strongly an impact at a place excites each mode: the paper's attention network (section 3.5)."""
+"""The paper's attention network (section 3.5): gains from image features, and the choice of its dampings."""
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from typing import Any, ClassVar
 
@@ -11,11 +11,19 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from avmsf._utils.text import RecordError, count_of, like, record_of
+from avmsf.capture.impacts import rows_by_place
 from avmsf.features.feature_field import FeatureField, Regions
 from avmsf.field.config import AttentionShape
+from avmsf.field.gains.data import GainData
 from avmsf.field.gains.model import GainModel, Gains
+from avmsf.field.trainer import FittedGains, GainEstimator, Trainer
 from avmsf.field.training import TrainableGains
+from avmsf.gaussians.points import farthest_points
 
+SHARED, PER_CONTACT = "shared", "per-contact"
+"""Dampings that are the same everywhere, and those that vary with the contact."""
+_MIN_PLACES = 6
+"""Positions below which none are left to validate on."""
 _MAX_LAYERS = 64
 """Hidden layers, or bands of frequency, of a network in a file: thirty times those of the paper's. Each takes time
 to build before it can be compared with the file's tensors."""
@@ -168,6 +176,100 @@ class AttentionGains(TrainableGains, GainModel):
                 generator=torch.Generator(device="cpu"),
                 regions=Regions(torch.empty(shape.clusters, 3), torch.empty(shape.clusters, dim)),
             )
+
+
+@dataclass(frozen=True, eq=False)
+class Attention(GainEstimator):
+    """Trains the paper's network, on the features of the fit or on its own."""
+
+    features: FeatureField | None = None
+    """What it reads in place of the fit's features."""
+    name: str = "attention"
+
+    def digest(self) -> str:
+        """Return the name and the digest of the network's own features."""
+        return f"attention {'' if self.features is None else self.features.digest()}"
+
+    def start(self, data: GainData) -> tuple[AttentionGains, Int[Tensor, " contacts"]]:
+        """Return an untrained network, and the points nearest to the contacts."""
+        features, config = self._features(data), data.config
+        scale = data.gains.square().mean(0).sqrt()
+        # Never zero: the network's output is measured in it.
+        least = float(scale.max()) * 1e-6 + torch.finfo(scale.dtype).tiny
+        network = AttentionGains(
+            features,
+            gain_scale=scale.clamp_min(least),
+            shape=replace(config.shape, spatial_damping=config.damping == PER_CONTACT),
+            generator=torch.Generator().manual_seed(config.seed),
+        )
+        return network, features.nearest(data.train.contacts)
+
+    def fit(self, data: GainData, trainer: Trainer) -> FittedGains:
+        """Choose what the config leaves open on held-out training contacts, then train with all."""
+        damping, steps, report = self._validated(data, trainer)
+        network, rows = self.start(_with_damping(data, damping))
+        run = trainer.run("fit", network, data, rows, warmup=data.config.warmup_steps, steps=steps)
+        return FittedGains(network.finished(run.order), run, range(len(data.train)), report)
+
+    def _validated(self, data: GainData, trainer: Trainer) -> tuple[str, int, dict[str, Any]]:
+        """Return the form of the dampings, the number of steps, and how they were decided."""
+        config, train = data.config, data.train
+        dampings = (SHARED, PER_CONTACT) if config.damping == "validated" else (config.damping,)
+        held = held_out(train.contacts, config.validation)
+        few = len(rows_by_place(train.contacts)) < _MIN_PLACES
+        if config.damping in dampings:
+            reason = "as set"
+        elif few:
+            reason = f"fewer than {_MIN_PLACES} positions leave none to validate on"
+        else:
+            reason = "chosen on validation contacts" if held else "no positions are held out to validate on"
+        undecided = len(dampings) > 1 or config.patience > 0
+        if few or not held or not undecided:
+            return dampings[0], config.steps, {"damping": dampings[0], "validated": False, "damping_reason": reason}
+        learned, unseen = data.take([row for row in range(len(train)) if row not in held]), data.take(held)
+        unseen_rows = self._features(data).nearest(unseen.train.contacts)
+        outcomes = {}
+        for damping in dampings:
+            name = f"trial with {damping} damping"
+            if name not in trainer.trials:
+                network, rows = self.start(_with_damping(learned, damping))
+                trainer.run(
+                    name, network, learned, rows, warmup=config.warmup_steps, steps=config.steps,
+                    held=(unseen, unseen_rows),
+                )  # fmt: skip
+            outcomes[damping] = trainer.trials[name]
+        best = min(outcomes, key=lambda damping: outcomes[damping]["envelope"])
+        steps = outcomes[best]["steps"] if config.patience else config.steps
+        return (
+            best,
+            steps,
+            {
+                "damping": best,
+                "validated": True,
+                "damping_reason": reason,
+                "validation_contacts": [train.names[row] for row in held],
+                "validation_envelope": {damping: each["envelope"] for damping, each in outcomes.items()},
+                "validation_spectral": {damping: each["spectral"] for damping, each in outcomes.items()},
+                "steps": steps,
+            },
+        )
+
+    def _features(self, data: GainData) -> FeatureField:
+        return data.features if self.features is None else self.features
+
+
+def held_out(contacts: Float[Tensor, "contacts 3"], fraction: float) -> list[int]:
+    """Return all rows of the places, a fraction of all, that farthest-point sampling takes last.
+
+    Of single rows it would take repeats last, whose places are trained on.
+    """
+    rows = rows_by_place(contacts)
+    order = farthest_points(contacts[[each[0] for each in rows]], len(rows)).tolist()
+    return [row for place in order[len(rows) - round(fraction * len(rows)) :] for row in rows[place]]
+
+
+def _with_damping(data: GainData, damping: Any) -> GainData:
+    return replace(data, config=replace(data.config, damping=damping))
 
 
 def encode(offsets: Float[Tensor, "*shape 3"], bands: int) -> Float[Tensor, "*shape encoded"]:

@@ -23,6 +23,8 @@ from avmsf.fem.supports import FREE, FREE_PRIOR
 from avmsf.fem.thickness import search_thickness
 from avmsf.fem.updating import update
 from avmsf.field.config import AUTO, NETWORK, GainModelName
+from avmsf.field.gains.attention import SHARED, Attention
+from avmsf.field.gains.data import GainData, along_phase, gain_variance
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, matched, total_evidence
 from avmsf.field.gains.kernels import KernelFamily, Sites, Smooth, ThinPlate, Unstructured, Visual, sites_along
@@ -32,8 +34,9 @@ from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.outliers import Fit, Judgment, assess_contacts, predicts_better
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.gains.symmetry import Symmetric
-from avmsf.field.recipes import Attention, GainCase, GainRecipe
+from avmsf.field.trainer import FittedGains, GainEstimator, Trainer
 from avmsf.gaussians.points import farthest_points
+from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.symmetry.characters import Group, groups_of
 from avmsf.symmetry.symmetries import Symmetries
 
@@ -56,7 +59,7 @@ _PLACES = 500
 
 
 @dataclass(frozen=True, eq=False)
-class MixtureEstimator(GainRecipe):
+class MixtureEstimator(GainEstimator):
     """Fits a Gaussian process whose kernel families are weighed by evidence."""
 
     kinds: tuple[str, ...] = FAMILIES
@@ -90,16 +93,30 @@ class MixtureEstimator(GainRecipe):
         symmetries = "" if self.symmetries is None else json.dumps(self.symmetries.to_dict())
         return hashlib.sha256(f"{' '.join(self.kinds)} {bodies} {symmetries} {self.update}".encode()).hexdigest()
 
-    def start(self, case: GainCase, damping: str) -> RefinedGains:
-        """Return the gain model, to be refined end to end.
+    def start(self, data: GainData) -> tuple[RefinedGains, Int[Tensor, " contacts"]]:
+        """Return the gain model, to be refined end to end, and its row of each contact. Raises as `solve`."""
+        model, used = self.solve(data)
+        rows = torch.full((len(data.train),), -1)
+        rows[used] = torch.arange(len(used))
+        return RefinedGains(model, data.modes.bank), rows
+
+    def fit(self, data: GainData, trainer: Trainer) -> FittedGains:
+        """Return the gain model, refined end to end, with its noise as measured by the refined modes."""
+        refined, rows = self.start(data)
+        used = torch.nonzero(rows >= 0).flatten()
+        # A recording of another position than its label would pull the others' gains to its sound.
+        run = trainer.run("fit", refined, data.take(used.tolist()), rows[used], warmup=0, steps=data.config.steps)
+        order, rate = run.order, data.train.sample_rate
+        measured = along_phase(*fit_gains(data.train.sounds, run.trained, sample_rate=rate), data.phase[order])
+        reason = "as set" if data.config.damping == SHARED else "the only form of this gain model"
+        damping = {"damping": SHARED, "validated": False, "damping_reason": reason}
+        model = refined.finished(order, measured[used])
+        return FittedGains(model, run, used.tolist(), model.report | damping)
+
+    def solve(self, data: GainData) -> tuple[MixtureGains, Int[Tensor, " used"]]:
+        """Return the gain model as it follows from the data's gains, and the rows of the contacts it is fitted to.
 
         Raises FitError where one family alone was asked for, elastic, symmetry or visual, and it cannot be had.
-        """
-        model, used = self.fit(case)
-        return RefinedGains(model, case.modes.bank, used=used, training=len(case.train))
-
-    def fit(self, case: GainCase) -> tuple[MixtureGains, Int[Tensor, " used"]]:
-        """Return the gain model and the rows of the contacts that it is fitted to. Raises as `start`.
 
         The thickness of a wall that is not known is searched for. Of several coarse bodies the most probable one is
         computed with finer elements, and the model is fitted again, until the most probable one is fine. Where it
@@ -107,16 +124,16 @@ class MixtureEstimator(GainRecipe):
         these are predicted better from each other without them. Last, the most probable body with its stiffness and
         density updated becomes one more hypothesis.
         """
-        bodies, missing = self._usable_bodies(case)
-        given, every = case.train.directions, torch.arange(len(case.train))
+        bodies, missing = self._usable_bodies(data)
+        given, every = data.train.directions, torch.arange(len(data.train))
         directional = bool(bodies) or (given is not None and bool(given.any()))
         groups = () if bodies or self.symmetries is None else groups_of(self.symmetries)
-        self._expect_inputs(case, groups)
+        self._expect_inputs(data, groups)
         candidates, supported = self.bodies, False
         searched = candidates is not None and candidates.searches_thickness
         # Of a wall that is too thin, shapes of high modes may fit as well as those of the right one.
         largest = largest_factor(searched=True) if searched else math.inf
-        fit = _Fit(case, self.kinds, _sites(case, bodies), directional, groups, largest)
+        fit = _Fit(data, self.kinds, _sites(data, bodies), directional, groups, largest)
         thickness = None
         if candidates is not None and searched and bodies:
             bodies, thickness = search_thickness(bodies, partial(fit.evidence, every), candidates.with_thickness)
@@ -152,26 +169,26 @@ class MixtureEstimator(GainRecipe):
                 families = fit.families(used, bodies)
                 model = fit(used, families)
         weights = _body_weights(model, families, fit.measured)
-        report = _report(bodies, families, weights, missing) | _outlier_report(judgment, case, used)
+        report = _report(bodies, families, weights, missing) | _outlier_report(judgment, data, used)
         report["thickness"] = None if thickness is None else asdict(thickness)
         report["advice"] = None if judgment.informative else _two_levels(fit) or _better_order(fit, bodies)
         return replace(model, report=report), used
 
-    def _expect_inputs(self, case: GainCase, groups: Sequence[Group]) -> None:
+    def _expect_inputs(self, data: GainData, groups: Sequence[Group]) -> None:
         """Raise FitError where one family alone was asked for and the symmetries or features that it needs are none."""
         if self.name == Symmetric.kind and not groups:
             raise FitError(
                 "symmetry: expected symmetries of the object's shape, got none; take another gain model",
                 name=Symmetric.kind,
             )
-        if self.name == Visual.kind and case.features.encoder == GEOMETRY:
+        if self.name == Visual.kind and data.features.encoder == GEOMETRY:
             raise FitError(
                 "visual: expected visual features, got positions only; give --features, or take another gain model",
                 name=Visual.kind,
                 value=GEOMETRY,
             )
 
-    def _usable_bodies(self, case: GainCase) -> tuple[list[CandidateBody], dict[str, str]]:
+    def _usable_bodies(self, data: GainData) -> tuple[list[CandidateBody], dict[str, str]]:
         """Return the bodies that the contacts lie on, and why there are none."""
         missing = {body_name(each): reason for each, reason in self.bodies.refused.items()} if self.bodies else {}
         if Elastic.kind not in self.kinds:
@@ -184,7 +201,7 @@ class MixtureEstimator(GainRecipe):
                 )
             return [], {Elastic.kind: self.missing} if self.missing else {}
         try:
-            expect_placed(case.train.contacts, self.bodies.bodies[0].elastic.points, names=case.train.names)
+            expect_placed(data.train.contacts, self.bodies.bodies[0].elastic.points, names=data.train.names)
         except FitError as error:
             if self.name == Elastic.kind:
                 raise
@@ -214,7 +231,7 @@ def estimator_for(
     symmetries: Callable[[], Symmetries | None] = lambda: None,
     features: FeatureField | None = None,
     log: Callable[[str], None] | None = None,
-) -> GainRecipe:
+) -> GainEstimator:
     """Return the estimator of this name; the network reads `features`, or the fit's own.
 
     `bodies` computes what may lie behind the object's surface. Where it raises an AvmsfError, `auto` has no elastic
@@ -240,7 +257,7 @@ def estimator_for(
 class _Fit:
     """Fits families to some of a case's contacts."""
 
-    case: GainCase
+    case: GainData
     kinds: tuple[str, ...]
     sites: Sites
     """All contacts."""
@@ -258,8 +275,8 @@ class _Fit:
     @cached_property
     def measured(self) -> MeasuredGains:
         """The gains at all contacts, with the variance that background noise gives them."""
-        values, bank = torch.view_as_complex(self.case.parts.contiguous()), self.case.modes.bank
-        return MeasuredGains(values, gain_variance(self.case), bank.frequency, bank.damping)
+        bank = self.case.modes.bank
+        return MeasuredGains(self.case.values, gain_variance(self.case), bank.frequency, bank.damping)
 
     def at(self, rows: Int[Tensor, " rows"]) -> MeasuredGains:
         """Return the gains at some contacts."""
@@ -317,21 +334,7 @@ class _Fit:
         return None if found is None else replace(body, elastic=found[0], updated=found[1])
 
 
-def gain_variance(case: GainCase) -> Float64[Tensor, " modes"]:
-    """Return the variance that the background noise gives each part of a gain by least squares.
-
-    White noise of variance v at a sample rate r leaves each part of a damped sine's amplitude with the variance
-    2 v / (r E), E = (1 - exp(-2 d T)) / (2 d) being the energy of its envelope over the duration T; around a mode's
-    frequency the residual is as good as white.
-    """
-    bank, magnitude = case.modes.bank, case.modes.residual.magnitude.double()
-    place = bank.frequency / (case.train.sample_rate / 2) * (len(magnitude) - 1)
-    noise = magnitude[place.round().long().clamp(0, len(magnitude) - 1)].square()
-    envelope = -torch.expm1(-2.0 * bank.damping * case.train.duration) / (2.0 * bank.damping)
-    return 2.0 * noise / (case.train.sample_rate * envelope)
-
-
-def _sites(case: GainCase, bodies: Sequence[CandidateBody]) -> Sites:
+def _sites(case: GainData, bodies: Sequence[CandidateBody]) -> Sites:
     """Return the training impacts; unknown directions go straight into the body.
 
     Without a body they are that of the nearest impact whose direction is known, or all alike where none is.
@@ -439,7 +442,7 @@ def _report(
     return {"bodies": sorted(found, key=lambda each: -each["weight"]), "unavailable": missing}
 
 
-def _outlier_report(judgment: Judgment, case: GainCase, used: Int[Tensor, " used"]) -> dict[str, Any]:
+def _outlier_report(judgment: Judgment, case: GainData, used: Int[Tensor, " used"]) -> dict[str, Any]:
     names, contacts, credibility = case.train.names, case.train.contacts, judgment.credibility
     kept = set(used.tolist())
     with_body, given = credibility is not None and credibility.credible, case.train.directions

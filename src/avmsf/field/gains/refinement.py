@@ -1,7 +1,5 @@
 """The gains at the training contacts, refined end to end through the gain model's smoother."""
 
-from typing import Any
-
 import torch
 from jaxtyping import Complex128, Float, Float32, Float64, Int
 from torch import Tensor, nn
@@ -28,19 +26,12 @@ class RefinedGains(TrainableGains):
     start: Float32[Tensor, "contacts modes 2"]
     noise: Float32[Tensor, "modes 2"]
     share: Float32[Tensor, " modes"]
-    position: Int[Tensor, " training"]
 
-    def __init__(self, model: MixtureGains, bank: ModalBank, *, used: Int[Tensor, " contacts"], training: int) -> None:
-        """Start from the model of the modes of `bank`, whose energies say how much a gain matters.
-
-        `used` are the rows, among `training` recordings, of the model's contacts.
-        """
+    def __init__(self, model: MixtureGains, bank: ModalBank) -> None:
+        """Start from the model of the modes of `bank`, whose energies say how much a gain matters."""
         super().__init__()
-        self.model, self.used = model, used
-        position = torch.full((training,), -1)
-        position[used] = torch.arange(len(used))
+        self.model = model
         smoother, values = model.smoother(), torch.view_as_real(model.values)
-        self.register_buffer("position", position)
         self.register_buffer("smoother", smoother.float())
         self.register_buffer("start", _applied(smoother, values).float())
         self.register_buffer("noise", model.noise().float())
@@ -48,18 +39,9 @@ class RefinedGains(TrainableGains):
         self.register_buffer("share", (energy / energy.sum().clamp_min(torch.finfo(torch.float64).tiny)).float())
         self.shift = nn.Parameter(torch.zeros_like(self.start))
 
-    @property
-    def report(self) -> dict[str, Any]:
-        """What the model's fit found."""
-        return self.model.report
-
-    def used_rows(self, contacts: int) -> list[int]:
-        """Return the rows of the recordings that the model uses."""
-        return self.used.tolist()
-
     def read(self, rows: Int[Tensor, " contacts"]) -> Gains:
-        """Return the gains at the contacts of these recordings."""
-        parts = (self.start + _applied(self.smoother, self.noise * _STEP * self.shift))[self.position[rows]]
+        """Return the gains at some of the model's contacts."""
+        parts = (self.start + _applied(self.smoother, self.noise * _STEP * self.shift))[rows]
         return Gains(parts[..., 0], parts[..., 1])
 
     def penalty(self) -> Float[Tensor, ""]:
@@ -67,21 +49,20 @@ class RefinedGains(TrainableGains):
         squares = (_STEP * self.shift).square().mean((0, 2))
         return 0.5 * _STRENGTH * (squares * self.share).sum()
 
-    def finished(self, order: Int[Tensor, " modes"]) -> MixtureGains:
-        """Return the model of the gains as they stand, with its modes in the given order."""
-        moved = (self.noise * _STEP * self.shift).detach().double()
-        return self.model.with_values(self.model.values + torch.view_as_complex(moved.contiguous())).take(order)
-
-    def finished_with(
-        self, order: Int[Tensor, " modes"], measured: Complex128[Tensor, "contacts modes"]
+    def finished(
+        self, order: Int[Tensor, " modes"], measured: Complex128[Tensor, "contacts modes"] | None = None
     ) -> MixtureGains:
-        """Return the finished model, judging itself by the gains that its modes, in order, have in the recordings.
+        """Return the model of the gains as they stand, with its modes in the given order.
 
-        Frequencies that moved end to end have turned their modes, which says nothing of the gains.
+        It judges itself by the `measured` gains that these modes, in order, have in the recordings. Frequencies that
+        moved end to end have turned their modes, which says nothing of the gains.
         """
-        finished = self.finished(order)
-        turned = turned_like(*(torch.view_as_real(each) for each in (measured[self.used], finished.values)))
-        return finished.with_measured(torch.view_as_complex(turned.contiguous()))
+        moved = (self.noise * _STEP * self.shift).detach().double()
+        model = self.model.with_values(self.model.values + torch.view_as_complex(moved.contiguous())).take(order)
+        if measured is None:
+            return model
+        turned = turned_like(torch.view_as_real(measured), torch.view_as_real(model.values))
+        return model.with_measured(torch.view_as_complex(turned.contiguous()))
 
 
 def _applied(smoother: Tensor, values: Float64[Tensor, "contacts modes 2"] | Tensor) -> Tensor:

@@ -1,41 +1,32 @@
-"""What a gain field is made from, and the ways to make one."""
+"""What gain models are fitted to: recordings whose modes and gains are known, checked."""
 
-import hashlib
-import json
-from abc import ABC, abstractmethod
-from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
-from typing import ClassVar
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Complex128, Float, Float64
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial.distance import cdist
 from torch import Tensor
 
-from avmsf._utils.caching import source_digest
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import FitError
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
-from avmsf.field.gains.attention import AttentionGains
-from avmsf.field.training import TrainableGains, gain_scale
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.finders import ShortTime
 from avmsf.modal.extraction.least_squares import fit_sine_gains
 from avmsf.modal.modes import common_phase
 from avmsf.modal.residual_noise import Residual, noise_power
 
-SHARED, PER_CONTACT = "shared", "per-contact"
-"""Dampings that are the same everywhere, and those that vary with the contact."""
 _OPPOSED = -0.5
 """Cosine between two neighbors' directions below which one of them comes from the other side: 120 degrees and more."""
 
 
 @dataclass(frozen=True, eq=False)
-class GainCase:
-    """Recordings whose gains are known, to be spread over an object."""
+class GainData:
+    """Recordings whose gains are known at their contacts."""
 
     train: Impacts
     """Aligned, in float32."""
@@ -50,17 +41,17 @@ class GainCase:
     config: FitConfig
 
     @property
-    def parts(self) -> Float64[Tensor, "contacts modes 2"]:
-        """The amplitudes along each mode's phase and a quarter of a period ahead of it."""
+    def values(self) -> Complex128[Tensor, "contacts modes"]:
+        """The extracted gains: amplitudes along each mode's phase, and a quarter of a period ahead of it."""
         return along_phase(self.modes.gains, self.modes.quadrature, self.phase)
 
-    def take(self, rows: list[int]) -> "GainCase":
-        """Return the case of some of the recordings, with the same modes and phases."""
+    def take(self, rows: Sequence[int]) -> "GainData":
+        """Return the data of some of the recordings, with the same modes and phases."""
         modes = replace(self.modes, gains=self.modes.gains[rows], quadrature=self.modes.quadrature[rows])
         return replace(self, train=self.train.take(rows), modes=modes, gains=self.gains[rows])
 
 
-def gain_case(train: Impacts, features: FeatureField, modes: Extraction, config: FitConfig) -> GainCase:
+def gain_data(train: Impacts, features: FeatureField, modes: Extraction, config: FitConfig) -> GainData:
     """Return what gain fields are made from. Raises FitError where no field can be fitted to recordings and modes."""
     _expect_fitting(train, modes)
     # The alignment comes first, as it recognizes recordings by their samples. Amplitudes are float32 from there on, so
@@ -83,17 +74,16 @@ def gain_case(train: Impacts, features: FeatureField, modes: Extraction, config:
         # No aim then, they only say how strong the modes are: what of the extraction's own has the phase does.
         turned = modes.gains * torch.cos(phase) + modes.quadrature * torch.sin(phase)
         gains = signs * turned.to(train.sounds)
-    return GainCase(train, features, modes, phase, gains, config)
+    return GainData(train, features, modes, phase, gains, config)
 
 
 def along_phase(
     gains: Float[Tensor, "contacts modes"],
     quadrature: Float[Tensor, "contacts modes"],
     phase: Float64[Tensor, " modes"],
-) -> Float64[Tensor, "contacts modes 2"]:
+) -> Complex128[Tensor, "contacts modes"]:
     """Return amplitudes of sines and cosines as those along each mode's phase (radians) and a quarter period ahead."""
-    both = torch.complex(gains.double(), quadrature.double())
-    return torch.view_as_real(both * torch.polar(torch.ones_like(phase), -phase))
+    return torch.complex(gains.double(), quadrature.double()) * torch.polar(torch.ones_like(phase), -phase)
 
 
 def orientation_signs(
@@ -120,80 +110,18 @@ def orientation_signs(
     return torch.from_numpy(-signs if signs.sum() < 0 else signs).float()
 
 
-class GainRecipe(ABC):
-    """A way to make a gain field; unless it says otherwise, one that solves for gains with shared dampings."""
+def gain_variance(data: GainData) -> Float64[Tensor, " modes"]:
+    """Return the variance that the background noise gives each part of a gain by least squares.
 
-    warms_up: ClassVar[bool] = False
-    """Whether gains have to be learned before the end-to-end stage, step by step (paper, eq. 13)."""
-
-    @property
-    @abstractmethod
-    def name(self) -> str:
-        """What reports, tables and the command line call it."""
-
-    @abstractmethod
-    def digest(self) -> str:
-        """Return what distinguishes this recipe from others, besides the config."""
-
-    @abstractmethod
-    def start(self, case: GainCase, damping: str) -> TrainableGains:
-        """Return the field as it is before training. Raises AvmsfError where it cannot be had."""
-
-    def dampings(self, config: FitConfig) -> tuple[str, ...]:
-        """Return the forms of damping to choose from."""
-        return (SHARED,)
-
-    def rows(self, case: GainCase) -> Int[Tensor, " contacts"]:
-        """Return what the field reads for the case's contacts."""
-        return torch.arange(len(case.train))
-
-
-@dataclass(frozen=True, eq=False)
-class Attention(GainRecipe):
-    """The paper's network, on the features of the fit or on its own."""
-
-    features: FeatureField | None = None
-    """What it reads in place of the fit's features."""
-    name: str = "attention"
-    warms_up: ClassVar[bool] = True
-
-    def digest(self) -> str:
-        """Return the name and the digest of the network's own features."""
-        return f"attention {'' if self.features is None else self.features.digest()}"
-
-    def dampings(self, config: FitConfig) -> tuple[str, ...]:
-        """Return the config's damping, or both where it leaves that to validation."""
-        return (SHARED, PER_CONTACT) if config.damping == "validated" else (config.damping,)
-
-    def start(self, case: GainCase, damping: str) -> AttentionGains:
-        """Return an untrained network."""
-        return AttentionGains(
-            self._features(case),
-            gain_scale=gain_scale(case.gains),
-            shape=replace(case.config.shape, spatial_damping=damping == PER_CONTACT),
-            generator=torch.Generator().manual_seed(case.config.seed),
-        )
-
-    def rows(self, case: GainCase) -> Int[Tensor, " contacts"]:
-        """Return the points nearest to the contacts."""
-        return self._features(case).nearest(case.train.contacts)
-
-    def _features(self, case: GainCase) -> FeatureField:
-        return case.features if self.features is None else self.features
-
-
-def fingerprint(case: GainCase, recipe: GainRecipe) -> str:
-    """Return a digest of all that decides a fit's result, this package's version and code among it."""
-    train, modes = case.train, case.modes
-    words = [version("avmsf"), source_digest("avmsf.field.fit"), asdict(case.config), recipe.name, recipe.digest()]
-    words += [train.digest(), case.features.digest()]
-    digest = hashlib.sha256(json.dumps(words, sort_keys=True).encode())
-    tensors = [modes.bank.frequency, modes.bank.damping, modes.residual.magnitude]
-    # Phases, and without a warm-up how strong the modes are, are those of the extraction.
-    for tensor in (*tensors, modes.gains, modes.quadrature):
-        digest.update(f"{tensor.dtype} {tuple(tensor.shape)}".encode())
-        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()
+    White noise of variance v at a sample rate r leaves each part of a damped sine's amplitude with the variance
+    2 v / (r E), E = (1 - exp(-2 d T)) / (2 d) being the energy of its envelope over the duration T; around a mode's
+    frequency the residual is as good as white.
+    """
+    bank, magnitude = data.modes.bank, data.modes.residual.magnitude.double()
+    place = bank.frequency / (data.train.sample_rate / 2) * (len(magnitude) - 1)
+    noise = magnitude[place.round().long().clamp(0, len(magnitude) - 1)].square()
+    envelope = -torch.expm1(-2.0 * bank.damping * data.train.duration) / (2.0 * bank.damping)
+    return 2.0 * noise / (data.train.sample_rate * envelope)
 
 
 def _expect_fitting(train: Impacts, modes: Extraction) -> None:

@@ -1,0 +1,206 @@
+"""What fits gain models: estimators, and the runs of training that they ask for, which a checkpoint may continue."""
+
+import math
+import time
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from avmsf._utils.device import steps_between_losses
+from avmsf._utils.state import read_checkpoint, write_checkpoint
+from avmsf.errors import AvmsfWarning, FieldFileError, FitError
+from avmsf.field.config import FitConfig
+from avmsf.field.gains.data import GainData
+from avmsf.field.gains.model import GainModel
+from avmsf.field.losses import spectral_loss
+from avmsf.field.training import Targets, TrainableGains, TrainingRun
+from avmsf.modal.spectra import envelope
+
+_CHECKPOINT_SECONDS = 30.0
+_VALIDATION_STEPS = 10
+"""Steps between validations."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a fit stands."""
+
+    stage: str
+    """Name of what is being done."""
+    step: int
+    """Steps done of this run."""
+    steps: int
+    """Steps of this run."""
+    loss: float
+    """Loss of the last step: relative squared gain error in warm-up, spectral loss after."""
+    warmup: int
+    """Steps of this run that are warm-up: each takes a small part of the time of one end to end."""
+
+
+class Trainer:
+    """The runs of one fit, in order, with a memory of those that are done."""
+
+    def __init__(
+        self,
+        identity: Mapping[str, str],
+        *,
+        checkpoint: Path | None,
+        progress: Callable[[Progress], None] | None,
+        device: torch.device,
+    ) -> None:
+        self.checkpoint, self.progress, self.device = checkpoint, progress, device
+        # Each kind of device draws noise of its own.
+        self.identity = {**identity, "device": device.type}
+        saved = (
+            None
+            if checkpoint is None
+            else read_checkpoint(checkpoint, self.identity, what="a fit", raising=FieldFileError)
+        )
+        self.trials: dict[str, dict[str, Any]] = {} if saved is None else saved["trials"]
+        self.running: dict[str, Any] | None = None if saved is None else saved["running"]
+        self.saved_at = time.monotonic()
+
+    def run(
+        self,
+        name: str,
+        network: TrainableGains,
+        data: GainData,
+        rows: Int[Tensor, " contacts"],
+        *,
+        warmup: int,
+        steps: int,
+        held: tuple[GainData, Int[Tensor, " held"]] | None = None,
+    ) -> TrainingRun:
+        """Train gains on recordings, for which they read `rows`; with `held`, note in `trials` how well they do there.
+
+        Raises FitError for a run that diverges.
+        """
+        # The cosine runs out where the run ends, for one that is meant to end early as well.
+        config = replace(data.config, warmup_steps=warmup, steps=max(1, steps))
+        run = TrainingRun(network, replace(data, config=config), self.device)
+        targets = Targets.of(data, rows, self.device)
+        validation = None if held is None else _Validation(Targets.of(*held, self.device), held[0], config)
+        if self.running is not None and self.running["name"] == name:
+            run.resume(self.running["run"])
+            if validation is not None:
+                validation.best = self.running["validation"]
+        end, every = warmup + steps, steps_between_losses(self.device)
+        try:
+            while True:
+                # First in the loop, so that a run which goes on takes the validation that an interruption may have cut
+                # off; a second one at the same step changes nothing.
+                if (validation is not None and validation.stops(run, end)) or run.step >= end:
+                    break
+                loss = run.advance(targets)
+                if run.step % every == 0 or run.step in (warmup, end):
+                    self._note(Progress(name, run.step, end, float(loss), warmup))
+                if time.monotonic() - self.saved_at > _CHECKPOINT_SECONDS:
+                    self._save(name, run, validation)
+        except KeyboardInterrupt:
+            # Amid a step's changes there is nothing to keep but what was saved before.
+            if run.whole and run.finite:
+                self._save(name, run, validation)
+            raise
+        if validation is not None:
+            self.trials[name] = {**validation.best, "steps": max(0, validation.best["steps"] - warmup)}
+        else:
+            # The work is done but the field is not saved yet: should that fail, it need not be done again.
+            self._save(name, run, None)
+        run.end()
+        return run
+
+    def _note(self, progress: Progress) -> None:
+        if not math.isfinite(progress.loss):
+            raise FitError(
+                f"{progress.stage}: expected a finite loss, got {progress.loss} at step {progress.step}; lower "
+                "learning_rate, warmup_rate or correction_rate",
+                name=progress.stage,
+                value=progress.loss,
+            )
+        if self.progress is not None:
+            self.progress(progress)
+
+    def _save(self, name: str, run: TrainingRun, validation: "_Validation | None") -> None:
+        if self.checkpoint is None:
+            return
+        # On a GPU the loss is read every few steps only: a fit may have diverged since, and could not go on from that.
+        if not run.finite:
+            self._note(Progress(name, run.step, run.step, math.nan, 0))
+        running = {"name": name, "run": run.state(), "validation": None if validation is None else validation.best}
+        state = {"trials": self.trials, "running": running}
+        try:
+            write_checkpoint(self.checkpoint, state, self.identity, raising=FieldFileError)
+        except FieldFileError as error:
+            # A full disk costs the checkpoint, not the fit.
+            message = f"{error}; the fit continues without a new checkpoint"
+            warnings.warn(AvmsfWarning(message, file=error.file, value=error.value), stacklevel=2)
+        self.saved_at = time.monotonic()
+
+
+class _Validation:
+    """Held-out contacts, and how well a run predicts them: at its best step with patience, or at its last."""
+
+    def __init__(self, targets: Targets, held: GainData, config: FitConfig) -> None:
+        self.targets, self.envelope, self.config = targets, envelope(held.train.sounds), config
+        self.best: dict[str, Any] = {"spectral": float("inf"), "envelope": float("inf"), "steps": 0}
+
+    def stops(self, run: TrainingRun, end: int) -> bool:
+        """Note the errors where it is time, relative and ENV (paper, 4.2); return whether patience is at its end."""
+        done = run.step - self.config.warmup_steps
+        if done < 0 or (done % _VALIDATION_STEPS and run.step != end):
+            return False
+        # Validation must not disturb the run: its noise comes from the same place in the stream every time.
+        state = run.generator.get_state()
+        with torch.no_grad():
+            sounds = run.sounds(self.targets.rows)
+            spectral = float(spectral_loss(sounds, self.targets.whole)) / len(self.targets.whole.hops)
+            distance = float((envelope(sounds.cpu()) - self.envelope).square().mean(1).sqrt().mean())
+        run.generator.set_state(state)
+        if not self.config.patience or spectral < self.best["spectral"]:
+            self.best = {"spectral": spectral, "envelope": distance, "steps": run.step}
+        return self.config.patience > 0 and run.step - self.best["steps"] >= self.config.patience
+
+
+@dataclass(frozen=True, eq=False)
+class FittedGains:
+    """What an estimator made of recordings."""
+
+    model: GainModel
+    """Its modes are in the `order` of the run."""
+    run: TrainingRun
+    """With the frequencies, dampings and noise as trained."""
+    used: Sequence[int]
+    """Rows of the recordings that the model was fitted to."""
+    report: dict[str, Any]
+    """What was chosen and found, as plain values."""
+
+
+class GainEstimator(ABC):
+    """A frozen configuration by which a gain model is fitted."""
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """What reports, tables and the command line call it."""
+
+    @abstractmethod
+    def digest(self) -> str:
+        """Return what distinguishes this estimator from others of its name."""
+
+    @abstractmethod
+    def start(self, data: GainData) -> tuple[TrainableGains, Int[Tensor, " contacts"]]:
+        """Return gains before they are trained end to end, and what they read for each contact; -1 for one left out.
+
+        Raises AvmsfError where they cannot be had.
+        """
+
+    @abstractmethod
+    def fit(self, data: GainData, trainer: Trainer) -> FittedGains:
+        """Return the fitted gain model. Raises as `start` and `Trainer.run`."""
