@@ -18,7 +18,8 @@ from avmsf.capture.audio import read_recording
 from avmsf.capture.prepare import margin_length, prepare
 from avmsf.capture.table import parse_row, read_rows
 from avmsf.errors import CaptureWarning
-from avmsf.evaluation.splits import evaluate, split
+from avmsf.evaluation.scores import evaluate
+from avmsf.evaluation.splits import split
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit

@@ -11,8 +11,9 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf.capture import Impacts
+from avmsf.evaluation.scores import Scores, evaluate, score
 from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor
-from avmsf.evaluation.splits import Scores, evaluate, score, split
+from avmsf.evaluation.splits import split
 from avmsf.evaluation.task import Renderer
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.candidate_bodies import SurfaceBodies

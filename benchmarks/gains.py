@@ -15,8 +15,9 @@ import torch
 from avmsf.capture import Impacts
 from avmsf.errors import CaptureWarning
 from avmsf.evaluation.modal_metrics import truth_at, truth_from_first_sample
+from avmsf.evaluation.scores import evaluate, score
 from avmsf.evaluation.simple_methods import MeanWaveform
-from avmsf.evaluation.splits import evaluate, score, split
+from avmsf.evaluation.splits import split
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.field.config import FitConfig

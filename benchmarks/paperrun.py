@@ -12,8 +12,9 @@ from torch import Tensor
 from avmsf.capture.impacts import Impacts
 from avmsf.datasets import CaptureCollection
 from avmsf.evaluation.objects import ObjectInputs
+from avmsf.evaluation.scores import evaluate
 from avmsf.evaluation.simple_methods import MeanWaveform
-from avmsf.evaluation.splits import evaluate, split
+from avmsf.evaluation.splits import split
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.gains.attention import Attention

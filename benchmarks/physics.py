@@ -13,7 +13,8 @@ from typing import Any
 import torch
 
 from avmsf.capture import read_capture, write_capture
-from avmsf.evaluation.splits import evaluate, split
+from avmsf.evaluation.scores import evaluate
+from avmsf.evaluation.splits import split
 from avmsf.fem.candidate_bodies import SurfaceBodies
 from avmsf.fem.material import NOMINAL, material_named
 from avmsf.field.config import FitConfig

@@ -8,7 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.capture import Impacts, read_capture
-from avmsf.evaluation.splits import score, split
+from avmsf.evaluation.scores import score
+from avmsf.evaluation.splits import split
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit

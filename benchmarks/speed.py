@@ -16,7 +16,8 @@ from typing import Literal, TypeVar
 import torch
 
 from avmsf.capture import Impacts
-from avmsf.evaluation.splits import evaluate, split
+from avmsf.evaluation.scores import evaluate
+from avmsf.evaluation.splits import split
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import fit

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.errors import CaptureWarning
-from avmsf.evaluation.splits import evaluate, split
+from avmsf.evaluation.scores import evaluate
+from avmsf.evaluation.splits import split
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.field.config import FitConfig

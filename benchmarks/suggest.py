@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from avmsf.capture import Capture, Impacts
-from avmsf.evaluation.splits import evaluate
+from avmsf.evaluation.scores import evaluate
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit

@@ -23,7 +23,7 @@ from . import studio as studio
 from . import symmetry as symmetry
 from .capture import Capture as Capture
 from .editing.material import edit as edit
-from .evaluation.splits import evaluate as evaluate
+from .evaluation.scores import evaluate as evaluate
 from .evaluation.splits import split as split
 from .export.write import write as write
 from .field.sound_field import SoundField as SoundField

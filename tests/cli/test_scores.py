@@ -7,8 +7,9 @@ import torch
 
 from avmsf.capture.impacts import Impacts
 from avmsf.cli.scores import compare
+from avmsf.evaluation.scores import evaluate
 from avmsf.evaluation.simple_methods import MeanWaveform
-from avmsf.evaluation.splits import evaluate, split
+from avmsf.evaluation.splits import split
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit

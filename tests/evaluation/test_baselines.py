@@ -14,8 +14,9 @@ import torch
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, FitError
 from avmsf.evaluation.metrics import relative_stft_error
+from avmsf.evaluation.scores import Scores, evaluate, score
 from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor
-from avmsf.evaluation.splits import Scores, evaluate, score, split
+from avmsf.evaluation.splits import split
 from avmsf.evaluation.task import expect_renderer
 from avmsf.gaussians.points import farthest_points
 from avmsf.modal.extraction.extract import Extraction

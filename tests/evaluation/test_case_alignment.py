@@ -13,12 +13,12 @@ from avmsf.datasets.dataset import ObjectFacts
 from avmsf.errors import EvaluationError
 from avmsf.evaluation import align_split, evaluate
 from avmsf.evaluation.case_run import CaseRun, Evaluation, ObjectData
-from avmsf.evaluation.cases import Case
 from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.methods import method_named
 from avmsf.evaluation.registry import PROTOCOLS
+from avmsf.evaluation.scores import MetricSettings
 from avmsf.evaluation.simple_methods import NearestRecording
-from avmsf.evaluation.splits import MetricSettings
+from avmsf.evaluation.splits import Case
 from avmsf.evaluation.task import Task
 from factories.delayed_plate import ALIGNED, delays, distance, strikes, without_delays
 from factories.plate_set import PlateInputs

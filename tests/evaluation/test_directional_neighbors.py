@@ -12,8 +12,9 @@ from torch.nn.functional import normalize
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import CaptureWarning
+from avmsf.evaluation.scores import evaluate
 from avmsf.evaluation.simple_methods import MeanWaveform
-from avmsf.evaluation.splits import evaluate, split
+from avmsf.evaluation.splits import split
 from factories.plate_field import plate_impacts
 
 X, Y = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]

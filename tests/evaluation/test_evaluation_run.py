@@ -24,8 +24,9 @@ from avmsf.evaluation.registry import PROTOCOLS
 from avmsf.evaluation.report import write_summary
 from avmsf.evaluation.results import ENCODER, ResultsFolder
 from avmsf.evaluation.runner import Progress, run_objects
+from avmsf.evaluation.scores import MetricSettings
 from avmsf.evaluation.simple_methods import NearestRecording
-from avmsf.evaluation.splits import MetricSettings, split, spread
+from avmsf.evaluation.splits import split, spread
 from avmsf.evaluation.task import Method, Renderer, Task
 from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
 from factories.plate_set import PlateInputs, fill_plates
@@ -333,7 +334,7 @@ def test_cdpam_is_taken_of_a_few_contacts(plates: Path, tmp_path: Path, monkeypa
             assert sample_rate == 8000.0
             return (predicted - truth).abs().sum(1).double()
 
-    monkeypatch.setattr("avmsf.evaluation.splits._cdpam", Ear)
+    monkeypatch.setattr("avmsf.evaluation.scores._cdpam", Ear)
     evaluation = replace(planned(plates, "nearest"), metric_settings=MetricSettings(level="raw", cdpam_contacts=3))
     run_objects(evaluation, ("a",), ResultsFolder(tmp_path))
     (record,) = ResultsFolder(tmp_path).records()

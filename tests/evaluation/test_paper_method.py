@@ -15,7 +15,7 @@ from avmsf.evaluation.field_methods import NETWORK, FieldMethod
 from avmsf.evaluation.methods import method_named
 from avmsf.evaluation.registry import PROTOCOLS
 from avmsf.evaluation.results import ResultsFolder
-from avmsf.evaluation.splits import MetricSettings
+from avmsf.evaluation.scores import MetricSettings
 from avmsf.evaluation.task import Task
 from avmsf.features.descriptors import ImageDescriptors
 from avmsf.features.encoder import Encoder

@@ -6,8 +6,7 @@ import torch
 from avmsf.capture.impacts import Impacts
 from avmsf.cli.scores import parts_words
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.cases import Choosing, Closest, Farthest, LeaveOneOut, Places, Shots
-from avmsf.evaluation.splits import split
+from avmsf.evaluation.splits import Choosing, Closest, Farthest, LeaveOneOut, Places, Shots, split
 from factories.raising import raises
 
 COUNT = 20

@@ -9,9 +9,8 @@ import torch
 
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.cases import Closest, Farthest, FewerViews, LeaveOneOut, Predefined, Shots
 from avmsf.evaluation.registry import BASELINE, METHODS, PROTOCOLS, protocol_named
-from avmsf.evaluation.splits import split
+from avmsf.evaluation.splits import Closest, Farthest, FewerViews, LeaveOneOut, Predefined, Shots, split
 from factories.plate_field import plate_impacts
 from factories.raising import raises
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from avmsf.evaluation.scores import evaluate
 from avmsf.evaluation.simple_methods import MeanWaveform
-from avmsf.evaluation.splits import evaluate
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit

@@ -12,8 +12,8 @@ from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.registry import PROTOCOLS
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.runner import run_object
+from avmsf.evaluation.scores import MetricSettings
 from avmsf.evaluation.simple_methods import NearestRecording
-from avmsf.evaluation.splits import MetricSettings
 from avmsf.evaluation.task import Task
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import write_splats

@@ -19,7 +19,6 @@ from avmsf.datasets import CaptureCollection, open_dataset
 from avmsf.datasets.dataset import Dataset
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.case_run import Evaluation
-from avmsf.evaluation.cases import Predefined, Shots
 from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.methods import RecordedMethod, method_named
 from avmsf.evaluation.objects import SUBSETS, ObjectInputs, choose_objects, members
@@ -29,7 +28,8 @@ from avmsf.evaluation.report import PAGE, SUMMARY, TABLES, write_figures, write_
 from avmsf.evaluation.report_tables import Section
 from avmsf.evaluation.results import IDENTITY, ResultsFolder
 from avmsf.evaluation.runner import run_objects
-from avmsf.evaluation.splits import MetricSettings
+from avmsf.evaluation.scores import MetricSettings
+from avmsf.evaluation.splits import Predefined, Shots
 from avmsf.evaluation.task import Method, VisualInput
 from avmsf.modal.extraction.finders import finder_named
 from avmsf.pipeline.config import AUTO, PRESETS, LiftConfig, SceneConfig, TimeZero, ViewsConfig

@@ -34,7 +34,8 @@ from avmsf.cli.scores import (
     score_values,
 )
 from avmsf.errors import FitError
-from avmsf.evaluation.splits import Scores, split
+from avmsf.evaluation.scores import Scores
+from avmsf.evaluation.splits import split
 from avmsf.features.store import load_features, read_report
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load

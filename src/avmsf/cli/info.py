@@ -16,7 +16,7 @@ from avmsf.cli.options.info import Options
 from avmsf.cli.options.paths import kind_of
 from avmsf.cli.printing import console, next_command, print_json, say
 from avmsf.cli.scores import body_warnings, outlier_words, quality_words, score_table, score_values
-from avmsf.evaluation.splits import evaluate
+from avmsf.evaluation.scores import evaluate
 from avmsf.field.config import NETWORK
 from avmsf.field.gains.attention import AttentionGains
 from avmsf.field.gains.scaled import BodyGains

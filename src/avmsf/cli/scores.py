@@ -13,8 +13,8 @@ from avmsf.capture import Impacts
 from avmsf.capture.impacts import places_of
 from avmsf.cli.heartbeat import verbosity
 from avmsf.cli.printing import table
+from avmsf.evaluation.scores import Scores, evaluate, score
 from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor
-from avmsf.evaluation.splits import Scores, evaluate, score
 from avmsf.evaluation.task import Renderer
 from avmsf.field.sound_field import SoundField
 from avmsf.modal.extraction.extract import Extraction

@@ -1,4 +1,22 @@
-"""Evaluation: splits, metrics, baselines, datasets and reports."""
+"""Evaluation: how far predicted sounds are from recorded ones, of any method on any dataset.
+
+In go recordings with their contacts; out come one value for each metric, method and held-out recording, and a report.
+
+- `Renderer` (`task`): anything that turns contacts into sounds. A *method* fits one to a `Task`: the training
+  recordings of one object, and what may be made of them (modes, features, elastic bodies, Gaussians).
+- `registry`: the tables of all methods, protocols and metrics. A new one is a function and a line.
+- `splits`: farthest-point, leave-one-out and other splits of contacts, `Case`s as data. `scores`: a renderer's values.
+- Metrics: spectral, log-mel and envelope distance (`metrics`); CDPAM (`cdpam`; Manocha et al., ICASSP 2021); CLAP score
+  (`clap`); modal assurance criterion and errors of modes and gains against a simulation's (`modal_metrics`); error of
+  located contacts (`localization`).
+- Methods: k nearest recordings, mean gains, thin-plate splines (`simple_methods`, `methods`), DiffSound and SonicGauss
+  (`avmsf.baselines`), and configurations of the sound field (`field_methods`).
+- `run_objects` (`runner`) runs an `Evaluation` (`case_run`) in this process or on ray, into a `ResultsFolder`
+  (`results`) that a stopped run goes on with; `summary`, `report_tables` and `report` make means, ratios to `knn3`, and
+  one report, as Markdown and as a page. `published` has the paper's values.
+
+Start at `evaluate` in `scores`, then `case_run.CaseRun.outcome`.
+"""
 
 import lazy_loader
 

@@ -17,14 +17,14 @@ from torch import Tensor
 from avmsf._utils.caching import Given, Result, once, source_digest
 from avmsf.capture.impacts import Impacts
 from avmsf.datasets.dataset import Dataset
-from avmsf.evaluation.cases import Case
 from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.localization import located, write_map
 from avmsf.evaluation.modal_metrics import truth_at, truth_from_first_sample, truth_of
 from avmsf.evaluation.objects import ObjectInputs, draw_other_recording
-from avmsf.evaluation.registry import Protocol
+from avmsf.evaluation.registry import METRICS, Protocol
 from avmsf.evaluation.results import ENCODER, CaseRecord, Outcome, ResultsFolder, failure_of, file_word
-from avmsf.evaluation.splits import MetricSettings, Values, align_split, spread
+from avmsf.evaluation.scores import MetricSettings, Values
+from avmsf.evaluation.splits import Case, align_split, spread
 from avmsf.evaluation.stored_sounds import RECORDED, keep_sound, listening_gain
 from avmsf.evaluation.task import Method, Renderer, Task, expect_renderer, report_of
 from avmsf.modal.extraction.extract import extract_once
@@ -74,6 +74,7 @@ class Evaluation:
             "seed": self.seed,
             "time_zero": self.time_zero,
             "metrics": _plain(self.metric_settings),
+            "columns": list(METRICS),
             "modes": _plain(self.finder),
             "settings": dict(self.settings),
         }

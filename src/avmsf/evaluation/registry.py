@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from avmsf.errors import EvaluationError
 
 if TYPE_CHECKING:
-    from avmsf.evaluation.cases import Choosing
+    from avmsf.evaluation.splits import Choosing
 
 BASELINE = "knn3"
 """The method that all others are compared with."""
@@ -148,7 +148,7 @@ class Protocol:
     """What the command line calls it."""
     title: str
     """What it does, in a sentence."""
-    cases: "str | Choosing" = "cases:Farthest"
+    cases: "str | Choosing" = "splits:Farthest"
     """How each object's contacts are split, or the import path of a class of it."""
     methods: tuple[str, ...] = _TABLE
     """Names of the methods that take part unless others are asked for; the baseline is among them."""
@@ -170,28 +170,28 @@ PROTOCOLS: dict[str, Protocol] = {
     each.name: each
     for each in (
         Protocol("farthest", "Train on 20 % of the contacts, chosen by farthest-point sampling; test on the others."),
-        Protocol("leave-one-out", "Test on every contact once, after training on all others.", "cases:LeaveOneOut"),
+        Protocol("leave-one-out", "Test on every contact once, after training on all others.", "splits:LeaveOneOut"),
         Protocol(
             "closest",
             "Train on 20 % of the contacts, in one region; test on the others.",
-            "cases:Closest",
+            "splits:Closest",
             subset="ablation",
         ),
         Protocol(
             "predefined",
             "Test on the recordings that are named; train on those at other contacts.",
-            "cases:Predefined",
+            "splits:Predefined",
         ),
         Protocol(
             "shots",
             "Train on nested subsets of contacts by farthest-point sampling; test on those left by the largest.",
-            "cases:Shots",
+            "splits:Shots",
             subset="ablation",
         ),
         Protocol(
             "views",
             "Visual features from all views and from 12; train and test as in `farthest`.",
-            "cases:FewerViews",
+            "splits:FewerViews",
             (BASELINE, "field"),
             subset="ablation",
         ),

@@ -14,9 +14,10 @@ from avmsf._utils.device import one_thread
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import AvmsfError, EvaluationError
 from avmsf.evaluation.case_run import CaseRun, Evaluation, ObjectData
-from avmsf.evaluation.cases import Case
 from avmsf.evaluation.methods import RecordedMethod
+from avmsf.evaluation.registry import METRICS, MetricEntry
 from avmsf.evaluation.results import CaseRecord, ObjectRecord, ResultsFolder, failure_of
+from avmsf.evaluation.splits import Case
 
 Progress = Callable[[str, int, int], None]
 """Gets what has begun or ended, the number of finished objects, and of all."""
@@ -130,8 +131,9 @@ def _run_remotely(
     progress: Progress,
 ) -> None:
     # max_retries: a worker that was killed for memory would be killed again.
-    remote, shared = ray.remote(num_cpus=1, max_retries=0)(run_object), ray.put(evaluation)
-    pending: dict[Any, str] = {remote.remote(shared, identifier, results): identifier for identifier in identifiers}
+    remote = ray.remote(num_cpus=1, max_retries=0)(_run_elsewhere)
+    shared = ray.put((evaluation, results, METRICS))
+    pending: dict[Any, str] = {remote.remote(shared, identifier): identifier for identifier in identifiers}
     progress(f"{len(pending)} objects on ray", 0, len(identifiers))
     try:
         while pending:
@@ -155,6 +157,12 @@ def _run_remotely(
     finally:
         for reference in pending:
             ray.cancel(reference, force=True)
+
+
+def _run_elsewhere(shared: tuple[Evaluation, ResultsFolder, dict[str, MetricEntry]], identifier: str) -> None:
+    evaluation, results, metrics = shared
+    METRICS.update(metrics)
+    run_object(evaluation, identifier, results)
 
 
 @contextmanager

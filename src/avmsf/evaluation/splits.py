@@ -1,59 +1,222 @@
-"""Splits into training and test recordings, and the scores of any renderer on the test recordings."""
+"""Splits of an object's recordings into training and test recordings: those of the protocols as data, and by hand.
 
-import math
+Contacts are chosen and counted, not recordings: all recordings at a contact are either training or test recordings. A
+test at a training contact would be too easy.
+"""
+
 import random
-import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
-from typing import Any, Literal, TypeVar, cast
+from typing import Protocol, TypeVar, cast, runtime_checkable
 
-import torch
-from jaxtyping import Float
+from jaxtyping import Float64
 from torch import Tensor
 
-from avmsf._utils.arrays import ArrayLike, as_floats
 from avmsf._utils.text import counted
 from avmsf.capture.folder import Capture
-from avmsf.capture.impacts import Impacts
-from avmsf.errors import EvaluationError, ExtractionError, FitError, PositionWarning
-from avmsf.evaluation.cases import Places
-from avmsf.evaluation.cdpam import Cdpam
-from avmsf.evaluation.metrics import PerContact, validate
-from avmsf.evaluation.modal_metrics import ModalRenderer, compare_modes
-from avmsf.evaluation.registry import METRICS, resolve
-from avmsf.evaluation.task import Renderer, expect_renderer
-from avmsf.field.sound_field import SoundField
-from avmsf.gaussians.points import farthest_points
+from avmsf.capture.impacts import Impacts, rows_by_place
+from avmsf.errors import EvaluationError, ExtractionError
+from avmsf.gaussians.points import closest_points, farthest_points
 from avmsf.modal.extraction.extract import Extraction, extract_modes
-from avmsf.simulate.ground_truth import Truth
 
 Recordings = TypeVar("Recordings", bound=Capture | Impacts)
 
 
+@dataclass(frozen=True)
+class Case:
+    """One choice of training and test impacts, by their rows in an object's `Impacts`."""
+
+    label: str
+    """Heading in tables; the cases of one label are folds of one experiment, and their values are pooled."""
+    train: tuple[int, ...]
+    """Indices of training recordings, in the order of their choice."""
+    test: tuple[int, ...]
+    """Indices of test recordings, ascending."""
+    fold: str = ""
+    """Fold of the experiment, where it has several."""
+    views: int | None = None
+    """Maximum number of views for visual features; None for all."""
+
+    @property
+    def key(self) -> str:
+        """Unique name among the cases of the object."""
+        return f"{self.label}: {self.fold}" if self.fold else self.label
+
+
+@runtime_checkable
+class Choosing(Protocol):
+    """A choice of training contacts, with all recordings there."""
+
+    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
+        """Return the cases of an object. Raises EvaluationError for too few contacts."""
+        ...
+
+
+@dataclass(frozen=True)
+class Farthest:
+    """Training contacts by farthest-point sampling, from the first one on (paper, section 4.1)."""
+
+    fraction: float = 0.2
+    """Fraction of the contacts to train on, at least 2 contacts."""
+
+    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
+        """Return the one case, the same as that of `avmsf.evaluation.splits.split`."""
+        places = Places.of(impacts)
+        return (places.case("farthest", farthest_points(places.contacts, places.expect_part(self.fraction))),)
+
+
+@dataclass(frozen=True)
+class Closest:
+    """Training contacts in one region: the first contact and those nearest to it (paper, supplement)."""
+
+    fraction: float = 0.2
+    """Fraction of the contacts to train on, at least 2 contacts."""
+
+    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
+        """Return the one case."""
+        places = Places.of(impacts)
+        return (places.case("closest", closest_points(places.contacts, places.expect_part(self.fraction))),)
+
+
+@dataclass(frozen=True)
+class Predefined:
+    """Test recordings by their names; all others are for training, but for those at contacts of the test recordings."""
+
+    test: tuple[str, ...] = ()
+    """Names of test recordings."""
+
+    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
+        """Return the one case. Raises EvaluationError for a name that no recording has."""
+        unknown = sorted(set(self.test) - set(impacts.names))
+        if unknown:
+            raise EvaluationError.expected(
+                f"names of {counted(len(impacts.names), 'recording')}, {impacts.names[0]} to {impacts.names[-1]}",
+                unknown[0],
+                name="test",
+            )
+        places, tested = Places.of(impacts), {row for row, name in enumerate(impacts.names) if name in self.test}
+        chosen = [place for place, rows in enumerate(places.rows) if tested.isdisjoint(rows)]
+        places.expect(len(chosen))
+        case = places.case("predefined", chosen)
+        return (replace(case, test=tuple(sorted(tested))),)
+
+
+@dataclass(frozen=True)
+class LeaveOneOut:
+    """Every contact is tested once, after training on all others."""
+
+    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
+        """Return a case for each contact, named by its first recording."""
+        places = Places.of(impacts)
+        count = len(places.rows)
+        places.expect(count - 1)
+        return tuple(
+            places.case("leave-one-out", (place for place in range(count) if place != left), fold=impacts.names[row[0]])
+            for left, row in enumerate(places.rows)
+        )
+
+
+@dataclass(frozen=True)
+class Shots:
+    """Nested subsets of training contacts by farthest-point sampling, all with the same test contacts."""
+
+    counts: tuple[int, ...] = (16, 8, 4, 2, 1)
+    """Numbers of training contacts; those that would leave no test contact are omitted."""
+    starts: int = 1
+    """Number of first contacts, evenly spaced in the table, each with subsets and test contacts of its own."""
+
+    def __post_init__(self) -> None:
+        if not self.counts or min(self.counts) < 1:
+            raise EvaluationError.expected("numbers of contacts of 1 or more", list(self.counts), name="counts")
+        if self.starts < 1:
+            raise EvaluationError.expected("1 start or more", self.starts, name="starts")
+
+    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
+        """Return a case for each number and start; the test contacts are those left by the largest number."""
+        places = Places.of(impacts)
+        total = len(places.rows)
+        counts = [count for count in self.counts if count < total] or [places.expect(min(self.counts))]
+        cases = []
+        for first in dict.fromkeys(round(number * total / self.starts) for number in range(self.starts)):
+            order = farthest_points(places.contacts, max(counts), start=first).tolist()
+            test = places.case("", order).test
+            fold = f"from {impacts.names[places.rows[first][0]]}" if self.starts > 1 else ""
+            cases += [
+                Case(f"{count} shots" if count > 1 else "1 shot", places.case("", order[:count]).train, test, fold)
+                for count in counts
+            ]
+        return tuple(cases)
+
+
+@dataclass(frozen=True)
+class FewerViews:
+    """The training contacts of `Farthest`, with all views of the object and with fewer."""
+
+    counts: tuple[int | None, ...] = (None, 12)
+    """Numbers of views; None is all."""
+
+    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
+        """Return the case of `Farthest`, once for each number of views."""
+        (case,) = Farthest().cases(impacts)
+        labels = {views: "all views" if views is None else f"{views} views" for views in self.counts}
+        return tuple(replace(case, label=label, views=views) for views, label in labels.items())
+
+
 @dataclass(frozen=True, eq=False)
-class Scores:
-    """How far rendered sounds are from recorded ones, by several metrics; lower is better."""
+class Places:
+    """The distinct contacts of an object, by `places_of`, in the order of their first recordings.
 
-    def __repr__(self) -> str:
-        means = ", ".join(f"{metric} {value:.3g}" for metric, value in self.mean().items())
-        return f"Scores({counted(len(self.names), 'recording')}: {means})"
+    Repeated recordings are of one contact even if its position was measured each time.
+    """
 
-    names: tuple[str, ...]
-    """Name of each scored recording."""
-    values: Mapping[str, PerContact]
-    """For each metric, by name, one value a recording."""
+    contacts: Float64[Tensor, "places 3"]
+    """Position of the first recording at each, meters."""
+    rows: tuple[tuple[int, ...], ...]
+    """Indices of the recordings at each."""
 
-    def mean(self) -> dict[str, float]:
-        """Return each metric's mean over the impacts."""
-        return {metric: float(values.mean()) for metric, values in self.values.items()}
+    @classmethod
+    def of(cls, impacts: Impacts) -> "Places":
+        """Find the distinct contacts of an object's impacts."""
+        rows = rows_by_place(impacts.contacts)
+        return cls(impacts.contacts.double()[[each[0] for each in rows]], rows)
 
-    def standard_error(self) -> dict[str, float]:
-        """Return the standard error of each mean, as if the impacts were independent; NaN for a single impact."""
-        return {
-            metric: float(values.std()) / math.sqrt(len(values)) if len(values) > 1 else math.nan
-            for metric, values in self.values.items()
-        }
+    @property
+    def recordings(self) -> int:
+        """Number of recordings at all contacts."""
+        return sum(map(len, self.rows))
+
+    def number_of(self, row: int) -> int:
+        """Return the contact of a recording. Raises EvaluationError for an index out of range."""
+        for place, rows in enumerate(self.rows):
+            if row in rows:
+                return place
+        raise EvaluationError(
+            f"expected the index of a recording, 0 to {self.recordings - 1}, got {row}", name="start", value=row
+        )
+
+    def expect(self, wanted: int, *, least: int = 1) -> int:
+        """Return `wanted`, or raise EvaluationError for fewer training contacts than `least` or no test contact."""
+        if not least <= wanted < len(self.rows):
+            raise EvaluationError(
+                f"expected {least} to {len(self.rows) - 1} training contacts of "
+                f"{counted(self.recordings, 'recording')} at {counted(len(self.rows), 'contact')}, got {wanted}; "
+                "choose another number or record more contacts",
+                name="count",
+                value=wanted,
+            )
+        return wanted
+
+    def expect_part(self, fraction: float) -> int:
+        """Return the number of a fraction of the contacts, at least 2. Raises EvaluationError as `expect`."""
+        return self.expect(max(2, round(fraction * len(self.rows))), least=2)
+
+    def case(self, label: str, chosen: Iterable[int] | Tensor, *, fold: str = "") -> Case:
+        """Return the case that trains on the chosen contacts: first recordings first, then the repeated ones."""
+        taken = [self.rows[int(place)] for place in chosen]
+        train = [rows[0] for rows in taken] + sorted(row for rows in taken for row in rows[1:])
+        used = set(train)
+        test = tuple(row for row in range(self.recordings) if row not in used)
+        return Case(label, tuple(train), test, fold)
 
 
 def split(
@@ -101,183 +264,8 @@ def align_split(
     return found.aligned(train), found.aligned(test)
 
 
-def evaluate(
-    renderer: Renderer | Callable[[Impacts], Renderer],
-    test: Capture | Impacts,
-    *,
-    train: Capture | Impacts | None = None,
-    fft_sizes: Sequence[int] | None = None,
-) -> Scores:
-    """Score the sounds that `renderer` renders at the contacts of recordings against these recordings.
-
-    With the training recordings as `train`, `renderer` is a class or function that makes one from them. It gets them,
-    and is scored on `test`, as the methods of `avmsf evaluate` are: aligned with one another (`align_split`). Without
-    them, recordings are taken as they are. For a SoundField, those that are not aligned yet are aligned as its fit
-    aligned those it was fitted to, and its sounds are as long as the recordings. Raises as `score`, and EvaluationError
-    for what is no renderer, and for one at another sample rate.
-    """
-    impacts = _impacts_of(test, "test")
-    if train is not None:
-        make = _expect_maker(renderer)
-        aligned, impacts = align_split(_impacts_of(train, "train"), impacts)
-        try:
-            renderer = make(aligned)
-        except FitError as error:
-            if error.name != "capture":
-                raise
-            raise EvaluationError.expected(
-                "a renderer made of recordings alone",
-                "SoundField",
-                got="a SoundField, whose fit needs the shape in a Capture",
-                name="renderer",
-                advice="give avmsf.fit(train), without `train`: it aligns the test recordings itself",
-            ) from error
-    made = expect_renderer(renderer)
-    if isinstance(made, SoundField):
-        impacts = made.aligned(impacts)
-    if made.sample_rate != impacts.sample_rate:
-        raise EvaluationError(
-            f"expected recordings at the field's {made.sample_rate:g} Hz, got {impacts.sample_rate:g} Hz; resample "
-            "them, or fit a field to recordings of their rate",
-            name="sample_rate",
-            value=impacts.sample_rate,
-        )
-    with torch.no_grad(), warnings.catch_warnings():
-        # Reading the capture has warned of contacts off the object.
-        warnings.simplefilter("ignore", PositionWarning)
-        if isinstance(made, SoundField):
-            samples = impacts.sounds.shape[1]
-            sounds = made.render(impacts.contacts, impacts.directions, samples=samples)
-        else:
-            sounds = made.render(impacts.contacts, directions=impacts.directions)
-    return score(sounds, impacts, fft_sizes=fft_sizes)
-
-
-def _impacts_of(recordings: Capture | Impacts, name: str) -> Impacts:
-    impacts = recordings.impacts if isinstance(recordings, Capture) else recordings
-    if not isinstance(impacts, Impacts):
-        raise EvaluationError(
-            f"{name}: expected a Capture or Impacts, got {type(impacts).__name__}",
-            name=name,
-            value=type(impacts).__name__,
-        )
-    return impacts
-
-
-def _expect_maker(given: Any) -> Callable[[Impacts], Renderer]:
-    if not callable(given) or (isinstance(given, Renderer) and not isinstance(given, type)):
-        raise EvaluationError.expected(
-            "a class or function that makes a renderer of the training recordings",
-            type(given).__name__,
-            got=f"an object of {type(given).__name__}",
-            name="renderer",
-            advice="leave out `train`, or give the class",
-        )
-    make: Callable[[Impacts], Renderer] = given
-    return make
-
-
-def score(
-    sounds: ArrayLike,
-    impacts: Impacts,
-    *,
-    fft_sizes: Sequence[int] | None = None,
-) -> Scores:
-    """Score sounds that were made otherwise than by a renderer, row for row of the impacts.
-
-    By all of `METRICS` that are functions of sounds; `relative_stft` with `fft_sizes` in samples where they are given.
-    Raises EvaluationError for sounds that do not fit the impacts or are not finite, with the name of the impact, and
-    ArrayError for what are no numbers.
-    """
-    sounds = as_floats(sounds, "sounds")
-    validate(sounds, impacts.sounds, names=impacts.names)
-    functions = {name: resolve(each.function) for name, each in METRICS.items() if each.function is not None}
-    if fft_sizes is not None:
-        functions["relative_stft"] = partial(functions["relative_stft"], fft_sizes=fft_sizes)
-    rate = impacts.sample_rate
-    return Scores(
-        impacts.names, {name: each(sounds, impacts.sounds, sample_rate=rate) for name, each in functions.items()}
-    )
-
-
-Values = dict[str, tuple[float | None, ...]]
-"""Each metric's value for every test contact; None where it was not computed."""
-
-
-@dataclass(frozen=True)
-class MetricSettings:
-    """Which metrics are computed."""
-
-    level: Literal["full-scale", "raw"] = "full-scale"
-    """full-scale: all sounds of an object times one factor, so that its loudest recording has a peak of one and L1, ENV
-    and CDPAM of different objects can be averaged; methods do not depend on it. raw: in the unit of the recordings,
-    such as pascals per newton."""
-    cdpam: bool = True
-    """Whether to compute CDPAM, the slowest metric."""
-    cdpam_contacts: int = 8
-    """Number of test contacts per case, evenly spaced, at which CDPAM is computed; 0 for all."""
-
-    def __post_init__(self) -> None:
-        if self.cdpam_contacts < 0:
-            raise EvaluationError(
-                f"expected cdpam_contacts of 0 (all) or more, got {self.cdpam_contacts}",
-                name="cdpam_contacts",
-                value=self.cdpam_contacts,
-            )
-
-    def prepare(self) -> None:
-        """Raise EvaluationError where a required package is not installed, before hours of computation."""
-        if self.cdpam:
-            _cdpam()
-
-    def values(
-        self,
-        renderer: Renderer,
-        sounds: Float[Tensor, "..."],
-        test: Impacts,
-        truth: Truth | None,
-        *,
-        loudest: float,
-    ) -> tuple[Values, dict[str, float | None]]:
-        """Return the metrics of `renderer` at the test contacts, and its figures over all of them.
-
-        `truth`, if known, has the rows of `test`; its time counts from the first sample of the recordings, as the
-        renderer's does (`truth_from_first_sample`). `loudest` is the peak of the object's loudest recording, in the
-        unit of the recordings. Raises as `score`.
-        """
-        if renderer.sample_rate != test.sample_rate:
-            raise EvaluationError.expected(
-                f"sounds at the recordings' {test.sample_rate:g} Hz", renderer.sample_rate, name="sample_rate"
-            )
-        if self.level == "full-scale" and loudest > 0:
-            sounds, test = sounds / loudest, replace(test, sounds=test.sounds / loudest)
-        scores = score(sounds, test)
-        values: Values = {metric: tuple(figures.tolist()) for metric, figures in scores.values.items()}
-        if self.cdpam:
-            values["cdpam"] = self._cdpam_values(sounds, test)
-        return values, {} if truth is None else _modal_figures(renderer, test, truth)
-
-    def _cdpam_values(self, sounds: Float[Tensor, "contacts samples"], test: Impacts) -> tuple[float | None, ...]:
-        rows = spread(len(test), self.cdpam_contacts or len(test))
-        taken = _cdpam().distance(sounds[rows], test.sounds[rows], sample_rate=test.sample_rate)
-        found = dict(zip(rows, taken.tolist(), strict=True))
-        return tuple(map(found.get, range(len(test))))
-
-
 def spread(count: int, wanted: int) -> list[int]:
     """Return at most `wanted` of the rows 0 to `count` - 1, evenly spread, in ascending order."""
     if wanted >= count:
         return list(range(count))
     return [(2 * place + 1) * count // (2 * wanted) for place in range(wanted)]
-
-
-def _modal_figures(renderer: Renderer, test: Impacts, truth: Truth) -> dict[str, float | None]:
-    """Return how near a method's modes and gains are to the truth; nothing of methods that have no modes."""
-    if not isinstance(renderer, ModalRenderer):
-        return {}
-    figures = compare_modes(renderer, test.contacts, truth, directions=test.directions).figures()
-    # Gains at a single contact agree with any others.
-    return {name: value for name, value in figures.items() if name != "mac" or len(test) > 1}
-
-
-_cdpam = lru_cache(maxsize=1)(Cdpam.load)
