@@ -1,8 +1,8 @@
 from .config import PAPER as PAPER
 from .config import FitConfig as FitConfig
 from .config import GainModelName as GainModelName
+from .gains.attention import Attention as Attention
 from .gains.estimator import MixtureEstimator as MixtureEstimator
-from .recipes import Attention as Attention
 from .sound_field import FieldQuality as FieldQuality
 from .sound_field import GainPosterior as GainPosterior
 from .sound_field import Origin as Origin
