@@ -279,16 +279,10 @@ def test_interpolation_is_exact_for_second_degree_and_takes_the_nearest_place(mo
     assert torch.allclose(field.gains(above, along)[:, 0], (expected * along).sum(dim=1), atol=1e-14)
 
 
-def test_highest_leaves_out_what_lies_above(bracket, modes):
-    limit = float(modes.frequency[3]) + 1.0
-    assert torch.equal(elastic_modes(bracket, STEEL, count=8, highest=limit).frequency, modes.frequency[:4])
-
-
 @pytest.mark.parametrize(
     ("settings", "name", "row", "value"),
     [
         ({"count": 0}, "count", None, 0),
-        ({"highest": 10.0}, "highest", None, 10.0),
         ({"stiffness_factor": torch.ones(3)}, "stiffness_factor", None, 3),
         ({"density_factor": -torch.ones(36)}, "density_factor", 0, -1.0),
         ({"springs": [(torch.zeros(3), 0.0)]}, "springs", 0, 0.0),

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
-from avmsf.fem.elements import SecondOrder, elements_of
+from avmsf.fem.elements import SecondOrder
 from avmsf.fem.material import STEEL
 from avmsf.fem.perturbation import Perturbations, smooth_fields
 from avmsf.fem.solid import Solid
@@ -33,8 +33,7 @@ def changes() -> Perturbations:
 
 
 def fields() -> np.ndarray:
-    elements = elements_of(SecondOrder.of(body()))
-    return smooth_fields(elements.centers, elements.volumes, length=0.25 * body().size, seed=0)
+    return smooth_fields(SecondOrder.of(body()))
 
 
 def squares(modes: ElasticModes) -> np.ndarray:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
-from avmsf.fem.elements import SecondOrder, elements_of
+from avmsf.fem.elements import SecondOrder
 from avmsf.fem.material import NOMINAL
 from avmsf.fem.perturbation import smooth_fields
 from avmsf.fem.solid import Solid
@@ -35,8 +35,7 @@ def nominal() -> ElasticModes:
 @cache
 def uneven(kind: str) -> ElasticModes:
     """Return the body as it is: stiffness or density departs by 1.5 or 2 prior deviations."""
-    elements = elements_of(SecondOrder.of(body()))
-    fields = smooth_fields(elements.centers, elements.volumes, length=0.25 * body().size, seed=0)
+    fields = smooth_fields(SecondOrder.of(body()))
     deviation = {"stiffness_factor": 1.5 * STIFFNESS, "density_factor": 2.0 * DENSITY}[kind]
     drawn = np.random.default_rng(3).normal(0.0, deviation, len(fields))
     return elastic_modes(body(), NOMINAL, count=MODES, **{kind: torch.from_numpy(np.exp(drawn @ fields))})

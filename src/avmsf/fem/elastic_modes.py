@@ -12,17 +12,17 @@ from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from avmsf.errors import SimulationError
-from avmsf.fem.eigen import Vibrations, lowest_vibrations, rigid_motions
-from avmsf.fem.elements import SecondOrder, elements_of, mass, stiffness
+from avmsf.fem.eigen import lowest_vibrations, rigid_motions
+from avmsf.fem.elements import SecondOrder, mass, stiffness
 from avmsf.fem.material import Material
 from avmsf.fem.perturbation import Perturbations, perturbations
-from avmsf.fem.solid import Solid, no_tetrahedra
+from avmsf.fem.solid import Solid
 from avmsf.mesh.closest_point import Closest, ClosestPoints
 from avmsf.mesh.surface import Surface, surface_points
 
 _PENDULUM = 1e-9
 """Squared frequency over the largest, below which a body turns about the nodes that it is held at: rounding alone."""
-_SHIFT = 1e-5
+RELATIVE_SHIFT = 1e-5
 """Shift of the eigenvalues over E / (density size^2), which is a tenth of the squared angular frequency of a bar."""
 
 
@@ -52,30 +52,37 @@ class ElasticModes:
 
     def at(self, places: Float[Tensor, "contacts 3"]) -> Float64[Tensor, "contacts modes 3"]:
         """Return the shapes where the surface is nearest to each place, interpolated as the elements do."""
-        return self._shapes_in(self._nearest(places))
-
-    def normals(self, places: Float[Tensor, "contacts 3"]) -> Float64[Tensor, "contacts 3"]:
-        """Return the unit normals, out of the body, of the triangles nearest to each place."""
-        return self._normals_of(self._nearest(places))
-
-    def distances(self, places: Float[Tensor, "contacts 3"]) -> Float64[Tensor, " contacts"]:
-        """Return the distance of each place from the surface, meters."""
-        return torch.from_numpy(self._nearest(places).distances)
+        rows, weights = self._interpolation(places)
+        # A node at a time: the shapes of all six at once would be six times the result.
+        total = torch.zeros(len(rows), *self.shapes.shape[1:], dtype=torch.float64)
+        for node in range(6):
+            total += weights[:, node, None, None] * self.shapes[rows[:, node]]
+        return total
 
     def gains(
         self, places: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"]
     ) -> Float64[Tensor, "contacts modes"]:
         """Return the shapes' components along `directions` where the surface is nearest to each place, 1 / sqrt(kg).
 
-        A blow of one newton-second along a unit vector gives a mode the velocity gain times shape. The response at
-        one place to a blow at another is the product of the two gains, whichever of them is struck.
+        An impact of one newton-second along a unit vector gives a mode the velocity gain times shape. The response at
+        one place to an impact at another is the product of the two gains, whichever of them is struck.
         """
-        rows, weights = self._interpolation(self._nearest(places))
+        rows, weights = self._interpolation(places)
         total = torch.zeros(len(places), len(self), dtype=torch.float64)
         for node in range(6):
             along = torch.einsum("cmd,cd->cm", self.shapes[rows[:, node]], directions.double())
             total += weights[:, node, None] * along
         return total
+
+    def normals(self, places: Float[Tensor, "contacts 3"]) -> Float64[Tensor, "contacts 3"]:
+        """Return the unit normals, out of the body, of the triangles nearest to each place."""
+        corners = self.nodes[self.triangles[torch.from_numpy(self._nearest(places).rows), :3]]
+        normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        return normals / normals.norm(dim=1, keepdim=True)
+
+    def distances(self, places: Float[Tensor, "contacts 3"]) -> Float64[Tensor, " contacts"]:
+        """Return the distance of each place from the surface, meters."""
+        return torch.from_numpy(self._nearest(places).distances)
 
     def near(self, places: Float[Tensor, "contacts 3"]) -> "ElasticModes":
         """Return the modes on those triangles of the surface alone that are nearest to the places."""
@@ -88,30 +95,14 @@ class ElasticModes:
         unfit = torch.nonzero(~torch.isfinite(places).all(dim=1)).flatten()
         if len(unfit):
             row = int(unfit[0])
-            value = places[row].tolist()
-            raise SimulationError(
-                f"position {row}: expected finite coordinates in meters, got {value}",
-                row=row,
-                name="places",
-                value=value,
-            )
+            raise SimulationError.expected("finite coordinates in meters", places[row].tolist(), row=row, name="places")
         return self._closest(places.double().numpy())
 
-    def _shapes_in(self, found: Closest) -> Float64[Tensor, "contacts modes 3"]:
-        rows, weights = self._interpolation(found)
-        # A node at a time: the shapes of all six at once would be six times the result.
-        total = torch.zeros(len(rows), *self.shapes.shape[1:], dtype=torch.float64)
-        for node in range(6):
-            total += weights[:, node, None, None] * self.shapes[rows[:, node]]
-        return total
-
-    def _normals_of(self, found: Closest) -> Float64[Tensor, "contacts 3"]:
-        corners = self.nodes[self.triangles[torch.from_numpy(found.rows), :3]]
-        normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        return normals / normals.norm(dim=1, keepdim=True)
-
-    def _interpolation(self, found: Closest) -> tuple[Int[Tensor, "contacts 6"], Float64[Tensor, "contacts 6"]]:
+    def _interpolation(
+        self, places: Float[Tensor, "contacts 3"]
+    ) -> tuple[Int[Tensor, "contacts 6"], Float64[Tensor, "contacts 6"]]:
         """Return the nodes of the nearest triangle, and the second-order shape functions in the nearest point of it."""
+        found = self._nearest(places)
         corner = torch.from_numpy(found.weights)
         weights = torch.cat([corner * (2.0 * corner - 1.0), 4.0 * corner * corner.roll(-1, dims=1)], dim=1)
         return self.triangles[torch.from_numpy(found.rows)], weights
@@ -134,11 +125,10 @@ def elastic_modes(
     stiffness_factor: Float[Tensor, " cells"] | None = None,
     density_factor: Float[Tensor, " cells"] | None = None,
     springs: Sequence[tuple[Float[Tensor, " 3"], float]] | None = None,
-    highest: float | None = None,
     fixed: Int[np.ndarray, " fixed"] | None = None,
     perturbed: bool = False,
 ) -> ElasticModes:
-    """Return the lowest `count` elastic modes of a body by second-order finite elements, none above `highest` Hz.
+    """Return the lowest `count` elastic modes of a body by second-order finite elements.
 
     The factors multiply Young's modulus and the density in each cell. The body is free, or held by `springs`: places
     on its surface and their stiffness in newtons per meter, the same in all directions. A free body's six rigid
@@ -147,101 +137,61 @@ def elastic_modes(
     leave no such mode, and then none is left out. `fixed` names nodes of `SecondOrder.of(solid)` that do not move. With
     `perturbed` the modes come with the first-order changes of their matrices, for a body without factors.
 
-    Raises SimulationError for a body of several parts or too few nodes, factors and springs that are not positive,
-    and where no mode lies below `highest`.
+    Raises SimulationError for a body of several parts or too few nodes, and factors and springs that are not positive.
     """
     if count < 1:
-        raise SimulationError(f"count: expected 1 mode or more, got {count}", name="count", value=count)
+        raise SimulationError.expected("1 mode or more", count, name="count")
     if perturbed and (stiffness_factor is not None or density_factor is not None):
         raise SimulationError.expected(
             "no stiffness or density factors", True, got="some", name="perturbed", advice="leave them out"
         )
-    expect_whole(solid)
+    solid.expect_connected()
     light = _factor(solid, density_factor, "density_factor")
     mesh = SecondOrder.of(solid)
     weights = mass(mesh, material.density * light)
     forces = stiffness(mesh, material, _factor(solid, stiffness_factor, "stiffness_factor"))
     if springs:
         forces = forces + _support(mesh, springs)
-    shift = _SHIFT * material.young / (material.density * solid.size**2)
-    found = _vibrations(mesh, forces, weights, count=count, shift=shift, supported=bool(springs), fixed=fixed)
-    frequency = torch.from_numpy(np.sqrt(found.squares) / (2.0 * math.pi))
-    kept = len(frequency) if highest is None else _modes_up_to(highest, frequency)
-    whole = found.shapes[:, :kept].reshape(len(mesh.nodes), 3, -1)
-    changes = None if not perturbed else perturbations(
-        elements_of(mesh), whole, size=float(solid.size), young=material.young, poisson=material.poisson,
-        density=material.density,
-    )  # fmt: skip
-    outer, triangles = np.unique(mesh.boundary, return_inverse=True)
-    shapes = whole[outer].transpose(0, 2, 1)
-    return ElasticModes(
-        frequency=frequency[:kept].clone(),
-        nodes=torch.from_numpy(mesh.nodes[outer]),
-        triangles=torch.from_numpy(triangles.reshape(-1, 6)),
-        shapes=torch.from_numpy(np.ascontiguousarray(shapes)),
-        material=material,
-        mass=float((solid.volumes * light).sum()) * material.density,
-        perturbations=changes,
-    )
-
-
-def _modes_up_to(highest: float, frequency: Float64[Tensor, " modes"]) -> int:
-    """Return how many of the modes, in order, lie below a limit in Hz; raises SimulationError for none."""
-    count = int((frequency <= highest).sum())
-    if not count:
-        raise SimulationError(
-            f"highest: expected a limit above the lowest mode at {float(frequency[0]):g} Hz, got {highest:g} Hz; raise "
-            "it, or make the object larger or thinner",
-            name="highest",
-            value=highest,
-        )
-    return count
-
-
-def _vibrations(
-    mesh: SecondOrder,
-    forces: scipy.sparse.sparray,
-    weights: scipy.sparse.csr_array,
-    *,
-    count: int,
-    shift: float,
-    supported: bool,
-    fixed: Int[np.ndarray, " fixed"] | None,
-) -> Vibrations:
-    """Return the lowest vibrations from the matrices of all nodes, whether or not some of these are fixed."""
+    shift = RELATIVE_SHIFT * material.young / (material.density * solid.size**2)
     rigid = rigid_motions(mesh.nodes, weights)
     if fixed is None:
-        return lowest_vibrations(forces, weights, rigid, count=count, shift=shift, supported=supported)
-    free = np.setdiff1d(np.arange(len(mesh.nodes)), fixed)
-    moving = (3 * free[:, None] + np.arange(3)).ravel()
-    forces, weights = forces.tocsr()[moving][:, moving], weights[free][:, free]
-    # A cantilever's lowest mode is mostly a turn, and yet none of a rigid body.
-    rigid = np.zeros_like(rigid[moving])
-    found = lowest_vibrations(forces, weights, rigid, count=count, shift=shift, supported=True)
-    bending = found.squares > _PENDULUM * found.squares.max()
-    shapes = np.zeros((3 * len(mesh.nodes), int(bending.sum())))
-    shapes[moving] = found.shapes[:, bending]
-    return Vibrations(found.squares[bending], shapes)
+        found = lowest_vibrations(forces, weights, rigid, count=count, shift=shift, supported=bool(springs))
+        squares, shapes = found.squares, found.shapes
+    else:
+        free = np.setdiff1d(np.arange(len(mesh.nodes)), fixed)
+        moving = (3 * free[:, None] + np.arange(3)).ravel()
+        forces, weights = forces.tocsr()[moving][:, moving], weights[free][:, free]
+        # A cantilever's lowest mode is mostly a turn, and yet none of a rigid body.
+        found = lowest_vibrations(
+            forces, weights, np.zeros_like(rigid[moving]), count=count, shift=shift, supported=True
+        )
+        bending = found.squares > _PENDULUM * found.squares.max()
+        squares, shapes = found.squares[bending], np.zeros((3 * len(mesh.nodes), int(bending.sum())))
+        shapes[moving] = found.shapes[:, bending]
+    whole = shapes.reshape(len(mesh.nodes), 3, -1)
+    outer, triangles = mesh.surface
+    return ElasticModes(
+        frequency=torch.from_numpy(np.sqrt(squares) / (2.0 * math.pi)),
+        nodes=torch.from_numpy(mesh.nodes[outer]),
+        triangles=torch.from_numpy(triangles),
+        shapes=torch.from_numpy(np.ascontiguousarray(whole[outer].transpose(0, 2, 1))),
+        material=material,
+        mass=float((solid.volumes * light).sum()) * material.density,
+        perturbations=perturbations(mesh, whole, material) if perturbed else None,
+    )
 
 
 def _support(mesh: SecondOrder, springs: Sequence[tuple[Tensor, float]]) -> scipy.sparse.csr_array:
     """Return the stiffness that springs at the nearest points of the surface add, spread over a triangle's nodes."""
     triangles = mesh.boundary
-    closest = ClosestPoints(mesh.nodes[triangles[:, :3]])
-    found = closest(np.stack([place.double().numpy() for place, _ in springs]))
+    found = ClosestPoints(mesh.nodes[triangles[:, :3]])(np.stack([place.double().numpy() for place, _ in springs]))
     total = scipy.sparse.csr_array((3 * len(mesh.nodes),) * 2)
     for spring, (_, strength) in enumerate(springs):
         if not 0 < strength < math.inf:
-            raise SimulationError(
-                f"spring {spring}: expected a stiffness above 0 N/m, got {strength:g}",
-                row=spring,
-                name="springs",
-                value=strength,
-            )
+            raise SimulationError.expected("a stiffness above 0 N/m", strength, row=spring, name="springs")
         corner = found.weights[spring]
         weights = np.concatenate([corner * (2.0 * corner - 1.0), 4.0 * corner * np.roll(corner, -1)])
-        nodes = triangles[found.rows[spring]]
-        row = scipy.sparse.csr_array((weights, nodes, [0, 6]), shape=(1, len(mesh.nodes)))
+        row = scipy.sparse.csr_array((weights, triangles[found.rows[spring]], [0, 6]), shape=(1, len(mesh.nodes)))
         total = total + scipy.sparse.kron(strength * (row.T @ row), scipy.sparse.eye_array(3), format="csr")
     return total
 
@@ -254,23 +204,5 @@ def _factor(solid: Solid, factor: Float[Tensor, " cells"] | None, name: str) -> 
     unfit = torch.nonzero(~((factor > 0) & torch.isfinite(factor))).flatten()
     if len(unfit):
         row = int(unfit[0])
-        value = float(factor[row])
-        raise SimulationError.expected("more than 0", value, row=row, name=name)
+        raise SimulationError.expected("more than 0", float(factor[row]), row=row, name=name)
     return factor.double()
-
-
-def expect_whole(solid: Solid) -> None:
-    """Raise SimulationError for a body without volume, with flat tetrahedra, or of several parts."""
-    if not len(solid.cells):
-        raise no_tetrahedra()
-    solid.expect_volume()
-    number = int(solid.parts.max()) + 1
-    if number > 1:
-        volumes = torch.bincount(solid.parts, weights=solid.volumes)
-        sizes = ", ".join(f"{volume:.3g}" for volume in volumes[:4].tolist())
-        raise SimulationError(
-            f"expected a connected shape, got {number} parts of {sizes}{', ...' if number > 4 else ''} m3; join them, "
-            "or use the largest",
-            name="parts",
-            value=number,
-        )

@@ -8,6 +8,7 @@ mass matrix is the same for all cells but for their volume.
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 import scipy.sparse
@@ -15,7 +16,6 @@ from jaxtyping import Float64, Int
 from torch import Tensor
 
 from avmsf.fem.material import Material
-from avmsf.fem.perturbation import Elements
 from avmsf.fem.solid import Solid
 
 _EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
@@ -57,6 +57,12 @@ class SecondOrder:
         found = first[np.searchsorted(keys, outer[..., 0] * points + outer[..., 1])]
         return np.concatenate([corners, self.cells[:, 4:].ravel()[found]], axis=1)
 
+    @cached_property
+    def surface(self) -> tuple[Int[np.ndarray, " outer"], Int[np.ndarray, "triangles 6"]]:
+        """Rows of the nodes on the outer triangles, ascending, and those triangles as places among these rows."""
+        outer, triangles = np.unique(self.boundary, return_inverse=True)
+        return outer, triangles.reshape(-1, 6)
+
     def assemble(
         self, factors: Float64[np.ndarray, "cells 10 10 size size"] | Float64[np.ndarray, "cells 10 10"]
     ) -> scipy.sparse.bsr_array | scipy.sparse.csr_array:
@@ -93,7 +99,7 @@ def stiffness(
     young = material.young * (np.ones(len(mesh.cells)) if factor is None else factor.numpy())
     shear = young / (2.0 * (1.0 + material.poisson))
     squeeze = shear * 2.0 * material.poisson / (1.0 - 2.0 * material.poisson)
-    slopes = _slopes(mesh)
+    slopes = shape_gradients(mesh)
     weight = mesh.solid.volumes.numpy() / len(_QUADRATURE)
     flat = slopes.reshape(len(slopes), len(_QUADRATURE), 30)
     # products[cell, a, i, b, j]: the integral of the slope of a's function along i times that of b's along j.
@@ -113,16 +119,10 @@ def mass(mesh: SecondOrder, density: Float64[Tensor, " cells"]) -> scipy.sparse.
     `density` is in kilograms per cubic meter.
     """
     weight = (mesh.solid.volumes * density).numpy()
-    return mesh.assemble(weight[:, None, None] * _REFERENCE_MASS)
+    return mesh.assemble(weight[:, None, None] * REFERENCE_MASS)
 
 
-def elements_of(mesh: SecondOrder) -> Elements:
-    """Return what the matrices are integrated from."""
-    centers = mesh.nodes[mesh.cells[:, :4]].mean(axis=1)
-    return Elements(mesh.cells, centers, mesh.solid.volumes.numpy(), _slopes(mesh), _REFERENCE_MASS)
-
-
-def _slopes(mesh: SecondOrder) -> Float64[np.ndarray, "cells points 10 3"]:
+def shape_gradients(mesh: SecondOrder) -> Float64[np.ndarray, "cells points 10 3"]:
     """Return the gradients of the shape functions at the quadrature's points, 1/m."""
     corners = mesh.nodes[mesh.cells[:, :4]]
     inverse = np.linalg.inv(corners[:, 1:] - corners[:, :1])
@@ -133,8 +133,7 @@ def _slopes(mesh: SecondOrder) -> Float64[np.ndarray, "cells points 10 3"]:
 def _reference_slopes(places: Float64[np.ndarray, "points 4"]) -> Float64[np.ndarray, "points 10 4"]:
     """Return the derivatives of the shape functions by the four barycentric coordinates."""
     slopes = np.zeros((len(places), 10, 4))
-    for corner in range(4):
-        slopes[:, corner, corner] = 4.0 * places[:, corner] - 1.0
+    slopes[:, range(4), range(4)] = 4.0 * places - 1.0
     for edge, (one, other) in enumerate(_EDGES):
         slopes[:, 4 + edge, one] = 4.0 * places[:, other]
         slopes[:, 4 + edge, other] = 4.0 * places[:, one]
@@ -147,22 +146,15 @@ def _reference_mass() -> Float64[np.ndarray, "10 10"]:
     The integral of l_0^a l_1^b l_2^c l_3^d is 6 a! b! c! d! / (a + b + c + d + 3)!, of which the products need a few.
     """
     factorial = np.array([1.0, 1.0, 2.0, 6.0, 24.0, 120.0, 720.0, 5040.0])
-    terms: list[list[tuple[float, np.ndarray]]] = []
     unit = np.eye(4, dtype=int)
-    for corner in range(4):
-        terms.append([(2.0, 2 * unit[corner]), (-1.0, unit[corner])])
-    for one, other in _EDGES:
-        terms.append([(4.0, unit[one] + unit[other])])
+    terms = [[(2.0, 2 * corner), (-1.0, corner)] for corner in unit]
+    terms += [[(4.0, unit[one] + unit[other])] for one, other in _EDGES]
     table = np.zeros((10, 10))
-    for row, left in enumerate(terms):
-        for column, right in enumerate(terms):
-            for scale, powers in left:
-                for other_scale, other_powers in right:
-                    total = powers + other_powers
-                    table[row, column] += (
-                        scale * other_scale * 6.0 * factorial[total].prod() / factorial[total.sum() + 3]
-                    )
+    for (row, left), (column, right) in product(enumerate(terms), repeat=2):
+        for (scale, powers), (other_scale, other_powers) in product(left, right):
+            total = powers + other_powers
+            table[row, column] += scale * other_scale * 6.0 * factorial[total].prod() / factorial[total.sum() + 3]
     return table
 
 
-_REFERENCE_MASS = _reference_mass()
+REFERENCE_MASS = _reference_mass()

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from avmsf.errors import SimulationError
 from avmsf.fem.eigen import lowest_vibrations, rigid_motions
-from avmsf.fem.elastic_modes import ElasticModes, expect_whole
+from avmsf.fem.elastic_modes import RELATIVE_SHIFT, ElasticModes
 from avmsf.fem.elements import SecondOrder, mass, stiffness
 from avmsf.fem.material import Material
 from avmsf.fem.solid import Solid
@@ -32,8 +32,6 @@ _SPARE = 8
 """Modes of each value beyond those wanted: their order changes with Poisson's ratio."""
 _DEPENDENT = 1e-9
 """Squared norm of a part of the basis, over the largest, below which it is rounding."""
-_SHIFT = 1e-5
-"""Shift of the eigenvalues over E / (density size^2), as for `elastic_modes`."""
 _UNIT_SHEAR = Material("unit shear modulus", 1.0, 2.0, 0.0, 0.0, 0.0)
 _OTHER = Material("Poisson's ratio of .25", 1.0, 2.5, 0.25, 0.0, 0.0)
 """Both of Lamé's constants are 1."""
@@ -86,8 +84,8 @@ def isotropic_modes(solid: Solid, *, count: int) -> IsotropicModes:
     Raises SimulationError for a body of several parts, and one whose modes cannot be computed.
     """
     if count < 1:
-        raise SimulationError(f"count: expected 1 mode or more, got {count}", name="count", value=count)
-    expect_whole(solid)
+        raise SimulationError.expected("1 mode or more", count, name="count")
+    solid.expect_connected()
     mesh = SecondOrder.of(solid)
     weights = mass(mesh, torch.ones(len(solid.cells), dtype=torch.float64))
     shear = stiffness(mesh, _UNIT_SHEAR)
@@ -97,7 +95,7 @@ def isotropic_modes(solid: Solid, *, count: int) -> IsotropicModes:
     for poisson in SAMPLED_POISSON:
         forces = shear / (2.0 * (1.0 + poisson)) + squeeze * (poisson / ((1.0 + poisson) * (1.0 - 2.0 * poisson)))
         vibrations = lowest_vibrations(
-            forces, weights, rigid, count=count + _SPARE, shift=_SHIFT / solid.size**2, supported=False
+            forces, weights, rigid, count=count + _SPARE, shift=RELATIVE_SHIFT / solid.size**2, supported=False
         )
         found.append(vibrations.shapes)
     spread = np.concatenate(found, axis=1)
@@ -105,14 +103,14 @@ def isotropic_modes(solid: Solid, *, count: int) -> IsotropicModes:
     squares, turned = np.linalg.eigh(spread.T @ heavy)
     kept = squares > _DEPENDENT * squares[-1]
     basis = spread @ (turned[:, kept] / np.sqrt(squares[kept]))
-    outer, triangles = np.unique(mesh.boundary, return_inverse=True)
+    outer, triangles = mesh.surface
     shapes = basis.reshape(len(mesh.nodes), 3, -1)[outer].transpose(0, 2, 1)
     return IsotropicModes(
         count=count,
         shear=_symmetric(basis.T @ (shear @ basis)),
         squeeze=_symmetric(basis.T @ (squeeze @ basis)),
         nodes=torch.from_numpy(mesh.nodes[outer]),
-        triangles=torch.from_numpy(triangles.reshape(-1, 6)),
+        triangles=torch.from_numpy(triangles),
         shapes=torch.from_numpy(np.ascontiguousarray(shapes)),
         volume=solid.volume,
     )

@@ -14,6 +14,7 @@ from scipy.sparse.linalg import splu
 
 from avmsf.errors import SimulationError
 from avmsf.fem.skin import Skin, components
+from avmsf.fem.solid import several_parts
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.surface import Surface
 
@@ -243,13 +244,7 @@ class CheckedSurface:
         """
         areas = np.bincount(self.parts, weights=self.skin.areas)
         if areas[0] < (1.0 - _LOOSE) * areas.sum():
-            sizes = ", ".join(f"{10000 * area:.3g}" for area in areas[:4])
-            raise SimulationError(
-                f"expected a connected mesh, got {len(areas)} parts of {sizes}{', ...' if len(areas) > 4 else ''} cm2; "
-                "join them, or give one of them",
-                name="parts",
-                value=len(areas),
-            )
+            raise several_parts("mesh", (10_000 * areas).tolist(), "cm2")
         return Skin.compact(self.skin.points, self.skin.faces[self.parts == 0]).oriented()
 
 

@@ -13,7 +13,10 @@ with K[b] and M[b] the stiffness and mass matrices in which b takes the place of
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64, Int
+from jaxtyping import Float64
+
+from avmsf.fem.elements import REFERENCE_MASS, SecondOrder, shape_gradients
+from avmsf.fem.material import Material
 
 FIELDS = 24
 """Smooth functions for the stiffness, and as many for the density."""
@@ -37,34 +40,10 @@ class Perturbations:
     """N, 1/s2."""
 
 
-@dataclass(frozen=True, eq=False)
-class Elements:
-    """Second-order tetrahedra with what their stiffness and mass matrices are integrated from."""
-
-    cells: Int[np.ndarray, "cells 10"]
-    """Rows of nodes."""
-    centers: Float64[np.ndarray, "cells 3"]
-    """Meters."""
-    volumes: Float64[np.ndarray, " cells"]
-    """Cubic meters."""
-    slopes: Float64[np.ndarray, "cells points 10 3"]
-    """Gradients of the shape functions at quadrature points of equal weight, 1/m."""
-    reference_mass: Float64[np.ndarray, "10 10"]
-    """Integrals of the products of shape functions over a cell of volume 1."""
-
-
-def perturbations(
-    elements: Elements,
-    shapes: Float64[np.ndarray, "nodes 3 modes"],
-    *,
-    size: float,
-    young: float,
-    poisson: float,
-    density: float,
-) -> Perturbations:
+def perturbations(mesh: SecondOrder, shapes: Float64[np.ndarray, "nodes 3 modes"], material: Material) -> Perturbations:
     """Return the changes on the basis of some mode shapes, 1 / sqrt(kg)."""
-    fields = smooth_fields(elements.centers, elements.volumes, length=_LENGTH * size, seed=0)
-    modes = shapes.shape[2]
+    fields, slopes, volumes = smooth_fields(mesh), shape_gradients(mesh), mesh.solid.volumes.numpy()
+    modes, young, poisson = shapes.shape[2], material.young, material.poisson
     shear, squeeze = young / (2.0 * (1.0 + poisson)), young * poisson / ((1.0 + poisson) * (1.0 - 2.0 * poisson))
     by_poisson = (
         -young / (2.0 * (1.0 + poisson) ** 2),
@@ -72,16 +51,16 @@ def perturbations(
     )
     stiff, heavy = np.zeros((len(fields), modes, modes)), np.zeros((len(fields), modes, modes))
     turned = np.zeros((modes, modes))
-    root = np.linalg.cholesky(elements.reference_mass)
-    for first in range(0, len(elements.cells), _CHUNK):
+    root = np.linalg.cholesky(REFERENCE_MASS)
+    for first in range(0, len(mesh.cells), _CHUNK):
         part = slice(first, first + _CHUNK)
-        moved = shapes[elements.cells[part]]
-        weight = elements.volumes[part] / elements.slopes.shape[1]
-        distortion, dilation = _strains(elements.slopes[part], moved, np.sqrt(weight))
+        moved = shapes[mesh.cells[part]]
+        weight = volumes[part] / slopes.shape[1]
+        distortion, dilation = _strains(slopes[part], moved, np.sqrt(weight))
         both = np.concatenate([np.sqrt(2.0 * shear) * distortion, np.sqrt(squeeze) * dilation[:, :, None]], axis=2)
         flat = both.reshape(len(weight), -1, modes)
         moving = np.einsum("ab,cadm->cbdm", root, moved).reshape(len(weight), 30, modes)
-        moving *= np.sqrt(density * elements.volumes[part])[:, None, None]
+        moving *= np.sqrt(material.density * volumes[part])[:, None, None]
         stiff += _products(flat, fields[:, part])
         heavy += _products(moving, fields[:, part])
         everywhere = np.ones((1, len(weight)))
@@ -90,13 +69,11 @@ def perturbations(
     return Perturbations(stiff, heavy, turned)
 
 
-def smooth_fields(
-    centers: Float64[np.ndarray, "cells 3"], volumes: Float64[np.ndarray, " cells"], *, length: float, seed: int
-) -> Float64[np.ndarray, "fields cells"]:
+def smooth_fields(mesh: SecondOrder) -> Float64[np.ndarray, "fields cells"]:
     """Return the leading eigenfunctions of the covariance, at cells, whose squares sum to one in each cell."""
-    count = min(_SAMPLES, len(centers))
-    generator = np.random.default_rng(seed)
-    some = np.sort(generator.choice(len(centers), count, replace=False, p=volumes / volumes.sum()))
+    centers, volumes = mesh.nodes[mesh.cells[:, :4]].mean(axis=1), mesh.solid.volumes.numpy()
+    length, count = _LENGTH * mesh.solid.size, min(_SAMPLES, len(centers))
+    some = np.sort(np.random.default_rng(0).choice(len(centers), count, replace=False, p=volumes / volumes.sum()))
     covariance = _covariance(centers[some], centers[some], length)
     values, vectors = np.linalg.eigh(covariance)
     kept = slice(max(0, count - FIELDS), count)

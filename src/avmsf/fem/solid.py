@@ -1,5 +1,6 @@
 """A body as tetrahedra."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -35,22 +36,17 @@ class Solid:
         for coordinates that are not finite.
         """
         if not len(cells):
-            raise no_tetrahedra()
+            message = "expected tetrahedra, got none: the shape has no volume; give a sheet a thickness"
+            raise SimulationError(message, name="cells", value=0)
         if int(cells.min()) < 0 or int(cells.max()) >= len(points):
             found = int(cells.max()) if int(cells.min()) >= 0 else int(cells.min())
-            raise SimulationError(
-                f"expected corners of tetrahedra from 0 to {len(points) - 1}, got {found}; make the tetrahedra again",
-                name="cells",
-                value=found,
-            )
+            wanted = f"corners of tetrahedra from 0 to {len(points) - 1}"
+            raise SimulationError.expected(wanted, found, name="cells", advice="make the tetrahedra again")
         used, rows = torch.unique(cells, return_inverse=True)
         corners = points[used]
         if not bool(torch.isfinite(corners).all()):
             row = int(used[(~torch.isfinite(corners)).any(dim=1).nonzero()[0]])
-            value = points[row].tolist()
-            raise SimulationError(
-                f"point {row}: expected finite coordinates in meters, got {value}", row=row, name="points", value=value
-            )
+            raise SimulationError.expected("finite coordinates in meters", points[row].tolist(), row=row, name="points")
         volumes = _volumes(corners, rows)
         turned = torch.where((volumes < 0)[:, None], rows[:, [0, 2, 1, 3]], rows)
         solid = cls(corners, turned)
@@ -114,12 +110,19 @@ class Solid:
                 value=volume,
             )
 
+    def expect_connected(self, *, loose: float = 0.0) -> None:
+        """Raise SimulationError where more than a share `loose` of the volume is not of the largest part."""
+        volumes = torch.bincount(self.parts, weights=self.volumes)
+        if float(volumes[1:].sum()) > loose * float(volumes.sum()):
+            raise several_parts("shape", volumes.tolist(), "m3")
 
-def no_tetrahedra() -> SimulationError:
-    """Return the error of a body without volume."""
-    return SimulationError(
-        "expected tetrahedra, got none: the shape has no volume; give a sheet a thickness", name="cells", value=0
-    )
+
+def several_parts(what: str, sizes: Sequence[float], unit: str) -> SimulationError:
+    """Return the error of something whose connected parts have these sizes, the largest first."""
+    some = ", ".join(f"{size:.3g}" for size in sizes[:4])
+    got = f"{len(sizes)} parts of {some}{', ...' if len(sizes) > 4 else ''} {unit}"
+    message = f"expected a connected {what}, got {got}; join them, or give one of them"
+    return SimulationError(message, name="parts", value=len(sizes))
 
 
 def _volumes(points: Float64[Tensor, "points 3"], cells: Int[Tensor, "cells 4"]) -> Float64[Tensor, " cells"]:

@@ -44,7 +44,7 @@ class Support:
 
     def nodes(self, mesh: SecondOrder) -> Int[np.ndarray, " nodes"]:
         """Return the rows of the nodes that are held. Raises SimulationError where there are none."""
-        outer = np.unique(mesh.boundary)
+        outer = mesh.surface[0]
         places, size = mesh.nodes[outer], mesh.solid.size
         heights = places[:, 2] - places[:, 2].min()
         if self.edge is None:
@@ -61,7 +61,7 @@ class Support:
 
 def supports_of(mesh: SecondOrder) -> list[Support]:
     """Return where a body may be held: at its lowest face or point, and along its long straight lower edges."""
-    outer = np.unique(mesh.boundary)
+    outer = mesh.surface[0]
     places, size = mesh.nodes[outer], mesh.solid.size
     heights = places[:, 2] - places[:, 2].min()
     extent = float(np.linalg.norm(np.ptp(places[heights <= _NEAR * size, :2], axis=0)))

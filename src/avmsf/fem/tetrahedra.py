@@ -70,7 +70,9 @@ def fill(surface: Surface, *, detail: float = 0.05, timeout: float = 600.0) -> S
             name="volume",
             value=skin.open_edges,
         )
-    solid = _largest(Solid.build(torch.from_numpy(points), torch.from_numpy(cells)))
+    solid = Solid.build(torch.from_numpy(points), torch.from_numpy(cells))
+    solid.expect_connected(loose=_LOST)
+    solid = Solid.build(solid.points, solid.cells[solid.parts == 0])
     _expect_likeness(solid, skin, tolerance=4.0 * _ENVELOPE * detail * skin.size, advice=advice)
     return solid
 
@@ -144,20 +146,6 @@ def _tetrahedralize(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarr
             )
         with np.load(result) as arrays:
             return arrays["points"], arrays["cells"]
-
-
-def _largest(solid: Solid) -> Solid:
-    """Return the largest part. Raises SimulationError where the others are more than loose bits."""
-    volumes = torch.bincount(solid.parts, weights=solid.volumes)
-    if float(volumes[0]) < (1.0 - _LOST) * float(volumes.sum()):
-        sizes = ", ".join(f"{volume:.3g}" for volume in volumes[:4].tolist())
-        raise SimulationError(
-            f"expected a connected shape, got {len(volumes)} parts of {sizes}{', ...' if len(volumes) > 4 else ''} m3; "
-            "join them, or give one of them",
-            name="parts",
-            value=len(volumes),
-        )
-    return Solid.build(solid.points, solid.cells[solid.parts == 0])
 
 
 def _expect_likeness(solid: Solid, skin: Skin, *, tolerance: float, advice: str) -> None:
