@@ -1,9 +1,8 @@
 """Elastic modes as tensors: in files of fields with shapes in float32, and to the last bit in files of a cache.
 
-A file of a cache has the tensors of `ElasticModes` and in its header one JSON:
+A file of a cache has the tensors of `ElasticModes`, those of its perturbations, and in its header one JSON:
 
-{"mass": 0.31, "sizes": {"shapes": 64, "nodes": 9000, "triangles": 4400}, "fields": null,
- "material": {"name": "ceramic", "density": 2700.0, "young": 7.2e10, "poisson": 0.19, "alpha": 6.0, "beta": 1e-7}}
+{"mass": 0.31, "material": {"name": "ceramic", "density": 2700.0, "young": 7.2e10, ...}}
 """
 
 import json
@@ -26,7 +25,7 @@ from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.material import NOMINAL, Material
 from avmsf.fem.perturbation import Perturbations
 
-_KEY = "avmsf_elastic"
+_KEY, _ADVICE = "avmsf_elastic", "compute them again"
 _PERTURBATIONS = ("stiffness", "mass", "poisson")
 
 
@@ -78,51 +77,39 @@ def save_modes(modes: ElasticModes, path: Path) -> None:
     A file that is there stays whole until the new one is. Raises SimulationError where it cannot be written.
     """
     tensors = mode_tensors(modes) | {"shapes": modes.shapes}
-    fields = None if modes.perturbations is None else len(modes.perturbations.stiffness)
     if modes.perturbations is not None:
         tensors |= {name: torch.from_numpy(getattr(modes.perturbations, name)) for name in _PERTURBATIONS}
-    record = {
-        "mass": modes.mass, "sizes": mode_sizes(modes), "fields": fields, "material": asdict(modes.material)
-    }  # fmt: skip
-    content = to_bytes(
-        {name: tensor.cpu().clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()},
-        {_KEY: json.dumps(record, allow_nan=False)},
-    )
+    header = json.dumps({"mass": modes.mass, "material": asdict(modes.material)}, allow_nan=False)
+    content = to_bytes({name: tensor.contiguous().clone() for name, tensor in tensors.items()}, {_KEY: header})
     write_whole(path, lambda place: place.write_bytes(content), raising=SimulationError)
 
 
 def load_modes(path: Path) -> ElasticModes:
     """Read modes that `save_modes` wrote.
 
-    Raises SimulationError for a file that is missing, cut short or of another kind, and where its tensors are not those
-    that its header states.
+    Raises SimulationError for a file that is missing, cut short or of another kind, and where its tensors do not fit
+    together.
     """
-    words, tensors = read_tensors(
-        path, _KEY, what="elastic modes", advice="compute them again", raising=SimulationError
-    )
+    header, tensors = read_tensors(path, _KEY, what="elastic modes", advice=_ADVICE, raising=SimulationError)
     try:
-        record = parse_json(words)
-        expected = mode_skeleton(record["sizes"], shapes_dtype=torch.float64)
-        if record["fields"] is not None:
-            fields, modes = count_of(record["fields"], "fields"), len(expected["frequency"])
-            sizes = ((fields, modes, modes), (fields, modes, modes), (modes, modes))
-            for name, size in zip(_PERTURBATIONS, sizes, strict=True):
-                expected[name] = torch.empty(size, dtype=torch.float64, device="meta")
+        record = parse_json(header)
+        sizes = {"nodes": len(tensors["nodes"]), "triangles": len(tensors["triangles"])}
+        expected = mode_skeleton(sizes | {"shapes": len(tensors["frequency"])}, shapes_dtype=torch.float64)
+        changes = None
+        if "stiffness" in tensors:
+            modes, fields = len(tensors["frequency"]), len(tensors["stiffness"])
+            table, both = torch.empty(modes, modes, dtype=torch.float64, device="meta"), (fields, modes, modes)
+            expected |= {"poisson": table, "stiffness": table.expand(both), "mass": table.expand(both)}
+            changes = Perturbations(*(tensors[name].numpy() for name in _PERTURBATIONS))
         stated, found = (
-            {name: (tuple(each.shape), each.dtype) for name, each in sorted(named.items())}
-            for named in (expected, tensors)
+            {name: (tuple(each.shape), each.dtype) for name, each in named.items()} for named in (expected, tensors)
         )
         if stated != found:
             raise ValueError(f"tensors {found} instead of {stated}")
-        changes = None
-        if record["fields"] is not None:
-            changes = Perturbations(*(tensors[name].numpy() for name in _PERTURBATIONS))
         material, mass = Material(**record["material"]), float(record["mass"])
         return replace(restored_modes(tensors, ""), material=material, mass=mass, perturbations=changes)
     except (ValueError, TypeError, KeyError) as error:
-        raise SimulationError.expected(
-            "elastic modes", repr(error), file=path, name="modes", advice="compute them again"
-        ) from error
+        raise SimulationError.expected("elastic modes", repr(error), file=path, name="modes", advice=_ADVICE) from error
 
 
 def modes_once(path: Path | None, compute: Callable[[], ElasticModes], *, log: Callable[[str], None]) -> ElasticModes:
