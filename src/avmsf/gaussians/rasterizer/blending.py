@@ -72,10 +72,10 @@ class Blending(torch.autograd.Function):
         chosen, places, packed, starts, rows, slots, ends, bounds, paint, kept = ctx.kept
         results = [by_color.new_zeros(ctx.points, width) for width in (2, 3, 1, 3, 1)]
         parts = np.empty((len(rows), 10), np.float32)
-        slopes = [each.contiguous().numpy() for each in (by_color, by_alpha, by_depth)]
+        slopes = tuple(each.contiguous().numpy() for each in (by_color, by_alpha, by_depth))
         lanes = len(bounds) - 1
         listed = places, packed, starts, rows, slots, bounds, paint, _LOG2_MIN_ALPHA, working_numbers(lanes)
-        run_lanes(blend_back, lanes, *listed, *slopes, kept, parts)
+        run_lanes(blend_back, lanes, *listed, slopes, kept, parts)
         run_lanes(
             _gather, lanes, parts, ends, chosen, packed, np.empty((lanes, 10)), *(each.numpy() for each in results)
         )

@@ -117,28 +117,13 @@ def _usable(center, rotation, log_scale, logit, weights):
 
 @compiled(error_model="numpy")
 @no_type_check
-def project_points(
-    lane,
-    lanes,
-    centers,
-    rotations,
-    log_scales,
-    logits,
-    harmonics,
-    pose,
-    lens,
-    scratch,
-    screen,
-    ellipses,
-    opacities,
-    depths,
-    radii,
-    remainders,
-):
+def project_points(lane, lanes, cloud, pose, lens, scratch, results):
     """Write what `Projection.forward` returns into arrays of zeros, all but the colors, which are only checked.
 
     `scratch` [lanes, 16, 3] are float64 numbers to work with.
     """
+    centers, rotations, log_scales, logits, harmonics = cloud
+    screen, ellipses, opacities, depths, radii, remainders = results
     points = len(centers)
     turn, slope, axes, scales = scratch[lane, :3], scratch[lane, 3:5], scratch[lane, 5:7], scratch[lane, 7]
     for i in range(lane * points // lanes, (lane + 1) * points // lanes):
@@ -229,30 +214,15 @@ def _center_slope(by_place, by_depth, by_slope, x, y, z, across, down, pose, len
 
 @compiled(error_model="numpy")
 @no_type_check
-def project_points_back(
-    lane,
-    lanes,
-    centers,
-    rotations,
-    log_scales,
-    logits,
-    radii,
-    by_screen,
-    by_ellipses,
-    by_opacities,
-    by_depths,
-    pose,
-    lens,
-    scratch,
-    by_centers,
-    by_rotations,
-    by_log_scales,
-    by_logits,
-):
+def project_points_back(lane, lanes, cloud, radii, slopes, pose, lens, scratch, results):
     """Write the derivatives by centers, rotations, sizes and opacities, without what the colors add to the centers.
 
-    The arrays come as zeros, and stay so where the radius is zero. `scratch` is that of `project_points`.
+    `slopes` are those by places, ellipses, opacities and depths. The results come as zeros, and stay so where the
+    radius is zero. `scratch` is that of `project_points`.
     """
+    centers, rotations, log_scales, logits = cloud
+    by_screen, by_ellipses, by_opacities, by_depths = slopes
+    by_centers, by_rotations, by_log_scales, by_logits = results
     # Inlined, for views of rows that a call hands over cost more than these steps.
     points = len(centers)
     turn, slope, axes, scales = scratch[lane, :3], scratch[lane, 3:5], scratch[lane, 5:7], scratch[lane, 7]

@@ -198,24 +198,13 @@ def _uncover(scratch, packed, row, middle, center, first, last, number, min_leve
 @compiled(error_model="numpy", fastmath=_FAST)
 @no_type_check
 def blend_back(
-    lane,
-    lanes,
-    places,
-    packed,
-    starts,
-    rows,
-    slots,
-    bounds,
-    paint,
-    min_level,
-    numbers,
-    by_color,
-    by_alpha,
-    by_depth,
-    kept,
-    parts,
+    lane, lanes, places, packed, starts, rows, slots, bounds, paint, min_level, numbers, slopes, kept, parts
 ):
-    """Write for each pair of tile and Gaussian the sums that `_uncover` makes into its row of `parts`."""
+    """Write for each pair of tile and Gaussian the sums that `_uncover` makes into its row of `parts`.
+
+    `slopes` are the loss's derivatives by color, alpha and depth.
+    """
+    by_color, by_alpha, by_depth = slopes
     height, width = by_alpha.shape
     across = (width + SIDE - 1) // SIDE
     scratch = numbers[lane]

@@ -45,10 +45,10 @@ class Projection(torch.autograd.Function):
         count = len(centers)
         outputs = [inputs[0].new_zeros(count, width) for width in (2, 3, 1, 3, 1, 1, 2)]
         screen, ellipses, opacities, colors, depths, radii, remainders = outputs
-        results = [each.numpy() for each in (screen, ellipses, opacities, depths, radii, remainders)]
-        given, lanes = [each.numpy() for each in inputs], lane_count()
+        results = tuple(each.numpy() for each in (screen, ellipses, opacities, depths, radii, remainders))
+        given, lanes = tuple(each.numpy() for each in inputs), lane_count()
         position = camera.position.double().numpy()
-        run_lanes(project_points, lanes, *given, pose, lens, np.empty((lanes, 16, 3)), *results)
+        run_lanes(project_points, lanes, given, pose, lens, np.empty((lanes, 16, 3)), results)
         run_lanes(shade, lanes, given[0], given[4], radii.numpy(), position, np.empty((lanes, 35)), colors.numpy())
         ctx.save_for_backward(*inputs, radii)
         ctx.pose, ctx.lens, ctx.position = pose, lens, position
@@ -64,9 +64,10 @@ class Projection(torch.autograd.Function):
         by_screen, by_ellipses, by_opacities, by_colors, by_depths = (each.contiguous().numpy() for each in slopes[:5])
         outputs = [torch.zeros_like(each) for each in inputs]
         *results, by_weights = (each.numpy() for each in outputs)
-        given = centers, rotations, log_scales, logits, reach, by_screen, by_ellipses, by_opacities, by_depths
+        given, by_places = (centers, rotations, log_scales, logits), (by_screen, by_ellipses, by_opacities, by_depths)
         lanes = lane_count()
-        run_lanes(project_points_back, lanes, *given, ctx.pose, ctx.lens, np.empty((lanes, 16, 3)), *results)
+        working = ctx.pose, ctx.lens, np.empty((lanes, 16, 3))
+        run_lanes(project_points_back, lanes, given, reach, by_places, *working, tuple(results))
         shaded = centers, weights, reach, ctx.position, by_colors, np.empty((lanes, 35))
         run_lanes(shade_back, lanes, *shaded, results[0], by_weights)
         return *outputs, None
