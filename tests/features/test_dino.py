@@ -95,7 +95,7 @@ def test_without_constants_of_its_own_a_model_gets_imagenets(folder, tmp_path):
     for name in ("config.json", "model.safetensors"):
         (bare / name).write_bytes((folder / name).read_bytes())
     picture = image(28, 28)
-    # What ImageNet's constants make of it, told to the model with the other constants.
+    # What ImageNet's constants make of it, for the model with the other constants.
     usual = (picture - torch.tensor([0.485, 0.456, 0.406])) / torch.tensor([0.229, 0.224, 0.225])
     expected = own_tokens(load(folder), usual * torch.tensor([0.2, 0.3, 0.1]) + torch.tensor([0.4, 0.5, 0.6]))
     torch.testing.assert_close(load(bare).describe(picture), expected, rtol=0, atol=1e-4)

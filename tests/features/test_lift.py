@@ -1,4 +1,4 @@
-"""Lifting: what a point is told in the images is what the images show of that very point, and of no other."""
+"""Lifting: a point gets the features that the images show at that very point, and at no other."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -77,11 +77,13 @@ def painted_sphere(cameras: list[Camera], *, columns: int = 80, rows: int = 55) 
 
 
 def facing(points: torch.Tensor, least: float):
-    """A weighting that hears only views that look at a sphere's points no flatter than a cosine of `least`."""
+    """A weighting that counts only views that see a sphere's points no flatter than a cosine of `least`."""
 
-    def weigh(sight):
-        towards = sight.camera.position - points
-        return sight.seen * ((points / RADIUS * towards / towards.norm(dim=1, keepdim=True)).sum(1) > least).double()
+    def weigh(visibility):
+        towards = visibility.camera.position - points
+        return (
+            visibility.seen * ((points / RADIUS * towards / towards.norm(dim=1, keepdim=True)).sum(1) > least).double()
+        )
 
     return weigh
 
@@ -108,7 +110,7 @@ def test_a_map_of_places_in_the_image_is_read_where_the_points_are(columns, rows
     torch.testing.assert_close(lifted.features.features.double(), camera.project(points)[0], rtol=0, atol=1e-3)
 
 
-def test_every_point_is_told_its_own_place():
+def test_every_point_gets_its_own_position():
     points = sphere_points()
     views = [view_of(camera) for camera in AROUND]
     lifted = lift_points(points, views, painted_sphere(AROUND), depth_map=sphere_depth, weighting=facing(points, 0.5))
@@ -122,7 +124,7 @@ def test_every_point_is_told_its_own_place():
     assert float(error.median()) < 1e-4
 
 
-def test_gaussians_are_told_their_own_places():
+def test_gaussians_get_their_own_positions():
     points = sphere_points()
 
     def rasterizer(cloud, camera, *, background):
@@ -133,14 +135,14 @@ def test_gaussians_are_told_their_own_places():
     views = [view_of(camera) for camera in AROUND]
     lifted = lift(sphere_cloud(points), views, painted_sphere(AROUND), rasterizer=rasterizer)
     known = lifted.seen > 0
-    # Steep views are heard, too: their cells span four times as much.
+    # Steep views count, too: their cells span four times as much.
     assert float((lifted.features.features - points)[known].norm(dim=1).median()) < 5e-4
     assert lifted.features.encoder == "painted"
     # What the views say of one point differs by tenths of millimeters, between points by ten centimeters.
     assert lifted.agreement > 0.999
 
 
-def test_the_far_side_is_never_heard():
+def test_the_far_side_is_never_seen():
     points, cameras = sphere_points(), AROUND[:1]
     truth = painted_sphere(cameras)
     lifted = lift_points(points, [view_of(cameras[0])], truth, depth_map=sphere_depth)
@@ -154,7 +156,7 @@ def test_the_far_side_is_never_heard():
 def test_rendered_gaussians_hide_what_lies_behind_them():
     points = sphere_points(2500)
     cloud, camera = sphere_cloud(points), AROUND[0]
-    sight = depth_test(
+    visibility = depth_test(
         cloud.centers,
         view_of(camera),
         depth_of_cloud(cloud, NumbaRasterizer())(camera),
@@ -163,8 +165,8 @@ def test_rendered_gaussians_hide_what_lies_behind_them():
     towards = camera.position - points
     cosine = (points / RADIUS * towards / towards.norm(dim=1, keepdim=True)).sum(1)
     # Gaussians of 4 mm: the shell is some millimeters thick and its rim uncertain by as much.
-    assert not bool(sight.seen[cosine < -0.2].any())
-    assert float(sight.seen[cosine > 0.6].double().mean()) > 0.95
+    assert not bool(visibility.seen[cosine < -0.2].any())
+    assert float(visibility.seen[cosine > 0.6].double().mean()) > 0.95
 
 
 def test_an_occluder_hides_what_is_behind_it_and_no_more():
@@ -184,7 +186,7 @@ def test_an_occluder_hides_what_is_behind_it_and_no_more():
     assert depth_test(plate, view_of(camera), depth, reach=still).seen.all()
 
 
-def test_points_beside_or_behind_the_camera_or_outside_the_mask_are_not_seen():
+def test_points_outside_the_image_or_the_mask_or_behind_the_camera_are_not_seen():
     camera = camera_at([0, 0, 1], width=100, height=100)
     depth = torch.full((100, 100), 0.5, dtype=torch.float64)
     mask = torch.full((100, 100), 255, dtype=torch.uint8)

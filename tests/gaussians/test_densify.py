@@ -25,7 +25,7 @@ def _cloud(scales: list[float], opacities: list[float]) -> GaussianCloud:
     )
 
 
-def _grown(cloud: GaussianCloud, gradient: list[float], config: SplatConfig) -> tuple[torch.Tensor, GaussianCloud]:
+def _densified(cloud: GaussianCloud, gradient: list[float], config: SplatConfig) -> tuple[torch.Tensor, GaussianCloud]:
     # Seen twice each: the mean counts.
     density = Density(2 * torch.tensor(gradient), torch.full((len(cloud),), 2.0))
     return density.densify(cloud, config, HALF_DIAGONAL, generator=torch.Generator().manual_seed(3))
@@ -33,7 +33,7 @@ def _grown(cloud: GaussianCloud, gradient: list[float], config: SplatConfig) -> 
 
 def test_small_ones_are_copied_large_ones_split_and_faint_ones_go() -> None:
     cloud = _cloud([0.005, 0.005, 0.05, 0.05, 0.005, 0.9], [0.5, 0.5, 0.5, 0.5, 0.05, 0.5])
-    rows, fresh = _grown(cloud, [2.0, 0.5, 3.0, 0.5, 9.0, 9.0], CONFIG)
+    rows, fresh = _densified(cloud, [2.0, 0.5, 3.0, 0.5, 9.0, 9.0], CONFIG)
     # 0 is copied and stays, 2 gives way to its halves, 4 is faint and 5 as large as the object: neither is doubled.
     assert rows.tolist() == [0, 1, 3]
     assert len(fresh) == 3
@@ -48,7 +48,7 @@ def test_halves_are_drawn_from_the_gaussian_that_they_replace() -> None:
     turned = torch.tensor([0.9, 0.1, -0.3, 0.2])
     cloud = _cloud([0.2], [0.5])
     cloud = replace(cloud, rotations=turned[None], log_scales=scales.log()[None]).take(torch.zeros(count).long())
-    _, fresh = _grown(cloud, [2.0] * count, CONFIG)
+    _, fresh = _densified(cloud, [2.0] * count, CONFIG)
     offsets = (fresh.centers - cloud.centers[0]).double()
     rotation = torch.from_numpy(Rotation.from_quat(turned.tolist(), scalar_first=True).as_matrix())
     expected = rotation @ torch.diag(scales.double() ** 2) @ rotation.T
@@ -58,9 +58,11 @@ def test_halves_are_drawn_from_the_gaussian_that_they_replace() -> None:
 
 def test_the_strongest_come_first_when_room_is_short() -> None:
     cloud = _cloud([0.005] * 5, [0.5] * 5)
-    rows, fresh = _grown(cloud, [2.0, 5.0, 3.0, 4.0, 0.1], replace(CONFIG, gaussians=100))
+    rows, fresh = _densified(cloud, [2.0, 5.0, 3.0, 4.0, 0.1], replace(CONFIG, gaussians=100))
     assert len(fresh) == 4
-    _, fresh = _grown(cloud.take(torch.arange(100) % 5), [2.0, 5.0, 3.0, 4.0, 0.1] * 20, replace(CONFIG, gaussians=103))
+    _, fresh = _densified(
+        cloud.take(torch.arange(100) % 5), [2.0, 5.0, 3.0, 4.0, 0.1] * 20, replace(CONFIG, gaussians=103)
+    )
     assert torch.equal(fresh.centers, cloud.centers[[1, 1, 1]])
     assert rows.tolist() == [0, 1, 2, 3, 4]
 

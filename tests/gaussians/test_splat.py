@@ -42,7 +42,7 @@ def _ball_points(count: int) -> torch.Tensor:
 
 
 @pytest.mark.slow
-def test_held_out_views_of_a_ball_are_foretold_and_its_gaussians_lie_on_it() -> None:
+def test_held_out_views_of_a_ball_are_predicted_and_its_gaussians_lie_on_it() -> None:
     views = ball_views(30)
     held, seen = views[::6], [view for place, view in enumerate(views) if place % 6]
     cloud = splat(seen, replace(QUICK, steps=200, start_points=800, gaussians=1500))
@@ -98,13 +98,13 @@ def test_a_checkpoint_that_cannot_be_written_costs_no_result(tmp_path: Path) -> 
 
 
 def test_progress_tells_what_the_last_step_did() -> None:
-    told: list[SplatProgress] = []
+    reports: list[SplatProgress] = []
     views = ball_views(8)
-    splat(views, replace(QUICK, steps=25), progress=told.append)
-    assert [each.step for each in told] == [10, 20, 25]
-    assert all(each.steps == 25 and each.loss > 0 and math.isfinite(each.psnr) for each in told)
-    assert [each.seconds for each in told] == sorted(each.seconds for each in told)
-    assert told[-1].gaussians == len(told[-1].cloud)
+    splat(views, replace(QUICK, steps=25), progress=reports.append)
+    assert [each.step for each in reports] == [10, 20, 25]
+    assert all(each.steps == 25 and each.loss > 0 and math.isfinite(each.psnr) for each in reports)
+    assert [each.seconds for each in reports] == sorted(each.seconds for each in reports)
+    assert reports[-1].gaussians == len(reports[-1].cloud)
 
 
 def test_photographs_without_masks_start_from_points() -> None:

@@ -18,7 +18,7 @@ from avmsf.gaussians.rasterizer.protocol import Rasterizer
 from avmsf.gaussians.visibility import DepthMap, Visibility, depth_of_cloud, depth_reach, depth_test
 from avmsf.photographs.cameras import Camera, View
 
-_REACH = 1.0
+_DEPTH_DEVIATIONS = 1.0
 """Standard deviations by which a Gaussian may lie behind the depth that is seen and still be of that surface. Two let
 twice as many through thin walls; what one turns away is seen at a slant, and by other views better."""
 _NEIGHBORS = 3
@@ -110,7 +110,7 @@ def lift(
         views,
         encoder,
         depth_map=depth_of_cloud(cloud, rasterizer),
-        reach=lambda camera: _REACH * depth_reach(cloud, camera),
+        reach=lambda camera: _DEPTH_DEVIATIONS * depth_reach(cloud, camera),
         weighting=weighting,
         inpainted=inpainted,
         progress=progress,
@@ -208,9 +208,9 @@ def _describe(view: View, encoder: Encoder, *, inpainted: bool) -> Float[Tensor,
 
 def _sample(features: Float[Tensor, "dim rows columns"], visibility: Visibility) -> Float[Tensor, "points dim"]:
     """Return the map's values at the places that are seen, bilinear between the cells' centers."""
-    size = visibility.places.new_tensor([visibility.camera.width, visibility.camera.height])
+    size = visibility.pixels.new_tensor([visibility.camera.width, visibility.camera.height])
     # Without aligned corners, -1 and 1 are the image's edges, as in the pixels' own convention.
-    grid = (2 * visibility.places / size - 1).float().to(features.device)
+    grid = (2 * visibility.pixels / size - 1).float().to(features.device)
     return functional.grid_sample(
         features[None], grid[None, None], mode="bilinear", padding_mode="border", align_corners=False
     )[0, :, 0].T.cpu()

@@ -15,11 +15,11 @@ from avmsf.features.feature_field import FeatureField
 from avmsf.gaussians.neighborhoods import read_neighborhoods
 from avmsf.symmetry.symmetries import Symmetries
 
-ITERATIONS = 3
+DEFAULT_ITERATIONS = 3
 """Rounds of orbit and mirror pooling (paper: T, not stated)."""
-ANGLES = 36
+DEFAULT_ANGLES = 36
 """Angles of an orbit about a continuous axis: every 10 degrees."""
-REACH = 3.0
+DEFAULT_REACH_SPACINGS = 3.0
 """Distance in point spacings up to which the nearest point is a counterpart."""
 
 SymmetricPoints = tuple[Int[Tensor, "members points"], Bool[Tensor, "members points"]]
@@ -30,9 +30,9 @@ def refine(
     features: FeatureField,
     symmetries: Symmetries,
     *,
-    iterations: int = ITERATIONS,
-    angles: int = ANGLES,
-    reach: float = REACH,
+    iterations: int = DEFAULT_ITERATIONS,
+    angles: int = DEFAULT_ANGLES,
+    reach: float = DEFAULT_REACH_SPACINGS,
     log: Callable[[str], None] = lambda _: None,
 ) -> FeatureField:
     """Return the same points with features that agree between symmetric places.
@@ -58,7 +58,7 @@ def refine(
     return FeatureField(features.points, torch.from_numpy(values).to(features.features), features.encoder)
 
 
-def orbit_spread(features: FeatureField, symmetries: Symmetries, *, angles: int = ANGLES) -> float:
+def orbit_spread(features: FeatureField, symmetries: Symmetries, *, angles: int = DEFAULT_ANGLES) -> float:
     """Return how much features differ between symmetric places, relative to how much they differ over the object.
 
     The square root of the mean variance over a point's counterparts, itself included, divided by the variance over all
@@ -98,7 +98,7 @@ def _orbits(
     *,
     angles: int,
     log: Callable[[str], None] = lambda _: None,
-    reach: float = REACH,
+    reach: float = DEFAULT_REACH_SPACINGS,
 ) -> list[SymmetricPoints]:
     """Return the counterparts under every rotation, and then under every mirror plane."""
     if not symmetries:

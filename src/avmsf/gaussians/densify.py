@@ -16,9 +16,9 @@ from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.rasterizer.protocol import Rendering
 from avmsf.photographs.cameras import Camera
 
-_SHRINK = 1.6
+_SPLIT_RATIO = 1.6
 """How much smaller the halves of a split Gaussian are (3DGS)."""
-_OVERSIZE = 0.3
+_MAX_SCALE_RATIO = 0.3
 """Largest scale, in half diagonals of the object, that a Gaussian may have."""
 
 
@@ -52,7 +52,7 @@ class Density:
         Of more candidates than the config has room for, those with the largest gradient are taken.
         """
         largest = cloud.log_scales.amax(1).exp()
-        kept = (cloud.opacities >= config.least_opacity) & (largest <= _OVERSIZE * half_diagonal)
+        kept = (cloud.opacities >= config.least_opacity) & (largest <= _MAX_SCALE_RATIO * half_diagonal)
         strength = torch.where(kept, self.gradient / self.views.clamp(min=1.0), 0.0)
         room = max(0, config.gaussians - int(kept.sum()))
         wanted = min(room, int((strength > config.growth).sum()))
@@ -68,5 +68,5 @@ def _split(cloud: GaussianCloud, *, generator: torch.Generator) -> GaussianCloud
     twice = cloud.take(torch.arange(len(cloud), device=cloud.centers.device).repeat(2))
     offsets = torch.randn(len(twice), 3, generator=generator).to(twice.centers) * twice.log_scales.exp()
     centers = twice.centers + (rotation_matrices(twice.rotations) @ offsets[..., None])[..., 0]
-    scales = twice.log_scales - math.log(_SHRINK)
+    scales = twice.log_scales - math.log(_SPLIT_RATIO)
     return GaussianCloud(centers, twice.rotations, scales, twice.logit_opacities, twice.harmonics)

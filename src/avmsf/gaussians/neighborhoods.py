@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 NEIGHBORS = 24
 """Points that a plane is laid through: few enough for detail, enough to average noise away."""
-_SHELLS = (0.08, 0.16, 0.28)
+_RADIUS_RATIOS = (0.08, 0.16, 0.28)
 """Radii in which descriptors see the surface, in diagonals of the object."""
 
 
@@ -62,7 +62,7 @@ def describe_neighborhoods(
     products = cloud[:, :, None] * cloud[:, None, :]
     squares = ((centers[:, None] - cloud) ** 2).sum(axis=2)
     columns: list[Float[np.ndarray, "rows any"]] = []
-    for radius in diagonal * np.asarray(_SHELLS):
+    for radius in diagonal * np.asarray(_RADIUS_RATIOS):
         weights = areas * (squares <= radius**2)
         # Far from all counted points there is nothing to describe; a trace of weight keeps the division defined.
         total = weights.sum(axis=1) + 1e-9 * areas.mean()
@@ -74,7 +74,7 @@ def describe_neighborhoods(
         across = np.sqrt(np.maximum((offset**2).sum(axis=1) - along**2, 0.0))
         scaled = np.sqrt(np.maximum(spread, 0.0)) / radius
         columns.append(np.c_[total / radius**2, scaled, along / radius, across / radius])
-    columns.append(_spin_images(centers, normals, cloud, areas, squares, radius=diagonal * _SHELLS[-1]))
+    columns.append(_spin_images(centers, normals, cloud, areas, squares, radius=diagonal * _RADIUS_RATIOS[-1]))
     described = np.concatenate(columns, axis=1)
     deviation = np.abs(described - np.median(described, axis=0)).mean(axis=0)
     return (described - np.median(described, axis=0)) / np.maximum(deviation, 0.02 * np.abs(described).max())

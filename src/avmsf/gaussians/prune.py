@@ -17,11 +17,11 @@ from avmsf.gaussians.rasterizer.protocol import Rasterizer
 from avmsf.photographs.cameras import View
 
 _NEIGHBORS = 8
-_AFLOAT = 6.0
+_MAX_DISTANCE_RATIO = 6.0
 """Distance to the neighbors, in medians of that distance, beyond which a Gaussian belongs to nothing."""
-_OVERSIZE = 0.15
+_MAX_SCALE_RATIO = 0.15
 """Largest scale, in diagonals of the box around the middle 98 % of the centers."""
-_RIM = 2
+_MASK_MARGIN_PIXELS = 2
 """Pixels that a center may lie outside of a mask, whose edge is not known better."""
 
 
@@ -68,12 +68,12 @@ def masks_agree(
     view could have.
     """
     device, points = points.device, points.cpu()
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _MASK_MARGIN_PIXELS + 1,) * 2)
     seen, against, voters = torch.zeros(len(points)), torch.zeros(len(points)), 0
     for view in views:
         if view.mask is None or not bool((view.mask > 127).any()):
             continue
         voters += 1
-        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _RIM + 1, 2 * _RIM + 1))
         mask = torch.from_numpy(cv2.dilate(view.mask.numpy(), kernel)) > 127
         places, depth = view.camera.project(points)
         inside = (depth > 0) & (places >= 0).all(1)
@@ -105,7 +105,7 @@ def blended_weight(cloud: GaussianCloud, views: Sequence[View], *, rasterizer: R
 def _is_smaller_than_object(cloud: GaussianCloud) -> Bool[Tensor, " points"]:
     places = cloud.centers
     low, high = torch.quantile(places[:: max(1, len(places) // 100_000)], places.new_tensor([0.01, 0.99]), dim=0)
-    return cloud.log_scales.amax(1).exp() <= _OVERSIZE * float((high - low).norm())
+    return cloud.log_scales.amax(1).exp() <= _MAX_SCALE_RATIO * float((high - low).norm())
 
 
 def _is_near_others(cloud: GaussianCloud) -> Bool[Tensor, " points"]:
@@ -114,4 +114,4 @@ def _is_near_others(cloud: GaussianCloud) -> Bool[Tensor, " points"]:
     if count < 1:
         return torch.ones_like(cloud.logit_opacities, dtype=torch.bool)
     distance = cKDTree(places).query(places, k=np.arange(2, count + 2))[0].mean(1)
-    return torch.from_numpy(distance <= _AFLOAT * np.median(distance)).to(cloud.centers.device)
+    return torch.from_numpy(distance <= _MAX_DISTANCE_RATIO * np.median(distance)).to(cloud.centers.device)

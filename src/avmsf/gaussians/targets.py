@@ -13,7 +13,7 @@ from avmsf.errors import CaptureWarning, SceneError
 from avmsf.gaussians.config import SplatConfig
 from avmsf.photographs.cameras import View
 
-_PLAIN_STEP, _PLAIN_PART = 24, 0.9
+_MAX_PLAIN_STEP, _MIN_PLAIN_FRACTION = 24, 0.9
 """A background is plain where this part of its pixels lies within so many levels of 255 of the median color."""
 
 
@@ -47,7 +47,7 @@ def choose_background(views: Sequence[View], config: SplatConfig) -> Float[Tenso
     if not len(pixels):
         return torch.zeros(3)
     color = np.median(pixels, axis=0)
-    plain = float((np.abs(pixels - color).max(1) <= _PLAIN_STEP).mean()) >= _PLAIN_PART
+    plain = float((np.abs(pixels - color).max(1) <= _MAX_PLAIN_STEP).mean()) >= _MIN_PLAIN_FRACTION
     # Without a mask there is no other way than to fit the whole photograph.
     return torch.from_numpy(color / 255.0).float() if plain or not masked else None
 

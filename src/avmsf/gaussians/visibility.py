@@ -20,7 +20,7 @@ from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.mesh_views import MeshTracer
 
-_COVERED = 0.5
+_MIN_COVERAGE = 0.5
 """Share of a pixel that the object must cover for the pixel to tell its depth."""
 
 DepthMap = Callable[[Camera], Float[Tensor, "height width"]]
@@ -31,7 +31,7 @@ DepthMap = Callable[[Camera], Float[Tensor, "height width"]]
 class Visibility:
     """What one camera sees of many points."""
 
-    places: Float[Tensor, "points 2"]
+    pixels: Float[Tensor, "points 2"]
     """In the image, pixels; meaningless where the share is zero."""
     depth: Float[Tensor, " points"]
     """Meters along the optical axis."""
@@ -73,7 +73,7 @@ def depth_test(
         there = surface[rows, columns]
         shows = (there > 0) & (there >= deep - tolerance)
         if coverage is not None:
-            shows &= coverage[rows, columns] >= _COVERED
+            shows &= coverage[rows, columns] >= _MIN_COVERAGE
         share += weight * shows
         past += weight * (shows & (there > deep + tolerance))
     return Visibility(places, deep, torch.where(inside, share, 0.0), torch.where(inside, past, 0.0), inside, camera)
@@ -85,7 +85,7 @@ def depth_of_cloud(cloud: GaussianCloud, rasterizer: Rasterizer) -> DepthMap:
     def render(camera: Camera) -> Float[Tensor, "height width"]:
         with torch.no_grad():
             rendering = rasterizer(cloud, camera, background=cloud.centers.new_zeros(3))
-            return torch.where(rendering.alpha >= _COVERED, rendering.depth, 0.0)
+            return torch.where(rendering.alpha >= _MIN_COVERAGE, rendering.depth, 0.0)
 
     return render
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.rasterizer.blending import Blending
-from avmsf.gaussians.rasterizer.ellipses import NEAR
+from avmsf.gaussians.rasterizer.ellipses import MIN_DEPTH_M
 from avmsf.gaussians.rasterizer.projection import project
 from avmsf.gaussians.rasterizer.protocol import Rasterizer, Rendering
 from avmsf.photographs.cameras import Camera
@@ -110,7 +110,7 @@ class GsplatRasterizer:
             Ks=camera.intrinsics.to(centers, non_blocking=True)[None],
             width=camera.width,
             height=camera.height,
-            near_plane=NEAR,
+            near_plane=MIN_DEPTH_M,
             sh_degree=cloud.degree,
             packed=False,
             backgrounds=background[None],

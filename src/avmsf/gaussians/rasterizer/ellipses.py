@@ -16,13 +16,13 @@ import numpy as np
 
 from avmsf._utils.compiled import compiled
 
-NEAR = 0.01
+MIN_DEPTH_M = 0.01
 """Gaussians with centers nearer than this to the camera's plane are not seen, meters (gsplat's default)."""
-_WIDEST = 1e30
+_MAX_VARIANCE = 1e30
 """Ellipses with larger variances, square pixels, are dropped: float32 cannot hold what follows from them."""
 MIN_ALPHA = 1.0 / 255.0
 """A Gaussian counts at a pixel where it covers at least this much (3DGS)."""
-BLUR = 0.3
+_BLUR = 0.3
 """What is added to the variances in the image, square pixels (3DGS)."""
 
 
@@ -95,7 +95,7 @@ def _variances(axes):
     crossed = (axes[0, 1] * axes[1, 2] - axes[0, 2] * axes[1, 1]) ** 2
     crossed += (axes[0, 2] * axes[1, 0] - axes[0, 0] * axes[1, 2]) ** 2
     crossed += (axes[0, 0] * axes[1, 1] - axes[0, 1] * axes[1, 0]) ** 2
-    return xx + BLUR, xy, yy + BLUR, crossed + BLUR * (xx + yy) + BLUR * BLUR
+    return xx + _BLUR, xy, yy + _BLUR, crossed + _BLUR * (xx + yy) + _BLUR * _BLUR
 
 
 @compiled()
@@ -132,7 +132,7 @@ def project_points(lane, lanes, cloud, pose, lens, scratch, results):
             continue
         x, y, z = _inside(centers[i], pose)
         opacity = 1.0 / (1.0 + math.exp(-float(logits[i])))
-        if z < NEAR or opacity < MIN_ALPHA:
+        if z < MIN_DEPTH_M or opacity < MIN_ALPHA:
             continue
         for j in range(3):
             scales[j] = math.exp(float(log_scales[i, j]))
@@ -140,7 +140,7 @@ def project_points(lane, lanes, cloud, pose, lens, scratch, results):
         _axes(turn, scales, pose, x, y, z, lens, slope, axes)
         xx, xy, yy, determinant = _variances(axes)
         # Also false for what is not a number.
-        if not xx + yy < _WIDEST:
+        if not xx + yy < _MAX_VARIANCE:
             continue
         across, down = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
         reach = math.sqrt(2.0 * math.log(opacity / MIN_ALPHA))

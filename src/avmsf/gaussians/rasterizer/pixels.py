@@ -17,11 +17,11 @@ from avmsf._utils.compiled import compiled
 SIDE = 8
 """Width and height of a tile, pixels: its 64 pixels fill the registers, and few of them lie outside an ellipse."""
 PIXELS = SIDE * SIDE
-_OPAQUE = np.float32(0.999)
+_MAX_ALPHA = np.float32(0.999)
 """No Gaussian covers more than this of a pixel, so that 1 - alpha can be divided by (gsplat)."""
-_LEAST = np.float32(1e-4)
+_MIN_TRANSMITTANCE = np.float32(1e-4)
 """A Gaussian that would leave this little of what lies behind is not drawn, nor any behind it (3DGS)."""
-_LOWEST = np.float32(-8.0)
+_MIN_EXPONENT = np.float32(-8.0)
 _ONE, _ZERO, _NONE = np.float32(1.0), np.float32(0.0), np.float32(-1.0)
 _ROW, _LIVE, _REST, _RED, _GREEN, _BLUE, _AWAY, _NUMBER = (np.uint64(k * PIXELS) for k in range(1, 9))
 """Where a tile's working numbers begin; unsigned, so that no check for a negative index keeps loops from vectors."""
@@ -88,11 +88,11 @@ def _cover(scratch, packed, row, middle, center, first, last, number, min_level)
         x, y = scratch[p] - middle, scratch[_ROW + p] - center
         u, w = p_x * x + r_y * y, s_y * y
         power = peak - (u * u + w * w)
-        covered = min(_exponential(max(power, _LOWEST)), _OPAQUE)
+        covered = min(_exponential(max(power, _MIN_EXPONENT)), _MAX_ALPHA)
         before, rest, previous = scratch[_LIVE + p], scratch[_REST + p], scratch[_NUMBER + p]
         after = before * (_ONE - covered)
         counts = power >= min_level
-        drawn = counts & (after > _LEAST)
+        drawn = counts & (after > _MIN_TRANSMITTANCE)
         weight = covered * before if drawn else _ZERO
         left = after if drawn else _ZERO
         scratch[_LIVE + p] = left if counts else before
@@ -165,9 +165,9 @@ def _uncover(scratch, packed, row, middle, center, first, last, number, min_leve
         x, y = scratch[p] - middle, scratch[_ROW + p] - center
         u, w = p_x * x + r_y * y, s_y * y
         power = peak - (u * u + w * w)
-        raw = _exponential(max(power, _LOWEST))
+        raw = _exponential(max(power, _MIN_EXPONENT))
         drawn = (power >= min_level) & (number <= scratch[_NUMBER + p])
-        covered = min(raw, _OPAQUE) if drawn else _ZERO
+        covered = min(raw, _MAX_ALPHA) if drawn else _ZERO
         passed = _ONE / (_ONE - covered)
         before, behind = scratch[_LIVE + p] * passed, scratch[_REST + p]
         by_red, by_green = scratch[_RED + p], scratch[_GREEN + p]
@@ -176,7 +176,7 @@ def _uncover(scratch, packed, row, middle, center, first, last, number, min_leve
         weight = covered * before
         slope = covered * (before * gain - behind * passed)
         # Where alpha is held at its largest nothing moves it.
-        by_power = slope if raw <= _OPAQUE else _ZERO
+        by_power = slope if raw <= _MAX_ALPHA else _ZERO
         scratch[_LIVE + p] = before
         scratch[_REST + p] = behind + weight * gain
         by_u, by_w = by_power * u, by_power * w

@@ -17,7 +17,7 @@ from avmsf.gaussians.rasterizer.ellipses import project_points, project_points_b
 from avmsf.gaussians.rasterizer.harmonics import shade, shade_back
 from avmsf.photographs.cameras import Camera
 
-_MARGIN = 0.3
+_SLOPE_MARGIN = 0.3
 """The perspective's slope is taken no further off axis than the image's edge and this part of half its width (3DGS)."""
 
 
@@ -84,7 +84,7 @@ def project(cloud: GaussianCloud, camera: Camera) -> tuple[Tensor, ...]:
 def _lens(camera: Camera) -> Float64[np.ndarray, "10"]:
     """Return focal lengths, principal point, size, and the tangents left, right, up and down where the slope ends."""
     (across, down), (middle, center) = camera.focal, camera.principal
-    sides, ends = _MARGIN * 0.5 * camera.width / across, _MARGIN * 0.5 * camera.height / down
+    sides, ends = _SLOPE_MARGIN * 0.5 * camera.width / across, _SLOPE_MARGIN * 0.5 * camera.height / down
     left, right = -middle / across - sides, (camera.width - middle) / across + sides
     top, bottom = -center / down - ends, (camera.height - center) / down + ends
     return np.array([across, down, middle, center, camera.width, camera.height, left, right, top, bottom])

@@ -26,13 +26,13 @@ def _moved(cloud: GaussianCloud, count: int, offset: tuple[float, float, float])
     return replace(some, centers=some.centers + torch.tensor(offset))
 
 
-def test_what_lies_beside_the_object_goes_and_all_of_the_object_stays() -> None:
+def test_what_is_not_the_object_goes_and_all_of_the_object_stays() -> None:
     ball, views = _ball(opacity=0.5), ball_views(24)
     # In front of some cameras, outside of all masks; faint ones on the ball; a huge one.
-    beside = _moved(ball, 30, (0.12, 0.0, 0.0))
+    outside = _moved(ball, 30, (0.12, 0.0, 0.0))
     faint = replace(_ball(), logit_opacities=torch.full((COUNT,), -4.0))
     huge = replace(ball.take(torch.tensor([0])), log_scales=torch.full((1, 3), RADIUS).log())
-    kept = keep_object(ball.join(beside).join(faint).join(huge), views)
+    kept = keep_object(ball.join(outside).join(faint).join(huge), views)
     assert torch.equal(kept.centers, ball.centers)
 
 
