@@ -9,19 +9,24 @@ import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
 
 from avmsf._utils.text import read_json
 from avmsf.errors import AvmsfError, EvaluationError
-from avmsf.plotting.edits import Move, draw_clap_curves, draw_embedding
+from avmsf.plotting.edits import draw_clap_curves
 from avmsf.plotting.pictures import save_picture
+from avmsf.plotting.style import series_color, styled, titled_figure
 
 BEFORE = "before"
 """Method of the protocol that leaves an object as it was."""
 _SAME = ("object", "source", "target", "prompt", "seed")
 """What scores of one task have in common."""
+Move: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
+"""Where an edited object's modes lie in an embedding before and after the edit."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -71,6 +76,42 @@ def write_figures(record: Path, folder: Path) -> list[Path]:
     for file, figure in figures.items():
         save_picture(figure, folder / file)
     return [folder / file for file in figures]
+
+
+@styled
+def draw_embedding(
+    points: Float[np.ndarray, "objects 2"],
+    materials: Sequence[str],
+    moves: Mapping[str, Sequence[Move]],
+    *,
+    target: str,
+    title: str,
+) -> Figure:
+    """Draw labelled objects in an embedding of their modes, and arrows from edited objects before to after the edit.
+
+    One panel for each method of `moves`. A star marks the mean of the objects of the material `target`, from which the
+    UMAP distance is measured.
+    """
+    figure = titled_figure(title, 4.2 * len(moves) + 1.6, 4.8)
+    panels = figure.subplots(1, len(moves), sharex=True, sharey=True, squeeze=False)[0]
+    for axes, (method, changes) in zip(panels, moves.items(), strict=True):
+        for number, material in enumerate(sorted(set(materials))):
+            own = points[[each == material for each in materials]]
+            axes.scatter(own[:, 0], own[:, 1], s=36, alpha=0.75, color=series_color(number), label=material)
+        center = points[[material == target for material in materials]].mean(axis=0)
+        axes.plot(*center, "*", color="black", markersize=13, label=f"mean of {target}")
+        for before, after in changes:
+            axes.annotate(
+                "", after, before, arrowprops={"arrowstyle": "->", "color": "0.3", "shrinkA": 0, "shrinkB": 0}
+            )
+        ends = np.asarray(changes, dtype=float).reshape(-1, 2, 2)
+        axes.plot(*ends[:, 0].T, "o", mfc="white", color="black", markersize=6, label="before the edit")
+        axes.plot(*ends[:, 1].T, "D", color="black", markersize=5, label="after the edit")
+        axes.set_title(method)
+        axes.set_xlabel("UMAP 1")
+    panels[0].set_ylabel("UMAP 2")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right upper")
+    return figure
 
 
 def _moves(scores: Sequence[Mapping[str, Any]], space: str) -> dict[str, list[Move]]:

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from matplotlib.text import Annotation
 
-from avmsf.plotting.edits import draw_clap_curves, draw_embedding
+from avmsf.plotting.edits import draw_clap_curves
+from benchmarks.editingfigures import draw_embedding
 
 POINTS = np.array([[0.0, 0.0], [1.0, 0.0], [5.0, 5.0], [5.0, 7.0]])
 MATERIALS = ("wood", "wood", "glass", "glass")

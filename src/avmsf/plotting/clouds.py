@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -12,33 +12,20 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from avmsf.errors import EvaluationError
-from avmsf.plotting.style import FIRST, SECOND, styled
+from avmsf.plotting.style import FIRST, SECOND, scatter_surface, styled, titled_figure
 from avmsf.symmetry.symmetries import Symmetries
 
 Side: TypeAlias = tuple[float, float]
 """Azimuth about the direction to the sky, and elevation above the horizon, of an eye far away; degrees."""
 UP = (0.0, 0.0, 1.0)
-ABOVE = 25.0
-"""Elevation of an eye that looks into what is open above and still sees the sides, degrees."""
-AROUND: tuple[Side, ...] = tuple((azimuth, ABOVE) for azimuth in (30.0, 120.0, 210.0, 300.0))
-"""Four sides from a little above."""
+AROUND: tuple[Side, ...] = ((30.0, 25.0), (120.0, 25.0), (210.0, 25.0), (300.0, 25.0))
+"""Four sides from a little above, from where an eye looks into what is open above and still sees the sides."""
 ALL_SIDES: tuple[Side, ...] = (
-    (-60.0, 25.0),
-    (60.0, 25.0),
-    (180.0, 25.0),
-    (-60.0, 75.0),
-    (-60.0, -25.0),
-    (-60.0, -75.0),
+    *((-60.0, 25.0), (60.0, 25.0), (180.0, 25.0), (-60.0, 75.0), (-60.0, -25.0), (-60.0, -75.0)),
 )
 """Three sides, into what is open above, and two from below: nothing on a convex object is out of sight in all."""
 _ARROW = 28.0
 """Length of the arrows along the axes, points."""
-
-
-def side_words(side: Side) -> str:
-    """Return a side's azimuth and elevation as text."""
-    azimuth, elevation = side
-    return f"azimuth {azimuth:g}°, elevation {elevation:g}°"
 
 
 def view_from(side: Side, up: Sequence[float] = UP) -> Float[np.ndarray, "3 3"]:
@@ -49,7 +36,7 @@ def view_from(side: Side, up: Sequence[float] = UP) -> Float[np.ndarray, "3 3"]:
     azimuth, elevation = side
     sky = np.asarray(up, dtype=float)
     if sky.shape != (3,) or not np.isfinite(sky).all() or np.linalg.norm(sky) == 0.0:
-        raise EvaluationError(f"expected an up direction of three numbers, got {list(up)}", name="up", value=list(up))
+        raise EvaluationError.expected("a direction of three numbers", list(up), name="up")
     sky = sky / np.linalg.norm(sky)
     first = np.roll(np.eye(3)[np.argmax(np.abs(sky))], 1)
     first = first - (first @ sky) * sky
@@ -61,32 +48,32 @@ def view_from(side: Side, up: Sequence[float] = UP) -> Float[np.ndarray, "3 3"]:
     return np.stack([right, np.cross(eye, right), eye])
 
 
+def plane_of(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "3 3"] | None:
+    """Return the rows of `view_from` for points that are flat along an axis, seen along it; None for others."""
+    extent = np.ptp(points, axis=0)
+    thin = int(extent.argmin())
+    wide = [axis for axis in range(3) if axis != thin]
+    return np.eye(3)[[*wide, thin]] if extent[thin] <= 1e-3 * extent.max() else None
+
+
 def name_axes(axes: Axes, view: Float[np.ndarray, "3 3"]) -> None:
     """Draw the directions of x, y and z in the lower left corner; rows of `view` as of `view_from`."""
     for axis, name in enumerate("xyz"):
         across, along = _ARROW * view[:2, axis]
         # What points at the eye or away from it has no direction here.
         if np.hypot(across, along) > 0.4 * _ARROW:
-            axes.annotate(
-                name,
-                (0.06, 0.06),
-                (across, along),
-                xycoords="axes fraction",
-                textcoords="offset points",
-                arrowprops={"arrowstyle": "<-", "color": FIRST},
-                color=FIRST,
-                ha="center",
-                va="center",
-            )
+            systems: dict[str, Any] = {
+                "xycoords": "axes fraction",
+                "textcoords": "offset points",
+                "ha": "center",
+                "va": "center",
+            }
+            arrow = {"arrowstyle": "<-", "color": FIRST}
+            axes.annotate(name, (0.06, 0.06), (across, along), arrowprops=arrow, color=FIRST, **systems)
 
 
-_GRAY = 0.62
 _INCHES = 3.0
-_MARGIN = 1.12
-_WIDTH = 1.9
-"""Width of a dot over the picture's, times the root of how many there are."""
-_FEW = 400
-"""Points below which dots grow no wider."""
+"""Width of an object in its picture."""
 
 
 @styled
@@ -106,24 +93,30 @@ def draw_cloud(
     """
     rows = dict(colors)
     if symmetries is not None:
-        rows["symmetries"] = torch.full((len(points), 3), _GRAY)
-    if not rows or not sides or not len(points):
-        raise EvaluationError(
-            f"expected points, colors or symmetries, and sides to draw, got {len(points)} points, {len(rows)} sets of "
-            f"colors and {len(sides)} sides",
-            value=(len(points), len(rows), len(sides)),
-        )
-    figure = Figure(figsize=(_INCHES * len(sides), _INCHES * len(rows) + 0.5), layout="constrained")
+        rows["symmetries"] = torch.full((len(points), 3), 0.62)
+    counts = (len(points), len(rows), len(sides))
+    if not all(counts):
+        got = "{} points, {} sets of colors and {} sides".format(*counts)
+        raise EvaluationError.expected("points, colors or symmetries, and sides", counts, got=got, name="cloud")
+    figure = titled_figure(title, _INCHES * len(sides), _INCHES * len(rows) + 0.5)
     grid = figure.subplots(len(rows), len(sides), squeeze=False)
+    places = points.double().numpy()
+    middle = (places.min(0) + places.max(0)) / 2
+    radius = float(np.linalg.norm(places - middle, axis=1).max())
     for (name, shown), line in zip(rows.items(), grid, strict=True):
         for side, axes in zip(sides, line, strict=True):
             view = view_from(side, up)
-            _scatter(axes, points, shown, view)
+            seen = (places - middle) @ view.T
+            # What is farther is darker: flat dots alone show no depth.
+            shade = 0.72 + 0.28 * (seen[:, 2:] / max(radius, 1e-30) + 1) / 2
+            scatter_surface(axes, seen, np.clip(shown.numpy() * shade, 0.0, 1.0), inches=_INCHES)
             if symmetries is not None and name == "symmetries":
-                _draw_symmetries(axes, points, symmetries, view)
+                _draw_symmetries(axes, middle, radius, symmetries, view)
             name_axes(axes, view)
-            axes.set_title(f"{name}\n{side_words(side)}")
-    figure.suptitle(title)
+            reach = 1.12 * radius if radius > 0.0 else 1.0
+            axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
+            axes.set_axis_off()
+            axes.set_title("{}\nazimuth {:g}°, elevation {:g}°".format(name, *side))
     return figure
 
 
@@ -144,53 +137,26 @@ def component_colors(features: Float[Tensor, "points dim"]) -> Float[Tensor, "po
     return colors
 
 
-def _middle(points: Float[Tensor, "points 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
-    places = points.double().numpy()
-    middle = (places.min(0) + places.max(0)) / 2
-    return middle, float(np.linalg.norm(places - middle, axis=1).max())
-
-
-def _scatter(
+def _draw_symmetries(
     axes: Axes,
-    points: Float[Tensor, "points 3"],
-    colors: Float[Tensor, "points 3"],
+    middle: Float[np.ndarray, " 3"],
+    radius: float,
+    symmetries: Symmetries,
     view: Float[np.ndarray, "3 3"],
 ) -> None:
-    middle, radius = _middle(points)
-    seen = (points.double().numpy() - middle) @ view.T
-    order = np.argsort(seen[:, 2])
-    # What is farther is darker: flat dots alone show no depth.
-    shade = 0.72 + 0.28 * (seen[:, 2:] / max(radius, 1e-30) + 1) / 2
-    shown = np.clip(colors.numpy() * shade, 0.0, 1.0)
-    # Dots so wide that near ones hide far ones: about twice as wide as they lie apart.
-    dot = 72 * _INCHES * _WIDTH / math.sqrt(max(len(seen), _FEW))
-    axes.scatter(seen[order, 0], seen[order, 1], c=shown[order], s=dot**2, linewidths=0, rasterized=True)
-    reach = _MARGIN * radius if radius > 0.0 else 1.0
-    axes.set_xlim(-reach, reach)
-    axes.set_ylim(-reach, reach)
-    axes.set_aspect("equal")
-    axes.set_axis_off()
-
-
-def _draw_symmetries(
-    axes: Axes, points: Float[Tensor, "points 3"], symmetries: Symmetries, view: Float[np.ndarray, "3 3"]
-) -> None:
-    middle, radius = _middle(points)
     for mirror in symmetries.mirrors:
         normal, point = mirror.normal.double().numpy(), mirror.point.double().numpy()
         center = middle - ((middle - point) @ normal) * normal
         first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
         first /= np.linalg.norm(first)
         second = np.cross(normal, first)
-        signs = ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))
-        corners = np.array([center + 0.72 * radius * (a * first + b * second) for a, b in signs])
-        seen = (corners - middle) @ view.T
+        signs = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1)])
+        seen = (center + 0.72 * radius * signs @ [first, second] - middle) @ view.T
         axes.plot(seen[:, 0], seen[:, 1], color=FIRST, linewidth=1.0, alpha=0.8)
     for rotation in symmetries.rotations:
         axis, point = rotation.axis.double().numpy(), rotation.point.double().numpy()
         center = point + ((middle - point) @ axis) * axis
-        ends = np.array([center - 1.05 * radius * axis, center + 1.05 * radius * axis])
-        seen = (ends - middle) @ view.T
+        seen = (center + 1.05 * radius * np.array([-axis, axis]) - middle) @ view.T
         axes.plot(seen[:, 0], seen[:, 1], color=SECOND, linewidth=1.6)
         name = "∞" if rotation.order is None else f"{rotation.order}"
         axes.annotate(name, (seen[1, 0], seen[1, 1]), color=SECOND, annotation_clip=False)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -24,6 +25,7 @@ _FOUND, _OTHER, _TRUTH = to_rgb(FIRST), (0.95, 0.95, 0.95), to_rgb(SECOND)
 """Blue and red, the paper's colors of the found and the true contact."""
 _MARK = 0.018
 """Radius of a mark over the object's diagonal."""
+_Mark: TypeAlias = tuple[Tensor, tuple[float, float, float]]
 _DRAWN = 6000
 """Points in a picture, about."""
 
@@ -45,25 +47,26 @@ def draw_contact(
     # The likeliest point and its neighborhood must not fall between those that are drawn.
     rows = torch.arange(0, len(points), max(1, len(points) // _DRAWN))
     rows = torch.unique(torch.cat([rows, torch.topk(contact.probability, min(64, len(points))).indices]))
-    marks: list[tuple[Tensor, tuple[float, float, float]]] = [] if others is None else [(o, _OTHER) for o in others]
+    marks: list[_Mark] = [] if others is None else [(each, _OTHER) for each in others]
     marks.append((contact.position, _FOUND))
     if truth is not None:
         marks.append((truth, _TRUTH))
-    likely, distance = (
-        _marked(points, colors, marks)[rows] for colors in (contact_colors(contact), _distance_colors(contact))
-    )
-    figure = draw_cloud(
-        points[rows], {"probability": likely, "cosine distance": distance}, title=_title(title, marks), sides=sides
-    )
-    low, high = _span(contact)
-    for line, (first, last, words, heat) in enumerate(
-        (
-            (-_DECADES, 0.0, "log10 of probability / maximum", SEQUENTIAL),
-            (low, high, "cosine distance of the gains", f"{SEQUENTIAL}_r"),
-        )
-    ):
-        panels = figure.axes[line * len(sides) : (line + 1) * len(sides)]
-        figure.colorbar(ScalarMappable(Normalize(first, last), heat), ax=list(panels), shrink=0.75, label=words)
+    low, high = float(contact.distance.min()), float(contact.distance.max())
+    high = max(high, low + 1e-6)
+    colors = {
+        "probability": contact_colors(contact),
+        "cosine distance": _heat(1.0 - (contact.distance.double() - low) / (high - low)),
+    }
+    painted = {name: _marked(points, each, marks)[rows] for name, each in colors.items()}
+    used = {color for _, color in marks}
+    named = ((_FOUND, "blue: most probable"), (_OTHER, "white: equivalent"), (_TRUTH, "red: true contact"))
+    legend = ", ".join(words for color, words in named if color in used)
+    figure = draw_cloud(points[rows], painted, title=f"{title}\n{legend}", sides=sides)
+    panels = np.array(figure.axes).reshape(len(colors), -1)
+    likely = ScalarMappable(Normalize(-_DECADES, 0.0), SEQUENTIAL)
+    figure.colorbar(likely, ax=list(panels[0]), shrink=0.75, label="log10 of probability / maximum")
+    distant = ScalarMappable(Normalize(low, high), f"{SEQUENTIAL}_r")
+    figure.colorbar(distant, ax=list(panels[1]), shrink=0.75, label="cosine distance of the gains")
     return figure
 
 
@@ -99,16 +102,6 @@ def write_contact_cloud(contact: ContactMap, path: Path) -> None:
     write_whole(path, lambda place: place.write_bytes(content), raising=EvaluationError)
 
 
-def _distance_colors(contact: ContactMap) -> Float[Tensor, "points 3"]:
-    low, high = _span(contact)
-    return _heat(1.0 - (contact.distance.double() - low) / (high - low))
-
-
-def _span(contact: ContactMap) -> tuple[float, float]:
-    low, high = float(contact.distance.min()), float(contact.distance.max())
-    return low, max(high, low + 1e-6)
-
-
 def _heat(level: Float[Tensor, " points"]) -> Float[Tensor, "points 3"]:
     return torch.from_numpy(colormaps[SEQUENTIAL](level.clamp(0.0, 1.0).numpy())[:, :3]).float()
 
@@ -116,7 +109,7 @@ def _heat(level: Float[Tensor, " points"]) -> Float[Tensor, "points 3"]:
 def _marked(
     points: Float[Tensor, "points 3"],
     colors: Float[Tensor, "points 3"],
-    marks: Sequence[tuple[Tensor, tuple[float, float, float]]],
+    marks: Sequence[_Mark],
 ) -> Float[Tensor, "points 3"]:
     """Return the colors with those of the points about each mark replaced by the mark's."""
     painted = colors.clone()
@@ -128,9 +121,3 @@ def _marked(
         # A ring leaves the heat in its middle visible; where points are sparse, the nearest one alone is painted.
         painted[ring if len(ring) >= 6 else near] = torch.tensor(color)
     return painted
-
-
-def _title(title: str, marks: Sequence[tuple[Tensor, tuple[float, float, float]]]) -> str:
-    used = {color for _, color in marks}
-    named = ((_FOUND, "blue: most probable"), (_OTHER, "white: equivalent"), (_TRUTH, "red: true contact"))
-    return "\n".join([title, ", ".join(words for color, words in named if color in used)])

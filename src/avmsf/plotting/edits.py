@@ -1,4 +1,4 @@
-"""Figures of edits: modes before and after, where they lie among labelled objects, and CLAP scores over the steps."""
+"""Figures of edits: modes before and after, and CLAP scores over the steps."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,14 +7,14 @@ from typing import TypeAlias
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float64
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import StrMethodFormatter
 from torch import Tensor
 
 from avmsf.field.sound_field import SoundField
-from avmsf.plotting.style import FIRST, SECOND, series_color, styled
+from avmsf.plotting.style import FIRST, SECOND, series_color, styled, titled_figure
 
 _RANGE_DB = 80.0
 """What is shown below the loudest."""
@@ -54,7 +54,7 @@ def draw_edit(before: ModeLevels, after: ModeLevels, *, sample_rate: float, titl
 
     Modes that are silent have no level; the band above half the sample rate (Hz), where all are, is shaded.
     """
-    figure = Figure(figsize=(9, 8.4), layout="constrained")
+    figure = titled_figure(title, 9, 8.4)
     levels, rings, counts = figure.subplots(3, 1, sharex=True, height_ratios=(3, 3, 2))
     loudest = float(before.size.max())
     drawn = [("before", before, FIRST), ("after", after, SECOND)]
@@ -68,8 +68,8 @@ def draw_edit(before: ModeLevels, after: ModeLevels, *, sample_rate: float, titl
         levels.plot(frequency[audible], level, "o", color=color, markersize=4, label=name)
         rings.plot(frequency[audible], t60[audible], "o", color=color, markersize=4, alpha=0.8)
         rings.plot(frequency[~audible], t60[~audible], "o", color=color, markersize=4, mfc="none")
-    for one, other in zip(_places(before), _places(after), strict=True):
-        rings.plot([one[0], other[0]], [one[1], other[1]], color="gray", linewidth=0.5, alpha=0.5, zorder=0)
+    moves = (torch.stack([getattr(each, name) for each in (before, after)]).numpy() for name in ("frequency", "t60"))
+    rings.plot(*moves, color="gray", linewidth=0.5, alpha=0.5, zorder=0)
     _count(counts, drawn)
     levels.set_ylim(top - _RANGE_DB, top + 6.0)
     levels.set_ylabel("level (dB re strongest mode before)")
@@ -78,18 +78,15 @@ def draw_edit(before: ModeLevels, after: ModeLevels, *, sample_rate: float, titl
     rings.set_ylabel("decay time T60 (s)")
     counts.set_ylabel("modes per third-octave band")
     counts.set_xlabel("frequency (Hz); hollow: silent")
+    highest = max(float(each.frequency.max()) for _, each, _ in drawn)
     for axes in (levels, rings, counts):
         axes.set_xscale("log")
         axes.grid(which="both")
-        _shade(axes, 0.5 * sample_rate, max(float(each.frequency.max()) for _, each, _ in drawn))
+        if highest >= 0.5 * sample_rate:
+            axes.axvspan(0.5 * sample_rate, 1.1 * highest, color="gray", alpha=0.2, linewidth=0)
     for axis in (counts.xaxis, rings.yaxis):
         axis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    figure.suptitle(title)
     return figure
-
-
-def _places(modes: ModeLevels) -> list[tuple[float, float]]:
-    return list(zip(modes.frequency.tolist(), modes.t60.tolist(), strict=True))
 
 
 def _count(axes: Axes, drawn: list[tuple[str, ModeLevels, str]]) -> None:
@@ -103,52 +100,8 @@ def _count(axes: Axes, drawn: list[tuple[str, ModeLevels, str]]) -> None:
         axes.stairs(np.histogram(places, edges)[0], 2.0 ** (edges / _BANDS), color=color, fill=True, alpha=0.35)
 
 
-def _shade(axes: Axes, start: float, highest: float) -> None:
-    if highest >= start:
-        axes.axvspan(start, 1.1 * highest, color="gray", alpha=0.2, linewidth=0)
-
-
-Move: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
-"""Where an edited object's modes lie in an embedding before and after the edit."""
 Curve: TypeAlias = Sequence[tuple[int, float]]
 """Steps of an edit and its CLAP score after each; step 0 is the object as it was."""
-_PANEL = 4.2
-"""Inches."""
-
-
-@styled
-def draw_embedding(
-    points: Float[np.ndarray, "objects 2"],
-    materials: Sequence[str],
-    moves: Mapping[str, Sequence[Move]],
-    *,
-    target: str,
-    title: str,
-) -> Figure:
-    """Draw labelled objects in an embedding of their modes, and arrows from edited objects before to after the edit.
-
-    One panel for each method of `moves`. A star marks the mean of the objects of the material `target`, from which the
-    UMAP distance is measured.
-    """
-    figure = Figure(figsize=(_PANEL * len(moves) + 1.6, _PANEL + 0.6), layout="constrained")
-    panels = figure.subplots(1, len(moves), sharex=True, sharey=True, squeeze=False)[0]
-    for axes, (method, changes) in zip(panels, moves.items(), strict=True):
-        _draw_objects(axes, points, materials)
-        center = points[[material == target for material in materials]].mean(axis=0)
-        axes.plot(*center, "*", color="black", markersize=13, label=f"mean of {target}")
-        for before, after in changes:
-            axes.annotate(
-                "", after, before, arrowprops={"arrowstyle": "->", "color": "0.3", "shrinkA": 0, "shrinkB": 0}
-            )
-        ends = np.asarray(changes, dtype=float).reshape(-1, 2, 2)
-        axes.plot(*ends[:, 0].T, "o", mfc="white", color="black", markersize=6, label="before the edit")
-        axes.plot(*ends[:, 1].T, "D", color="black", markersize=5, label="after the edit")
-        axes.set_title(method)
-        axes.set_xlabel("UMAP 1")
-    panels[0].set_ylabel("UMAP 2")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right upper")
-    figure.suptitle(title)
-    return figure
 
 
 @styled
@@ -157,7 +110,7 @@ def draw_clap_curves(curves: Mapping[str, Sequence[Curve]], *, title: str) -> Fi
 
     The mean is taken at the steps that all edits of the method have.
     """
-    figure = Figure(figsize=(7.0, 4.4), layout="constrained")
+    figure = titled_figure(title, 7.0, 4.4)
     axes = figure.subplots()
     for number, (method, edits) in enumerate(curves.items()):
         color = series_color(number)
@@ -170,11 +123,4 @@ def draw_clap_curves(curves: Mapping[str, Sequence[Curve]], *, title: str) -> Fi
     axes.set_ylabel("CLAP score")
     axes.grid()
     axes.legend()
-    figure.suptitle(title)
     return figure
-
-
-def _draw_objects(axes: Axes, points: Float[np.ndarray, "objects 2"], materials: Sequence[str]) -> None:
-    for number, material in enumerate(sorted(set(materials))):
-        own = points[[each == material for each in materials]]
-        axes.scatter(own[:, 0], own[:, 1], s=36, alpha=0.75, color=series_color(number), label=material)

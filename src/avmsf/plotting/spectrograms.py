@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch
@@ -9,18 +10,18 @@ from jaxtyping import Float, Float64
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator, StrMethodFormatter
 from torch import Tensor
 
 from avmsf.modal.config import scaled_fft_size
 from avmsf.modal.spectra import magnitude_stft
-from avmsf.plotting.style import SEQUENTIAL, styled
+from avmsf.plotting.style import SEQUENTIAL, styled, titled_figure
 
 LOWEST_HZ, HIGHEST_HZ, SECONDS = 20.0, 20000.0, 1.0
 """Band and time of the paper's spectrograms (its figure of qualitative comparisons)."""
 RANGE_DB = 80.0
 """Levels further below the loudest one have the darkest color."""
+_LEVELS: dict[str, Any] = {"cmap": SEQUENTIAL, "vmin": -RANGE_DB, "vmax": 0.0}
 _WIDTH, _HEIGHT = 240, 160
 """Cells of a spectrogram: about one for each printed pixel."""
 
@@ -61,23 +62,14 @@ def draw_spectrograms(
 
     Shows the band and the time in which the recordings have energy.
     """
-    figure = Figure(figsize=(10, 2.1 * len(truth) + 1.2), layout="constrained")
-    grid = figure.subplots(len(truth), 2, sharex=True, sharey=True, squeeze=False, gridspec_kw={"wspace": 0.06})
+    titles = [[f"{name}: {what}" for what in ("recorded", "rendered")] for name in names]
+    sounds = torch.stack([truth, predicted], dim=1)
+    label = "level (dB re maximum of the recording)"
+    figure, axes = _draw_linear(sounds, titles, sample_rate=sample_rate, title=title, label=label, shared_scale=True)
     fft_size, hop = _linear_sizes(sample_rate)
-    spectra = [magnitude_stft(sounds, fft_size=fft_size, hop=hop) for sounds in (truth, predicted)]
-    highest, latest = _energy_extent(spectra[0])
-    for row, name in enumerate(names):
-        reference = float(spectra[0][row].max())
-        for axes, spectrum, what in zip(grid[row], spectra, ("recorded", "rendered"), strict=True):
-            image = _draw_linear(axes, spectrum[row], reference, sample_rate)
-            axes.set_title(f"{name}: {what}")
-        grid[row, 0].set_ylabel("frequency (Hz)")
-    grid[0, 0].set_ylim(0.0, highest * sample_rate / 2)
-    grid[0, 0].set_xlim(0.0, max(latest * truth.shape[1] / sample_rate, 4 * hop / sample_rate))
-    for axes in grid[-1]:
-        axes.set_xlabel("time (s)")
-    figure.colorbar(image, ax=grid, label="level (dB re maximum of the recording)", shrink=0.8)
-    figure.suptitle(title)
+    highest, latest = _energy_extent(magnitude_stft(truth, fft_size=fft_size, hop=hop))
+    axes.set_ylim(0.0, highest * sample_rate / 2)
+    axes.set_xlim(0.0, max(latest * truth.shape[1] / sample_rate, 4 * hop / sample_rate))
     return figure
 
 
@@ -86,18 +78,46 @@ def draw_sound_change(
     before: Float[Tensor, " samples"], after: Float[Tensor, " samples"], *, sample_rate: float, title: str
 ) -> Figure:
     """Draw the spectrograms of two sounds side by side, each on the scale of its own loudest point."""
-    figure = Figure(figsize=(10, 4.2), layout="constrained")
-    grid = figure.subplots(1, 2, sharex=True, sharey=True)
+    sounds, titles, label = torch.stack([before, after])[None], [["before", "after"]], "level (dB re maximum of each)"
+    return _draw_linear(sounds, titles, sample_rate=sample_rate, title=title, label=label, shared_scale=False)[0]
+
+
+def _draw_linear(
+    sounds: Float[Tensor, "rows columns samples"],
+    titles: Sequence[Sequence[str]],
+    *,
+    sample_rate: float,
+    title: str,
+    label: str,
+    shared_scale: bool,
+) -> tuple[Figure, Axes]:
+    """Draw levels with a linear frequency axis, over the maximum of each sound or of the first one of its row.
+
+    Return the figure and one of its axes, whose limits all share.
+    """
+    rows, columns, _ = sounds.shape
+    figure = titled_figure(title, 10, 2.1 * rows + 1.2)
+    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     fft_size, hop = _linear_sizes(sample_rate)
-    spectra = magnitude_stft(torch.stack([before, after]), fft_size=fft_size, hop=hop)
-    for axes, spectrum, what in zip(grid, spectra, ("before", "after"), strict=True):
-        image = _draw_linear(axes, spectrum, float(spectrum.max()), sample_rate)
-        axes.set_title(what)
+    step = hop / sample_rate
+    for line, row, names in zip(grid, sounds, titles, strict=True):
+        spectra = magnitude_stft(row, fft_size=fft_size, hop=hop)
+        for axes, spectrum, name in zip(line, spectra, names, strict=True):
+            reference = max(float((spectra[0] if shared_scale else spectrum).max()), 1e-30)
+            image = axes.imshow(
+                20 * torch.log10((spectrum / reference).clamp_min(1e-10)).numpy(),
+                origin="lower",
+                aspect="auto",
+                extent=(-step / 2, (spectrum.shape[1] - 0.5) * step, 0.0, sample_rate / 2),
+                interpolation="nearest",
+                **_LEVELS,
+            )
+            axes.set_title(name)
+        line[0].set_ylabel("frequency (Hz)")
+    for axes in grid[-1]:
         axes.set_xlabel("time (s)")
-    grid[0].set_ylabel("frequency (Hz)")
-    figure.colorbar(image, ax=grid, label="level (dB re maximum of each)", shrink=0.8)
-    figure.suptitle(title)
-    return figure
+    figure.colorbar(image, ax=grid, label=label, shrink=0.8)
+    return figure, grid[0, 0]
 
 
 @styled
@@ -117,7 +137,7 @@ def draw_method_spectrograms(
     """
     top = min(HIGHEST_HZ, highest, 0.5 * sample_rate)
     bottom = min(LOWEST_HZ, top / 50)
-    figure = Figure(figsize=(2.3 * len(methods) + 1.2, 2.2 * len(contacts) + 0.8), layout="constrained")
+    figure = titled_figure(title, 2.3 * len(methods) + 1.2, 2.2 * len(contacts) + 0.8)
     grid = figure.subplots(len(contacts), len(methods), sharex=True, sharey=True, squeeze=False)
     mesh: QuadMesh | None = None
     longest = 0.0
@@ -128,7 +148,10 @@ def draw_method_spectrograms(
                 start = _first_second(sounds[method], sample_rate=sample_rate)
                 levels = log_spectrogram(start, sample_rate=sample_rate, lowest=bottom, highest=top)
                 loudest = float(levels.max()) if loudest is None else loudest
-                mesh = _draw(axes, levels - loudest, _hop(len(start), _WIDTH) / sample_rate, (bottom, top))
+                # Frames are centered on 0, 1, 2, ... hops.
+                times = (np.arange(levels.shape[1] + 1) - 0.5) * _hop(len(start)) / sample_rate
+                bands = np.geomspace(bottom, top, _HEIGHT + 1)
+                mesh = axes.pcolormesh(times, bands, (levels - loudest).numpy(), rasterized=True, **_LEVELS)
                 longest = max(longest, len(start) / sample_rate)
         row[0].set_ylabel(f"{contact}\nfrequency (Hz)")
     for axes in grid.flat:
@@ -139,7 +162,6 @@ def draw_method_spectrograms(
         axes.set_xlabel("time (s)")
     if mesh is not None:
         figure.colorbar(mesh, ax=grid, label="level (dB, 0 = loudest of the first column)", shrink=0.8)
-    figure.suptitle(title)
     return figure
 
 
@@ -148,22 +170,8 @@ def _first_second(sound: Float[Tensor, " samples"], *, sample_rate: float) -> Fl
     return start / start.abs().max().clamp_min(torch.finfo(torch.float64).tiny)
 
 
-def _hop(samples: int, width: int) -> int:
+def _hop(samples: int, width: int = _WIDTH) -> int:
     return max(1, -(-samples // width))
-
-
-def _draw(axes: Axes, levels: Float64[Tensor, "height frames"], step: float, band: tuple[float, float]) -> QuadMesh:
-    """Draw levels whose frames are centered on 0, `step`, 2 `step`, ... seconds."""
-    height, frames = levels.shape
-    return axes.pcolormesh(
-        (np.arange(frames + 1) - 0.5) * step,
-        np.geomspace(*band, height + 1),
-        levels.numpy(),
-        cmap=SEQUENTIAL,
-        vmin=-RANGE_DB,
-        vmax=0.0,
-        rasterized=True,
-    )
 
 
 def _set_axes(axes: Axes, seconds: float, band: tuple[float, float]) -> None:
@@ -181,21 +189,6 @@ def _linear_sizes(sample_rate: float) -> tuple[int, int]:
     """Return FFT size and hop of spectrograms with a linear frequency axis."""
     fft_size = scaled_fft_size(1024, sample_rate=sample_rate)
     return fft_size, max(1, fft_size // 8)
-
-
-def _draw_linear(axes: Axes, spectrum: Float[Tensor, "bins frames"], reference: float, sample_rate: float) -> AxesImage:
-    """Draw magnitudes as levels over a reference, with a linear frequency axis."""
-    step = _linear_sizes(sample_rate)[1] / sample_rate
-    return axes.imshow(
-        20 * torch.log10((spectrum / max(reference, 1e-30)).clamp_min(1e-10)).numpy(),
-        origin="lower",
-        aspect="auto",
-        extent=(-step / 2, (spectrum.shape[1] - 0.5) * step, 0.0, sample_rate / 2),
-        cmap=SEQUENTIAL,
-        vmin=-RANGE_DB,
-        vmax=0.0,
-        interpolation="nearest",
-    )
 
 
 def _energy_extent(magnitude: Float[Tensor, "contacts bins frames"]) -> tuple[float, float]:

@@ -6,10 +6,15 @@ colors (`studio/page/colors.js`, `style.css`).
 """
 
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
+import numpy as np
 from cycler import cycler
+from jaxtyping import Float
 from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
+from matplotlib.figure import Figure
 
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#f0e442", "#000000")
 """Colors of curves and categories, in their order."""
@@ -45,3 +50,26 @@ def styled(draw: Callable[_Given, _Drawn]) -> Callable[_Given, _Drawn]:
 def series_color(number: int) -> str:
     """Return the color of a series, counted from 0; they repeat."""
     return SERIES[number % len(SERIES)]
+
+
+def titled_figure(title: str, width: float, height: float) -> Figure:
+    """Return an empty figure of this size, inches."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    figure.suptitle(title)
+    return figure
+
+
+def scatter_surface(
+    axes: Axes, seen: Float[np.ndarray, "points 3"], colors: np.ndarray, *, inches: float, **settings: Any
+) -> PathCollection:
+    """Draw points of a surface as dots that close to it: columns of `seen` are right, up and towards the eye.
+
+    Dots are about twice as wide as they lie apart where the object fills `inches`, and near ones hide far ones.
+    """
+    wide, high = np.ptp(seen[:, :2], axis=0)
+    slender = max(wide, high) / max(min(wide, high), 0.05 * max(wide, high), 1e-30)
+    dot = 72 * inches * 2.4 / np.sqrt(max(len(seen) * slender, 400))
+    order = np.argsort(seen[:, 2])
+    across, along = seen[order, 0], seen[order, 1]
+    axes.set_aspect("equal")
+    return axes.scatter(across, along, c=colors[order], s=dot**2, linewidths=0, rasterized=True, **settings)

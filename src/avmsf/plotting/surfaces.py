@@ -11,7 +11,7 @@ from torch import Tensor
 from avmsf.errors import EvaluationError
 from avmsf.mesh.surface import Surface
 from avmsf.plotting.clouds import ALL_SIDES, name_axes, view_from
-from avmsf.plotting.style import FIRST, SERIES, styled
+from avmsf.plotting.style import FIRST, SECOND, styled, titled_figure
 
 _LIGHT = np.array([-0.4, 0.5, 0.77])
 """Direction to the light in the picture's frame: right, up, towards the eye; of unit length."""
@@ -28,11 +28,9 @@ def draw_surface(surface: Surface, *, title: str, contacts: Float[Tensor, "conta
     dots, on a cut those within a tenth of the diagonal of it. Raises EvaluationError for a surface without triangles.
     """
     if not len(surface.faces):
-        raise EvaluationError(
-            f"expected a surface with triangles, got {len(surface.vertices)} points", name="surface", value=0
-        )
+        raise EvaluationError.expected("triangles", 0, got=f"{len(surface.vertices)} points", name="surface")
     mesh = trimesh.Trimesh(_MILLIMETERS * surface.vertices.double().numpy(), surface.faces.numpy(), process=False)
-    figure = Figure(figsize=(14, 5), layout="constrained")
+    figure = titled_figure(title, 14, 5)
     whole, *cuts = figure.subplots(1, 3)
     _shade(whole, mesh)
     middle = mesh.bounds.mean(axis=0)
@@ -40,7 +38,6 @@ def draw_surface(surface: Surface, *, title: str, contacts: Float[Tensor, "conta
         _cut(axes, mesh, middle, across=across)
     if contacts is not None:
         _mark(whole, cuts, mesh, _MILLIMETERS * contacts.double().numpy())
-    figure.suptitle(title)
     return figure
 
 
@@ -78,8 +75,8 @@ def _mark(whole: Axes, cuts: list[Axes], mesh: trimesh.Trimesh, contacts: np.nda
     """Draw contacts, millimeters: all in the view, and in each cut those near its plane."""
     middle, diagonal = mesh.bounds.mean(axis=0), float(np.linalg.norm(mesh.extents))
     seen = contacts @ view_from(ALL_SIDES[0]).T
-    whole.plot(seen[:, 0], seen[:, 1], "o", color=SERIES[1], markersize=4, label="contacts")
+    whole.plot(seen[:, 0], seen[:, 1], "o", color=SECOND, markersize=4, label="contacts")
     whole.legend(loc="upper right")
     for axes, across in zip(cuts, (0, 1), strict=True):
         near = contacts[np.abs(contacts[:, 1 - across] - middle[1 - across]) < _NEAR * diagonal]
-        axes.plot(near[:, across], near[:, 2], "o", color=SERIES[1], markersize=4)
+        axes.plot(near[:, across], near[:, 2], "o", color=SECOND, markersize=4)

@@ -1,26 +1,21 @@
 """Pictures of predictive uncertainty: over the object from several sides, with contacts, and of a spectrum."""
 
 import math
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
-from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from avmsf.field.uncertainty import SpectrumBand
-from avmsf.plotting.clouds import ALL_SIDES, name_axes, view_from
-from avmsf.plotting.style import FIRST, SECOND, SEQUENTIAL, styled
+from avmsf.plotting.clouds import ALL_SIDES, name_axes, plane_of, view_from
+from avmsf.plotting.style import FIRST, SECOND, SEQUENTIAL, scatter_surface, styled, titled_figure
 
 _RANGE_DB = 100.0
 """What a spectrum shows below its highest level."""
-_FLAT = 1e-3
-"""Extent over the longest below which an object is flat."""
 _BEHIND = 0.04
 """Depth over the object's size by which a point in front hides a mark."""
-_INCHES = 4.0
-"""Width of an object in its picture."""
 
 
 @styled
@@ -42,16 +37,19 @@ def draw_uncertainty(
     """
     places, values = points.double().numpy(), std.double().numpy()
     crosses, numbers = (None if each is None else each.double().numpy() for each in (contacts, suggested))
-    extent = np.ptp(places, axis=0)
-    flat = np.flatnonzero(extent <= _FLAT * extent.max())
-    frames = [view_from(side).T for side in ALL_SIDES] if len(flat) == 0 else [_plane(int(flat[0]))]
-    figure = Figure(figsize=(14, 9.5) if len(frames) > 1 else (8, 5), layout="constrained")
+    plane = plane_of(places)
+    frames = [view_from(side).T for side in ALL_SIDES] if plane is None else [plane.T]
+    figure = titled_figure("", 14, 9.5) if len(frames) > 1 else titled_figure("", 8, 5)
     grid = figure.subplots(2, 3).flatten() if len(frames) > 1 else np.array([figure.subplots()])
+    scale: dict[str, Any] = {"cmap": SEQUENTIAL, "vmin": 0.0, "vmax": max(float(values.max()), 1e-12)}
     for axes, frame in zip(grid, frames, strict=True):
-        drawn = _scatter(axes, places @ frame, values)
+        drawn = scatter_surface(axes, places @ frame, values, inches=4.0, **scale)
+        axes.set_axis_off()
         name_axes(axes, frame.T)
         if crosses is not None:
-            _cross(axes, (crosses @ frame)[_in_front(places @ frame, crosses @ frame)])
+            visible = (crosses @ frame)[_in_front(places @ frame, crosses @ frame)]
+            for color, size, width in (("white", 45, 3.5), ("black", 35, 1.5)):
+                axes.scatter(visible[:, 0], visible[:, 1], c=color, marker="x", s=size, linewidths=width)
     hidden = False
     if numbers is not None:
         away = None if directions is None or len(frames) == 1 else directions.double().numpy()
@@ -66,7 +64,7 @@ def draw_uncertainty(
 @styled
 def draw_band(band: SpectrumBand, *, title: str) -> Figure:
     """Draw the credible band of a sound's spectrum."""
-    figure = Figure(figsize=(9, 4.2), layout="constrained")
+    figure = titled_figure(title, 9, 4.2)
     axes = figure.subplots()
     frequencies = band.frequencies.numpy()
     lower, middle, upper = (each.numpy() for each in (band.lower_db, band.middle_db, band.upper_db))
@@ -79,28 +77,7 @@ def draw_band(band: SpectrumBand, *, title: str) -> Figure:
     axes.set_ylabel("energy (dB re loudest band)")
     axes.grid()
     axes.legend()
-    figure.suptitle(title)
     return figure
-
-
-def _plane(thin: int) -> np.ndarray:
-    wide = [axis for axis in range(3) if axis != thin]
-    return np.eye(3)[:, [*wide, thin]]
-
-
-def _scatter(axes: Axes, seen: np.ndarray, values: np.ndarray) -> PathCollection:
-    wide, high = np.ptp(seen[:, 0]), np.ptp(seen[:, 1])
-    # Dots about twice as wide as their distance close to a surface; near ones cover far ones.
-    dot = 72 * _INCHES * 2.4 / math.sqrt(len(seen) * max(wide, high) / max(min(wide, high), 0.05 * wide))
-    order = np.argsort(seen[:, 2])
-    across, along = seen[order, 0], seen[order, 1]
-    top = max(float(values.max()), 1e-12)
-    drawn = axes.scatter(
-        across, along, c=values[order], s=dot**2, cmap=SEQUENTIAL, vmin=0.0, vmax=top, linewidths=0, rasterized=True
-    )
-    axes.set_aspect("equal")
-    axes.set_axis_off()
-    return drawn
 
 
 def _in_front(seen: np.ndarray, marks: np.ndarray) -> np.ndarray:
@@ -110,11 +87,6 @@ def _in_front(seen: np.ndarray, marks: np.ndarray) -> np.ndarray:
     nearer = seen[None, :, 2] - marks[:, None, 2] > _BEHIND * size
     visible: np.ndarray = ~np.any((apart < size / math.sqrt(len(seen))) & nearer, axis=1)
     return visible
-
-
-def _cross(axes: Axes, marks: np.ndarray) -> None:
-    axes.scatter(marks[:, 0], marks[:, 1], c="white", marker="x", s=45, linewidths=3.5)
-    axes.scatter(marks[:, 0], marks[:, 1], c="black", marker="x", s=35, linewidths=1.5)
 
 
 def _number(
