@@ -16,7 +16,6 @@ from avmsf.fem.updating import DENSITY, STIFFNESS, Matched, update
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, matched
 from avmsf.field.gains.kernels import Sites, Smooth, Unstructured
-from avmsf.field.gains.mixture import NOISE_SHARES
 from oracles.block import block
 
 MODES = 14
@@ -54,9 +53,7 @@ def updated(true: ElasticModes) -> tuple[ElasticModes, float] | None:
     gains = torch.complex(values + noise[0], noise[1])
     weak = torch.full((MODES,), 1e-12, dtype=torch.float64)
     measured = MeasuredGains(gains, weak, true.frequency[:MODES], torch.full((MODES,), 5.0, dtype=torch.float64))
-    others = [
-        WeighedFamily.of(family, measured, NOISE_SHARES) for family in (Unstructured(known, size), Smooth(known, size))
-    ]
+    others = [WeighedFamily.of(family, measured) for family in (Unstructured(known, size), Smooth(known, size))]
     return update(
         nominal(), known.points, known.directions, measured.frequency, values + noise[0],
         measured.informative[:MODES],
@@ -99,7 +96,7 @@ def test_silent_and_doubled_modes_say_nothing_of_the_body():
     measured = MeasuredGains(twice.to(torch.complex128), torch.full_like(damping, 1e-12), frequency, damping)
     usable = measured.informative[: MODES + 1]
     assert usable.tolist() == [row not in (2, MODES) for row in range(MODES + 1)]
-    family = WeighedFamily.of(Smooth(known, 0.24), measured, NOISE_SHARES)
+    family = WeighedFamily.of(Smooth(known, 0.24), measured)
 
     def match(modes: ElasticModes) -> Matched:
         return matched([family], Elastic(known, 0.24, modes), measured)

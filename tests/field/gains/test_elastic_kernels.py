@@ -23,7 +23,7 @@ from avmsf.field.gains.elastic import (
 )
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, hypotheses_of, weigh_factors
 from avmsf.field.gains.kernels import Sites
-from avmsf.field.gains.mixture import NOISE_SHARES, log_evidence
+from avmsf.field.gains.mixture import log_evidence
 from avmsf.field.gains.mixture_gains import MixtureGains, series_of
 from factories.gain_cases import SIZE, families, impacts, measured, plate
 
@@ -124,7 +124,7 @@ def test_a_factor_on_all_frequencies_is_found(factor):
     sites = impacts(12, seed=1)
     given = families(sites)
     gains = measured(sites, factor=factor)
-    weigh_factors([WeighedFamily.of(each, gains, NOISE_SHARES) for each in given], gains)
+    weigh_factors([WeighedFamily.of(each, gains) for each in given], gains)
     elastic = given[-1]
     assert isinstance(elastic, Elastic)
     assert float(elastic.frequency_weights.sum()) == pytest.approx(1.0)
@@ -137,7 +137,7 @@ def test_no_factor_above_the_largest_is_considered():
     sites = impacts(12, seed=1)
     gains, others = measured(sites, factor=1.8), families(sites)[:-1]
     body = Elastic(sites, SIZE, plate(), largest_factor=1.28)
-    weigh_factors([WeighedFamily.of(each, gains, NOISE_SHARES) for each in (*others, body)], gains)
+    weigh_factors([WeighedFamily.of(each, gains) for each in (*others, body)], gains)
     weights = body.frequency_weights.reshape(len(FACTORS), -1).sum(1)
     assert float(weights.sum()) == pytest.approx(1.0)
     assert float(weights[FACTORS > 1.28].sum()) == 0.0
@@ -160,7 +160,7 @@ def test_gains_tell_the_factor_where_frequencies_do_not():
     body = Elastic(sites, SIZE, replace(plate(), frequency=progression))
     gains = replace(measured(sites), frequency=1.3 * progression[:5])
     given = [*families(sites, elastic=False), body]
-    weigh_factors([WeighedFamily.of(each, gains, NOISE_SHARES) for each in given], gains)
+    weigh_factors([WeighedFamily.of(each, gains) for each in given], gains)
     assert abs(math.log(body.factor / 1.3)) <= 0.05
 
 
@@ -180,7 +180,7 @@ def test_all_modes_together_tell_how_exact_the_frequencies_are(scatter, expected
     offsets = scatter * torch.tensor([1.0, -1.0, 1.0, 1.0, -1.0], dtype=torch.float64)
     gains = replace(gains, frequency=gains.frequency * offsets.exp())
     given = families(sites)
-    weigh_factors([WeighedFamily.of(each, gains, NOISE_SHARES) for each in given], gains)
+    weigh_factors([WeighedFamily.of(each, gains) for each in given], gains)
     elastic = given[-1]
     assert isinstance(elastic, Elastic)
     weights = elastic.frequency_weights.reshape(len(FACTORS), -1).sum(0)
@@ -285,7 +285,7 @@ def test_one_impact_tells_a_visible_shape_from_one_that_does_not_move_there():
     # The least remainder, which moves everywhere.
     seen = torch.where(given.shares[:, -1] == RESIDUALS[0], given.visibility(), torch.nan)
     typical, hidden = (int((seen - each).abs().nan_to_num(torch.inf).argmin()) for each in (1.0, 0.0))
-    evidence = WeighedFamily.of(given, gains, NOISE_SHARES).evidence[:, 0]
+    evidence = WeighedFamily.of(given, gains).evidence[:, 0]
     plain = log_evidence(given.kernels(), series_of(gains.values), gains.floor)[:, 0]
     assert torch.allclose(plain, plain[:1].expand_as(plain), atol=1e-9)
     assert bool((evidence[typical] > evidence[hidden] + 0.5).all())

@@ -13,7 +13,6 @@ from avmsf.fem.supports import FREE, supports_of
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, total_evidence
 from avmsf.field.gains.kernels import Sites, Smooth, ThinPlate, Unstructured
-from avmsf.field.gains.mixture import NOISE_SHARES
 from factories.gain_cases import draw
 from oracles.block import block
 
@@ -50,9 +49,9 @@ def recorded(support: str, count: int = 12) -> tuple[Sites, MeasuredGains]:
 def test_the_support_of_a_plate_is_the_most_probable(support: str):
     sites, gains = recorded(support)
     size = float(np.linalg.norm(SIDES))
-    others = [WeighedFamily.of(kind(sites, size), gains, NOISE_SHARES) for kind in (Unstructured, Smooth, ThinPlate)]
+    others = [WeighedFamily.of(kind(sites, size), gains) for kind in (Unstructured, Smooth, ThinPlate)]
     evidence = {
-        name: total_evidence([*others, WeighedFamily.of(Elastic(sites, size, modes), gains, NOISE_SHARES)], gains)
+        name: total_evidence([*others, WeighedFamily.of(Elastic(sites, size, modes), gains)], gains)
         for name, modes in candidates().items()
     }
     true = evidence.pop(support)

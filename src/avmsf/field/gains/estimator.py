@@ -129,50 +129,44 @@ class MixtureEstimator(GainEstimator):
         directional = bool(bodies) or (given is not None and bool(given.any()))
         groups = () if bodies or self.symmetries is None else groups_of(self.symmetries)
         self._expect_inputs(data, groups)
-        candidates, supported = self.bodies, False
+        candidates, thickness, supported = self.bodies, None, False
         searched = candidates is not None and candidates.searches_thickness
         # Of a wall that is too thin, shapes of high modes may fit as well as those of the right one.
         largest = largest_factor(searched=True) if searched else math.inf
         fit = _Fit(data, self.kinds, _sites(data, bodies), directional, groups, largest)
-        thickness = None
         if candidates is not None and searched and bodies:
             bodies, thickness = search_thickness(bodies, partial(fit.evidence, every), candidates.with_thickness)
+        found = fit(every, bodies)
         while True:
-            families = fit.families(every, bodies)
-            model = fit(every, families)
-            weights = _body_weights(model, families, fit.measured)
-            best = max(range(len(bodies)), key=weights.__getitem__, default=None)
-            fine = None if best is None else self._refined(bodies[best])
-            if best is not None and fine is not None:
-                bodies[best] = fine
+            best = found.best
+            fine = best if best is None or candidates is None or best.fine else candidates.refined(best)
+            if fine is not None and fine is not best:
+                found = fit(every, [fine if each is best else each for each in found.bodies])
                 continue
-            judgment, used = _assessed(fit, model, None if best is None else bodies[best]), every
+            judgment = fit.assess(found)
             if best is None or candidates is None or supported or not self._may_be_held(judgment):
                 break
-            rows, supported = _without(every, judgment), True
-            held = _more_probable(fit, rows, candidates.supported(bodies[best]))
+            supported = True
+            held = fit.more_probable(_without(every, judgment), candidates.supported(best))
             if held is None:
                 break
             # All modes have the support in common, so free bodies are no hypotheses any more.
-            bodies = [held]
+            found = fit(every, [held])
         if judgment.outliers:
             rows = _without(every, judgment)
-            fewer_families = fit.families(rows, bodies)
-            fewer = fit(rows, fewer_families)
-            if predicts_better(fewer.leave_one_out(), model.leave_one_out()[rows], fit.at(rows)):
-                model, families, used = fewer, fewer_families, rows
-                weights = _body_weights(model, families, fit.measured)
-        if bodies and self.update:
-            updated = fit.updated(used, bodies[max(range(len(bodies)), key=weights.__getitem__)])
+            fewer = fit(rows, found.bodies)
+            if predicts_better(fewer.model.leave_one_out(), found.model.leave_one_out()[rows], fit.measured.take(rows)):
+                found = fewer
+        if found.best is not None and self.update:
+            updated = fit.updated(found.rows, found.best)
             if updated is not None:
-                bodies.append(updated)
-                families = fit.families(used, bodies)
-                model = fit(used, families)
-        weights = _body_weights(model, families, fit.measured)
-        report = _report(bodies, families, weights, missing) | _outlier_report(judgment, data, used)
+                found = fit(found.rows, [*found.bodies, updated])
+        kept, names = set(found.rows.tolist()), data.train.names
+        report = found.report() | {"unavailable": missing} | judgment.report(data.train)
+        report["excluded"] = [name for row, name in enumerate(names) if row not in kept]
         report["thickness"] = None if thickness is None else asdict(thickness)
-        report["advice"] = None if judgment.informative else _two_levels(fit) or _better_order(fit, bodies)
-        return replace(model, report=report), used
+        report["advice"] = None if judgment.informative else fit.advice(found.bodies)
+        return replace(found.model, report=report), found.rows
 
     def _expect_inputs(self, data: GainData, groups: Sequence[Group]) -> None:
         """Raise FitError where one family alone was asked for and the symmetries or features that it needs are none."""
@@ -216,13 +210,6 @@ class MixtureEstimator(GainEstimator):
         little = found is not None and found.with_body - found.without_body < _PREDICTS
         return self.bodies.supports == "try" or little
 
-    def _refined(self, body: CandidateBody) -> CandidateBody | None:
-        """Return a body with finer elements; None where it has been computed as finely as it can."""
-        if self.bodies is None or body.fine:
-            return None
-        fine = self.bodies.refined(body)
-        return None if fine is body else fine
-
 
 def estimator_for(
     name: GainModelName,
@@ -254,10 +241,44 @@ def estimator_for(
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
-    """Fits families to some of a case's contacts."""
+class _Solution:
+    """The gain model of some contacts and bodies."""
 
-    case: GainData
+    model: MixtureGains
+    rows: Int[Tensor, " rows"]
+    bodies: Sequence[CandidateBody]
+    elastic: Sequence[Elastic]
+    """The family of each body."""
+    weights: Sequence[float]
+    """Each body's posterior probability, mean over modes by their energy."""
+
+    @property
+    def best(self) -> CandidateBody | None:
+        """The most probable body."""
+        row = max(range(len(self.bodies)), key=self.weights.__getitem__, default=None)
+        return None if row is None else self.bodies[row]
+
+    def report(self) -> dict[str, Any]:
+        found: list[dict[str, Any]] = [
+            {
+                "body": body.name,
+                "wall_thickness": body.thickness,
+                "support": FREE if body.support is None else body.support.name,
+                "updating_nats": body.updated,
+                "refined": body.fine,
+                "weight": weight,
+                "frequency_factor": family.factor,
+            }
+            for body, family, weight in zip(self.bodies, self.elastic, self.weights, strict=True)
+        ]
+        return {"bodies": sorted(found, key=lambda each: -each["weight"])}
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Fits families and bodies to some of the data's contacts."""
+
+    data: GainData
     kinds: tuple[str, ...]
     sites: Sites
     """All contacts."""
@@ -268,54 +289,65 @@ class _Fit:
     largest_factor: float
     """The largest factor on the frequencies of bodies."""
 
-    def elastic(self, sites: Sites, size: float, modes: ElasticModes) -> Elastic:
-        """Return the family of a body."""
-        return Elastic(sites, size, modes, largest_factor=self.largest_factor)
-
     @cached_property
     def measured(self) -> MeasuredGains:
         """The gains at all contacts, with the variance that background noise gives them."""
-        bank = self.case.modes.bank
-        return MeasuredGains(self.case.values, gain_variance(self.case), bank.frequency, bank.damping)
+        bank = self.data.modes.bank
+        return MeasuredGains(self.data.values, gain_variance(self.data), bank.frequency, bank.damping)
 
-    def at(self, rows: Int[Tensor, " rows"]) -> MeasuredGains:
-        """Return the gains at some contacts."""
-        return replace(self.measured, values=self.measured.values[rows])
-
-    @cached_property
-    def compared(self) -> Int[Tensor, " rows"]:
-        """Contacts at which orders and levels are compared, as recorded."""
-        return farthest_points(self.sites.points, min(_UPDATED, len(self.sites))).sort().values
-
-    def families(self, rows: Int[Tensor, " rows"], bodies: Sequence[CandidateBody]) -> list[KernelFamily]:
-        """Return the families of these contacts; the elastic ones come last, in the order of the bodies."""
-        sites, size = self.sites.take(rows), 2.0 * self.case.features.half_diagonal
+    def families(self, rows: Int[Tensor, " rows"]) -> list[KernelFamily]:
+        """Return the families of these contacts that know of no body."""
+        sites, size, features = self.sites.take(rows), self._size, self.data.features
         found: list[KernelFamily] = [Unstructured(sites, size)]
         found += [POSITIONAL[kind](sites, size) for kind in POSITIONAL if kind in self.kinds]
         if self.groups and Symmetric.kind in self.kinds:
             found.append(Symmetric(sites, size, self.groups, directional=self.directional))
-        features = self.case.features
         if Visual.kind in self.kinds and features.encoder != GEOMETRY:
             found.append(Visual(sites, size, features.points, features.features))
-        return [*found, *(self.elastic(sites, size, body.elastic) for body in bodies)]
+        return found
+
+    def elastic(self, rows: Int[Tensor, " rows"], modes: ElasticModes) -> Elastic:
+        """Return the family of these contacts and a body's modes."""
+        return Elastic(self.sites.take(rows), self._size, modes, largest_factor=self.largest_factor)
 
     def __call__(
         self,
         rows: Int[Tensor, " rows"],
-        families: Sequence[KernelFamily],
+        bodies: Sequence[CandidateBody],
         noise_shares: tuple[float, ...] = NOISE_SHARES,
-    ) -> MixtureGains:
-        """Return the gain model of families of these contacts."""
-        points = self.case.features.points
-        return fit_mixture(families, self.at(rows), points, directional=self.directional, noise_shares=noise_shares)
+    ) -> _Solution:
+        """Return the gain model of these contacts."""
+        families = self.families(rows)
+        elastic = [self.elastic(rows, body.elastic) for body in bodies]
+        points, directional = self.data.features.points, self.directional
+        model = fit_mixture(
+            [*families, *elastic], self.measured.take(rows), points, directional=directional, noise_shares=noise_shares
+        )
+        share = self.measured.energy / self.measured.energy.sum().clamp_min(torch.finfo(torch.float64).tiny)
+        weights = dict(zip(map(id, model.families), (model.shares() @ share).tolist(), strict=True))
+        return _Solution(model, rows, bodies, elastic, [weights.get(id(each), 0.0) for each in elastic])
 
     def evidence(self, rows: Int[Tensor, " rows"], bodies: Sequence[CandidateBody]) -> list[float]:
         """Return the log evidence of the gains of some contacts with each body by itself."""
-        sites, size = self.sites.take(rows), 2.0 * self.case.features.half_diagonal
-        measured = self.at(rows)
-        others = [WeighedFamily.of(each, measured, NOISE_SHARES) for each in self.families(rows, [])]
-        elastic = (WeighedFamily.of(self.elastic(sites, size, each.elastic), measured, NOISE_SHARES) for each in bodies)
+        measured = self.measured.take(rows)
+        others = [WeighedFamily.of(each, measured) for each in self.families(rows)]
+        elastic = (WeighedFamily.of(self.elastic(rows, body.elastic), measured) for body in bodies)
         return [total_evidence([*others, each], measured) for each in elastic]
+
+    def more_probable(self, rows: Int[Tensor, " rows"], bodies: Sequence[CandidateBody]) -> CandidateBody | None:
+        """Return the most probable held body by the evidence of all modes, or None where the first, free, is the best.
+
+        Where both bodies are far from the object, evidence between them means little: the held one also has to predict
+        contacts left out surely better.
+        """
+        if len(bodies) < 2:
+            return None
+        free, *held = self.evidence(rows, bodies)
+        best = max(range(len(held)), key=held.__getitem__)
+        if held[best] - free <= math.log(FREE_PRIOR / (1.0 - FREE_PRIOR) * len(held)):
+            return None
+        new, old = (self(rows, [body]).model.leave_one_out() for body in (bodies[1 + best], bodies[0]))
+        return bodies[1 + best] if predicts_better(new, old, self.measured.take(rows), candidates=len(held)) else None
 
     def updated(self, rows: Int[Tensor, " rows"], body: CandidateBody) -> CandidateBody | None:
         """Return the body with its stiffness and density updated; None where that has no higher evidence."""
@@ -323,23 +355,60 @@ class _Fit:
             return None
         # Spread contacts say enough of a few dozen coefficients, and the cost goes with the cube of their number.
         rows = rows[farthest_points(self.sites.points[rows], min(_UPDATED, len(rows))).sort().values]
-        sites, size = self.sites.take(rows), 2.0 * self.case.features.half_diagonal
-        measured = self.at(rows)
-        others = [WeighedFamily.of(family, measured, NOISE_SHARES) for family in self.families(rows, [])]
+        sites, measured = self.sites.take(rows), self.measured.take(rows)
+        others = [WeighedFamily.of(family, measured) for family in self.families(rows)]
         found = update(
             body.elastic, sites.points, sites.directions, measured.frequency, measured.values.real,
-            measured.informative.chunk(2)[0],
-            lambda modes: matched(others, self.elastic(sites, size, modes), measured),
+            measured.informative.chunk(2)[0], lambda modes: matched(others, self.elastic(rows, modes), measured),
         )  # fmt: skip
         return None if found is None else replace(body, elastic=found[0], updated=found[1])
 
+    def assess(self, found: _Solution) -> Judgment:
+        """Return what contradicts the other contacts, and whether the most probable body is credible."""
+        points, best = found.model.points, found.best
+        places = found.model.sites(points[farthest_points(points, min(_PLACES, len(points)))])
 
-def _sites(case: GainData, bodies: Sequence[CandidateBody]) -> Sites:
+        def fitted(bodies: list[CandidateBody]) -> Fit:
+            return lambda rows, noise_shares: self(rows, bodies, noise_shares).model
+
+        return assess_contacts(fitted([]), None if best is None else fitted([best]), self.sites, places, self.measured)
+
+    def advice(self, bodies: Sequence[CandidateBody]) -> str | None:
+        """Return what makes the recordings agree with the contacts far better: one level, or another order."""
+        names = self.data.train.names
+        rows = farthest_points(self.sites.points, min(_UPDATED, len(self.sites))).sort().values
+        kinds: tuple[type[KernelFamily], ...] = (Unstructured, *POSITIONAL.values())
+        found = two_levels([kind(self.sites.take(rows), self._size) for kind in kinds], self.measured.take(rows))
+        if found is not None:
+            first, level = found
+            return (
+                f"the recordings from {names[int(rows[first])]} on are {abs(level):.0f} dB "
+                f"{'louder' if level > 0 else 'weaker'} than those before let expect, as if the gain, the microphone's "
+                "place or the force's scale had changed: bring all to one level, or fit each group by itself"
+            )
+        families = [*self.families(rows), *(self.elastic(rows, body.elastic) for body in bodies)]
+        better = better_order(
+            names, families, rows, self.measured, self.data.features.points, directional=self.directional
+        )
+        if better is None:
+            return None
+        changed = [f"{names[new]} for {names[row]}" for row, new in enumerate(better[1].tolist()) if new != row]
+        return (
+            f"the recordings do not agree with the contacts, but would far better in another order, {better[0]}: in "
+            f"{TABLE} write {', '.join(changed[:_SHOWN])}{', ...' * (len(changed) > _SHOWN)} and fit again"
+        )
+
+    @property
+    def _size(self) -> float:
+        return 2.0 * self.data.features.half_diagonal
+
+
+def _sites(data: GainData, bodies: Sequence[CandidateBody]) -> Sites:
     """Return the training impacts; unknown directions go straight into the body.
 
     Without a body they are that of the nearest impact whose direction is known, or all alike where none is.
     """
-    points, given = case.train.contacts.double(), case.train.directions
+    points, given = data.train.contacts.double(), data.train.directions
 
     def otherwise(unknown: Float64[Tensor, "unknown 3"]) -> Float64[Tensor, "unknown 3"]:
         if bodies:
@@ -353,110 +422,6 @@ def _sites(case: GainData, bodies: Sequence[CandidateBody]) -> Sites:
     return sites_along(points, given, otherwise)
 
 
-def _assessed(fit: _Fit, model: MixtureGains, body: CandidateBody | None) -> Judgment:
-    """Return what contradicts the other contacts; the body is the most probable one."""
-    points = model.points[farthest_points(model.points, min(_PLACES, len(model.points)))]
-
-    def fitted(bodies: list[CandidateBody]) -> Fit:
-        return lambda rows, noise_shares: fit(rows, fit.families(rows, bodies), noise_shares)
-
-    elastic = None if body is None else fitted([body])
-    return assess_contacts(fitted([]), elastic, fit.sites, model.sites(points), fit.measured)
-
-
-def _two_levels(fit: _Fit) -> str | None:
-    """Return from which recording on the level is another, and what to do; None where levels agree."""
-    names, rows = fit.case.train.names, fit.compared
-    sites, size = fit.sites.take(rows), 2.0 * fit.case.features.half_diagonal
-    families = [Unstructured(sites, size), *(kind(sites, size) for kind in POSITIONAL.values())]
-    found = two_levels(families, fit.at(rows))
-    if found is None:
-        return None
-    first, level = found
-    return (
-        f"the recordings from {names[int(rows[first])]} on are {abs(level):.0f} dB "
-        f"{'louder' if level > 0 else 'weaker'} than those before let expect, as if the gain, the microphone's place "
-        "or the force's scale had changed: bring all to one level, or fit each group by itself"
-    )
-
-
-def _better_order(fit: _Fit, bodies: Sequence[CandidateBody]) -> str | None:
-    """Return in which order the recordings agree with the contacts far better, and what to change; None for none."""
-    names, rows = fit.case.train.names, fit.compared
-    points, directional = fit.case.features.points, fit.directional
-    found = better_order(names, fit.families(rows, bodies), rows, fit.measured, points, directional=directional)
-    if found is None:
-        return None
-    best, order = found
-    changed = [f"{names[new]} for {names[row]}" for row, new in enumerate(order.tolist()) if new != row]
-    return (
-        f"the recordings do not agree with the contacts, but would far better in another order, {best}: in "
-        f"{TABLE} write {', '.join(changed[:_SHOWN])}{', ...' * (len(changed) > _SHOWN)} and fit again"
-    )
-
-
 def _without(rows: Int[Tensor, " rows"], judgment: Judgment) -> Int[Tensor, " kept"]:
     """Return the rows that are no outliers."""
     return torch.tensor([row for row in rows.tolist() if row not in {each.row for each in judgment.outliers}])
-
-
-def _more_probable(fit: _Fit, rows: Int[Tensor, " rows"], bodies: Sequence[CandidateBody]) -> CandidateBody | None:
-    """Return the most probable held body by the evidence of all modes, or None where the first, free, is the best.
-
-    Where both bodies are far from the object, evidence between them means little: the held one also has to predict
-    contacts left out surely better.
-    """
-    if len(bodies) < 2:
-        return None
-    free, *held = fit.evidence(rows, bodies)
-    best = max(range(len(held)), key=held.__getitem__)
-    if held[best] - free <= math.log(FREE_PRIOR / (1.0 - FREE_PRIOR) * len(held)):
-        return None
-    new, old = (fit(rows, fit.families(rows, [body])).leave_one_out() for body in (bodies[1 + best], bodies[0]))
-    return bodies[1 + best] if predicts_better(new, old, fit.at(rows), candidates=len(held)) else None
-
-
-def _body_weights(model: MixtureGains, families: Sequence[KernelFamily], measured: MeasuredGains) -> list[float]:
-    """Return each body's posterior probability, mean over modes by their energy."""
-    share = measured.energy / measured.energy.sum().clamp_min(torch.finfo(torch.float64).tiny)
-    known = dict(zip(map(id, model.families), (model.shares() @ share).tolist(), strict=True))
-    return [known.get(id(each), 0.0) for each in families if isinstance(each, Elastic)]
-
-
-def _report(
-    bodies: Sequence[CandidateBody], families: Sequence[KernelFamily], weights: Sequence[float], missing: dict[str, str]
-) -> dict[str, Any]:
-    elastic = [each for each in families if isinstance(each, Elastic)]
-    found = [
-        {
-            "body": body.name,
-            "wall_thickness": body.thickness,
-            "support": FREE if body.support is None else body.support.name,
-            "updating_nats": body.updated,
-            "refined": body.fine,
-            "weight": weight,
-            "frequency_factor": family.factor,
-        }
-        for body, family, weight in zip(bodies, elastic, weights, strict=True)
-    ]
-    return {"bodies": sorted(found, key=lambda each: -each["weight"]), "unavailable": missing}
-
-
-def _outlier_report(judgment: Judgment, case: GainData, used: Int[Tensor, " used"]) -> dict[str, Any]:
-    names, contacts, credibility = case.train.names, case.train.contacts, judgment.credibility
-    kept = set(used.tolist())
-    with_body, given = credibility is not None and credibility.credible, case.train.directions
-    return {
-        "outliers": {
-            names[each.row]: each.describe(
-                names,
-                contacts,
-                directed=given is not None and bool(given[each.row].any()),
-                with_body=with_body,
-            )
-            for each in judgment.outliers
-        },
-        "outlier_figures": {names[each.row]: each.figures() for each in judgment.outliers},
-        "excluded": [name for row, name in enumerate(names) if row not in kept],
-        "credibility": None if credibility is None else asdict(credibility) | {"credible": credibility.credible},
-    }

@@ -2,10 +2,10 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Complex128, Float32, Float64
+from jaxtyping import Bool, Complex128, Float32, Float64, Int
 from torch import Tensor
 
 from avmsf.fem.updating import Matched
@@ -36,6 +36,10 @@ class MeasuredGains:
     """Hz."""
     damping: Float64[Tensor, " modes"]
     """1/s."""
+
+    def take(self, rows: Int[Tensor, " rows"]) -> "MeasuredGains":
+        """Return the gains at some of the contacts."""
+        return replace(self, values=self.values[rows])
 
     @property
     def energy(self) -> Float64[Tensor, " modes"]:
@@ -101,7 +105,9 @@ class WeighedFamily:
     evidence: Float64[Tensor, "kernels noises series"]
 
     @classmethod
-    def of(cls, family: KernelFamily, measured: MeasuredGains, noise_shares: tuple[float, ...]) -> "WeighedFamily":
+    def of(
+        cls, family: KernelFamily, measured: MeasuredGains, noise_shares: tuple[float, ...] = NOISE_SHARES
+    ) -> "WeighedFamily":
         """Return the family with its log evidence."""
         kernels = family.kernels()
         evidence = log_evidence(
@@ -184,7 +190,7 @@ def weigh_factors(families: Sequence[WeighedFamily], measured: MeasuredGains) ->
 
 def matched(families: Sequence[WeighedFamily], elastic: Elastic, measured: MeasuredGains) -> Matched:
     """Return what gains say of a body: of its shapes and of all gains, with it among the families."""
-    weighed = [*families, WeighedFamily.of(elastic, measured, NOISE_SHARES)]
+    weighed = [*families, WeighedFamily.of(elastic, measured)]
     total, active = total_evidence(weighed, measured), measured.informative
     # Parts that say nothing of their mode's shape are left out, and each mode counts its frequency once.
     prior = elastic.shape_log_prior(torch.log(measured.frequency))

@@ -27,7 +27,6 @@ from avmsf._utils.text import counted
 from avmsf.capture.filenames import number_key
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, total_evidence
 from avmsf.field.gains.kernels import KernelFamily
-from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.outliers import CHANCE, WIDE_NOISE_SHARES, PredictiveRatios
 
 _FEWEST = 3
@@ -80,7 +79,7 @@ def better_order(
 
     def evidence(words: str) -> float:
         moved = at(orders[words])
-        return total_evidence([WeighedFamily.of(each, moved, NOISE_SHARES) for each in families], moved)
+        return total_evidence([WeighedFamily.of(each, moved) for each in families], moved)
 
     def ratios(order: Int[Tensor, " contacts"]) -> Float64[Tensor, " rows"]:
         moved = at(order)
@@ -110,7 +109,7 @@ def two_levels(families: Sequence[KernelFamily], measured: MeasuredGains) -> tup
         values[first:] *= 10 ** (-level / 20)
         moved = replace(measured, values=values)
         jacobian = series * (count - first) * level / 20 * math.log(10)
-        return total_evidence([WeighedFamily.of(each, moved, NOISE_SHARES) for each in families], moved) - jacobian
+        return total_evidence([WeighedFamily.of(each, moved) for each in families], moved) - jacobian
 
     tried = {
         (first, level): evidence(first, level) for first in range(_FEWEST, count - _FEWEST + 1) for level in _COARSE

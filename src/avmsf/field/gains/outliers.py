@@ -39,7 +39,7 @@ import torch
 from jaxtyping import Complex128, Float, Float64, Int
 from torch import Tensor
 
-from avmsf.capture.impacts import places_of
+from avmsf.capture.impacts import Impacts, places_of
 from avmsf.field.gains.fitting import MeasuredGains
 from avmsf.field.gains.kernels import KernelFamily, Sites
 from avmsf.field.gains.mixture import NOISE_SHARES
@@ -271,6 +271,25 @@ class Judgment:
     """None without a body."""
     informative: bool
     """Whether places say enough of the gains to accuse a contact; else all labels may be wrong, or places too far."""
+
+    def report(self, train: Impacts) -> dict[str, Any]:
+        """Return it as plain values, with the possible causes; of the recordings' names, contacts and directions."""
+        names, known, body = train.names, train.directions, self.credibility
+        with_body = body is not None and body.credible
+        return {
+            "outliers": {
+                names[each.row]: each.describe(
+                    names,
+                    train.contacts,
+                    directed=known is not None and bool(known[each.row].any()),
+                    with_body=with_body,
+                )
+                for each in self.outliers
+            },
+            "outlier_figures": {names[each.row]: each.figures() for each in self.outliers},
+            "excluded": [],
+            "credibility": None if body is None else asdict(body) | {"credible": body.credible},
+        }
 
 
 @dataclass(frozen=True, eq=False)
