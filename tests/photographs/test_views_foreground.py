@@ -14,7 +14,7 @@ import trimesh
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.photographs import find_foreground, read_views
 from avmsf.photographs.cameras import Camera, View
-from avmsf.photographs.hull import carve
+from avmsf.photographs.visual_hull import carve
 from factories.raising import raises, warns
 
 WIDTH, HEIGHT = 120, 90
@@ -209,7 +209,7 @@ def test_few_views_and_masks_without_background_are_refused() -> None:
 def test_the_hull_of_true_outlines_holds_the_ring_and_not_its_hole() -> None:
     hull = carve([seen(row)[0] for row in range(len(cameras()))], cameras())
     assert hull is not None
-    occupied, centers = hull.occupied(missing=0), hull.grid.places(np.indices(hull.grid.shape).transpose(1, 2, 3, 0))
+    occupied, centers = hull.occupied(missing=0), hull.grid.centers(np.indices(hull.grid.shape).transpose(1, 2, 3, 0))
     inside = centers[occupied]
     assert np.abs(inside.max(axis=0)[:2] - (RING + TUBE)).max() < 2 * hull.grid.spacing
     # The middle is seen through from above and below.
@@ -257,7 +257,7 @@ def test_what_is_bright_in_all_views_fills_the_bounding_box(dino: tuple[View, ..
     masks = [view.image.numpy().max(axis=2) > 40 for view in dino]
     hull = carve(masks, [view.camera for view in dino])
     assert hull is not None
-    inside = hull.grid.places(np.argwhere(hull.occupied(missing=2)))
+    inside = hull.grid.centers(np.argwhere(hull.occupied(missing=2)))
     # Millimetres: shadows cost some, a cube is 1 mm, and a pixel 0.4 mm.
     assert np.abs(inside.min(axis=0) - LOW).max() < 4e-3
     assert np.abs(inside.max(axis=0) - HIGH).max() < 4e-3

@@ -8,7 +8,7 @@ import torch
 import trimesh
 
 from avmsf.mesh.level_set import enclose
-from avmsf.photographs.hull import Grid
+from avmsf.photographs.visual_hull import Grid
 from avmsf.reconstruction.distance import distance_from
 from avmsf.reconstruction.fairing import fair_hull
 from avmsf.reconstruction.visual_hull import Outline, hull_distance
@@ -32,7 +32,7 @@ def test_an_outline_lies_where_half_of_a_pixel_is_covered() -> None:
 def test_the_hull_of_a_ball_is_the_ball_within_half_a_pixel() -> None:
     outlines = [Outline.of(view) for view in views_of(ball(RADIUS), azimuths=24)]
     found = hull_distance(outlines, GRID, rank=0)
-    truth = RADIUS - np.linalg.norm(GRID.places(np.argwhere(np.ones(GRID.shape, bool))), axis=1).reshape(GRID.shape)
+    truth = RADIUS - np.linalg.norm(GRID.centers(np.argwhere(np.ones(GRID.shape, bool))), axis=1).reshape(GRID.shape)
     near = np.abs(truth) < 0.004
     # A pixel is 1 mm wide there.
     assert float(np.abs(found - truth)[near].mean()) < 0.5e-3

@@ -12,7 +12,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from avmsf.photographs.cameras import View
-from avmsf.photographs.hull import Grid, count_votes, masked_views, no_common_point, object_extent, touches_edge
+from avmsf.photographs.visual_hull import Grid, count_votes, masked_views, no_common_point, object_extent, touches_edge
 
 _ROUGH = 48
 """Voxels along the longest side of the first carving, which finds where the object is."""
@@ -67,12 +67,12 @@ def visual_hull(views: Sequence[View], *, points: int, wrong_fraction: float = 0
         raise no_common_point(len(masked))
     rows = np.argwhere(_surface(solid))
     normals = torch.from_numpy(_normals(solid, rows)).float()
-    return Hull(torch.from_numpy(grid.places(rows)).float(), normals, grid.spacing)
+    return Hull(torch.from_numpy(grid.centers(rows)).float(), normals, grid.spacing)
 
 
 def _carve(views: Sequence[View], grid: Grid, wrong_fraction: float) -> Bool[np.ndarray, "x y z"]:
     """Return which voxels of a grid the views leave."""
-    masks, middle = [], grid.places((np.array(grid.shape) - 1) / 2)
+    masks, middle = [], grid.centers((np.array(grid.shape) - 1) / 2)
     for view in views:
         assert view.mask is not None
         pose, mask = view.camera.world_to_camera.numpy(), view.mask.numpy() > 127

@@ -83,6 +83,11 @@ class Camera:
             dtype=torch.float64,
         )
 
+    @cached_property
+    def projection(self) -> Float[Tensor, "3 4"]:
+        """The matrix that takes homogeneous positions in the object frame to homogeneous pixels times their depth."""
+        return self.intrinsics @ self.world_to_camera[:3]
+
     def project(self, points: Float[Tensor, "points 3"]) -> tuple[Float[Tensor, "points 2"], Float[Tensor, " points"]]:
         """Return the points' positions in the image, pixels, and their depths along the optical axis, meters; float64.
 

@@ -17,7 +17,7 @@ from scipy import ndimage
 from avmsf._utils.text import counted, listed
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.photographs.cameras import Camera, View
-from avmsf.photographs.hull import carve, silhouette
+from avmsf.photographs.visual_hull import carve, silhouette
 
 MIN_VIEWS = 3
 # Parts of a first mask smaller than this against its largest are taken for spots in the background.
@@ -124,7 +124,7 @@ def _outlines(masks: Sequence[Bool[np.ndarray, "height width"]], cameras: Sequen
     # With few views a single one that sees the background weighs: each carves.
     few = hull.occupied(missing=max(int(MAX_MISSING_LIKELY * hull.views), 1) if hull.views >= 8 else 0)
     many = hull.occupied(missing=max(int(MAX_MISSING_POSSIBLE * hull.views), 1))
-    few, many = (hull.grid.places(np.argwhere(each)) for each in (few, many))
+    few, many = (hull.grid.centers(np.argwhere(each)) for each in (few, many))
     outlines, explained = [], 0
     for mask, camera in zip(masks, cameras, strict=True):
         likely, cube = silhouette(few, hull.grid.spacing, camera)

@@ -20,8 +20,8 @@ from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.folder import check_cameras
-from avmsf.photographs.hull import Hull, carve
 from avmsf.photographs.mesh_views import MeshTracer
+from avmsf.photographs.visual_hull import Hull, carve
 
 MAX_VIEWS = 12
 """Views that are compared, as far apart as they stand."""
@@ -205,7 +205,7 @@ def _surface_of(hull: Hull) -> Float[Tensor, "places 3"]:
     """Return the middles of the outermost cubes that are object, float64."""
     occupied = np.pad(hull.occupied(missing=hull.views // 6), 1)
     edge = occupied & ~ndimage.binary_erosion(occupied)
-    return torch.from_numpy(hull.grid.places(np.argwhere(edge) - 1))
+    return torch.from_numpy(hull.grid.centers(np.argwhere(edge) - 1))
 
 
 def _masked(views: Sequence[View]) -> list[View]:

@@ -14,7 +14,7 @@ import scipy.sparse.linalg
 from jaxtyping import Bool, Float32, Float64, Int
 from scipy import ndimage
 
-from avmsf.photographs.hull import Grid
+from avmsf.photographs.visual_hull import Grid
 from avmsf.reconstruction.object_shape import closed_surface
 from avmsf.reconstruction.visual_hull import Outline
 
@@ -83,7 +83,8 @@ def _passing(
     outline: Outline, places: Float64[np.ndarray, "places 3"]
 ) -> tuple[Int[np.ndarray, " found"], Int[np.ndarray, "2 found"]]:
     """Return which places an outline passes, and the rows and columns of their pixels."""
-    seen = places @ outline.projection[:, :3].T + outline.projection[:, 3]
+    projection = outline.camera.projection.numpy()
+    seen = places @ projection[:, :3].T + projection[:, 3]
     pixels = seen[:, :2] / np.maximum(seen[:, 2:], 1e-12)
     height, width = outline.inside.shape
     rows = np.flatnonzero((seen[:, 2] > 0) & (pixels > 0).all(axis=1) & (pixels < [width, height]).all(axis=1))

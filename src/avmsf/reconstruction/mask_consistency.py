@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float32
 
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import View
-from avmsf.photographs.hull import Grid
 from avmsf.photographs.mesh_views import MeshTracer
+from avmsf.photographs.visual_hull import Grid
 from avmsf.reconstruction.object_shape import closed_surface
 from avmsf.reconstruction.visual_hull import Outline, hull_distance
 

@@ -11,7 +11,7 @@ from scipy import ndimage
 from avmsf.errors import CaptureError, SceneError
 from avmsf.mesh.level_set import difference, enclose
 from avmsf.mesh.surface import Surface
-from avmsf.photographs.hull import Grid
+from avmsf.photographs.visual_hull import Grid
 from avmsf.reconstruction.distance import distance_from
 
 FACES = 6000

@@ -11,8 +11,8 @@ from torch import Tensor
 from avmsf.errors import SceneError
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import Camera, View
-from avmsf.photographs.hull import Grid, masked_views, no_common_point, object_extent, touches_edge
 from avmsf.photographs.mesh_views import MeshTracer
+from avmsf.photographs.visual_hull import Grid, masked_views, no_common_point, object_extent, touches_edge
 from avmsf.reconstruction.fairing import fair_hull
 from avmsf.reconstruction.mask_consistency import WRONG_FRACTION, consistent_masks, edge_offset
 from avmsf.reconstruction.object_shape import ObjectShape, ShapeReport, closed_surface
@@ -203,7 +203,7 @@ def _closed(
         raise SceneError.expected("a surface in their masks", 0, got="none", name="views", advice=advice)
     near = hull > -2 * grid.spacing
     bound = hull.copy()
-    inside = depth_in_convex_hull(places[known], grid, np.argwhere(near))
+    inside = depth_in_convex_hull(places[known], grid.centers(np.argwhere(near)))
     bound[near] = np.minimum(hull[near], inside)
     corners = surface.vertices.double()[surface.faces]
     areas = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=1).numpy()

@@ -10,13 +10,13 @@ from typing import no_type_check
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int
+from jaxtyping import Bool, Float32, Float64
 from scipy.spatial import ConvexHull, QhullError
 
 from avmsf._utils.compiled import compiled, lane_count, run_lanes
 from avmsf.errors import SceneError
 from avmsf.photographs.cameras import Camera, View
-from avmsf.photographs.hull import Grid
+from avmsf.photographs.visual_hull import Grid, project_votes
 
 _SUBPIXELS = 3
 """Times as many pixels across in which the distance to an outline is measured. It must be odd."""
@@ -32,10 +32,7 @@ _OUTSIDE_M = np.float32(1e6)
 class Outline:
     """The outline of an object in one view."""
 
-    projection: Float64[np.ndarray, "3 4"]
-    """Takes places in the object frame, meters, to homogeneous pixels times their depth."""
-    focal: float
-    """Pixels."""
+    camera: Camera
     inside: Float32[np.ndarray, "height width"]
     """How far inside the outline the middle of each pixel lies, pixels; negative outside."""
 
@@ -43,9 +40,12 @@ class Outline:
     def of(cls, view: View) -> "Outline":
         """Return the outline in a view's mask: where it covers half of a pixel, between pixels by interpolation."""
         assert view.mask is not None
-        camera = view.camera
-        projection = (camera.intrinsics @ camera.world_to_camera[:3]).numpy()
-        return cls(projection, float(np.sqrt(camera.focal[0] * camera.focal[1])), _inside(view.mask.numpy()))
+        return cls(view.camera, _inside(view.mask.numpy()))
+
+    @property
+    def focal(self) -> float:
+        """The camera's focal length, pixels."""
+        return float(np.sqrt(self.camera.focal[0] * self.camera.focal[1]))
 
     def moved_in(self, pixels: float) -> "Outline":
         """Return the outline moved inwards by so many pixels."""
@@ -76,84 +76,54 @@ def hull_distance(
     cell's depth, negative outside. It is -1e6 where fewer than half as many views have the cell in their image as have
     any, and in cells that are not `where`.
     """
-    rows = np.argwhere(np.ones(grid.shape, dtype=bool) if where is None else where)
-    least = np.full((len(rows), rank + 1), np.inf, dtype=np.float32)
-    seen = np.zeros(len(rows), dtype=np.uint16)
-    for each in outlines:
-        outline = each.projection, each.inside, each.focal
-        run_lanes(_measure, lane_count(), *outline, grid.lowest, grid.spacing, rows, least, seen)
+    cells = np.flatnonzero(np.ones(grid.shape, dtype=bool) if where is None else where)
+    least = np.full((rank + 1, len(cells)), np.inf, dtype=np.float32)
+    seen = np.zeros(len(cells), dtype=np.uint16)
+
+    def keep_least(part: slice, view: int, values: np.ndarray, depths: np.ndarray) -> None:
+        distances = (values * depths / outlines[view].focal).astype(np.float32)
+        seen[part] += ~np.isnan(values)
+        for row in least[:, part]:
+            distances, row[:] = np.fmax(row, distances), np.fmin(row, distances)
+
+    cameras, images = [each.camera for each in outlines], [each.inside for each in outlines]
+    project_votes(grid, cells, cameras, images, keep_least, linear=True)
     # Of what few views have in their image nothing is known, and the object is in most of them.
-    known = np.isfinite(least[:, rank]) & (seen >= 0.5 * seen.max(initial=0))
+    known = np.isfinite(least[rank]) & (seen >= 0.5 * seen.max(initial=0))
     distance = np.full(grid.shape, -_OUTSIDE_M, dtype=np.float32)
-    distance[tuple(rows.T)] = np.where(known, least[:, rank], -_OUTSIDE_M)
+    distance.ravel()[cells] = np.where(known, least[rank], -_OUTSIDE_M)
     return distance
 
 
-@compiled(error_model="numpy", inline="always")
-@no_type_check
-def _pixel(projection, lowest, spacing, place):
-    """Return the depth, row and column of the middle of a cell in a view."""
-    x, y, z = lowest[0] + spacing * place[0], lowest[1] + spacing * place[1], lowest[2] + spacing * place[2]
-    depth = projection[2, 0] * x + projection[2, 1] * y + projection[2, 2] * z + projection[2, 3]
-    column = (projection[0, 0] * x + projection[0, 1] * y + projection[0, 2] * z + projection[0, 3]) / depth
-    row = (projection[1, 0] * x + projection[1, 1] * y + projection[1, 2] * z + projection[1, 3]) / depth
-    return depth, row, column
-
-
-@compiled(error_model="numpy")
-@no_type_check
-def _measure(lane, lanes, projection, inside, focal, lowest, spacing, rows, least, seen):
-    """Sort one view's distance into the smallest of each cell."""
-    height, width = inside.shape
-    count, kept = least.shape
-    for cell in range(lane * count // lanes, (lane + 1) * count // lanes):
-        depth, row, column = _pixel(projection, lowest, spacing, rows[cell])
-        if not (depth > 0.0 and 0.0 <= column < width and 0.0 <= row < height):
-            continue
-        seen[cell] += 1
-        across, down = min(max(column - 0.5, 0.0), width - 1.001), min(max(row - 0.5, 0.0), height - 1.001)
-        left, top = int(across), int(down)
-        a, b = across - left, down - top
-        upper = (1 - a) * inside[top, left] + a * inside[top, left + 1]
-        lower = (1 - a) * inside[top + 1, left] + a * inside[top + 1, left + 1]
-        value = ((1 - b) * upper + b * lower) * depth / focal
-        for place in range(kept):
-            if value < least[cell, place]:
-                value, least[cell, place] = least[cell, place], value
-
-
 def depth_in_convex_hull(
-    points: Float64[np.ndarray, "points 3"], grid: Grid, rows: Int[np.ndarray, "cells 3"]
-) -> Float32[np.ndarray, " cells"]:
-    """Return how far inside the convex hull of points the middles of cells lie, meters, negative outside.
+    points: Float64[np.ndarray, "points 3"], positions: Float64[np.ndarray, "positions 3"]
+) -> Float32[np.ndarray, " positions"]:
+    """Return how far inside the convex hull of points positions lie, meters, negative outside.
 
     Raises SceneError for points in one plane.
     """
     try:
         planes = ConvexHull(points).equations
     except QhullError as error:
-        raise SceneError.expected(
-            "points that span a volume", len(points), got=f"{len(points)} in one plane", name="points"
-        ) from error
+        got = f"{len(points)} in one plane"
+        raise SceneError.expected("points that span a volume", len(points), got=got, name="points") from error
     # Triangles of one flat face share their plane.
     planes = np.unique(np.round(planes, 6), axis=0)
-    result = np.full(len(rows), np.inf, dtype=np.float32)
-    run_lanes(_depth_below_planes, lane_count(), planes, grid.lowest, grid.spacing, rows, result)
+    result = np.full(len(positions), np.inf, dtype=np.float32)
+    run_lanes(_depth_below_planes, lane_count(), planes, positions, result)
     return result
 
 
 @compiled(error_model="numpy")
 @no_type_check
-def _depth_below_planes(lane, lanes, planes, lowest, spacing, rows, result):
-    count = rows.shape[0]
-    for cell in range(lane * count // lanes, (lane + 1) * count // lanes):
-        x = lowest[0] + spacing * rows[cell, 0]
-        y = lowest[1] + spacing * rows[cell, 1]
-        z = lowest[2] + spacing * rows[cell, 2]
+def _depth_below_planes(lane, lanes, planes, positions, result):
+    count = len(positions)
+    for row in range(lane * count // lanes, (lane + 1) * count // lanes):
+        x, y, z = positions[row]
         least = np.inf
-        for plane in range(planes.shape[0]):
+        for plane in range(len(planes)):
             least = min(least, -(planes[plane, 0] * x + planes[plane, 1] * y + planes[plane, 2] * z + planes[plane, 3]))
-        result[cell] = least
+        result[row] = least
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,42 +158,25 @@ def fused_depth(
 
     A view sees a cell that lies before its depth or at most `band` behind. The distance is the `quantile` of theirs.
     """
-    rows = np.argwhere(where)
-    counts = np.zeros((len(rows), _BINS), dtype=np.uint8)
-    for each in views:
-        projection = (each.camera.intrinsics @ each.camera.world_to_camera[:3]).numpy()
-        run_lanes(_count, lane_count(), projection, each.depth, grid.lowest, grid.spacing, rows, band, counts)
+    cells = np.flatnonzero(where)
+    counts = np.zeros((len(cells), _BINS), dtype=np.uint16)
+
+    def count(part: slice, _: int, reached: np.ndarray, depths: np.ndarray) -> None:
+        before = (reached - depths) / band
+        known = np.flatnonzero((reached > 0.0) & (before >= -1.0))
+        counts[part][known, np.minimum(((before[known] + 1.0) * 0.5 * _BINS).astype(int), _BINS - 1)] += 1
+
+    project_votes(grid, cells, [each.camera for each in views], [each.depth for each in views], count)
     total = np.cumsum(counts, axis=1, dtype=np.float32)
     view_counts = total[:, -1]
     wanted = quantile * view_counts
     first = np.minimum((total < wanted[:, None]).sum(axis=1), _BINS - 1)
-    at = np.arange(len(rows))
+    at = np.arange(len(cells))
     before = np.where(first > 0, total[at, np.maximum(first - 1, 0)], 0.0)
     within = (wanted - before) / np.maximum(counts[at, first], 1)
     value = ((first + np.clip(within, 0.0, 1.0)) / _BINS * 2.0 - 1.0) * band
     values = np.full(grid.shape, -band, dtype=np.float32)
     seen = np.zeros(grid.shape, dtype=np.float32)
-    values[tuple(rows.T)] = np.where(view_counts >= least, value, -band)
-    seen[tuple(rows.T)] = view_counts
+    values.ravel()[cells] = np.where(view_counts >= least, value, -band)
+    seen.ravel()[cells] = view_counts
     return values, seen
-
-
-@compiled(error_model="numpy")
-@no_type_check
-def _count(lane, lanes, projection, reached, lowest, spacing, rows, band, counts):
-    """Count one view's distance before its depth in the bin of each cell."""
-    height, width = reached.shape
-    count, bins = counts.shape
-    for cell in range(lane * count // lanes, (lane + 1) * count // lanes):
-        depth, row, column = _pixel(projection, lowest, spacing, rows[cell])
-        if not (depth > 0.0 and 0.0 <= column < width and 0.0 <= row < height):
-            continue
-        there = reached[int(row), int(column)]
-        if there <= 0.0:
-            continue
-        before = (there - depth) / band
-        if before < -1.0:
-            continue
-        place = min(int((before + 1.0) * 0.5 * bins), bins - 1)
-        if counts[cell, place] < 255:
-            counts[cell, place] += 1

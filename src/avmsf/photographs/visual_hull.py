@@ -1,23 +1,26 @@
 """The visual hull: what no mask speaks against, by the votes of views on cells; and where their object is."""
 
+import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import no_type_check
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, Real, UInt16
+from jaxtyping import Bool, Float, Float64, Int64, Real, Shaped, UInt16
 
 from avmsf._utils.compiled import compiled, lane_count, run_lanes
 from avmsf.errors import CaptureWarning, SceneError
 from avmsf.photographs.cameras import Camera, View, nearest_to_lines
 
-# Cells of the hull on its first and its second grid.
 COARSE_CELLS, FINE_CELLS = 40**3, 80**3
-# Of the views that could see a place, so many at least must be there to say anything of it.
-MIN_SEEING = 1 / 3
+"""Cells of the hull on its first and its second grid."""
+MIN_VIEW_RATIO = 1 / 3
+"""Part of the views that must have a cell in their image for it to be object."""
+_CELLS_AT_ONCE = 1 << 16
+"""Cells that all views vote on before the next ones: their values stay in the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,14 +55,14 @@ class Grid:
         """Diagonal of the box of all cells, meters."""
         return self.spacing * float(np.linalg.norm(self.shape))
 
-    def places(self, rows: Real[np.ndarray, "*cells 3"]) -> Float64[np.ndarray, "*cells 3"]:
+    def centers(self, rows: Real[np.ndarray, "*cells 3"]) -> Float64[np.ndarray, "*cells 3"]:
         """Return the middles of cells given by their indices, meters."""
         return self.lowest + self.spacing * rows
 
     def box(self, inside: Bool[np.ndarray, "x y z"]) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
         """Return the middles of the lowest and highest of the cells that are inside, of which there must be one."""
         rows = np.argwhere(inside)
-        return self.places(rows.min(axis=0)), self.places(rows.max(axis=0))
+        return self.centers(rows.min(axis=0)), self.centers(rows.max(axis=0))
 
     def coarser(self, factor: int) -> "Grid":
         """Return a grid that covers this one with cells `factor` times as wide; both have the same first middle."""
@@ -72,37 +75,69 @@ def touches_edge(solid: Bool[np.ndarray, "x y z"]) -> bool:
     return any(solid.take(end, axis=axis).any() for axis in range(3) for end in (0, -1))
 
 
-def count_votes(
-    masks: Sequence[Bool[np.ndarray, "height width"]], cameras: Sequence[Camera], grid: Grid
-) -> tuple[UInt16[np.ndarray, "x y z"], UInt16[np.ndarray, "x y z"]]:
-    """Return how many views have the middle of each cell in their image, and how many of these show object there."""
-    seen, inside = np.zeros(grid.shape, dtype=np.uint16), np.zeros(grid.shape, dtype=np.uint16)
-    for mask, camera in zip(masks, cameras, strict=True):
-        projection = (camera.intrinsics @ camera.world_to_camera[:3]).numpy()
-        run_lanes(_vote, lane_count(), projection, mask, grid.lowest, grid.spacing, seen, inside)
-    return seen, inside
+def project_votes(
+    grid: Grid,
+    cells: Int64[np.ndarray, " cells"],
+    cameras: Sequence[Camera],
+    images: Sequence[Shaped[np.ndarray, "_ _"]],
+    reduce: Callable[[slice, int, Float64[np.ndarray, " part"], Float64[np.ndarray, " part"]], None],
+    *,
+    linear: bool = False,
+) -> None:
+    """Let each view's image vote on the middles of a grid's cells, given by their flat indices.
+
+    Calls `reduce(part, view, values, depths)` for parts of the cells and each view: the image's values at the pixels
+    that the cells' middles lie in, or `linear` between the middles of pixels, NaN beyond the image and behind the
+    camera; and the depths along the optical axis, meters.
+    """
+    projections = [camera.projection.numpy() for camera in cameras]
+    for start in range(0, len(cells), _CELLS_AT_ONCE):
+        part = slice(start, start + _CELLS_AT_ONCE)
+        values, depths = np.empty((2, len(cells[part])))
+        for view, (projection, image) in enumerate(zip(projections, images, strict=True)):
+            place = grid.lowest, grid.spacing, grid.shape, cells[part]
+            run_lanes(_sample, lane_count(), projection, image, linear, *place, values, depths)
+            reduce(part, view, values, depths)
 
 
 @compiled(error_model="numpy")
 @no_type_check
-def _vote(lane, lanes, projection, mask, first, spacing, seen, inside):
-    height, width = mask.shape
-    cells = seen.shape[0]
-    for i in range(lane * cells // lanes, (lane + 1) * cells // lanes):
-        x = first[0] + i * spacing
-        for j in range(seen.shape[1]):
-            y = first[1] + j * spacing
-            for k in range(seen.shape[2]):
-                z = first[2] + k * spacing
-                depth = projection[2, 0] * x + projection[2, 1] * y + projection[2, 2] * z + projection[2, 3]
-                if depth <= 0.0:
-                    continue
-                column = (projection[0, 0] * x + projection[0, 1] * y + projection[0, 2] * z + projection[0, 3]) / depth
-                row = (projection[1, 0] * x + projection[1, 1] * y + projection[1, 2] * z + projection[1, 3]) / depth
-                if 0.0 <= column < width and 0.0 <= row < height:
-                    seen[i, j, k] += 1
-                    if mask[int(row), int(column)]:
-                        inside[i, j, k] += 1
+def _sample(lane, lanes, projection, image, linear, lowest, spacing, shape, cells, values, depths):
+    height, width = image.shape
+    count = len(cells)
+    for cell in range(lane * count // lanes, (lane + 1) * count // lanes):
+        row, k = divmod(cells[cell], shape[2])
+        i, j = divmod(row, shape[1])
+        x, y, z = lowest[0] + i * spacing, lowest[1] + j * spacing, lowest[2] + k * spacing
+        depth = projection[2, 0] * x + projection[2, 1] * y + projection[2, 2] * z + projection[2, 3]
+        across = (projection[0, 0] * x + projection[0, 1] * y + projection[0, 2] * z + projection[0, 3]) / depth
+        down = (projection[1, 0] * x + projection[1, 1] * y + projection[1, 2] * z + projection[1, 3]) / depth
+        values[cell], depths[cell] = np.nan, depth
+        if not (depth > 0.0 and 0.0 <= across < width and 0.0 <= down < height):
+            continue
+        if not linear:
+            values[cell] = image[int(down), int(across)]
+            continue
+        across, down = min(max(across - 0.5, 0.0), width - 1.001), min(max(down - 0.5, 0.0), height - 1.001)
+        left, top = int(across), int(down)
+        a, b = across - left, down - top
+        upper = (1 - a) * image[top, left] + a * image[top, left + 1]
+        lower = (1 - a) * image[top + 1, left] + a * image[top + 1, left + 1]
+        values[cell] = (1 - b) * upper + b * lower
+
+
+def count_votes(
+    masks: Sequence[Bool[np.ndarray, "_ _"]], cameras: Sequence[Camera], grid: Grid
+) -> tuple[UInt16[np.ndarray, "x y z"], UInt16[np.ndarray, "x y z"]]:
+    """Return how many views have the middle of each cell in their image, and how many of these show object there."""
+    seen, inside = np.zeros((2, math.prod(grid.shape)), dtype=np.uint16)
+
+    def count(part: slice, _: int, values: np.ndarray, __: np.ndarray) -> None:
+        seen[part] += values >= 0
+        inside[part] += values > 0
+
+    project_votes(grid, np.arange(len(seen)), cameras, masks, count)
+    return seen.reshape(grid.shape), inside.reshape(grid.shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +155,7 @@ class Hull:
     def occupied(self, *, missing: int) -> Bool[np.ndarray, "x y z"]:
         """Return which cells are object, where up to `missing` views, of as many as voted, may say otherwise."""
         allowed = np.floor(missing * self.seeing.astype(np.float64) / self.views)
-        enough = self.seeing >= max(2.0, MIN_SEEING * self.views)
+        enough = self.seeing >= max(2.0, MIN_VIEW_RATIO * self.views)
         return enough & (self.agreeing >= self.seeing - allowed)
 
 
