@@ -1,8 +1,9 @@
-"""Pictures of a mesh, taken by casting rays: what stands for photographs where there is a scan."""
+"""Views of a mesh, rendered by casting rays: what stands for photographs where there is a scan."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -22,12 +23,10 @@ FOCAL = 886.81
 FOCAL_SIZE = 1024
 RADIUS = 2.25
 """Object units from the middle of an object's bounding box to its corners: see `orbit_cameras`."""
-MOST_RAYS = 1 << 19
-"""Rays cast at once: about 100 bytes each."""
-
-
 DISTANCE = 5.0
 """Of the cameras of `orbit_cameras` from that middle, object units."""
+MAX_RAYS = 1 << 19
+"""Rays cast at once: about 100 bytes each."""
 AMBIENT = 0.4
 """Part of the light on a matte surface that comes from everywhere. The rest comes from a sky, a half sphere of even
 brightness: a face that leans by an angle t from the middle of the sky sees (1 + cos t) / 2 of it, so that no side of an
@@ -37,55 +36,67 @@ SKY = np.array([0.36, 0.48, 0.8])
 one color in all views. Along none of the axes, so that the sides of a box differ."""
 
 
+class _Hits(NamedTuple):
+    """Rays that met the mesh."""
+
+    rows: np.ndarray
+    columns: np.ndarray
+    faces: np.ndarray
+    weights: np.ndarray
+    """Of each of the face's corners, [hits, 3]."""
+    directions: np.ndarray
+    depth: np.ndarray
+    """Meters along the optical axis."""
+
+
 class MeshTracer:
     """A mesh made ready for rays (by Embree, on the CPU)."""
 
     def __init__(self, mesh: TexturedMesh) -> None:
-        vertices = mesh.vertices.double().numpy()
-        low, high = vertices.min(axis=0), vertices.max(axis=0)
+        self.vertices, self.faces = mesh.vertices.double().numpy(), mesh.faces.numpy()
+        low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
         # Embree counts in float32 and near the origin: the mesh is moved there and given the size of a few units.
         self.middle, self.size = (low + high) / 2, float(np.linalg.norm(high - low))
-        self.vertices, self.faces = vertices, mesh.faces.numpy()
-        self.normals = mesh.normals.numpy()
-        self.colors = mesh.colors.numpy()
-        self.coordinates = mesh.coordinates.numpy()
-        self.materials = mesh.materials.numpy()
+        self.normals, self.colors = mesh.normals.numpy(), mesh.colors.numpy()
+        self.coordinates, self.materials = mesh.coordinates.numpy(), mesh.materials.numpy()
         self.atlas = TextureAtlas([texture.numpy() for texture in mesh.textures])
-        self.texels = self._texels_per_meter()
         self.scene = EmbreeScene()
-        placed = ((vertices - self.middle) / self.size).astype(np.float32)
+        placed = ((self.vertices - self.middle) / self.size).astype(np.float32)
         TriangleMesh(self.scene, placed, self.faces.astype(np.int32))
+        pixels = self.coordinates * self.atlas.sizes[self.materials][:, None]
+        across, down = pixels[:, 1] - pixels[:, 0], pixels[:, 2] - pixels[:, 0]
+        texels, corners = np.abs(across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0]), self.vertices[self.faces]
+        doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        self.texels_per_meter = np.sqrt(texels / np.maximum(doubled, 1e-30))
 
     def depth(self, camera: Camera) -> Float[Tensor, "height width"]:
         """Return the depth of the face behind the center of each pixel, meters along the optical axis.
 
         Float64; infinite where there is no face.
         """
-        depth = torch.full((camera.height, camera.width), torch.inf, dtype=torch.float64)
+        depth = np.full((camera.height, camera.width), np.inf)
         for hits in self._cast(camera):
-            depth[torch.from_numpy(hits.rows), torch.from_numpy(hits.columns)] = torch.from_numpy(hits.depth)
-        return depth
+            depth[hits.rows, hits.columns] = hits.depth
+        return torch.from_numpy(depth)
 
-    def photograph(
+    def view(
         self, camera: Camera, *, name: str, ambient: float, background: tuple[float, float, float], supersample: int
     ) -> View:
-        """Take one picture as `render_views` does."""
+        """Render one view as `render_views` does."""
         fine = camera.resized(camera.width * supersample, camera.height * supersample)
         count = camera.width * camera.height
-        sums, covered = np.zeros((count, 3)), np.zeros(count)
+        sums = np.zeros((4, count))
         for hits in self._cast(fine):
             pixel = hits.rows // supersample * camera.width + hits.columns // supersample
-            color = self._colors(hits, fine, ambient)
-            covered += np.bincount(pixel, minlength=count)
-            for channel in range(3):
-                sums[:, channel] += np.bincount(pixel, weights=color[:, channel], minlength=count)
-        part = covered[:, None] / supersample**2
-        image = np.clip(sums / supersample**2 + (1 - part) * np.asarray(background), 0, 1)
-        shaped = np.rint(255 * np.hstack([image, part])).astype(np.uint8).reshape(camera.height, camera.width, 4)
-        color, mask = np.ascontiguousarray(shaped[..., :3]), np.ascontiguousarray(shaped[..., 3])
+            for total, weights in zip(sums, [*self._colors(hits, fine, ambient).T, None], strict=True):
+                total += np.bincount(pixel, weights=weights, minlength=count)
+        color, covered = sums[:3].T / supersample**2, sums[3:].T / supersample**2
+        image = np.clip(color + (1 - covered) * np.asarray(background), 0, 1)
+        pixels = np.rint(255 * np.hstack([image, covered])).astype(np.uint8).reshape(camera.height, camera.width, 4)
+        color, mask = np.ascontiguousarray(pixels[..., :3]), np.ascontiguousarray(pixels[..., 3])
         return View(name, torch.from_numpy(color), camera, torch.from_numpy(mask))
 
-    def _cast(self, camera: Camera) -> "Iterator[_Hits]":
+    def _cast(self, camera: Camera) -> Iterator[_Hits]:
         """Cast a ray through each pixel of the rectangle that the mesh fills, a band of rows at a time."""
         left, top, right, bottom = self._rectangle(camera)
         if right <= left:
@@ -95,10 +106,10 @@ class MeshTracer:
         pose = camera.world_to_camera.numpy()
         depths = self.vertices @ pose[2, :3] + pose[2, 3]
         x, y = camera.principal
-        width, height = right - left, max(1, MOST_RAYS // (right - left))
+        width, height = right - left, max(1, MAX_RAYS // (right - left))
         for start in range(top, bottom, height):
-            high = min(height, bottom - start)
-            band = replace(camera, principal=(x - left, y - start), width=width, height=high)
+            rows = min(height, bottom - start)
+            band = replace(camera, principal=(x - left, y - start), width=width, height=rows)
             directions = band.rays().reshape(-1, 3).numpy()
             origins = np.ascontiguousarray(np.broadcast_to(origin, directions.shape))
             found = self.scene.run(origins, directions.astype(np.float32), output=1)
@@ -106,13 +117,14 @@ class MeshTracer:
             faces = found["primID"][hit].astype(np.int64)
             u, v = found["u"][hit].astype(np.float64), found["v"][hit].astype(np.float64)
             weights = np.stack([1 - u - v, u, v], axis=1)
+            depth = (depths[self.faces[faces]] * weights).sum(axis=1)
             yield _Hits(
-                rows=hit // width + start,
-                columns=hit % width + left,
-                faces=faces,
-                weights=weights.astype(np.float32),
-                directions=directions[hit].astype(np.float32),
-                depth=(depths[self.faces[faces]] * weights).sum(axis=1),
+                hit // width + start,
+                hit % width + left,
+                faces,
+                weights.astype(np.float32),
+                directions[hit].astype(np.float32),
+                depth,
             )
 
     def _rectangle(self, camera: Camera) -> tuple[int, int, int, int]:
@@ -127,45 +139,20 @@ class MeshTracer:
         right, bottom = min(camera.width, math.ceil(high[0])), min(camera.height, math.ceil(high[1]))
         return left, top, max(left, right), max(top, bottom)
 
-    def _normals(self, hits: "_Hits") -> np.ndarray:
-        normals = np.einsum("nca,nc->na", self.normals[hits.faces], hits.weights)
-        towards = np.sign((normals * hits.directions).sum(axis=1, keepdims=True))
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        return normals * -np.where(towards == 0, 1, towards) / np.maximum(length, 1e-30)
-
-    def _colors(self, hits: "_Hits", camera: Camera, ambient: float) -> np.ndarray:
+    def _colors(self, hits: _Hits, camera: Camera, ambient: float) -> np.ndarray:
         """Return the color of each hit, 0 to 1."""
         places = np.einsum("nca,nc->na", self.coordinates[hits.faces], hits.weights)
         # Size of a ray's neighborhood on a face that looks at the camera; one that leans shows more.
-        spans = hits.depth / min(camera.focal) * self.texels[hits.faces]
+        spans = hits.depth / min(camera.focal) * self.texels_per_meter[hits.faces]
         colors = self.atlas.look_up(places, self.materials[hits.faces], spans=spans)
         colors *= np.einsum("nca,nc->na", self.colors[hits.faces], hits.weights)
         if ambient < 1:
-            colors *= (ambient + (1 - ambient) * (1 + self._normals(hits) @ SKY) / 2)[:, None]
+            normals = np.einsum("nca,nc->na", self.normals[hits.faces], hits.weights)
+            normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+            # Both sides are lit as the one that is seen.
+            facing = np.where((normals * hits.directions).sum(axis=1) > 0, -1, 1)
+            colors *= (ambient + (1 - ambient) * (1 + facing * (normals @ SKY)) / 2)[:, None]
         return colors
-
-    def _texels_per_meter(self) -> np.ndarray:
-        """Return how many texels lie side by side on a meter of each face, [faces]."""
-        corners = self.vertices[self.faces]
-        doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        pixels = self.coordinates * self.atlas.sizes[self.materials][:, None]
-        across, down = pixels[:, 1] - pixels[:, 0], pixels[:, 2] - pixels[:, 0]
-        texels = np.abs(across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0])
-        return np.sqrt(texels / np.maximum(doubled, 1e-30))
-
-
-@dataclass(frozen=True, eq=False)
-class _Hits:
-    """Rays that met the mesh."""
-
-    rows: np.ndarray
-    columns: np.ndarray
-    faces: np.ndarray
-    weights: np.ndarray
-    """How much of each of the face's corners, [hits, 3]."""
-    directions: np.ndarray
-    depth: np.ndarray
-    """Meters along the optical axis."""
 
 
 def render_views(
@@ -177,12 +164,12 @@ def render_views(
     supersample: int = 3,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[View, ...]:
-    """Return one picture of the mesh from each camera, called view_000, view_001, ..., with masks.
+    """Return one view of the mesh from each camera, called view_000, view_001, ..., with masks.
 
     Each pixel is the mean of `supersample` x `supersample` rays on an even grid; the mask says how many met the mesh,
     and `background` (red, green, blue, 0 to 1) fills what they left. Both sides of every face are seen. `ambient` is
     the part of the light that comes from everywhere: with 1 the surface has its own colors (albedo). `progress` is
-    called with the number of pictures done and their total. Raises CaptureError for no camera and for values out of
+    called with the number of views done and their total. Raises CaptureError for no camera and for values out of
     range.
     """
     if not cameras:
@@ -191,12 +178,10 @@ def render_views(
         raise CaptureError.expected("a supersample of at least 1", supersample, name="supersample")
     if not all(0 <= value <= 1 for value in background):
         raise CaptureError.expected("numbers from 0 to 1", background, name="background")
-    tracer = MeshTracer(mesh)
-    views = []
+    tracer, views = MeshTracer(mesh), []
     for number, camera in enumerate(cameras):
         name = f"view_{number:03d}"
-        taken = tracer.photograph(camera, name=name, ambient=ambient, background=background, supersample=supersample)
-        views.append(taken)
+        views.append(tracer.view(camera, name=name, ambient=ambient, background=background, supersample=supersample))
         if progress is not None:
             progress(number + 1, len(cameras))
     return tuple(views)

@@ -11,7 +11,7 @@ from avmsf._utils.files import new_folder
 from avmsf.errors import CaptureError, CaptureWarning
 
 SHARPNESS_PIXELS = 480
-"""Pixels of the longer side on which sharpness is judged: less would hide a slight blur, more measures the noise."""
+"""Pixels of the longer side on which sharpness is measured: less would hide a slight blur, more measures the noise."""
 _CONVERT = "convert it to MP4 (H.264)"
 
 
@@ -27,25 +27,22 @@ def pick_frames(path: str | Path, folder: str | Path, *, count: int) -> None:
     path = Path(path)
     if count < 1:
         raise CaptureError.expected("at least 1 frame", count, name="count")
+    if not path.is_file():
+        raise CaptureError.expected("a video file", file=path)
     claimed = _claimed_frames(path)
     with new_folder(Path(folder), raising=CaptureError) as begun:
-        total = claimed if claimed >= count else sum(1 for _ in _frames(path))
-        while True:
+        total, before = claimed if claimed >= count else sum(1 for _ in _frames(path)), -1
+        while total != before:
             if total == 0:
-                got = "none that can be read"
-                raise CaptureError.expected(
-                    "a video with frames", 0, got=got, file=path, name="frames", advice=_CONVERT
-                )
+                wanted, got = "a video with frames", "none that can be read"
+                raise CaptureError.expected(wanted, 0, got=got, file=path, name="frames", advice=_CONVERT)
             if total < count:
                 wanted, advice = f"a video of at least {count} frames", f"choose at most {total}"
                 raise CaptureError.expected(wanted, total, file=path, name="count", advice=advice)
-            read = _pick(path, begun, total=total, count=count)
-            if read == total:
-                break
-            # What was picked belongs to spans of another length.
+            # What was picked before belongs to spans of another length.
             for picked in begun.iterdir():
                 picked.unlink()
-            total = read
+            total, before = _pick(path, begun, total=total, count=count), total
     if total < 0.95 * claimed:
         wanted, advice = f"{claimed} frames as its header says", "the frames are selected from these"
         warning = CaptureWarning.expected(wanted, total, file=path, name="frames", advice=advice)
@@ -53,16 +50,15 @@ def pick_frames(path: str | Path, folder: str | Path, *, count: int) -> None:
 
 
 def sharpness(frame: np.ndarray) -> float:
-    """Return the variance of the Laplacian of a picture's brightness, 0 to 255.
+    """Return the variance of the Laplacian of an image's brightness, 0 to 255.
 
-    The picture is [height, width, 3] in 8 bits, blue first; a copy of `SHARPNESS_PIXELS` at most is measured.
+    The image is [height, width, 3] in 8 bits, blue first; a copy of `SHARPNESS_PIXELS` at most is measured.
     """
     gray = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-    height, width = gray.shape
-    if max(height, width) > SHARPNESS_PIXELS:
-        factor = SHARPNESS_PIXELS / max(height, width)
-        smaller = (max(1, round(width * factor)), max(1, round(height * factor)))
-        gray = cv2.resize(gray, smaller, interpolation=cv2.INTER_AREA)
+    factor = SHARPNESS_PIXELS / max(gray.shape)
+    if factor < 1:
+        size = [max(1, round(side * factor)) for side in gray.shape[::-1]]
+        gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
     return float(cv2.Laplacian(gray, cv2.CV_32F).var())
 
 
@@ -93,29 +89,19 @@ def _write(folder: Path, number: int, frame: np.ndarray) -> None:
 def _frames(path: Path) -> Iterator[np.ndarray]:
     video = _open(path)
     try:
-        while True:
-            there, frame = video.read()
-            if not there:
-                return
-            yield frame
+        while (taken := video.read())[0]:
+            yield taken[1]
     finally:
         video.release()
 
 
 def _claimed_frames(path: Path) -> int:
-    video = _open(path)
-    try:
-        return max(0, round(video.get(cv2.CAP_PROP_FRAME_COUNT)))
-    finally:
-        video.release()
+    return max(0, round(_open(path).get(cv2.CAP_PROP_FRAME_COUNT)))
 
 
 def _open(path: Path) -> cv2.VideoCapture:
-    if not path.is_file():
-        raise CaptureError.expected("a video file", file=path)
     video = cv2.VideoCapture(str(path))
     if not video.isOpened():
-        video.release()
         got = "a file that cannot be read"
         raise CaptureError.expected("a video", got=got, file=path, name="format", advice=_CONVERT)
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
