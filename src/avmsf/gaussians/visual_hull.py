@@ -74,8 +74,7 @@ def _carve(views: Sequence[View], grid: Grid, wrong_fraction: float) -> Bool[np.
     """Return which voxels of a grid the views leave."""
     masks, middle = [], grid.centers((np.array(grid.shape) - 1) / 2)
     for view in views:
-        assert view.mask is not None
-        pose, mask = view.camera.world_to_camera.numpy(), view.mask.numpy() > 127
+        pose, mask = view.camera.world_to_camera.numpy(), view.foreground
         # A voxel is in the mask when some of it is: the mask grows by half a voxel, as far away as the middle is.
         depth = float(pose[2, :3] @ middle + pose[2, 3])
         grown = 0.5 * grid.spacing * view.camera.focal[0] / max(depth, 1e-9)

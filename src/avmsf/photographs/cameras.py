@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, UInt8
+from jaxtyping import Bool, Float, Float64, UInt8
 from torch import Tensor
 
 from avmsf._utils.arrays import short_repr
@@ -147,6 +147,11 @@ class View:
     def color(self) -> Float[Tensor, "height width 3"]:
         """The image as numbers from 0 to 1, float32."""
         return self.image.float() / 255
+
+    @property
+    def foreground(self) -> Bool[np.ndarray, "height width"]:
+        """Which pixels the object is known to cover by more than half: none where there is no mask."""
+        return np.zeros(self.image.shape[:2], dtype=bool) if self.mask is None else self.mask.numpy() > 127
 
     @property
     def coverage(self) -> Float[Tensor, "height width"] | None:

@@ -50,11 +50,6 @@ class Grid:
         middle = (low + high) / 2
         return cls(middle - spacing * (counts - 1) / 2, spacing, (int(counts[0]), int(counts[1]), int(counts[2])))
 
-    @property
-    def diagonal(self) -> float:
-        """Diagonal of the box of all cells, meters."""
-        return self.spacing * float(np.linalg.norm(self.shape))
-
     def centers(self, rows: Real[np.ndarray, "*cells 3"]) -> Float64[np.ndarray, "*cells 3"]:
         """Return the middles of cells given by their indices, meters."""
         return self.lowest + self.spacing * rows
@@ -244,20 +239,20 @@ def masked_views(views: Sequence[View]) -> list[View]:
     Raises SceneError for fewer than 3.
     """
     known = [view for view in views if view.mask is not None]
-    empty = [view.name for view in known if view.mask is not None and not bool((view.mask > 127).any())]
-    if known and len(empty) == len(known):
+    shown = [view for view in known if view.foreground.any()]
+    empty = [view.name for view in known if view not in shown]
+    if empty and not shown:
         wanted, got = "the object in the masks", f"only background in all {len(known)}"
         advice = "check that white is the object, or remove the masks so that the foreground is found"
         raise SceneError.expected(wanted, empty, got=got, name="masks", advice=advice)
     if empty:
         message = f"views whose masks are empty are not used: {', '.join(empty)}"
         warnings.warn(CaptureWarning(message, name="masks", value=empty), stacklevel=3)
-    kept = [view for view in known if view.name not in empty]
-    if len(kept) < 3:
-        wanted, got = "3 or more views with a mask", f"{len(kept)} of {len(views)}"
+    if len(shown) < 3:
+        wanted, got = "3 or more views with a mask", f"{len(shown)} of {len(views)}"
         advice = "give masks, images with alpha or a plain background, or initial points"
-        raise SceneError.expected(wanted, len(kept), got=got, name="views", advice=advice)
-    return kept
+        raise SceneError.expected(wanted, len(shown), got=got, name="views", advice=advice)
+    return shown
 
 
 def no_common_point(views: int) -> SceneError:
@@ -278,8 +273,7 @@ def object_extent(views: Sequence[View]) -> tuple[np.ndarray, float]:
     """
     positions, directions, sizes = [], [], []
     for view in views:
-        assert view.mask is not None
-        rows, columns = np.nonzero(view.mask.numpy() > 127)
+        rows, columns = np.nonzero(view.foreground)
         camera = view.camera
         pixel = np.array([np.median(columns) + 0.5, np.median(rows) + 0.5])
         ray = np.append((pixel - camera.principal) / camera.focal, 1.0)

@@ -184,8 +184,7 @@ def expect_on_object(
 
 
 def _hull(views: Sequence[View]) -> Hull | None:
-    masks = [view.mask.numpy() > 127 for view in views if view.mask is not None]
-    return carve(masks, [view.camera for view in views])
+    return carve([view.foreground for view in views], [view.camera for view in views])
 
 
 def _conventions(views: Sequence[View]) -> Iterator[tuple[str, list[View]]]:
@@ -210,7 +209,7 @@ def _surface_of(hull: Hull) -> Float[Tensor, "places 3"]:
 
 def _masked(views: Sequence[View]) -> list[View]:
     """Return views with masks that show something, `MAX_VIEWS` at most, as far apart as they stand."""
-    masked = [view for view in views if view.mask is not None and bool((view.mask > 127).any())]
+    masked = [view for view in views if view.foreground.any()]
     if not masked:
         return []
     positions = torch.stack([view.camera.position for view in masked])

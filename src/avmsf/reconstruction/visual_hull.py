@@ -137,8 +137,7 @@ class SeenDepth:
     @classmethod
     def of(cls, view: View, depth: Float32[np.ndarray, "height width"]) -> "SeenDepth":
         """Return the depth inside a view's mask: at the outline a pixel's depth is the background's in part."""
-        assert view.mask is not None
-        return cls(view.camera, np.where(view.mask.numpy() > 127, depth, np.float32(0.0)).astype(np.float32))
+        return cls(view.camera, np.where(view.foreground, depth, np.float32(0.0)).astype(np.float32))
 
     def moved(self, meters: float) -> "SeenDepth":
         """Return the depth that lies so much farther away, where it is known."""
