@@ -94,7 +94,7 @@ def _fit(*, quick_look: bool) -> dict[str, Any]:
                 {
                     "seconds": paused - began - judging,
                     "step": progress.step,
-                    "gaussians": progress.gaussians,
+                    "gaussians": len(progress.cloud),
                     **judge(progress.cloud, held, rasterizer=rasterizer),
                 }
             )

@@ -31,7 +31,7 @@ def test_a_region_is_described_by_the_mean_of_its_points_features(dtype):
     points = box()
     features = torch.randn(200, 5, generator=torch.Generator().manual_seed(2), dtype=dtype)
     field = FeatureField(points, features, "anyone")
-    regions, labels = field.clusters(7), cluster(points, 7).labels
+    regions, labels = field.clusters(7), cluster(points, 7)[1]
     for group in range(7):
         # Sums of some thirty numbers of unit size in float32.
         torch.testing.assert_close(regions.descriptors[group], features[labels == group].mean(0), rtol=0, atol=1e-6)

@@ -43,17 +43,17 @@ def paper_gains(net: AttentionGains, contact: torch.Tensor) -> tuple[list[float]
     """Return gains and attention weights at one contact by the paper's equations, with loops, in float64."""
     state = {name: tensor.double() for name, tensor in net.state_dict().items()}
     place, own, bands = state["points"], state["features"] * net.shape.feature_scale, net.shape.bands
-    groups = cluster(place, net.shape.clusters)
+    centers, labels = cluster(place, net.shape.clusters)
     row = min(range(len(place)), key=lambda i: math.dist(place[i].tolist(), contact.tolist()))
     size = math.dist(place.amax(0).tolist(), place.amin(0).tolist()) / 2
     encoded = []
-    for center in groups.centers:  # r_k = x_i* - c_k, with its sines and cosines
+    for center in centers:  # r_k = x_i* - c_k, with its sines and cosines
         offset = ((place[row] - center) / size).tolist()
         encoded += offset
         for value in offset:
             encoded += [math.sin(2**band * math.pi * value) for band in range(bands)]
             encoded += [math.cos(2**band * math.pi * value) for band in range(bands)]
-    means = [own[groups.labels == group].mean(0) for group in range(len(groups.centers))]  # equation 7
+    means = [own[labels == group].mean(0) for group in range(len(centers))]  # equation 7
     query = state["query.weight"] @ torch.cat([torch.tensor(encoded, dtype=torch.float64), own[row]])  # 8
     keys = [state["key.weight"] @ mean for mean in means]  # 9
     values = [state["value.weight"] @ mean for mean in means]

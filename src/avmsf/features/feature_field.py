@@ -89,10 +89,10 @@ class FeatureField:
 
     def clusters(self, count: int) -> Regions:
         """Return `count` regions by k-means on the positions, with the mean feature of each (paper, eq. 7)."""
-        groups = cluster(self.points, count)
-        sums = self.features.new_zeros(count, self.features.shape[1]).index_add_(0, groups.labels, self.features)
-        sizes = torch.bincount(groups.labels, minlength=count)
-        return Regions(groups.centers.float(), sums / sizes[:, None])
+        centers, labels = cluster(self.points, count)
+        sums = self.features.new_zeros(count, self.features.shape[1]).index_add_(0, labels, self.features)
+        sizes = torch.bincount(labels, minlength=count)
+        return Regions(centers.float(), sums / sizes[:, None])
 
 
 def reduce(features: FeatureField, dim: int) -> FeatureField:

@@ -54,11 +54,6 @@ class SplatProgress:
     cloud: GaussianCloud
     """The Gaussians as they are; they change with the next step, so copy what is to be kept."""
 
-    @property
-    def gaussians(self) -> int:
-        """How many there are."""
-        return len(self.cloud)
-
 
 def splat(
     views: Sequence[View],

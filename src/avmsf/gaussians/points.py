@@ -6,7 +6,6 @@ in decimals is broken by the rounding of float32, and then another split or anot
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -15,16 +14,6 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf.errors import CaptureError, EvaluationError, FitError
-
-
-@dataclass(frozen=True, eq=False)
-class Clusters:
-    """Groups of points that lie together, none of them empty."""
-
-    centers: Float[Tensor, "clusters 3"]
-    """Mean of each group's points, meters."""
-    labels: Int[Tensor, " points"]
-    """Which group each point belongs to: that of the nearest center."""
 
 
 def farthest_points(points: Float[Tensor, "points 3"], count: int, *, start: int = 0) -> Int[Tensor, " chosen"]:
@@ -80,11 +69,14 @@ def nearest_points(
     return torch.from_numpy(np.take_along_axis(rows, order, axis=1)).long().to(queries.device)
 
 
-def cluster(points: Float[Tensor, "points 3"], count: int, *, iterations: int = 100) -> Clusters:
-    """Return `count` groups of the points by k-means: Lloyd's iteration from farthest points, until no label changes.
+def cluster(
+    points: Float[Tensor, "points 3"], count: int, *, iterations: int = 100
+) -> tuple[Float[Tensor, "clusters 3"], Int[Tensor, " points"]]:
+    """Return the means of `count` groups of the points, none of them empty, and which group each point belongs to.
 
-    The result is deterministic. A group that loses its last point restarts at the point that is farthest from its
-    center. Raises FitError where the points have fewer than `count` different positions.
+    By k-means: Lloyd's iteration from farthest points, until no label changes. The result is deterministic. A group
+    that loses its last point restarts at the point that is farthest from its center. Raises FitError where the points
+    have fewer than `count` different positions.
     """
     places = points.detach().double().cpu()
     distinct = len(torch.unique(places, dim=0)) if len(places) else 0
@@ -98,7 +90,7 @@ def cluster(points: Float[Tensor, "points 3"], count: int, *, iterations: int = 
         if torch.equal(moved, labels) and len(torch.unique(labels)) == count:
             break
         labels = moved
-    return Clusters(centers.to(points), labels.to(points.device))
+    return centers.to(points), labels.to(points.device)
 
 
 def sample_surface(

@@ -43,7 +43,7 @@ def keep_object(
     """
     tests: list[Callable[[GaussianCloud], Bool[Tensor, " points"]]] = [
         lambda cloud: cloud.opacities >= least_opacity,
-        lambda cloud: masks_agree(cloud.centers, views, wrong_fraction=wrong_fraction),
+        lambda cloud: _masks_agree(cloud.centers, views, wrong_fraction=wrong_fraction),
         _is_smaller_than_object,
     ]
     if rasterizer is not None:
@@ -59,8 +59,8 @@ def keep_object(
     return kept
 
 
-def masks_agree(
-    points: Float[Tensor, "points 3"], views: Sequence[View], *, wrong_fraction: float = 0.1
+def _masks_agree(
+    points: Float[Tensor, "points 3"], views: Sequence[View], *, wrong_fraction: float
 ) -> Bool[Tensor, " points"]:
     """Return which points at most `wrong_fraction` of the views with them in their image see outside of their mask.
 

@@ -55,7 +55,7 @@ class ProgressListener:
 
     def splatting(self, progress: SplatProgress) -> None:
         """Pass on how far Gaussians are fitted."""
-        message = f"loss {progress.loss:.3g}, {progress.psnr:.1f} dB, {progress.gaussians} Gaussians"
+        message = f"loss {progress.loss:.3g}, {progress.psnr:.1f} dB, {len(progress.cloud)} Gaussians"
         self.step("splat", progress.step, progress.steps, message)
 
     def lifting(self, done: int, total: int, view: str) -> None:

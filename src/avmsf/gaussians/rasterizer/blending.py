@@ -56,7 +56,7 @@ class Blending(torch.autograd.Function):
         chosen = _from_front_to_back(radii.numpy()[:, 0], inputs[-1][:, 0])
         places, packed, reaches = _pack(*(each[chosen] for each in inputs))
         lanes = lane_count()
-        starts, rows, slots, ends = list_tiles(places, packed, reaches, size, lanes=lanes)
+        starts, rows, slots, ends = _list_tiles(places, packed, reaches, size, lanes=lanes)
         bounds = _bounds(starts, lanes)
         kept = np.empty((len(starts) - 1, 3, PIXELS), np.float32)
         listed = places, packed, starts, rows, bounds, paint, _LOG2_MIN_ALPHA, working_numbers(lanes)
@@ -121,7 +121,7 @@ def _pack(
     return screen.astype(np.float64) + remainders, packed, reaches
 
 
-def list_tiles(
+def _list_tiles(
     places: Float64[np.ndarray, "seen 2"],
     packed: Float32[np.ndarray, "seen 16"],
     reaches: Float64[np.ndarray, " seen"],
