@@ -91,16 +91,24 @@ def test_noise_and_uneven_cover_hide_no_symmetry():
     assert max(min(degrees(each.normal, axis) for axis in np.eye(3)) for each in found.mirrors) < 2.0
 
 
-def test_a_blob_has_none():
+@pytest.mark.parametrize("count", [240, 500, 4000])
+def test_a_blob_has_none_however_few_points_there_are(count):
     ball = trimesh.creation.icosphere(subdivisions=4)
     random = np.random.default_rng(0)
     radius = np.ones(len(ball.vertices))
     for _ in range(5):
         bump = random.normal(size=3)
         radius += random.uniform(0.2, 0.5) * np.exp((ball.vertices @ bump / np.linalg.norm(bump) - 1) / 0.15)
-    found = find(draw(trimesh.Trimesh(ball.vertices * radius[:, None], ball.faces)))
+    found = find(draw(trimesh.Trimesh(ball.vertices * radius[:, None], ball.faces), count=count))
     assert not found
     assert found.rejected > found.tolerance
+
+
+def test_points_too_few_for_the_noise_have_no_symmetry_and_say_so():
+    found = find(draw(trimesh.creation.box((1.0, 0.7, 0.4)), count=240))
+    assert not found
+    assert found.tolerance == 0.0
+    assert "too few" in found.summary()
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Motions of space, how well they carry a cloud onto itself, and where they do so best.
+"""How well a motion carries a cloud onto itself, and where it does so best.
 
 The cloud is divided at random into two halves, and a motion is scored by how it carries points of the one onto the
 surface that the other one samples. A symmetry does that as well as leaving the points where they are: what noise and
@@ -6,112 +6,125 @@ uneven cover do to distances, they do to both, and it is taken away.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
-from avmsf.gaussians.neighborhoods import Neighborhoods, read_neighborhoods
+from avmsf.gaussians.neighborhoods import NEIGHBORS, Neighborhoods, read_neighborhoods
+from avmsf.symmetry.motion import Motion
 
+TOLERANCE = 0.38
+"""Largest error of a symmetry, in point spacings, where the points are dense; see `find_symmetries`."""
+_MIN_SPACING, _MAX_SPACING = 0.01, 0.016
+"""Bounds of the spacing that errors are measured in, in diagonals: things are not made, nor scanned, more exactly than
+the first lets pass, and what is off by more than the second lets pass is so however few points there are."""
 _MAX_DISTANCE = 3.0
 """Distance in spacings from which on a point has no counterpart; counted distances end here."""
+_QUERIES = 1500
+_MIN_NEIGHBORS, _MAX_PATCH = 8, 1 / 40
+"""A plane stands for at most this part of a surface, unless it had fewer points than the first."""
 
-Vector = Float[np.ndarray, " 3"]
-
-
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """A reflection in a plane, or a turn about an axis."""
-
-    direction: Vector
-    """Unit normal of the plane, or unit vector along the axis; of either sign."""
-    point: Vector
-    """A point of the plane or axis."""
-    angle: float | None
-    """Radians; None for a reflection."""
-
-    @property
-    def linear(self) -> Float[np.ndarray, "3 3"]:
-        """The motion without its shift."""
-        if self.angle is None:
-            return np.eye(3) - 2 * np.outer(self.direction, self.direction)
-        return Rotation.from_rotvec(self.angle * self.direction).as_matrix()
-
-    def apply(self, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
-        """Return where the points go."""
-        return (points - self.point) @ self.linear.T + self.point
-
-    def shifted(self, turn: Vector, shift: Vector) -> "Motion":
-        """Return the motion whose plane or axis is turned about the origin (rotation vector) and then shifted."""
-        carried = Rotation.from_rotvec(turn)
-        return replace(self, direction=carried.apply(self.direction), point=carried.apply(self.point) + shift)
-
-    def with_angle(self, angle: float) -> "Motion":
-        """Return a turn about the same axis by another angle."""
-        return replace(self, angle=angle)
-
-    def conjugated_by(self, other: "Motion") -> "Motion":
-        """Return the symmetry that follows from this and another one: the other's image of this plane or axis."""
-        return replace(self, direction=other.linear @ self.direction, point=other.apply(self.point[None])[0])
-
-    def centered(self) -> "Motion":
-        """Return the same motion, its point the one nearest to the origin."""
-        along = (self.point @ self.direction) * self.direction
-        return replace(self, point=along if self.angle is None else self.point - along)
-
-    def separation(self, other: "Motion") -> tuple[float, float]:
-        """Return the angle between two planes or axes, degrees, and how far apart they pass the origin."""
-        cosine = min(1.0, abs(float(self.direction @ other.direction)))
-        gap = self.centered().point - other.centered().point
-        return math.degrees(math.acos(cosine)), float(np.linalg.norm(gap))
+Points = Float[np.ndarray, "points 3"]
 
 
-@dataclass(frozen=True, eq=False)
-class Halves:
-    """A cloud in two halves: points to be moved, drawn evenly by area, and a surface that they should meet."""
+class SymmetryTest:
+    """A cloud in two halves, points to be moved and a surface that they should meet; lengths in its diagonals."""
 
-    queries: Float[np.ndarray, "queries 3"]
+    queries: Points
+    """Of one half, drawn evenly by area."""
     target: Neighborhoods
-    tree: cKDTree
     spacing: float
-    """Median spacing of the target, or what stands for it, in the unit of the points: that of the errors."""
+    """Median spacing of the target within its bounds: the unit of errors."""
     noise: float
     """Mean square distance of queries that are not moved, in spacings squared."""
+    tolerance: float
+    """Largest error of a symmetry. Its square is less by two standard errors of `noise`, which a wrong motion may gain
+    by chance; 0 where nothing is left, as no motion can then be told from a symmetry."""
 
-    @classmethod
-    def of(
-        cls,
-        points: Float[np.ndarray, "points 3"],
-        count: int,
-        *,
-        bounds: tuple[float, float],
-        generator: np.random.Generator,
-    ) -> "Halves":
-        """Divide a cloud, and draw `count` queries from one half; errors are in spacings, kept within `bounds`."""
+    def __init__(self, points: Points, generator: np.random.Generator) -> None:
         order = generator.permutation(len(points))
-        moved, target = (read_neighborhoods(points[order[part::2]]) for part in (0, 1))
-        chosen = draw_by_area(moved, count, generator)
-        spacing = float(np.clip(np.median(target.spacing), *bounds))
-        halves = cls(moved.points[chosen], target, cKDTree(target.points), spacing, noise=0.0)
-        return replace(halves, noise=halves.mean_square_distance(halves.queries))
-
-    def mean_square_distance(self, moved: Float[np.ndarray, "queries 3"]) -> float:
-        """Return the mean square distance to the surface in spacings squared, distances counted up to 3 spacings.
-
-        Where there is a counterpart the distance is taken along the normal, since nothing marks a position within a
-        surface.
-        """
-        distance, index = self.tree.query(moved)
-        normal = np.abs(np.einsum("ni,ni->n", moved - self.target.points[index], self.target.normals[index]))
-        lost = distance > _MAX_DISTANCE * np.maximum(self.target.spacing[index], self.spacing)
-        counted = np.where(lost, _MAX_DISTANCE, np.minimum(normal / self.spacing, _MAX_DISTANCE))
-        return float((counted**2).mean())
+        moved, self.target = (read_surface(points[order[part::2]]) for part in (0, 1))
+        self.queries = moved.points[draw_by_area(moved, _QUERIES, generator)]
+        self.spacing = float(np.clip(np.median(self.target.spacing), _MIN_SPACING, _MAX_SPACING))
+        self._tree = cKDTree(self.target.points)
+        unmoved = self._squared_distances(self.queries)
+        self.noise = float(unmoved.mean())
+        chance = 2.0 * float(unmoved.std()) / math.sqrt(len(unmoved))
+        self.tolerance = math.sqrt(max(TOLERANCE**2 - chance, 0.0))
 
     def error(self, motion: Motion) -> float:
         """Return the root mean square distance of moved points, without what noise alone makes, in spacings."""
-        return math.sqrt(max(self.mean_square_distance(motion.apply(self.queries)) - self.noise, 0.0))
+        squares = self._squared_distances(motion.apply(self.queries))
+        return math.sqrt(max(float(squares.mean()) - self.noise, 0.0))
+
+    def _squared_distances(self, moved: Points) -> Float[np.ndarray, " points"]:
+        """Return squared distances along the surface's normals, as nothing marks a position within a surface."""
+        distance, index = self._tree.query(moved)
+        normal = np.abs(np.einsum("ni,ni->n", moved - self.target.points[index], self.target.normals[index]))
+        lost = distance > _MAX_DISTANCE * np.maximum(self.target.spacing[index], self.spacing)
+        return np.where(lost, _MAX_DISTANCE, np.minimum(normal / self.spacing, _MAX_DISTANCE)) ** 2
+
+    def refine(self, motion: Motion, *, width: float) -> Motion:
+        """Return a motion moved to where it holds best, first roughly and, where that promises something, finely."""
+        fitted = self.fit(motion, queries=300, width=width)
+        rough = replace(fitted, error=self.error(fitted))
+        if rough.error >= 4 * self.tolerance:
+            return rough
+        fitted = self.fit(fitted, queries=1500, steps=5, width=0.01)
+        return min(rough, replace(fitted, error=self.error(fitted)), key=lambda each: each.error)
+
+    def fit(
+        self,
+        motion: Motion,
+        *,
+        angles: tuple[float, ...] = (),
+        queries: int = 600,
+        steps: int = 14,
+        width: float = 0.05,
+    ) -> Motion:
+        """Return the motion with its plane or axis where moved points lie nearest to the surface.
+
+        Gauss-Newton on the distances along the target's normals: turning the plane or axis by w about the origin and
+        shifting it by v moves the image q = L p + t of p by w x q + v - L (w x p + v). Turns are fitted at all `angles`
+        together, their own by default. Distances are weighted down (Geman and McClure) beyond a width that shrinks from
+        `width` to half a spacing, so that one-sided parts lose their pull.
+        """
+        least = 0.5 * self.spacing
+        for scale in np.geomspace(max(width, least), least, steps):
+            left, right = np.zeros((6, 6)), np.zeros(6)
+            for angle in angles or (motion.angle,):
+                one_left, one_right = self._normal_equations(
+                    replace(motion, angle=angle), self.queries[:queries], float(scale)
+                )
+                left, right = left + one_left, right + one_right
+            # Turning a plane within itself or an axis about itself changes nothing: those directions stay unmoved.
+            values, vectors = np.linalg.eigh(left)
+            kept = values > 1e-4 * values[-1]
+            step = vectors[:, kept] @ ((vectors[:, kept].T @ right) / values[kept])
+            step *= min(1.0, 0.15 / max(float(np.linalg.norm(step)), 1e-12))
+            motion = motion.shifted(step[:3], step[3:])
+        return motion
+
+    def _normal_equations(
+        self, motion: Motion, points: Points, scale: float
+    ) -> tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, " 6"]]:
+        linear, moved = motion.linear, motion.apply(points)
+        distance, index = self._tree.query(moved, distance_upper_bound=3 * scale + 3 * self.spacing)
+        met = np.isfinite(distance)
+        image, source, near = moved[met], points[met], index[met]
+        normal = self.target.normals[near]
+        residual = np.einsum("ni,ni->n", image - self.target.points[near], normal)
+        back = normal @ linear
+        slopes = np.c_[np.cross(image, normal) - np.cross(source, back), normal - back]
+        weights = (scale**2 / (scale**2 + distance[met] ** 2)) ** 2
+        return slopes.T @ (weights[:, None] * slopes), -slopes.T @ (weights * residual)
+
+
+def read_surface(points: Points) -> Neighborhoods:
+    """Return the surface about the points of a cloud, by planes through few enough of them for what it resolves."""
+    return read_neighborhoods(points, count=int(np.clip(_MAX_PATCH * len(points), _MIN_NEIGHBORS, NEIGHBORS)))
 
 
 def draw_by_area(
@@ -125,48 +138,3 @@ def draw_by_area(
     areas = surface.spacing**2
     areas = np.minimum(areas, max_ratio * np.median(areas))
     return generator.choice(len(areas), min(count, len(areas)), replace=False, p=areas / areas.sum())
-
-
-def fit_motion(
-    motion: Motion,
-    halves: Halves,
-    *,
-    angles: tuple[float, ...] = (),
-    queries: int = 600,
-    steps: int = 14,
-    width: float = 0.05,
-) -> Motion:
-    """Return the motion with its plane or axis where moved points lie nearest to the surface.
-
-    Gauss-Newton on the distances along the target's normals: turning the plane or axis by w about the origin and
-    shifting it by v moves the image q = L p + t of p by w x q + v - L (w x p + v). Turns are fitted at all `angles`
-    together, their own by default. Distances are weighted down (Geman and McClure) beyond a width that shrinks from
-    `width` to half a spacing, so that one-sided parts lose their pull.
-    """
-    points = halves.queries[:queries]
-    turns = [motion.angle] if motion.angle is None or not angles else list(angles)
-    least = 0.5 * halves.spacing
-    scales: list[float] = np.geomspace(max(width, least), least, steps).tolist()
-    for scale in scales:
-        left, right = np.zeros((6, 6)), np.zeros(6)
-        for angle in turns:
-            moved_by = Motion(motion.direction, motion.point, angle)
-            linear, moved = moved_by.linear, moved_by.apply(points)
-            distance, index = halves.tree.query(moved, distance_upper_bound=3 * scale + 3 * halves.spacing)
-            met = np.isfinite(distance)
-            image, source, near = moved[met], points[met], index[met]
-            normal = halves.target.normals[near]
-            residual = np.einsum("ni,ni->n", image - halves.target.points[near], normal)
-            back = normal @ linear
-            slopes = np.c_[np.cross(image, normal) - np.cross(source, back), normal - back]
-            weights = (scale**2 / (scale**2 + distance[met] ** 2)) ** 2
-            left += slopes.T @ (weights[:, None] * slopes)
-            right -= slopes.T @ (weights * residual)
-        # Turning a plane within itself or an axis about itself changes nothing: those directions stay unmoved.
-        values, vectors = np.linalg.eigh(left)
-        kept = values > 1e-4 * values[-1]
-        step = vectors[:, kept] @ ((vectors[:, kept].T @ right) / values[kept])
-        length = float(np.linalg.norm(step))
-        step *= min(1.0, 0.15 / max(length, 1e-12))
-        motion = motion.shifted(step[:3], step[3:])
-    return motion

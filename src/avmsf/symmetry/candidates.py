@@ -6,67 +6,82 @@ the cloud, and the best that differ are kept.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.ndimage import distance_transform_edt
-from scipy.spatial.transform import Rotation
 
 from avmsf.gaussians.neighborhoods import Neighborhoods, describe_neighborhoods
-from avmsf.symmetry.alignment import Motion, draw_by_area
+from avmsf.symmetry.alignment import draw_by_area
+from avmsf.symmetry.motion import Motion
 
-_CELLS = 56
+_PRIMES = (2, 3, 5, 7, 11)
+_MIRRORS, _AXES, _PRINCIPAL_AXES, _TURNS = 24, 30, 9, 40
+"""Candidates from matching pairs, axes among the principal ones, and turns about all axes that are fitted."""
+_CELLS, _COARSE_POINTS = 56, 150
+_COARSE_DISTANCE = 0.03
+"""Distance in diagonals at which a moved point counts 1/e on the coarse cloud."""
 _DESCRIBED, _COUNTED, _PARTNERS = 900, 1800, 24
+_MIN_COSINE = math.cos(math.radians(25.0))
+"""Of the angle between a point's normal and the moved one of its partner."""
 _SAME_DEGREES, _SAME_GAP = 9.0, 0.05
+"""Angle and distance, in diagonals, within which candidates are one."""
 
+Points = Float[np.ndarray, "points 3"]
 Pairs = tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]
-"""Rows of the first and of the second points of pairs."""
+"""Indices of the first and of the second points of pairs."""
 
 
-@dataclass(frozen=True, eq=False)
+def candidates(surface: Neighborhoods, queries: Points, random: np.random.Generator) -> Iterator[Motion]:
+    """Yield the turns and reflections to fit: the most promising of all axes, then planes; `queries` score them."""
+    coarse = CoarseCloud(surface, queries[:_COARSE_POINTS])
+    principal = principal_motions(surface)
+    axes = distinct([motion for motion in principal if motion.angle is not None], most=_PRINCIPAL_AXES)
+    pairs = matching_pairs(surface, random)
+    axes += coarse.best(math.pi, *half_turns_of_pairs(surface, pairs), most=_AXES)
+    turns = [replace(axis, angle=2 * math.pi / prime) for axis in axes for prime in _PRIMES]
+    scores = coarse.score(np.stack([each.linear for each in turns]), np.stack([each.point for each in turns]))
+    yield from (turns[row] for row in np.argsort(-scores)[:_TURNS])
+    # Planes that contain an axis of any angle follow from it: axes are looked for first.
+    yield from (motion for motion in principal if motion.angle is None)
+    yield from coarse.best(None, *mirrors_of_pairs(surface, pairs), most=_MIRRORS)
+
+
 class CoarseCloud:
-    """Distances to a cloud on a grid, and a few points of it: quick to ask, good to a fiftieth of the object."""
+    """Distances to a cloud on a grid, and a few points to move: quick to ask, good to a fiftieth of the object."""
 
-    distances: Float[np.ndarray, "across along up"]
-    lowest: Float[np.ndarray, " 3"]
-    cell: float
-    points: Float[np.ndarray, "few 3"]
-    width: float
-
-    @classmethod
-    def of(cls, surface: Neighborhoods, few: Float[np.ndarray, "few 3"], *, width: float = 0.03) -> "CoarseCloud":
-        """Fill the grid; `few` are the points that will be moved."""
+    def __init__(self, surface: Neighborhoods, few: Float[np.ndarray, "few 3"]) -> None:
         lowest, highest = surface.points.min(0) - 0.1, surface.points.max(0) + 0.1
-        cell = float((highest - lowest).max()) / _CELLS
-        shape = np.ceil((highest - lowest) / cell).astype(int) + 1
-        empty = np.ones(shape, dtype=bool)
-        empty[tuple(((surface.points - lowest) / cell).astype(int).T)] = False
-        return cls(distance_transform_edt(empty) * cell, lowest, cell, few, width)
+        self._cell = float((highest - lowest).max()) / _CELLS
+        empty = np.ones(np.ceil((highest - lowest) / self._cell).astype(int) + 1, dtype=bool)
+        empty[tuple(((surface.points - lowest) / self._cell).astype(int).T)] = False
+        # The outermost cells stand for all that is outside.
+        self._distances = np.pad(distance_transform_edt(empty) * self._cell, 1, constant_values=1.0)
+        self._lowest = lowest - self._cell
+        self._few = few
 
     def score(
         self, linear: Float[np.ndarray, "motions 3 3"], fixed: Float[np.ndarray, "motions 3"]
     ) -> Float[np.ndarray, " motions"]:
         """Return how much of the cloud each motion L, with a point that it leaves, carries onto the cloud, 0 to 1."""
-        scores, offset = np.empty(len(linear)), fixed - np.einsum("mij,mj->mi", linear, fixed)
+        scores, offset = np.empty(len(linear)), fixed - np.einsum("mij,mj->mi", linear, fixed) - self._lowest
         for start in range(0, len(linear), 2000):
             part = slice(start, start + 2000)
             # Single precision is exact to a millionth of the object and takes half the time.
-            turned = self.points.astype(np.float32) @ linear[part].astype(np.float32).transpose(0, 2, 1)
-            moved = turned + (offset[part] - self.lowest)[:, None].astype(np.float32)
-            place = (moved / np.float32(self.cell)).astype(np.int32)
-            limit = np.array(self.distances.shape) - 1
-            inside = ((moved >= 0) & (place <= limit)).all(axis=2)
-            place = np.clip(place, 0, limit)
-            distance = np.where(inside, self.distances[place[..., 0], place[..., 1], place[..., 2]], 1.0)
-            scores[part] = np.exp(-((distance / self.width) ** 2)).mean(axis=1)
+            turned = self._few.astype(np.float32) @ linear[part].astype(np.float32).transpose(0, 2, 1)
+            cells = ((turned + offset[part, None].astype(np.float32)) / np.float32(self._cell)).astype(np.int32)
+            cells = np.clip(cells, 0, np.array(self._distances.shape) - 1)
+            distance = self._distances[cells[..., 0], cells[..., 1], cells[..., 2]]
+            scores[part] = np.exp(-((distance / _COARSE_DISTANCE) ** 2)).mean(axis=1)
         return scores
 
-    def score_motions(self, motions: list[Motion]) -> Float[np.ndarray, " motions"]:
-        """Return `score` of each motion."""
-        if not motions:
-            return np.zeros(0)
-        return self.score(np.stack([each.linear for each in motions]), np.stack([each.point for each in motions]))
+    def best(self, angle: float | None, directions: Points, points: Points, *, most: int) -> list[Motion]:
+        """Return the half turns (angle pi) or reflections (None) of the best scores whose axes or planes differ."""
+        half_turns = 2 * directions[:, :, None] * directions[:, None, :] - np.eye(3)
+        rows = np.argsort(-self.score(half_turns if angle else -half_turns, points))[: 60 * most]
+        return distinct([Motion(directions[row], points[row], angle) for row in rows], most)
 
 
 def principal_motions(surface: Neighborhoods) -> list[Motion]:
@@ -85,68 +100,49 @@ def principal_motions(surface: Neighborhoods) -> list[Motion]:
     ]
 
 
-def mirrors_of_pairs(surface: Neighborhoods, pairs: Pairs, *, coarse: CoarseCloud, most: int) -> list[Motion]:
-    """Return reflections that matching points propose, the best on the coarse cloud first."""
-    first, second = pairs
-    points, normals = surface.points, surface.normals
-    gap = points[second] - points[first]
-    length = np.linalg.norm(gap, axis=1)
-    direction = gap / length[:, None]
-    mirrored = normals[first] - 2 * np.einsum("ni,ni->n", normals[first], direction)[:, None] * direction
-    fits = np.abs(np.einsum("ni,ni->n", mirrored, normals[second])) > math.cos(math.radians(25))
-    direction, middle = direction[fits], ((points[first] + points[second]) / 2)[fits]
-    linear = np.eye(3) - 2 * direction[:, :, None] * direction[:, None, :]
-    order = np.argsort(-coarse.score(linear, middle))[: 60 * most]
-    return distinct([Motion(direction[row], middle[row], None) for row in order], most=most)
+def mirrors_of_pairs(surface: Neighborhoods, pairs: Pairs) -> tuple[Points, Points]:
+    """Return normals and points of planes that mirror one point of a pair onto the other, with its normal."""
+    start, end = (surface.points[rows] for rows in pairs)
+    before, after = (surface.normals[rows] for rows in pairs)
+    direction = (end - start) / np.linalg.norm(end - start, axis=1)[:, None]
+    fits = np.abs(_dot(2 * _dot(before, direction)[:, None] * direction - before, after)) > _MIN_COSINE
+    return direction[fits], ((start + end) / 2)[fits]
 
 
-def turns_of_pairs(surface: Neighborhoods, pairs: Pairs, *, coarse: CoarseCloud, most: int) -> list[Motion]:
-    """Return turns that matching points propose, the best on the coarse cloud first, about axes that differ."""
-    first, second = pairs
-    directions, places, angles = [], [], []
-    for sign in (1.0, -1.0):
-        start, end = surface.points[first], surface.points[second]
-        before, after = surface.normals[first], sign * surface.normals[second]
-        gap = end - start
+def half_turns_of_pairs(surface: Neighborhoods, pairs: Pairs) -> tuple[Points, Points]:
+    """Return axes, and points of them, of half turns of one point of a pair onto the other, with its normal."""
+    start, end = (surface.points[rows] for rows in pairs)
+    before = surface.normals[pairs[0]]
+    directions, points = [], []
+    # Normals are of either sign.
+    for after in (surface.normals[pairs[1]], -surface.normals[pairs[1]]):
         # A turn changes nothing along its axis: neither the normal nor the place.
-        axis = np.cross(after - before, gap)
+        axis = np.cross(after - before, end - start)
         size = np.linalg.norm(axis, axis=1)
         parallel = np.linalg.norm(after - before, axis=1) < 0.2
-        crossing = ~parallel & (size > 0.2 * np.linalg.norm(gap, axis=1))
-        axis = axis / np.maximum(size, 1e-12)[:, None]
-        flat_before = before - np.einsum("ni,ni->n", before, axis)[:, None] * axis
-        flat_after = after - np.einsum("ni,ni->n", after, axis)[:, None] * axis
-        sine = np.einsum("ni,ni->n", np.cross(flat_before, flat_after), axis)
-        angle = np.arctan2(sine, np.einsum("ni,ni->n", flat_before, flat_after))
-        turned = crossing & (np.abs(angle) > math.radians(25))
-        away = np.cross(axis, gap) / (2 * np.tan(np.where(turned, angle, 1.0) / 2))[:, None]
-        directions += [axis[turned], before[parallel]]
-        places += [((start + end) / 2 + away)[turned], ((start + end) / 2)[parallel]]
-        angles += [angle[turned], np.full(int(parallel.sum()), math.pi)]
-    axis, place, angle = np.concatenate(directions), np.concatenate(places), np.concatenate(angles)
-    near = np.linalg.norm(place - surface.points.mean(0), axis=1) < 1.0
-    axis, place, angle = axis[near], place[near], angle[near]
-    linear = Rotation.from_rotvec(angle[:, None] * axis).as_matrix()
-    order = np.argsort(-coarse.score(linear, place))[: 60 * most]
-    return distinct([Motion(axis[row], place[row], float(angle[row])) for row in order], most=most)
+        axis = np.where(parallel[:, None], before, axis / np.maximum(size, 1e-12)[:, None])
+        fits = _dot(2 * _dot(before, axis)[:, None] * axis - before, after) > _MIN_COSINE
+        fits &= parallel | (size > 0.2 * np.linalg.norm(end - start, axis=1))
+        directions.append(axis[fits])
+        points.append(((start + end) / 2)[fits])
+    return np.concatenate(directions), np.concatenate(points)
 
 
-def distinct(motions: list[Motion], *, most: int) -> list[Motion]:
+def distinct(motions: list[Motion], most: int) -> list[Motion]:
     """Return the first motions whose planes or axes differ from those before them."""
     chosen: list[Motion] = []
     for motion in motions:
         if len(chosen) == most:
             break
-        gaps = (motion.separation(other) for other in chosen)
-        if not any(degrees < _SAME_DEGREES and gap < _SAME_GAP for degrees, gap in gaps):
+        if not any(motion.is_near(other, _SAME_DEGREES, _SAME_GAP) for other in chosen):
             chosen.append(motion)
     return chosen
 
 
-def matching_pairs(surface: Neighborhoods, *, generator: np.random.Generator) -> Pairs:
-    """Return rows of points that are far from one another and about which the surface is alike."""
-    rows = draw_by_area(surface, _DESCRIBED, generator)
-    counted = generator.choice(len(surface.points), min(_COUNTED, len(surface.points)), replace=False)
+def matching_pairs(surface: Neighborhoods, random: np.random.Generator) -> Pairs:
+    """Return indices of points that are far from one another and about which the surface is alike."""
+    rows = draw_by_area(surface, _DESCRIBED, random)
+    counted = random.choice(len(surface.points), min(_COUNTED, len(surface.points)), replace=False)
     described = describe_neighborhoods(surface, rows, counted, diagonal=1.0)
     squares = (described**2).sum(axis=1)
     unlike = squares[:, None] + squares - 2 * described @ described.T
@@ -155,5 +151,9 @@ def matching_pairs(surface: Neighborhoods, *, generator: np.random.Generator) ->
     partners = np.argpartition(unlike, _PARTNERS, axis=1)[:, :_PARTNERS]
     first = np.repeat(np.arange(len(rows)), _PARTNERS)
     second = partners.ravel()
-    fine = np.isfinite(unlike[first, second])
-    return rows[first[fine]], rows[second[fine]]
+    finite = np.isfinite(unlike[first, second])
+    return rows[first[finite]], rows[second[finite]]
+
+
+def _dot(one: Points, other: Points) -> Float[np.ndarray, " points"]:
+    return np.einsum("ni,ni->n", one, other)

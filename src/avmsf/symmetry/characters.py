@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from avmsf.symmetry.symmetries import MirrorSymmetry, RotationalSymmetry, Symmetries
+from avmsf.symmetry.symmetries import Symmetries
 
 TURNS = 12
 """Order that stands for a turn by any angle: waves up to half as many around the axis are told apart."""
@@ -34,41 +34,39 @@ class Group:
 
 def groups_of(symmetries: Symmetries) -> tuple[Group, ...]:
     """Return the groups that an object's symmetries form; none where it has none beyond doubt."""
-    mirrors, turns = symmetries.mirrors, symmetries.rotations
-    if not (mirrors or turns):
+    planes = [(each.normal.double(), -1.0) for each in symmetries.mirrors]
+    axes = [(each.axis.double(), 1.0) for each in symmetries.rotations]
+    orders = [TURNS if each.order is None else each.order for each in symmetries.rotations]
+    points = [each.point.double() for each in (*symmetries.mirrors, *symmetries.rotations)]
+    if not points:
         return ()
-    center = _center([*mirrors, *turns])
-    flips = [(each.normal.double(), -1.0) for each in mirrors]
-    found = [([_flip(line, sign)], _SIGNS) for line, sign in flips]
-    for turn in turns:
-        order = TURNS if turn.order is None else turn.order
-        found.append((_turns(turn.axis.double(), order), _cyclic(order)))
-        if order % 2 == 0:
-            flips.append((turn.axis.double(), 1.0))
+    center = _center(torch.stack(points), torch.stack([_flip(*line) for line in (*planes, *axes)]))
+    found = [([_flip(*plane)], _SIGNS) for plane in planes]
+    found += [(_turns(axis, order), _cyclic(order)) for (axis, _), order in zip(axes, orders, strict=True)]
+    flips = planes + [axis for axis, order in zip(axes, orders, strict=True) if order % 2 == 0]
     found += [(each, torch.kron(_SIGNS, _SIGNS)) for each in _pairs(flips)]
-    one = torch.eye(3, dtype=torch.float64)
     groups = []
     for moved, characters in found:
-        linear = torch.stack([one, *moved])
+        linear = torch.stack([_ONE, *moved])
         groups.append(Group(torch.cat([linear, (center - linear @ center)[..., None]], dim=2), characters))
     return tuple(groups)
 
 
+_ONE = torch.eye(3, dtype=torch.float64)
 _SIGNS = torch.tensor([[1.0, 1.0], [1.0, -1.0]], dtype=torch.float64)
 """The characters of a group of two."""
 
 
 def _flip(line: Float64[Tensor, " 3"], sign: float) -> Float64[Tensor, "3 3"]:
     """Return the half turn about a line (sign 1), or the mirror whose normal it is (sign -1)."""
-    return sign * (2.0 * torch.outer(line, line) - torch.eye(3, dtype=torch.float64))
+    return sign * (2.0 * torch.outer(line, line) - _ONE)
 
 
 def _turns(axis: Float64[Tensor, " 3"], order: int) -> list[Float64[Tensor, "3 3"]]:
     """Return all turns of an axis but the identity."""
-    cross = torch.linalg.cross(axis.expand(3, 3), torch.eye(3, dtype=torch.float64)).T
+    cross = torch.linalg.cross(axis.expand(3, 3), _ONE).T
     angles = [2.0 * math.pi * step / order for step in range(1, order)]
-    one = torch.eye(3, dtype=torch.float64)
-    return [one + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross for angle in angles]
+    return [_ONE + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross for angle in angles]
 
 
 def _cyclic(order: int) -> Float64[Tensor, "characters order"]:
@@ -105,18 +103,11 @@ def _same(group: Sequence[Tensor], other: Sequence[Tensor]) -> bool:
     return all(any(float((each - one).norm()) < 4.0 * _MAX_SINE for one in other) for each in group)
 
 
-def _center(symmetries: Sequence[MirrorSymmetry | RotationalSymmetry]) -> Float64[Tensor, " 3"]:
-    """Return the point nearest to all planes and axes, which meet where an object is bounded."""
-    points = torch.stack([each.point.double() for each in symmetries])
-    across = torch.stack([_across(each) for each in symmetries])
+def _center(points: Float64[Tensor, "flips 3"], flips: Float64[Tensor, "flips 3 3"]) -> Float64[Tensor, " 3"]:
+    """Return the point nearest to all planes and axes, which meet where an object is bounded, from a point of each."""
+    # What leads away from a plane or axis, its flip turns round.
+    across = (_ONE - flips) / 2.0
     side = (across @ points[..., None]).flatten()
     # The least change to the mean of their points: along what none of them fixes, it stays there.
     middle, matrix = points.mean(0), across.flatten(0, 1)
     return middle + torch.linalg.pinv(matrix, rtol=_MAX_SINE) @ (side - matrix @ middle)
-
-
-def _across(symmetry: MirrorSymmetry | RotationalSymmetry) -> Float64[Tensor, "3 3"]:
-    """Return the projection of an offset from the symmetry's point on what leads away from its plane or axis."""
-    line = symmetry.normal if isinstance(symmetry, MirrorSymmetry) else symmetry.axis
-    along = torch.outer(line.double(), line.double())
-    return along if isinstance(symmetry, MirrorSymmetry) else torch.eye(3, dtype=torch.float64) - along

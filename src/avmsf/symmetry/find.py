@@ -1,7 +1,6 @@
 """Finding the symmetries of a cloud: candidates, refined, tested, and completed by one another."""
 
 import math
-from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -10,31 +9,16 @@ from torch import Tensor
 
 from avmsf._utils.arrays import Seed, generator_of
 from avmsf.errors import SceneError
-from avmsf.gaussians.neighborhoods import NEIGHBORS, Neighborhoods, read_neighborhoods
-from avmsf.symmetry.alignment import Halves, Motion, draw_by_area
-from avmsf.symmetry.candidates import (
-    CoarseCloud,
-    distinct,
-    matching_pairs,
-    mirrors_of_pairs,
-    principal_motions,
-    turns_of_pairs,
-)
-from avmsf.symmetry.group import Group, ScoredMotion, SymmetryTest, follows
+from avmsf.gaussians.neighborhoods import NEIGHBORS
+from avmsf.symmetry.alignment import SymmetryTest, draw_by_area, read_surface
+from avmsf.symmetry.candidates import candidates
+from avmsf.symmetry.group import SymmetryGroup
+from avmsf.symmetry.motion import Motion
 from avmsf.symmetry.symmetries import MirrorSymmetry, RotationalSymmetry, Symmetries
 
-TOLERANCE = 0.38
-"""Largest error of a symmetry, in point spacings; see `find_symmetries`."""
 LIMIT = 8000
 """Most points of a cloud that are used."""
-_QUERIES = 1500
-_SPACINGS = (0.01, 0.016)
-"""Bounds of the spacing that errors are measured in, in diagonals: things are not made, nor scanned, more exactly than
-the first lets pass, and what is off by more than the second lets pass is so however few points there are."""
 _MIN_POINTS = 10 * NEIGHBORS
-_PRIMES = (2, 3, 5, 7, 11)
-_MIRRORS, _AXES, _TURNS = 24, 30, 40
-"""Candidates from matching pairs, and turns about the axes among them, that are fitted."""
 
 
 def find_symmetries(
@@ -53,7 +37,9 @@ def find_symmetries(
     root mean square of their distances from it, without what the distances are when nothing is moved (noise), in
     spacings of that half; a spacing below 1 or above 1.6 % of the object's diagonal counts as that. A distance counts
     up to 3 spacings. So the tolerance of .38 lets the whole surface be off by that many spacings, or
-    (.38 / 3)^2 = 1.6 % of it have no counterpart at all.
+    (.38 / 3)^2 = 1.6 % of it have no counterpart at all. The tolerance is less where the points are few or noisy: its
+    square loses two standard errors of the noise. Where nothing of it is left, often below 600 points, no symmetry can
+    be told from chance, and none is returned.
 
     An object that is damaged, or of which large parts are in no view, has only the symmetries of what is there.
     Compositions of two symmetries may have 1.15 times the error.
@@ -68,41 +54,18 @@ def find_symmetries(
     random = np.random.default_rng(int(torch.randint(2**31 - 1, (1,), generator=generator_of(seed))))
     places, middle, diagonal = _normalized(points)
     if len(places) > limit:
-        places = places[draw_by_area(read_neighborhoods(places), limit, random, max_ratio=9.0)]
-    surface = read_neighborhoods(places)
-    halves = Halves.of(places, _QUERIES, bounds=_SPACINGS, generator=random)
-    coarse = CoarseCloud.of(surface, halves.queries[:150])
-    group = Group(SymmetryTest(halves, TOLERANCE))
-    for motion in _candidates(surface, coarse, random):
-        group.consider(motion)
-    group.drop_crowded_mirrors()
-    group.complete()
-    return _symmetries(group, halves.spacing, middle, diagonal)
+        places = places[draw_by_area(read_surface(places), limit, random, max_ratio=9.0)]
+    surface = read_surface(places)
+    test = SymmetryTest(places, random)
+    group = SymmetryGroup(test)
+    if test.tolerance > 0.0:
+        for motion in candidates(surface, test.queries, random):
+            group.consider(motion)
+        group.drop_crowded_mirrors()
+        group.complete()
 
-
-def _candidates(surface: Neighborhoods, coarse: CoarseCloud, random: np.random.Generator) -> Iterator[Motion]:
-    """Yield the rotations and mirrors to fit, by the principal axes and by pairs of points with similar surface."""
-    principal = principal_motions(surface)
-    axes = distinct([motion for motion in principal if motion.angle is not None], most=9)
-    pairs = matching_pairs(surface, generator=random)
-    axes += turns_of_pairs(surface, pairs, coarse=coarse, most=_AXES)
-    turns = [axis.with_angle(2 * math.pi / prime) for axis in axes for prime in _PRIMES]
-    yield from (turns[row] for row in np.argsort(-coarse.score_motions(turns))[:_TURNS])
-    # Planes that contain an axis of any angle follow from it: axes are looked for first.
-    yield from (motion for motion in principal if motion.angle is None)
-    yield from mirrors_of_pairs(surface, pairs, coarse=coarse, most=_MIRRORS)
-
-
-def _symmetries(group: Group, spacing: float, middle: Float[np.ndarray, " 3"], diagonal: float) -> Symmetries:
-    # Of what was tried and failed, only what is no symmetry after all; some failed before what implies them was found.
-    rejected = [
-        each.error
-        for each in group.rejected
-        if not group.knows(each.motion) and not follows(each.motion, group.continuous)
-    ]
-
-    def vectors(found: ScoredMotion) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
-        point, direction = middle + diagonal * found.motion.centered().point, found.motion.direction
+    def vectors(motion: Motion) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
+        point, direction = middle + diagonal * motion.centered().point, motion.direction
         # Of two opposite vectors the one whose largest number is positive.
         return torch.from_numpy(direction * np.sign(direction[np.argmax(np.abs(direction))])), torch.from_numpy(point)
 
@@ -111,9 +74,11 @@ def _symmetries(group: Group, spacing: float, middle: Float[np.ndarray, " 3"], d
     return Symmetries(
         tuple(RotationalSymmetry(*vectors(each), each.order, each.error) for each in turns),
         tuple(MirrorSymmetry(*vectors(each), each.error) for each in mirrors),
-        spacing * diagonal,
-        group.test.tolerance,
-        min(rejected, default=math.inf),
+        test.spacing * diagonal,
+        test.tolerance,
+        # Of what was tried and failed, only what is no symmetry after all; some failed before what implies them was
+        # found.
+        min((each.error for each in group.rejected if not group.knows(each)), default=math.inf),
     )
 
 

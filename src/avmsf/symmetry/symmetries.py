@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
@@ -93,6 +93,8 @@ class Symmetries:
         nearest = f"the best rejected candidate has an error of {self.rejected:.2f}"
         if not math.isfinite(self.rejected):
             nearest = "there was no other candidate"
+        if self.tolerance <= 0.0:
+            return "no symmetry found: the points are too few or too noisy to tell one"
         if not found:
             return f"no symmetry found: {nearest} ({measure})"
         lines = [f"{each}: error {each.error:.2f}, {self._confidence(each.error)}" for each in found]
@@ -107,14 +109,8 @@ class Symmetries:
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers, lists and strings, as JSON holds them; `from_dict` reads them back to the last bit."""
         return {
-            "rotations": [
-                {"axis": each.axis.tolist(), "point": each.point.tolist(), "order": each.order, "error": each.error}
-                for each in self.rotations
-            ],
-            "mirrors": [
-                {"normal": each.normal.tolist(), "point": each.point.tolist(), "error": each.error}
-                for each in self.mirrors
-            ],
+            "rotations": [_stored(each) for each in self.rotations],
+            "mirrors": [_stored(each) for each in self.mirrors],
             "spacing": self.spacing,
             "tolerance": self.tolerance,
             # JSON knows no infinity.
@@ -125,22 +121,11 @@ class Symmetries:
     def from_dict(cls, stored: Mapping[str, Any]) -> "Symmetries":
         """Read what `to_dict` returned, now or earlier. Raises SceneError for anything else."""
         try:
-            rotations = tuple(
-                RotationalSymmetry(
-                    _vector(each, "axis", unit=True),
-                    _vector(each, "point"),
-                    None if each["order"] is None else count_of(each["order"], "order", least=2),
-                    _number(each, "error"),
-                )
-                for each in stored["rotations"]
-            )
-            mirrors = tuple(
-                MirrorSymmetry(_vector(each, "normal", unit=True), _vector(each, "point"), _number(each, "error"))
-                for each in stored["mirrors"]
-            )
+            rotations = tuple(RotationalSymmetry(**_read(each)) for each in stored["rotations"])
+            mirrors = tuple(MirrorSymmetry(**_read(each)) for each in stored["mirrors"])
             rejected = math.inf if stored["rejected"] is None else _number(stored, "rejected")
             return cls(rotations, mirrors, _number(stored, "spacing"), _number(stored, "tolerance"), rejected)
-        except (ValueError, TypeError, KeyError) as error:
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
             advice = "find the symmetries again"
             raise SceneError.expected(
                 "numbers as they are stored", got=repr(error), name="symmetries", advice=advice
@@ -152,16 +137,28 @@ def _numbers(values: Float[Tensor, " 3"]) -> str:
     return " ".join(f"{round(value, 4) + 0.0:.4g}" for value in values.tolist())
 
 
+def _stored(symmetry: RotationalSymmetry | MirrorSymmetry) -> dict[str, Any]:
+    values = {each.name: getattr(symmetry, each.name) for each in fields(symmetry)}
+    return {name: value.tolist() if isinstance(value, Tensor) else value for name, value in values.items()}
+
+
+def _read(stored: Mapping[str, Any]) -> dict[str, Any]:
+    values: dict[str, Any] = {name: _vector(stored, name) for name in stored.keys() - {"order", "error"}}
+    if "order" in stored:
+        values["order"] = None if stored["order"] is None else count_of(stored["order"], "order", least=2)
+    return values | {"error": _number(stored, "error")}
+
+
+def _vector(entry: Mapping[str, Any], name: str) -> Float[Tensor, " 3"]:
+    value = like(entry[name], (1.0,), name)
+    length = math.hypot(*value)
+    if len(value) != 3 or not math.isfinite(length) or (name != "point" and abs(length - 1.0) > 1e-6):
+        raise ValueError(f"{name}: expected {'three numbers' if name == 'point' else 'a unit vector'}, got {value}")
+    return torch.tensor(value, dtype=torch.float64)
+
+
 def _number(entry: Mapping[str, Any], name: str) -> float:
     value = float(like(entry[name], 1.0, name))
     if not math.isfinite(value):
         raise ValueError(f"{name}: expected a finite number, got {value}")
     return value
-
-
-def _vector(entry: Mapping[str, Any], name: str, *, unit: bool = False) -> Float[Tensor, " 3"]:
-    value = like(entry[name], (1.0,), name)
-    length = math.hypot(*value)
-    if len(value) != 3 or not math.isfinite(length) or (unit and abs(length - 1.0) > 1e-6):
-        raise ValueError(f"{name}: expected {'a unit vector' if unit else 'three numbers'}, got {value}")
-    return torch.tensor(value, dtype=torch.float64)
