@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from avmsf._utils.state import write_checkpoint
+from avmsf._utils.tensor_files import write_checkpoint
 from avmsf.errors import AvmsfWarning, FieldFileError, FitError
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit

@@ -321,7 +321,7 @@ def test_truths_that_are_damaged_or_of_something_else_are_refused(simulation: Si
     with raises(SimulationError, file=path, name="format", value=9):
         read_truth(path)
     short = replace(simulation.truth, names=simulation.truth.names[1:])
-    with raises(SimulationError, file=path, name="tensors"):
+    with raises(SimulationError, file=path, name="gains"):
         write_truth(short, path)
     broken = replace(simulation.truth, gains=simulation.truth.gains * math.nan)
     with raises(SimulationError, file=path, name="gains"):

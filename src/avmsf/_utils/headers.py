@@ -1,9 +1,16 @@
-"""The header of a safetensors file, read without the library that reads its tensors, which takes seconds to load."""
+"""The header of a safetensors file and the JSON in it, read without the library that reads its tensors.
+
+That one takes seconds to load.
+"""
 
 import json
 import struct
+from collections.abc import Callable, Mapping
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
+from avmsf._utils.text import parse_json
 from avmsf.errors import AvmsfError
 
 MAX_HEADER_BYTES = 100_000_000
@@ -28,6 +35,46 @@ def read_header_text(path: Path, key: str, *, what: str, advice: str, raising: t
         advice = f"name another, or {advice}"
         raise raising.expected(wanted, sorted(metadata), got=got, file=path, name=key, advice=advice)
     return metadata[key]
+
+
+def parse_record(
+    text: str,
+    path: Path,
+    check: Callable[[dict[str, Any]], None],
+    *,
+    formats: tuple[int, ...],
+    what: str,
+    advice: str,
+    raising: type[AvmsfError],
+) -> dict[str, Any]:
+    """Return the record that a file's header has as JSON, with a `format` and the `version` that wrote it.
+
+    `check` raises ValueError, TypeError or KeyError for a record whose entries are not those of the formats. Raises
+    `raising` for such a record, and for a format of another version.
+    """
+    try:
+        record = parse_json(text)
+        found, writer = record["format"], record["version"]
+        if found in formats:
+            check(record)
+    except (ValueError, TypeError, KeyError) as error:
+        got = f"a damaged one ({type(error).__name__}: {error})"
+        raise raising.expected(f"the header of {what}", got=got, file=path, name="header", advice=advice) from error
+    if found not in formats:
+        wanted = f"{what} in format {' or '.join(map(str, formats))}"
+        got = f"format {found}, written by avmsf {writer} (this is avmsf {version('avmsf')})"
+        advice = f"install avmsf {writer} or newer, or {advice}"
+        raise raising.expected(wanted, found, got=got, file=path, name="format", advice=advice)
+    return record
+
+
+def record_text(record: Mapping[str, Any], path: Path, *, name: str, raising: type[AvmsfError]) -> str:
+    """Return a record as JSON. Raises `raising` for what JSON does not hold, which came in its entry `name`."""
+    try:
+        return json.dumps(record, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        wanted, got = "finite numbers, text, lists and dicts", f"other values ({error})"
+        raise raising.expected(wanted, str(error), got=got, file=path, name=name) from error
 
 
 def unreadable(path: Path, *, what: str, advice: str, raising: type[AvmsfError]) -> AvmsfError:

@@ -16,7 +16,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from avmsf._utils.caching import key_of, source_digest
-from avmsf._utils.state import read_checkpoint, write_checkpoint
+from avmsf._utils.tensor_files import read_checkpoint, write_checkpoint
 from avmsf.editing.clips import Sounds, level
 from avmsf.editing.config import GuidedEditConfig
 from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit

@@ -7,11 +7,9 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float, Float64
-from safetensors.torch import save
 from torch import Tensor
 
-from avmsf._utils.files import write_whole
-from avmsf._utils.state import read_tensors
+from avmsf._utils.tensor_files import read_tensors, write_tensors
 from avmsf.baselines.diffsound.renderer import DiffSound
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, LocationError
@@ -197,10 +195,7 @@ def write_map(path: Path, found: ContactMap, *, truth: Float[Tensor, " 3"]) -> N
     """Write a map, and the true contact (meters). Raises EvaluationError where that cannot be."""
     tensors = {"points": found.points, "distance": found.distance, "probability": found.probability, "truth": truth}
     energies = torch.tensor([found.explained_energy, found.modal_energy, found.null_energy], dtype=torch.float64)
-    content = save(
-        {name: each.contiguous() for name, each in {**tensors, "energies": energies}.items()}, {_MAP_KEY: "1"}
-    )
-    write_whole(path, lambda place: place.write_bytes(content), raising=EvaluationError)
+    write_tensors(path, {**tensors, "energies": energies}, {_MAP_KEY: "1"}, raising=EvaluationError)
 
 
 def read_map(path: Path) -> tuple[ContactMap, Float[Tensor, " 3"]]:

@@ -8,12 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save as to_bytes
 from torch import Tensor
 
-from avmsf._utils.files import write_whole
-from avmsf._utils.headers import FEATURES_KEY
-from avmsf._utils.state import expect_tensors, parse_record, read_tensors, record_text
+from avmsf._utils.headers import FEATURES_KEY, parse_record, record_text
+from avmsf._utils.tensor_files import expect_tensors, read_tensors, write_tensors
 from avmsf.errors import SceneError
 from avmsf.features.feature_field import FeatureField
 
@@ -29,10 +27,7 @@ def save_features(features: FeatureField, path: str | Path, *, report: dict[str,
     SceneError where the file cannot be written, or could not be read back.
     """
     path = Path(path)
-    tensors = {
-        name: tensor.detach().float().cpu().clone(memory_format=torch.contiguous_format)
-        for name, tensor in (("points", features.points), ("features", features.features))
-    }
+    tensors = {"points": features.points.float(), "features": features.features.float()}
     record = {
         "format": FORMAT,
         "version": version("avmsf"),
@@ -40,10 +35,9 @@ def save_features(features: FeatureField, path: str | Path, *, report: dict[str,
         "sizes": {"points": features.features.shape[0], "dim": features.features.shape[1]},
         "report": report or {},
     }
-    expect_tensors(tensors, _sizes(record), path, dtype=torch.float32, advice=_ADVICE, raising=SceneError)
+    expect_tensors(tensors, _skeleton(record), path, advice=_ADVICE, raising=SceneError)
     text = record_text(record, path, name="report", raising=SceneError)
-    content = to_bytes(tensors, {FEATURES_KEY: text})
-    write_whole(path, lambda place: place.write_bytes(content), raising=SceneError)
+    write_tensors(path, tensors, {FEATURES_KEY: text}, raising=SceneError)
 
 
 def load_features(path: str | Path) -> FeatureField:
@@ -66,7 +60,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     what = "a file of features"
     text, tensors = read_tensors(path, FEATURES_KEY, what=what, advice=_ADVICE, raising=SceneError)
     record = parse_record(text, path, _check_record, formats=(FORMAT,), what=what, advice=_ADVICE, raising=SceneError)
-    expect_tensors(tensors, _sizes(record), path, dtype=torch.float32, advice=_ADVICE, raising=SceneError)
+    expect_tensors(tensors, _skeleton(record), path, advice=_ADVICE, raising=SceneError)
     return record, tensors
 
 
@@ -77,6 +71,6 @@ def _check_record(record: dict[str, Any]) -> None:
         raise ValueError(f"sizes {record['sizes']}, encoder {record['encoder']!r}")
 
 
-def _sizes(record: dict[str, Any]) -> dict[str, tuple[int, ...]]:
+def _skeleton(record: dict[str, Any]) -> dict[str, Tensor]:
     points, dim = (record["sizes"][name] for name in ("points", "dim"))
-    return {"points": (points, 3), "features": (points, dim)}
+    return {name: torch.empty(points, size, device="meta") for name, size in (("points", 3), ("features", dim))}

@@ -13,12 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save as to_bytes
 from torch import Tensor
 
 from avmsf._utils.caching import keep_if_possible
-from avmsf._utils.files import write_whole
-from avmsf._utils.state import read_tensors
+from avmsf._utils.tensor_files import expect_tensors, read_tensors, write_tensors
 from avmsf._utils.text import count_of, parse_json
 from avmsf.errors import SimulationError
 from avmsf.fem.elastic_modes import ElasticModes
@@ -80,8 +78,7 @@ def save_modes(modes: ElasticModes, path: Path) -> None:
     if modes.perturbations is not None:
         tensors |= {name: torch.from_numpy(getattr(modes.perturbations, name)) for name in _PERTURBATIONS}
     header = json.dumps({"mass": modes.mass, "material": asdict(modes.material)}, allow_nan=False)
-    content = to_bytes({name: tensor.contiguous().clone() for name, tensor in tensors.items()}, {_KEY: header})
-    write_whole(path, lambda place: place.write_bytes(content), raising=SimulationError)
+    write_tensors(path, tensors, {_KEY: header}, raising=SimulationError)
 
 
 def load_modes(path: Path) -> ElasticModes:
@@ -95,17 +92,14 @@ def load_modes(path: Path) -> ElasticModes:
         record = parse_json(header)
         sizes = {"nodes": len(tensors["nodes"]), "triangles": len(tensors["triangles"])}
         expected = mode_skeleton(sizes | {"shapes": len(tensors["frequency"])}, shapes_dtype=torch.float64)
-        changes = None
         if "stiffness" in tensors:
             modes, fields = len(tensors["frequency"]), len(tensors["stiffness"])
             table, both = torch.empty(modes, modes, dtype=torch.float64, device="meta"), (fields, modes, modes)
             expected |= {"poisson": table, "stiffness": table.expand(both), "mass": table.expand(both)}
+        expect_tensors(tensors, expected, path, advice=_ADVICE, raising=SimulationError)
+        changes = None
+        if "stiffness" in tensors:
             changes = Perturbations(*(tensors[name].numpy() for name in _PERTURBATIONS))
-        stated, found = (
-            {name: (tuple(each.shape), each.dtype) for name, each in named.items()} for named in (expected, tensors)
-        )
-        if stated != found:
-            raise ValueError(f"tensors {found} instead of {stated}")
         material, mass = Material(**record["material"]), float(record["mass"])
         return replace(restored_modes(tensors, ""), material=material, mass=mass, perturbations=changes)
     except (ValueError, TypeError, KeyError) as error:

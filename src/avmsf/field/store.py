@@ -20,11 +20,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save as to_bytes
 from torch import Tensor
 
-from avmsf._utils.files import write_whole
-from avmsf._utils.state import read_tensors
+from avmsf._utils.tensor_files import expect_tensors, read_tensors, write_tensors
 from avmsf._utils.text import RecordError, count_of, like, record_of
 from avmsf.capture.audio import HIGHEST_RATE, LOWEST_RATE, MAX_PEAK, MAX_SAMPLES
 from avmsf.capture.settings import CaptureSettings
@@ -78,8 +76,7 @@ def save(field: SoundField, path: str | Path) -> None:
             value=value_of(error),
         ) from error
     _expect_tensors(tensors, header.skeleton, path)
-    content = to_bytes(tensors, {KEY: words})
-    write_whole(path, lambda place: place.write_bytes(content))
+    write_tensors(path, tensors, {KEY: words})
 
 
 def load(path: str | Path) -> SoundField:
@@ -237,8 +234,7 @@ def _tensors(field: SoundField) -> dict[str, Tensor]:
     if field.alignment is not None:
         named |= {_ALIGNMENT + name: tensor for name, tensor in field.alignment.tensors().items()}
     named |= {_GAINS + name: tensor for name, tensor in field.gain_field.tensors().items()}
-    # Safetensors refuses tensors that share memory, as a field's points may with its features.
-    return {name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format) for name, tensor in named.items()}
+    return named
 
 
 def _alignment(record: Mapping[str, Any] | None, tensors: Mapping[str, Tensor]) -> Alignment | None:
@@ -250,32 +246,13 @@ def _alignment(record: Mapping[str, Any] | None, tensors: Mapping[str, Tensor]) 
 
 def _expect_tensors(tensors: dict[str, Tensor], skeleton: dict[str, Tensor], path: Path) -> None:
     """Compare names, shapes and dtypes with those of the skeleton, and the values with what they mean."""
-    missing, unexpected = sorted(skeleton.keys() - tensors.keys()), sorted(tensors.keys() - skeleton.keys())
-    if missing or unexpected:
-        raise FieldFileError(
-            f"{path}: expected the tensors of format {FORMAT}; missing {', '.join(missing) or 'none'}; unexpected "
-            f"{', '.join(unexpected) or 'none'}; fit and save the field again",
-            file=path,
-            name=(missing or unexpected)[0],
-            value=[missing, unexpected],
-        )
-    for name, tensor in tensors.items():
-        if tensor.shape != skeleton[name].shape or tensor.dtype != skeleton[name].dtype:
-            found, wanted = _named(tensor), f"{name} as {_named(skeleton[name])}"
-            raise FieldFileError.expected(wanted, found, got=found, file=path, name=name, advice=_SAVE_AGAIN)
-        low, high = (float(each) for each in tensor.aminmax()) if tensor.numel() else (0.0, 0.0)
-        negative = low < 0 and name == "residual.magnitude"
-        if not bool(torch.isfinite(tensor).all()) or (name in _POSITIVE and low <= 0) or negative:
-            wanted = "positive" if name in _POSITIVE else "not negative" if negative else "finite"
-            found = f"{low:.3g} to {high:.3g}"
-            raise FieldFileError.expected(
-                f"{name} to be {wanted}", (low, high), got=found, file=path, name=name, advice=_SAVE_AGAIN
-            )
-        if high > _MAX.get(name, math.inf):
-            raise FieldFileError.expected(
-                f"{name} up to {_MAX[name]:g}", high, got=f"{high:.3g}", file=path, name=name, advice=_SAVE_AGAIN
-            )
-
-
-def _named(tensor: Tensor) -> str:
-    return f"{str(tensor.dtype).removeprefix('torch.')}{list(tensor.shape)}"
+    expect_tensors(tensors, skeleton, path, advice=_SAVE_AGAIN, raising=FieldFileError)
+    for name, highest in _MAX.items():
+        low, high = (float(each) for each in tensors[name].aminmax()) if tensors[name].numel() else (1.0, 1.0)
+        if low < 0.0 or (low == 0.0 and name in _POSITIVE):
+            wanted = f"{name} to be {'positive' if name in _POSITIVE else 'not negative'}"
+            got = f"{low:.3g} to {high:.3g}"
+            raise FieldFileError.expected(wanted, (low, high), got=got, file=path, name=name, advice=_SAVE_AGAIN)
+        if high > highest:
+            wanted, got = f"{name} up to {highest:g}", f"{high:.3g}"
+            raise FieldFileError.expected(wanted, high, got=got, file=path, name=name, advice=_SAVE_AGAIN)

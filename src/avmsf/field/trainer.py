@@ -14,7 +14,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from avmsf._utils.device import steps_between_losses
-from avmsf._utils.state import read_checkpoint, write_checkpoint
+from avmsf._utils.tensor_files import read_checkpoint, write_checkpoint
 from avmsf.errors import AvmsfWarning, FieldFileError, FitError
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.data import GainData

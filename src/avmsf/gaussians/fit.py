@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from avmsf._utils.device import steps_between_losses
-from avmsf._utils.state import read_checkpoint, write_checkpoint
+from avmsf._utils.tensor_files import read_checkpoint, write_checkpoint
 from avmsf.errors import AvmsfWarning, SceneError
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.config import SplatConfig

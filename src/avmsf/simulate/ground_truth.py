@@ -14,11 +14,10 @@ from typing import Any
 
 import torch
 from jaxtyping import Complex128, Float64
-from safetensors.torch import save as to_bytes
 from torch import Tensor
 
-from avmsf._utils.files import write_whole
-from avmsf._utils.state import expect_tensors, parse_record, read_tensors, record_text
+from avmsf._utils.headers import parse_record, record_text
+from avmsf._utils.tensor_files import expect_tensors, read_tensors, write_tensors
 from avmsf.errors import SimulationError
 
 FORMAT = 2
@@ -82,12 +81,11 @@ def write_truth(truth: Truth, path: str | Path) -> None:
     """
     path = Path(path)
     tensors = {name: getattr(truth, name) for name in (*_MODES, *_TABLES, *_OPTIONAL)}
-    tensors = {name: tensor.clone().contiguous() for name, tensor in tensors.items() if tensor is not None}
+    tensors = {name: tensor for name, tensor in tensors.items() if tensor is not None}
     record = {"format": FORMAT, "version": version("avmsf"), "names": list(truth.names), "recipe": truth.recipe}
     _expect(tensors, record, path)
     words = record_text(record, path, name="recipe", raising=SimulationError)
-    content = to_bytes(tensors, {_KEY: words})
-    write_whole(path, lambda place: place.write_bytes(content), raising=SimulationError)
+    write_tensors(path, tensors, {_KEY: words}, raising=SimulationError)
 
 
 def read_truth(path: str | Path) -> Truth:
@@ -120,4 +118,5 @@ def _expect(tensors: dict[str, Tensor], record: dict[str, Any], path: Path) -> N
     modes = tensors["frequency"].numel() if "frequency" in tensors else 0
     sizes: dict[str, tuple[int, ...]] = dict.fromkeys(_MODES, (modes,)) | dict.fromkeys(_TABLES, (contacts, modes))
     sizes |= {name: size for name, size in (("contacts", (contacts, 3)), ("starts", (contacts,))) if name in tensors}
-    expect_tensors(tensors, sizes, path, dtype=torch.float64, advice=_ADVICE, raising=SimulationError)
+    skeleton = {name: torch.empty(size, dtype=torch.float64, device="meta") for name, size in sizes.items()}
+    expect_tensors(tensors, skeleton, path, advice=_ADVICE, raising=SimulationError)

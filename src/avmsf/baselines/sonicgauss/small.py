@@ -10,11 +10,9 @@ from typing import Any
 
 import torch
 from jaxtyping import Float, Int
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from avmsf._utils.files import write_whole
-from avmsf._utils.state import read_tensors
+from avmsf._utils.tensor_files import read_tensors, write_tensors
 from avmsf._utils.text import record_of
 from avmsf.baselines.sonicgauss.conditioning import (
     CHANNELS,
@@ -160,9 +158,9 @@ class SmallWeights:
 
     def write(self, path: Path) -> None:
         """Write one safetensors file. Raises EvaluationError where that cannot be."""
-        tensors = {name: each.contiguous() for name, each in _together(self.network, self.codec).state_dict().items()}
+        tensors = _together(self.network, self.codec).state_dict()
         text = json.dumps({"config": asdict(self.network.config), "report": dict(self.report)})
-        write_whole(path, lambda place: save_file(tensors, place, {_KEY: text}), raising=EvaluationError)
+        write_tensors(path, tensors, {_KEY: text}, raising=EvaluationError)
 
     @classmethod
     def read(cls, path: Path) -> "SmallWeights":

@@ -13,13 +13,11 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor
 
 from avmsf._utils.arrays import short_repr
 from avmsf._utils.caching import keep_if_possible, source_digest
-from avmsf._utils.files import write_whole
+from avmsf._utils.tensor_files import read_tensors, write_tensors
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExtractionError
@@ -153,10 +151,9 @@ def extract_once(train: Impacts, method: ModeFinder, path: Path, *, needed: bool
     }
     if found.alignment is not None:
         tensors |= {_ALIGNMENT + name: each for name, each in found.alignment.tensors().items()}
-    content = save({name: tensor.contiguous() for name, tensor in tensors.items()}, {_KEY: digest})
 
     def write() -> None:
-        write_whole(path, lambda place: place.write_bytes(content))
+        write_tensors(path, tensors, {_KEY: digest})
 
     if needed:
         write()
@@ -167,11 +164,9 @@ def extract_once(train: Impacts, method: ModeFinder, path: Path, *, needed: bool
 
 def _read(path: Path, digest: str, train: Impacts) -> Extraction | None:
     try:
-        with safe_open(path, framework="pt") as file:
-            if (file.metadata() or {}).get(_KEY) != digest:
-                return None
-            # Clones, for what the file maps into memory goes with it.
-            read = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
+        found, read = read_tensors(path, _KEY, what="modes", advice="find them again", raising=ExtractionError)
+        if found != digest:
+            return None
         kept = {name.removeprefix(_ALIGNMENT): each for name, each in read.items() if name.startswith(_ALIGNMENT)}
         return Extraction(
             ModalBank(read["frequency"], read["damping"]),
@@ -180,7 +175,7 @@ def _read(path: Path, digest: str, train: Impacts) -> Extraction | None:
             read["quadrature"],
             Alignment.restore(kept, train.names, recording_keys(train)) if kept else None,
         )
-    except (SafetensorError, OSError, KeyError):
+    except (ExtractionError, KeyError):
         return None
 
 

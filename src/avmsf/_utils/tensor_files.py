@@ -1,20 +1,18 @@
 """Tensors in files: safetensors with one text, and checkpoints of work that may be interrupted."""
 
 import io
-import json
-from collections.abc import Callable, Mapping
-from importlib.metadata import version
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
 from torch import Tensor
 
 from avmsf._utils.files import write_whole
 from avmsf._utils.headers import read_header_text, unreadable
-from avmsf._utils.text import parse_json
-from avmsf.errors import AvmsfError
+from avmsf.errors import AvmsfError, FieldFileError
 
 
 def read_tensors(
@@ -33,64 +31,49 @@ def read_tensors(
         raise unreadable(path, what=what, advice=advice, raising=raising) from error
 
 
-def parse_record(
-    text: str,
-    path: Path,
-    check: Callable[[dict[str, Any]], None],
-    *,
-    formats: tuple[int, ...],
-    what: str,
-    advice: str,
-    raising: type[AvmsfError],
-) -> dict[str, Any]:
-    """Return the record that a file's header has as JSON, with a `format` and the `version` that wrote it.
-
-    `check` raises ValueError, TypeError or KeyError for a record whose entries are not those of the formats. Raises
-    `raising` for such a record, and for a format of another version.
-    """
-    try:
-        record = parse_json(text)
-        found, writer = record["format"], record["version"]
-        if found in formats:
-            check(record)
-    except (ValueError, TypeError, KeyError) as error:
-        got = f"a damaged one ({type(error).__name__}: {error})"
-        raise raising.expected(f"the header of {what}", got=got, file=path, name="header", advice=advice) from error
-    if found not in formats:
-        wanted = f"{what} in format {' or '.join(map(str, formats))}"
-        got = f"format {found}, written by avmsf {writer} (this is avmsf {version('avmsf')})"
-        advice = f"install avmsf {writer} or newer, or {advice}"
-        raise raising.expected(wanted, found, got=got, file=path, name="format", advice=advice)
-    return record
-
-
-def record_text(record: Mapping[str, Any], path: Path, *, name: str, raising: type[AvmsfError]) -> str:
-    """Return a record as JSON. Raises `raising` for what JSON does not hold, which came in its entry `name`."""
-    try:
-        return json.dumps(record, allow_nan=False)
-    except (TypeError, ValueError) as error:
-        wanted, got = "finite numbers, text, lists and dicts", f"other values ({error})"
-        raise raising.expected(wanted, str(error), got=got, file=path, name=name) from error
+def write_tensors(
+    path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str], *, raising: type[AvmsfError] = FieldFileError
+) -> None:
+    """Write a safetensors file, whole or not at all. Raises `raising`."""
+    # Safetensors refuses tensors that share memory.
+    copies = {name: each.detach().cpu().clone(memory_format=torch.contiguous_format) for name, each in tensors.items()}
+    content = save(copies, metadata)
+    write_whole(path, lambda place: place.write_bytes(content), raising=raising)
 
 
 def expect_tensors(
     tensors: Mapping[str, Tensor],
-    sizes: Mapping[str, tuple[int, ...]],
+    skeleton: Mapping[str, Tensor],
     path: Path,
     *,
-    dtype: torch.dtype,
     advice: str,
     raising: type[AvmsfError],
 ) -> None:
-    """Raise `raising` unless these are the tensors of these names, sizes and type, all of finite numbers."""
-    found = {name: tuple(tensor.shape) for name, tensor in tensors.items() if tensor.dtype == dtype}
-    if found != sizes or tensors.keys() != sizes.keys():
-        wanted = f"the {str(dtype).removeprefix('torch.')} tensors {dict(sizes)}"
-        shapes = {name: list(tensor.shape) for name, tensor in tensors.items()}
-        raise raising.expected(wanted, shapes, file=path, name="tensors", advice=advice)
+    """Raise `raising` unless these are tensors of the names, shapes and types of a skeleton, all of finite numbers.
+
+    The skeleton's are on the device `meta`, where they take no memory.
+    """
+    missing, unexpected = sorted(skeleton.keys() - tensors.keys()), sorted(tensors.keys() - skeleton.keys())
+    if missing or unexpected:
+        got = f"missing {', '.join(missing) or 'none'}; unexpected {', '.join(unexpected) or 'none'}"
+        raise raising.expected(
+            f"{len(skeleton)} tensors",
+            [missing, unexpected],
+            got=got,
+            file=path,
+            name=(missing or unexpected)[0],
+            advice=advice,
+        )
     for name, tensor in tensors.items():
+        wanted, found = (
+            f"{str(each.dtype).removeprefix('torch.')}{list(each.shape)}" for each in (skeleton[name], tensor)
+        )
+        if wanted != found:
+            raise raising.expected(f"{name} as {wanted}", found, got=found, file=path, name=name, advice=advice)
         if not bool(torch.isfinite(tensor).all()):
-            raise raising.expected(f"finite {name}", got="others", file=path, name=name, advice=advice)
+            low, high = (float(each) for each in tensor.aminmax())
+            got = f"{low:.3g} to {high:.3g}"
+            raise raising.expected(f"{name} to be finite", (low, high), got=got, file=path, name=name, advice=advice)
 
 
 def write_checkpoint(
