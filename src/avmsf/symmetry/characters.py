@@ -37,7 +37,8 @@ def groups_of(symmetries: Symmetries) -> tuple[Group, ...]:
     planes = [(each.normal.double(), -1.0) for each in symmetries.mirrors]
     axes = [(each.axis.double(), 1.0) for each in symmetries.rotations]
     orders = [TURNS if each.order is None else each.order for each in symmetries.rotations]
-    points = [each.point.double() for each in (*symmetries.mirrors, *symmetries.rotations)]
+    points = [each.point.double() for each in symmetries.mirrors]
+    points += [each.point.double() for each in symmetries.rotations]
     if not points:
         return ()
     center = _center(torch.stack(points), torch.stack([_flip(*line) for line in (*planes, *axes)]))
