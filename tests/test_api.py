@@ -105,7 +105,7 @@ def test_a_split_that_leaves_nothing_to_train_or_to_test_is_refused(size):
 
 def test_fit_makes_the_field_that_the_command_makes(tmp_path):
     folder, output = fill_plate(tmp_path / "plate", surface=False), tmp_path / "field.safetensors"
-    assert main(["fit", str(folder), "--output", str(output), "--modes", "6", "--steps", "5"]) == 0
+    assert main(["fit", str(folder), "--output", str(output), "--modes", "6", "--set", "fit.steps=5"]) == 0
     made = avmsf.fit(avmsf.read(folder), config=PipelineConfig(modes=6, fit=FitConfig(steps=5)), progress=False)
     one, other = made.render([CONTACT]), avmsf.load(output).render([CONTACT])
     # Modes of two runs differ in their last digits.

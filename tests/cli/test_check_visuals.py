@@ -182,7 +182,7 @@ def test_what_is_wrong_with_cameras_is_named_by_check_as_by_reconstruct(
     assert lines[-1] == ("readable, with 1 warning" if words else "no problem found")
     if words:
         (line,) = [line for line in lines if words in line]
-        assert main(["fit", str(folder), "--gain-model", "visual", "--lift.encoder", "descriptors"]) == 2
+        assert main(["fit", str(folder), "--gain-model", "visual", "--set", "lift.encoder=descriptors"]) == 2
         assert not (folder / ".avmsf" / "cloud.ply").exists()
         # The views that are compared are others, and so is the number of the cameras.
         assert line.partition(words)[2] in capsys.readouterr().err
@@ -227,7 +227,7 @@ def test_check_opens_gaussians_and_tells_another_frame_which_fit_refuses(
     if words:
         (line,) = [line for line in lines if words in line]
         assert "feet" not in line
-        assert main(["fit", str(folder), "--gain-model", "visual", "--lift.encoder", "descriptors"]) == 2
+        assert main(["fit", str(folder), "--gain-model", "visual", "--set", "lift.encoder=descriptors"]) == 2
         assert words in capsys.readouterr().err
         assert not (folder / ".avmsf" / "features.safetensors").exists()
 

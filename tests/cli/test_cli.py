@@ -17,11 +17,11 @@ import avmsf
 from avmsf.capture import Capture, CaptureSettings, read_capture
 from avmsf.cli import VERBS, main
 from avmsf.errors import CaptureError
-from avmsf.field import PAPER, FitConfig
 from avmsf.field.store import load
 from avmsf.gaussians.ply_header import NEEDED
 from factories.plate_capture import CONTACT_TIME, HIGHEST, PLATE, RATE, TINY, fill_plate
 from factories.raising import raises
+from factories.settings import sets
 from oracles.plate import plate_modes
 
 Streams = pytest.CaptureFixture[str]
@@ -103,7 +103,7 @@ def test_common_options_may_stand_before_the_verb(capture: Path, capsys: Streams
 
 
 def test_what_is_no_verb_ends_with_2_on_the_standard_error(capsys: Streams) -> None:
-    for words in (["fit"], ["fit", "capture", "--output", "x", "--steps", "many"]):
+    for words in (["fit"], ["fit", "capture", "--output", "x", "--set", "fit.steps=many"]):
         with pytest.raises(SystemExit) as ended:
             main(words)
         assert ended.value.code == 2
@@ -365,7 +365,7 @@ def test_modes_of_the_paper_start_at_the_peak(capture: Path, monkeypatch: pytest
     assert asked == ["onset", "peak", "onset"]
 
 
-SHEET = ("--body.wall", "0.004", "--body.shapes", "8", "--body.dofs", "1000")
+SHEET = sets("body.wall=0.004 body.shapes=8 body.dofs=1000")
 
 
 def test_fit_says_why_elastic_mode_shapes_took_no_part(tmp_path: Path, capsys: Streams) -> None:
@@ -388,9 +388,9 @@ def test_fit_says_why_elastic_mode_shapes_took_no_part(tmp_path: Path, capsys: S
 def test_a_stated_wall_that_the_object_cannot_have_ends_the_fit(tmp_path: Path, capsys: Streams) -> None:
     folder, output = fill_plate(tmp_path / "plate"), tmp_path / "plate.safetensors"
     for words in (["fit", str(folder)], ["fit", str(folder / "surface.ply"), "--material", "glass"]):
-        assert main([*words, "--output", str(output), "--body.wall", "3", *TINY]) == 2
+        assert main([*words, "--output", str(output), "--set", "body.wall=3", *TINY]) == 2
         error = capsys.readouterr().err
-        assert "--body.wall" in error
+        assert "body.wall" in error
         assert "modes: " not in error
     assert not output.exists()
 
@@ -399,7 +399,7 @@ def test_a_stated_wall_that_the_object_cannot_have_ends_the_fit(tmp_path: Path, 
 def test_a_refused_fit_leaves_nothing_behind(tmp_path: Path, capsys: Streams, wrong: str) -> None:
     early = wrong.endswith("before the modes")
     folder, output = fill_plate(tmp_path / "plate", surface=not early), tmp_path / "fields" / "plate.safetensors"
-    words = ["--gain-model", "elastic", *SHEET, *TINY, *(() if early else ("--learning-rate", "1e30"))]
+    words = ["--gain-model", "elastic", *SHEET, *TINY, *(() if early else ("--set", "fit.learning_rate=1e30"))]
     assert main(["fit", str(folder), "--output", str(output), *words]) == 2
     error = capsys.readouterr().err
     assert ("surface.obj" in error) == early
@@ -416,17 +416,6 @@ def test_a_surface_in_another_unit_is_refused_once(tmp_path: Path, capsys: Strea
     _, err = capsys.readouterr()
     assert err.count("is the surface's unit mm?") == 1
     assert not output.exists()
-
-
-def test_a_presets_settings_hold_where_the_options_say_nothing() -> None:
-    from avmsf.cli.options.fit import Options
-
-    words = ["bowl", "--output", "bowl.safetensors"]
-    assert Options.parse(words).config == FitConfig()
-    paper = Options.parse([*words, "--preset", "paper"])
-    assert (paper.config, paper.gain_model, paper.extraction) == (PAPER, "network", "short-time")
-    mixed = Options.parse(["--preset", "paper", *words, "--steps", "7", "--extraction", "high-resolution"])
-    assert (mixed.config.steps, mixed.config.clusters, mixed.extraction) == (7, PAPER.clusters, "high-resolution")
 
 
 def test_without_a_surface_the_contacts_box_stands_for_the_object(tmp_path: Path, capsys: Streams) -> None:

@@ -25,7 +25,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     fill_plate(folder / "plate")
     fill_plate(folder / "fast", rate=9000.0)
     words = ["fit", str(folder / "plate"), "--output", str(folder / "field.safetensors"), *TINY]
-    assert main([*words, "--gain-model", "smooth", "--steps", "1"]) == 0
+    assert main([*words, "--gain-model", "smooth", "--set", "fit.steps=1"]) == 0
     (folder / "not-ours.safetensors").write_bytes(b"RIFF and so on")
     (folder / "no-z.csv").write_text("file,x,y\na.wav,0,0\n")
     (folder / "far.csv").write_text("file,x,y,z\na.wav,0.1,0.05,0\n\nb.wav,50,60,0\n")

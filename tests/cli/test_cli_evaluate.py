@@ -71,7 +71,7 @@ def test_a_changed_setting_is_named(plates: Path, tmp_path: Path) -> None:
         run(Options.parse(words))
     assert "cdpam_contacts 8, got 3" in str(caught.value)
     with raises(EvaluationError, file=tmp_path / "results", name="settings.body.wall", value=None):
-        run(Options.parse([*words, "--cdpam-contacts", "3", "--body.wall", "0.002"]))
+        run(Options.parse([*words, "--cdpam-contacts", "3", "--set", "body.wall=0.002"]))
     # Neither is a result of other methods, objects or workers another one.
     assert run(Options.parse([*words, "--cdpam-contacts", "3", "--objects", "b"])) == 0
 
@@ -173,7 +173,7 @@ def test_all_methods_hear_the_start_of_sounds_and_share_the_modes_that_are_asked
 ) -> None:
     plates, results = fill_plates(tmp_path / "plates", ("a",), truth=True), tmp_path / "results"
     words = ["farthest", str(plates), "--methods", "knn-gains,paper", "--no-cdpam", "--extraction", "short-time"]
-    words += ["--lift.encoder", "descriptors", "--output", str(results)]
+    words += ["--set", "lift.encoder=descriptors", "--output", str(results)]
     heard = []
 
     def stop(field: FieldMethod, task: Task) -> None:
@@ -237,7 +237,7 @@ def test_a_known_wall_is_handed_on(plates: Path, tmp_path: Path, monkeypatch: py
         raise KeyboardInterrupt
 
     monkeypatch.setattr("avmsf.cli.evaluate.run_objects", stop)
-    words = ["farthest", str(plates), *CHEAP, "--output", str(tmp_path / "results"), "--body.wall", "0"]
+    words = ["farthest", str(plates), *CHEAP, "--output", str(tmp_path / "results"), "--set", "body.wall=0"]
     assert run(Options.parse([*words, "--geometry", "noisy"])) == 130
     inputs = asked[0].inputs
     assert (inputs.body.wall, inputs.geometry) == (0.0, "noisy")

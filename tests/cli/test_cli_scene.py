@@ -19,11 +19,12 @@ from avmsf.mesh import Surface
 from avmsf.mesh.surface import write_surface
 from avmsf.photographs.folder import write_views
 from factories.plate_capture import PLATE, TINY, fill_plate
+from factories.settings import sets
 from factories.small_scene import SMALL_SPLAT, THICKNESS, slab_views, write_surface_file
 
 Streams = pytest.CaptureFixture[str]
-LIFT = ("--lift.encoder", "descriptors", "--lift.points", "1200")
-RENDERED = ("--views.rendered", "48", "--views.count", "18")
+LIFT = sets("lift.encoder=descriptors lift.points=1200")
+RENDERED = sets("views.rendered=48 views.count=18")
 MODES = ("--modes", "12")
 FIT = TINY[: -len(MODES)]
 SMALL = (*SMALL_SPLAT, *LIFT, *FIT, *MODES, "--gain-model", "network")
@@ -92,12 +93,12 @@ def test_the_same_command_makes_nothing_anew_and_another_setting_only_what_follo
     assert main(words) == 0
     kept_all = dict.fromkeys(("views", "cloud", "features", "modes", "fit"), False)
     assert made_now(capsys) == kept_all
-    assert main([*words, "--learning-rate", "2e-3"]) == 0
+    assert main([*words, "--set", "fit.learning_rate=2e-3"]) == 0
     found, messages = capsys.readouterr()
     assert {each["stage"]: each["fresh"] for each in json.loads(found)["stages"]} == kept_all | {"fit": True}
     cached = [(str(row), "5", name, " (cached)") for row, name in enumerate(("views", "cloud", "features", "modes"), 1)]
     assert counts(messages) == [*cached, ("5", "5", "field", "")]
-    assert main([*words, "--lift.components", "4"]) == 0
+    assert main([*words, "--set", "lift.components=4"]) == 0
     assert made_now(capsys) == kept_all | {"features": True, "fit": True}
 
 
@@ -152,7 +153,7 @@ def test_a_mesh_is_the_object_itself(tmp_path: Path, capsys: Streams) -> None:
     folder.mkdir()
     write_surface_file(folder)
     output = tmp_path / "features.safetensors"
-    words = ["fit", str(folder), "--until", "features", *LIFT[:2], "--lift.points", "700", *RENDERED]
+    words = ["fit", str(folder), "--until", "features", *LIFT[:2], "--set", "lift.points=700", *RENDERED]
     assert main([*words, "--output", str(output)]) == 0
     capsys.readouterr()
     features, report = load_features(output), read_report(output)
@@ -194,7 +195,7 @@ def test_a_gain_model_without_features_reads_the_shape_of_views_and_no_encoder(
     words = ["fit", str(capture), "--cache", str(tmp_path / "cache"), "--gain-model", "smooth", *SMALL_SPLAT, *TINY]
     stages = {}
     for given in ([], ["--features", str(kept / "features.safetensors")]):
-        assert main([*words, "--lift.encoder", "facebook/dinov2-base", *given, "--json"]) == 0
+        assert main([*words, "--set", "lift.encoder=facebook/dinov2-base", *given, "--json"]) == 0
         values = json.loads(capsys.readouterr().out)
         assert values["surface"] is not None
         stages[len(given)] = [each["stage"] for each in values["stages"]]

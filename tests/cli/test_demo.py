@@ -11,7 +11,7 @@ from avmsf.cli import demo, main
 from avmsf.field.store import load
 from avmsf.gaussians.ply import read_splats
 
-SMALL = "--views.count 6 --splat.steps 30 --splat.start-points 400 --gain-model thin-plate --steps 2"
+SMALL = "--set views.count=6 --set splat.steps=30 --set start_points=400 --set fit.steps=2 --gain-model thin-plate"
 
 
 @pytest.mark.slow
@@ -31,7 +31,7 @@ def test_the_demo_errs_by_half_of_the_nearest_recording_and_finds_the_wall(
 def test_the_demo_goes_all_the_way(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    check, fit, *others = [each.replace("--splat.steps 500", SMALL) for each in demo.COMMANDS]
+    check, fit, *others = [each.replace("--set splat.steps=500", SMALL) for each in demo.COMMANDS]
     monkeypatch.setattr(demo, "COMMANDS", [check, fit, *others])
     folder = tmp_path / "a demo"
     assert main(["demo", str(folder)]) == 0

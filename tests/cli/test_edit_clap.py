@@ -17,9 +17,10 @@ from avmsf.evaluation.clap import Clap
 from avmsf.field.store import load, save
 from factories.made_clap import save_clap
 from factories.raising import raises
+from factories.settings import sets
 
 PROMPT = "a bell"
-QUICK = ("--prompt", PROMPT, "--model", "here", "--steps", "5", "--contacts-per-step", "2", "--preview-every", "2")
+QUICK = ("--prompt", PROMPT, "--model", "here", *sets("guide.steps=5 guide.contacts_per_step=2 guide.preview_every=2"))
 
 
 @pytest.fixture
@@ -30,7 +31,7 @@ def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     save(ceramic(), tmp_path / "plate.safetensors")
     model = Echo(adjust_modes(ceramic(), pitch=1.02).render(PLACES[:1])[0])
     monkeypatch.setattr(edit.StableAudio, "load", lambda *_, **__: model)
-    return [str(tmp_path / "plate.safetensors"), *QUICK, "--clap", str(tmp_path / "clap")]
+    return [str(tmp_path / "plate.safetensors"), *QUICK, "--set", f"prompt.clap={tmp_path / 'clap'}"]
 
 
 def test_the_curve_is_stored_drawn_and_shown(
@@ -89,17 +90,13 @@ def test_an_interrupted_edit_has_the_whole_curve(
     assert not kept.exists()
     # Without a state to go on from, old scores are of another edit.
     kept.write_text(text, encoding="utf-8")
-    assert run(Options.parse([*part, "--preview-every", "3"])) == 0
+    assert run(Options.parse([*part, "--set", "guide.preview_every=3"])) == 0
     assert report("part.safetensors")["steps"] == [0, 3, 5]
 
 
-@pytest.mark.parametrize(
-    "given", [("--like", "a.wav", "--clap", "x"), ("--prompt", "a", "--clap", "x", "--preview-every", "0")]
-)
-def test_scores_need_a_prompt_and_previews(given: tuple[str, ...], tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "given"), [("prompt", ("--like", "a.wav")), ("prompt.clap", ("--prompt", "a"))])
+def test_scores_need_a_prompt_and_previews(name: str, given: tuple[str, str], tmp_path: Path) -> None:
     save(ceramic(), tmp_path / "plate.safetensors")
-    (tmp_path / "a.wav").write_bytes(b"")
-    words = [str(tmp_path / "plate.safetensors"), "--output", str(tmp_path / "new.safetensors"), "--clap", "x"]
-    options = Options.parse([*words, *(str(tmp_path / each) if each == "a.wav" else each for each in given)])
-    with raises(AvmsfError, name="--clap"):
-        options.check_inputs()
+    words = [str(tmp_path / "plate.safetensors"), "--output", str(tmp_path / "new.safetensors"), *given]
+    with raises(AvmsfError, name=name):
+        Options.parse([*words, *sets("prompt.clap=x guide.preview_every=0")]).check_inputs()

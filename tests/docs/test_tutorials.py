@@ -13,6 +13,7 @@ from avmsf.evaluation.registry import METHODS, METRICS
 from avmsf.photographs.folder import write_views
 from factories.plate_capture import fill_plate
 from factories.plate_set import fill_plates
+from factories.settings import sets
 from factories.small_scene import slab_views
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -21,13 +22,13 @@ PAGES = (*sorted((DOCS / "tutorials").glob("*.md")), REPOSITORY / "README.md", D
 """Tutorials first: what they have run in the same folder is not repeated for README and getting started."""
 PHOTOGRAPHS, PYTHON = "**With photographs**", "## Python"
 """Where README turns from a capture with a mesh to one with photographs, and to Python."""
-FEW_STEPS = ("--splat.steps", "60", "--splat.start-points", "800")
-FEW_VIEWS = ("--views.rendered", "48", "--views.count", "18")
+FEW_STEPS = sets("splat.steps=60 splat.start_points=800")
+FEW_VIEWS = sets("views.rendered=48 views.count=18")
 SMALL = {
-    "fit bowl.ply": ("--modes", "8", "--body.dofs", "2000", "--body.wall", "0.003"),
+    "fit bowl.ply": ("--modes", "8", *sets("body.dofs=2000 body.wall=0.003")),
     "fit": (
-        *(*FEW_STEPS, *FEW_VIEWS, "--lift.encoder", "descriptors", "--lift.no-symmetry"),
-        *("--gain-model", "smooth", "--modes", "8", "--steps", "4"),
+        *(*FEW_STEPS, *FEW_VIEWS, *sets("lift.encoder=descriptors lift.symmetry=false")),
+        *("--gain-model", "smooth", "--modes", "8", "--set", "fit.steps=4"),
     ),
     "evaluate": ("--modes", "8"),
     "evaluate shots": ("--methods", "knn3", "--counts", "3", "--starts", "1", "--modes", "8"),

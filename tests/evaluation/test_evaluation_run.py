@@ -262,7 +262,7 @@ def test_another_encoder_is_named_by_its_option(tmp_path: Path) -> None:
     results.begin({"protocol": "farthest"}, {"field": f"Field(width=3){ENCODER}descriptors"})
     with raises(EvaluationError, name="field") as caught:
         results.begin({"protocol": "farthest"}, {"field": f"Field(width=3){ENCODER}facebook/dinov2-base"})
-    assert "--lift.encoder descriptors" in str(caught.value)
+    assert "--set lift.encoder=descriptors" in str(caught.value)
     assert "width" not in str(caught.value)
     with raises(EvaluationError, name="field") as caught:
         results.begin({"protocol": "farthest"}, {"field": f"Field(width=4){ENCODER}descriptors"})

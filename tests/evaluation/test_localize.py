@@ -144,7 +144,7 @@ def test_heat_maps_have_the_true_contacts_and_the_papers_methods_their_own_dista
     monkeypatch.setattr("avmsf.evaluation.case_run.located", watched)
     monkeypatch.setattr(report, "draw_contact", draw)
     words = ["evaluate", "localize", str(data), "--objects", "a", "--methods", "field-auto,paper-grid,paper,nearest"]
-    words += ["--lift.encoder", "descriptors", "--output", str(results), "--figures"]
+    words += ["--set", "lift.encoder=descriptors", "--output", str(results), "--figures"]
     assert main(words) == 0
     assert set(asked) == {False, True}
     assert asked[True].shape == (4, 3)

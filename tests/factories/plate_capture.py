@@ -7,6 +7,7 @@ import torch
 
 from avmsf.capture import Capture, write_capture
 from avmsf.mesh import Surface
+from factories.settings import sets
 from oracles.plate import Plate, sample_contacts, strike
 
 RATE, HIGHEST, CONTACT_TIME = 8000.0, 2500.0, 5e-4
@@ -14,8 +15,9 @@ PLATE = Plate(alpha=40.0)
 """Damped, so that half a second is enough for it to die away."""
 
 TINY = (
-    *("--clusters", "8", "--width", "16", "--hidden", "32", "--layers", "1", "--fft-sizes", "1024", "256"),
-    *("--warmup-steps", "12", "--steps", "6", "--early", "1024", "--damping", "shared", "--modes", "12"),
+    *sets("fit.clusters=8 fit.width=16 fit.hidden=32 fit.layers=1 fit.fft_sizes=1024,256 fit.warmup_steps=12"),
+    *sets("fit.steps=6 fit.early=1024 fit.damping=shared"),
+    *("--modes", "12"),
 )
 
 

@@ -51,7 +51,7 @@ def test_the_paper_preset_deviates_nowhere_that_there_is_a_switch_for() -> None:
 
 def test_commands_start_from_the_preset_and_change_what_is_said() -> None:
     assert FitOptions.parse(["mug", "--preset", "paper"]).pipeline == PRESETS["paper"]
-    words = ["mug", "--lift.encoder", "descriptors", "--preset", "paper", "--steps", "7"]
+    words = ["mug", "--set", "lift.encoder=descriptors", "--preset", "paper", "--set", "fit.steps=7"]
     mixed = FitOptions.parse(words).pipeline
     assert (mixed.fit.steps, mixed.fit.clusters) == (7, 256)
     assert (mixed.scene.lift.encoder, mixed.scene.lift.onto) == ("descriptors", "gaussians")
@@ -73,7 +73,7 @@ def test_no_setting_of_a_preset_is_left_out_by_the_commands(monkeypatch: pytest.
     scene = SceneConfig(ViewsConfig(count=9), SplatConfig(steps=8), LiftConfig(angles=7))
     other = PipelineConfig("smooth", BodyConfig(wall=0.5), scene, FitConfig(steps=6), "short-time", 5, "peak", "cpu")
     assert all(getattr(other, each.name) != getattr(PipelineConfig(), each.name) for each in fields(other))
-    monkeypatch.setattr("avmsf.cli.options.common.PRESETS", {"default": PipelineConfig(), "paper": other})
+    monkeypatch.setitem(PRESETS, "paper", other)
     assert FitOptions.parse(["mug", "--preset", "paper"]).pipeline == other
 
 

@@ -187,7 +187,7 @@ def test_a_mesh_or_its_file_and_a_material_give_a_field(tmp_path: Path):
 def test_a_mesh_and_a_material_give_a_field_from_the_command_line(tmp_path: Path, capsys):
     write_surface(box(LENGTH, WIDTH, HEIGHT), tmp_path / "surface.ply")
     output = tmp_path / "field.safetensors"
-    words = ["--material", "steel", "--modes", "12", "--body.dofs", "6000", "--output", str(output)]
+    words = ["--material", "steel", "--modes", "12", "--set", "body.dofs=6000", "--output", str(output)]
     assert main(["fit", str(tmp_path), *words]) == 0
     assert "No recordings" in capsys.readouterr().out
     field = load(output)

@@ -94,6 +94,6 @@ def test_reconstruct_refuses_them_before_it_fits_gaussians(tmp_path: Path, capsy
         shutil.move(part, folder / part.name)
     with open(folder / "capture.toml", "a") as file:
         file.write('views_unit = "cm"\n')
-    assert main(["fit", str(folder), "--gain-model", "visual", "--lift.encoder", "descriptors"]) == 2
+    assert main(["fit", str(folder), "--gain-model", "visual", "--set", "lift.encoder=descriptors"]) == 2
     assert 'views_unit = "m"' in capsys.readouterr().err
     assert not (folder / ".avmsf" / "cloud.ply").exists()

@@ -17,12 +17,13 @@ from avmsf.pipeline.config import CACHE
 from avmsf.pipeline.shape import SURFACE
 from avmsf.simulate.recipe import EXAMPLE, EXAMPLE_FOLDER
 from factories.plate_capture import TINY, fill_plate
+from factories.settings import sets
 from factories.small_scene import SMALL_SPLAT, slab_views
 
 Streams = pytest.CaptureFixture[str]
 SMALL = (
     *SMALL_SPLAT,
-    *("--lift.encoder", "descriptors", "--lift.points", "600", "--lift.no-symmetry", "--modes", "12"),
+    *(*sets("lift.encoder=descriptors lift.points=600 lift.symmetry=false"), "--modes", "12"),
     *TINY[:-2],
 )
 
@@ -39,7 +40,7 @@ def slab(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_photographs_alone_give_elastic_mode_shapes(slab: Path, capsys: Streams) -> None:
-    bodies = ("--body.wall", "0", "--body.shapes", "6", "--body.dofs", "1500", "--body.supports", "free")
+    bodies = (*sets("body.wall=0 body.shapes=6 body.dofs=1500 body.supports=free"),)
     assert main(["fit", str(slab), *SMALL, *bodies, "--json"]) == 0
     made = json.loads(capsys.readouterr().out)
     report = made["report"]
@@ -55,9 +56,9 @@ def test_photographs_alone_give_elastic_mode_shapes(slab: Path, capsys: Streams)
 def test_the_thickness_of_a_wall_reaches_the_report_and_the_summary(tmp_path: Path, capsys: Streams) -> None:
     folder = tmp_path / "mug"
     shutil.copytree(EXAMPLE_FOLDER, folder)
-    words = ["--splat.steps", "100", "--splat.start-points", "3000", "--lift.encoder", "descriptors"]
-    words += ["--lift.no-symmetry", "--steps", "2", "--train-count", "12", "--modes", "32"]
-    bodies = ["--body.shapes", "16", "--body.dofs", "8000", "--body.supports", "free"]
+    words = [*sets("splat.steps=100 splat.start_points=3000 lift.encoder=descriptors")]
+    words += [*sets("lift.symmetry=false fit.steps=2"), "--train-count", "12", "--modes", "32"]
+    bodies = [*sets("body.shapes=16 body.dofs=8000 body.supports=free")]
     assert main(["fit", str(folder), *words, *bodies, "--json"]) == 0
     made = json.loads(capsys.readouterr().out)
     found = made["report"]["thickness"]

@@ -331,8 +331,8 @@ def test_truths_that_are_damaged_or_of_something_else_are_refused(simulation: Si
 def test_the_command_makes_an_object_of_a_mesh_and_keeps_it(
     recipe: ObjectRecipe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["--mesh", str(recipe.mesh), "--thickness", "0.006", "--detail", "0.2", "--material", "glass"]
-    words += ["--impacts", "4", "--seconds", "1", "--views", "0", "--elastic-modes", "6"]
+    words = ["--mesh", str(recipe.mesh), "--thickness", "0.006", "--set", "detail=0.2", "--material", "glass"]
+    words += ["--impacts", "4", "--seconds", "1", "--views", "0", "--set", "elastic_modes=6"]
     words += ["--output", str(tmp_path / "mine")]
     assert simulate.run(options.Options.parse(words)) == 0
     assert "mine: done (1 of 1" in capsys.readouterr().err

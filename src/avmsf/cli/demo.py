@@ -21,9 +21,9 @@ BEGUN = ".begun"
 # A quarter of the Gaussians' usual steps: the field's error is the same within the variation of runs.
 COMMANDS = (
     "check {0}/capture",
-    "fit {0}/capture --train-count 12 --splat.steps 500 --output {0}/mug.safetensors",
-    "fit {0}/capture --until gaussians --splat.steps 500 --output {0}/mug.ply",
-    "fit {0}/capture --until surface --splat.steps 500 --output {0}/mug-surface.ply",
+    "fit {0}/capture --train-count 12 --set splat.steps=500 --output {0}/mug.safetensors",
+    "fit {0}/capture --until gaussians --set splat.steps=500 --output {0}/mug.ply",
+    "fit {0}/capture --until surface --set splat.steps=500 --output {0}/mug-surface.ply",
     "info {0}/mug.safetensors --capture {0}/capture --plots {0}/pictures",
     "render {0}/mug.safetensors --contact-table {0}/capture/impacts.csv --output {0}/sounds --normalize peak",
     "export {0}/mug.safetensors --to web --capture {0}/capture --object {0}/mug.ply --output {0}/mug.html --overwrite",

@@ -13,21 +13,9 @@ from torch import Tensor
 
 from avmsf._utils.files import write_whole
 from avmsf._utils.text import counted, format_number, read_json
-from avmsf.capture.settings import METRES
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.contacts import contacts_at, refuse_far
-from avmsf.cli.options.common import Unit
-from avmsf.cli.options.edit import (
-    AFTER,
-    BEFORE,
-    CURVE,
-    MODES,
-    SPECTROGRAMS,
-    GuideOptions,
-    MaterialOptions,
-    ModeOptions,
-    Options,
-)
+from avmsf.cli.options.edit import AFTER, BEFORE, CURVE, MODES, SPECTROGRAMS, EditSettings, Options
 from avmsf.cli.printing import console, decimals, next_command, print_json, say, table
 from avmsf.cli.progress import ProgressBar
 from avmsf.cli.writing import Level, write_sound
@@ -62,7 +50,7 @@ _LOUD_NOISE_DB = 6.0
 """Decrease of the modes' level, dB, from which on the noise, whose level stays, may be too loud: half the amplitude."""
 
 
-def _adjustments(options: ModeOptions, named: Float[Tensor, " modes"]) -> dict[str, Any]:
+def _adjustments(options: Options, named: Float[Tensor, " modes"]) -> dict[str, Any]:
     """Return what `edit` does with each mode by hand; modes are called by the frequencies `named`, Hz."""
     levels = torch.zeros(len(named), dtype=torch.float64)
     pitch, decay = torch.full_like(levels, options.pitch), torch.full_like(levels, options.decay)
@@ -93,7 +81,7 @@ def _called(frequency: float, named: Float[Tensor, " modes"], option: str) -> in
 def run(options: Options) -> int:
     """Edit, write, and print the result; return 130 where Ctrl-C stopped it."""
     old = load(options.field)
-    contact = _contact(old, options.position, unit=options.unit)
+    contact = _contact(old, options.position)
     try:
         new = _edited(options, old)
     except KeyboardInterrupt:
@@ -102,7 +90,7 @@ def run(options: Options) -> int:
         say(f"avmsf edit: interrupted; run the same command again to continue {where}")
         return INTERRUPTED
     save(new, options.output)
-    if options.steering.asked:
+    if options.guides:
         for ending in ("checkpoint", "preview.wav", "clap.json"):
             _next_to(options.output, ending).unlink(missing_ok=True)
     edits = new.origin.report[EDITS][len(old.origin.report.get(EDITS, [])) :]
@@ -118,8 +106,8 @@ def run(options: Options) -> int:
             f"render and export with --seconds {math.ceil(10 * ringing) / 10:g}",
             soft_wrap=True,
         )
-    if options.change.size != 1.0:
-        screen.print(f"note: positions on the edited object are {options.change.size:g} times as large", soft_wrap=True)
+    if options.scale != 1.0:
+        screen.print(f"note: positions on the edited object are {options.scale:g} times as large", soft_wrap=True)
     softer = _level(before) - _level(after)
     if _LOUD_NOISE_DB < softer < math.inf and bool(new.residual.magnitude.any()):
         screen.print(
@@ -128,7 +116,7 @@ def run(options: Options) -> int:
             soft_wrap=True,
         )
     if options.plots is not None:
-        _show(options.plots, (old, contact), (new, options.change.size * contact))
+        _show(options.plots, (old, contact), (new, options.scale * contact))
         if CLAP in edits[-1]:
             _show_scores(options.plots / CURVE, edits[-1])
     screen.print(f"wrote {options.output}", soft_wrap=True)
@@ -149,28 +137,21 @@ def run(options: Options) -> int:
 
 def _edited(options: Options, field: SoundField) -> SoundField:
     """Return the edited field: material, size and modes by `edit`, then the guided edit."""
-    change, guide = options.change, options.steering
+    settings = options.all_settings
     old: Material | None = None
     target: Material | None = None
-    if change.asked or guide.like_material is not None:
-        new = None if change.material is None else material_named(change.material)
-        old = old_material(field, new=new) if change.old is None else material_named(change.old)
-    if change.asked and old is not None:
-        target = _target(change, old)
-    if change.asked or options.sliders.asked:
-        adjusted = _adjustments(options.sliders, field.bank.frequency) if options.sliders.asked else dict[str, Any]()
-        field = edit(field, material=target, old_material=old, size=change.size, law=LAWS[change.law], **adjusted)
-    if guide.asked:
-        field = _guided(guide, field, output=options.output, old=target or old)
-    return field
-
-
-def _target(change: MaterialOptions, old: Material) -> Material:
-    """Return the new material of an object of `old`."""
-    new = old if change.material is None else material_named(change.material)
-    if change.constants:
-        new = replace(new, name=f"{new.name} with {', '.join(change.constants)} changed", **change.constants)
-    return new
+    if options.changes_material or options.like_material is not None:
+        new = None if options.to is None else material_named(options.to)
+        old = old_material(field, new=new) if options.old is None else material_named(options.old)
+    if options.changes_material and old is not None:
+        target = old if options.to is None else material_named(options.to)
+        if constants := settings.material.constants:
+            target = replace(target, name=f"{target.name} with {', '.join(constants)} changed", **constants)
+    if options.changes_material or options.changes_modes:
+        adjusted = _adjustments(options, field.bank.frequency) if options.changes_modes else dict[str, Any]()
+        law = LAWS[settings.material.law]
+        field = edit(field, material=target, old_material=old, size=options.scale, law=law, **adjusted)
+    return _guided(options, settings, field, target or old) if options.guides else field
 
 
 def old_material(field: SoundField, *, new: Material | None = None) -> Material:
@@ -180,19 +161,19 @@ def old_material(field: SoundField, *, new: Material | None = None) -> Material:
     return material
 
 
-def _guided(options: GuideOptions, field: SoundField, *, output: Path, old: Material | None) -> SoundField:
+def _guided(options: Options, settings: EditSettings, field: SoundField, old: Material | None) -> SoundField:
     """Return the field edited towards a prompt, recordings, or the sound of a material.
 
-    State and preview are written next to `output`, its later file, so that the same command continues to the same
-    result. `old` is the field's material, needed only for `like_material`.
+    State and preview are written next to the output, so that the same command continues to the same result. `old` is
+    the field's material, needed only for `like_material`.
     """
-    preview, checkpoint = _next_to(output, "preview.wav"), _next_to(output, "checkpoint")
+    preview, checkpoint = _next_to(options.output, "preview.wav"), _next_to(options.output, "checkpoint")
     curve: ClapCurve | None = None
-    if options.clap is not None and options.prompt is not None:
-        clap, kept = Clap.load(options.clap), _next_to(output, "clap.json")
+    if settings.prompt.clap is not None and options.prompt is not None:
+        clap, kept = Clap.load(settings.prompt.clap), _next_to(options.output, "clap.json")
         curve = ClapCurve(clap, options.prompt, field, kept, resumed=checkpoint.exists())
     # After CLAP: a wrong name of its network is refused before the large model is loaded.
-    guide = _guide(options, field, old)
+    guide = _guide(options, settings, field, old)
     with ProgressBar() as bar:
 
         def progress(reached: GuidedEditProgress) -> None:
@@ -206,7 +187,7 @@ def _guided(options: GuideOptions, field: SoundField, *, output: Path, old: Mate
             bar.step("edit", reached.step, reached.steps, message)
 
         edited = edit_towards(
-            field, guide, config=options.config, parameters=PARAMETERISATIONS[options.parameters], progress=progress,
+            field, guide, config=settings.guide, parameters=PARAMETERISATIONS[settings.parameters], progress=progress,
             checkpoint=checkpoint,
         )  # fmt: skip
     if curve is None:
@@ -216,24 +197,25 @@ def _guided(options: GuideOptions, field: SoundField, *, output: Path, old: Mate
     return replace(edited, origin=replace(edited.origin, report=report))
 
 
-def _guide(options: GuideOptions, field: SoundField, old: Material | None) -> Guide:
+def _guide(options: Options, settings: EditSettings, field: SoundField, old: Material | None) -> Guide:
+    prompted, seed = settings.prompt, settings.guide.seed
     if options.like_material is not None:
         assert old is not None
-        return Reference.of_material(field, old, material_named(options.like_material), seed=options.config.seed)
+        return Reference.of_material(field, old, material_named(options.like_material), seed=seed)
     if options.prompt is None:
         return Reference.read(options.like, sample_rate=field.sample_rate)
     say(f"loading {options.model}")
-    model = StableAudio.load(options.model, seconds=options.model_seconds, device=options.device)
-    if options.generated is not None:
-        seconds = _GENERATED_SECONDS if options.model_seconds is None else options.model_seconds
-        made = model.generate(options.prompt, seconds=seconds, seed=options.config.seed, negative=options.negative)
-        write_sound(options.generated, made, sample_rate=model.sample_rate, coding="float32")
+    model = StableAudio.load(options.model, seconds=prompted.model_seconds, device=prompted.device)
+    if prompted.generated is not None:
+        seconds = _GENERATED_SECONDS if prompted.model_seconds is None else prompted.model_seconds
+        made = model.generate(options.prompt, seconds=seconds, seed=seed, negative=prompted.negative)
+        write_sound(prompted.generated, made, sample_rate=model.sample_rate, coding="float32")
     return DecoderDistillation(
         model,
         options.prompt,
         sample_rate=field.sample_rate,
-        negative=options.negative,
-        config=options.distillation,
+        negative=prompted.negative,
+        config=prompted.distillation,
     )
 
 
@@ -289,11 +271,11 @@ def _read_scores(path: Path, clap: Clap) -> dict[int, float]:
     return scores
 
 
-def _contact(field: SoundField, at: tuple[float, float, float] | None, *, unit: Unit = "m") -> Float[Tensor, " 3"]:
+def _contact(field: SoundField, at: tuple[float, float, float] | None) -> Float[Tensor, " 3"]:
     """Return the contact of the sounds: the requested one, or the loudest of some."""
     if at is not None:
-        chosen = contacts_at([at], meters=METRES[unit])
-        refuse_far(chosen, field, advice=", see --unit")
+        chosen = contacts_at([at], meters=1.0)
+        refuse_far(chosen, field, advice=", in meters")
         return chosen.places[0].double()
     points = field.gain_field.points
     some = points[:: max(1, len(points) // _CANDIDATES)]

@@ -130,14 +130,14 @@ def evaluation_of(
 
     Raises SceneError for an encoder, and EvaluationError for a device, that is not available.
     """
-    device, body = options.device, options.body
+    device, shared = options.device, options.shared
     if device is not None:
         usable_device(device, raising=EvaluationError, kinds=TRAINABLE)
     kept = (options.cache or folder / "features").resolve()
-    lift, paper = settled_lifts(options.lift, inputs_of(methods, protocol), device=device)
-    given = SceneConfig(ViewsConfig(source=options.visual_source), options.splat, options.lift)
+    lift, paper = settled_lifts(shared.lift, inputs_of(methods, protocol), device=device)
+    given = SceneConfig(ViewsConfig(source=options.visual_source), shared.splat, shared.lift)
     inputs = ObjectInputs(
-        dataset, kept, replace(given, lift=lift), paper, options.geometry, body, device, seed=options.seed
+        dataset, kept, replace(given, lift=lift), paper, shared.geometry, shared.body, device, seed=options.seed
     )
     cdpam = not options.no_cdpam and not protocol.locating
     return Evaluation(
@@ -147,11 +147,11 @@ def evaluation_of(
         methods,
         inputs,
         options.seed,
-        MetricSettings(level=options.amplitude_scale, cdpam=cdpam, cdpam_contacts=options.cdpam_contacts),
-        finder_named(options.extraction, options.modes),
-        {"scene": asdict(given), "paper": asdict(paper), "geometry": options.geometry, "body": asdict(body)},
+        MetricSettings(level=shared.amplitude_scale, cdpam=cdpam, cdpam_contacts=options.cdpam_contacts),
+        finder_named(shared.extraction, shared.modes),
+        {"scene": asdict(given), "paper": asdict(paper), "geometry": shared.geometry, "body": asdict(shared.body)},
         device,
-        None if lift == options.lift else lift.encoder,
+        None if lift == shared.lift else lift.encoder,
         options.time_zero,
     )
 
@@ -171,8 +171,8 @@ def _note_start(methods: Sequence[Method], time_zero: TimeZero | None) -> None:
     for method in methods:
         if isinstance(method, RecordedMethod) and time_zero == "peak":
             say(
-                f"note: the files of {method.name} are taken as they are; with --time-zero peak each has to start at "
-                "its largest sample, as the recordings do"
+                f"note: the files of {method.name} are taken as they are; with --time-zero peak each has to start "
+                "at its largest sample, as the recordings do"
             )
         wanted = method.pipeline.time_zero if isinstance(method, FieldMethod) else None
         if wanted not in (None, time_zero):

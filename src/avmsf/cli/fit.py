@@ -136,7 +136,7 @@ def _fit(options: Options, settings: CaptureSettings) -> None:
                 "quality": None if fitted.quality is None else fitted.quality.level,
                 "surface": None if made.surface is None else str(made.surface),
                 "preset": options.preset,
-                "config": asdict(options.config),
+                "config": asdict(options.pipeline.fit),
                 "features_report": made.report,
                 "stages": [asdict(each) for each in made.stages],
                 "sample_rate": fitted.sample_rate,

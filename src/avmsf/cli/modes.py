@@ -54,7 +54,7 @@ def run(options: Options) -> int:
                 "recordings": len(impacts),
                 "sample_rate": impacts.sample_rate,
                 "seconds": impacts.duration,
-                "method": options.extraction,
+                "method": options.pipeline.extraction,
                 "alignment": None if aligned is None else asdict(aligned),
                 "modes": [asdict(row) | asdict(how) for row, how in modes],
                 "supporting_poles": [asdict(row) | asdict(how) for row, how in supporting],

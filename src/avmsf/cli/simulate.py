@@ -1,6 +1,5 @@
 """`avmsf simulate`: objects whose modes and gains are known, struck, recorded and photographed."""
 
-from dataclasses import fields, replace
 from pathlib import Path
 
 from avmsf.cli import INTERRUPTED
@@ -42,12 +41,7 @@ def run(options: Options) -> int:
 def _chosen(options: Options, output: Path) -> tuple[dict[str, ObjectRecipe], Path]:
     """Return the recipes by their folders' names, and the folder that holds these."""
     if options.what == SET:
-        changes = {
-            each.name: getattr(options.recipe, each.name)
-            for each in fields(ObjectRecipe)
-            if getattr(options.recipe, each.name) != getattr(ObjectRecipe(), each.name)
-        }
-        return {name: replace(recipe, **changes) for name, recipe in SIM20.items()}, output
+        return {name: options.applied(recipe) for name, recipe in SIM20.items()}, output
     place = output.resolve()
     return {place.name: options.recipe}, place.parent
 

@@ -125,7 +125,7 @@ class ResultsFolder:
                 parts = [each.partition(ENCODER) for each in (methods[name], kept[name])]
                 ours, theirs = "these settings and weights", "others"
                 if parts[0][0] == parts[1][0]:
-                    ours, theirs = (f"--lift.encoder {each[2]}" for each in parts)
+                    ours, theirs = (f"--set lift.encoder={each[2]}" for each in parts)
                 raise self._of_another(name, kept[name], f"of {name} made with {ours}", f"those made with {theirs}")
         write_json(place, {**wanted, "methods": {**kept, **methods}})
 

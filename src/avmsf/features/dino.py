@@ -119,7 +119,7 @@ def _download(name: str) -> Path:
         got = f"none: they could not be downloaded ({why_not(error)})"
         advice = (
             f"save {', '.join(_FILES)} from https://huggingface.co/{name}/tree/main in one FOLDER and use "
-            "--lift.encoder FOLDER, or use --lift.encoder descriptors, which needs no download"
+            "lift.encoder=FOLDER, or use lift.encoder=descriptors, which needs no download"
         )
         raise SceneError.expected(f"the weights of {name}", name, got=got, name="encoder", advice=advice) from error
 
@@ -168,6 +168,6 @@ def _model_classes() -> dict[str, Any]:
         from transformers import Dinov2Model, Dinov2WithRegistersModel
     except (ImportError, RuntimeError) as error:  # RuntimeError: one of its own optional packages is broken
         wanted, got = "the package transformers for DINOv2", f"an import error ({error})"
-        advice = "pip install 'avmsf[vision]', or use --lift.encoder descriptors"
+        advice = "pip install 'avmsf[vision]', or use --set lift.encoder=descriptors"
         raise SceneError.expected(wanted, got=got, name="transformers", advice=advice) from error
     return {"dinov2": Dinov2Model, "dinov2_with_registers": Dinov2WithRegistersModel}

@@ -92,7 +92,7 @@ class ProbableBody:
         wrong, measure = "body", "check the unit of the mesh"
         if self.wall_thickness is not None:
             wrong = f"wall of {1000 * self.wall_thickness:.2g} mm"
-            measure = "measure the wall and give --body.wall"
+            measure = "measure the wall and give --set body.wall=METERS"
         return (
             f"The fit needs {over:.2g} times the stiffness-to-density ratio of {STIFFEST.name}, the stiffest material "
             f"of the table, so the {wrong} is probably wrong, as where directions of impacts on edges are missing: "

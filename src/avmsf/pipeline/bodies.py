@@ -57,7 +57,7 @@ def wall_error(surface: Surface | Shape, wall: float, error: SimulationError) ->
         wanted = f"a wall thickness in meters that an object of {extent:.3g} m can have"
         advice = "give it in meters, as 0.003 for 3 mm, or leave it out"
     return SimulationError(
-        f"--body.wall: expected {wanted}, got {wall:g} m ({reasons}); {advice}", name="wall", value=wall
+        f"body.wall: expected {wanted}, got {wall:g} m ({reasons}); {advice}", name="wall", value=wall
     )
 
 

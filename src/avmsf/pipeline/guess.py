@@ -135,7 +135,7 @@ def _body(
     if between is not None and config.wall is None:
         low, high = (1000 * each for each in between)
         raise FitError(
-            f"wall: expected the wall thickness, which sets the frequencies; give it in meters by --body.wall (0: "
+            f"wall: expected the wall thickness, which sets the frequencies; give it by --set body.wall=METERS (0: "
             f"solid; by the views {low:.2g} to {high:.2g} mm)",
             name="wall",
             value=between,
@@ -151,7 +151,7 @@ def _body(
         if config.wall:
             raise
         raise SimulationError(
-            f"{error}; give the wall thickness in meters by --body.wall",
+            f"{error}; give the wall thickness by --set body.wall=METERS",
             file=error.file,
             name="wall",
             value=error.value,

@@ -1,16 +1,17 @@
 """Options of `avmsf edit`."""
 
-import dataclasses
 import math
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from avmsf.cli.options.checks import OutputError, expect_device, expect_writable
-from avmsf.cli.options.common import Printing, Unit, option_of
+from avmsf.cli.options.common import Configured
 from avmsf.cli.options.paths import NEW_TENSORS, FieldFile, NewFile, PlotsFolder
+from avmsf.cli.options.settings import with_settings
 from avmsf.editing.config import STABLE_AUDIO, DistillationConfig, GuidedEditConfig, check_prompt
 from avmsf.errors import EditError
 from avmsf.fem.material import material_named
@@ -20,31 +21,22 @@ _Pairs = tyro.conf.UseAppendAction[tuple[tuple[float, float], ...]]
 MODES, SPECTROGRAMS, BEFORE, AFTER = "modes.png", "spectrograms.png", "before.wav", "after.wav"
 CURVE = "clap.png"
 """What the folder of pictures holds."""
-_OF_THE_MODEL = ("--model", "--negative", "--model-seconds", "--device", "--generated", "--clap")
-"""Options that only a prompt needs."""
 
 
 @dataclass(frozen=True)
-class MaterialOptions:
-    """Change material and size by the laws of linear modal analysis; the shape stays."""
+class MaterialSettings:
+    """Constants of the new material in place of the table's, or without --to of the present material's."""
 
-    material: Annotated[str | None, tyro.conf.arg(name="to-material", metavar="NAME")] = None
-    """New material: ceramic, glass, wood, plastic, iron, polycarbonate or steel."""
-    old: Annotated[str | None, tyro.conf.arg(name="from", metavar="NAME")] = None
-    """Present material; by default estimated from the dampings of the modes."""
-    size: Annotated[float, tyro.conf.arg(name="scale")] = 1.0
-    """Lengths of the new object relative to the old one."""
     young: float | None = None
-    """Young's modulus of the new material in Pa, instead of the table's, as for the others below; without
-    --to-material, instead of the present material's."""
+    """Young's modulus, Pa."""
     density: float | None = None
-    """Density of the new material in kg/m3."""
+    """Density, kg/m3."""
     poisson: float | None = None
-    """Poisson's ratio of the new material; only its expected effect is printed."""
+    """Poisson's ratio; only its expected effect is printed."""
     alpha: float | None = None
-    """Mass-proportional Rayleigh damping of the new material in 1/s."""
+    """Mass-proportional Rayleigh damping, 1/s."""
     beta: float | None = None
-    """Stiffness-proportional Rayleigh damping of the new material in s."""
+    """Stiffness-proportional Rayleigh damping, s."""
     law: Literal["displacement", "velocity", "acceleration", "ratio-only"] = "displacement"
     """Quantity that the recordings are proportional to, which decides the level of each mode; ratio-only is the paper's
     law, which leaves mass and size out."""
@@ -52,19 +44,67 @@ class MaterialOptions:
     @property
     def constants(self) -> dict[str, float]:
         """The constants that are given."""
-        given = {name: getattr(self, name) for name in ("young", "density", "poisson", "alpha", "beta")}
+        given = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "law"}
         return {name: value for name, value in given.items() if value is not None}
-
-    @property
-    def asked(self) -> bool:
-        """Whether anything changes."""
-        return self.material is not None or self.size != 1.0 or bool(self.constants)
 
 
 @dataclass(frozen=True)
-class ModeOptions:
-    """Change modes directly."""
+class PromptSettings:
+    """Targets from a text-to-audio model."""
 
+    negative: str | None = None
+    """Text that describes what to move away from."""
+    model_seconds: float | None = None
+    """Length that the model works at; by default all that it was trained for, and time grows in proportion."""
+    device: str | None = None
+    """Device of the model, cpu or cuda; by default the GPU if there is one."""
+    generated: Path | None = None
+    """Also write the sound that the model makes from the prompt without the field to this wav file: the paper's
+    baseline."""
+    clap: str | None = None
+    """Also compute the CLAP score of the unedited field and of every preview with this network, a folder or a name on
+    the hub; needs the extra `eval`."""
+    distillation: DistillationConfig = field(default_factory=DistillationConfig)
+    """Targets from the model."""
+
+
+@dataclass(frozen=True)
+class EditSettings:
+    """Settings of an edit."""
+
+    material: MaterialSettings = field(default_factory=MaterialSettings)
+    """The new material."""
+    prompt: PromptSettings = field(default_factory=PromptSettings)
+    """Targets from a text-to-audio model."""
+    parameters: Literal["hierarchical", "published", "independent", "searched"] = "hierarchical"
+    """Parameters that are optimized. hierarchical: factors on all frequencies and all dampings, then single modes, with
+    a penalty. published: the paper's form, a factor on all frequencies and single modes without a penalty, gains times
+    f1/f2 at the end. independent: only single modes (Audio-SDS). searched: the same after a search for common
+    factors."""
+    guide: GuidedEditConfig = field(default_factory=GuidedEditConfig)
+    """How the modes are optimized."""
+
+
+@dataclass(frozen=True)
+class Options(Configured):
+    """Change a field's material, size, pitch or decay, or optimize it towards a text prompt or recordings.
+
+    Material and size first, by the laws of linear modal analysis; then the modes; then the optimization towards one of
+    a prompt, recordings and the sound of a material, of which a preview is written next to the output while it runs.
+    Repeat an interrupted command to continue it to the same result. The pattern of each mode over the object stays, so
+    the edited field can be rendered and used for localization like any other.
+    """
+
+    field: tyro.conf.Positional[FieldFile]
+    """Field file, as `avmsf fit` writes it."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="NEW.safetensors"), NEW_TENSORS]
+    """File to write the edited field to."""
+    to: Annotated[str | None, tyro.conf.arg(metavar="MATERIAL")] = None
+    """New material: ceramic, glass, wood, plastic, iron, polycarbonate or steel."""
+    old: Annotated[str | None, tyro.conf.arg(name="from", metavar="MATERIAL")] = None
+    """Present material; by default estimated from the dampings of the modes."""
+    scale: float = 1.0
+    """Lengths of the new object relative to the old one."""
     pitch: float = 1.0
     """Factor on all frequencies."""
     decay: float = 1.0
@@ -77,146 +117,70 @@ class ModeOptions:
     """Factor on the frequency of the mode at this frequency, in addition to --pitch."""
     mode_decay: Annotated[_Pairs, tyro.conf.arg(metavar="HZ FACTOR")] = ()
     """Factor on the decay time of the mode at this frequency, in addition to --decay."""
-
-    @property
-    def asked(self) -> bool:
-        """Whether anything changes."""
-        single = self.mode_db or self.mode_pitch or self.mode_decay
-        return (self.pitch, self.decay, self.brightness) != (1.0, 1.0, 0.0) or bool(single)
-
-
-@dataclass(frozen=True)
-class GuideOptions:
-    """Optimize the modes towards a text prompt, recordings, or the sound of a material; only one of them.
-
-    A preview of the sound is written next to the output while it runs. Repeat an interrupted command to continue it
-    to the same result.
-    """
-
     prompt: Annotated[str | None, tyro.conf.arg(metavar="TEXT")] = None
     """Text that describes the sound, such as "an impact on a wooden bowl", for a text-to-audio model; needs the extra
     `text`."""
-    like: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="WAV|FOLDER ...")] = ()
-    """Recordings of impacts on another object to imitate: files or folders of them."""
-    like_material: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Material to imitate statistically, with this object's modes in it by the laws of elasticity as the target;
-    --to-material follows these laws exactly."""
     model: Annotated[str, tyro.conf.arg(metavar="FOLDER|NAME")] = STABLE_AUDIO
     """Stable Audio pipeline: a folder, or its name on the hub."""
-    negative: Annotated[str | None, tyro.conf.arg(metavar="TEXT")] = None
-    """Text that describes what to move away from."""
-    model_seconds: float | None = None
-    """Length that the model works at; by default all that it was trained for, and time grows in proportion."""
-    device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda")] = None
-    """Device of the model; by default the GPU if there is one."""
-    generated: Annotated[Path | None, tyro.conf.arg(metavar="FILE.wav"), NewFile((".wav",))] = None
-    """Also write the sound that the model makes from the prompt without the field: the paper's baseline."""
-    clap: Annotated[str | None, tyro.conf.arg(metavar="FOLDER|NAME")] = None
-    """Also compute the CLAP score of the unedited field and of every preview with this network, a folder or a name on
-    the hub; needs the extra `eval`."""
-    parameters: Literal["hierarchical", "published", "independent", "searched"] = "hierarchical"
-    """Parameters that are optimized. hierarchical: factors on all frequencies and all dampings, then single modes, with
-    a penalty. published: the paper's form, a factor on all frequencies and single modes without a penalty, gains times
-    f1/f2 at the end. independent: only single modes (Audio-SDS). searched: the same after a search for common
-    factors."""
-    distillation: Annotated[tyro.conf.OmitArgPrefixes[DistillationConfig], tyro.conf.arg(name="")] = field(
-        default_factory=DistillationConfig
-    )
-    """Targets from the model."""
-    config: Annotated[tyro.conf.OmitArgPrefixes[GuidedEditConfig], tyro.conf.arg(name="")] = field(
-        default_factory=GuidedEditConfig
-    )
-    """How the modes are optimized."""
+    like: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="WAV|FOLDER ...")] = ()
+    """Recordings of impacts on another object to imitate: files or folders of them."""
+    like_material: Annotated[str | None, tyro.conf.arg(metavar="MATERIAL")] = None
+    """Material to imitate statistically, with this object's modes in it by the laws of elasticity as the target; --to
+    follows these laws exactly."""
+    plots: PlotsFolder = None
+    """Write modes.png, spectrograms.png, before.wav and after.wav to this folder; with prompt.clap also clap.png, the
+    score over the steps."""
+    position: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
+    """Contact of these sounds, meters, on the object as it was; by default where it is loudest."""
 
     @property
-    def asked(self) -> bool:
-        """Whether there is a guide."""
-        return bool(self._guides)
+    def all_settings(self) -> EditSettings:
+        """The settings."""
+        return with_settings(EditSettings(), self.set, self.config)
 
-    def expect_usable(self) -> None:
-        """Raise before a field or a model is loaded, `SimulationError` for a material that is not known.
-
-        And `EditError` for more than one guide, an empty prompt, and settings of a guide that is not given.
-        """
-        if len(self._guides) > 1:
-            raise EditError(
-                f"expected one of --prompt, --like and --like-material, got {' and '.join(self._guides)}; use one "
-                "after the other",
-                name=self._guides[0],
-                value=tuple(self._guides),
-            )
-        if self.like_material is not None:
-            material_named(self.like_material, option="--like-material")
-        if not self._guides:
-            given = [*(name for name in _changed(self) if name == "--parameters"), *_changed(self.config)]
-            _expect_unchanged(given, "--prompt, --like or --like-material")
-        if self.prompt is None:
-            own = [name for name in _changed(self) if name in _OF_THE_MODEL]
-            _expect_unchanged([*own, *_changed(self.distillation)], "--prompt")
-            return
-        check_prompt(self.prompt)
-        if self.clap is not None and self.config.preview_every == 0:
-            raise EditError.expected("--preview-every 1 or more with it, such as 50", 0, got="0", name="--clap")
-        if self.model_seconds is not None and not 0 < self.model_seconds < math.inf:
-            raise EditError.expected("more than 0, such as 3", self.model_seconds, name="--model-seconds")
+    @classmethod
+    def default_settings(cls, words: Sequence[str]) -> EditSettings:
+        """Return the usual settings."""
+        return EditSettings()
 
     @property
-    def _guides(self) -> list[str]:
+    def changes_material(self) -> bool:
+        """Whether the material or the size changes."""
+        return self.to is not None or self.scale != 1.0 or bool(self.all_settings.material.constants)
+
+    @property
+    def changes_modes(self) -> bool:
+        """Whether modes are changed directly."""
+        single = self.mode_db or self.mode_pitch or self.mode_decay
+        return (self.pitch, self.decay, self.brightness) != (1.0, 1.0, 0.0) or bool(single)
+
+    @property
+    def guides(self) -> list[str]:
+        """The options that say what the modes are optimized towards."""
         given = {"--prompt": self.prompt is not None, "--like": bool(self.like)}
         given["--like-material"] = self.like_material is not None
         return [name for name, present in given.items() if present]
 
-
-@dataclass(frozen=True)
-class Options(Printing):
-    """Change a field's material, size, pitch or decay, or optimize it towards a text prompt or recordings.
-
-    Material first, then modes, then the prompt, recordings or material sound. The pattern of each mode over the object
-    stays, so the edited field can be rendered and used for localization like any other.
-    """
-
-    field: tyro.conf.Positional[FieldFile]
-    """Field file, as `avmsf fit` writes it."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="NEW.safetensors"), NEW_TENSORS]
-    """File to write the edited field to."""
-    change: Annotated[tyro.conf.OmitArgPrefixes[MaterialOptions], tyro.conf.arg(name="material")] = dataclasses.field(
-        default_factory=MaterialOptions
-    )
-    """Material and size."""
-    sliders: Annotated[tyro.conf.OmitArgPrefixes[ModeOptions], tyro.conf.arg(name="modes")] = dataclasses.field(
-        default_factory=ModeOptions
-    )
-    """Modes."""
-    steering: Annotated[tyro.conf.OmitArgPrefixes[GuideOptions], tyro.conf.arg(name="guided-edit")] = dataclasses.field(
-        default_factory=GuideOptions
-    )
-    """Guided edits."""
-    plots: PlotsFolder = None
-    """Write modes.png, spectrograms.png, before.wav and after.wav to this folder; with --clap also clap.png, the score
-    over the steps."""
-    position: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
-    """Contact of these sounds, on the object as it was; by default where it is loudest."""
-    unit: Unit = "m"
-    """Unit of --position. The field itself is in meters, also where its capture is in another unit."""
-
     def check_inputs(self) -> None:
-        """Raise the package's errors for an edit that cannot be done or written."""
+        """Raise the package's errors for an edit that cannot be done or written, before anything is loaded."""
         super().check_inputs()
-        self.steering.expect_usable()
-        expect_device(self.steering.device, raising=EditError)
-        for option, name in (("--to-material", self.change.material), ("--from", self.change.old)):
+        settings = self.all_settings
+        self._check_guide(settings)
+        for option, name in (("--to", self.to), ("--from", self.old), ("--like-material", self.like_material)):
             if name is not None:
                 material_named(name, option=option)
-        if self.change.law != MaterialOptions.law and not self.change.asked:
-            raise EditError.expected("--to-material, --scale or a constant of a material with it", name="--law")
+        if settings.material.law != MaterialSettings.law and not self.changes_material:
+            raise EditError.expected("--to, --scale or a constant of a material with it", name="material.law")
         if self.position is not None and self.plots is None:
             raise EditError("--position: expected --plots with it, got none", name="--position")
-        if self.change.old is not None and not (self.change.asked or self.steering.like_material):
-            raise EditError.expected("--to-material, --scale, a constant or --like-material with it", name="--from")
-        if not (self.change.asked or self.sliders.asked or self.steering.asked):
+        if self.old is not None and not (self.changes_material or self.like_material):
+            raise EditError.expected(
+                "--to, --scale, a constant of a material or --like-material with it", name="--from"
+            )
+        if not (self.changes_material or self.changes_modes or self.guides):
             raise EditError(
-                "expected an edit, got none: give --to-material, --scale or a constant of a material, --pitch, "
-                "--decay, --brightness, --mode-db, --mode-pitch or --mode-decay, --prompt, --like or --like-material",
+                "expected an edit, got none: give --to, --scale, --pitch, --decay, --brightness, --mode-db, "
+                "--mode-pitch or --mode-decay, --prompt, --like or --like-material, or --set material.young=PASCALS",
                 name="options",
             )
         if self.output.exists() and self.field.exists() and self.output.samefile(self.field):
@@ -229,18 +193,29 @@ class Options(Printing):
             for name in (MODES, SPECTROGRAMS, BEFORE, AFTER, CURVE):
                 expect_writable(self.plots / name)
 
-
-def _changed(options: Any) -> list[str]:
-    """Return which options of a dataclass are not at their defaults, as the command line calls them."""
-    return [
-        option_of(each.name)
-        for each in dataclasses.fields(options)
-        if each.default is not dataclasses.MISSING and getattr(options, each.name) != each.default
-    ]
-
-
-def _expect_unchanged(given: list[str], wanted: str) -> None:
-    if given:
-        raise EditError(
-            f"{' and '.join(given)}: expected {wanted} as well, got none", name=given[0], value=tuple(given)
-        )
+    def _check_guide(self, settings: EditSettings) -> None:
+        """Raise EditError for more than one guide, an empty prompt, and settings of a guide that is not given."""
+        if len(self.guides) > 1:
+            raise EditError(
+                f"expected one of --prompt, --like and --like-material, got {' and '.join(self.guides)}; use one "
+                "after the other",
+                name=self.guides[0],
+                value=tuple(self.guides),
+            )
+        usual, prompted = EditSettings(), settings.prompt
+        if not self.guides:
+            for name in ("parameters", "guide"):
+                if getattr(settings, name) != getattr(usual, name):
+                    raise EditError.expected("--prompt, --like or --like-material as well", name=name)
+        expect_device(prompted.device, raising=EditError)
+        if self.prompt is None:
+            if prompted != usual.prompt or self.model != STABLE_AUDIO:
+                raise EditError.expected("--prompt as well", name="prompt" if self.model == STABLE_AUDIO else "--model")
+            return
+        check_prompt(self.prompt)
+        if prompted.clap is not None and settings.guide.preview_every == 0:
+            raise EditError.expected("guide.preview_every of 1 or more with it, such as 50", 0, name="prompt.clap")
+        if prompted.model_seconds is not None and not 0 < prompted.model_seconds < math.inf:
+            raise EditError.expected("more than 0, such as 3", prompted.model_seconds, name="prompt.model_seconds")
+        if prompted.generated is not None:
+            NewFile((".wav",)).check(prompted.generated)

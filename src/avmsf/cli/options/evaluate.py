@@ -8,8 +8,9 @@ from typing import Annotated, Literal
 import tyro
 
 from avmsf.cli.options.checks import expect_device, expect_modes
-from avmsf.cli.options.common import Flag, Printing
+from avmsf.cli.options.common import Configured, Flag
 from avmsf.cli.options.paths import CacheFolder, Existing, OutputFolder
+from avmsf.cli.options.settings import with_settings
 from avmsf.datasets.detect import detect_dataset
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.registry import expect_suited, method_entry, protocol_named
@@ -19,7 +20,33 @@ from avmsf.pipeline.config import BodyConfig, Geometry, LiftConfig, TimeZero
 
 
 @dataclass(frozen=True)
-class Options(Printing):
+class EvaluationSettings:
+    """What methods share."""
+
+    geometry: Geometry = "mesh"
+    """Shape that finite elements use. mesh: the object's mesh. gaussians: the surface of Gaussians fitted to its views.
+    noisy: its mesh with vertices displaced by 2 % of its size."""
+    amplitude_scale: Literal["full-scale", "raw"] = "full-scale"
+    """full-scale: an object's sounds times one factor that brings its loudest recording to a peak of one, so that
+    values of different objects can be averaged. raw: in the recordings' unit."""
+    extraction: ExtractionMethod = "high-resolution"
+    """How the modes that methods share are extracted; see `avmsf modes --help`. The methods `paper` have their own."""
+    modes: int = 128
+    """Maximum number of the modes that methods share."""
+    splat: SplatConfig = field(default_factory=SplatConfig)
+    """How Gaussians are fitted."""
+    lift: LiftConfig = field(default_factory=LiftConfig)
+    """How features are made. The methods `paper` use the paper's own settings and only the encoder given here: DINOv2
+    without `lift.encoder`, which then has to be installed."""
+    body: BodyConfig = field(default_factory=BodyConfig)
+    """Elastic bodies."""
+
+    def __post_init__(self) -> None:
+        expect_modes(self.modes)
+
+
+@dataclass(frozen=True)
+class Options(Configured):
     """Evaluate methods at held-out contacts, on all objects of a dataset.
 
     Every value is kept as it is computed: repeat an interrupted command to continue it, and add methods or objects
@@ -53,11 +80,6 @@ class Options(Printing):
     visual_source: Literal["best", "mesh"] = "best"
     """Source of the visual features. best: photographs if there are any, by Gaussians, otherwise the mesh. mesh: the
     mesh, onto its own surface."""
-    splat: SplatConfig = field(default_factory=SplatConfig)
-    """How Gaussians are fitted."""
-    lift: LiftConfig = field(default_factory=LiftConfig)
-    """How features are made. The methods `paper` use the paper's own settings and only the encoder given here: DINOv2
-    without `--lift.encoder`, which then has to be installed."""
     workers: int = 1
     """Number of objects computed at a time, each on one thread; more than one needs the extra `scale`."""
     ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
@@ -66,22 +88,10 @@ class Options(Printing):
     """Seed of all methods."""
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda")] = None
     """Device for Gaussians (with gsplat), DINOv2 and training; by default the GPU if there is one."""
-    geometry: Geometry = "mesh"
-    """Shape that finite elements use. mesh: the object's mesh. gaussians: the surface of Gaussians fitted to its views.
-    noisy: its mesh with vertices displaced by 2 % of its size."""
-    body: BodyConfig = field(default_factory=BodyConfig)
-    """Elastic bodies."""
-    amplitude_scale: Literal["full-scale", "raw"] = "full-scale"
-    """full-scale: an object's sounds times one factor that brings its loudest recording to a peak of one, so that
-    values of different objects can be averaged. raw: in the recordings' unit."""
     no_cdpam: Flag = False
     """Do not compute the metric CDPAM, which needs the extra `eval`."""
     cdpam_contacts: int = 8
     """Number of test contacts per case at which CDPAM is computed, evenly spaced; 0 for all."""
-    extraction: ExtractionMethod = "high-resolution"
-    """How the modes that methods share are extracted; see `avmsf modes --help`. The methods `paper` have their own."""
-    modes: int = 128
-    """Maximum number of the modes that methods share."""
     time_zero: TimeZero | None = None
     """Start of the sounds on which all methods are scored: onset, or peak (paper); by default that of the dataset or of
     each capture.toml. With peak, the methods `field...` are fitted to the recordings from the dataset's own starts,
@@ -95,6 +105,16 @@ class Options(Printing):
     20 kHz, first second; with localize also each field's heat maps of three recordings, with the true contact
     marked."""
 
+    @property
+    def shared(self) -> EvaluationSettings:
+        """What methods share."""
+        return with_settings(EvaluationSettings(), self.set, self.config)
+
+    @classmethod
+    def default_settings(cls, words: Sequence[str]) -> EvaluationSettings:
+        """Return the usual settings."""
+        return EvaluationSettings()
+
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
@@ -107,7 +127,7 @@ class Options(Printing):
                 "names of the recordings to test on", name="--test", advice="such as --test 009.wav,010.wav"
             )
         expect_device(self.device, raising=EvaluationError)
-        expect_modes(self.modes)
+        _ = self.shared
         detect_dataset(self.data)
 
 

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Self
 
 import tyro
 
-from avmsf.cli.options.common import Flag, Printing, Unit, option_of, parse_options
+from avmsf.cli.options.common import Flag, Printing, Unit, option_of
 from avmsf.cli.options.paths import ContactTable, Existing, NewFile, NewFolder, OtherCapture, PositionList, ShapeFile
 from avmsf.errors import ExportError
 from avmsf.export.formats import (
@@ -135,11 +135,11 @@ class Options(Printing):
         read_record(self.field)
 
     @classmethod
-    def parse(cls, words: Sequence[str]) -> "Options":
+    def parse(cls, words: Sequence[str]) -> Self:
         """Return the options that the words spell."""
         if ("--to", "sfz") in pairwise(words):
             raise ExportError.expected("--to wavs, which writes an SFZ instrument too", "sfz", name="--to")
-        return parse_options(cls, "export", words)
+        return super().parse(words)
 
 
 def unused_options(options: Options) -> list[str]:

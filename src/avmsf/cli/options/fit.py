@@ -1,32 +1,22 @@
 """Options of `avmsf fit`."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
-from functools import partial
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
 from avmsf.capture.filenames import expect_views
-from avmsf.cli.options.checks import OutputError, expect_device, expect_modes, expect_rows, read_settings
-from avmsf.cli.options.common import Flag, Printing, option_of, parse_options, preset_of, preset_values
+from avmsf.cli.options.checks import OutputError, expect_device, expect_rows, read_settings
+from avmsf.cli.options.common import Configured, Flag, option_of, preset_of
 from avmsf.cli.options.paths import CacheFolder, Existing, NewFile, PlotsFolder, SettingsFile
+from avmsf.cli.options.settings import with_settings
 from avmsf.errors import EvaluationError, FitError
 from avmsf.fem.material import material_named
-from avmsf.field.config import FitConfig, GainModelName
-from avmsf.gaussians.config import SplatConfig
+from avmsf.field.config import GainModelName
 from avmsf.modal.config import ExtractionMethod
-from avmsf.pipeline.config import (
-    CACHE,
-    BodyConfig,
-    LiftConfig,
-    PipelineConfig,
-    Preset,
-    SceneConfig,
-    TimeZero,
-    ViewsConfig,
-)
+from avmsf.pipeline.config import CACHE, PRESETS, PipelineConfig, Preset, TimeZero
 
 Stage = Literal["gaussians", "features", "surface"]
 _SUFFIXES: dict[Stage | None, tuple[str, ...]] = {
@@ -39,7 +29,7 @@ _SUFFIXES: dict[Stage | None, tuple[str, ...]] = {
 
 
 @dataclass(frozen=True)
-class Options(Printing):
+class Options(Configured):
     """Fit a sound field to a capture and write it to one file.
 
     CAPTURE holds impacts.csv, the recordings that it names, and what shows the object: a mesh, photographs, a video or
@@ -86,44 +76,38 @@ class Options(Printing):
     where the gain model reads features."""
     without_shape: Flag = False
     """Fit to the positions of the contacts alone, whatever shows the object's shape."""
-    gain_model: GainModelName = "auto"
-    """How gains vary over the object. auto: a Gaussian process over all kernel families, weighted by evidence; the
-    elastic family needs a shape. network: the paper's attention network on image features. The others: a Gaussian
-    process over one family, for study; symmetry needs a shape, visual image features."""
-    body: BodyConfig = field(default_factory=BodyConfig)
-    """Finite-element models."""
-    extraction: ExtractionMethod = "high-resolution"
-    """How modes are extracted; see `avmsf modes --help`."""
-    modes: int = 128
-    """Maximum number of modes."""
+    gain_model: GainModelName | None = None
+    """How gains vary over the object, by default auto. auto: a Gaussian process over all kernel families, weighted by
+    evidence; the elastic family needs a shape. network: the paper's attention network on image features. The others: a
+    Gaussian process over one family, for study; symmetry needs a shape, visual image features."""
+    extraction: ExtractionMethod | None = None
+    """How modes are extracted, by default high-resolution; see `avmsf modes --help`."""
+    modes: int | None = None
+    """Maximum number of modes, by default 128."""
     time_zero: TimeZero | None = None
     """Start of the sounds: onset, or peak (paper); by default that of capture.toml."""
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda")] = None
     """Device for Gaussians (with gsplat), DINOv2, training end to end and the network; by default the GPU if there is
     one. Mode extraction, finite elements and the Gaussian process run on the CPU."""
-    views: ViewsConfig = field(default_factory=ViewsConfig)
-    """How views are made."""
-    splat: SplatConfig = field(default_factory=SplatConfig)
-    """How Gaussians are fitted."""
-    lift: LiftConfig = field(default_factory=LiftConfig)
-    """How features are made."""
+    seed: int = 0
+    """Random seed of all stages."""
     preset: Preset = "default"
-    """Defaults of all settings. default: takes seconds to minutes. paper: everything as published, the middle of each
-    published list; takes hours. `--preset paper --help` shows its values."""
-    config: Annotated[tyro.conf.OmitArgPrefixes[FitConfig], tyro.conf.arg(name="fit")] = field(
-        default_factory=FitConfig
-    )
-    """How the field is fitted; --seed is the seed of all stages."""
+    """All settings. default: takes seconds to minutes. paper: everything as published, the middle of each published
+    list; takes hours."""
 
     @property
     def pipeline(self) -> PipelineConfig:
         """All settings as one."""
-        scene, start = SceneConfig(self.views, self.splat, self.lift), self.time_zero
-        if self.config.seed:
-            scene = scene.with_seed(self.config.seed)
-        return PipelineConfig(
-            self.gain_model, self.body, scene, self.config, self.extraction, self.modes, start, self.device
-        )
+        config = with_settings(PRESETS[self.preset], self.set, self.config)
+        if self.seed:
+            config = replace(config, fit=replace(config.fit, seed=self.seed), scene=config.scene.with_seed(self.seed))
+        names = ("gain_model", "extraction", "modes", "time_zero", "device")
+        return replace(config, **{name: value for name in names if (value := getattr(self, name)) is not None})
+
+    @classmethod
+    def default_settings(cls, words: Sequence[str]) -> PipelineConfig:
+        """Return the settings of the preset that the words name."""
+        return preset_of(words)
 
     @property
     def kept(self) -> Path:
@@ -140,12 +124,12 @@ class Options(Printing):
         if self.plots is not None and self.until != "surface":
             raise OutputError.expected("--until surface with it", self.until, name="--plots")
         expect_device(self.device, raising=FitError)
-        expect_modes(self.modes)
+        config = self.pipeline
         self._check_split()
         settings = read_settings(self.capture, self.settings)
         if self.material is not None:
             material_named(self.material, option="--material")
-        self._check_unused()
+        self._check_unused(config)
         if self.until is not None or (self.material is not None and self.capture.is_dir()):
             expect_views(self.capture, settings)
         elif self.material is None:
@@ -166,12 +150,12 @@ class Options(Printing):
                 name="--train-fraction",
             )
 
-    def _check_unused(self) -> None:
+    def _check_unused(self, config: PipelineConfig) -> None:
         """Raise FitError for options that nothing would read."""
         given = {each.name for each in fields(self) if getattr(self, each.name) != each.default}
-        if self.gain_model == "elastic":
+        if config.gain_model in ("auto", "elastic"):
             given.discard("gain_model")
-        if self.body.supports == "try":
+        if config.body.supports == "try":
             given.add("body.supports")
         fitted = ("train_fraction", "train_count", "start", "features", "without_shape")
         unread = {"until": fitted, "material": (*fitted, "until", "time_zero", "gain_model", "body.supports")}
@@ -184,11 +168,3 @@ class Options(Printing):
                     )
         if self.start and self.train_fraction is None and self.train_count is None:
             raise FitError.expected("--train-fraction or --train-count with it", got="neither", name="--start")
-
-    @classmethod
-    def parse(cls, words: Sequence[str]) -> "Options":
-        """Return the options that the words spell, with the preset's settings as defaults."""
-        values = preset_values(preset_of(words), fit="config")
-        scene = values.pop("scene")
-        values |= {each.name: getattr(scene, each.name) for each in fields(scene)}
-        return parse_options(partial(cls, **values), "fit", words)

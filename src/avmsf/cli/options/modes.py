@@ -1,16 +1,14 @@
 """Options of `avmsf modes`."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 
 import tyro
 
-from avmsf.cli.options.checks import expect_capture, expect_modes
-from avmsf.cli.options.common import Printing, parse_options, preset_of, preset_values
+from avmsf.cli.options.checks import expect_capture
+from avmsf.cli.options.common import Printing
 from avmsf.cli.options.paths import CaptureFolder, PlotsFolder, SettingsFile
 from avmsf.modal.config import ExtractionMethod
-from avmsf.pipeline.config import PipelineConfig, Preset, TimeZero
+from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset, TimeZero
 
 
 @dataclass(frozen=True)
@@ -19,11 +17,11 @@ class Options(Printing):
 
     capture: tyro.conf.Positional[CaptureFolder]
     """Folder with impacts.csv and the recordings that it names."""
-    extraction: ExtractionMethod = "high-resolution"
-    """How modes are extracted. high-resolution: ESPRIT in subbands, which separates modes a few hertz apart.
+    extraction: ExtractionMethod | None = None
+    """How modes are extracted, by default high-resolution: ESPRIT in subbands, which separates modes a few hertz apart.
     short-time: the paper's method, bin by bin of a short-time spectrum."""
-    modes: int = 128
-    """Maximum number of modes."""
+    modes: int | None = None
+    """Maximum number of modes, by default 128."""
     time_zero: TimeZero | None = None
     """Start of the sounds: onset, or peak (paper); by default that of capture.toml."""
     preset: Preset = "default"
@@ -36,17 +34,12 @@ class Options(Printing):
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
-        expect_modes(self.modes)
+        _ = self.pipeline
         expect_capture(self.capture, self.settings)
 
     @property
     def pipeline(self) -> PipelineConfig:
-        """The settings that modes depend on, with the defaults of all others."""
-        return PipelineConfig(extraction=self.extraction, modes=self.modes, time_zero=self.time_zero)
-
-    @classmethod
-    def parse(cls, words: Sequence[str]) -> "Options":
-        """Return the options that the words spell, with the preset's settings as defaults."""
-        values = preset_values(preset_of(words))
-        own = {name: values[name] for name in ("extraction", "modes", "time_zero", "preset")}
-        return parse_options(partial(cls, **own), "modes", words)
+        """The settings of the preset, with those that are given."""
+        names = ("extraction", "modes", "time_zero")
+        given = {name: value for name in names if (value := getattr(self, name)) is not None}
+        return replace(PRESETS[self.preset], **given)

@@ -1,19 +1,21 @@
 """Options of `avmsf simulate`."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from avmsf.cli.options.common import Flag, Printing, parse_options
-from avmsf.cli.options.paths import CacheFolder, InputError, OutputFolder
+from avmsf.cli.options.common import Configured, Flag
+from avmsf.cli.options.paths import CacheFolder, Existing, OutputFolder
+from avmsf.cli.options.settings import with_settings
 from avmsf.errors import SimulationError
 from avmsf.simulate.recipe import EXAMPLE, SET, ObjectRecipe, sim20_recipe
 
 
 @dataclass(frozen=True)
-class Options(Printing):
+class Options(Configured):
     """Simulate objects, their recordings and images, as capture folders with ground truth.
 
     `avmsf simulate sim-20 --output FOLDER` makes the benchmark set, one folder per object. It skips complete objects,
@@ -30,36 +32,65 @@ class Options(Printing):
     """Only list the set's objects, the shapes and the materials."""
     cache: CacheFolder = None
     """Cache of elastic modes, which take most of the time: other hammers, noises and views are then fast."""
-    recipe: Annotated[ObjectRecipe, tyro.conf.arg(name="")] = field(default_factory=ObjectRecipe)
-    """The object, its impacts, recordings and images; for an object of the set, what differs from it."""
+    kind: str | None = None
+    """Shape; --list names them."""
+    mesh: Annotated[
+        Path | None, tyro.conf.arg(metavar="MESH"), Existing("a mesh: obj, ply, glb or stl", ("a mesh or Gaussians",))
+    ] = None
+    """A mesh or scan instead of a shape, in meters."""
+    material: str | None = None
+    """Name in the table of materials; --list names them."""
+    seed: int | None = None
+    """Random seed of the shape's proportions, the contacts, the noise and the imperfections."""
+    impacts: int | None = None
+    """Number of impacts."""
+    seconds: float | None = None
+    """Length of each recording that is used, from its onset. The files are longer."""
+    sample_rate: int | None = None
+    """Sample rate, Hz."""
+    thickness: float | None = None
+    """Wall thickness, meters. By default that of a shape is drawn at random, and a mesh is a solid body; with a
+    thickness the mesh is the outside of a wall."""
+    size: float | None = None
+    """Longest side of the bounding box, meters; by default that of the random shape or of the mesh."""
+    views: int | None = None
+    """Images to render, on three circles around the object; 0 for none."""
+
+    def applied(self, recipe: ObjectRecipe) -> ObjectRecipe:
+        """Return a recipe with the settings and options that are given."""
+        names = (*_IDENTITY, "impacts", "seconds", "sample_rate", "thickness", "size", "views")
+        given = {name: value for name in names if (value := getattr(self, name)) is not None}
+        return replace(with_settings(recipe, self.set, self.config), **given)
+
+    @property
+    def recipe(self) -> ObjectRecipe:
+        """The recipe of a single object."""
+        return self.applied(_recipe_of(self.what))
+
+    @classmethod
+    def default_settings(cls, words: Sequence[str]) -> ObjectRecipe:
+        """Return the recipe of the object that the first of the words names."""
+        return _recipe_of(next((word for word in words if not word.startswith("-")), None))
 
     def check_inputs(self) -> None:
-        """Raise `InputError` also for a mesh that does not exist, `SimulationError` for options that do not fit."""
+        """Raise `InputError` for a mesh that does not exist, `SimulationError` for options that do not fit."""
         super().check_inputs()
         if self.output is None and not self.list:
             raise SimulationError("--output: expected a folder, got none; --list names the objects", name="output")
-        for name in ("kind", "mesh", "material", "seed") if self.what == SET else ():
-            value = getattr(self.recipe, name)
-            if value != getattr(ObjectRecipe(), name):
+        changed, usual = self.recipe, _recipe_of(self.what)
+        for name in _IDENTITY if self.what == SET else ():
+            if (value := getattr(changed, name)) != getattr(usual, name):
                 raise SimulationError(
                     f"--{name}: expected none with {SET}, got {value}; leave it out", name=name, value=str(value)
                 )
-        if (mesh := self.recipe.mesh) is not None and not mesh.is_file():
-            raise InputError.expected(
-                "a mesh: obj, ply, glb or stl", got="no such file or folder", file=mesh, advice="check the name"
-            )
-
-    @classmethod
-    def parse(cls, words: Sequence[str]) -> "Options":
-        """Return the options that the words spell."""
-        options = parse_options(cls, "simulate", words, default=cls())
-        # A second time from the named object's recipe: what is asked for may be a default, and not that object's.
-        recipe = None if options.list else _recipe_of(options.what)
-        return options if recipe is None else parse_options(cls, "simulate", words, default=cls(recipe=recipe))
 
 
-def _recipe_of(what: str | None) -> ObjectRecipe | None:
-    """Return the named object's recipe; None for the whole set and for an object of the user's own."""
+_IDENTITY = ("kind", "mesh", "material", "seed")
+"""What distinguishes the objects of the set."""
+
+
+def _recipe_of(what: str | None) -> ObjectRecipe:
+    """Return the named object's recipe; for the whole set and for an object of the user's own the usual one."""
     if what in (None, SET):
-        return None
+        return ObjectRecipe()
     return EXAMPLE if what == "example" else sim20_recipe(what)
