@@ -103,7 +103,7 @@ def test_common_options_may_stand_before_the_verb(capture: Path, capsys: Streams
 
 
 def test_what_is_no_verb_ends_with_2_on_the_standard_error(capsys: Streams) -> None:
-    for words in (["fit"], ["fit", "capture", "--output", "x", "--set", "fit.steps=many"]):
+    for words in (["fit"], ["fit", "capture", "--output", "x", "--seed", "many"]):
         with pytest.raises(SystemExit) as ended:
             main(words)
         assert ended.value.code == 2

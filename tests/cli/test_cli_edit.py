@@ -6,7 +6,6 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import soundfile
 import torch
@@ -198,18 +197,6 @@ def test_the_table_has_the_modes_of_most_energy(field: Path, capsys: Streams, mo
     assert "level change" in out
 
 
-def test_the_contact_of_the_sounds_has_its_unit(field: Path) -> None:
-    sounds = []
-    for unit, meters in (("m", 1.0), ("mm", 1e-3)):
-        place = [f"{value / meters:.6f}" for value in PLACES[1].tolist()]
-        folder = field.with_name(unit)
-        edited(field, "--pitch", "2", "--plots", str(folder), "--position", *place, "--unit", unit)
-        sounds.append(soundfile.read(folder / "before.wav")[0])
-    # Coordinates are written to a micrometer.
-    assert np.allclose(*sounds, atol=1e-4)
-    assert np.abs(sounds[0]).max() > 0.1
-
-
 @pytest.mark.parametrize(("decay", "noted"), [("0.1", False), ("0.9", False), ("2", True)])
 def test_longer_decays_than_the_sounds_are_noted(field: Path, capsys: Streams, decay: str, noted: bool) -> None:
     new = edited(field, "--decay", decay)
@@ -375,15 +362,8 @@ def test_towards_words(field: Path, monkeypatch: pytest.MonkeyPatch, capsys: Str
         return model
 
     monkeypatch.setattr(edit.StableAudio, "load", load_model)
-    words = [
-        "--prompt",
-        "a bell",
-        "--set",
-        "prompt.negative=wood",
-        "--model",
-        "here",
-        *sets("guide.steps=40 guide.contacts_per_step=2"),
-    ]
+    words = ["--prompt", "a bell", "--model", "here", *sets("guide.steps=40 guide.contacts_per_step=2")]
+    words += sets("prompt.negative=wood prompt.model_seconds=1 parameters=published")
     alone = field.with_name("generated.wav")
     new = edited(field, *words, "--set", f"prompt.generated={alone}")
     assert soundfile.info(str(alone)).samplerate == RATE

@@ -53,7 +53,7 @@ WRONG: dict[str, dict[str, Any]] = {
     "fit plate --output f.safetensors --train-fraction 1.5": {"name": "--train-fraction", "value": 1.5},
     "fit plate --output f.safetensors --train-count 4 --start 8": {"name": "start", "value": 8},
     "fit plate --output f.safetensors --train-count 4 --train-fraction 0.5": {"name": "--train-count"},
-    "fit plate --output f.safetensors --validation 2": {"name": "validation", "value": 2.0},
+    "fit plate --output f.safetensors --set validation=2": {"name": "validation", "value": 2.0},
     "fit plate --output f.safetensors --material glass --train-count 4": {"name": "--train-count", "value": "glass"},
     "fit plate --material glass --start 2": {"name": "--start", "value": "glass"},
     "fit plate --until gaussians --without-shape": {"name": "--without-shape", "value": "gaussians"},

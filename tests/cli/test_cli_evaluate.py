@@ -17,6 +17,7 @@ from avmsf.modal.extraction.finders import ShortTime
 from avmsf.simulate.recipe import ABLATED
 from factories.plate_set import fill_plates
 from factories.raising import raises
+from factories.settings import sets
 
 Streams = pytest.CaptureFixture[str]
 CHEAP = ("--methods", "knn3,nearest", "white-noise", "--no-cdpam")
@@ -172,8 +173,8 @@ def test_all_methods_hear_the_start_of_sounds_and_share_the_modes_that_are_asked
     tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plates, results = fill_plates(tmp_path / "plates", ("a",), truth=True), tmp_path / "results"
-    words = ["farthest", str(plates), "--methods", "knn-gains,paper", "--no-cdpam", "--extraction", "short-time"]
-    words += ["--set", "lift.encoder=descriptors", "--output", str(results)]
+    words = ["farthest", str(plates), "--methods", "knn-gains,paper", "--no-cdpam"]
+    words += [*sets("extraction=short-time lift.encoder=descriptors"), "--output", str(results)]
     heard = []
 
     def stop(field: FieldMethod, task: Task) -> None:
@@ -238,7 +239,7 @@ def test_a_known_wall_is_handed_on(plates: Path, tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr("avmsf.cli.evaluate.run_objects", stop)
     words = ["farthest", str(plates), *CHEAP, "--output", str(tmp_path / "results"), "--set", "body.wall=0"]
-    assert run(Options.parse([*words, "--geometry", "noisy"])) == 130
+    assert run(Options.parse([*words, "--set", "geometry=noisy"])) == 130
     inputs = asked[0].inputs
     assert (inputs.body.wall, inputs.geometry) == (0.0, "noisy")
     # Figures of another wall are not these.

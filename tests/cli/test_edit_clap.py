@@ -79,7 +79,7 @@ def test_an_interrupted_edit_has_the_whole_curve(
     kept = tmp_path / "part.safetensors.clap.json"
     save_clap(tmp_path / "other", seed=1)
     with raises(AvmsfError, file="part.safetensors.clap.json", name="digest"):
-        run(Options.parse([*part[:-3], str(tmp_path / "other"), *part[-2:]]))
+        run(Options.parse([*part, "--set", f"prompt.clap={tmp_path / 'other'}"]))
     text = kept.read_text(encoding="utf-8")
     kept.write_text("{}", encoding="utf-8")
     with raises(AvmsfError, file="part.safetensors.clap.json", name=None):

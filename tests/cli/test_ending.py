@@ -152,7 +152,7 @@ def test_a_terminal_obeys_nothing_that_stands_in_a_file(run: Callable[..., int],
         ("fit nowhere -o f.safetensors --device tpu", {"file": "nowhere"}),
         ("fitt", {"value": "fitt"}),
         ("--quiet", {"value": None}),
-        ("fit nowhere -o f.safetensors --steps many", {"name": "fit"}),
+        ("fit nowhere -o f.safetensors --seed many", {"name": "fit"}),
         ("render --position 0 0 0", {"name": "render"}),
     ],
 )
