@@ -31,7 +31,6 @@ MIN_CHANNEL_LEVEL = 0.1
 """Level of a channel over the loudest one's below which it is not used: a muted or far microphone's, 20 dB down."""
 OFFSET_SIGNIFICANCE = 1e-6
 """Probability by which noise without an offset would look as if it had one."""
-_CHANNELS = "response_channel or force_channel in capture.toml"
 EIGHT_BIT = frozenset({"PCM_U8", "PCM_S8", "ULAW", "ALAW", "DPCM_8"})
 LOSSLESS = ("PCM_", "FLOAT", "DOUBLE", "ALAC_", "DWVW_", "DPCM_")
 """What libsndfile's names of formats without loss begin with; FLAC's is that of its samples, PCM_16 or PCM_24."""
@@ -63,7 +62,8 @@ class Recording:
     def channel(self, number: int) -> Float64[np.ndarray, " frames"]:
         """Return one channel, counted from 1 as sound editors count them; `CaptureError` where there is none."""
         if not 1 <= number <= len(self.channels):
-            wanted, advice = f"a channel from 1 to {len(self.channels)}", f"correct {_CHANNELS}"
+            wanted = f"a channel from 1 to {len(self.channels)}"
+            advice = "correct response_channel or force_channel in capture.toml"
             raise CaptureError.expected(wanted, number, file=self.name, name="channel", advice=advice)
         return self.channels[number - 1]
 
@@ -77,26 +77,19 @@ class Recording:
         """
         if number is not None:
             return number
-        left = [index + 1 for index in range(len(self.channels)) if index + 1 != force_channel]
-        if not left:
-            wanted, advice = "a channel with the sound", "record both, or remove force_channel from capture.toml"
-            got, key = "only the force channel", "response_channel"
+        count, wanted, key = len(self.channels), "one channel with the sound", "response_channel"
+        levels = {each: float(np.std(self.channels[each - 1])) for each in range(1, count + 1) if each != force_channel}
+        if not levels:
+            got, advice = "only the force channel", "record both, or remove force_channel from capture.toml"
             raise CaptureError.expected(wanted, 0, got=got, file=self.name, name=key, advice=advice)
-        if len(left) == 1:
-            return left[0]
-        loudest = max(left, key=lambda each: float(np.std(self.channels[each - 1])))
-        if not all(self._agree(loudest, each) for each in left):
-            raise CaptureError.expected(
-                "one channel with the sound",
-                len(self.channels),
-                got=f"{len(self.channels)} different ones",
-                file=self.name,
-                name="response_channel",
-                advice="write response_channel, counted from 1, in capture.toml (`avmsf check` proposes one where it "
-                "can, and the hammer's force_channel), or save it as mono",
+        loudest = max(levels, key=levels.__getitem__)
+        if not all(self._agree(loudest, each) for each in levels if each != loudest):
+            got = f"{count} different ones"
+            advice = (
+                "write response_channel, counted from 1, in capture.toml (`avmsf check` proposes one), or save as mono"
             )
-        levels = {each: float(np.std(self.channels[each - 1])) for each in left}
-        return next(each for each in left if levels[each] >= MIN_CHANNEL_LEVEL * levels[loudest])
+            raise CaptureError.expected(wanted, count, got=got, file=self.name, name=key, advice=advice)
+        return next(each for each, level in levels.items() if level >= MIN_CHANNEL_LEVEL * levels[loudest])
 
     def response(
         self, number: int | None = None, *, force_channel: int | None = None
@@ -149,15 +142,13 @@ def read_recording(path: Path, name: str | None = None, *, advice: str = "check 
     """
     name = name or str(path)
     try:
-        missing = not path.is_file()
+        if path.is_dir():
+            raise CaptureError(f"{name}: expected a sound file, got a folder; name a file in it", file=path)
+        if not path.is_file():
+            raise missing_recording(path, name, advice=advice)
     except OSError as error:
-        got, short = repr(error.strerror), f"{name[:80]}…"
-        message = f"{short}: expected the name of a sound file, got {got}; {advice}"
+        message = f"{name[:80]}…: expected the name of a sound file, got {error.strerror!r}; {advice}"
         raise CaptureError(message, file=path, value=name) from error
-    if path.is_dir():
-        raise CaptureError(f"{name}: expected a sound file, got a folder; name a file in it", file=path)
-    if missing:
-        raise missing_recording(path, name, advice=advice)
     if is_lfs_pointer(path):
         raise CaptureError.expected("a sound file", got="a Git LFS pointer", file=name, advice="run git lfs pull")
     return decode_recording(path, name)
@@ -178,25 +169,30 @@ def decode_recording(source: Path | SoundBytes, name: str) -> Recording:
     """Read every channel of a sound file on disk or in memory. Raises `CaptureError` as `read_recording`."""
     try:
         with soundfile.SoundFile(source) as file:
-            _refuse_long(file, name)
-            samples = file.read(dtype="float64", always_2d=True)
+            samples = file.frames * file.channels
+            if samples > MAX_SAMPLES:
+                got = f"{samples:,} ({file.frames / file.samplerate / 60:.3g} minutes of {file.channels})"
+                wanted, advice = (
+                    f"at most {MAX_SAMPLES:,} samples in all channels",
+                    "cut it to the seconds around the impact",
+                )
+                raise RecordingLengthError.expected(wanted, samples, got=got, file=name, advice=advice)
+            channels = file.read(dtype="float64", always_2d=True).T
             rate, subtype = float(file.samplerate), str(file.subtype)
     except (soundfile.LibsndfileError, OSError, UnicodeEncodeError) as error:
         reason = getattr(error, "error_string", str(error)).strip().rstrip(".")
         size = source.stat().st_size if isinstance(source, Path) else source.getbuffer().nbytes
         got, advice = f"{size} bytes that cannot be read ({reason})", "export it again as wav"
         raise CaptureError.expected("a sound file", size, got=got, file=name, name="bytes", advice=advice) from error
-    if not samples.size:
-        raise CaptureError.expected("samples", 0, got="none", file=name, advice="record or export it again")
-    wrong = int((~np.isfinite(samples)).sum())
-    if wrong:
-        got = f"{wrong} that are not"
-        raise CaptureError.expected("finite samples", wrong, got=got, file=name, advice="export it again")
-    peak = float(np.abs(samples).max())
-    if peak > MAX_PEAK:
-        got, wanted = f"{peak:.3g}", f"samples of at most {MAX_PEAK:g}"
-        raise CaptureError.expected(wanted, peak, got=got, file=name, advice="export it again")
-    return Recording(name, np.ascontiguousarray(samples.T), rate, subtype)
+    wrong, peak = int((~np.isfinite(channels)).sum()), float(np.abs(channels).max(initial=0.0))
+    for wanted, value, got, bad in (
+        ("samples", 0, "none", not channels.size),
+        ("finite samples", wrong, f"{wrong} that are not", wrong),
+        (f"samples of at most {MAX_PEAK:g}", peak, f"{peak:.3g}", peak > MAX_PEAK),
+    ):
+        if bad:
+            raise CaptureError.expected(wanted, value, got=got, file=name, advice="record or export it again")
+    return Recording(name, np.ascontiguousarray(channels), rate, subtype)
 
 
 def wav_bytes(samples: Shaped[np.ndarray, "frames *channels"], rate: int) -> bytes:
@@ -204,23 +200,6 @@ def wav_bytes(samples: Shaped[np.ndarray, "frames *channels"], rate: int) -> byt
     memory = io.BytesIO()
     soundfile.write(memory, samples.astype(np.float32), rate, subtype="FLOAT", format="WAV")
     return memory.getvalue()
-
-
-def refuse_rate(rate: float, name: str) -> None:
-    """Raise `CaptureError` unless the rate lies between 100 Hz and 192 kHz."""
-    if not LOWEST_RATE <= rate <= HIGHEST_RATE:
-        wanted = f"a sample rate of {LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz (the file's rate times playback_speed)"
-        advice = "export it at another rate"
-        raise CaptureError.expected(wanted, rate, got=f"{rate:g} Hz", file=name, name="sample_rate", advice=advice)
-
-
-def refuse_peak(sound: Float64[np.ndarray, " frames"], name: str) -> None:
-    """Raise `CaptureError` for a sound whose samples are too large or too small to be computed with in float32."""
-    peak = float(np.abs(sound).max())
-    if not MIN_PEAK <= peak <= MAX_PEAK:
-        wanted, got = f"a peak of {MIN_PEAK:g} to {MAX_PEAK:g}", f"{peak:.3g}"
-        advice = "export it again, or check the force that it is divided by"
-        raise CaptureError.expected(wanted, peak, got=got, file=name, name="peak", advice=advice)
 
 
 def refuse_silence(sound: Float64[np.ndarray, " frames"], name: str) -> None:
@@ -249,13 +228,3 @@ def clipped_samples(samples: Shaped[np.ndarray, " frames"]) -> int:
             runs = runs[runs >= 3] if (runs >= 3).sum() >= 3 else runs[:0]
         total += int(runs.sum()) if runs.sum() >= 3 else 0
     return total
-
-
-def _refuse_long(file: soundfile.SoundFile, name: str) -> None:
-    """Raise `RecordingLengthError` for a file of too many samples, by its header."""
-    samples = file.frames * file.channels
-    if samples > MAX_SAMPLES:
-        minutes = file.frames / file.samplerate / 60
-        got = f"{samples:,} ({minutes:.3g} minutes of {file.channels})"
-        wanted, advice = f"at most {MAX_SAMPLES:,} samples in all channels", "cut it to the seconds around the impact"
-        raise RecordingLengthError.expected(wanted, samples, got=got, file=name, advice=advice)

@@ -57,23 +57,21 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
     """Measure one recording that could be read and prepared, and say what about it looks wrong."""
     rate = recording.sample_rate
     channel = recording.response_channel(settings.response_channel, force_channel=settings.force_channel)
-    response = recording.channel(channel)
-    peak = float(np.abs(response).max())
+    response, seconds = recording.channel(channel), settings.kept_seconds(rate)
+    level = decibels(float(np.abs(response).max()))
     # Rumble that the settings remove is not in the sounds.
     filtered = remove_rumble(response, settings.highpass, recording)
     noise = decibels(noise_level(filtered, prepared.onset, rate) / float(np.abs(filtered).max()))
-    clipped, second = clipped_samples(response), None
+    clipped = clipped_samples(response)
     if prepared.pulse is not None and settings.force_channel is not None:
         force = recording.channel(settings.force_channel)
         clipped += clipped_samples(force)
-        second = find_second_push(force, prepared.pulse, sample_rate=rate, seconds=settings.kept_seconds(rate))
+        second = find_second_push(force, prepared.pulse, sample_rate=rate, seconds=seconds)
     else:
-        second = find_second_impact(response, prepared.onset, sample_rate=rate, seconds=settings.kept_seconds(rate))
+        second = find_second_impact(response, prepared.onset, sample_rate=rate, seconds=seconds)
+    others = (each for row, each in enumerate(recording.channels, 1) if row not in (channel, settings.force_channel))
     problems = []
-    others = [each for each in range(1, len(recording.channels) + 1) if each not in (channel, settings.force_channel)]
-    if settings.response_channel is None and any(
-        not np.array_equal(recording.channel(each), response) for each in others
-    ):
+    if settings.response_channel is None and any(not np.array_equal(each, response) for each in others):
         problems.append(
             f"its channels hold one sound, up to a constant factor and rounding: channel {channel} is used; to choose "
             "another, write response_channel in capture.toml"
@@ -90,8 +88,8 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
         problems.append(f"only 8 bits a sample ({recording.subtype}): its noise hides the decay; record 16 or more")
     elif not recording.subtype.startswith(LOSSLESS):
         problems.append(f"compressed with loss ({recording.subtype}): soft parts of the decay are altered; record wav")
-    elif recording.subtype.startswith("PCM") and decibels(peak) < LOWEST_PEAK_DB:
-        problems.append(f"its peak is {-decibels(peak):.0f} dB below full scale: turn the gain up")
+    elif recording.subtype.startswith("PCM") and level < LOWEST_PEAK_DB:
+        problems.append(f"its peak is {-level:.0f} dB below full scale: turn the gain up")
     return RecordingReport(
         file=recording.name,
         line=line,
@@ -101,7 +99,7 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
         sample_rate=rate,
         channels=len(recording.channels),
         coding=recording.subtype,
-        peak_db=decibels(peak),
+        peak_db=level,
         noise_db=noise,
         onset_seconds=prepared.onset / rate,
         clipped=clipped,
@@ -117,21 +115,17 @@ def shared_problems(reports: Sequence[RecordingReport]) -> list[str]:
             places.setdefault(problem.removeprefix(f"{report.file}: "), []).append(report.file)
     sentences = []
     for problem, files in places.items():
+        # Errors of the table's reader begin with the row.
+        where = "" if problem.startswith("impacts.csv") else f"{files[0]}: "
         if len(files) > 1:
-            shown = f"{', '.join(files[:3])}{', …' * (len(files) > 3)}"
-            sentences.append(f"{len(files)} recordings ({shown}): {problem}")
-        elif problem.startswith((files[0], "impacts.csv")):
-            # Errors of the capture's reader begin with the file or the row.
-            sentences.append(problem)
-        else:
-            sentences.append(f"{files[0]}: {problem}")
+            where = f"{len(files)} recordings ({', '.join(files[:3])}{', …' * (len(files) > 3)}): "
+        sentences.append(f"{where}{problem}")
     return sentences
 
 
 def shortened(sentences: Sequence[str], *, most: int = 5) -> str:
     """Return the first messages, and how many more there are."""
-    more = f"; and {len(sentences) - most} more" if len(sentences) > most else ""
-    return "; ".join(sentences[:most]) + more
+    return "; ".join([*sentences[:most], *([f"and {len(sentences) - most} more"] if len(sentences) > most else [])])
 
 
 def noise_level(response: Float64[np.ndarray, " frames"], onset: int, rate: float) -> float:
@@ -163,21 +157,15 @@ def check_impulsive(sound: Float64[np.ndarray, " samples"], *, sample_rate: floa
     loudest, quietest = float(levels.max()), float(np.quantile(levels, 0.1))
     if loudest < _MIN_RISE * quietest:
         level = 20 * math.log10(loudest / quietest)
-        raise CaptureError(
-            f"{name}: expected an impact, its loudest 10 ms at least 6 dB above its quietest, got {level:.1f} dB; "
-            "record a single impact with silence before or after it",
-            file=name,
-            value=level,
+        wanted, advice = (
+            "its loudest 10 ms at least 6 dB above its quietest",
+            "record one impact with silence around it",
         )
+        raise CaptureError.expected(wanted, level, got=f"{level:.1f} dB", file=name, advice=advice)
 
 
 def find_clipping(response: Float64[np.ndarray, " frames"], *, name: str) -> str | None:
     """Return a message on how much of a sound is clipped; None where nothing is."""
     clipped = clipped_samples(response)
-    if not clipped:
-        return None
-    share = 100.0 * clipped / len(response)
-    return (
-        f"{name}: {clipped} samples ({share:.2g} %) are clipped at {np.abs(response).max():.3g}, which no mode can "
-        "explain; turn the gain down and record it again"
-    )
+    found = f"{name}: {clipped} samples ({clipped / len(response):.2%}) are clipped at {np.abs(response).max():.3g}"
+    return f"{found}, which no mode can explain; turn the gain down and record it again" if clipped else None

@@ -37,23 +37,15 @@ _IDENTITY, _ORIGIN = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=tor
 class _Bounds:
     """Bounds of the comparison; lengths are over the object's diagonal."""
 
-    spot: float = 0.05
-    """Diagonal of the contacts below which their unit must be another."""
-    min_spot_contacts: int = 5
-    """Contacts on the surface from which on their small spread alone shows another unit."""
-    least_spread: float = 0.4
-    """Diagonal of the contacts that another unit must leave: what is shrunk enough fits anywhere."""
-    resolution: float = 1 / 200
-    """Distance below which contacts lie equally well: points are no surface, nor contacts exact."""
-    log_size: float = 0.25
-    """Logarithm of a scale beyond which it is another object's: what materials cannot explain either."""
-    outlier_nats: float = 3.0
-    """Nats of a contact that is a mistake of its own, as one of twenty is."""
-    min_axes: int = 5
-    min_fitted: int = 8
-    """Contacts from which on axes are tried, and scales and shifts are fitted: fewer fit much by chance."""
-    max_contacts: int = 200
-    """Contacts, evenly taken from all, that the search compares."""
+    spot: float = 0.05  # diagonal of the contacts below which their unit must be another
+    spot_contacts: int = 5  # from which on a small spread alone shows that
+    least_spread: float = 0.4  # diagonal that another unit must leave: what is shrunk enough fits anywhere
+    resolution: float = 1 / 200  # distance below which contacts lie equally well: they are not exact
+    log_size: float = 0.25  # logarithm of a scale beyond which it is another object's: no material explains that
+    outlier_nats: float = 3.0  # of a contact that is a mistake of its own, as one of twenty is
+    axes_contacts: int = 5  # from which on axes are tried
+    fit_contacts: int = 8  # from which on scales and shifts are fitted: fewer fit much by chance
+    max_contacts: int = 200  # that are compared, evenly taken from all
     max_starts: int = 24
     max_steps: int = 60
 
@@ -160,18 +152,17 @@ class Placement:
         Where they lie on it already, as first impacts near the middle of a plate do, only many that are very close
         together say so.
         """
-        many = self.mostly_off or (self.shrunken and len(self.distances) >= _BOUNDS.min_spot_contacts)
+        many = self.mostly_off or (self.shrunken and len(self.distances) >= _BOUNDS.spot_contacts)
         return self.mistake is not None and self.mistake.unit is not None and many
 
     @property
     def misplaced(self) -> bool:
         """Whether no shape can be used as it lies: turned, mirrored, of another size, or with most contacts off."""
         mistake = self.mistake
-        if mistake is not None and (
-            mistake.turned or self.mostly_off or abs(math.log(mistake.factor)) > _BOUNDS.log_size
-        ):
+        if float(self.distances.median()) > self.tolerance:
             return True
-        return float(self.distances.median()) > self.tolerance
+        resized = mistake is not None and abs(math.log(mistake.factor)) > _BOUNDS.log_size
+        return mistake is not None and (mistake.turned or self.mostly_off or resized)
 
     def describe(self, names: Sequence[str] = (), *, what: str = "surface") -> str:
         """Return a message on the contacts off `what` there is, by these names or else by indices; "" for none."""
@@ -182,9 +173,9 @@ class Placement:
             farthest = float(self.distances.max())
             few = self.mistake is None and 2 * len(self.off) < len(self.distances) and not self.shrunken
             which = f"{len(self.off)} of {len(self.distances)} contacts lie" if few else "the contacts lie"
-            ratio = farthest / self.diagonal
-            relative = f"{ratio:.0f}" if ratio >= 100 else f"{ratio:.2g}"
-            found = f"{which} up to {_length(farthest)} ({relative} object diagonals) off the {what}"
+            found = (
+                f"{which} up to {_length(farthest)} ({farthest / self.diagonal:.3g} object diagonals) off the {what}"
+            )
             if few:
                 shown = ", ".join(names[row] if names else f"row {row}" for row in self.off[:8])
                 return f"{found}, the others on it; check {shown}{', …' * (len(self.off) > 8)}"
@@ -307,37 +298,29 @@ class _Search:
         """Yield similarities, the nats of their parameters, and whether their scale and their shift are fitted."""
         spread, diagonal, count = self.placement.spread, self.placement.diagonal, len(self.contacts)
         # What is symmetric but for errors of this size does not show which way it lies.
-        turning = count >= _BOUNDS.min_axes and float(self.placement.distances.max()) > self.placement.tolerance / 2
-        ratio, least = diagonal / spread if spread else 1.0, _BOUNDS.least_spread * diagonal
-        scales = [
-            (each, False) for each in FACTORS if each == 1 or not spread or least <= each * spread <= 1.2 * diagonal
-        ]
-        scales += [(each, True) for each in (1.0, 0.8 * ratio, ratio)]
-        free = (False, True) if count >= _BOUNDS.min_fitted else (False,)
-        for rarity, axes in _axes() if turning else [(0.0, _IDENTITY)]:
-            for (factor, scaled), shifted in itertools.product(scales, free):
-                if scaled and len(free) == 1:
-                    continue
-                start = Mistake(factor, axes)
+        off = float(self.placement.distances.max()) > self.placement.tolerance / 2
+        least, ratio = _BOUNDS.least_spread * diagonal, diagonal / spread if spread else 1.0
+        fits = [each for each in FACTORS if each == 1 or not spread or least <= each * spread <= 1.2 * diagonal]
+        scales, shifts = [(factor, False) for factor in fits], [False]
+        if count >= _BOUNDS.fit_contacts:
+            scales, shifts = scales + [(factor, True) for factor in (1.0, 0.8 * ratio, ratio)], [False, True]
+        middle, own = (points.amin(0) + points.amax(0) for points in (torch.from_numpy(self.tree.data), self.contacts))
+        for rarity, axes in _axes() if off and count >= _BOUNDS.axes_contacts else [(0.0, _IDENTITY)]:
+            for (factor, scaled), shifted in itertools.product(scales, shifts):
+                # From box to box.
+                start = Mistake(factor, axes, (middle - factor * axes @ own) / 2 if shifted else _ORIGIN)
                 # Nothing in meters takes two units.
-                units = 0 if factor == 1 and not scaled else 1 if start.unit and not scaled else 2
-                code = rarity + units * math.log(len(FACTORS)) + (3 * shifted + scaled) * math.log(count)
-                yield code, self.centered(start) if shifted else start, scaled, shifted
-
-    def centered(self, mistake: Mistake) -> Mistake:
-        """Return the mistake with the shift that brings the middle of the contacts' box to that of the object's."""
-        boxes = np.asarray(self.tree.data), mistake.undo(self.contacts).numpy()
-        middle, own = ((box.min(axis=0) + box.max(axis=0)) / 2 for box in boxes)
-        return replace(mistake, shift=torch.from_numpy(middle - own))
+                units = 2 if scaled or (factor != 1 and start.unit is None) else int(factor != 1)
+                nats = rarity + units * math.log(len(FACTORS)) + (3 * shifted + scaled) * math.log(count)
+                yield nats, start, scaled, shifted
 
     def fit(self, start: Mistake, scaled: bool, shifted: bool) -> Mistake:
-        """Return the mistake with the scale and the shift that iterated closest points find from a start."""
+        """Return the similarity with the scale and the shift that iterated closest points find from a start."""
         found, source = start, self.contacts @ start.axes.T
         old = source.mean(0) if shifted else _ORIGIN
         size = float((source - old).square().sum())
         for _ in range(_BOUNDS.max_steps if scaled or shifted else 0):
-            nearest = self.tree.query((found.factor * source + found.shift).numpy())[1]
-            target = torch.from_numpy(self.tree.data[nearest])
+            target = torch.from_numpy(self.tree.data[self.tree.query(found.undo(self.contacts).numpy())[1]])
             new = target.mean(0) if shifted else old
             factor = float(((source - old) * (target - new)).sum()) / size if scaled and size else found.factor
             last, found = found, replace(found, factor=factor, shift=new - factor * old)

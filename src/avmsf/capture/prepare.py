@@ -2,13 +2,14 @@
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy
 from jaxtyping import Float, Float64
 from scipy.fft import irfft, next_fast_len, rfft
 
-from avmsf.capture.audio import Recording, refuse_peak, refuse_rate, refuse_silence
+from avmsf.capture.audio import HIGHEST_RATE, LOWEST_RATE, MAX_PEAK, MIN_PEAK, Recording, refuse_silence
 from avmsf.capture.onset import SECONDS_BEFORE, Pulse, find_onset, find_pulse
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError
@@ -48,21 +49,23 @@ def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float |
     Raises `CaptureError` for rates outside 100 Hz to 192 kHz, silence, peaks outside `MIN_PEAK` to `MAX_PEAK`, and
     normalizations that lack their force.
     """
-    refuse_rate(recording.sample_rate * settings.playback_speed, recording.name)
+    played, refused = (
+        recording.sample_rate * settings.playback_speed,
+        partial(CaptureError.expected, file=recording.name),
+    )
+    if not LOWEST_RATE <= played <= HIGHEST_RATE:
+        wanted = f"a sample rate of {LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz (the file's rate times playback_speed)"
+        raise refused(wanted, played, got=f"{played:g} Hz", name="sample_rate", advice="export it at another rate")
     sound = recording.response(settings.response_channel, force_channel=settings.force_channel)
     refuse_silence(sound, recording.name)
-    refuse_peak(sound, recording.name)
-    refuse_short(sound, recording)
+    _check_length_and_peak(sound, recording)
     sound = remove_rumble(sound, settings.highpass, recording)
     pulse, onset = None, 0
     if settings.force_channel is not None:
         force = recording.channel(settings.force_channel)
         if np.ptp(force) == 0:
-            wanted, advice = "a force in its channel", "choose another force_channel or remove the recording"
-            value, key = settings.force_channel, "force_channel"
-            raise CaptureError.expected(
-                wanted, value, got=f"silence in {value}", file=recording.name, name=key, advice=advice
-            )
+            wanted, advice = "a force in the hammer's channel", "choose another one, or remove the recording"
+            raise refused(wanted, settings.force_channel, got="silence", name="force_channel", advice=advice)
         pulse = find_pulse(force)
         onset = pulse.start
         if newtons is None:
@@ -73,10 +76,8 @@ def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float |
     if manner == "auto":
         manner = "none" if newtons is None else "peak"
     if manner == "peak" and newtons is None:
-        advice = "give force_newtons in impacts.csv, or a force_channel"
-        raise CaptureError.expected(
-            'a force for normalize = "peak"', "peak", got="none", file=recording.name, name="normalize", advice=advice
-        )
+        wanted, advice = 'a force for normalize = "peak"', "give force_newtons in impacts.csv, or a force_channel"
+        raise refused(wanted, "peak", got="none", name="normalize", advice=advice)
     if manner == "deconvolve" and pulse is not None:
         before, kept = deconvolve(sound, force, pulse=pulse, regularization=settings.regularization)
     else:
@@ -86,10 +87,9 @@ def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float |
         peak = int(np.argmax(np.abs(whole)))
         onset += peak - len(before)
         before, kept = np.split(whole, [peak])
-    refuse_short(kept, recording)
-    if manner in ("peak", "deconvolve") and newtons is not None:
-        before, kept = before / newtons, kept / newtons
-    refuse_peak(kept, recording.name)
+    divisor = newtons if manner in ("peak", "deconvolve") and newtons is not None else 1.0
+    before, kept = before / divisor, kept / divisor
+    _check_length_and_peak(kept, recording)
     before = before[max(0, len(before) - margin_length(recording.sample_rate)) :].copy()
     return Prepared(kept, before, onset, pulse, None if manner == "none" else newtons, recording.sample_rate)
 
@@ -130,13 +130,17 @@ def margin_length(rate: float) -> int:
     return max(MIN_MARGIN, math.ceil(SECONDS_BEFORE * rate))
 
 
-def refuse_short(kept: Float64[np.ndarray, " samples"], recording: Recording) -> None:
-    """Raise `CaptureError` where less than `shortest_allowed` follows the onset."""
-    least = shortest_allowed(recording.sample_rate)
-    if len(kept) < least:
-        got = f"{len(kept)} ({len(kept) / recording.sample_rate * 1e3:.3g} ms)"
+def _check_length_and_peak(sound: Float64[np.ndarray, " samples"], recording: Recording) -> None:
+    """Raise `CaptureError` for less than `shortest_allowed`, and for samples that float32 cannot compute with."""
+    least, count, peak = shortest_allowed(recording.sample_rate), len(sound), float(np.abs(sound).max(initial=0.0))
+    if count < least:
+        got = f"{count} ({count / recording.sample_rate * 1e3:.3g} ms)"
         wanted, advice = f"at least {least} samples after the onset", "record it again, or remove its row"
-        raise CaptureError.expected(wanted, len(kept), got=got, file=recording.name, name="samples", advice=advice)
+        raise CaptureError.expected(wanted, count, got=got, file=recording.name, name="samples", advice=advice)
+    if not MIN_PEAK <= peak <= MAX_PEAK:
+        wanted, got = f"a peak of {MIN_PEAK:g} to {MAX_PEAK:g}", f"{peak:.3g}"
+        advice = "export it again, or check the force that it is divided by"
+        raise CaptureError.expected(wanted, peak, got=got, file=recording.name, name="peak", advice=advice)
 
 
 def deconvolve(

@@ -65,29 +65,26 @@ class CaptureSettings:
     Recordings that start at their peaks are not aligned with one another."""
 
     def __post_init__(self) -> None:
-        for key in ("unit", "surface_unit", "views_unit"):
-            if getattr(self, key) not in (*METRES, *((None,) if key == "surface_unit" else ())):
-                raise _unexpected(key, getattr(self, key), f"one of {', '.join(METRES)}")
-        for key in ("seconds", "playback_speed", "regularization"):
-            value = getattr(self, key)
-            if value is not None and not (value > 0 and math.isfinite(value)):
-                raise _unexpected(key, value, "a number above 0")
-        if not 0 <= self.highpass < math.inf:
-            raise _unexpected("highpass", self.highpass, "a frequency in Hz, or 0 for none")
-        if self.force_scale == 0 or not math.isfinite(self.force_scale):
-            raise _unexpected("force_scale", self.force_scale, "newtons for each unit of the channel")
-        for key in ("response_channel", "force_channel"):
-            value = getattr(self, key)
-            if value is not None and value < 1:
-                raise _unexpected(key, value, "a channel from 1 on")
-        if self.force_channel is not None and self.force_channel == self.response_channel:
-            raise _unexpected("force_channel", self.force_channel, "another channel than response_channel")
-        if self.time_zero not in TIME_ZEROS:
-            raise _unexpected("time_zero", self.time_zero, f"one of {', '.join(TIME_ZEROS)}")
-        if self.normalize not in NORMALIZATIONS:
-            raise _unexpected("normalize", self.normalize, f"one of {', '.join(NORMALIZATIONS)}")
-        if self.normalize == "deconvolve" and self.force_channel is None:
-            raise _unexpected("force_channel", None, 'the channel of the hammer\'s pulse, for normalize = "deconvolve"')
+        units, positive, channel = f"one of {', '.join(METRES)}", "a number above 0", "a channel from 1 on"
+        response, force = self.response_channel, self.force_channel
+        for key, valid, expected in (
+            ("unit", self.unit in METRES, units),
+            ("surface_unit", self.surface_unit in (None, *METRES), units),
+            ("views_unit", self.views_unit in METRES, units),
+            ("seconds", self.seconds is None or 0 < self.seconds < math.inf, positive),
+            ("playback_speed", 0 < self.playback_speed < math.inf, positive),
+            ("regularization", 0 < self.regularization < math.inf, positive),
+            ("highpass", 0 <= self.highpass < math.inf, "a frequency in Hz, or 0 for none"),
+            ("force_scale", 0 < abs(self.force_scale) < math.inf, "newtons for each unit of the channel"),
+            ("response_channel", response is None or response >= 1, channel),
+            ("force_channel", force is None or force >= 1, channel),
+            ("force_channel", force is None or force != response, "another channel than response_channel"),
+            ("time_zero", self.time_zero in TIME_ZEROS, f"one of {', '.join(TIME_ZEROS)}"),
+            ("normalize", self.normalize in NORMALIZATIONS, f"one of {', '.join(NORMALIZATIONS)}"),
+            ("force_channel", self.normalize != "deconvolve" or force, 'the hammer\'s, for normalize = "deconvolve"'),
+        ):
+            if not valid:
+                raise CaptureError.expected(expected, getattr(self, key), name=key)
 
     def kept_seconds(self, rate: float) -> float:
         """Return how many seconds are kept from the onset of files of this sample rate, Hz.
@@ -140,33 +137,28 @@ class CaptureSettings:
         """Return settings of these keys' plain values; `CaptureError` gives `name`, the key and what was expected."""
         known = {field.name: get_args(field.type) or (field.type,) for field in fields(cls)}
         try:
-            for key in values:
-                if key not in known:
-                    raise _unknown_key(key, list(known))
-            return cls(**{key: _typed(key, value, known[key]) for key, value in values.items()})
+            return cls(**{key: _typed(key, value, known) for key, value in values.items()})
         except CaptureError as error:
             raise CaptureError(f"{name}: {error}", file=file, name=error.name, value=error.value) from error
 
 
-def _unexpected(key: str, value: object, expected: str) -> CaptureError:
-    return CaptureError(f"{key}: expected {expected}, got {value!r}", name=key, value=value)
+def _typed(key: str, value: Any, known: Mapping[str, tuple[object, ...]]) -> Any:
+    """Return the value as one of its key's types; whole numbers serve as numbers, and `true` as neither.
 
-
-def _typed(key: str, value: Any, kinds: tuple[object, ...]) -> Any:
-    """Return the value as one of the kinds; whole numbers serve as numbers, and `true` as neither."""
-    if float in kinds and type(value) is int and abs(value) <= sys.float_info.max:
+    The `value` of the error of an unknown key is the most similar known one, if any.
+    """
+    if key not in known:
+        similar = next(iter(get_close_matches(key, known, n=1)), None)
+        advice = "" if similar is None else f"did you mean {similar}?"
+        wanted, got = f"keys among {', '.join(known)}", "another one"
+        raise CaptureError.expected(wanted, similar, got=got, name=key, advice=advice)
+    if float in known[key] and type(value) is int and abs(value) <= sys.float_info.max:
         return float(value)
-    if type(value) not in kinds:
-        words = {str: "text", int: "a whole number", float: "a number", bool: "true or false"}
-        raise _unexpected(key, value, " or ".join(word for kind, word in words.items() if kind in kinds))
+    if type(value) not in known[key]:
+        names = {str: "text", int: "a whole number", float: "a number", bool: "true or false"}
+        expected = " or ".join(name for kind, name in names.items() if kind in known[key])
+        raise CaptureError.expected(expected, value, name=key)
     return value
-
-
-def _unknown_key(key: str, known: list[str]) -> CaptureError:
-    """Return the error of a key; its `value` is the most similar known one, if any."""
-    similar = next(iter(get_close_matches(key, known, n=1, cutoff=0.6)), None)
-    advice = "" if similar is None else f" (did you mean {similar}?)"
-    return CaptureError(f"expected keys among {', '.join(known)}, got {key!r}{advice}", name=key, value=similar)
 
 
 def settings_of(folder: Path) -> CaptureSettings:

@@ -1,7 +1,6 @@
 """`impacts.csv`: one row for each recording, with the contact and, where known, the impact's direction and force."""
 
 import csv
-import glob
 import io
 import math
 import re
@@ -11,12 +10,13 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 from avmsf._utils.files import is_lfs_pointer
 from avmsf._utils.text import listed, read_text
 from avmsf.capture.filenames import missing_recording
 from avmsf.capture.settings import METRES, CaptureSettings
-from avmsf.errors import CaptureError, CaptureWarning, Location
+from avmsf.errors import CaptureError, CaptureWarning
 
 TABLE = "impacts.csv"
 REQUIRED = ("file", "x", "y", "z")
@@ -47,10 +47,9 @@ class Row:
     decimal_comma: bool
     """Whether numbers may be written 0,75: so in tables whose columns are not separated by commas."""
 
-    @property
-    def location(self) -> Location:
-        """Where it is, for errors."""
-        return Location(TABLE, self.line, f"row {self.line}")
+    def error(self, wanted: str, value: Any, *, name: str, got: str | None = None, advice: str = "") -> CaptureError:
+        """Return an error about a value in this row."""
+        return CaptureError.expected(wanted, value, got=got, file=TABLE, row=self.line, name=name, advice=advice)
 
 
 @dataclass(frozen=True)
@@ -87,8 +86,8 @@ def read_cells(path: Path) -> tuple[list[tuple[int, list[str]]], str]:
     except (OSError, ValueError, csv.Error) as error:
         raise CaptureError.expected("a table", got=f"a file that cannot be read: {error}", file=path) from error
     if len(lines) > MAX_ROWS + 1:
-        message = f"{path}: expected at most {MAX_ROWS:,} rows, got more; divide the table"
-        raise CaptureError(message, file=path, row=lines[-1][0])
+        wanted, advice = f"at most {MAX_ROWS:,} rows", "divide the table"
+        raise CaptureError.expected(wanted, got="more", file=path, row=lines[-1][0], advice=advice)
     return [(line, cells) for line, cells in lines if any(cells)], separator
 
 
@@ -104,10 +103,10 @@ def read_rows(folder: Path) -> tuple[list[Row], list[CaptureWarning]]:
         kind = "a file" if folder.exists() else "none"
         raise CaptureError.expected("a capture folder", got=kind, file=folder, advice="check the path")
     if not path.is_file():
-        raise CaptureError(f"{folder}: expected {TABLE} in this folder, got none; {HOW_TO_WRITE}", file=path)
+        raise CaptureError.expected("a table", file=path, advice=HOW_TO_WRITE)
     lines, separator = read_cells(path)
     if not lines:
-        raise CaptureError(f"{path}: expected a table, got an empty file; {HOW_TO_WRITE}", file=path, value="")
+        raise CaptureError.expected("a table", "", got="an empty file", file=path, advice=HOW_TO_WRITE)
     header = [name.lower() for name in lines[0][1]]
     remarks = _check_header(header, path)
     rows = []
@@ -119,7 +118,7 @@ def read_rows(folder: Path) -> tuple[list[Row], list[CaptureWarning]]:
         named["file"] = _as_on_disk(folder, named["file"])
         rows.append(Row(line, named, separator != ","))
     if not rows:
-        raise CaptureError(f"{path}: expected rows below the header, got none; {HOW_TO_WRITE}", file=path, value=0)
+        raise CaptureError.expected("rows below the header", 0, got="none", file=path, advice=HOW_TO_WRITE)
     return rows, remarks
 
 
@@ -137,29 +136,35 @@ def _as_on_disk(folder: Path, file: str) -> str:
 
 def parse_row(row: Row, settings: CaptureSettings) -> Strike:
     """Turn one row into a contact in meters, a unit direction and a force; `CaptureError` names the row and value."""
-    where = row.location
-    written = [_number(row, name) for name in ("x", "y", "z")]
-    contact = [value * settings.meters for value in written]
-    farthest = max(written, key=abs)
-    if abs(farthest) * settings.meters > FARTHEST:
-        shown = ", ".join(row.cells[name] for name in ("x", "y", "z"))
-        raise where.error(
-            f"expected a contact within {FARTHEST:g} m of the origin, got ({shown}), {math.hypot(*contact):.4g} m away "
-            f"(unit = {settings.unit!r}): {fitting_units(abs(farthest))}",
-            name="unit",
-            value=written,
-        )
-    direction = None
+    x, y, z = written = [_number(row, name) for name in REQUIRED[1:]]
+    farthest, direction, newtons = max(map(abs, written)), None, None
+    if farthest * settings.meters > FARTHEST:
+        got = f"({', '.join(row.cells[name] for name in REQUIRED[1:])}) {settings.unit}"
+        wanted, advice = f"a contact within {FARTHEST:g} m of the origin", fitting_units(farthest)
+        raise row.error(wanted, written, got=got, name="unit", advice=advice)
     if DIRECTION[0] in row.cells:
-        direction = _unit_vector([_number(row, name) for name in DIRECTION], where)
-    newtons = None
+        vector = [_number(row, name) for name in DIRECTION]
+        length = math.hypot(*vector)
+        if length == 0:
+            wanted, advice = "a direction as nx,ny,nz", "give a direction or remove the columns"
+            raise row.error(wanted, vector, got="the zero vector", name=DIRECTION[0], advice=advice)
+        # What has unit length already stays as it is, so that writing and reading again changes no digit.
+        scale = 1.0 if abs(length - 1) < 1e-6 else 1 / length
+        direction = (vector[0] * scale, vector[1] * scale, vector[2] * scale)
     if FORCE in row.cells:
         newtons = _number(row, FORCE)
         if not MIN_FORCE_NEWTONS <= newtons <= MAX_FORCE_NEWTONS:
-            limits = f"{MIN_FORCE_NEWTONS:g} to {MAX_FORCE_NEWTONS:g} N"
-            message = f"expected {FORCE}, a peak force of {limits}, got {newtons:g}"
-            raise where.error(message, name=FORCE, value=newtons)
-    return Strike(_inside(row.cells["file"], where), row.line, (contact[0], contact[1], contact[2]), direction, newtons)
+            wanted = f"{FORCE}, a peak force, of {MIN_FORCE_NEWTONS:g} to {MAX_FORCE_NEWTONS:g} N"
+            raise row.error(wanted, newtons, name=FORCE)
+    text = row.cells["file"]
+    path = PurePosixPath(text.replace("\\", "/"))
+    # A capture is one folder that can be moved, sent and read by others, so nothing outside it belongs to it.
+    if not text or path.is_absolute() or ".." in path.parts or ":" in path.parts[0]:
+        raise row.error(
+            "a path inside the capture folder", text, got=text or "nothing", name="file", advice="copy it there"
+        )
+    meters = settings.meters
+    return Strike(str(path), row.line, (x * meters, y * meters, z * meters), direction, newtons)
 
 
 def valid_rows(rows: Iterable[Row], settings: CaptureSettings) -> Iterator[Strike]:
@@ -212,17 +217,22 @@ def refuse_missing(folder: Path, strikes: Sequence[Strike]) -> None:
     missing = [file for file in files if is_missing(folder / file)]
     if not missing:
         return
-    moved = ((file, _path_below(folder, file, files)) for file in missing)
-    file, below = next(((file, below) for file, below in moved if below is not None), (missing[0], None))
-    if len(missing) == 1 and below is not None:
-        message = f"{file}: expected a sound file, got none; write {below} in {TABLE}"
-        raise CaptureError(message, file=folder / file, name="file", value=below)
-    if len(missing) == 1:
+    paths = (path.relative_to(folder) for path in folder.rglob("*") if path.name in missing)
+    shown = sorted(
+        (path.as_posix() for path in paths if not any(part.startswith(".") for part in path.parts)), reverse=True
+    )
+    below = {PurePosixPath(path).name: path for path in shown if path not in files}
+    moved, single = next((file for file in missing if file in below), None), len(missing) == 1
+    if single and moved is None:
         advice, used = f"copy it there, or remove its row from {TABLE}", {folder / each for each in files}
-        raise missing_recording(folder / file, file, advice=advice, used=used)
-    advice = "copy them there, or correct their names" if below is None else f"write {below} in place of {file}"
-    got, table = f"none for {len(missing)} of {len(strikes)} ({listed(missing)})", folder / TABLE
-    raise CaptureError.expected("a file for each row", missing, got=got, file=table, name="file", advice=advice)
+        raise missing_recording(folder / missing[0], missing[0], advice=advice, used=used)
+    advice = f"write {below[moved]} in place of {moved}" if moved else "copy them there, or correct their names"
+    got, value = (
+        f"none for {len(missing)} of {len(strikes)} ({listed(missing)})",
+        below[moved] if single and moved else missing,
+    )
+    path = folder / (missing[0] if single else TABLE)
+    raise CaptureError.expected("a file for each row", value, got=got, file=path, name="file", advice=advice)
 
 
 def is_missing(path: Path) -> bool:
@@ -231,15 +241,6 @@ def is_missing(path: Path) -> bool:
         return not path.exists()
     except OSError:
         return False
-
-
-def _path_below(folder: Path, file: str, files: Sequence[str]) -> str | None:
-    """Return the path of a file in a subfolder that has the name of a missing one and no row; None without."""
-    if PurePosixPath(file).name != file:
-        return None
-    found = sorted(path.relative_to(folder) for path in folder.rglob(glob.escape(file)))
-    seen = (path.as_posix() for path in found if not any(part.startswith(".") for part in path.parts))
-    return next((path for path in seen if path not in files), None)
 
 
 def fitting_units(written: float) -> str:
@@ -282,30 +283,6 @@ def _number(row: Row, name: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        advice = "; separate the columns by semicolons where numbers have decimal commas" if "," in text else ""
-        raise row.location.error(f"expected a number as {name}, got {text!r}{advice}", name=name, value=text)
+        advice = "separate the columns by semicolons where numbers have decimal commas" if "," in text else ""
+        raise row.error(f"a number as {name}", text, name=name, advice=advice)
     return value
-
-
-def _unit_vector(values: Sequence[float], where: Location) -> tuple[float, float, float]:
-    length = math.hypot(*values)
-    if length == 0:
-        message = "expected a direction as nx,ny,nz, got the zero vector; give a direction or remove the columns"
-        raise where.error(message, name=DIRECTION[0], value=list(values))
-    # What has unit length already stays as it is, so that writing and reading again changes no digit.
-    scale = 1.0 if abs(length - 1) < 1e-6 else 1 / length
-    return (values[0] * scale, values[1] * scale, values[2] * scale)
-
-
-def _inside(text: str, where: Location) -> str:
-    """Return the path with forward slashes; `CaptureError` for one that leaves the folder.
-
-    A capture is one folder that can be moved, sent and read by others, so nothing outside it belongs to it.
-    """
-    path = PurePosixPath(text.replace("\\", "/"))
-    if not text:
-        raise where.error("expected a wav file's path as file, got nothing", name="file", value=text)
-    if path.is_absolute() or ".." in path.parts or ":" in path.parts[0]:
-        message = f"expected a path inside the capture folder as file, got {text}; copy it there"
-        raise where.error(message, name="file", value=text)
-    return str(path)
