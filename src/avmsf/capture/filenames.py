@@ -24,14 +24,24 @@ _OTHER_NAMES = {
 _OF_VIEWS = frozenset(("transforms.json", "sparse", "cameras.bin", "cameras.txt", *SPLATS))
 
 
-def number_key(name: str) -> list[tuple[bool, int, str]]:
+def number_key(name: str) -> str:
     """Return what sorts names by the numbers in them: 2.wav before 10.wav."""
-    parts = re.findall(r"\d+|\D+", name)
-    # By their length first: numbers of thousands of digits are not for int.
-    digits = [each.lstrip("0") if each.isdecimal() else None for each in parts]
-    return [
-        (True, 0, part) if each is None else (False, len(each), each) for each, part in zip(digits, parts, strict=True)
-    ]
+    return re.sub(r"\d+", lambda digits: digits[0].zfill(255), name)
+
+
+def files_in(folder: Path, *, deep: bool = True) -> list[Path]:
+    """Return the files in a folder, sorted, and `deep` in those beneath it; none where there is no folder.
+
+    Hidden files and folders are left out: a cache in `.avmsf` holds images and recordings of its own.
+    """
+    paths = folder.rglob("*") if deep else folder.glob("*")
+    seen = (path for path in paths if not any(part.startswith(".") for part in path.relative_to(folder).parts))
+    return sorted(path for path in seen if path.is_file())
+
+
+def pictures_in(folder: Path, *, deep: bool) -> list[Path]:
+    """Return the image files among `files_in`."""
+    return [path for path in files_in(folder, deep=deep) if path.suffix.lower() in PICTURE_SUFFIXES]
 
 
 def find_surface_file(folder: Path, settings: CaptureSettings) -> Path | None:
@@ -51,10 +61,9 @@ def find_surface_file(folder: Path, settings: CaptureSettings) -> Path | None:
 def unused_files(folder: Path, settings: CaptureSettings) -> list[str]:
     """Return a sentence for each file that looks like a shape, pictures, cameras or a table and is not used.
 
-    Hidden folders are left out. Of many pictures in one folder one sentence is made.
+    Of many pictures in one folder one sentence is made.
     """
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    files = [path for path in files if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
+    files = files_in(folder)
     cameras = any(path.name in ("transforms.json", "cameras.bin", "cameras.txt") for path in files)
     surface, advice = find_surface_file(folder, settings), dict[str, str]()
     for path in files:
@@ -109,28 +118,10 @@ def missing_recording(path: Path, name: str, *, advice: str, used: Collection[Pa
     else:
         # A file with another number is another recording, not another spelling: 5.wav is similar to 005.wav, 040.wav
         # is not. Sorted by name: the order of a folder differs from disk to disk.
-        numbers = _numbers(path.name)
         unused = sorted(other.name for other in path.parent.iterdir() if other not in used)
-        names = {each.lower(): each for each in unused if not numbers or _numbers(each) in (numbers, [])}
+        numbers = {each: [int(digits) for digits in re.findall("[0-9]+", each)] for each in (*unused, path.name)}
+        wanted = numbers[path.name]
+        names = {each.lower(): each for each in unused if not wanted or numbers[each] in (wanted, [])}
         near = next((names[each] for each in get_close_matches(path.name.lower(), names, n=1, cutoff=0.7)), None)
         advice = advice if near is None else f"did you mean {near}?"
     return CaptureError(f"{name}: expected a sound file, got none; {advice}", file=path, value=near)
-
-
-def _numbers(name: str) -> list[int]:
-    return [int(digits) for digits in re.findall("[0-9]+", name)]
-
-
-def pictures_in(folder: Path, *, deep: bool) -> list[Path]:
-    """Return the image files in a folder, sorted, and `deep` in those beneath it; none where there is no folder.
-
-    Hidden folders are left out: a cache in `.avmsf` holds images of its own.
-    """
-    found = folder.rglob("*") if deep else folder.glob("*")
-    return sorted(
-        path
-        for path in found
-        if path.suffix.lower() in PICTURE_SUFFIXES
-        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
-        and path.is_file()
-    )

@@ -1,8 +1,9 @@
 """A capture folder: `impacts.csv`, its wav files, perhaps `capture.toml` and a surface; read, checked and written."""
 
 import csv
+import json
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
@@ -12,7 +13,7 @@ from avmsf._utils.files import new_folder
 from avmsf._utils.text import counted, listed
 from avmsf.capture.audio import read_recording, wav_bytes
 from avmsf.capture.checks import check_contacts, check_surface, find_surface
-from avmsf.capture.filenames import number_key
+from avmsf.capture.filenames import files_in, number_key
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.measure import RecordingReport, shared_problems, shortened
 from avmsf.capture.preprocess import Issues, RecordedImpact, check_levels, preprocess
@@ -127,7 +128,7 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
     names = [report.file for report in reports]
     if names == sorted(names) != sorted(names, key=number_key):
         remarks.append(TEXT_ORDER)
-    problems = [*map(str, issues.errors), *map(str, issues.warnings), *_copies(issues), *_unlisted(folder, names)]
+    problems = [*map(str, issues.errors), *map(str, issues.warnings), *_copies(issues), *_unlisted(folder, set(names))]
     return CaptureReport(not issues.errors and not failed, tuple(reports), tuple(problems), tuple(remarks))
 
 
@@ -182,11 +183,10 @@ def _copies(issues: Issues) -> list[str]:
     return sentences
 
 
-def _unlisted(folder: Path, listed_names: Sequence[str]) -> list[str]:
+def _unlisted(folder: Path, names: Collection[str]) -> list[str]:
     """Return a sentence on wav files without a row; hidden ones, such as what the studio has removed, are left out."""
-    names = (path.relative_to(folder) for path in folder.rglob("*.wav"))
-    found = {name.as_posix() for name in names if not any(part.startswith(".") for part in name.parts)}
-    unlisted = sorted(found - set(listed_names))
+    found = (path.relative_to(folder).as_posix() for path in files_in(folder) if path.suffix == ".wav")
+    unlisted = [name for name in found if name not in names]
     verb = "has" if len(unlisted) == 1 else "have"
     return [f"{counted(len(unlisted), 'wav file')} {verb} no row in {TABLE}: {listed(unlisted)}"] if unlisted else []
 
@@ -227,12 +227,11 @@ def _write_files(capture: Capture, folder: Path, *, onsets_within: float | None)
             table.writerow([name, *(f"{value:.17g}" for value in values)])
     if capture.surface is not None:
         write_surface(capture.surface, folder / "surface.ply")
-    name = "".join(
-        f"\\u{ord(mark):04x}" if mark in '"\\' or ord(mark) in (*range(32), 127) else mark for mark in capture.name
-    )
+    # TOML's strings are JSON's, but for the character 127.
+    name = json.dumps(capture.name, ensure_ascii=False).replace("\x7f", "\\u007f")
     seconds = impacts.sounds.shape[1] / rate if onsets_within is None else onsets_within
     (folder / SETTINGS).write_text(
-        f'name = "{name}"\n'
+        f"name = {name}\n"
         f"seconds = {seconds!r}\n"
         f"playback_speed = {speed!r}\n"
         f'normalize = "{"none" if impacts.forces is None else "done"}"\n'

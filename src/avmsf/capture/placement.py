@@ -88,25 +88,22 @@ class Mistake:
         return next((name for meters, name in UNITS.items() if abs(size / meters - 1) < 1e-6), None)
 
     def __str__(self) -> str:
-        within = f"they lie within {_length(self.distance)} of it"
+        within, steps = f"they lie within {_length(self.distance)} of it", []
         if self.stated:
             return f"{within} once moved as {self.stated} says that the object was: give both in one frame"
-        steps, questions, moved = [], [], bool(self.shift.any())
         if self.factor != 1:
-            larger = self.factor > 1
-            steps.append(f"{'multiplied' if larger else 'divided'} by {max(self.factor, 1 / self.factor):.4g}")
-            whose = "the surface's unit" if larger else "their unit"
-            questions.append(f"is {whose} {self.unit}?" if self.unit else "are they and the surface of one scale?")
+            whose = "the surface's unit" if self.factor > 1 else "their unit"
+            unit = f" (is {whose} {self.unit}?)" if self.unit else ""
+            done = "multiplied" if self.factor > 1 else "divided"
+            steps.append(f"{done} by {max(self.factor, 1 / self.factor):.4g}{unit}")
         if self.turned:
-            steps.append(f"with (x, y, z) taken as {_axis_names(self.axes)}")
-            upright = "upside down?" if float(self.axes[2, 2]) < -0.9 else "does another axis point up?"
-            questions.append("are the axes mirrored?" if float(torch.linalg.det(self.axes)) < 0 else upright)
-        if moved:
+            columns = enumerate(self.axes.abs().argmax(1).tolist())
+            names = ", ".join("-" * bool(self.axes[row, column] < 0) + "xyz"[column] for row, column in columns)
+            mirrored = " (are they mirrored?)" if float(torch.linalg.det(self.axes)) < 0 else ""
+            steps.append(f"with (x, y, z) taken as ({names}){mirrored}")
+        if self.shift.any():
             steps.append(f"moved by ({', '.join(f'{value:.3g}' for value in self.shift.tolist())}) m")
-            questions.append("do the origins differ?")
-        if self.factor != 1 and self.unit is None and moved:
-            questions = ["are they in another frame?"]
-        return f"{', '.join(steps)}{',' * (len(steps) > 1)} {within}: {' '.join(questions)}"
+        return f"{', '.join(steps)}, {within}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,19 +165,17 @@ class Placement:
         """Return a message on the contacts off `what` there is, by these names or else by indices; "" for none."""
         if self.on_surface:
             return ""
-        found = f"the contacts lie within {_length(self.spread)} on an object {_length(self.diagonal)} across"
-        if self.off or not self.shrunken:
-            farthest = float(self.distances.max())
-            few = self.mistake is None and 2 * len(self.off) < len(self.distances) and not self.shrunken
-            which = f"{len(self.off)} of {len(self.distances)} contacts lie" if few else "the contacts lie"
-            found = (
-                f"{which} up to {_length(farthest)} ({farthest / self.diagonal:.3g} object diagonals) off the {what}"
-            )
-            if few:
-                shown = ", ".join(names[row] if names else f"row {row}" for row in self.off[:8])
-                return f"{found}, the others on it; check {shown}{', …' * (len(self.off) > 8)}"
+        count, farthest = len(self.distances), float(self.distances.max())
+        few = self.mistake is None and not self.shrunken and 2 * len(self.off) < count
+        which = f"{len(self.off)} of {count} contacts lie" if few else "the contacts lie"
+        found = f"{which} up to {_length(farthest)} ({farthest / self.diagonal:.3g} object diagonals) off the {what}"
+        if not self.off and self.shrunken:
+            found = f"the contacts lie within {_length(self.spread)} on an object {_length(self.diagonal)} across"
         if self.mistake is not None:
             return f"{found}; {self.mistake}"
+        if few:
+            shown = ", ".join(names[row] if names else f"row {row}" for row in self.off[:8])
+            return f"{found}, the others on it; check {shown}{', …' * (len(self.off) > 8)}"
         if not self.off:
             return f"{found}; check that both are in one frame and unit"
         return (
@@ -336,11 +331,6 @@ def _axes() -> list[tuple[float, Float[Tensor, "3 3"]]]:
     rarities = [1 if turn.trace() == 3 else 4 if turn[0, 0] == 1 and turn.trace() == 1 else 24 for turn in turns]
     found = [(math.log(rarity), turn) for rarity, turn in zip(rarities, turns, strict=True)]
     return found + [(math.log(48), 0.0 - turn) for turn in turns]
-
-
-def _axis_names(axes: Float[Tensor, "3 3"]) -> str:
-    columns = axes.abs().argmax(1).tolist()
-    return f"({', '.join('-' * bool(axes[row, name] < 0) + 'xyz'[name] for row, name in enumerate(columns))})"
 
 
 def _some(places: np.ndarray, most: int) -> np.ndarray:

@@ -14,7 +14,7 @@ from typing import Any
 
 from avmsf._utils.files import is_lfs_pointer
 from avmsf._utils.text import listed, read_text
-from avmsf.capture.filenames import missing_recording
+from avmsf.capture.filenames import files_in, missing_recording
 from avmsf.capture.settings import METRES, CaptureSettings
 from avmsf.errors import CaptureError, CaptureWarning
 
@@ -217,11 +217,8 @@ def refuse_missing(folder: Path, strikes: Sequence[Strike]) -> None:
     missing = [file for file in files if is_missing(folder / file)]
     if not missing:
         return
-    paths = (path.relative_to(folder) for path in folder.rglob("*") if path.name in missing)
-    shown = sorted(
-        (path.as_posix() for path in paths if not any(part.startswith(".") for part in path.parts)), reverse=True
-    )
-    below = {PurePosixPath(path).name: path for path in shown if path not in files}
+    unlisted = (path.relative_to(folder).as_posix() for path in reversed(files_in(folder)) if path.name in missing)
+    below = {PurePosixPath(path).name: path for path in unlisted if path not in files}
     moved, single = next((file for file in missing if file in below), None), len(missing) == 1
     if single and moved is None:
         advice, used = f"copy it there, or remove its row from {TABLE}", {folder / each for each in files}
