@@ -10,7 +10,8 @@ from scipy.signal import fftconvolve
 from avmsf.capture import CaptureSettings, check, read_capture
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.prepare import prepare
-from avmsf.capture.preprocess import RecordedImpact, start_with_impact
+from avmsf.capture.preprocess import start_with_impact
+from avmsf.capture.table import Impact
 from avmsf.datasets.recordings import build_capture
 from factories.capture_folder import RATE, fill, ring
 from oracles.plate import Plate, sample_contacts, strike
@@ -190,7 +191,7 @@ def test_a_force_channel_says_where_an_impulse_response_starts(tmp_path: Path) -
 def test_a_dataset_s_recordings_have_margins_in_the_sounds_unit() -> None:
     files = {name: each.astype(np.float64) for name, each in pre_triggered(40, 300, 1000).items()}
     recordings = [
-        RecordedImpact(name, Recording(name, each[None], float(RATE), "FLOAT"), np.full(3, row), gain_db=20.0)
+        (Impact(name, [row] * 3, gain_db=20.0), Recording(name, each[None], float(RATE), "FLOAT"))
         for row, (name, each) in enumerate(files.items())
     ]
     impacts = build_capture(

@@ -15,7 +15,7 @@ import torch
 
 from avmsf._utils.processes import write_lock
 from avmsf.capture import check, read_capture
-from avmsf.capture.table import Strike
+from avmsf.capture.table import Impact
 from avmsf.errors import CaptureError, FolderInUseError, RecordingLengthError
 from avmsf.pipeline.config import CACHE
 from avmsf.studio import capture
@@ -26,7 +26,7 @@ from factories.raising import raises
 from opened_plate import blow, wav
 
 
-def contact(x: float) -> Strike:
+def contact(x: float) -> Impact:
     return read_contact({"x": repr(x), "y": "0.25", "z": "-0.001", "nx": "0", "ny": "0", "nz": "-2"})
 
 

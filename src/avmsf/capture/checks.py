@@ -13,7 +13,7 @@ import torch
 from avmsf.capture.filenames import find_surface_file
 from avmsf.capture.placement import Placement, check_placement
 from avmsf.capture.settings import METRES, CaptureSettings
-from avmsf.capture.table import TABLE, Strike, fitting_units, read_rows, valid_rows
+from avmsf.capture.table import TABLE, Impact, fitting_units, read_rows, valid_rows
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.mesh.surface import Surface, contacted_part, read_surface, surface_points
 
@@ -23,21 +23,21 @@ USUAL_SIZE = 0.24
 """Meters across of an object whose impacts are recorded: the median of the 20 simulated objects (.14 to .55)."""
 
 
-def check_contacts(strikes: Sequence[Strike], settings: CaptureSettings) -> list[CaptureWarning]:
+def check_contacts(impacts: Sequence[Impact], settings: CaptureSettings) -> list[CaptureWarning]:
     """Return warnings of repeated contacts, and of contacts that together look like another unit's."""
     remarks = []
     places = defaultdict(list)
-    for strike in strikes:
+    for impact in impacts:
         # Impacts along other directions are no repetitions.
-        label = (*strike.contact, *(strike.direction or ()))
-        places[tuple(round(value, 6) for value in label)].append(strike.line)
+        label = (*impact.contact, *(impact.direction or ()))
+        places[tuple(round(value, 6) for value in label)].append(impact.line)
     repeated = [lines for lines in places.values() if len(lines) > 1]
     if repeated:
         shown = "; ".join(", ".join(map(str, lines)) for lines in repeated[:5])
         more = " and more" * (len(repeated) > 5)
         message = f"{TABLE}: rows at the same contact: {shown}{more}; used as repeated impacts"
         remarks.append(CaptureWarning(message, file=TABLE, row=repeated[0][1], value=repeated))
-    across = float(np.linalg.norm(np.ptp([strike.contact for strike in strikes], axis=0))) if strikes else 0.0
+    across = float(np.linalg.norm(np.ptp([impact.contact for impact in impacts], axis=0))) if impacts else 0.0
     if across > WIDEST or 0 < across < NARROWEST:
         size = f"{across:.3g} m apart" if across > WIDEST else f"within {across * 1e3:.2g} mm"
         message = (
@@ -49,14 +49,14 @@ def check_contacts(strikes: Sequence[Strike], settings: CaptureSettings) -> list
 
 
 def check_surface(
-    strikes: Sequence[Strike], surface: Surface, *, settings: CaptureSettings
+    impacts: Sequence[Impact], surface: Surface, *, settings: CaptureSettings
 ) -> tuple[Surface, list[CaptureWarning]]:
     """Return the part of a surface that the contacts lie on, and a warning of contacts off it.
 
     `CaptureError` where surface and contacts are in different units, and where a contact lies farther off than the
     surface is large.
     """
-    contacts = torch.tensor([strike.contact for strike in strikes], dtype=torch.float64)
+    contacts = torch.tensor([impact.contact for impact in impacts], dtype=torch.float64)
     surface, areas = contacted_part(surface, contacts)
     if areas:
         sizes = " and ".join(f"{1e4 * area:.3g} cm2" for area in areas[1:3])
@@ -67,12 +67,12 @@ def check_surface(
         return surface, []
     lines = [f'{key} = "{value}"' for key, value in fitting_units_of(placement, settings).items()]
     advice = f" If so, write {' and '.join(lines)} in capture.toml" if lines else ""
-    found = placement.describe([f"row {strike.line}" for strike in strikes]) + advice
+    found = placement.describe([f"row {impact.line}" for impact in impacts]) + advice
     farthest = float(placement.distances.max())
     if placement.other_unit:
         message = f"{TABLE}: expected contacts and surface in one unit; {found}"
         raise CaptureError(message, file=TABLE, name="unit", value=farthest)
-    worst = strikes[int(placement.distances.argmax())].line
+    worst = impacts[int(placement.distances.argmax())].line
     if farthest > placement.diagonal:
         got = f"one {farthest:.3g} m off it, more than its extent of {placement.diagonal:.3g} m: {found}"
         wanted = "a contact on the surface"
@@ -85,12 +85,12 @@ def expect_one_unit(folder: Path, settings: CaptureSettings) -> None:
 
     For callers that read only the surface. Rows, and tables, that cannot be read are skipped.
     """
-    strikes = list[Strike]()
+    impacts = list[Impact]()
     with suppress(CaptureError):
-        strikes += valid_rows(read_rows(folder)[0], settings)
-    surface = find_surface(folder, settings) if strikes else None
+        impacts += valid_rows(read_rows(folder)[0], settings)
+    surface = find_surface(folder, settings) if impacts else None
     if surface is not None:
-        check_surface(strikes, surface, settings=settings)
+        check_surface(impacts, surface, settings=settings)
 
 
 def fitting_units_of(placement: Placement, settings: CaptureSettings) -> dict[str, str]:

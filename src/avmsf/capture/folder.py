@@ -3,7 +3,7 @@
 import csv
 import json
 import warnings
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
@@ -11,12 +11,12 @@ import torch
 
 from avmsf._utils.files import new_folder
 from avmsf._utils.text import counted, listed
-from avmsf.capture.audio import read_recording, wav_bytes
+from avmsf.capture.audio import Recording, read_recording, wav_bytes
 from avmsf.capture.checks import check_contacts, check_surface, find_surface
 from avmsf.capture.filenames import files_in, number_key
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.measure import RecordingReport, shared_problems, shortened
-from avmsf.capture.preprocess import Issues, RecordedImpact, check_levels, preprocess
+from avmsf.capture.preprocess import Issues, check_levels, preprocess
 from avmsf.capture.settings import SETTINGS, CaptureSettings, settings_of
 from avmsf.capture.table import (
     DIRECTION,
@@ -24,7 +24,7 @@ from avmsf.capture.table import (
     FORCE,
     REQUIRED,
     TABLE,
-    Strike,
+    Impact,
     fitting_units,
     in_folder,
     is_missing,
@@ -136,40 +136,39 @@ def _walk(folder: Path, settings: CaptureSettings, issues: Issues) -> tuple[Impa
     """Return the impacts and the part of the surface that they lie on; add to what is wrong."""
     rows, warned = read_rows(folder)
     issues.warnings += warned
-    strikes = []
+    parsed = []
     for row in rows:
-        with issues.keep(row.cells["file"], row.line):
-            strikes.append(parse_row(row, settings))
+        with issues.keep(row):
+            parsed.append(parse_row(row, settings))
     with issues.keep():
-        refuse_repeated_files(strikes)
+        refuse_repeated_files(parsed)
     with issues.keep():
-        refuse_missing(folder, strikes)
-    issues.warnings += check_contacts(strikes, settings)
+        refuse_missing(folder, parsed)
+    issues.warnings += check_contacts(parsed, settings)
     surface = None
     with issues.keep():
         surface = find_surface(folder, settings)
-        if surface is not None and strikes:
-            surface, warned = check_surface(strikes, surface, settings=settings)
+        if surface is not None and parsed:
+            surface, warned = check_surface(parsed, surface, settings=settings)
             issues.warnings += warned
-    impacts, _ = preprocess(_recordings(folder, strikes, issues), settings, issues)
+    impacts, _ = preprocess(read_recordings(folder, parsed, issues), settings, issues)
     with issues.keep():
         issues.warnings += check_levels(issues.sounds)
     return impacts, surface
 
 
-def _recordings(folder: Path, strikes: Sequence[Strike], issues: Issues) -> Iterator[RecordedImpact]:
+def read_recordings(folder: Path, impacts: Iterable[Impact], issues: Issues) -> Iterator[tuple[Impact, Recording]]:
+    """Read the recordings of impacts one after the other; add what is wrong with those that cannot be read."""
     advice = f"copy it there, or remove its row from {TABLE}"
-    for each in strikes:
+    for each in impacts:
         recording = None
-        with issues.keep(each.file, each.line):
+        with issues.keep(each):
             # Reading would name similar files, for which it compares up to a thousand names.
             if is_missing(folder / each.file):
                 raise CaptureError.expected("a sound file", file=each.file)
             recording = read_recording(folder / each.file, each.file, advice=advice)
         if recording is not None:
-            yield RecordedImpact(
-                each.file, recording, each.contact, each.direction, newtons=each.newtons, line=each.line
-            )
+            yield each, recording
 
 
 def _copies(issues: Issues) -> list[str]:

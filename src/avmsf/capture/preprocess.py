@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float64
 
 from avmsf._utils.text import counted
 from avmsf.capture.audio import Recording
@@ -19,6 +18,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.measure import RecordingReport, measure
 from avmsf.capture.prepare import MIN_MARGIN, Prepared, margin_length, prepare, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.table import Impact, Row
 from avmsf.errors import CaptureError, CaptureWarning
 
 START_LEVEL = 10**-2.0
@@ -40,27 +40,6 @@ MAX_RANGE_DB = 140.0
 """Level between the loudest and the faintest recording beyond which the faintest is less than the rounding of the
 loudest in float32 (144 dB), in which they are fitted."""
 
-Vector = Sequence[float] | Float64[np.ndarray, " 3"]
-
-
-@dataclass(frozen=True, eq=False)
-class RecordedImpact:
-    """One recording, with what is known of the impact."""
-
-    name: str
-    """What the capture calls it; messages on the sound alone have the recording's own name."""
-    recording: Recording
-    contact: Vector
-    """Object frame, meters."""
-    direction: Vector | None = None
-    """Unit vector along which the hammer moved, where it is known."""
-    newtons: float | None = None
-    """Peak force, where it is known by other means than a channel of the recording."""
-    gain_db: float = 0.0
-    """By how much the recorder made the sound louder, which is divided out."""
-    line: int = 0
-    """Line of impacts.csv."""
-
 
 @dataclass
 class Issues:
@@ -81,21 +60,21 @@ class Issues:
     """Whether all recordings start with the impact, and are not cut."""
 
     @contextmanager
-    def keep(self, name: str | None = None, line: int = 0) -> Iterator[None]:
-        """Collect or raise an error of one recording, or without a name of all."""
+    def keep(self, impact: Row | Impact | None = None) -> Iterator[None]:
+        """Collect or raise an error of one impact, or without it of the capture."""
         try:
             yield
         except CaptureError as error:
             if not self.collect:
                 raise
-            if name is None:
+            if impact is None:
                 self.errors.append(error)
             else:
-                self.failures.append((name, line, error))
+                self.failures.append((impact.file, impact.line, error))
 
 
 def preprocess(
-    recordings: Iterable[RecordedImpact],
+    recordings: Iterable[tuple[Impact, Recording]],
     settings: CaptureSettings,
     issues: Issues | None = None,
     *,
@@ -111,14 +90,13 @@ def preprocess(
     """
     issues = Issues() if issues is None else issues
     used = []
-    for each in recordings:
-        with issues.keep(each.name, each.line):
-            prepared = prepare(each.recording, settings, newtons=each.newtons)
+    for impact, recording in recordings:
+        with issues.keep(impact):
+            prepared = prepare(recording, settings, newtons=impact.newtons)
             if measured:
-                issues.reports.append(measure(each.recording, prepared, settings=settings, line=each.line))
-            issues.sounds[each.name] = hashlib.sha256(prepared.sound.tobytes()).digest(), prepared.peak
-            sound = _shorten(prepared, settings, gain=10 ** (-each.gain_db / 20))
-            used.append((each.name, each.contact, each.direction, sound))
+                issues.reports.append(measure(recording, prepared, settings=settings, line=impact.line))
+            issues.sounds[impact.file] = hashlib.sha256(prepared.sound.tobytes()).digest(), prepared.peak
+            used.append((impact, _shorten(prepared, settings, gain=10 ** (-impact.gain_db / 20))))
     if used:
         with issues.keep():
             return _join(*zip(*used, strict=True), settings=settings, issues=issues), issues
@@ -133,14 +111,9 @@ def _shorten(prepared: Prepared, settings: CaptureSettings, *, gain: float) -> P
 
 
 def _join(
-    names: Sequence[str],
-    contacts: Sequence[Vector],
-    directions: Sequence[Vector | None],
-    sounds: Sequence[Prepared],
-    *,
-    settings: CaptureSettings,
-    issues: Issues,
+    impacts: Sequence[Impact], sounds: Sequence[Prepared], *, settings: CaptureSettings, issues: Issues
 ) -> Impacts:
+    names = [each.file for each in impacts]
     rate = common_rate([each.rate for each in sounds], names)
     issues.uncut = (
         settings.align and not settings.from_peaks and settings.force_channel is None and start_with_impact(sounds)
@@ -159,10 +132,10 @@ def _join(
             rest = each.sound[length : length + size]
             before[row, size - len(each.before) :] = torch.from_numpy(each.before)
             after[row, : len(rest)] = torch.from_numpy(rest)
-    forces = [each.newtons for each in sounds]
-    known = not any(each is None for each in directions)
+    forces, directions = [each.newtons for each in sounds], [each.direction for each in impacts]
+    known = all(each is not None for each in directions)
     return Impacts(
-        contacts=torch.from_numpy(np.array(contacts, dtype=np.float64)),
+        contacts=torch.from_numpy(np.array([each.contact for each in impacts], dtype=np.float64)),
         sounds=torch.from_numpy(np.stack([each.sound[:length] for each in sounds])),
         sample_rate=rate * settings.playback_speed,
         names=tuple(names),

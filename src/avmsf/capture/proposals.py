@@ -5,7 +5,6 @@ docs/decisions/reading-recordings.md has the measurements behind the limits.
 """
 
 import json
-import os
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -19,14 +18,16 @@ from torch import Tensor
 
 from avmsf._utils.files import unwritable
 from avmsf._utils.text import read_toml
-from avmsf.capture.audio import Recording, read_recording
+from avmsf.capture.audio import Recording
 from avmsf.capture.checks import NARROWEST, WIDEST, find_surface, fitting_units_of
+from avmsf.capture.folder import read_recordings
 from avmsf.capture.measure import HIGHEST_NOISE_DB, decibels, noise_level
 from avmsf.capture.onset import SECONDS_BEFORE, find_onset, find_pulse
 from avmsf.capture.placement import check_placement
 from avmsf.capture.prepare import prepare, remove_rumble
+from avmsf.capture.preprocess import Issues
 from avmsf.capture.settings import METRES, SETTINGS, CaptureSettings, settings_of
-from avmsf.capture.table import Row, Strike, read_rows, valid_rows
+from avmsf.capture.table import Impact, Row, read_rows, valid_rows
 from avmsf.errors import CaptureError
 from avmsf.mesh.surface import surface_points
 
@@ -83,10 +84,14 @@ def propose_settings(
         return ()
     defaults, found = vars(CaptureSettings()), list[Proposal]()
     chosen |= {key for key, value in vars(settings).items() if value != defaults[key]}
+
+    def recordings(settings: CaptureSettings) -> Iterator[tuple[Impact, Recording]]:
+        return read_recordings(folder, valid_rows(rows, settings), Issues(collect=True))
+
     steps: list[tuple[set[str], Callable[[CaptureSettings], list[Proposal]]]] = [
         ({"unit", "surface_unit"}, lambda changed: _units(folder, rows, changed, factor)),
-        ({"force_channel", "response_channel"}, lambda changed: _channels(_recordings(folder, rows, changed))),
-        ({"highpass"}, lambda changed: _highpass(_recordings(folder, rows, changed), changed)),
+        ({"force_channel", "response_channel"}, lambda changed: _channels(recordings(changed))),
+        ({"highpass"}, lambda changed: _highpass(recordings(changed), changed)),
     ]
     for keys, propose in steps:
         if not chosen & keys:
@@ -158,7 +163,7 @@ def _units(folder: Path, rows: Sequence[Row], settings: CaptureSettings, factor:
     return [Proposal(key, unit, reason) for key, unit in units.items()]
 
 
-def _channels(recordings: Iterator[tuple[Strike, Recording]]) -> list[Proposal]:
+def _channels(recordings: Iterator[tuple[Impact, Recording]]) -> list[Proposal]:
     """Return which channel is the hammer's and which the sound's.
 
     A hammer's channel holds one short push in every recording. Of several sounds beside it, the one that stands highest
@@ -207,16 +212,16 @@ def _push_and_level(channel: Float64[np.ndarray, " frames"], rate: float) -> tup
     return share, -decibels(noise / float(np.abs(channel).max()))
 
 
-def _highpass(recordings: Iterator[tuple[Strike, Recording]], settings: CaptureSettings) -> list[Proposal]:
+def _highpass(recordings: Iterator[tuple[Impact, Recording]], settings: CaptureSettings) -> list[Proposal]:
     """Return the lowest cutoff that removes most of the noise and nothing of the object's.
 
     Or the lowest where most of what follows the impacts lies below it, as of a sensor that settles. Recordings that
     cannot be prepared are passed over; those of different rates, which are refused as a capture, show nothing.
     """
     rates, durations, noise, low = set(), [], [], []
-    for strike, recording in recordings:
+    for impact, recording in recordings:
         try:
-            prepared = prepare(recording, settings, newtons=strike.newtons)
+            prepared = prepare(recording, settings, newtons=impact.newtons)
         except CaptureError:
             continue
         rate, onset = recording.sample_rate, prepared.onset
@@ -264,14 +269,3 @@ def _powers_below(signal: Float64[np.ndarray, " samples"], rate: float) -> Float
     power[1 : (len(signal) + 1) // 2] *= 2.0
     frequency = np.fft.rfftfreq(len(signal), 1.0 / rate)
     return np.array([power[frequency < limit].sum() for limit in (*CUTOFFS_HZ, np.inf)])
-
-
-def _recordings(folder: Path, rows: Sequence[Row], settings: CaptureSettings) -> Iterator[tuple[Strike, Recording]]:
-    for strike in valid_rows(rows, settings):
-        # The error would name similar files, for which it compares up to a thousand names.
-        if not os.path.exists(folder / strike.file):
-            continue
-        try:
-            yield strike, read_recording(folder / strike.file, strike.file)
-        except CaptureError:
-            continue

@@ -47,23 +47,32 @@ class Row:
     decimal_comma: bool
     """Whether numbers may be written 0,75: so in tables whose columns are not separated by commas."""
 
+    @property
+    def file(self) -> str:
+        """Name of the recording as it is written."""
+        return self.cells["file"]
+
     def error(self, wanted: str, value: Any, *, name: str, got: str | None = None, advice: str = "") -> CaptureError:
         """Return an error about a value in this row."""
         return CaptureError.expected(wanted, value, got=got, file=TABLE, row=self.line, name=name, advice=advice)
 
 
 @dataclass(frozen=True)
-class Strike:
-    """One row parsed."""
+class Impact:
+    """What is known of one impact: a row parsed, or an entry of a dataset."""
 
     file: str
-    """Path of the wav file inside the capture folder, with forward slashes."""
-    line: int
-    contact: tuple[float, float, float]
-    """Meters."""
-    direction: tuple[float, float, float] | None
-    """Unit vector."""
-    newtons: float | None
+    """What the capture calls the recording: the path of its file inside the folder, with forward slashes."""
+    contact: Sequence[float]
+    """Object frame, meters."""
+    direction: Sequence[float] | None = None
+    """Unit vector along which the hammer moved."""
+    newtons: float | None = None
+    """Peak force, where it is known by other means than a channel of the recording."""
+    gain_db: float = 0.0
+    """By how much the recorder made the sound louder, which is divided out."""
+    line: int = 0
+    """Line of the table."""
 
 
 def read_cells(path: Path) -> tuple[list[tuple[int, list[str]]], str]:
@@ -134,7 +143,7 @@ def _as_on_disk(folder: Path, file: str) -> str:
     return file
 
 
-def parse_row(row: Row, settings: CaptureSettings) -> Strike:
+def parse_row(row: Row, settings: CaptureSettings) -> Impact:
     """Turn one row into a contact in meters, a unit direction and a force; `CaptureError` names the row and value."""
     x, y, z = written = [_number(row, name) for name in REQUIRED[1:]]
     farthest, direction, newtons = max(map(abs, written)), None, None
@@ -156,18 +165,17 @@ def parse_row(row: Row, settings: CaptureSettings) -> Strike:
         if not MIN_FORCE_NEWTONS <= newtons <= MAX_FORCE_NEWTONS:
             wanted = f"{FORCE}, a peak force, of {MIN_FORCE_NEWTONS:g} to {MAX_FORCE_NEWTONS:g} N"
             raise row.error(wanted, newtons, name=FORCE)
-    text = row.cells["file"]
-    path = PurePosixPath(text.replace("\\", "/"))
+    path = PurePosixPath(row.file.replace("\\", "/"))
     # A capture is one folder that can be moved, sent and read by others, so nothing outside it belongs to it.
-    if not text or path.is_absolute() or ".." in path.parts or ":" in path.parts[0]:
+    if not row.file or path.is_absolute() or ".." in path.parts or ":" in path.parts[0]:
         raise row.error(
-            "a path inside the capture folder", text, got=text or "nothing", name="file", advice="copy it there"
+            "a path inside the capture folder", row.file, got=row.file or "nothing", name="file", advice="copy it there"
         )
     meters = settings.meters
-    return Strike(str(path), row.line, (x * meters, y * meters, z * meters), direction, newtons)
+    return Impact(str(path), (x * meters, y * meters, z * meters), direction, newtons, line=row.line)
 
 
-def valid_rows(rows: Iterable[Row], settings: CaptureSettings) -> Iterator[Strike]:
+def valid_rows(rows: Iterable[Row], settings: CaptureSettings) -> Iterator[Impact]:
     """Yield the rows that can be parsed."""
     for row in rows:
         with suppress(CaptureError):
@@ -188,32 +196,32 @@ def in_folder(folder: Path) -> Iterator[None]:
         raise type(error)(f"{place}{error}", **{**error.attributes, "file": file}) from error
 
 
-def read_strikes(folder: Path, settings: CaptureSettings) -> tuple[list[Strike], list[CaptureWarning]]:
+def read_impacts(folder: Path, settings: CaptureSettings) -> tuple[list[Impact], list[CaptureWarning]]:
     """Return the parsed rows of the folder's `impacts.csv`, and warnings of columns that are not used.
 
     Raises `CaptureError` as `read_rows` and `parse_row`, for two rows of one file, and where several are missing.
     """
     with in_folder(folder):
         rows, remarks = read_rows(folder)
-        strikes = [parse_row(row, settings) for row in rows]
-        refuse_repeated_files(strikes)
-        refuse_missing(folder, strikes)
-    return strikes, remarks
+        impacts = [parse_row(row, settings) for row in rows]
+        refuse_repeated_files(impacts)
+        refuse_missing(folder, impacts)
+    return impacts, remarks
 
 
-def refuse_repeated_files(strikes: Sequence[Strike]) -> None:
+def refuse_repeated_files(impacts: Sequence[Impact]) -> None:
     """Raise `CaptureError` where two rows name one file: one of the two contacts must be wrong."""
     lines: dict[str, int] = {}
-    for strike in strikes:
-        if strike.file in lines:
-            wanted, got = "a different recording for each row", f"{strike.file} as in row {lines[strike.file]}"
-            raise CaptureError.expected(wanted, strike.file, got=got, file=TABLE, row=strike.line, name="file")
-        lines[strike.file] = strike.line
+    for impact in impacts:
+        if impact.file in lines:
+            wanted, got = "a different recording for each row", f"{impact.file} as in row {lines[impact.file]}"
+            raise CaptureError.expected(wanted, impact.file, got=got, file=TABLE, row=impact.line, name="file")
+        lines[impact.file] = impact.line
 
 
-def refuse_missing(folder: Path, strikes: Sequence[Strike]) -> None:
+def refuse_missing(folder: Path, impacts: Sequence[Impact]) -> None:
     """Raise one `CaptureError` where recordings are missing; for a single one with the file that may be meant."""
-    files = [strike.file for strike in strikes]
+    files = [impact.file for impact in impacts]
     missing = [file for file in files if is_missing(folder / file)]
     if not missing:
         return
@@ -225,7 +233,7 @@ def refuse_missing(folder: Path, strikes: Sequence[Strike]) -> None:
         raise missing_recording(folder / missing[0], missing[0], advice=advice, used=used)
     advice = f"write {below[moved]} in place of {moved}" if moved else "copy them there, or correct their names"
     got, value = (
-        f"none for {len(missing)} of {len(strikes)} ({listed(missing)})",
+        f"none for {len(missing)} of {len(impacts)} ({listed(missing)})",
         below[moved] if single and moved else missing,
     )
     path = folder / (missing[0] if single else TABLE)

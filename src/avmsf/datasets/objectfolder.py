@@ -15,8 +15,8 @@ from avmsf._utils.text import parse_json, read_text
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.checks import find_surface
 from avmsf.capture.folder import Capture
-from avmsf.capture.preprocess import RecordedImpact
 from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.table import Impact
 from avmsf.datasets.dataset import DatasetReport, ObjectFacts, ObjectReport, VisualSource
 from avmsf.datasets.numbering import (
     REALIMPACT_NAMES,
@@ -208,20 +208,20 @@ class ObjectFolderRaw:
             wrong.append(f"{shown}: expected contact coordinates{files and f' in {files}'}, got none")
         return wrong, newtons, gain_db
 
-    def _recordings(self, identifier: str, entries: list[_Entry]) -> Iterator[RecordedImpact]:
+    def _recordings(self, identifier: str, entries: list[_Entry]) -> Iterator[tuple[Impact, Recording]]:
         usual = _usual_gain(entries) or 0.0
         for entry in entries:
             force, sound = (read_recording(entry.folder / name) for name in ("Force.wav", "mic.wav"))
             frames = min(force.frames, sound.frames)
             channels = np.stack([force.channels[0, :frames], sound.channels[0, :frames]])
             name = f"{identifier}/audio/{entry.contact}/mic.wav"
-            yield RecordedImpact(
-                name=f"{entry.contact}.wav",
-                recording=Recording(name, channels, sound.sample_rate, sound.subtype),
-                contact=np.array(self._contacts[identifier, entry.contact]),
+            impact = Impact(
+                file=f"{entry.contact}.wav",
+                contact=self._contacts[identifier, entry.contact],
                 newtons=entry.newtons,
                 gain_db=usual if entry.gain_db is None else entry.gain_db,
             )
+            yield impact, Recording(name, channels, sound.sample_rate, sound.subtype)
 
     def _missing_archives(self) -> list[str]:
         present = {int(name) for name in self._folders}

@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 
 from avmsf.capture.audio import Recording
 from avmsf.capture.folder import Capture
-from avmsf.capture.preprocess import RecordedImpact
 from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.table import Impact
 from avmsf.datasets.dataset import DatasetReport, ObjectFacts, ObjectReport, VisualSource
 from avmsf.datasets.numbering import (
     REALIMPACT_NAMES,
@@ -153,7 +153,7 @@ class RealImpact:
 
     def _recordings(
         self, identifier: str, rows: list[int], *, vertices: np.ndarray, positions: np.ndarray
-    ) -> Iterator[RecordedImpact]:
+    ) -> Iterator[tuple[Impact, Recording]]:
         sounds = self._array(identifier, SOUNDS)
         for row in rows:
             name = f"{identifier}/{FOLDER}/{SOUNDS}, row {row}"
@@ -163,7 +163,7 @@ class RealImpact:
                 advice = f"unpack {identifier}.zip again"
                 raise DatasetError.expected("finite samples", got=got, file=file, row=row, advice=advice)
             recording = Recording(name, sound[None], SAMPLE_RATE_HZ, "FLOAT")
-            yield RecordedImpact(f"vertex_{vertices[row]}.wav", recording, positions[row])
+            yield Impact(f"vertex_{vertices[row]}.wav", positions[row].tolist()), recording
 
     def _report(self, identifier: str) -> ObjectReport:
         folder = self.folder / identifier / FOLDER

@@ -6,12 +6,14 @@ from pathlib import Path
 
 import soundfile
 
+from avmsf.capture.audio import Recording
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.measure import shared_problems, shortened
 from avmsf.capture.placement import check_placement
-from avmsf.capture.preprocess import Issues, RecordedImpact, preprocess
+from avmsf.capture.preprocess import Issues, preprocess
 from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.table import Impact
 from avmsf.errors import CaptureError, CaptureWarning, DatasetError
 from avmsf.mesh.surface import Surface, surface_points
 
@@ -19,7 +21,7 @@ MIN_RECORDINGS = 2
 
 
 def build_capture(
-    recordings: Iterable[RecordedImpact],
+    recordings: Iterable[tuple[Impact, Recording]],
     *,
     name: str,
     origin: str,

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from avmsf.capture.audio import Recording
 from avmsf.capture.folder import Capture
-from avmsf.capture.preprocess import RecordedImpact, preprocess
+from avmsf.capture.preprocess import preprocess
 from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.table import Impact
 from avmsf.fem.damping import Vibration, damped
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.radiation import radiated, travel_time
@@ -251,20 +252,19 @@ def _captured(
         normalize="done",
         align=bool((truth.starts != 0.0).any()),
     )
-    impacts_recorded = (
-        RecordedImpact(
-            file, Recording(file, sound.double().numpy()[None], rate, "FLOAT"), place, direction, newtons=force
-        )
-        for file, sound, place, direction, force in zip(
-            truth.names,
-            recordings,
-            strikes.written_places.numpy(),
-            strikes.written_directions.numpy(),
-            forces.tolist(),
-            strict=True,
-        )
+    rows = zip(
+        truth.names,
+        strikes.written_places.tolist(),
+        strikes.written_directions.tolist(),
+        forces.tolist(),
+        recordings,
+        strict=True,
     )
-    impacts, _ = preprocess(impacts_recorded, settings, measured=False)
+    struck = (
+        (Impact(file, place, direction, force), Recording(file, sound.double().numpy()[None], rate, "FLOAT"))
+        for file, place, direction, force, sound in rows
+    )
+    impacts, _ = preprocess(struck, settings, measured=False)
     assert impacts is not None
     return Capture(name, impacts, surface, settings)
 

@@ -34,8 +34,8 @@ from avmsf.capture.table import (
     FORCE,
     REQUIRED,
     TABLE,
+    Impact,
     Row,
-    Strike,
     parse_row,
     read_cells,
     read_rows,
@@ -53,7 +53,7 @@ _LOCK_TIMEOUT_SECONDS = 10.0
 _NUMBERED = re.compile(r"(\d{1,6})\.wav", re.IGNORECASE)
 
 
-def read_contact(query: Mapping[str, str]) -> Strike:
+def read_contact(query: Mapping[str, str]) -> Impact:
     """Return the contact, meters, of a query x, y, z, with the direction nx, ny, nz and the force, newtons, if given.
 
     Raises RequestError (400).
@@ -107,7 +107,7 @@ class ImpactTable:
             raise bad_request("file", wanted, file, got="none", advice="reload the page", status=404, file=TABLE)
         return indices
 
-    def add(self, file: str, impact: Strike, settings: CaptureSettings) -> None:
+    def add(self, file: str, impact: Impact, settings: CaptureSettings) -> None:
         """Append a row; a new table gets columns for the known values of the impact."""
         numbers = dict(zip(REQUIRED[1:], (value / settings.meters for value in impact.contact), strict=True))
         if impact.direction is not None:
@@ -175,7 +175,7 @@ class CaptureEditor:
             problems, ready = list(report.problems), report.readable and all(each["readable"] for each in impacts)
         return {"folder": str(self.folder), "strikes": impacts, "problems": problems, "ready": ready}
 
-    def impacts(self) -> list[Strike]:
+    def impacts(self) -> list[Impact]:
         """Return the impacts that are valid and whose recordings exist, in the order of the table."""
         settings = self.settings
         found = []
@@ -190,7 +190,7 @@ class CaptureEditor:
         """Return the report on a recording, without writing it. Raises CaptureError for what cannot be used."""
         return _plain(self._check_usable(read_upload(content), newtons=1.0))
 
-    def add(self, content: bytes, impact: Strike) -> dict[str, Any]:
+    def add(self, content: bytes, impact: Impact) -> dict[str, Any]:
         """Write the recording of an impact and return it; one of the same recording and contact is returned as it is.
 
         Raises CaptureError for a recording that cannot be used, and RequestError (422) for an impact without a value
@@ -377,7 +377,7 @@ def _report(
 
 
 @lru_cache(maxsize=4096)
-def _measured(path: Path, state: object, impact: Strike, settings: CaptureSettings) -> tuple[RecordingReport, str]:
+def _measured(path: Path, state: object, impact: Impact, settings: CaptureSettings) -> tuple[RecordingReport, str]:
     """Return the report on an impact's recording, and its digest. Raises CaptureError for an unreadable one."""
     recording = read_recording(path, impact.file)
     report = _report(recording, settings, newtons=impact.newtons, line=impact.line)
