@@ -19,7 +19,8 @@ from avmsf.fem.material import CERAMIC, GLASS, IRON, PLASTIC, STEEL, WOOD, Mater
 from avmsf.fem.solid import Solid
 from avmsf.field.gains.kernels import Sites, Smooth
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
-from avmsf.field.gains.mixture_gains import MixtureGains, series_of
+from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.gains.model import series_of
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
 from avmsf.modal.modes import ModalBank

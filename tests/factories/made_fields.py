@@ -107,7 +107,7 @@ def elastic() -> MixtureGains:
     """Return a model with the plate's own mode shapes, fitted to gains a little off the measured ones."""
     impacts, values = struck(9)
     body = Elastic(impacts, DIAGONAL, plate())
-    return mixture(impacts, 1.1 * values, body, directional=True).with_measured(values)
+    return replace(mixture(impacts, 1.1 * values, body, directional=True), measured=values)
 
 
 def body() -> BodyGains:

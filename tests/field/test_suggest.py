@@ -123,11 +123,11 @@ def test_what_is_not_known_of_places_has_no_negative_variance(made: type, count:
     contacts = bar_contacts(count)
     rows = [*range(count), 0]
     known = made(contacts[rows], drawn_gains(contacts, seed=4)[rows]).covariances(bar_contacts(40, seed=9), None)
-    for each in known:
-        size = float(torch.diagonal(each.covariance).max())
-        assert each.noise > 0
-        assert torch.allclose(each.covariance, each.covariance.T, atol=1e-9 * size)
-        assert float(torch.linalg.eigvalsh(each.covariance).min()) > -1e-9 * size
+    for covariance, noise in known:
+        size = float(torch.diagonal(covariance).max())
+        assert noise > 0
+        assert torch.allclose(covariance, covariance.T, atol=1e-9 * size)
+        assert float(torch.linalg.eigvalsh(covariance).min()) > -1e-9 * size
 
 
 def test_gains_of_unknown_uncertainty_are_refused() -> None:

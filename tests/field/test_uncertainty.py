@@ -102,7 +102,7 @@ def test_fields_judge_themselves_by_the_gains_that_were_measured(made) -> None:
     values = drawn_gains(contacts, seed=4)
     gains = made(contacts, values)
     moved = torch.randn(values.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    judged = gains.with_measured(torch.view_as_complex(values + moved))
+    judged = replace(gains, measured=torch.view_as_complex(values + moved))
     # What predicts a contact left out is measured too: gains refined end to end have seen the recording.
     others = gains.with_values(torch.view_as_complex(values + moved))
     torch.testing.assert_close(judged.leave_one_out(), others.leave_one_out())

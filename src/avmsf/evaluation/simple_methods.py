@@ -21,7 +21,7 @@ from torch.nn.functional import normalize
 from avmsf.capture.impacts import Impacts, places_of
 from avmsf.errors import EvaluationError
 from avmsf.field.gains.data import orientation_signs
-from avmsf.field.gains.kernels import Axes, Sites, nearest_sites
+from avmsf.field.gains.kernels import Axes, Sites
 from avmsf.gaussians.points import nearest_points
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_gains, fit_sine_gains
@@ -174,7 +174,7 @@ class MeanWaveform(_Neighbors, _Trained):
     """The mean of the nearest training sounds, sample by sample: the paper's KNN. Phases cancel in it.
 
     With `by_direction`, where the directions of both sides are known, an impact's direction is part of where it is, by
-    `nearest_sites`. The size there is the diagonal of the box around the training contacts, as the object itself is not
+    `Sites.nearest`. The size there is the diagonal of the box around the training contacts, as the object itself is not
     known here. Recordings are neighbors, each one, also those of one contact.
     """
 
@@ -192,7 +192,7 @@ class MeanWaveform(_Neighbors, _Trained):
         known = Sites(self.train.contacts.double(), normalize(self.train.directions.double()))
         asked = Sites(contacts.double(), normalize(directions.double()))
         size = float((known.points.amax(0) - known.points.amin(0)).norm())
-        rows, signs = nearest_sites(asked, known, size=size, count=self.count)
+        rows, signs = asked.nearest(known, size=size, count=self.count)
         signs = signs.to(self.train.sounds.dtype)
         return (signs[:, :, None] * self.train.sounds[rows]).mean(dim=1)
 

@@ -140,10 +140,10 @@ class _ExpectedError:
         places = torch.cat([points, candidates.points])
         directions = torch.cat([gains.sites(points).directions, candidates.directions])
         weights = (1.0 / (4.0 * field.bank.damping.double())).tolist()
-        for weight, known in zip(weights, gains.covariances(places, directions), strict=True):
-            self.variance = self.variance + weight * torch.diagonal(known.covariance)[: self.points].clamp_min(0.0)
-            self.shared.append(weight * known.covariance[:, -self.candidates :])
-            self.noise.append(weight * known.noise)
+        for weight, (covariance, noise) in zip(weights, gains.covariances(places, directions), strict=True):
+            self.variance = self.variance + weight * torch.diagonal(covariance)[: self.points].clamp_min(0.0)
+            self.shared.append(weight * covariance[:, -self.candidates :])
+            self.noise.append(weight * noise)
         expected = float(energy_of(field, gains.predict(points.float()).parts).mean())
         self.energy = expected + float(self.variance.mean())
 

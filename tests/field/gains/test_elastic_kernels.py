@@ -24,7 +24,8 @@ from avmsf.field.gains.elastic import (
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, hypotheses_of, weigh_factors
 from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture import log_evidence
-from avmsf.field.gains.mixture_gains import MixtureGains, series_of
+from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.gains.model import series_of
 from factories.gain_cases import SIZE, families, impacts, measured, plate
 
 SHAPES = 6

@@ -11,7 +11,8 @@ from avmsf.field.gains import mixture_gains as module
 from avmsf.field.gains.fitting import fit_mixture
 from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture import NOISE_SHARES
-from avmsf.field.gains.mixture_gains import MixtureGains, series_of
+from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.gains.model import series_of
 from factories.gain_cases import draw, families, impacts, measured, model
 
 ASKED = impacts(9, seed=5)
@@ -109,20 +110,20 @@ def test_covariances_are_those_of_the_most_probable_hypothesis(make):
     values, kernels = series_of(given.values), joint_kernels(given)
     found = list(given.covariances(ASKED.points, ASKED.directions))
     assert len(found) == MODES
-    for mode, each in enumerate(found):
+    for mode, (covariance, noise) in enumerate(found):
         parts = [mode, mode + MODES]
         weight = sum(given.mixture.weights[..., part] * values[:, part].square().sum() for part in parts)
         row, share = divmod(int(weight.flatten().argmax()), len(NOISE_SHARES))
         both = [dense(given, kernels[row], share, part) for part in parts]
-        assert torch.allclose(each.covariance, sum(part[1] for part in both), rtol=1e-6, atol=1e-9)
-        assert each.noise == pytest.approx(float(sum(part[2] for part in both)), rel=1e-9)
-        assert float(torch.linalg.eigvalsh(each.covariance).min()) > -1e-9 * each.noise
+        assert torch.allclose(covariance, sum(part[1] for part in both), rtol=1e-6, atol=1e-9)
+        assert noise == pytest.approx(float(sum(part[2] for part in both)), rel=1e-9)
+        assert float(torch.linalg.eigvalsh(covariance).min()) > -1e-9 * noise
 
 
 def test_covariances_at_the_contacts_are_below_the_noise():
     given = model()
-    for each in given.covariances(given.contacts, given.training.directions):
-        assert float(each.covariance.diagonal().max()) < each.noise
+    for covariance, noise in given.covariances(given.contacts, given.training.directions):
+        assert float(covariance.diagonal().max()) < noise
 
 
 def test_without_noise_nothing_is_unknown_at_the_contacts():
@@ -134,8 +135,8 @@ def test_without_noise_nothing_is_unknown_at_the_contacts():
         directional=True,
         noise_shares=(1e-9,),
     )
-    for each in given.covariances(sites.points, sites.directions):
-        assert float(each.covariance.diagonal().max()) < 1e-6 * float(given.values.abs().square().max())
+    for covariance, _ in given.covariances(sites.points, sites.directions):
+        assert float(covariance.diagonal().max()) < 1e-6 * float(given.values.abs().square().max())
     assert torch.allclose(gains_at(given, sites), given.values, rtol=1e-3, atol=1e-4)
 
 
@@ -197,7 +198,7 @@ def test_standardized_errors_judge_the_measured_gains():
     given = model()
     errors = given.standardized_errors()
     assert errors.shape == (14, MODES, 2)
-    moved = given.with_values(2.0 * given.values).with_measured(given.values)
+    moved = replace(given.with_values(2.0 * given.values), measured=given.values)
     assert torch.equal(moved.leave_one_out(), given.leave_one_out())
     assert torch.equal(moved.standardized_errors(), errors)
 
@@ -259,7 +260,7 @@ def test_smoother_and_noise_go_with_their_modes_and_parts():
 
 
 def test_take_takes_modes_in_their_order():
-    given, rows = model().with_measured(2.0 * model().values), torch.tensor([3, 0, 4])
+    given, rows = replace(model(), measured=2.0 * model().values), torch.tensor([3, 0, 4])
     taken = given.take(rows)
     assert torch.equal(taken.values, given.values[:, rows])
     assert torch.equal(taken.measured, given.measured[:, rows])
@@ -271,7 +272,7 @@ def test_take_takes_modes_in_their_order():
 
 
 def test_without_contacts_the_rest_predicts():
-    given = model().with_measured(2.0 * model().values)
+    given = replace(model(), measured=2.0 * model().values)
     none = given.without(torch.zeros(14, dtype=torch.bool))
     assert torch.allclose(gains_at(none), gains_at(given), rtol=1e-6, atol=1e-7)
     left_out = torch.arange(14) % 3 == 1
@@ -324,7 +325,7 @@ def test_a_model_that_knows_no_directions_takes_none():
 
 @pytest.mark.parametrize("elastic", [True, False])
 def test_a_model_comes_back_from_its_tensors_to_the_last_bit(elastic):
-    given = replace(model(elastic=elastic).with_measured(1.1 * model(elastic=elastic).values), spread_share=0.75)
+    given = replace(model(elastic=elastic), measured=1.1 * model(elastic=elastic).values, spread_share=0.75)
     record = json.loads(json.dumps(given.record()))
     tensors = {name: tensor.detach().clone().contiguous() for name, tensor in given.tensors().items()}
     back = MixtureGains.restore(record, tensors)
@@ -334,8 +335,8 @@ def test_a_model_comes_back_from_its_tensors_to_the_last_bit(elastic):
     assert torch.equal(back.predict(ASKED.points).mean, given.predict(ASKED.points).mean)
     assert torch.equal(back.leave_one_out(), given.leave_one_out())
     assert torch.equal(back.standardized_errors(), given.standardized_errors())
-    pairs = zip(*(each.covariances(ASKED.points, None) for each in (back, given)), strict=True)
-    assert all(torch.equal(one.covariance, other.covariance) and one.noise == other.noise for one, other in pairs)
+    pairs = zip(*(covariances(ASKED.points, None) for each in (back, given)), strict=True)
+    assert all(torch.equal(one[0], other[0]) and one[1] == other[1] for one, other in pairs)
     assert back.record() == record
     assert back.directional is given.directional
     assert torch.equal(back.points, given.points)

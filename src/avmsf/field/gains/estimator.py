@@ -27,7 +27,7 @@ from avmsf.field.gains.attention import SHARED, Attention
 from avmsf.field.gains.data import GainData, along_phase, gain_variance
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, matched, total_evidence
-from avmsf.field.gains.kernels import KernelFamily, Sites, Smooth, ThinPlate, Unstructured, Visual, sites_along
+from avmsf.field.gains.kernels import KernelFamily, Sites, Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.labels import better_order, two_levels
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.mixture_gains import MixtureGains
@@ -419,7 +419,7 @@ def _sites(data: GainData, bodies: Sequence[CandidateBody]) -> Sites:
         nearest = (unknown[:, None] - points[known]).square().sum(2).argmin(1)
         return torch.nn.functional.normalize(given[known][nearest].double(), dim=1)
 
-    return sites_along(points, given, otherwise)
+    return Sites.along(points, given, otherwise)
 
 
 def _without(rows: Int[Tensor, " rows"], judgment: Judgment) -> Int[Tensor, " kept"]:

@@ -12,7 +12,8 @@ from avmsf.fem.updating import Matched
 from avmsf.field.gains.elastic import Elastic, frequency_log_prior
 from avmsf.field.gains.kernels import KernelFamily
 from avmsf.field.gains.mixture import NOISE_SHARES, Hypotheses, KernelMixture, active_series, log_evidence, log_joint
-from avmsf.field.gains.mixture_gains import MixtureGains, series_of
+from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.gains.model import series_of
 
 _STRONGEST = 16
 """Modes of the most energy, which decide on the factor on nominal frequencies: many weak ones are not the body's."""

@@ -52,6 +52,22 @@ class Sites:
         """Return some of the impacts."""
         return Sites(self.points[rows], self.directions[rows])
 
+    @classmethod
+    def along(
+        cls,
+        points: Float64[Tensor, "sites 3"],
+        directions: Float[Tensor, "sites 3"] | None,
+        otherwise: Callable[[Float64[Tensor, "unknown 3"]], Float64[Tensor, "unknown 3"]],
+    ) -> "Sites":
+        """Return impacts at points; `otherwise` gives the directions that are not known, None or of length zero."""
+        given = torch.zeros_like(points) if directions is None else directions.double()
+        length = given.norm(dim=1, keepdim=True)
+        unknown = ~(length[:, 0] > 0)
+        used = given / length.clamp_min(torch.finfo(torch.float64).tiny)
+        if bool(unknown.any()):
+            used[unknown] = otherwise(points[unknown])
+        return cls(points, used)
+
     def cosine(self, other: "Sites") -> Float64[Tensor, "sites others"]:
         """Return the cosines between directions.
 
@@ -61,38 +77,22 @@ class Sites:
         """
         return self.directions @ other.directions.T
 
+    def nearest(
+        self, others: "Sites", *, size: float, count: int, excluded: Bool[Tensor, "sites others"] | None = None
+    ) -> tuple[Int[Tensor, "sites near"], Float64[Tensor, "sites near"]]:
+        """Return the rows of the nearest of other impacts, at most `count`, none that is excluded, and each one's sign.
 
-def sites_along(
-    points: Float64[Tensor, "sites 3"],
-    directions: Float[Tensor, "sites 3"] | None,
-    otherwise: Callable[[Float64[Tensor, "unknown 3"]], Float64[Tensor, "unknown 3"]],
-) -> Sites:
-    """Return impacts at points; `otherwise` gives the directions where they are not known, None or of length zero."""
-    given = torch.zeros_like(points) if directions is None else directions.double()
-    length = given.norm(dim=1, keepdim=True)
-    unknown = ~(length[:, 0] > 0)
-    used = given / length.clamp_min(torch.finfo(torch.float64).tiny)
-    if bool(unknown.any()):
-        used[unknown] = otherwise(points[unknown])
-    return Sites(points, used)
-
-
-def nearest_sites(
-    sites: Sites, others: Sites, *, size: float, count: int, excluded: Bool[Tensor, "sites others"] | None = None
-) -> tuple[Int[Tensor, "sites near"], Float64[Tensor, "sites near"]]:
-    """Return the rows of the nearest impacts, at most `count` and none that is excluded, and the sign of each.
-
-    With c the cosine between two directions the squared distance is that of the points plus (size / 2)^2 (1 - |c|): a
-    perpendicular impact counts as half the object away, for it excites modes in other proportions, as an impact
-    elsewhere does. The sign is that of c: a linear object answers an opposite force with the negated sound.
-    """
-    cosine = sites.cosine(others)
-    squares = (sites.points[:, None] - others.points).square().sum(2) + (size / 2.0) ** 2 * (1.0 - cosine.abs())
-    usable = len(others)
-    if excluded is not None:
-        squares, usable = squares.masked_fill(excluded, torch.inf), usable - int(excluded.sum(1).max())
-    rows = squares.argsort(dim=1, stable=True)[:, : min(count, usable)]
-    return rows, torch.where(cosine.gather(1, rows) < -_PERPENDICULAR, -1.0, 1.0).double()
+        With c the cosine between two directions the squared distance is that of the points plus (size / 2)^2 (1 - |c|):
+        a perpendicular impact counts as half the object away, for it excites modes in other proportions, as an impact
+        elsewhere does. The sign is that of c: a linear object answers an opposite force with the negated sound.
+        """
+        cosine = self.cosine(others)
+        squares = (self.points[:, None] - others.points).square().sum(2) + (size / 2.0) ** 2 * (1.0 - cosine.abs())
+        usable = len(others)
+        if excluded is not None:
+            squares, usable = squares.masked_fill(excluded, torch.inf), usable - int(excluded.sum(1).max())
+        rows = squares.argsort(dim=1, stable=True)[:, : min(count, usable)]
+        return rows, torch.where(cosine.gather(1, rows) < -_PERPENDICULAR, -1.0, 1.0).double()
 
 
 class KernelFamily(ABC):

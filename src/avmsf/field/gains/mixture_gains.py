@@ -1,6 +1,6 @@
 """The gain model: kernel families weighed by evidence, and their predictions anywhere on the object."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import accumulate
@@ -17,19 +17,9 @@ from avmsf.capture.impacts import places_of
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.elastic_store import mode_sizes, mode_skeleton, mode_tensors, restored_modes
 from avmsf.field.gains.elastic import Elastic
-from avmsf.field.gains.kernels import (
-    Family,
-    KernelFamily,
-    Sites,
-    Smooth,
-    ThinPlate,
-    Unstructured,
-    Visual,
-    nearest_sites,
-    sites_along,
-)
+from avmsf.field.gains.kernels import Family, KernelFamily, Sites, Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture, Predictions
-from avmsf.field.gains.model import GainModel, Gains
+from avmsf.field.gains.model import GainModel, Gains, series_of
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.symmetry.characters import Group
 
@@ -44,16 +34,6 @@ _PRODUCTS = 64
 _POSITIONAL: dict[str, type[KernelFamily]] = {each.kind: each for each in (Unstructured, Smooth, ThinPlate)}
 _OF_OBJECT = {Elastic.kind: "bodies", Symmetric.kind: "symmetries", Visual.kind: "features"}
 """Families that know something of the object, and the entry of the record with its size."""
-
-
-@dataclass(frozen=True, eq=False)
-class PlaceCovariance:
-    """The posterior of one mode's gains at some places."""
-
-    covariance: Float64[Tensor, "places places"]
-    """Between the gains at places, summed over their two parts."""
-    noise: float
-    """Variance of the noise of one more measured gain, likewise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +71,7 @@ class MixtureGains(GainModel):
     @property
     def values(self) -> Complex128[Tensor, "contacts modes"]:
         """The gains there."""
-        return _complex(self.mixture.values)
+        return torch.complex(*self.mixture.values.chunk(2, dim=1))
 
     @property
     def place_count(self) -> int:
@@ -111,17 +91,17 @@ class MixtureGains(GainModel):
         Where there is no body they go as the nearest training impact does. Where the model knows nothing of directions,
         all are alike.
         """
-        return sites_along(contacts.double(), directions if self.directional else None, self._straight)
+        return Sites.along(contacts.double(), directions if self.directional else None, self._straight)
 
     def nearest(
         self, sites: Sites, others: Int[Tensor, " sites"] | None = None
     ) -> tuple[Int[Tensor, "sites near"], Float64[Tensor, "sites near"]]:
-        """Return the rows of the three nearest training impacts and the sign of each, by `nearest_sites`.
+        """Return the rows of the three nearest training impacts and the sign of each, by `Sites.nearest`.
 
         `others` is the place number of each site, whose own training impacts are left out.
         """
         own = None if others is None else others[:, None] == self.places
-        return nearest_sites(sites, self.training, size=self.families[0].size, count=NEIGHBORS, excluded=own)
+        return sites.nearest(self.training, size=self.families[0].size, count=NEIGHBORS, excluded=own)
 
     @property
     def body(self) -> ElasticModes | None:
@@ -135,23 +115,21 @@ class MixtureGains(GainModel):
         self, points: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
     ) -> Gains:
         """Return the mean gains of impacts, see `sites`."""
-        return _gains(self._mean(self.sites(points, directions)))
+        return Gains.of(self._mean(self.sites(points, directions)))
 
     def point_estimate(
         self, points: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
     ) -> Gains:
         """Return the mean magnitudes of the gains, as far as `spread_share` goes, with the signs of the mean gains."""
         sites = self.sites(points, directions)
-        magnitudes = [self._magnitude(some) for some in self._batches(sites)]
-        return _gains(torch.cat(magnitudes).copysign(self._mean(sites)))
+        return Gains.of(self._batched(self._magnitude, sites).copysign(self._mean(sites)))
 
     def posterior(
         self, points: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
     ) -> Gains:
         """Return the mean gains with the standard deviation of both parts, without the noise of a measurement."""
         sites = self.sites(points, directions)
-        std = torch.cat([self._std(some) for some in self._batches(sites)])
-        return replace(_gains(self._mean(sites)), std=_parts(std).float())
+        return replace(Gains.of(self._mean(sites)), std=_parts(self._batched(self._std, sites)).float())
 
     def noise(self) -> Float64[Tensor, "modes 2"]:
         """Return the standard deviation of the noise in both parts of a measured gain."""
@@ -164,12 +142,12 @@ class MixtureGains(GainModel):
 
     def leave_one_out(self) -> Complex128[Tensor, "contacts modes"]:
         """Return the gains at each contact as the measured ones at all other places predict them."""
-        return _complex(self._left_out.mean)
+        return torch.complex(*self._left_out.mean.chunk(2, dim=1))
 
     def left_out_estimate(self, share: float) -> Gains:
         """Return `point_estimate` at each contact from the measured gains at all other places, for a spread share."""
         left = self._left_out
-        return _gains(left.of_means.lerp(left.magnitude, share).copysign(left.mean))
+        return Gains.of(left.of_means.lerp(left.magnitude, share).copysign(left.mean))
 
     def standardized_errors(self) -> Float64[Tensor, "contacts modes 2"]:
         """Return the leave-one-place-out errors of the measured gains over their predicted standard deviations.
@@ -183,31 +161,43 @@ class MixtureGains(GainModel):
 
     def covariances(
         self, contacts: Float64[Tensor, "places 3"], directions: Float64[Tensor, "places 3"] | None
-    ) -> Iterator[PlaceCovariance]:
-        """Yield the posterior of each mode's gains at places, by the mode's most probable hypothesis."""
+    ) -> Iterator[tuple[Float64[Tensor, "places places"], float]]:
+        """Yield the posterior covariance of each mode's gains at places, and the noise variance of one more gain.
+
+        By the mode's most probable hypothesis; both are sums over the two parts of the gains.
+        """
         sites, count = self.sites(contacts, directions), len(self.contacts)
-        modes = self.mixture.values.shape[1] // 2
-        energy = self.mixture.values.square().sum(0)
-        both = (self.mixture.weights * energy).reshape(*self.mixture.weights.shape[:2], 2, modes).sum(2)
-        best = both.flatten(0, 1).argmax(0)
-        scale = self.mixture.quadratic.reshape(*self.mixture.weights.shape[:2], 2, modes).sum(2) / count
-        rows, shares = best // len(self.mixture.noise_shares), best % len(self.mixture.noise_shares)
-        kernels = self._kernels_between(sites, sites, rows), self._kernels_between(sites, self.training, rows)
+        energy, weights = self.mixture.values.square().sum(0), self.mixture.weights
+        best = _both_parts(weights * energy).flatten(0, 1).argmax(0)
+        scale = _both_parts(self.mixture.quadratic) / count
+        rows, shares = best // weights.shape[1], best % weights.shape[1]
+        used, place = torch.unique(rows, return_inverse=True)
+        own, cross = (
+            torch.cat([family.between(sites, others, kept) for family, kept in self.families_of(used)])
+            for others in (sites, self.training)
+        )
         for mode, (row, share) in enumerate(zip(rows.tolist(), shares.tolist(), strict=True)):
-            own, cross = (each[row] for each in kernels)
             noise = float(self.mixture.noise_variance[share, mode])
             known = self.mixture.kernels[row] + noise * torch.eye(count, dtype=torch.float64)
-            half = torch.linalg.solve_triangular(torch.linalg.cholesky(known), cross.T, upper=False)
+            half = torch.linalg.solve_triangular(torch.linalg.cholesky(known), cross[place[mode]].T, upper=False)
             size = float(scale[row, share, mode])
-            yield PlaceCovariance(size * (own - half.T @ half), size * noise)
+            yield size * (own[place[mode]] - half.T @ half), size * noise
+
+    def families_of(self, rows: Int[Tensor, " rows"]) -> Iterator[tuple[KernelFamily, Int[Tensor, " own"]]]:
+        """Yield the families of some of the mixture's kernels, given by their sorted rows, with the families' own rows.
+
+        In the order of the rows.
+        """
+        first = 0
+        for family, kept in zip(self.families, self.kept, strict=True):
+            own = rows[(rows >= first) & (rows < first + len(kept))] - first
+            first += len(kept)
+            if len(own):
+                yield family, kept[own]
 
     def with_values(self, values: Complex128[Tensor, "contacts modes"]) -> "MixtureGains":
         """Return the model of other gains at the same contacts, its hypotheses weighed as before."""
         return replace(self, mixture=self.mixture.with_values(series_of(values)))
-
-    def with_measured(self, measured: Complex128[Tensor, "contacts modes"]) -> "MixtureGains":
-        """Return the same model, which judges itself by these gains."""
-        return replace(self, measured=measured)
 
     def take(self, modes: Int[Tensor, " modes"]) -> "MixtureGains":
         """Return the model of some modes, in the given order."""
@@ -310,7 +300,12 @@ class MixtureGains(GainModel):
     def restore(cls, record: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> "MixtureGains":
         """Return the model."""
         training = Sites(tensors["contacts"], tensors["directions"])
-        _expect_sound(tensors)
+        # Values that no fit leaves would fail only when gains are asked for.
+        for name in ("object_size", "weights", "noise_floor"):
+            least, positive = float(tensors[name].min()), name == "object_size"
+            if least < 0 or (positive and least == 0):
+                wanted = f"values {'above 0' if positive else 'of 0 or more'}"
+                raise RecordError.expected(wanted, least, got=f"{least:g}", name=name)
         bodies = iter([restored_modes(tensors, f"bodies.{row}.") for row in range(len(record["bodies"]))])
 
         def family_of(kind: str, size: float) -> KernelFamily:
@@ -328,7 +323,10 @@ class MixtureGains(GainModel):
         families = tuple(family_of(kind, size) for kind, size in zip(record["families"], sizes, strict=True))
         kept = torch.split(tensors["kernels"], record["kernels"])
         for family, rows in zip(families, kept, strict=True):
-            _expect_rows(rows, len(family.shares), f"kept {family.kind} kernels")
+            count = len(family.shares)
+            if not 0 <= int(rows.min()) <= int(rows.max()) < count:
+                found = (int(rows.min()), int(rows.max()))
+                raise RecordError.expected(f"0 to {count - 1}", found, name=f"kept {family.kind} kernels")
         kernels = torch.cat([family.kernels()[rows] for family, rows in zip(families, kept, strict=True)])
         values, measured = (torch.view_as_complex(tensors[name].contiguous()) for name in ("values", "measured"))
         mixture = KernelMixture(kernels, series_of(values), tensors["noise_floor"], tensors["weights"])
@@ -382,19 +380,18 @@ class MixtureGains(GainModel):
         None for a family that has fewer kernels than factors, or whose matrices would exceed `_FORM_ENTRIES`: its
         covariances with the training impacts, kernel by kernel, are cheaper.
         """
-        firsts = accumulate(map(len, self.kept), initial=0)
-        return [self._form(*each) for each in zip(self.families, self.kept, firsts, strict=False)]
 
-    def _form(
-        self, family: KernelFamily, kept: Int[Tensor, " kept"], first: int
-    ) -> Float64[Tensor, "pairs series"] | None:
-        count = family.loadings(self.training, kept[:1]).shape[2]
-        if count >= len(kept) or self.mixture.values.shape[1] * count**2 > _FORM_ENTRIES:
-            return None
-        kernels = range(first, first + len(kept))
-        forms = self.mixture.explained_forms(kernels, lambda rows: family.loadings(self.training, kept[rows]))
-        row, column = torch.triu_indices(count, count)
-        return (forms[:, row, column] * torch.where(row == column, 1.0, 2.0)).T.contiguous()
+        def form(family: KernelFamily, kept: Int[Tensor, " kept"], first: int) -> Tensor | None:
+            count = family.loadings(self.training, kept[:1]).shape[2]
+            if count >= len(kept) or self.mixture.values.shape[1] * count**2 > _FORM_ENTRIES:
+                return None
+            kernels = range(first, first + len(kept))
+            forms = self.mixture.explained_forms(kernels, lambda rows: family.loadings(self.training, kept[rows]))
+            row, column = torch.triu_indices(count, count)
+            return (forms[:, row, column] * torch.where(row == column, 1.0, 2.0)).T.contiguous()
+
+        firsts = accumulate(map(len, self.kept), initial=0)
+        return [form(*each) for each in zip(self.families, self.kept, firsts, strict=False)]
 
     def _mean(self, sites: Sites) -> Float64[Tensor, "sites series"]:
         pairs = zip(self.families, self._coefficients, strict=True)
@@ -407,57 +404,14 @@ class MixtureGains(GainModel):
         own = torch.cat([family.own(sites, kept) for family, kept in pairs])
         return self.mixture.mean_magnitude(cross, own, self.spread_share)
 
-    def _batches(self, sites: Sites) -> Iterator[Sites]:
-        """Yield the sites in batches whose covariances fit the memory; one, without any, where there are none."""
+    def _batched(self, compute: Callable[[Sites], Tensor], sites: Sites) -> Float64[Tensor, "sites series"]:
+        """Return what is computed of sites, in batches whose covariances fit the memory."""
         size = max(1, _MEMORY // (len(self.mixture.kernels) * len(self.contacts)))
-        for rows in torch.split(torch.arange(len(sites)), size):
-            yield sites.take(rows)
-
-    def _kernels_between(
-        self, sites: Sites, others: Sites, rows: Int[Tensor, " rows"]
-    ) -> dict[int, Float64[Tensor, "sites others"]]:
-        """Return the kept kernels of some rows between two sets of impacts, by row; each family's all at once."""
-        found: dict[int, Float64[Tensor, "sites others"]] = {}
-        first = 0
-        for family, kept in zip(self.families, self.kept, strict=True):
-            used = torch.unique(rows[(rows >= first) & (rows < first + len(kept))])
-            if len(used):
-                between = family.between(sites, others, kept[used - first])
-                found.update(zip(used.tolist(), between, strict=True))
-            first += len(kept)
-        return found
+        return torch.cat([compute(sites.take(rows)) for rows in torch.split(torch.arange(len(sites)), size)])
 
 
-def _expect_sound(tensors: Mapping[str, Tensor]) -> None:
-    """Raise RecordError for values that no fit leaves: they would fail only when gains are asked for."""
-    if not bool((tensors["object_size"] > 0).all()):
-        least = float(tensors["object_size"].min())
-        raise RecordError(f"object_size: expected values above 0, got {least:g}", name="object_size", value=least)
-    for name in ("weights", "noise_floor"):
-        if not bool((tensors[name] >= 0).all()):
-            least = float(tensors[name].min())
-            raise RecordError(f"{name}: expected values of 0 or more, got {least:g}", name=name, value=least)
-
-
-def _expect_rows(rows: Int[Tensor, "*rows"], count: int, name: str) -> None:
-    if rows.numel() and not 0 <= int(rows.min()) <= int(rows.max()) < count:
-        found = (int(rows.min()), int(rows.max()))
-        raise RecordError(f"{name}: expected 0 to {count - 1}, got {found[0]} to {found[1]}", name=name, value=found)
-
-
-def series_of(values: Complex128[Tensor, "contacts modes"]) -> Float64[Tensor, "contacts series"]:
-    """Return the series of complex gains: the real parts of all modes, then the imaginary parts."""
-    return torch.cat([values.real, values.imag], dim=1)
-
-
-def _complex(series: Float64[Tensor, "contacts series"]) -> Complex128[Tensor, "contacts modes"]:
-    real, imaginary = series.chunk(2, dim=1)
-    return torch.complex(real, imaginary)
-
-
-def _gains(series: Float64[Tensor, "contacts series"]) -> Gains:
-    real, imaginary = series.float().chunk(2, dim=1)
-    return Gains(real, imaginary)
+def _both_parts(values: Float64[Tensor, "kernels noises series"]) -> Float64[Tensor, "kernels noises modes"]:
+    return values.reshape(*values.shape[:2], 2, -1).sum(2)
 
 
 def _parts(series: Float64[Tensor, "contacts series"]) -> Float64[Tensor, "contacts modes 2"]:

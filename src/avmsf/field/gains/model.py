@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Complex128, Float, Float64
 from torch import Tensor
 
 from avmsf.fem.elastic_modes import ElasticModes
@@ -26,6 +26,11 @@ class Gains:
     std: Float[Tensor, "contacts modes 2"] | None = None
     """Posterior standard deviations of gains and quadrature, without measurement noise; None where not known."""
 
+    @classmethod
+    def of(cls, series: Float64[Tensor, "contacts series"]) -> "Gains":
+        """Return gains of series as `series_of` has them, in float32."""
+        return cls(*series.float().chunk(2, dim=1))
+
     @property
     def parts(self) -> Float64[Tensor, "contacts modes 2"]:
         """The gains and the quadrature."""
@@ -40,6 +45,11 @@ class Gains:
     def energy(self, damping: Float64[Tensor, " modes"]) -> Float64[Tensor, " modes"]:
         """Return each mode's energy over time, gain^2 / (4 d), as the mean over the contacts; damping d in 1/s."""
         return (self.power / (4.0 * (damping if self.damping is None else damping * self.damping))).mean(0)
+
+
+def series_of(values: Complex128[Tensor, "contacts modes"]) -> Float64[Tensor, "contacts series"]:
+    """Return the series of complex gains: the real parts of all modes, then the imaginary parts."""
+    return torch.cat([values.real, values.imag], dim=1)
 
 
 class GainModel(ABC):

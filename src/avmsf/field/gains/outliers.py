@@ -43,7 +43,8 @@ from avmsf.capture.impacts import Impacts, places_of
 from avmsf.field.gains.fitting import MeasuredGains
 from avmsf.field.gains.kernels import KernelFamily, Sites
 from avmsf.field.gains.mixture import NOISE_SHARES
-from avmsf.field.gains.mixture_gains import MixtureGains, series_of
+from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.gains.model import series_of
 
 WIDE_NOISE_SHARES = (*NOISE_SHARES, 0.1, 0.3, 1.0, 3.0)
 """A wrong label may look like noise: the hypotheses that contacts are judged by have to allow for it."""
@@ -174,13 +175,7 @@ class PredictiveRatios:
     def _each(self, kernels: Callable[[KernelFamily, Int[Tensor, " rows"]], Tensor]) -> Tensor:
         """Return what each series's most probable kernel gives."""
         used, series = torch.unique(self._best // len(self.model.mixture.noise_shares), return_inverse=True)
-        found, first = [], 0
-        for family, kept in zip(self.model.families, self.model.kept, strict=True):
-            own = used[(used >= first) & (used < first + len(kept))] - first
-            first += len(kept)
-            if len(own):
-                found.append(kernels(family, kept[own]))
-        return torch.cat(found)[series]
+        return torch.cat([kernels(*each) for each in self.model.families_of(used)])[series]
 
 
 def _log_student(error: Tensor, variance: Tensor, whole: Tensor, count: int) -> Tensor:

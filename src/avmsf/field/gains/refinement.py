@@ -1,5 +1,7 @@
 """The gains at the training contacts, refined end to end through the gain model's smoother."""
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Complex128, Float, Float32, Float64, Int
 from torch import Tensor, nn
@@ -62,7 +64,7 @@ class RefinedGains(TrainableGains):
         if measured is None:
             return model
         turned = turned_like(torch.view_as_real(measured), torch.view_as_real(model.values))
-        return model.with_measured(torch.view_as_complex(turned.contiguous()))
+        return replace(model, measured=torch.view_as_complex(turned.contiguous()))
 
 
 def _applied(smoother: Tensor, values: Float64[Tensor, "contacts modes 2"] | Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from avmsf._utils.text import RecordError, count_of, like
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.elastic_store import mode_sizes, mode_skeleton, mode_tensors, restored_modes
 from avmsf.field.gains.attention import AttentionGains
-from avmsf.field.gains.kernels import sites_along
+from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import GainModel, Gains
 
@@ -45,7 +45,7 @@ class BodyGains(GainModel):
         self, points: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
     ) -> Gains:
         """Return the gains; without a direction impacts go straight into the body."""
-        sites = sites_along(points.double(), directions, lambda unknown: -self.modes.normals(unknown))
+        sites = Sites.along(points.double(), directions, lambda unknown: -self.modes.normals(unknown))
         return Gains(self.modes.gains(sites.points, sites.directions).float())
 
     def record(self) -> dict[str, Any]:
