@@ -245,7 +245,7 @@ def test_what_does_not_fit_together_is_refused():
     broken[0, 3] = math.nan
     with raises(EvaluationError, name="truth", row=0) as caught:
         evaluate(NearestRecording(train), replace(test, sounds=broken))
-    assert f"({test.names[0]})" in str(caught.value)
+    assert test.names[0] in str(caught.value)
 
 
 def read_aircraft(folder: Path) -> Impacts:

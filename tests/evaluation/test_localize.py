@@ -35,11 +35,11 @@ from factories.raising import raises
 def test_the_nearest_recording_finds_itself_and_noise_counts_as_a_random_point() -> None:
     train, points = plate_impacts(), plate_features().points
     size = float((points.amax(0) - points.amin(0)).norm())
-    assert located(NearestRecording(train), train, train, points).errors == {"rmed": (0.0,) * len(train)}
+    assert located(NearestRecording(train), train, train, points)[0] == {"rmed": (0.0,) * len(train)}
     expected = [random_distance(points, place) / size for place in train.contacts]
-    assert located(WhiteNoise(train), train, train, points).errors["rmed"] == pytest.approx(expected)
+    assert located(WhiteNoise(train), train, train, points)[0]["rmed"] == pytest.approx(expected)
     silent = replace(train, sounds=0 * train.sounds)
-    assert located(NearestRecording(train), train, silent, points).errors["rmed"] == pytest.approx(expected)
+    assert located(NearestRecording(train), train, silent, points)[0]["rmed"] == pytest.approx(expected)
 
 
 def smooth_field(train: Impacts, features: FeatureField) -> SoundField:
@@ -58,7 +58,7 @@ def struck(field: SoundField, points: torch.Tensor) -> Impacts:
 
 def test_a_field_finds_where_its_own_sounds_come_from() -> None:
     train, points, field = plate_impacts(), plate_features().points, smooth_field(plate_impacts(), plate_features())
-    found = located(field, train, struck(field, points), points).errors
+    found = located(field, train, struck(field, points), points)[0]
     assert set(found) == {"rmed", "rmed_posterior"}
     assert max(found["rmed"]) < 0.02
     assert sorted(found["rmed_posterior"])[5] < 0.1
@@ -86,15 +86,15 @@ def test_the_published_form_takes_the_least_cosine_distance_and_refuses_no_noise
     size = float((points.amax(0) - points.amin(0)).norm())
     noise = torch.randn(test.sounds[0].shape, generator=torch.Generator().manual_seed(1))
     test = replace(test, sounds=torch.cat([test.sounds[:-1], noise[None]]))
-    found = located(field, train, test, points, published=True, map_rows=(0, len(test) - 1))
+    errors, maps = located(field, train, test, points, published=True, map_rows=(0, len(test) - 1))
     gains = field.gains(points).double()
-    for row, rmed in enumerate(found.errors["rmed"]):
+    for row, rmed in enumerate(errors["rmed"]):
         place = points[int(published_distance(field, gains, test.sounds[row]).argmin())]
         assert rmed == pytest.approx(float((place - test.contacts[row]).norm()) / size, rel=1e-5)
     # Noise has a least distance too, and no map.
-    assert set(found.maps) == {0}
-    order = torch.cdist(found.maps[0].points, points).argmin(1)
-    torch.testing.assert_close(found.maps[0].distance, published_distance(field, gains, test.sounds[0])[order])
+    assert set(maps) == {0}
+    order = torch.cdist(maps[0].points, points).argmin(1)
+    torch.testing.assert_close(maps[0].distance, published_distance(field, gains, test.sounds[0])[order])
 
 
 def test_diffsound_searches_the_vertices_of_the_mesh(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ import trimesh
 
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.localization import NearestSpectrum, random_distance
+from avmsf.evaluation.localization import nearest_spectrum, random_distance
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.localization.contact_map import ContactMap
 from avmsf.localization.locator import Locator
@@ -51,22 +51,22 @@ def strikes() -> Impacts:
 
 
 def test_the_most_alike_spectrum_is_a_sounds_own_however_loud() -> None:
-    alike = NearestSpectrum(strikes())
+    alike = nearest_spectrum(strikes())
     generator = torch.Generator().manual_seed(1)
     for row, sound in enumerate(strikes().sounds):
         level = 1e-3 * float(sound.abs().max())
         other = -300.0 * (sound + level * torch.randn(SAMPLES, generator=generator))
-        assert alike.row(other) == row
+        assert alike(other) == row
     with raises(EvaluationError, name="sound", value=0.0):
-        alike.row(torch.zeros(SAMPLES))
+        alike(torch.zeros(SAMPLES))
 
 
 def test_silent_recordings_are_never_the_nearest() -> None:
     quiet = strikes().sounds.clone()
     quiet[1] = 0.0
-    alike = NearestSpectrum(replace(strikes(), sounds=quiet))
-    assert [alike.row(sound) for sound in strikes().sounds[[0, 2, 3]]] == [0, 2, 3]
-    assert alike.row(strikes().sounds[1]) != 1
+    alike = nearest_spectrum(replace(strikes(), sounds=quiet))
+    assert [alike(sound) for sound in strikes().sounds[[0, 2, 3]]] == [0, 2, 3]
+    assert alike(strikes().sounds[1]) != 1
 
 
 @cache

@@ -4,7 +4,7 @@ import hashlib
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -86,12 +86,9 @@ class Evaluation:
         return f"{method!r}{ENCODER}{self.encoder}" if read else repr(method)
 
 
-def _plain(settings: Any) -> Any:
-    """Return settings as plain values, those of a dataclass by their names, with the name of its class as `kind`."""
-    if not is_dataclass(settings):
-        return settings
-    values = {each.name: _plain(getattr(settings, each.name)) for each in fields(settings)}
-    return {"kind": type(settings).__name__, **values}
+def _plain(settings: Any) -> dict[str, Any]:
+    """Return the values of a dataclass, with the name of its class as `kind`."""
+    return {"kind": type(settings).__name__, **asdict(settings)}
 
 
 MAX_STORED_SOUNDS = 3
@@ -209,7 +206,7 @@ class CaseRun:
             return *settings.values(renderer, sounds, self.scored.test, self.truth, loudest=loudest), {}
         points = self._shared(self.features)("surface").points
         published = isinstance(method, FieldMethod) and method.published
-        found = located(
+        errors, found = located(
             renderer,
             recordings.train,
             recordings.test,
@@ -219,11 +216,11 @@ class CaseRun:
             map_rows=self.stored_rows,
         )
         maps = {}
-        for row, each in found.maps.items():
+        for row, each in found.items():
             file = f"maps/{self.place}/{row:03d} {file_word(method.name)}.safetensors"
             write_map(self.folder / file, each, truth=recordings.test.contacts[row])
             maps[recordings.test.names[row]] = file
-        return dict(found.errors), {}, maps
+        return dict(errors), {}, maps
 
     def _task(self, recordings: _Recordings) -> Task:
         return Task(

@@ -149,11 +149,7 @@ class Cdpam:
         with torch.no_grad():
             features = self._features(scaled.float())
         if not bool(torch.isfinite(features).all()):
-            raise EvaluationError(
-                f"expected sounds as fractions of full scale, 1, got a peak of {float(sound.abs().max()):g}",
-                name="sounds",
-                value=float(sound.abs().max()),
-            )
+            raise EvaluationError.expected("fractions of full scale, 1", float(sound.abs().max()), name="sounds")
         return features
 
     def _features(self, sound: Float[Tensor, " samples"]) -> Float64[Tensor, " features"]:

@@ -64,9 +64,9 @@ class Clap:
         try:
             from transformers import ClapModel, ClapProcessor
         except (ImportError, RuntimeError) as error:  # RuntimeError: one of its own optional packages is broken
-            raise EvaluationError(
-                f"CLAP score: expected the package transformers, got {error}; pip install 'avmsf[eval]'",
-                name="transformers",
+            advice = "pip install 'avmsf[eval]'"
+            raise EvaluationError.expected(
+                "an installed package", got=str(error), name="transformers", advice=advice
             ) from error
         place = folder if folder.is_dir() else str(source)
         try:
@@ -108,11 +108,7 @@ class Clap:
         """
         audio, text = self.embed(sounds, sample_rate=sample_rate), self.embed_words(prompts)
         if len(text) not in (1, len(audio)):
-            raise EvaluationError(
-                f"expected one prompt, or one for each of {len(audio)} sounds, got {len(text)}",
-                name="prompts",
-                value=len(text),
-            )
+            raise EvaluationError.expected(f"one, or one for each of {len(audio)} sounds", len(text), name="prompts")
         return (audio * text).sum(dim=1).clamp(-1.0, 1.0)
 
     def embed(self, sounds: Float[Tensor, "..."], *, sample_rate: float) -> Float64[Tensor, "contacts dim"]:
@@ -130,15 +126,11 @@ class Clap:
     def embed_words(self, prompts: Sequence[str]) -> Float64[Tensor, "prompts dim"]:
         """Return the prompts' embeddings, of length one. Raises EvaluationError for an empty prompt."""
         if isinstance(prompts, str) or not prompts:
-            raise EvaluationError(
-                f"expected a list of prompts, got {prompts!r}; give one as [prompt]", name="prompts", value=prompts
-            )
+            raise EvaluationError.expected("a list of prompts", prompts, name="prompts", advice="give one as [prompt]")
         embeddings = []
         for prompt in prompts:
             if not prompt.strip():
-                raise EvaluationError(
-                    "expected a prompt, such as 'striking a wooden bowl', got an empty one", name="prompt", value=prompt
-                )
+                raise EvaluationError.expected("words, such as 'striking a wooden bowl'", prompt, name="prompt")
             # One by one: padding would make the last digits depend on the other prompts.
             tokens = self.processor.tokenizer([prompt], return_tensors="pt", truncation=True)
             words = {name: tokens[name] for name in ("input_ids", "attention_mask")}

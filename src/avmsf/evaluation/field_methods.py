@@ -151,21 +151,23 @@ def gaussian_process(name: str, *, model: GainModelName) -> FieldMethod:
     return FieldMethod(name, PipelineConfig(gain_model=model), "surface")
 
 
-def quick_network(
-    name: str, *, visual_input: VisualInput = "visual", informed: bool = True, with_grid: bool = False, **fit: Any
+def network(
+    name: str,
+    visual_input: VisualInput,
+    *,
+    published: bool = False,
+    informed: bool = True,
+    grid: bool = False,
+    **fit: Any,
 ) -> FieldMethod:
-    """Return the attention network with the quick settings but for those of `fit`."""
-    pipeline = replace(NETWORK, fit=replace(NETWORK.fit, **fit))
-    return FieldMethod(name, pipeline, visual_input, informed=informed, grid=QUICK_GRID if with_grid else None)
+    """Return the attention network with the quick settings, or those of the preset `paper`, but for those of `fit`.
 
-
-def paper_network(
-    name: str, *, visual_input: VisualInput = "paper", informed: bool = True, with_grid: bool = False, **fit: Any
-) -> FieldMethod:
-    """Return the preset `paper` with one of its two dampings, shared unless `fit` names the other."""
-    preset = PRESETS["paper"]
-    pipeline = replace(preset, fit=replace(preset.fit, **{"damping": "shared", **fit}))
-    return FieldMethod(name, pipeline, visual_input, True, informed, PAPER_GRID if with_grid else None)
+    `published` has one of the preset's two dampings, shared unless `fit` names the other.
+    """
+    base, candidates = (PRESETS["paper"], PAPER_GRID) if published else (NETWORK, QUICK_GRID)
+    settings = {"damping": "shared", **fit} if published else fit
+    pipeline = replace(base, fit=replace(base.fit, **settings))
+    return FieldMethod(name, pipeline, visual_input, published, informed, candidates if grid else None)
 
 
 def _envelope_error(field: SoundField, held: Impacts) -> float:

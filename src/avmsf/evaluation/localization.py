@@ -1,8 +1,7 @@
 """Localization as an experiment of `evaluate`: how far off methods locate recordings, and the maps of some of them."""
 
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from collections.abc import Callable, Collection
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -34,23 +33,9 @@ _POWER_FLOOR = 1e-6
 _MAP_KEY = "avmsf-contact-map"
 
 
-@dataclass(frozen=True, eq=False)
-class Located:
-    """Where a method locates recordings."""
-
-    errors: Mapping[str, tuple[float, ...]]
-    """Distances from the true contacts over the diagonal of the object's points, a value for each recording.
-
-    `rmed`: at the point of least cosine distance between gains (the paper), of fields and DiffSound; at the contact of
-    the training recording with the most similar spectrum, of the nearest recording. `rmed_posterior`, of fields: at the
-    most probable point. What a method cannot locate counts as a random point, as do all recordings of a method that
-    locates nothing.
-    """
-    maps: Mapping[int, ContactMap] = field(default_factory=dict)
-    """Maps of fields by the rows of recordings, of those that were asked for and could be located."""
-
-
-_Places = tuple[dict[str, Float64[Tensor, " 3"]], ContactMap | None]
+Sound = Float[Tensor, " samples"]
+_Find = Callable[[Sound], tuple[dict[str, Float64[Tensor, " 3"]], ContactMap | None]]
+"""Returns where a sound comes from, by the names of the errors, and the map of a field."""
 
 
 def located(
@@ -62,21 +47,23 @@ def located(
     vertices: Float[Tensor, "vertices 3"] | None = None,
     published: bool = False,
     map_rows: Collection[int] = (),
-) -> Located:
+) -> tuple[dict[str, tuple[float, ...]], dict[int, ContactMap]]:
     """Locate each recording of `test` by a method, among `CANDIDATES` of the object's points.
+
+    Returns distances from the true contacts over the diagonal of the object's points, a value for each recording, and
+    the maps of a field for those recordings of the rows `map_rows` that could be located. `rmed` is taken at the point
+    of least cosine distance between gains (the paper), of fields and DiffSound, or at the contact of the training
+    recording with the most similar spectrum, of the nearest recording; `rmed_posterior` at the most probable point, of
+    fields. What a method cannot locate counts as a random point.
 
     DiffSound searches the `vertices` of the object's mesh where they are given, as in the paper. With `published`,
     `rmed` of a field is that of `published_distance`; otherwise its gains are compared at the best delay and without
-    their expected noise. Maps are returned of the recordings `map_rows`.
+    their expected noise.
     """
     points = points[farthest_points(points, min(CANDIDATES, len(points)))].double()
     diagonal = float((points.amax(0) - points.amin(0)).norm())
-    names: tuple[str, ...]
-    if isinstance(renderer, SoundField):
-        names, find = ("rmed", "rmed_posterior"), _by_field(renderer, points, published)
-    else:
-        searched = points if vertices is None else _fewer(vertices.double())
-        names, find = ("rmed",), _finder(renderer, train, searched)
+    names = ("rmed", "rmed_posterior") if isinstance(renderer, SoundField) else ("rmed",)
+    find = _finder(renderer, train, points, vertices, published)
     rows, maps = [], {}
     for row, (sound, truth) in enumerate(zip(test.sounds, test.contacts.double(), strict=True)):
         try:
@@ -88,17 +75,34 @@ def located(
         rows.append([distance / diagonal for distance in distances])
         if found is not None and row in map_rows:
             maps[row] = found
-    return Located({name: tuple(row[number] for row in rows) for number, name in enumerate(names)}, maps)
+    return {name: tuple(row[number] for row in rows) for number, name in enumerate(names)}, maps
 
 
-def _by_field(
-    field: SoundField, points: Float64[Tensor, "points 3"], published: bool
-) -> Callable[[Float[Tensor, " samples"]], _Places]:
-    """Return what locates a sound by a field."""
+def _finder(
+    renderer: Renderer,
+    train: Impacts,
+    points: Float64[Tensor, "points 3"],
+    vertices: Float[Tensor, "vertices 3"] | None,
+    published: bool,
+) -> _Find:
+    """Return what locates a sound by a method; nothing for methods that cannot."""
+    if isinstance(renderer, SoundField):
+        return _field_finder(renderer, points, published)
+    if isinstance(renderer, DiffSound):
+        searched = points if vertices is None else _fewer(vertices.double())
+        gains = renderer.gains(searched)
+        return lambda sound: ({"rmed": searched[int(renderer.distance(gains, sound).argmin())]}, None)
+    if isinstance(renderer, NearestRecording):
+        nearest = nearest_spectrum(train)
+        return lambda sound: ({"rmed": train.contacts[nearest(sound)].double()}, None)
+    return lambda sound: ({}, None)
+
+
+def _field_finder(field: SoundField, points: Float64[Tensor, "points 3"], published: bool) -> _Find:
     locator = Locator.of(field, points=points)
     gains = field.gains(points).double() if published else None
 
-    def find(sound: Float[Tensor, " samples"]) -> _Places:
+    def find(sound: Sound) -> tuple[dict[str, Float64[Tensor, " 3"]], ContactMap | None]:
         distance = None if gains is None else published_distance(field, gains, sound)
         try:
             found = locator.locate(sound)
@@ -110,19 +114,6 @@ def _by_field(
         return {"rmed": points[found.best], "rmed_posterior": found.position.double()}, found
 
     return find
-
-
-def _finder(
-    renderer: Renderer, train: Impacts, points: Float64[Tensor, "points 3"]
-) -> Callable[[Float[Tensor, " samples"]], _Places]:
-    """Return what locates a sound by another method; nothing for methods that cannot."""
-    if isinstance(renderer, DiffSound):
-        gains = renderer.gains(points)
-        return lambda sound: ({"rmed": points[int(renderer.distance(gains, sound).argmin())]}, None)
-    if isinstance(renderer, NearestRecording):
-        similar = NearestSpectrum(train)
-        return lambda sound: ({"rmed": train.contacts[similar.row(sound)].double()}, None)
-    return lambda sound: ({}, None)
 
 
 def _fewer(vertices: Float64[Tensor, "vertices 3"]) -> Float64[Tensor, "points 3"]:
@@ -148,42 +139,34 @@ def published_distance(
     return 1.0 - torch.nn.functional.cosine_similarity(gains, recorded[None], dim=1)
 
 
-@dataclass(frozen=True, eq=False)
-class NearestSpectrum:
-    """The training recording with the most similar spectrum, independent of level."""
+def nearest_spectrum(train: Impacts) -> Callable[[Sound], int]:
+    """Return what finds the row of the training recording with the most similar spectrum, independent of level.
 
-    train: Impacts
+    Training recordings that are silent are never the nearest. It raises EvaluationError for a sound that is silent.
+    """
+    signatures = torch.stack([_signature(sound, train.sample_rate) for sound in train.sounds])
 
-    def row(self, sound: Float[Tensor, " samples"]) -> int:
-        """Return the training recording's row.
-
-        Training recordings that are silent are never the nearest. Raises EvaluationError for a sound that is silent.
-        """
+    def row(sound: Sound) -> int:
         if not bool(sound.any()):
-            raise EvaluationError("expected a recording, got silence; omit it", name="sound", value=0.0)
-        similarity = self._signatures @ self._signature(sound)
-        return int(torch.where(self.train.sounds.any(dim=1), similarity, -torch.inf).argmax())
+            raise EvaluationError.expected("a recording", 0.0, got="silence", name="sound", advice="omit it")
+        similarity = signatures @ _signature(sound, train.sample_rate)
+        return int(torch.where(train.sounds.any(dim=1), similarity, -torch.inf).argmax())
 
-    @cached_property
-    def _signatures(self) -> Float64[Tensor, "contacts bins"]:
-        return torch.stack([self._signature(sound) for sound in self.train.sounds])
+    return row
 
-    def _signature(self, sound: Float[Tensor, " samples"]) -> Float64[Tensor, " bins"]:
-        """Return the log of the mean power spectrum, of mean zero and norm one: products are correlations.
 
-        Zero for silence.
-        """
-        size = scaled_fft_size(_FFT_SIZE, sample_rate=self.train.sample_rate)
-        padded = torch.nn.functional.pad(sound.double(), (0, max(0, size - len(sound))))
-        window = torch.hann_window(size, dtype=torch.float64)
-        # Frames from before the onset on, so that its window weighs the beginning of the sound too.
-        frames = torch.nn.functional.pad(padded, (size // 2, size // 2)).unfold(0, size, size // 4)
-        power = torch.fft.rfft(frames * window).abs().square().mean(dim=0)
-        if not float(power.max()) > 0.0:
-            return torch.zeros_like(power)
-        level = torch.log(power.clamp_min(_POWER_FLOOR * float(power.max())))
-        centered = level - level.mean()
-        return centered / centered.norm().clamp_min(torch.finfo(torch.float64).tiny)
+def _signature(sound: Sound, sample_rate: float) -> Float64[Tensor, " bins"]:
+    """Return the log of the mean power spectrum, of mean zero and norm one; 0 for silence."""
+    size = scaled_fft_size(_FFT_SIZE, sample_rate=sample_rate)
+    padded = torch.nn.functional.pad(sound.double(), (0, max(0, size - len(sound))))
+    # Frames from before the onset on, so that its window weighs the beginning of the sound too.
+    frames = torch.nn.functional.pad(padded, (size // 2, size // 2)).unfold(0, size, size // 4)
+    power = torch.fft.rfft(frames * torch.hann_window(size, dtype=torch.float64)).abs().square().mean(dim=0)
+    if not float(power.max()) > 0.0:
+        return torch.zeros_like(power)
+    level = torch.log(power.clamp_min(_POWER_FLOOR * float(power.max())))
+    centered = level - level.mean()
+    return centered / centered.norm().clamp_min(torch.finfo(torch.float64).tiny)
 
 
 def random_distance(points: Float[Tensor, "points 3"], right: Float[Tensor, " 3"]) -> float:

@@ -183,12 +183,12 @@ class Recorded:
         rows = torch.nonzero((self.contacts.double() - contact.double()).norm(dim=1) < 1e-6).flatten().tolist()
         if not rows:
             place = ", ".join(f"{value:g}" for value in contact.tolist())
-            raise EvaluationError(
-                f"{self.folder}: expected a contact of a recording, got ({place}) m; sounds from files are available "
-                "at recorded contacts only",
+            raise EvaluationError.expected(
+                "a contact of a recording, at which alone sounds from files are available",
+                contact.tolist(),
+                got=f"({place}) m",
                 file=self.folder,
                 name="contacts",
-                value=contact.tolist(),
             )
         paths = [self.path(self.names[row]) for row in rows]
         present = [path for path in paths if path.is_file()]

@@ -37,22 +37,19 @@ def validate(predicted: Sounds, truth: Sounds, *, names: Sequence[str] | None = 
 
     The message names a row by `names`, or else by its index.
     """
-    for what, sounds in (("predicted", predicted), ("truth", truth)):
+    both = {"predicted": predicted, "truth": truth}
+    for what, sounds in both.items():
         _expect_rows(sounds, what)
     if len(predicted) != len(truth):
-        raise EvaluationError(
-            f"expected one predicted sound for each of {len(truth)} true ones, got {len(predicted)}",
-            name="predicted",
-            value=len(predicted),
-        )
+        raise EvaluationError.expected(f"one for each of {len(truth)} true sounds", len(predicted), name="predicted")
     if predicted.shape[1] != truth.shape[1]:
-        raise EvaluationError(
-            f"expected predicted sounds of {truth.shape[1]} samples as the true ones, got {predicted.shape[1]}; check "
-            "sample rates and durations",
+        raise EvaluationError.expected(
+            f"sounds of {truth.shape[1]} samples as the true ones",
+            list(predicted.shape),
             name="predicted",
-            value=list(predicted.shape),
+            advice="check sample rates and durations",
         )
-    for what, sounds in (("predicted", predicted), ("truth", truth)):
+    for what, sounds in both.items():
         _expect_numbers(sounds, what, names)
 
 
@@ -91,7 +88,12 @@ def relative_stft_error(
     error = torch.zeros(len(truth), dtype=torch.float64)
     sizes = default_fft_sizes(sample_rate) if fft_sizes is None else tuple(fft_sizes)
     for size in sizes:
-        difference, weight = _stft_sums(predicted, truth, fft_size=size, hop=max(1, size // 4))
+
+        def sums(a: Sounds, b: Sounds, size: int = size) -> Float64[Tensor, "contacts 2"]:
+            spectra = [magnitude_stft(sounds, fft_size=size, hop=max(1, size // 4)) for sounds in (a, b)]
+            return torch.stack([(spectra[0] - spectra[1]).abs().sum(dim=(1, 2)), spectra[1].sum(dim=(1, 2))], dim=1)
+
+        difference, weight = _blockwise(sums, predicted, truth).unbind(dim=1)
         if weight.sum() == 0.0:
             raise EvaluationError.expected("sounds that are not all silent", 0.0, got="silence", name="truth")
         error += difference / weight.mean()
@@ -165,16 +167,10 @@ def envelope_distance(predicted: Sounds, truth: Sounds, *, sample_rate: float) -
 
 def _expect_rows(sounds: Sounds, what: str) -> None:
     if sounds.ndim != 2:
-        raise EvaluationError(
-            f"{what}: expected sounds [contacts, samples], got the shape {tuple(sounds.shape)}; give a single sound as "
-            "one row, sound[None]",
-            name=what,
-            value=list(sounds.shape),
-        )
+        advice = "give a single sound as one row, sound[None]"
+        raise EvaluationError.expected("sounds [contacts, samples]", list(sounds.shape), name=what, advice=advice)
     if sounds.numel() == 0:
-        raise EvaluationError.expected(
-            "one contact and one sample or more", list(sounds.shape), got=f"the shape {tuple(sounds.shape)}", name=what
-        )
+        raise EvaluationError.expected("one contact and one sample or more", list(sounds.shape), name=what)
 
 
 def _expect_numbers(sounds: Sounds, what: str, names: Sequence[str] | None) -> None:
@@ -182,24 +178,10 @@ def _expect_numbers(sounds: Sounds, what: str, names: Sequence[str] | None) -> N
     if len(bad):
         row, sample = bad[0].tolist()
         value = float(sounds[row, sample])
-        sound = f"row {row}" if names is None else f"row {row} ({names[row]})"
-        raise EvaluationError(
-            f"{what}, {sound}: expected finite samples, got {value} at sample {sample}",
-            row=row,
-            name=what,
-            value=value,
+        sound = "" if names is None else f" of {names[row]}"
+        raise EvaluationError.expected(
+            "finite samples", value, got=f"{value} at sample {sample}{sound}", row=row, name=what
         )
-
-
-def _stft_sums(predicted: Sounds, truth: Sounds, *, fft_size: int, hop: int) -> tuple[PerContact, PerContact]:
-    """Return the sums over bins and frames of the absolute differences, and of the truth's magnitudes."""
-
-    def sums(a: Sounds, b: Sounds) -> Float64[Tensor, "contacts 2"]:
-        spectra = [magnitude_stft(sounds, fft_size=fft_size, hop=hop) for sounds in (a, b)]
-        return torch.stack([(spectra[0] - spectra[1]).abs().sum(dim=(1, 2)), spectra[1].sum(dim=(1, 2))], dim=1)
-
-    difference, weight = _blockwise(sums, predicted, truth).unbind(dim=1)
-    return difference, weight
 
 
 def _blockwise(

@@ -204,12 +204,8 @@ def compare_modes(
     _expect_amplitudes(predicted, bank.frequency, "predicted")
     _expect_amplitudes(true, truth.frequency, "truth")
     if len(predicted) != len(true):
-        raise EvaluationError(
-            f"expected true gains at {len(predicted)} contacts, got {len(true)}; take the ground truth of these "
-            "recordings, in their order",
-            name="truth",
-            value=len(true),
-        )
+        advice = "take the ground truth of these recordings, in their order"
+        raise EvaluationError.expected(f"gains at {len(predicted)} contacts", len(true), name="truth", advice=advice)
     energy = true.abs().square().sum(dim=0) / (4 * truth.damping)
     if not float(energy.sum()) > 0.0:
         raise EvaluationError.expected("modes with energy", 0.0, got="zero gains at all contacts", name="truth")

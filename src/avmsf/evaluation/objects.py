@@ -201,12 +201,7 @@ def choose_objects(dataset: Dataset, protocol: Protocol, asked: Sequence[str] = 
         group = members(dataset).get(protocol.subset, frozenset())
         if group:
             return tuple(each for each in dataset.objects() if each in group)
-        if protocol.required:
-            raise EvaluationError.expected(
-                f"objects of the group {protocol.subset}",
-                protocol.subset,
-                got="none",
-                name="subset",
-                advice="name objects with --objects",
-            )
+        if protocol.subset != "ablation":
+            wanted, advice = f"objects of the group {protocol.subset}", "name objects with --objects"
+            raise EvaluationError.expected(wanted, protocol.subset, got="none", name="subset", advice=advice)
     return dataset.objects()

@@ -67,11 +67,12 @@ class MethodEntry:
     """The folder or file that it reads, for a method whose name goes on with `:` and a path."""
 
 
-def _made(make: str) -> Callable[..., MethodEntry]:
-    return lambda title, **settings: MethodEntry(title, make=f"field_methods:{make}", settings=settings)
+def _made(make: str, **common: Any) -> Callable[..., MethodEntry]:
+    return lambda title, **settings: MethodEntry(title, make=f"field_methods:{make}", settings={**common, **settings})
 
 
-_network, _process, _paper = _made("quick_network"), _made("gaussian_process"), _made("paper_network")
+_process, _network = _made("gaussian_process"), _made("network", visual_input="visual")
+_paper = _made("network", visual_input="paper", published=True)
 METHODS: dict[str, MethodEntry] = {
     "white-noise": MethodEntry("Gaussian noise at the level of the training recordings", "methods:white_noise"),
     "random-impact": MethodEntry("a recording of another object", "methods:random_impact"),
@@ -100,10 +101,7 @@ METHODS: dict[str, MethodEntry] = {
     # All steps end to end take long enough without two trials of dampings beforehand. The noise is trained, as
     # measuring it needs the modes.
     "field-no-initialization": _network(
-        "attention network, quick settings, without extracted modes",
-        informed=False,
-        damping="shared",
-        noise_rate=0.1,
+        "attention network, quick settings, without extracted modes", informed=False, damping="shared", noise_rate=0.1
     ),
     "field-no-residual": _network("attention network, quick settings, without residual noise", residual=False),
     # The warm-up moves no damping, so there is nothing to choose between.
@@ -114,8 +112,8 @@ METHODS: dict[str, MethodEntry] = {
     "paper-unaligned": _paper("the paper's method without symmetry pooling", visual_input="paper-unaligned"),
     "paper-no-residual": _paper("the paper's method without residual noise", residual=False),
     "paper-per-contact": _paper("the paper's method with damping per contact", damping="per-contact"),
-    "field-grid": _network("attention network, settings chosen from a small grid", with_grid=True),
-    "paper-grid": _paper("the paper's method with settings chosen from its lists", with_grid=True),
+    "field-grid": _network("attention network, settings chosen from a small grid", grid=True),
+    "paper-grid": _paper("the paper's method with settings chosen from its lists", grid=True),
     "sonicgauss": MethodEntry(
         "SonicGauss with its published weights, trained on ObjectFolder Real, fine-tuned",
         make="methods:sonicgauss",
@@ -153,9 +151,8 @@ class Protocol:
     methods: tuple[str, ...] = _TABLE
     """Names of the methods that take part unless others are asked for; the baseline is among them."""
     subset: Literal["ablation", "non-symmetric"] | None = None
-    """The objects that take part unless others are asked for; None for all."""
-    required: bool = False
-    """Whether the subset is required; otherwise all objects of a dataset without such a subset take part."""
+    """The objects that take part unless others are asked for; None for all. All objects of a dataset stand for those of
+    the ablation where it has none of them."""
     locating: bool = False
     """Whether methods are evaluated by localizing the test recordings, not by their sounds."""
 
@@ -205,14 +202,12 @@ PROTOCOLS: dict[str, Protocol] = {
             "non-symmetric",
             "As `farthest`, on objects without rotational symmetry.",
             subset="non-symmetric",
-            required=True,
         ),
         Protocol(
             "localize",
             "Train as in `farthest`; locate the test recordings, on objects without rotational symmetry.",
             methods=("white-noise", "nearest", "diffsound", "field", "field-no-residual", "field-auto"),
             subset="non-symmetric",
-            required=True,
             locating=True,
         ),
         Protocol(

@@ -103,16 +103,11 @@ class ResultsFolder:
         """
         wanted = json.loads(json.dumps(dict(identity)))
         place = self.path / IDENTITY
-        known = self.identity() if place.exists() else {**wanted, "methods": {}}
         # A kill may leave a hidden part of the file behind.
         if not place.exists() and self.path.is_dir() and any(self.path.glob("[!.]*")):
-            raise EvaluationError.expected(
-                f"an empty folder or one with {IDENTITY}",
-                got="other files",
-                file=self.path,
-                name="output",
-                advice="choose a new --output",
-            )
+            asked, advice = f"an empty folder or one with {IDENTITY}", "choose a new --output"
+            raise EvaluationError.expected(asked, got="other files", file=self.path, name="output", advice=advice)
+        known = self.identity() if place.exists() else {**wanted, "methods": {}}
         kept = known.pop("methods")
         if wanted != known:
             name, asked, found = _first_difference(wanted, known)
@@ -131,9 +126,7 @@ class ResultsFolder:
 
     def _of_another(self, name: str, value: object, wanted: str, found: str) -> EvaluationError:
         advice = "give the same options, or choose another --output"
-        return EvaluationError(
-            f"{self.path}: expected results {wanted}, got {found}; {advice}", file=self.path, name=name, value=value
-        )
+        return EvaluationError.expected(f"results {wanted}", value, got=found, file=self.path, name=name, advice=advice)
 
     def identity(self) -> dict[str, Any]:
         """Return the evaluation that the folder holds, with its methods. Raises EvaluationError where there is none."""
@@ -185,11 +178,8 @@ class ResultsFolder:
         return read
 
     def _damaged(self, place: Path, error: object) -> EvaluationError:
-        return EvaluationError(
-            f"{place}: expected results of this version, got {error}; delete the file to compute them again, or choose "
-            "another --output",
-            file=place,
-        )
+        advice = "delete the file to compute them again, or choose another --output"
+        return EvaluationError.expected("results of this version", got=str(error), file=place, advice=advice)
 
 
 def write_json(place: Path, values: Mapping[str, Any]) -> None:

@@ -86,11 +86,11 @@ def evaluate(
     if isinstance(made, SoundField):
         impacts = made.aligned(impacts)
     if made.sample_rate != impacts.sample_rate:
-        raise EvaluationError(
-            f"expected recordings at the field's {made.sample_rate:g} Hz, got {impacts.sample_rate:g} Hz; resample "
-            "them, or fit a field to recordings of their rate",
+        raise EvaluationError.expected(
+            f"recordings at the renderer's {made.sample_rate:g} Hz",
+            impacts.sample_rate,
             name="sample_rate",
-            value=impacts.sample_rate,
+            advice="resample them, or fit to recordings of their rate",
         )
     with torch.no_grad(), warnings.catch_warnings():
         # Reading the capture has warned of contacts off the object.
@@ -106,11 +106,7 @@ def evaluate(
 def _impacts_of(recordings: Capture | Impacts, name: str) -> Impacts:
     impacts = recordings.impacts if isinstance(recordings, Capture) else recordings
     if not isinstance(impacts, Impacts):
-        raise EvaluationError(
-            f"{name}: expected a Capture or Impacts, got {type(impacts).__name__}",
-            name=name,
-            value=type(impacts).__name__,
-        )
+        raise EvaluationError.expected("a Capture or Impacts", type(impacts).__name__, name=name)
     return impacts
 
 
@@ -169,11 +165,7 @@ class MetricSettings:
 
     def __post_init__(self) -> None:
         if self.cdpam_contacts < 0:
-            raise EvaluationError(
-                f"expected cdpam_contacts of 0 (all) or more, got {self.cdpam_contacts}",
-                name="cdpam_contacts",
-                value=self.cdpam_contacts,
-            )
+            raise EvaluationError.expected("0 (all) or more", self.cdpam_contacts, name="cdpam_contacts")
 
     def prepare(self) -> None:
         """Raise EvaluationError where a required package is not installed, before hours of computation."""

@@ -50,11 +50,7 @@ class _Neighbors:
 
     def __post_init__(self) -> None:
         if not 1 <= self.count <= len(self.train):
-            raise EvaluationError(
-                f"expected a count of 1 to {len(self.train)} nearest training impacts, got {self.count}",
-                name="count",
-                value=self.count,
-            )
+            raise EvaluationError.expected(f"1 to {len(self.train)} training impacts", self.count, name="count")
 
     @property
     def report(self) -> dict[str, Any]:
@@ -75,11 +71,11 @@ class ModalBaseline(_Trained, ABC):
 
     def __post_init__(self) -> None:
         if len(self.extraction.gains) != len(self.train):
-            raise EvaluationError(
-                f"expected gains of {len(self.train)} training impacts, got those of {len(self.extraction.gains)}; "
-                "extract the modes from these impacts",
+            raise EvaluationError.expected(
+                f"gains of {len(self.train)} training impacts",
+                len(self.extraction.gains),
                 name="extraction",
-                value=len(self.extraction.gains),
+                advice="extract the modes from these impacts",
             )
 
     @property

@@ -7,7 +7,7 @@ test at a training contact would be too easy.
 import random
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar, cast, runtime_checkable
+from typing import Protocol, TypeVar, cast
 
 from jaxtyping import Float64
 from torch import Tensor
@@ -43,7 +43,6 @@ class Case:
         return f"{self.label}: {self.fold}" if self.fold else self.label
 
 
-@runtime_checkable
 class Choosing(Protocol):
     """A choice of training contacts, with all recordings there."""
 
@@ -185,24 +184,15 @@ class Places:
         """Number of recordings at all contacts."""
         return sum(map(len, self.rows))
 
-    def number_of(self, row: int) -> int:
-        """Return the contact of a recording. Raises EvaluationError for an index out of range."""
-        for place, rows in enumerate(self.rows):
-            if row in rows:
-                return place
-        raise EvaluationError(
-            f"expected the index of a recording, 0 to {self.recordings - 1}, got {row}", name="start", value=row
-        )
-
     def expect(self, wanted: int, *, least: int = 1) -> int:
         """Return `wanted`, or raise EvaluationError for fewer training contacts than `least` or no test contact."""
         if not least <= wanted < len(self.rows):
-            raise EvaluationError(
-                f"expected {least} to {len(self.rows) - 1} training contacts of "
-                f"{counted(self.recordings, 'recording')} at {counted(len(self.rows), 'contact')}, got {wanted}; "
-                "choose another number or record more contacts",
+            there_are = f"{counted(self.recordings, 'recording')} at {counted(len(self.rows), 'contact')}"
+            raise EvaluationError.expected(
+                f"{least} to {len(self.rows) - 1} training contacts of {there_are}",
+                wanted,
                 name="count",
-                value=wanted,
+                advice="choose another number or record more contacts",
             )
         return wanted
 
@@ -240,7 +230,10 @@ def split(
         start = random.Random(seed).randrange(len(impacts))
     places = Places.of(impacts)
     wanted = places.expect_part(train_size) if isinstance(train_size, float) else places.expect(int(train_size))
-    case = places.case("", farthest_points(places.contacts, wanted, start=places.number_of(start)))
+    if not 0 <= start < len(impacts):
+        raise EvaluationError.expected(f"the index of a recording, 0 to {len(impacts) - 1}", start, name="start")
+    first = next(place for place, rows in enumerate(places.rows) if start in rows)
+    case = places.case("", farthest_points(places.contacts, wanted, start=first))
     train, test = impacts.take(case.train), impacts.take(case.test)
     if isinstance(recordings, Impacts):
         return cast("tuple[Recordings, Recordings]", (train, test))

@@ -72,9 +72,8 @@ class StoredSound:
             content = path.read_bytes()
             samples, rate = soundfile.read(io.BytesIO(content), dtype="float64")
         except (OSError, soundfile.LibsndfileError) as error:
-            raise EvaluationError(
-                f"{path}: expected a stored sound, got {error}; delete the object's file to compute it again", file=path
-            ) from error
+            advice = "delete the object's file to compute it again"
+            raise EvaluationError.expected("a stored sound", got=str(error), file=path, advice=advice) from error
         return cls(content, torch.from_numpy(samples), float(rate))
 
     @property
