@@ -211,3 +211,15 @@ def lacks_memory(error: BaseException) -> bool:
         # llvmlite raises another OSError, which names no reason, while it handles this one.
         return error.__context__ is not None and lacks_memory(error.__context__)
     return isinstance(error, MemoryError)
+
+
+def download_failure(error: BaseException) -> str:
+    """Return in plain words why a model could not be downloaded, from an error of the hub's client or its cause."""
+    response = getattr(error, "response", None)
+    if response is not None:
+        return f"the server answered with code {response.status_code}"
+    if error.__cause__ is not None:
+        return download_failure(error.__cause__)
+    if "Connect" in type(error).__name__ or isinstance(error, ConnectionError | TimeoutError):
+        return "the server cannot be reached"
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)[:200].rstrip(".")

@@ -47,6 +47,19 @@ def is_lfs_pointer(path: Path) -> bool:
         return False
 
 
+def model_folder(source: str | Path, what: str, *, raising: type[AvmsfError]) -> Path | None:
+    """Return the folder of a model, or None for its name on the hub: an owner and a model, where paths differ.
+
+    Raises `raising` where it is neither; `what` it should be.
+    """
+    folder, words = Path(source).expanduser(), str(source).split("/")
+    if folder.is_dir():
+        return folder
+    if isinstance(source, str) and len(words) == 2 and all(words) and words[0][0] not in ".~":
+        return None
+    raise raising.expected(what, str(source), got="no such folder", file=folder, name="source", advice="check the path")
+
+
 def temporary_path(path: Path) -> Path:
     """Return a name, free in all likelihood, of a hidden file or folder in the same folder as `path`."""
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")

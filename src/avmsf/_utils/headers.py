@@ -63,7 +63,8 @@ def parse_record(
     if found not in formats:
         wanted = f"{what} in format {' or '.join(map(str, formats))}"
         got = f"format {found}, written by avmsf {writer} (this is avmsf {version('avmsf')})"
-        advice = f"install avmsf {writer} or newer, or {advice}"
+        if isinstance(found, int) and found > max(formats):
+            advice = f"install avmsf {writer} or newer, or {advice}"
         raise raising.expected(wanted, found, got=got, file=path, name="format", advice=advice)
     return record
 

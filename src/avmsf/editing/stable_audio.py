@@ -21,10 +21,10 @@ from torch import Tensor, nn
 
 from avmsf._utils.arrays import Seed, generator_of
 from avmsf._utils.device import usable_device
-from avmsf._utils.hub import is_hub_name, why_not
+from avmsf._utils.files import model_folder
 from avmsf.editing.clips import with_length
 from avmsf.editing.config import STABLE_AUDIO, check_prompt
-from avmsf.errors import EditError
+from avmsf.errors import EditError, download_failure
 
 Latents = Float[Tensor, "contacts dim frames"]
 """What the autoencoder makes of waveforms."""
@@ -274,15 +274,12 @@ def _load_pipeline(source: str | Path, dtype: torch.dtype) -> tuple[Any, str]:
 
     All but its autoencoder is in `dtype`: in bfloat16 a waveform would have eight bits.
     """
-    kind, folder = _pipeline_class(), Path(source).expanduser()
-    here = folder.is_dir()
-    if not here and not is_hub_name(source):
-        wanted = f"a folder with a {kind.__name__}, or a name of the hub such as {STABLE_AUDIO}"
-        advice = "check the path"
-        raise EditError.expected(wanted, str(source), got="no such folder", file=folder, name="source", advice=advice)
-    name = folder.resolve().name if here else str(source)
+    kind = _pipeline_class()
+    what = f"a folder with a {kind.__name__}, or a name of the hub such as {STABLE_AUDIO}"
+    folder = model_folder(source, what, raising=EditError)
+    name = folder.resolve().name if folder else str(source)
     try:
-        place = folder if here else _downloaded(kind, name)
+        place = folder or _downloaded(kind, name)
         with warnings.catch_warnings():
             # No user of this package can fix it.
             warnings.filterwarnings("ignore", message="`torch.nn.utils.weight_norm` is deprecated")
@@ -298,10 +295,12 @@ def _load_pipeline(source: str | Path, dtype: torch.dtype) -> tuple[Any, str]:
         raise EditError.expected(
             f"a complete {kind.__name__} of diffusers",
             str(source),
-            got=f"none ({why_not(error)})",
-            file=folder if here else None,
+            got=f"none ({download_failure(error)})",
+            file=folder,
             name="source",
-            advice=f"copy it again; {_HOW_TO_GET.format(name=STABLE_AUDIO)}" if here else _HOW_TO_GET.format(name=name),
+            advice=f"copy it again; {_HOW_TO_GET.format(name=STABLE_AUDIO)}"
+            if folder
+            else _HOW_TO_GET.format(name=name),
         ) from error
     for part in _NETWORKS:
         # By hand, for how a pipeline is told its precision changed between versions of diffusers.

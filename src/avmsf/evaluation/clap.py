@@ -20,9 +20,9 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from avmsf._utils.hub import is_hub_name, why_not
+from avmsf._utils.files import model_folder
 from avmsf.editing.clips import resampled
-from avmsf.errors import EvaluationError
+from avmsf.errors import EvaluationError, download_failure
 from avmsf.evaluation.metrics import PerContact, validate_sounds
 
 DEFAULT: Final = "laion/clap-htsat-unfused"
@@ -51,16 +51,8 @@ class Clap:
         Raises EvaluationError where transformers is missing, where the weights are neither here nor to be downloaded,
         and for a folder that holds another model or a part of one.
         """
-        folder = Path(source).expanduser()
-        if not folder.is_dir() and not is_hub_name(source):
-            raise EvaluationError.expected(
-                f"a folder with a CLAP model, or a name such as {DEFAULT}",
-                str(source),
-                got="no such folder",
-                file=folder,
-                name="source",
-                advice="check the path",
-            )
+        what = f"a folder with a CLAP model, or a name such as {DEFAULT}"
+        folder = model_folder(source, what, raising=EvaluationError)
         try:
             from transformers import ClapModel, ClapProcessor
         except (ImportError, RuntimeError) as error:  # RuntimeError: one of its own optional packages is broken
@@ -68,7 +60,7 @@ class Clap:
             raise EvaluationError.expected(
                 "an installed package", got=str(error), name="transformers", advice=advice
             ) from error
-        place = folder if folder.is_dir() else str(source)
+        place = folder or str(source)
         try:
             loaded: Any = ClapModel.from_pretrained(place, output_loading_info=True)
             (model, report), processor = loaded, ClapProcessor.from_pretrained(place)
@@ -76,10 +68,10 @@ class Clap:
             raise EvaluationError.expected(
                 "a CLAP model",
                 str(source),
-                got=f"none ({why_not(error)})",
-                file=folder if folder.is_dir() else None,
+                got=f"none ({download_failure(error)})",
+                file=folder,
                 name="source",
-                advice=_how_to_download(DEFAULT if folder.is_dir() else str(source)),
+                advice=_how_to_download(DEFAULT if folder else str(source)),
             ) from error
         # Any weight that is not there would be left random.
         missing = tuple(sorted(name for name in report["missing_keys"] if not name.endswith("position_ids")))
@@ -88,7 +80,7 @@ class Clap:
                 "all weights of a CLAP model",
                 missing,
                 got=f"{len(missing)} missing such as {missing[0]}",
-                file=folder,
+                file=place,
                 name="weights",
                 advice=_how_to_download(DEFAULT),
             )

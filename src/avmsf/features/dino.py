@@ -9,8 +9,8 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 from torch.nn import functional
 
-from avmsf._utils.hub import HUB_SECONDS, read_settings, why_not
-from avmsf.errors import SceneError
+from avmsf._utils.text import read_json
+from avmsf.errors import SceneError, download_failure
 from avmsf.features.encoder import unit_image
 
 MODELS: Final = tuple(
@@ -20,6 +20,8 @@ MODELS: Final = tuple(
 IMAGENET_MEAN: Final = (0.485, 0.456, 0.406)
 IMAGENET_DEVIATION: Final = (0.229, 0.224, 0.225)
 _FILES = _CONFIG, _WEIGHTS, _PREPROCESSOR = "config.json", "model.safetensors", "preprocessor_config.json"
+_HUB_SECONDS = 5.0
+"""How long to wait for the hub's answer."""
 
 
 class DinoEncoder:
@@ -114,9 +116,9 @@ def _download(name: str) -> Path:
     if all(isinstance(path, str) for path in cached):
         return Path(str(cached[0])).parent
     try:
-        return Path(snapshot_download(name, allow_patterns=list(_FILES), etag_timeout=HUB_SECONDS))
+        return Path(snapshot_download(name, allow_patterns=list(_FILES), etag_timeout=_HUB_SECONDS))
     except Exception as error:  # the hub's client raises whatever the network beneath it does
-        got = f"none: they could not be downloaded ({why_not(error)})"
+        got = f"none: they could not be downloaded ({download_failure(error)})"
         advice = (
             f"save {', '.join(_FILES)} from https://huggingface.co/{name}/tree/main in one FOLDER and use "
             "lift.encoder=FOLDER, or use lift.encoder=descriptors, which needs no download"
@@ -130,7 +132,7 @@ def _load_model(folder: Path) -> nn.Module:
     for name in (_CONFIG, _WEIGHTS):
         if not (folder / name).is_file():
             raise SceneError.expected("a DINOv2 model", got=f"no {name}", file=folder, name=name, advice=advice)
-    kind = read_settings(folder / _CONFIG, raising=SceneError).get("model_type")
+    kind = _read_settings(folder / _CONFIG).get("model_type")
     if kind not in classes:
         wanted = f"a model of type {' or '.join(classes)}"
         raise SceneError.expected(wanted, kind, file=folder / _CONFIG, name="model_type")
@@ -149,9 +151,19 @@ def _load_model(folder: Path) -> nn.Module:
     return model
 
 
+def _read_settings(path: Path) -> dict[str, Any]:
+    try:
+        record = read_json(path)
+    except (OSError, ValueError) as error:
+        raise SceneError.expected("a JSON file", got=str(error), file=path, advice="copy it again") from error
+    if not isinstance(record, dict):
+        raise SceneError.expected("a JSON object", type(record).__name__, file=path, advice="copy it again")
+    return record
+
+
 def _read_normalization(path: Path) -> tuple[Sequence[float], Sequence[float]]:
     """Return the mean and standard deviation of colors in a preprocessor's file, ImageNet's without one."""
-    record = read_settings(path, raising=SceneError) if path.is_file() else {}
+    record = _read_settings(path) if path.is_file() else {}
     found = record.get("image_mean", IMAGENET_MEAN), record.get("image_std", IMAGENET_DEVIATION)
     for each in found:
         if not (
