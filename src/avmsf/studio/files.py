@@ -1,9 +1,8 @@
-"""The files that the page fetches: one folder for each revision, of which the last few are kept."""
+"""The files that the page fetches: those of the last few revisions."""
 
-import json
-import shutil
 import warnings
 from collections import OrderedDict
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Lock
@@ -41,8 +40,9 @@ _CACHED_REVISIONS = 4
 class Shown:
     """One revision's files."""
 
-    folder: Path
     manifest: dict[str, Any]
+    files: Mapping[str, bytes]
+    """Contents by relative path, those of the object and of recorded impacts included."""
     sampled: SampledField
     revision: Revision
     remarks: tuple[str, ...]
@@ -50,12 +50,11 @@ class Shown:
 
 
 class Showcase:
-    """The files of the last revisions, in a folder that is removed with the server."""
+    """The files of the last revisions, in memory."""
 
-    def __init__(self, opened: Opened, folder: Path, editor: CaptureEditor | None) -> None:
-        self.opened, self.folder, self.editor = opened, folder, editor
+    def __init__(self, opened: Opened, editor: CaptureEditor | None) -> None:
+        self.opened, self.editor = opened, editor
         self._shown: OrderedDict[int, Shown] = OrderedDict()
-        self._first_of_field: Shown | None = None
         self._lock = Lock()
 
     @property
@@ -63,15 +62,9 @@ class Showcase:
         """The last revision's files."""
         return next(reversed(self._shown.values()))
 
-    def files_of(self, number: int) -> Path:
-        """Return the folder of a revision's files, or of the last one's if they are no longer kept."""
-        return self._shown.get(number, self.current).folder
-
-    @property
-    def object_folder(self) -> Path:
-        """The folder with the object's files and the sounds of recorded impacts."""
-        assert self._first_of_field is not None
-        return self._first_of_field.folder
+    def files_of(self, number: int) -> Mapping[str, bytes]:
+        """Return a revision's files, or the last one's if they are no longer kept."""
+        return self._shown.get(number, self.current).files
 
     @property
     def meters(self) -> float:
@@ -79,33 +72,28 @@ class Showcase:
         return 1.0 if self.opened.object is not None else self.opened.settings.surface_meters
 
     def show(self, revision: Revision) -> None:
-        """Write a revision's files. Raises the errors of `make_bundle`, and StudioError without geometry."""
+        """Make a revision's files. Raises the errors of `make_bundle`, and StudioError without geometry."""
         with self._lock:
-            sampled = self._sampled(revision)
-            path = self.folder / f"revision-{revision.number}"
-            first, shows = self._first_of_field, dict[str, Any]()
-            remarks: tuple[str, ...] = ()
+            sampled, mute = self._sampled(revision), revision.field is None
             if self._is_other_field(revision):
-                first, field = None, revision.field
-                strikes, remarks = self._strikes(field)
-                surface = self._surface(field)
-                shows = {"object": find_object(self.opened), "surface": surface, "strikes": strikes}
-            bundle = make_bundle(sampled, meters=self.meters, mute=revision.field is None, **shows)
-            written = bundle.write(path, force=True).remarks
-            manifest = json.loads((path / "manifest.json").read_text(encoding="utf-8"))
+                strikes, remarks = self._strikes(revision.field)
+                shown, surface = find_object(self.opened), self._surface(revision.field)
+                bundle = make_bundle(
+                    sampled, object=shown, meters=self.meters, surface=surface, strikes=strikes, mute=mute
+                )
+                manifest, files, remarks = {**bundle.manifest}, bundle.files, remarks + bundle.remarks
+            else:
+                before, bundle = self.current, make_bundle(sampled, mute=mute)
+                kept = {part: before.manifest[part] for part in ("object", "surface", "strikes")}
+                manifest, files = {**bundle.manifest, **kept}, {**before.files, **bundle.files}
+                remarks = before.remarks
             manifest["name"] = revision.name or manifest["name"] or self.opened.name
-            if first is not None:
-                manifest |= {part: first.manifest[part] for part in ("object", "surface", "strikes")}
-            for tensor in manifest["tensors"].values():
-                # By revision, so that a page never reads one's manifest with another's numbers.
-                tensor["file"] = f"revisions/{revision.number}/field.bin"
-            notes = remarks + written if first is None else first.remarks
-            self._shown[revision.number] = shown = Shown(path, manifest, sampled, revision, notes)
-            self._first_of_field = first or shown
+            # By revision, so that a page never reads one's manifest with another's numbers.
+            file = {"file": f"revisions/{revision.number}/field.bin"}
+            manifest["tensors"] = {name: {**tensor, **file} for name, tensor in manifest["tensors"].items()}
+            self._shown[revision.number] = Shown(manifest, files, sampled, revision, remarks)
             while len(self._shown) > _CACHED_REVISIONS:
-                _, old = self._shown.popitem(last=False)
-                if old.folder != self.object_folder:
-                    shutil.rmtree(old.folder, ignore_errors=True)
+                self._shown.popitem(last=False)
 
     def _surface(self, field: SoundField | None) -> Path | Surface | None:
         """Return the surface to show in place of Gaussians or points: the field's body, or the reconstructed surface.

@@ -5,9 +5,9 @@ import base64
 import dataclasses
 import sys
 import traceback
-from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property, partial
 from threading import Lock
 from typing import Any
 
@@ -34,22 +34,6 @@ _SETTLED = 0.5
 """Seconds that a revision stays the last one before its tables are made: sliders are dragged."""
 
 
-class CachedSymmetries:
-    """The symmetries of one object, which an edit that makes it larger leaves as they are but for their lengths."""
-
-    def __init__(self) -> None:
-        self._found: tuple[Symmetries | None, float] | None = None
-        self._lock = Lock()
-
-    def on(self, field: SoundField, length: float) -> Symmetries | None:
-        """Return the symmetries of a field's object, `length` times as large as the one in the page; None for none."""
-        with self._lock:
-            if self._found is None:
-                self._found = (symmetries_of(field), length)
-            found, before = self._found
-        return None if found is None else enlarged(found, length / before)
-
-
 @dataclass(frozen=True, eq=False)
 class Finder:
     """The locator of one revision of a field, made at its first use."""
@@ -59,8 +43,10 @@ class Finder:
     """The page's points, on the object as the field has it now, meters."""
     length: float
     """Lengths on that object over those of the page's picture."""
-    cached_symmetries: CachedSymmetries
-    """The symmetries of the object, whose search other revisions need not repeat."""
+    find_symmetries: Callable[[], Symmetries | None]
+    """Returns the symmetries of the object as it was opened, whose search other revisions need not repeat."""
+    opened_length: float
+    """`length` of the field that they are found of."""
     settings: CaptureSettings | None
     """How the capture's recordings are read, where it is known."""
     _lock: Lock = dataclasses.field(default_factory=Lock, repr=False)
@@ -72,8 +58,9 @@ class Finder:
 
     @property
     def symmetries(self) -> Symmetries | None:
-        """The reason why several positions sound the same."""
-        return self.cached_symmetries.on(self.field, self.length)
+        """The reason why several positions sound the same: those of the object as it was opened, scaled."""
+        found = self.find_symmetries()
+        return None if found is None else enlarged(found, self.length / self.opened_length)
 
     def prepare(self) -> None:
         """Compute the tables, once for all threads."""
@@ -105,7 +92,7 @@ class Searches:
     def __init__(self, session: Session, showcase: Showcase, editor: CaptureEditor | None, threads: Threads) -> None:
         self.session, self.showcase, self.editor, self.threads = session, showcase, editor, threads
         self._finder: tuple[int, Finder] | None = None
-        self._symmetries: defaultdict[int, CachedSymmetries] = defaultdict(CachedSymmetries)
+        self._symmetries: dict[int, tuple[Callable[[], Symmetries | None], float]] = {}
         self._ahead: asyncio.Task[None] | None = None
 
     def finder_of(self, revision: Revision) -> Finder:
@@ -115,8 +102,8 @@ class Searches:
             length = field.gain_field.length
             points = (self.showcase.current.sampled.points.double() * length).float()
             settings = None if self.editor is None else self.editor.settings
-            finder = Finder(field, points, length, self._symmetries[revision.opening], settings)
-            self._finder = (revision.number, finder)
+            found = self._symmetries.setdefault(revision.opening, (cache(partial(symmetries_of, field)), length))
+            self._finder = (revision.number, Finder(field, points, length, *found, settings))
         return self._finder[1]
 
     def prepare_ahead(self) -> None:

@@ -45,9 +45,7 @@ def make_app(studio: Studio) -> Starlette:
         _route("GET", "/page/{path:path}", lambda request: _file(PAGE, request)),
         _route("GET", "/manifest.json", lambda request: studio.manifest()),
         _route("GET", "/capture", _without_body(studio.capture)),
-        _route("GET", "/revisions/{number:int}/{path}", calls.send_revision),
-        _route("GET", "/{path}", calls.send_shown),
-        _route("GET", "/strikes/{path}", lambda request: _file(studio.showcase.object_folder / "strikes", request)),
+        _route("GET", "/revisions/{number:int}/{path:path}", calls.send_shown),
         _route("POST", "/locate", _with_body(studio.locate)),
         _route("POST", "/edit", _with_json(studio.edit)),
         _route("POST", "/lead", calls.lead),
@@ -62,6 +60,7 @@ def make_app(studio: Studio) -> Starlette:
         _route("POST", "/object", _without_body(studio.make_object)),
         _route("GET", "/jobs/{job}/events", calls.send_job_events),
         _route("DELETE", "/jobs/{job}", calls.cancel_job),
+        _route("GET", "/{path:path}", calls.send_shown),
     ]
     kinds = (AvmsfError, HTTPException, ClientDisconnect, *FORESEEN_ERRORS, Exception)
     app = Starlette(routes=routes, lifespan=lifespan, exception_handlers=dict.fromkeys(kinds, _answer_error))
@@ -76,15 +75,14 @@ class Calls:
     def __init__(self, studio: Studio) -> None:
         self.studio = studio
 
-    def send_revision(self, request: Request) -> Response:
-        """A file of a revision."""
-        return _file(self.studio.showcase.files_of(request.path_params["number"]), request)
-
     def send_shown(self, request: Request) -> Response:
-        """The table of the current revision, or a file that shows the object."""
-        showcase = self.studio.showcase
-        of_object = request.path_params["path"].startswith(("object.", "surface."))
-        return _file(showcase.object_folder if of_object else showcase.current.folder, request)
+        """A file of a revision, by default of the current one: its table, the object, or the sound of an impact."""
+        showcase, path = self.studio.showcase, request.path_params["path"]
+        number = request.path_params.get("number")
+        files = showcase.current.files if number is None else showcase.files_of(number)
+        if path not in files:
+            raise nothing_here()
+        return Response(files[path], media_type=MEDIA_TYPES[Path(path).suffix])
 
     async def lead(self, request: Request) -> Any:
         """Optimize the sound towards a recording."""

@@ -50,7 +50,7 @@ class Studio:
         self.opened, self.folder = opened, folder
         self.config = StudioConfig() if config is None else config
         self.editor = None if opened.capture is None else CaptureEditor(opened.capture)
-        self.showcase = Showcase(opened, folder, self.editor)
+        self.showcase = Showcase(opened, self.editor)
         self.session = Session(opened.home, self.showcase.show)
         self.jobs = Jobs()
         self.model = text_model(self.config.model)
