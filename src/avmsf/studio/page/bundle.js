@@ -18,28 +18,28 @@ function fileUrl(name) {
 }
 
 /**
- * Return {manifest, tensors, url(file)}: tensors by name (points, normals, frequency, damping, sine, cosine, noise) as
- * flat arrays, row by row; `url` gives the address of a file that the manifest names. Throws with words for the reader.
+ * Return {manifest, tensors, read(file)}: tensors by name (points, normals, frequency, damping, sine, cosine, noise) as
+ * flat arrays, row by row; `read` gives the bytes of a file that the manifest names. Throws with words for the reader.
  */
 export async function loadBundle() {
-  const manifest = await (await fetched("manifest.json")).json();
+  const manifest = JSON.parse(new TextDecoder().decode(await read("manifest.json")));
   if (manifest.format !== FORMAT)
     throw new Error(`expected a field of format ${FORMAT}, got ${manifest.format}; export it again with this version`);
   live = Boolean(manifest.live);
   const files = {};
   const tensors = {};
   for (const [name, { file, offset, dtype, shape }] of Object.entries(manifest.tensors)) {
-    files[file] ??= await (await fetched(file)).arrayBuffer();
+    files[file] ??= await read(file);
     tensors[name] = readTensor(files[file], offset, dtype, shape, `${file}: ${name}`);
   }
   // Modes that all start as sines have no cosines to send.
   tensors.cosine ??= new Float32Array(tensors.sine.length);
-  return { manifest, tensors, url: fileUrl };
+  return { manifest, tensors, read };
 }
 
-async function fetched(name) {
+async function read(name) {
   const response = await fetch(fileUrl(name), { cache: "no-cache" }).catch(() => null);
-  if (response?.ok) return response;
+  if (response?.ok) return response.arrayBuffer();
   const moved = "a restarted studio prints a new address: open it";
   if (response === null)
     throw new Error(`${name} cannot be loaded: check that the server runs${live ? `; ${moved}` : ""}`);

@@ -1,6 +1,6 @@
 /** The strikes that a capture holds: listed, marked on the object, each to be heard, redone or taken out. */
 
-import { attempt, button, element } from "./dom.js";
+import { attempt, button, element, group, warning } from "./dom.js";
 import { server, strikePlace } from "./server.js";
 import { listenButton } from "./takes.js";
 
@@ -11,9 +11,9 @@ export class CapturedStrikes {
     this.strikes = [];
     this.count = element("h2");
     this.list = element("ul", { className: "listing" });
-    this.problems = element("div", { className: "group" });
+    this.problems = group();
     this.folder = element("small");
-    this.element = element("div", { className: "group" }, this.count, this.list, this.problems, this.folder);
+    this.element = group(this.count, this.list, this.problems, this.folder);
     studio.addEventListener("view", () => this.#mark());
   }
 
@@ -22,7 +22,7 @@ export class CapturedStrikes {
     this.count.textContent = strikes.length === 1 ? "1 impact" : `${strikes.length} impacts`;
     this.list.hidden = strikes.length === 0;
     this.list.replaceChildren(...strikes.map((strike) => this.#item(strike)));
-    this.problems.replaceChildren(...problems.map((words) => element("p", { className: "warning" }, words)));
+    this.problems.replaceChildren(...problems.map((words) => warning(words)));
     this.folder.textContent = folder ? `Folder: ${folder}` : "";
     this.#mark();
   }
@@ -30,11 +30,10 @@ export class CapturedStrikes {
   #mark() {
     const { view } = this.studio;
     if (!view) return;
-    for (const name of [...view.marks.keys()]) if (name.startsWith("captured-")) view.unmark(name);
+    view.unmarkAll("captured-");
     for (const { file, contact } of this.strikes.filter((strike) => strike.contact)) {
       const dot = button("", () => this.#highlight(file), { className: "dot", tabIndex: -1, title: file });
-      const { normal } = view.contactAt(contact);
-      view.mark(`captured-${file}`, element("div", { className: "mark" }, dot), contact, normal);
+      view.markDot(`captured-${file}`, dot, contact);
     }
   }
 
@@ -55,7 +54,7 @@ export class CapturedStrikes {
       listenButton(strikePlace(file)),
       button("Redo", () => this.redo(strike), { className: "small", "aria-label": `Record ${file} again` }),
       button("×", () => this.#remove(strike), { className: "small", "aria-label": `Remove ${file}` }),
-      ...warnings.map((words) => element("p", { className: "warning" }, words)),
+      ...warnings.map((words) => warning(words)),
     );
   }
 

@@ -1,6 +1,6 @@
 /** The tab that makes a capture: click where one is about to strike, record, look at it at once, keep it or redo it. */
 
-import { attempt, element, filePicker, say, unsay } from "./dom.js";
+import { attempt, element, filePicker, group, line, say, section, unsay } from "./dom.js";
 import { CapturedStrikes } from "./capturedstrikes.js";
 import { newKey, Outbox } from "./outbox.js";
 import { reconstructGroup } from "./reconstruct.js";
@@ -103,19 +103,9 @@ export async function captureSheet(studio) {
   allow();
   await attempt(read, "capture");
   return {
-    element: element(
-      "section",
-      {},
+    element: section(
       place.element,
-      element(
-        "div",
-        { className: "group" },
-        element("h2", {}, "2. Record"),
-        element("div", { className: "row" }, record.button, attach),
-        record.level,
-        card.element,
-        waiting.element,
-      ),
+      group(element("h2", {}, "2. Record"), line(record.button, attach), record.level, card.element, waiting.element),
       captured.element,
       reconstruction.element,
     ),

@@ -16,6 +16,18 @@ export function button(words, onclick, properties = {}) {
   return element("button", { type: "button", onclick, ...properties }, words);
 }
 
+export const section = (...children) => element("section", {}, ...children);
+export const group = (...children) => element("div", { className: "group" }, ...children);
+export const line = (...children) => element("div", { className: "row" }, ...children);
+export const warning = (words) => element("p", { className: "warning" }, words);
+
+/** Names and values below each other; `facts`: [name, words] each. */
+export function factList(facts) {
+  const list = element("dl", { className: "measures" });
+  for (const [name, words] of facts) list.append(element("dt", {}, name), element("dd", {}, words));
+  return list;
+}
+
 /** A slider with its name and its value in words. `even` ones step evenly, the others by factors. */
 export class Slider {
   constructor(name, { low, high, value, words, even = false, steps = 200, onInput }) {

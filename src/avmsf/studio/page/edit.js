@@ -1,7 +1,7 @@
 /** The tab that edits: sliders heard at once, undo, saved as a new field. */
 
 import { Changes } from "./changes.js";
-import { button, element, say, Slider } from "./dom.js";
+import { button, element, group, line, say, section, Slider } from "./dom.js";
 import { leadGroup } from "./lead.js";
 import { server } from "./server.js";
 
@@ -133,7 +133,7 @@ export function editSheet(studio, load) {
   });
 
   const modeTitle = element("p", { className: "faint" });
-  const modeBox = element("div", { className: "group" }, ...Object.values(modeSliders).map((slider) => slider.element));
+  const modeBox = group(...Object.values(modeSliders).map((slider) => slider.element));
   const showMode = () => {
     const { mode } = studio;
     modeBox.hidden = mode === null;
@@ -155,28 +155,21 @@ export function editSheet(studio, load) {
     tell(studio.live?.remarks ?? []);
   });
 
-  const sheet = element(
-    "section",
-    {},
-    element(
-      "div",
-      { className: "group" },
+  const sheet = section(
+    group(
       element("h2", {}, "Material"),
       // The server's messages use this label.
       element("label", { className: "choice" }, "Present material", from),
       element("label", { className: "choice" }, "New material", to),
     ),
-    element("div", { className: "group" }, ...Object.values(sliders).map((slider) => slider.element)),
+    group(...Object.values(sliders).map((slider) => slider.element)),
     element("details", {}, element("summary", {}, "A single mode"), modeTitle, modeBox),
-    element("div", { className: "row" }, undo, reset),
+    line(undo, reset),
     busy,
     remarks,
   );
   if (studio.can("like")) sheet.append(leadGroup(studio, changes, hold));
-  if (studio.can("save"))
-    sheet.append(
-      element("div", { className: "group" }, element("h2", {}, "Save"), element("div", { className: "row" }, name, save)),
-    );
+  if (studio.can("save")) sheet.append(group(element("h2", {}, "Save"), line(name, save)));
   takeSliders();
   return { element: sheet };
 }

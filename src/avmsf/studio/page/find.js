@@ -1,7 +1,7 @@
 /** The tab that finds a blow: a recording in, where on the object it was struck painted and listed. */
 
 import { amountScale } from "./colors.js";
-import { attempt, button, element, filePicker, millimeters, say } from "./dom.js";
+import { attempt, button, element, factList, filePicker, group, line, millimeters, say, section, warning } from "./dom.js";
 import { RecordButton } from "./recordbutton.js";
 import { numbers, server } from "./server.js";
 import { expectWav } from "./wav.js";
@@ -55,12 +55,12 @@ export function findSheet(studio) {
   };
 
   const show = (blows, name) => {
-    const list = element("div", { className: "group" });
+    const list = group();
     const paint = (place) => {
       painted = paintBlow(studio, blows[place]);
       list.replaceChildren(...describe(studio, blows[place]));
     };
-    const several = element("div", { className: "row" });
+    const several = line();
     if (blows.length > 1) {
       const pick = (_, place) => button(`Impact ${place + 1}`, () => paint(place), { className: "small" });
       several.append(...blows.map(pick));
@@ -80,11 +80,9 @@ export function findSheet(studio) {
   // Paint and found places belong to the recording, and to the field as it was when it was asked.
   studio.addEventListener("bundle", forget);
 
-  const sheet = element(
-    "section",
-    {},
+  const sheet = section(
     element("p", { className: "faint" }, "Strike the real object near the microphone, or drop a WAV file anywhere."),
-    element("div", { className: "row" }, record.button, filePicker("Choose a WAV file …", ".wav,audio/wav", take)),
+    line(record.button, filePicker("Choose a WAV file …", ".wav,audio/wav", take)),
     record.level,
     busy,
     results,
@@ -106,24 +104,16 @@ function paintBlow(studio, blow) {
   if (!studio.view) return values;
   clearFound(studio);
   studio.view.face(blow.position);
-  mark(studio, "found", blow.position, "estimate");
+  const dot = () => element("div", { className: "dot next" });
+  studio.view.markDot("found", dot(), blow.position, "estimate");
   (blow.equivalent_points ?? []).forEach(({ position }, number) =>
-    mark(studio, `equivalent-${number}`, position, "equivalent"),
+    studio.view.markDot(`found-equivalent-${number}`, dot(), position, "equivalent"),
   );
   return values;
 }
 
-function mark(studio, name, place, words) {
-  const { normal } = studio.view.contactAt(place);
-  const dot = element("div", { className: "dot next" });
-  const label = element("span", { className: "label" }, words);
-  studio.view.mark(name, element("div", { className: "mark" }, dot, label), place, normal);
-}
-
 function clearFound(studio) {
-  if (!studio.view) return;
-  for (const name of [...studio.view.marks.keys()])
-    if (name === "found" || name.startsWith("equivalent-")) studio.view.unmark(name);
+  studio.view?.unmarkAll("found");
 }
 
 const percent = (share) => `${(100 * share).toPrecision(2)} %`;
@@ -136,9 +126,7 @@ function describe(studio, blow) {
   ];
   if (blow.explained_energy !== undefined && blow.explained_energy !== null)
     facts.push(["Explained energy", `${percent(blow.explained_energy)} of the sound`]);
-  const list = element("dl", { className: "measures" });
-  for (const [name, words] of facts) list.append(element("dt", {}, name), element("dd", {}, words));
-  const parts = [list, button("Strike here", () => studio.strike(blow.row))];
+  const parts = [factList(facts), button("Strike here", () => studio.strike(blow.row))];
   if (blow.equivalent_points?.length) {
     parts.push(element("h3", {}, "Other possible contacts"));
     const places = element("ul", { className: "listing" });
@@ -148,6 +136,6 @@ function describe(studio, blow) {
     }
     parts.push(places);
   }
-  for (const note of blow.notes ?? []) parts.push(element("p", { className: "warning" }, note));
+  for (const note of blow.notes ?? []) parts.push(warning(note));
   return parts;
 }

@@ -1,6 +1,6 @@
 /** Lead the sound towards a recording or words: minutes of work, during which the sliders rest. */
 
-import { button, element, filePicker, say } from "./dom.js";
+import { button, element, filePicker, group, line, say } from "./dom.js";
 import { JobProgress } from "./jobprogress.js";
 import { server } from "./server.js";
 
@@ -49,14 +49,7 @@ export function leadGroup(studio, changes, hold) {
   const { job, jobKind } = studio.live;
   if (job && jobKind === LEADING) hold(() => follow(job), "minutes");
 
-  return element(
-    "div",
-    { className: "group" },
-    element("h2", {}, "Guided edit"),
-    element("div", { className: "row" }, ...rows, progress.stop),
-    progress.bar,
-    progress.stage,
-  );
+  return group(element("h2", {}, "Guided edit"), line(...rows, progress.stop), progress.bar, progress.stage);
 }
 
 /** What a descent of these steps, {loss, pitch} each, has come to. */

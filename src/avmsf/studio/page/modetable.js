@@ -1,7 +1,7 @@
 /** The table of the modes: pitch, decay and level at the contact struck last; one is chosen to paint its shape. */
 
 import { signScale } from "./colors.js";
-import { button, element, seconds } from "./dom.js";
+import { button, element, seconds, section } from "./dom.js";
 
 const COLUMNS = [
   ["mode", "#", "Index of the mode in the field, from 0"],
@@ -92,9 +92,7 @@ export function modeTable(studio) {
 
   const tableBox = element("div", { className: "table-box" }, table);
   return {
-    element: element(
-      "section",
-      {},
+    element: section(
       element("p", { className: "faint" }, "Choose a mode to color the object by its gain."),
       tableBox,
       where,

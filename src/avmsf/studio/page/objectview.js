@@ -2,6 +2,7 @@
 
 import * as THREE from "three";
 
+import { element } from "./dom.js";
 import { PointGrid } from "./nearest.js";
 import { MeshLayer, PointLayer, SplatLayer } from "./objectlayers.js";
 import { Viewpoint } from "./viewpoint.js";
@@ -113,9 +114,7 @@ export class ObjectView {
   async #layer(bundle, source) {
     const { kind, file } = bundle.manifest[source];
     if (kind === "points" || !file) return new PointLayer(this.grid, this.spacing);
-    const answer = await fetch(bundle.url(file));
-    if (!answer.ok) throw new ViewError(`The object's file ${file} cannot be read (${answer.status}).`);
-    const bytes = await answer.arrayBuffer();
+    const bytes = await bundle.read(file);
     if (kind === "mesh") return MeshLayer.load(bytes, this.grid, this.spacing);
     return SplatLayer.load(bytes, this.grid, { renderer: this.renderer, onDirty: () => this.redraw() });
   }
@@ -214,9 +213,20 @@ export class ObjectView {
     this.redraw();
   }
 
+  /** Mark a place by a dot, an element, with a label if there is one; on the side that the nearest contact faces. */
+  markDot(name, dot, place, label = null) {
+    const words = label && element("span", { className: "label" }, label);
+    this.mark(name, element("div", { className: "mark" }, dot, words), place, this.contactAt(place).normal);
+  }
+
   unmark(name) {
     this.marks.get(name)?.element.remove();
     this.marks.delete(name);
+  }
+
+  /** Take off the marks whose names begin so. */
+  unmarkAll(start) {
+    for (const name of [...this.marks.keys()]) if (name.startsWith(start)) this.unmark(name);
   }
 
   redraw() {

@@ -1,6 +1,6 @@
 /** From the strikes to a field, or from pictures to an object: minutes of work with its progress, and a way to stop. */
 
-import { attempt, button, element, say } from "./dom.js";
+import { attempt, button, element, line, say } from "./dom.js";
 import { JobProgress } from "./jobprogress.js";
 import { LEADING } from "./lead.js";
 import { server } from "./server.js";
@@ -53,7 +53,7 @@ export function reconstructGroup(studio) {
       { className: "group", hidden: !studio.can("reconstruct") },
       element("h2", {}, "3. Reconstruct"),
       words,
-      element("div", { className: "row" }, go, progress.stop),
+      line(go, progress.stop),
       progress.bar,
       progress.stage,
     ),

@@ -1,6 +1,6 @@
 /** The button that records a blow, with its level and whether it is cut off, told while it is heard. */
 
-import { button, element, say, unsay } from "./dom.js";
+import { button, element, group, say, unsay } from "./dom.js";
 import { prepareRecorder, Recorder } from "./recorder.js";
 
 export class RecordButton {
@@ -12,7 +12,7 @@ export class RecordButton {
     this.meter = element("meter", { min: 0, max: 1, high: 0.95, "aria-label": "Microphone level" });
     this.words = element("small");
     this.clipped = element("p", { className: "warning", role: "alert", hidden: true }, "Clipped: strike with less force.");
-    this.level = element("div", { className: "group" }, this.meter, this.words, this.clipped);
+    this.level = group(this.meter, this.words, this.clipped);
     prepareRecorder().catch(() => {});
   }
 

@@ -1,6 +1,6 @@
 /** Where the next recording is struck: a contact that is clicked or typed, or a strike that is recorded again. */
 
-import { button, element, millimeters, say } from "./dom.js";
+import { button, element, group, line, millimeters, say } from "./dom.js";
 
 const NOWHERE = Object.freeze({ contact: null, direction: null, redo: null, digest: null });
 
@@ -23,13 +23,11 @@ export class StrikePlace {
     );
     const labels = ["x", "y", "z"].map((axis, at) => element("label", {}, `${axis}, mm`, this.inputs[at]));
     this.stopRedo = button("Cancel", () => this.set(NOWHERE));
-    this.element = element(
-      "div",
-      { className: "group" },
+    this.element = group(
       element("h2", {}, "1. Contact"),
       this.words,
       element("div", { className: "place" }, ...labels),
-      element("div", { className: "row" }, this.stopRedo),
+      line(this.stopRedo),
     );
     studio.addEventListener("view", () => this.#mark());
     this.#show();

@@ -1,6 +1,6 @@
 /** The blows that were measured: marked on the object, each to be heard beside the model's sound. */
 
-import { attempt, button, element } from "./dom.js";
+import { attempt, button, element, group } from "./dom.js";
 import { PointGrid } from "./nearest.js";
 import { soundSpectrum } from "./spectrum.js";
 import { SpectrumView } from "./spectrumview.js";
@@ -11,9 +11,7 @@ const LONGEST_SECONDS = 2.5;
 export function measuredStrikes(studio) {
   const list = element("ul", { className: "listing" });
   const shown = element("input", { type: "checkbox", checked: true });
-  const box = element(
-    "div",
-    { className: "group" },
+  const box = group(
     element("h2", {}, "Recorded impacts"),
     element("small", {}, "Choose one to play its recording, then the model at the same contact."),
     list,
@@ -31,26 +29,17 @@ export function measuredStrikes(studio) {
   const play = (place, what) => attempt(() => comparison[what](choose(place)), "strike");
 
   const mark = () => {
-    if (!studio.view) return;
-    strikes.forEach((strike, place) => {
-      if (!shown.checked) {
-        studio.view.unmark(`strike-${place}`);
-        return;
-      }
-      const dot = button("", () => play(place, "both"), {
-        className: "dot",
-        tabIndex: -1,
-        title: `${strike.name}: recording, then model`,
-        "data-strike": place,
-      });
-      const { normal } = studio.view.contactAt(strike.contact);
-      studio.view.mark(`strike-${place}`, element("div", { className: "mark" }, dot), strike.contact, normal);
+    studio.view?.unmarkAll("strike-");
+    if (!studio.view || !shown.checked) return;
+    strikes.forEach(({ name, contact }, place) => {
+      const title = `${name}: recording, then model`;
+      const properties = { className: "dot", tabIndex: -1, title, "data-strike": place };
+      studio.view.markDot(`strike-${place}`, button("", () => play(place, "both"), properties), contact);
     });
   };
   shown.addEventListener("change", mark);
 
   const showAll = () => {
-    strikes.forEach((_, place) => studio.view?.unmark(`strike-${place}`));
     strikes = studio.bundle.manifest.strikes ?? [];
     box.hidden = strikes.length === 0;
     list.replaceChildren(
@@ -166,9 +155,7 @@ class Comparison {
 
   async #buffer(strike) {
     if (!this.#buffers.has(strike)) {
-      const answer = await fetch(this.studio.bundle.url(strike.sound));
-      if (!answer.ok) throw new Error(`The recording ${strike.sound} cannot be read (${answer.status}).`);
-      const bytes = await answer.arrayBuffer();
+      const bytes = await this.studio.bundle.read(strike.sound);
       const rate = this.studio.bundle.manifest.sampleRate;
       try {
         this.#buffers.set(strike, await new OfflineAudioContext(1, 1, rate).decodeAudioData(bytes));

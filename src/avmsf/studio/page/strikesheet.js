@@ -1,6 +1,6 @@
 /** The tab with which one plays: force, mallet, and the blows that were measured. */
 
-import { button, choices, element, Slider, seconds } from "./dom.js";
+import { button, choices, element, group, line, seconds, section, Slider } from "./dom.js";
 import { measuredStrikes } from "./strikes.js";
 
 const MALLETS = [
@@ -54,25 +54,19 @@ export function strikeSheet(studio) {
     onInput: (value) => studio.engine?.setVolume(value),
   });
   const atPress = element("input", { type: "checkbox" });
-  const sheet = element(
-    "section",
-    {},
-    element(
-      "div",
-      { className: "group" },
+  const sheet = section(
+    group(
       force.element,
       element("small", {}, "Hold a click longer to strike up to ten times harder; a pen's pressure counts too."),
     ),
-    element("div", { className: "group" }, element("h2", {}, "Mallet"), mallet, pulse),
+    group(element("h2", {}, "Mallet"), mallet, pulse),
     element(
       "label",
       { className: "check" },
       atPress,
       "Sound at the press, without waiting for the release",
     ),
-    element(
-      "div",
-      { className: "row" },
+    line(
       button("Strike again", () => studio.strikeAgain()),
       button("Strike at random", () => studio.strike(Math.floor(Math.random() * studio.modes.points))),
     ),

@@ -1,6 +1,6 @@
 /** One recording before it is kept: heard, seen and measured at once, then kept or made again. */
 
-import { button, element } from "./dom.js";
+import { button, element, line, warning } from "./dom.js";
 import { server } from "./server.js";
 import { drawTake, listenButton, measures } from "./takes.js";
 
@@ -29,7 +29,7 @@ export class TakeCard {
       element("h2", {}, "This recording"),
       canvas,
       verdict,
-      element("div", { className: "row" }, keep, redo, listenButton(take.blob)),
+      line(keep, redo, listenButton(take.blob)),
     );
     try {
       const report = await server.checkStrike(take.blob);
@@ -45,7 +45,7 @@ export class TakeCard {
       let words = `${error.message} ${error.unreachable ? this.refuge() : ""}`;
       if (barred) words = `It cannot be saved: ${error.message}`;
       else if (refused) words = `${error.message}. This holds for a new impact; the recording may still replace ${take.redo}.`;
-      verdict.replaceChildren(element("p", { className: "warning" }, words));
+      verdict.replaceChildren(warning(words));
       if (!refused) verdict.append(again);
       // What the server would not take shall not look like what is to be done next.
       keep.disabled = barred;

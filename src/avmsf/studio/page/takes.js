@@ -1,6 +1,6 @@
 /** One recording before it is kept: what it looks like, how loud it is, when it begins, whether it is cut off. */
 
-import { attempt, button, element, seconds } from "./dom.js";
+import { attempt, button, element, factList, group, seconds, warning } from "./dom.js";
 
 /** What the server measured, in words; `report` as `capture/check` gives it. */
 export function measures(report) {
@@ -10,13 +10,11 @@ export function measures(report) {
     ["Onset", report.onset_seconds === null ? "no impact found" : `at ${seconds(report.onset_seconds)}`],
     ["Length", seconds(report.seconds)],
   ];
-  const list = element("dl", { className: "measures" });
-  for (const [name, words] of rows) list.append(element("dt", {}, name), element("dd", {}, words));
   const warnings = report.warnings ?? [];
   const verdict = warnings.length
-    ? warnings.map((words) => element("p", { className: "warning" }, words))
+    ? warnings.map((words) => warning(words))
     : [element("p", { className: "fine" }, "✓ No problems found.")];
-  return element("div", { className: "group" }, list, ...verdict);
+  return group(factList(rows), ...verdict);
 }
 
 /** Draw a recording's envelope into a canvas, and a line at its onset. */

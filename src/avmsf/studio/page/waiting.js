@@ -1,6 +1,6 @@
 /** Recordings that the server does not have yet: sent, sent again, and told where it cannot be. */
 
-import { button, element, say, unsay } from "./dom.js";
+import { button, element, group, line, say, unsay } from "./dom.js";
 import { server } from "./server.js";
 import { placeInWords } from "./strikeplace.js";
 import { listenButton } from "./takes.js";
@@ -14,7 +14,7 @@ export class Waiting {
   /** `strikes()` are those that the server has told of, `shown()` the take that is judged elsewhere, `sent()` tells. */
   constructor(outbox, { strikes, shown, sent }) {
     Object.assign(this, { outbox, strikes, shown, sent });
-    this.element = element("div", { className: "group" });
+    this.element = group();
     window.addEventListener("online", () => this.send());
   }
 
@@ -72,17 +72,9 @@ export class Waiting {
         ? `The recording ${place} was rejected: ${entry.refused}`
         : `The recording ${place} waits for the server …`;
     const throwAway = () => this.outbox.remove(entry.key).then(() => this.show());
-    return element(
-      "div",
-      { className: "group" },
+    return group(
       element("p", { className: entry.kept && !entry.refused ? "faint" : "warning" }, words),
-      element(
-        "div",
-        { className: "row" },
-        ...this.#answers(entry),
-        listenButton(entry.blob),
-        button("Discard", throwAway, { className: "small" }),
-      ),
+      line(...this.#answers(entry), listenButton(entry.blob), button("Discard", throwAway, { className: "small" })),
     );
   }
 
