@@ -21,8 +21,8 @@ from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.attention import Attention
 from avmsf.field.gains.estimator import MixtureEstimator
+from avmsf.field.posterior import coverage
 from avmsf.field.sound_field import SoundField
-from avmsf.field.uncertainty import coverage
 from avmsf.mesh import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.modal.extraction.extract import extract_modes

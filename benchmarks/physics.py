@@ -20,7 +20,7 @@ from avmsf.fem.material import NOMINAL, material_named
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
-from avmsf.field.uncertainty import coverage
+from avmsf.field.posterior import coverage
 from avmsf.modal.extraction.extract import extract_modes
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig

@@ -16,8 +16,8 @@ from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.data import along_phase
 from avmsf.field.gains.estimator import MixtureEstimator
+from avmsf.field.posterior import coverage
 from avmsf.field.sound_field import SoundField
-from avmsf.field.uncertainty import coverage
 from avmsf.mesh import Surface
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.extraction.least_squares import fit_gains

@@ -12,8 +12,8 @@ from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
+from avmsf.field.next_contacts import suggest
 from avmsf.field.sound_field import SoundField
-from avmsf.field.suggest import suggest
 from avmsf.gaussians.points import farthest_points
 from avmsf.modal.extraction.alignment import align
 from avmsf.modal.extraction.extract import extract_modes

@@ -26,9 +26,9 @@ from .editing.material import edit as edit
 from .evaluation.scores import evaluate as evaluate
 from .evaluation.splits import split as split
 from .export.write import write as write
+from .field.next_contacts import suggest as suggest
 from .field.sound_field import SoundField as SoundField
 from .field.store import load as load
-from .field.suggest import suggest as suggest
 from .localization.locate import locate as locate
 from .mesh import Surface as Surface
 from .modal.extraction.extract import extract_modes as extract_modes

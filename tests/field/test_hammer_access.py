@@ -9,7 +9,7 @@ import trimesh
 
 from avmsf.errors import FitError
 from avmsf.field.hammer_access import HAMMER_DIAMETER, MeshAccess, PointAccess
-from avmsf.field.suggest import suggest
+from avmsf.field.next_contacts import suggest
 from factories.believing_field import (
     LENGTH,
     WIDTH,

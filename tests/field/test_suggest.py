@@ -14,9 +14,9 @@ from avmsf.field.gains.attention import Attention
 from avmsf.field.gains.data import gain_data
 from avmsf.field.gains.elastic import REACH
 from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.next_contacts import suggest
+from avmsf.field.posterior import relative_gain_std
 from avmsf.field.sound_field import SoundField
-from avmsf.field.suggest import suggest
-from avmsf.field.uncertainty import relative_gain_std
 from factories.believing_field import (
     BANK,
     DOWN,
@@ -189,7 +189,7 @@ def test_of_very_many_candidates_some_that_are_far_apart_are_weighed(
         return covariances(gains, places, ways)
 
     monkeypatch.setattr(MixtureGains, "covariances", counted)
-    monkeypatch.setattr("avmsf.field.suggest.MAX_CANDIDATES", 30)
+    monkeypatch.setattr("avmsf.field.next_contacts.MAX_CANDIDATES", 30)
     fewer = suggest(field, 3, candidates=candidates, directions=DOWN.expand(120, 3))
     assert asked == [len(whole.points) + 30]
     assert torch.equal(fewer.contacts, candidates[fewer.rows])

@@ -11,14 +11,13 @@ from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import FitError
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.scaled import ScaledGains
-from avmsf.field.uncertainty import (
+from avmsf.field.next_contacts import unedited_mixture
+from avmsf.field.posterior import (
     coverage,
     fitted_mixture,
     has_posterior,
     relative_gain_std,
     spectrum_band,
-    training_contacts,
-    unedited_mixture,
 )
 from avmsf.localization.locator import Locator
 from avmsf.modal.modes import ModalBank
@@ -180,7 +179,7 @@ def test_an_edited_field_is_as_sure_of_itself_as_before(made: type) -> None:
     # Larger and louder, each mode by its own factor: so are the deviations, and what is heard of others' blows.
     factor = torch.tensor([2.0, 0.5, 8.0, 1.0], dtype=torch.float64)
     louder = replace(field, gain_field=ScaledGains(field.gain_field, factor, 2.0))
-    assert torch.equal(training_contacts(louder), 2.0 * training_contacts(field))
+    assert torch.equal(louder.gain_field.contacts, 2.0 * field.gain_field.contacts)
     known = field.gain_field.posterior(others).std * factor[:, None]
     torch.testing.assert_close(louder.gain_field.posterior(2.0 * others).std.double(), known, rtol=1e-6, atol=0)
     heard = coverage(louder, 2.0 * others, values[12:] * factor[:, None])

@@ -18,9 +18,9 @@ from avmsf.fem.damping import Vibration
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.material import STEEL
 from avmsf.fem.radiation import AIR_DENSITY, SOUND_SPEED, radiated_pressure
+from avmsf.field.next_contacts import suggest
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
-from avmsf.field.suggest import suggest
 from avmsf.mesh.surface import Surface, write_surface
 from avmsf.pipeline.config import BodyConfig, PipelineConfig
 from avmsf.pipeline.guess import expect_no_recordings, guess_field

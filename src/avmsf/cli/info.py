@@ -20,9 +20,9 @@ from avmsf.evaluation.scores import evaluate
 from avmsf.field.config import NETWORK
 from avmsf.field.gains.attention import AttentionGains
 from avmsf.field.gains.scaled import BodyGains
+from avmsf.field.posterior import has_posterior, relative_gain_std, spectrum_band
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
-from avmsf.field.uncertainty import has_posterior, relative_gain_std, spectrum_band, training_contacts
 from avmsf.gaussians.points import farthest_points
 from avmsf.pipeline.record import RECORD, modes_words, recorded
 
@@ -139,7 +139,7 @@ def draw_field(
         )
     if has_posterior(field):
         std, title = relative_gain_std(field, points), f"uncertainty of the gains of {name}"
-        pictures["uncertainty"] = draw_uncertainty(points, std, title=title, contacts=training_contacts(field))
+        pictures["uncertainty"] = draw_uncertainty(points, std, title=title, contacts=field.gain_field.contacts)
         pictures["spectrum"] = draw_band(
             spectrum_band(field, points[0]), title=f"{name}: one impact, with its uncertainty"
         )

@@ -14,9 +14,9 @@ from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.suggest import PICTURE, TABLE, Options
 from avmsf.cli.printing import console, next_command, print_json, say, table
 from avmsf.cli.writing import write_text
+from avmsf.field.next_contacts import Suggestions, suggest, unedited_mixture
+from avmsf.field.posterior import relative_gain_std
 from avmsf.field.store import load
-from avmsf.field.suggest import Suggestions, suggest
-from avmsf.field.uncertainty import relative_gain_std, unedited_mixture
 from avmsf.plotting.pictures import save_picture
 from avmsf.plotting.uncertainty import draw_uncertainty
 

@@ -14,8 +14,8 @@ from avmsf.editing.clips import Sounds
 from avmsf.errors import EditError
 from avmsf.field.gains.model import Gains
 from avmsf.field.gains.scaled import ScaledGains
+from avmsf.field.posterior import scale_of
 from avmsf.field.sound_field import SoundField
-from avmsf.field.uncertainty import scale_of
 from avmsf.modal.modes import ModalBank
 
 EDITS = "edits"

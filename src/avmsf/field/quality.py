@@ -12,8 +12,8 @@ from avmsf.errors import FitError
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import Gains
 from avmsf.field.losses import spectral_loss, spectral_target
+from avmsf.field.next_contacts import suggest
 from avmsf.field.sound_field import FieldQuality, SoundField
-from avmsf.field.suggest import suggest
 from avmsf.modal.residual_noise import Residual
 
 MIN_PLACES = 4

@@ -214,7 +214,7 @@ class SoundField:
         `directions` as in `render`. Raises FitError for a field without a posterior: of the attention network, of
         recordings in one place, or guessed without recordings.
         """
-        from avmsf.field.uncertainty import posterior
+        from avmsf.field.posterior import posterior
 
         mean, std = posterior(self, *self._impacts(positions, directions))
         return GainPosterior(self._amplitudes(mean), std.square().sum(2).sqrt())

@@ -13,8 +13,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.posterior import fitted_mixture, has_posterior, scale_of
 from avmsf.field.sound_field import SoundField
-from avmsf.field.uncertainty import fitted_mixture, has_posterior, scale_of
 from avmsf.gaussians.points import farthest_points
 from avmsf.localization.likelihood import PredictedGains, evaluate_likelihood
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from avmsf.field.uncertainty import SpectrumBand
+from avmsf.field.posterior import SpectrumBand
 from avmsf.plotting.clouds import ALL_SIDES, name_axes, plane_of, view_from
 from avmsf.plotting.style import FIRST, SECOND, SEQUENTIAL, scatter_surface, styled, titled_figure
 

@@ -22,8 +22,8 @@ from avmsf.export.formats import MAX_POINTS
 from avmsf.export.sampled_field import SampledField, outward_normals, supporting_columns
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.positions import points_on_object
+from avmsf.field.posterior import scale_of
 from avmsf.field.sound_field import SoundField
-from avmsf.field.uncertainty import scale_of
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh.surface import Surface, read_surface
 from avmsf.studio.capture import CaptureEditor

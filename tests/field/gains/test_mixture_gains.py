@@ -335,7 +335,7 @@ def test_a_model_comes_back_from_its_tensors_to_the_last_bit(elastic):
     assert torch.equal(back.predict(ASKED.points).mean, given.predict(ASKED.points).mean)
     assert torch.equal(back.leave_one_out(), given.leave_one_out())
     assert torch.equal(back.standardized_errors(), given.standardized_errors())
-    pairs = zip(*(covariances(ASKED.points, None) for each in (back, given)), strict=True)
+    pairs = zip(*(each.covariances(ASKED.points, None) for each in (back, given)), strict=True)
     assert all(torch.equal(one[0], other[0]) and one[1] == other[1] for one, other in pairs)
     assert back.record() == record
     assert back.directional is given.directional

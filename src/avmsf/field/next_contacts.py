@@ -15,9 +15,10 @@ from avmsf._utils.progress import working
 from avmsf.errors import FitError
 from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.gains.scaled import ScaledGains
 from avmsf.field.hammer_access import HAMMER_DIAMETER, MeshAccess, PointAccess
+from avmsf.field.posterior import energy_of, fitted_mixture
 from avmsf.field.sound_field import SoundField
-from avmsf.field.uncertainty import energy_of, unedited_mixture
 from avmsf.gaussians.points import farthest_points
 
 PLACES = 400
@@ -77,43 +78,34 @@ def suggest(
     Raises FitError for gains without a posterior, unfit arguments, fewer candidates than contacts asked for, places
     none of which a hammer gets to, and `unseen` without a body.
     """
-    count, pool = _whole(count), None if candidates is None else as_vectors(candidates, "candidates")
-    with working("computing the expected error over the surface", shown=progress):
-        return _suggest(field, count, pool, directions, unseen=unseen)
-
-
-def _suggest(
-    field: SoundField,
-    count: int,
-    candidates: Float[Tensor, "candidates 3"] | None,
-    directions: Float[Tensor, "_given 3"] | None,
-    *,
-    unseen: bool,
-) -> Suggestions:
+    count, given = _whole(count), None if candidates is None else as_vectors(candidates, "candidates").double()
     gains = unedited_mixture(field)
-    surface = _body_nodes(gains) if unseen else gains.points
-    points = surface[farthest_points(surface, min(PLACES, len(surface)))].double()
-    _expect_directions(directions, candidates)
-    if candidates is None:
-        pool, directions = _reachable(gains, points)
-        unreachable = len(points) - len(pool)
-    else:
-        _expect_on_surface(candidates.double(), gains.points.double())
-        pool, unreachable = candidates.double(), 0
-    same = _SAME * float((points.amax(0) - points.amin(0)).norm())
-    allowed = (pool[:, None] - gains.contacts).norm(dim=2).amin(1) > same
-    if int(allowed.sum()) < count:
-        raise FitError(
-            f"candidates: expected {count} or more without a recording, got {int(allowed.sum())} of {len(pool)}; ask "
-            "for fewer, or give more candidates",
-            name="candidates",
-            value=int(allowed.sum()),
-        )
-    kept = _weighed(pool, allowed, max(MAX_CANDIDATES, count))
-    sites = gains.sites(pool[kept], None if directions is None else directions[kept])
-    error = _ExpectedError(field, gains, points, sites)
-    before = float(error.map().square().mean().sqrt())
-    rows, after = _chosen(error, sites, allowed[kept], count, same)
+    if unseen and gains.body is None:
+        wanted, advice = "a field with the object's surface", "leave unseen out, or give candidates"
+        raise FitError.expected(wanted, True, got="one without", name="unseen", advice=advice)
+    _expect_directions(directions, given)
+    with working("computing the expected error over the surface", shown=progress):
+        surface = gains.body.nodes if unseen and gains.body is not None else gains.points
+        points = surface[farthest_points(surface, min(PLACES, len(surface)))].double()
+        if given is None:
+            pool, directions = _reachable(gains, points)
+        else:
+            _expect_on_surface(given, gains.points.double())
+            pool = given
+        same = _SAME * float((points.amax(0) - points.amin(0)).norm())
+        allowed = (pool[:, None] - gains.contacts).norm(dim=2).amin(1) > same
+        if int(allowed.sum()) < count:
+            wanted, advice = f"{count} or more without a recording", "ask for fewer, or give more candidates"
+            left = int(allowed.sum())
+            raise FitError.expected(wanted, left, got=f"{left} of {len(pool)}", name="candidates", advice=advice)
+        kept, most = torch.arange(len(pool)), max(MAX_CANDIDATES, count)
+        if len(pool) > most:
+            kept = torch.nonzero(allowed).flatten()
+            kept = kept[farthest_points(pool[kept], min(most, len(kept)))].sort().values
+        sites = gains.sites(pool[kept], None if directions is None else directions[kept])
+        error = _ExpectedError(field, gains, points, sites)
+        before = float(error.map().square().mean().sqrt())
+        rows, after = _chosen(error, sites, allowed[kept], count, same)
     return Suggestions(
         sites.points[rows],
         sites.directions[rows] if gains.directional else None,
@@ -121,8 +113,16 @@ def _suggest(
         before,
         tuple(after),
         points,
-        unreachable,
+        len(points) - len(pool) if given is None else 0,
     )
+
+
+def unedited_mixture(field: SoundField) -> MixtureGains:
+    """Return the field's gain model, to plan measurements for. Raises as `fitted_mixture`, and for an edited field."""
+    if isinstance(field.gain_field, ScaledGains):
+        wanted, advice = "a field as fitted", "give the unedited field"
+        raise FitError.expected(wanted, "edited", got="an edited one", name="field", advice=advice)
+    return fitted_mixture(field)
 
 
 class _ExpectedError:
@@ -207,34 +207,10 @@ def _reachable(
     )
     reached, places, axes = access(points.numpy())
     if not reached.any():
-        raise FitError(
-            f"candidates: expected positions that a hammer of {1000 * HAMMER_DIAMETER:g} mm reaches from outside, got "
-            f"none of {len(points)}; check the object's shape, or give candidates",
-            name="candidates",
-            value=0,
-        )
+        wanted = f"positions that a hammer of {1000 * HAMMER_DIAMETER:g} mm reaches from outside"
+        advice = "check the object's shape, or give candidates"
+        raise FitError.expected(wanted, 0, got=f"none of {len(points)}", name="candidates", advice=advice)
     return torch.from_numpy(places[reached]), None if axes is None else -torch.from_numpy(axes[reached])
-
-
-def _body_nodes(gains: MixtureGains) -> Float64[Tensor, "nodes 3"]:
-    """Return places all over the body's surface. Raises FitError without a body."""
-    if gains.body is None:
-        raise FitError(
-            "unseen: expected a field with the object's surface, got one without; leave unseen out, or give candidates",
-            name="unseen",
-            value=True,
-        )
-    return gains.body.nodes
-
-
-def _weighed(
-    places: Float64[Tensor, "candidates 3"], allowed: Bool[Tensor, " candidates"], most: int
-) -> Int[Tensor, " weighed"]:
-    """Return the candidates' rows, or of too many of them some that are allowed and far apart, in the same order."""
-    if len(places) <= most:
-        return torch.arange(len(places))
-    open_to = torch.nonzero(allowed).flatten()
-    return open_to[farthest_points(places[open_to], min(most, len(open_to)))].sort().values
 
 
 def _whole(count: SupportsIndex) -> int:
@@ -258,19 +234,15 @@ def _expect_directions(directions: Float[Tensor, "_given 3"] | None, candidates:
         raise FitError.expected(f"one for each of the {len(candidates)} candidates", len(directions), name="directions")
     zero = torch.nonzero(~(directions.norm(dim=1) > 0)).flatten().tolist()
     if zero:
-        row, direction = zero[0], directions[zero[0]].tolist()
-        raise FitError(
-            f"directions, row {row}: expected a length above 0, got {direction}; give the direction in which the "
-            "hammer moves",
-            name="directions",
-            row=row,
-            value=direction,
+        advice = "give the direction in which the hammer moves"
+        raise FitError.expected(
+            "a length above 0", directions[zero[0]].tolist(), row=zero[0], name="directions", advice=advice
         )
 
 
 def _expect_on_surface(candidates: Float64[Tensor, "candidates 3"], surface: Float64[Tensor, "points 3"]) -> None:
     if not len(candidates):
-        raise FitError("candidates: expected 1 position or more, got none; leave it out", name="candidates", value=0)
+        raise FitError.expected("1 position or more", 0, got="none", name="candidates", advice="leave it out")
     if not bool(torch.isfinite(candidates).all()):
         row = int(torch.nonzero(~torch.isfinite(candidates).all(1))[0])
         found = candidates[row].tolist()
@@ -279,10 +251,7 @@ def _expect_on_surface(candidates: Float64[Tensor, "candidates 3"], surface: Flo
     worst = int(distance.argmax())
     if float(distance[worst]) > _OFF * float((surface.amax(0) - surface.amin(0)).norm()):
         found = [round(each, 4) for each in candidates[worst].tolist()]
-        raise FitError(
-            f"candidates, row {worst}: expected a position on the object's surface, got {found} m, "
-            f"{float(distance[worst]):.2g} m from it; check the unit and the frame",
-            name="candidates",
-            row=worst,
-            value=found,
-        )
+        raise FitError.expected(
+            "a position on the object's surface", found, got=f"{found} m, {float(distance[worst]):.2g} m from it",
+            row=worst, name="candidates", advice="check the unit and the frame",
+        )  # fmt: skip

@@ -59,20 +59,8 @@ class Coverage:
 
 def has_posterior(field: SoundField) -> bool:
     """Return whether the uncertainty of the field's gains is known."""
-    try:
-        fitted_mixture(field)
-    except FitError:
-        return False
-    return True
-
-
-def unedited_mixture(field: SoundField) -> MixtureGains:
-    """Return the field's gain model, to plan measurements for. Raises as `fitted_mixture`, and for an edited field."""
-    if isinstance(field.gain_field, ScaledGains):
-        raise FitError.expected(
-            "a field as fitted", "edited", got="an edited one", name="field", advice="give the unedited field"
-        )
-    return fitted_mixture(field)
+    gains = field.gain_field.fitted
+    return isinstance(gains, MixtureGains) and gains.place_count >= 2
 
 
 def fitted_mixture(field: SoundField) -> MixtureGains:
@@ -82,21 +70,15 @@ def fitted_mixture(field: SoundField) -> MixtureGains:
     """
     gains = field.gain_field.fitted
     if isinstance(gains, BodyGains):
-        raise FitError(
-            "field: expected one fitted to recordings, got one computed without; record impacts and fit",
-            name="field",
-            value=gains.kind,
-        )
+        wanted, got = "one fitted to recordings", "one computed without"
+        raise FitError.expected(wanted, gains.kind, got=got, name="field", advice="record impacts and fit")
     if not isinstance(gains, MixtureGains):
         raise FitError.expected(
             f"gains of the kind {MixtureGains.kind!r}", gains.kind, name="field", advice="fit with --gain-model auto"
         )
     if gains.place_count < 2:
-        raise FitError(
-            "field: expected recordings at 2 positions or more, got 1; record impacts at another position",
-            name="field",
-            value=gains.place_count,
-        )
+        wanted, advice = "recordings at 2 positions or more", "record impacts at another position"
+        raise FitError.expected(wanted, gains.place_count, name="field", advice=advice)
     return gains
 
 
@@ -106,19 +88,12 @@ def scale_of(field: SoundField) -> Float64[Tensor, " modes"]:
     return gains.scale if isinstance(gains, ScaledGains) else torch.ones(len(field.bank), dtype=torch.float64)
 
 
-def training_contacts(field: SoundField) -> Float64[Tensor, "contacts 3"]:
-    """Return the contacts that the gains were fitted to, meters, on the object as it is. Raises as `fitted_mixture`."""
-    fitted_mixture(field)
-    return field.gain_field.contacts
-
-
 def posterior(
     field: SoundField, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
 ) -> tuple[Float64[Tensor, "contacts modes 2"], Float64[Tensor, "contacts modes 2"]]:
     """Return the mean of both parts of the gains, and their standard deviation. Raises as `fitted_mixture`."""
     fitted_mixture(field)
-    with torch.no_grad():
-        known = field.gain_field.posterior(contacts, directions)
+    known = field.gain_field.posterior(contacts, directions)
     assert known.std is not None
     return known.parts, known.std.double()
 
@@ -194,13 +169,9 @@ def coverage(
     """
     _expect_level(level)
     gains, scale = fitted_mixture(field), scale_of(field).square()[:, None]
-    if parts.shape != (len(contacts), len(field.bank), 2):
-        raise FitError(
-            f"parts: expected the shape [{len(contacts)}, {len(field.bank)}, 2], got {list(parts.shape)}; give gains "
-            "of the contacts and of the field's modes",
-            name="parts",
-            value=list(parts.shape),
-        )
+    if parts.shape != (shape := (len(contacts), len(field.bank), 2)):
+        advice = "give gains of the contacts and of the field's modes"
+        raise FitError.expected(f"the shape {list(shape)}", list(parts.shape), name="parts", advice=advice)
     predicted, deviation = posterior(field, contacts, directions)
     spread = (deviation.square() + scale * gains.noise().square()).sqrt()
     parts = turned_like(parts, predicted)
