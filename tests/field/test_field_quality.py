@@ -11,8 +11,7 @@ from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.next_contacts import suggest
-from avmsf.field.quality import smallest_within_error
-from avmsf.field.sound_field import FieldQuality
+from avmsf.field.quality import FieldQuality, smallest_within_error
 from avmsf.field.store import load, save
 from avmsf.modal.extraction.extract import extract_modes
 from factories.delayed_plate import SAMPLES, strikes

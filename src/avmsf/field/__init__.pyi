@@ -4,7 +4,7 @@ from .config import GainModelName as GainModelName
 from .gains.attention import Attention as Attention
 from .gains.estimator import MixtureEstimator as MixtureEstimator
 from .next_contacts import Suggestions as Suggestions
-from .sound_field import FieldQuality as FieldQuality
+from .quality import FieldQuality as FieldQuality
 from .sound_field import GainPosterior as GainPosterior
 from .sound_field import Origin as Origin
 from .sound_field import SoundField as SoundField

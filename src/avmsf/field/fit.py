@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from importlib.metadata import version
@@ -18,11 +19,19 @@ from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.data import GainData, gain_data
 from avmsf.field.gains.estimator import MixtureEstimator
-from avmsf.field.quality import with_quality
+from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.gains.model import Gains
+from avmsf.field.next_contacts import suggest
+from avmsf.field.quality import FieldQuality, PlaceErrors, smallest_within_error
 from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
 from avmsf.field.trainer import GainEstimator, Progress, Trainer
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.residual_noise import Residual, estimate_residual
+
+_MIN_PLACES = 4
+"""Places below which leaving one out says nothing of the field of all."""
+_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
+"""Spread shares that are tried."""
 
 
 def fit(
@@ -88,7 +97,7 @@ def fit(
         silent = replace(field, residual=Residual(torch.zeros(bins)))
         explained = silent.render(used.contacts, directions=used.directions)
         field = replace(field, residual=estimate_residual(used.sounds, explained, bins=bins))
-    return with_quality(field, used, advise=features.on_surface)
+    return _with_quality(field, used, advise=features.on_surface)
 
 
 def fingerprint(data: GainData, estimator: GainEstimator) -> str:
@@ -103,3 +112,58 @@ def fingerprint(data: GainData, estimator: GainEstimator) -> str:
         digest.update(f"{tensor.dtype} {tuple(tensor.shape)}".encode())
         digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()
+
+
+def _with_quality(field: SoundField, train: Impacts, *, advise: bool) -> SoundField:
+    """Return a field with the residual and spread share that predict its own contacts best, and its quality reported.
+
+    The residual is the stationary noise of the field, or the mean of what the three nearest recordings have in addition
+    to their modes. By the error at contacts left out; of the shares the smallest within one standard error of the best,
+    since fewer contacts leave more spread. `train` holds the recordings that the gain model uses, row for row. A field
+    of fewer than `_MIN_PLACES` places keeps its noise, a share of zero, and has no quality. `advise`: whether to name
+    the contact to record next, one of the field's points; not if these are not on the object.
+    """
+    gains = field.gain_field
+    if not isinstance(gains, MixtureGains) or gains.place_count < _MIN_PLACES:
+        return field
+    samples, places = train.sounds.shape[1], gains.places
+    fitted = field.modal_sounds(Gains(gains.values.real.float(), gains.values.imag.float()), samples)
+    recordings = (train.sounds - fitted).float()
+    rows, signs = gains.nearest(gains.training, places)
+    neighbors = (train.sounds[rows] * signs[..., None]).float()
+    residuals = {"noise": field.noise(samples)}
+    if field.origin.config.residual:
+        residuals["recordings"] = (recordings[rows] * signs[..., None]).mean(1)
+    modes = [field.modal_sounds(gains.left_out_estimate(share), samples) for share in _SHARES]
+    error = PlaceErrors(train, places, field.origin.config)
+    errors = {kind: torch.stack([error(each + added) for each in modes]) for kind, added in residuals.items()}
+    best = min(errors, key=lambda kind: float(errors[kind].mean(1).min()))
+    if best == "recordings":
+        field = replace(field, residual=Residual(field.residual.magnitude, recordings))
+    chosen = smallest_within_error(errors[best])
+    field = replace(field, gain_field=replace(gains, spread_share=_SHARES[chosen]))
+    reached = {kind: float(each[chosen].mean()) for kind, each in errors.items()}
+    contact, distance = (_next(field, gains) if advise else ()) or (None, None)
+    nearest, averaged = error(neighbors[:, 0]), error(neighbors.mean(1))
+    simple = min(nearest, averaged, key=lambda each: float(each.mean()))
+    deviation = float((errors[best][chosen] - simple).std()) / math.sqrt(len(simple))
+    found = FieldQuality(
+        gains.place_count, reached[best], float(averaged.mean()), contact, distance, deviation, float(nearest.mean())
+    )
+    report = {**field.origin.report, "quality": asdict(found), "residual": reached}
+    return replace(field, origin=replace(field.origin, report=report))
+
+
+def _next(field: SoundField, gains: MixtureGains) -> tuple[tuple[float, float, float], float] | tuple[()]:
+    """Return the contact that reduces the expected error most and its distance to the nearest one; () for none."""
+    try:
+        (contact,) = suggest(field, 1, progress=False).contacts
+    except FitError:
+        # All points of the object are contacts already.
+        return ()
+    distance = float((gains.contacts - contact).norm(dim=1).min())
+    if distance > float((gains.contacts.amax(0) - gains.contacts.amin(0)).norm()):
+        # The points are in another unit or frame than the contacts.
+        return ()
+    x, y, z = contact.tolist()
+    return (x, y, z), distance

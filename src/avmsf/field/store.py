@@ -32,7 +32,8 @@ from avmsf.field.gains.model import GainModel
 from avmsf.field.gains.scaled import FITTED, ScaledGains
 from avmsf.field.header import ADVICE, FORMAT, KEY, UNREADABLE, WHAT, damaged, key_of, record_of_text, value_of
 from avmsf.field.probable_body import ProbableBody
-from avmsf.field.sound_field import SUPPORTING, FieldQuality, Origin, SoundField
+from avmsf.field.quality import FieldQuality
+from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
 from avmsf.modal.extraction.alignment import Alignment
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
