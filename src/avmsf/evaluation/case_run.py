@@ -2,8 +2,7 @@
 
 import hashlib
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
@@ -153,9 +152,8 @@ class CaseRun:
         path, finder = folder / "modes" / f"{self.place}.safetensors", evaluation.finder
         self.scored = self.own = _Recordings(data.impacts, case, finder, path)
         if data.own_starts is not None:
-            self.own = _Recordings(
-                data.own_starts, case, finder, path.with_name(f"{number:02d} own starts.safetensors")
-            )
+            own_path = path.with_name(f"{number:02d} own starts.safetensors")
+            self.own = _Recordings(data.own_starts, case, finder, own_path)
         self.truth = None if data.truth is None else truth_at(data.truth, self.scored.test.names)
         self.features = partial(data.features, views=case.views)
         self.stored_rows = spread(len(case.test), MAX_STORED_SOUNDS) if stores_sounds else []
@@ -166,9 +164,8 @@ class CaseRun:
         begun, shared = time.perf_counter(), self.shared
         recordings = self.own if isinstance(method, FieldMethod) and not method.published else self.scored
         try:
-            with self._sharing():
-                self.scored.align()
-                recordings.align()
+            self._shared(self.scored.align)()
+            self._shared(recordings.align)()
             renderer = expect_renderer(method.fit(self._task(recordings)))
             fit_seconds = time.perf_counter() - begun - (self.shared - shared)
             begun = time.perf_counter()
@@ -240,30 +237,22 @@ class CaseRun:
         )
 
     def _shared(self, make: Callable[Given, Result]) -> Callable[Given, Result]:
+        """Return `make`, whose time counts to no method: whichever asks first would seem the slowest."""
+
         def made(*given: Given.args, **named: Given.kwargs) -> Result:
-            with self._sharing():
+            begun = time.perf_counter()
+            try:
                 return make(*given, **named)
+            finally:
+                self.shared += time.perf_counter() - begun
 
         return made
 
-    @contextmanager
-    def _sharing(self) -> Iterator[None]:
-        """Count the time to no method: whichever asks first would seem the slowest."""
-        begun = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.shared += time.perf_counter() - begun
-
     def _keep_sounds(self, name: str, sounds: Float[Tensor, "contacts samples"]) -> dict[str, str]:
         """Write the sounds to listen to, and return their files by the names of their recordings."""
-        kept = {}
-        word = file_word(name)
+        kept, test = {}, self.scored.test
         for row in self.stored_rows:
-            file = f"sounds/{self.place}/{row:03d} {word}.flac"
-            test = self.scored.test
-            keep_sound(
-                self.folder / file, sounds[row], sample_rate=test.sample_rate, gain=listening_gain(test.sounds[row])
-            )
+            file, gain = f"sounds/{self.place}/{row:03d} {file_word(name)}.flac", listening_gain(test.sounds[row])
+            keep_sound(self.folder / file, sounds[row], sample_rate=test.sample_rate, gain=gain)
             kept[test.names[row]] = file
         return kept

@@ -32,7 +32,7 @@ from avmsf.evaluation.simple_methods import (
     SplineGains,
     WhiteNoise,
 )
-from avmsf.evaluation.task import Method, Renderer, Task
+from avmsf.evaluation.task import Contacts, Method, Renderer, Sounds, Task
 from avmsf.fem.material import MATERIALS
 
 NEIGHBORS = 3
@@ -145,7 +145,7 @@ class Recorded:
 
     folder: Path
     """Holds the object's files."""
-    contacts: Float[Tensor, "contacts 3"]
+    contacts: Contacts
     """Contacts of the object's recordings, meters."""
     names: tuple[str, ...]
     """The recordings' names, row for row."""
@@ -167,9 +167,7 @@ class Recorded:
         """Return where the sound that stands for a recording is expected."""
         return self.folder / (name if name.lower().endswith(".wav") else f"{name}.wav")
 
-    def render(
-        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Float[Tensor, "contacts samples"]:
+    def render(self, contacts: Contacts, *, directions: Contacts | None = None) -> Sounds:
         """Return the files' sounds, as they are.
 
         Raises EvaluationError for a contact without a recording, for a missing file, and for one that is no sound, has

@@ -23,13 +23,14 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Complex, Complex128, Float, Float64, Int
+from jaxtyping import Complex128, Float, Float64, Int
 from scipy.optimize import linear_sum_assignment, minimize_scalar
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
 from avmsf.datasets.dataset import Dataset
 from avmsf.errors import EvaluationError
+from avmsf.evaluation.task import Amplitudes, Contacts
 from avmsf.modal.extraction.least_squares import NormalEquations
 from avmsf.modal.inner_products import poles_of
 from avmsf.modal.modes import ModalBank
@@ -119,7 +120,6 @@ def _path(dataset: Dataset, identifier: str) -> Path | None:
     return source.folder / TRUTH if source is not None and (source.folder / TRUTH).is_file() else None
 
 
-Amplitudes = Complex128[Tensor, "contacts modes"]
 _SAME_FREQUENCY = 0.002
 """Difference of two frequencies of one mode, over the frequency, however narrow the mode is."""
 _TURNS = 100
@@ -135,9 +135,7 @@ class ModalRenderer(Protocol):
         """The modes, the same at all contacts."""
         ...
 
-    def complex_gains(
-        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Complex[Tensor, "contacts modes"]:
+    def complex_gains(self, contacts: Contacts, *, directions: Contacts | None = None) -> Amplitudes:
         """Return amplitudes A at the contacts: their sounds are the real part of the sum of A exp((-d + 2 pi i f) t).
 
         In the unit of the training sounds; `directions` are the unit vectors of the impacts, for methods that use them.
@@ -189,10 +187,10 @@ class ModalScores:
 
 def compare_modes(
     renderer: ModalRenderer,
-    contacts: Float[Tensor, "contacts 3"],
+    contacts: Contacts,
     truth: Truth,
     *,
-    directions: Float[Tensor, "contacts 3"] | None = None,
+    directions: Contacts | None = None,
 ) -> ModalScores:
     """Compare a method's modes and its gains at the contacts with the true ones, row for row.
 

@@ -13,13 +13,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Complex, Float, Float64
+from jaxtyping import Complex128, Float, Float64
 from scipy.interpolate import RBFInterpolator
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from avmsf.capture.impacts import Impacts, places_of
 from avmsf.errors import EvaluationError
+from avmsf.evaluation.task import Amplitudes, Contacts, Sounds
 from avmsf.field.gains.data import orientation_signs
 from avmsf.field.gains.kernels import Axes, Sites
 from avmsf.gaussians.points import nearest_points
@@ -84,41 +85,31 @@ class ModalBaseline(_Trained, ABC):
         return self.extraction.bank
 
     @cached_property
-    def amplitudes(self) -> Float[Tensor, "contacts two_modes"]:
-        """The training contacts' gains in phase, then in quadrature, as if all blows came from the same side.
+    def amplitudes(self) -> Amplitudes:
+        """The training contacts' amplitudes, as if all blows came from the same side.
 
         Of two blows from opposite sides of a thin wall the gains are opposite too, and their mean would be silence.
         """
-        both = torch.cat([self.extraction.gains, self.extraction.quadrature], dim=1)
-        return both * orientation_signs(self.train.contacts, self.train.directions).to(both)[:, None]
+        amplitudes = torch.complex(self.extraction.quadrature, -self.extraction.gains)
+        return amplitudes * orientation_signs(self.train.contacts, self.train.directions).to(amplitudes)[:, None]
 
     @abstractmethod
-    def amplitudes_at(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts two_modes"]:
-        """Return the gains in phase, then in quadrature, that the contacts are given."""
-
-    def complex_gains(
-        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Complex[Tensor, "contacts modes"]:
+    def complex_gains(self, contacts: Contacts, *, directions: Contacts | None = None) -> Amplitudes:
         """Return amplitudes A at the contacts: their sounds are the real part of the sum of A exp((-d + 2 pi i f) t).
 
         `directions` make no difference.
         """
-        gains, quadrature = self.amplitudes_at(contacts).chunk(2, dim=1)
-        return torch.complex(quadrature, -gains)
 
-    def render(
-        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Float[Tensor, "contacts samples"]:
+    def render(self, contacts: Contacts, *, directions: Contacts | None = None) -> Sounds:
         """Return the modes' sound at each contact, and the noise beside it where there is any."""
-        gains, quadrature = self.amplitudes_at(contacts).chunk(2, dim=1)
-        samples = self.train.sounds.shape[1]
+        amplitudes, samples = self.complex_gains(contacts), self.train.sounds.shape[1]
         sounds = synthesize(
-            gains,
+            -amplitudes.imag,
             self.bank.frequency,
             self.bank.damping,
             samples=samples,
             sample_rate=self.train.sample_rate,
-            quadrature=quadrature,
+            quadrature=amplitudes.real,
         )
         if not self.noise:
             return sounds
@@ -137,9 +128,7 @@ class WhiteNoise(_Trained):
 
     seed: int = 0
 
-    def render(
-        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Float[Tensor, "contacts samples"]:
+    def render(self, contacts: Contacts, *, directions: Contacts | None = None) -> Sounds:
         """Return noise that depends only on the seed and the contact."""
         loudness = self.train.sounds.square().mean(dim=1).sqrt().mean()
         sounds = [self._noise(contact) for contact in contacts]
@@ -158,9 +147,7 @@ class WhiteNoise(_Trained):
 class NearestRecording(_Trained):
     """The training sound whose contact is nearest."""
 
-    def render(
-        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Float[Tensor, "contacts samples"]:
+    def render(self, contacts: Contacts, *, directions: Contacts | None = None) -> Sounds:
         """Return the nearest training contact's sound."""
         return self.train.sounds[nearest_points(self.train.contacts, contacts)[:, 0]]
 
@@ -179,9 +166,7 @@ class MeanWaveform(_Neighbors, _Trained):
     by_direction: bool = False
     """Whether directions count as well as contacts."""
 
-    def render(
-        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Float[Tensor, "contacts samples"]:
+    def render(self, contacts: Contacts, *, directions: Contacts | None = None) -> Sounds:
         """Return the mean of the nearest training contacts' sounds."""
         if not self.by_direction or directions is None or self.train.directions is None:
             return self.train.sounds[nearest_points(self.train.contacts, contacts, count=self.count)].mean(dim=1)
@@ -195,18 +180,19 @@ class MeanWaveform(_Neighbors, _Trained):
 
 @dataclass(frozen=True, eq=False)
 class MeanGains(_Neighbors, ModalBaseline):
-    """The modes with the mean of the nearest contacts' signed gains, in phase and in quadrature."""
+    """The modes with the mean of the nearest contacts' amplitudes."""
 
     count: int = 3
-    """How many contacts' gains are averaged."""
+    """How many contacts' amplitudes are averaged."""
 
     def __post_init__(self) -> None:
         ModalBaseline.__post_init__(self)
         _Neighbors.__post_init__(self)
 
-    def amplitudes_at(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts two_modes"]:
-        """Return the mean of the nearest training contacts' gains in phase, then in quadrature."""
-        return self.amplitudes[nearest_points(self.train.contacts, contacts, count=self.count)].mean(dim=1)
+    def complex_gains(self, contacts: Contacts, *, directions: Contacts | None = None) -> Amplitudes:
+        """Return the mean of the nearest training contacts' amplitudes."""
+        nearest = self.amplitudes[nearest_points(self.train.contacts, contacts, count=self.count)]
+        return torch.complex(nearest.real.mean(dim=1), nearest.imag.mean(dim=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,9 +204,7 @@ class RandomImpact:
     sample_rate: float
     """Samples per second, Hz."""
 
-    def render(
-        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Float[Tensor, "contacts samples"]:
+    def render(self, contacts: Contacts, *, directions: Contacts | None = None) -> Sounds:
         """Return the recording for every contact."""
         return self.sound.expand(len(contacts), -1)
 
@@ -248,14 +232,14 @@ def floor(test: Impacts, bank: ModalBank, *, sines: bool = False) -> Float[Tenso
 
 @dataclass(frozen=True, eq=False)
 class SplineGains(ModalBaseline):
-    """The modes with gains in phase and in quadrature that are thin-plate splines through the training contacts.
+    """The modes with amplitudes that are thin-plate splines through the training contacts.
 
-    Contacts in one place count once, with their mean gains. With fewer places than twice what determines a linear
+    Contacts in one place count once, with their mean amplitudes. With fewer places than twice what determines a linear
     function the spline is linear in the distance, with a constant: the thin plate would run away beyond the contacts.
     """
 
-    def amplitudes_at(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts two_modes"]:
-        """Return the splines' gains in phase, then in quadrature."""
+    def complex_gains(self, contacts: Contacts, *, directions: Contacts | None = None) -> Amplitudes:
+        """Return the splines' amplitudes."""
         places, means = self._places
         along, asked = self._axes.along(places), self._axes.along(contacts.double())
         if len(places) == 1 or not along.shape[1]:
@@ -272,12 +256,12 @@ class SplineGains(ModalBaseline):
         return {"kernel": kernel, "directions": directions, "sites": len(self._places[0])}
 
     @cached_property
-    def _places(self) -> tuple[Float64[Tensor, "places 3"], Float64[Tensor, "places two_modes"]]:
-        """Distinct places, and the mean gains there."""
+    def _places(self) -> tuple[Float64[Tensor, "places 3"], Complex128[Tensor, "places modes"]]:
+        """Distinct places, and the mean amplitudes there."""
         owner = places_of(self.train.contacts.double())
         members = (owner[None, :] == torch.arange(int(owner.max()) + 1)[:, None]).double()
         mean = members / members.sum(1, keepdim=True)
-        return mean @ self.train.contacts.double(), mean @ self.amplitudes.double()
+        return mean @ self.train.contacts.double(), mean.to(torch.complex128) @ self.amplitudes.to(torch.complex128)
 
     @cached_property
     def _axes(self) -> Axes:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
@@ -17,6 +17,10 @@ from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.modal.extraction.extract import Extraction
 
+Contacts = Float[Tensor, "contacts 3"]
+"""Points in the object frame, meters; or as directions, unit vectors."""
+Sounds = Float[Tensor, "contacts samples"]
+Amplitudes = Complex[Tensor, "contacts modes"]
 _WANTED = (
     "an object with a number `sample_rate` (Hz) and a method `render(self, contacts, *, directions=None)` that returns "
     "sounds [contacts, samples]"
@@ -35,9 +39,7 @@ class Renderer(Protocol):
         """Samples per second of the rendered sounds, Hz."""
         ...
 
-    def render(
-        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Float[Tensor, "contacts samples"]:
+    def render(self, contacts: Contacts, *, directions: Contacts | None = None) -> Sounds:
         """Return the sound of a blow at each contact (object frame, meters), in the unit of the training sounds.
 
         `directions`, unit vectors along which the hammer moves, are for those to heed who know of directions.
@@ -94,7 +96,7 @@ class Task:
     """Name of the object, in messages and as the folder of other systems' sounds."""
     train: Impacts
     """The training recordings."""
-    contacts: Float[Tensor, "contacts 3"]
+    contacts: Contacts
     """Contacts of all recordings of the object, training and test, meters."""
     names: tuple[str, ...]
     """Names of their recordings, row for row."""
