@@ -50,21 +50,13 @@ def damaged(path: Path, error: Exception) -> FieldFileError:
         f"{path}: expected the header of a sound field of format {FORMAT}, got another or a damaged one "
         f"({type(error).__name__}: {error}); fit and save the field again",
         file=path,
-        name=key_of(error),
-        value=value_of(error),
+        name=error.name
+        if isinstance(error, AvmsfError)
+        else str(error.args[0])
+        if isinstance(error, KeyError)
+        else None,
+        value=error.value if isinstance(error, AvmsfError) else None,
     )
-
-
-def key_of(error: Exception) -> str | None:
-    """Return the key of a record that an error is about, where it is known."""
-    if isinstance(error, AvmsfError):
-        return error.name
-    return str(error.args[0]) if isinstance(error, KeyError) else None
-
-
-def value_of(error: Exception) -> Any:
-    """Return the value that an error is about, where it is known."""
-    return error.value if isinstance(error, AvmsfError) else None
 
 
 def _remake(record: Mapping[str, Any], path: Path) -> str:

@@ -14,7 +14,7 @@ holds under the key `avmsf` a record:
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from avmsf.errors import FieldFileError
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.model import GainModel
 from avmsf.field.gains.scaled import FITTED, ScaledGains
-from avmsf.field.header import ADVICE, FORMAT, KEY, UNREADABLE, WHAT, damaged, key_of, record_of_text, value_of
+from avmsf.field.header import ADVICE, FORMAT, KEY, UNREADABLE, WHAT, damaged, record_of_text
 from avmsf.field.probable_body import ProbableBody
 from avmsf.field.quality import FieldQuality
 from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
@@ -62,21 +62,13 @@ def save(field: SoundField, path: str | Path) -> None:
     try:
         words = json.dumps(record, allow_nan=False)
     except (TypeError, ValueError) as error:
-        raise FieldFileError(
-            f"{path}: expected origin.report of finite numbers, text, lists and dicts ({error}); remove the rest",
-            file=path,
-            name="origin.report",
-        ) from error
+        wanted, got = "finite numbers, text, lists and dicts", f"others ({error})"
+        raise FieldFileError.expected(wanted, got=got, file=path, name="origin.report", advice="remove them") from error
     try:
-        header = _Header.of(json.loads(words))
+        skeleton, _ = _checked(json.loads(words))
     except UNREADABLE as error:
-        raise FieldFileError(
-            f"{path}: expected a field that can be loaded: {error}",
-            file=path,
-            name=key_of(error),
-            value=value_of(error),
-        ) from error
-    _expect_tensors(tensors, header.skeleton, path)
+        raise damaged(path, error) from error
+    _expect_tensors(tensors, skeleton, path)
     write_tensors(path, tensors, {KEY: words})
 
 
@@ -90,84 +82,73 @@ def load(path: str | Path) -> SoundField:
     words, tensors = read_tensors(path, KEY, what=WHAT, advice=ADVICE, raising=FieldFileError)
     record = record_of_text(words, path)
     try:
-        header = _Header.of(record)
-        _expect_tensors(tensors, header.skeleton, path)
-        named = {name.removeprefix(_GAINS): each for name, each in tensors.items() if name.startswith(_GAINS)}
-        gains = _KINDS[header.kind].restore(header.gain_field, named)
+        skeleton, origin = _checked(record)
+        _expect_tensors(tensors, skeleton, path)
+        gains = _KINDS[record["gains"]["kind"]].restore(record["gains"], _named(_GAINS, tensors))
     except FieldFileError:
         raise
     except UNREADABLE as error:
         raise damaged(path, error) from error
+    kept = record["alignment"]
     return SoundField(
         ModalBank(tensors["bank.frequency"], tensors["bank.damping"]),
         gains,
         tensors["phase"],
         Residual(tensors["residual.magnitude"], tensors.get("residual.recordings")),
-        header.sample_rate,
-        header.samples,
-        header.origin,
-        _alignment(record["alignment"], tensors),
+        float(record["sample_rate"]),
+        record["samples"],
+        origin,
+        kept and Alignment.restore(_named(_ALIGNMENT, tensors), kept["names"], kept["keys"]),
     )
 
 
-@dataclass(frozen=True)
-class _Header:
-    """What a field's file states about its tensors."""
+def _checked(record: Mapping[str, Any]) -> tuple[dict[str, Tensor], Origin]:
+    """Return tensors as a field of this record has them, which take no memory, and the field's origin.
 
-    sample_rate: float
-    samples: int
-    kind: str
-    gain_field: Mapping[str, Any]
-    """The gain field's record."""
-    origin: Origin
-    skeleton: dict[str, Tensor]
-    """Tensors of the names, shapes and dtypes of a field with these sizes, which take no memory."""
-
-    @classmethod
-    def of(cls, record: Mapping[str, Any]) -> "_Header":
-        """Return the header of a file's record. Raises one of `UNREADABLE`, also for sounds that no recording has."""
-        sizes, gains, origin = (dict(like(record[name], {}, name)) for name in ("sizes", "gains", "origin"))
-        rate, samples = float(like(record["sample_rate"], 1.0, "sample_rate")), count_of(record["samples"], "samples")
-        # Those of the recordings that a field is fitted to.
-        if not LOWEST_RATE <= rate <= HIGHEST_RATE:
-            raise RecordError.expected(f"{LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz", rate, name="sample_rate")
-        if samples > MAX_SAMPLES:
-            raise RecordError.expected(f"at most {MAX_SAMPLES:,}", samples, got=f"{samples:,}", name="samples")
-        modes, bins = (count_of(sizes[name], f"sizes.{name}") for name in ("modes", "bins"))
-        kind = like(gains.pop("kind"), "", "gains.kind")
-        if kind not in _KINDS:
-            raise RecordError(f"gains.kind: expected {', '.join(_KINDS)}, got {kind!r}", name="gains.kind", value=kind)
-        bank = torch.empty(modes, dtype=torch.float64, device="meta")
-        skeleton = {"bank.frequency": bank, "bank.damping": bank, "phase": bank}
-        skeleton["residual.magnitude"] = torch.empty(bins, device="meta")
-        if sizes["recordings"] is not None:
-            contacts, length = (count_of(each, "sizes.recordings") for each in sizes["recordings"])
-            if gains.get("contacts") != contacts:
-                raise RecordError.expected(
-                    f"{gains.get('contacts')} contacts as in gains", contacts, name="sizes.recordings"
-                )
-            skeleton["residual.recordings"] = torch.empty(contacts, length, device="meta")
-        skeleton |= {_GAINS + name: each for name, each in _KINDS[kind].skeleton(gains).items()}
-        if (alignment := record["alignment"]) is not None:
-            names, keys = (like(alignment[name], [], f"alignment.{name}") for name in ("names", "keys"))
-            if len(names) != len(keys) or not all(isinstance(each, str) for each in (*names, *keys)):
-                raise RecordError.expected(f"{len(names)} as in alignment.names", len(keys), name="alignment.keys")
-            aligned = Alignment.skeleton(len(names), count_of(alignment["modes"], "alignment.modes", least=0))
-            skeleton |= {_ALIGNMENT + name: each for name, each in aligned.items()}
-        if gains["modes"] != modes:
-            raise RecordError.expected(f"{modes}, the number of frequencies", gains["modes"], name="gains.modes")
-        read = Origin(
-            capture=like(origin["capture"], "", "origin.capture"),
-            trained_on=tuple(like(name, "", "origin.trained_on") for name in origin["trained_on"]),
-            per_newton=like(origin["per_newton"], True, "origin.per_newton"),
-            config=record_of(FitConfig(), record["config"], "config"),
-            report=_checked_report(like(origin["report"], {}, "origin.report"), modes),
-            settings=CaptureSettings.of(like(origin["settings"], {}, "origin.settings"), name="origin.settings"),
-        )
-        if (quality := read.report.get("quality")) is not None:
-            FieldQuality.of(quality)
-        _ = ProbableBody.of(read.report)
-        return cls(rate, samples, kind, gains, read, skeleton)
+    Raises one of `UNREADABLE`, also for sounds that no recording has.
+    """
+    sizes, gains, origin = (dict(like(record[name], {}, name)) for name in ("sizes", "gains", "origin"))
+    rate, samples = like(record["sample_rate"], 1.0, "sample_rate"), count_of(record["samples"], "samples")
+    # Those of the recordings that a field is fitted to.
+    if not LOWEST_RATE <= rate <= HIGHEST_RATE:
+        raise RecordError.expected(f"{LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz", rate, name="sample_rate")
+    if samples > MAX_SAMPLES:
+        raise RecordError.expected(f"at most {MAX_SAMPLES:,}", samples, got=f"{samples:,}", name="samples")
+    modes, bins = (count_of(sizes[name], f"sizes.{name}") for name in ("modes", "bins"))
+    kind = like(gains["kind"], "", "gains.kind")
+    if kind not in _KINDS:
+        raise RecordError.expected(", ".join(_KINDS), kind, name="gains.kind")
+    bank = torch.empty(modes, dtype=torch.float64, device="meta")
+    skeleton = {"bank.frequency": bank, "bank.damping": bank, "phase": bank}
+    skeleton["residual.magnitude"] = torch.empty(bins, device="meta")
+    if sizes["recordings"] is not None:
+        contacts, length = (count_of(each, "sizes.recordings") for each in sizes["recordings"])
+        if gains.get("contacts") != contacts:
+            raise RecordError.expected(
+                f"{gains.get('contacts')} contacts as in gains", contacts, name="sizes.recordings"
+            )
+        skeleton["residual.recordings"] = torch.empty(contacts, length, device="meta")
+    skeleton |= {_GAINS + name: each for name, each in _KINDS[kind].skeleton(gains).items()}
+    if (alignment := record["alignment"]) is not None:
+        names, keys = (like(alignment[name], [], f"alignment.{name}") for name in ("names", "keys"))
+        if len(names) != len(keys) or not all(isinstance(each, str) for each in (*names, *keys)):
+            raise RecordError.expected(f"{len(names)} as in alignment.names", len(keys), name="alignment.keys")
+        aligned = Alignment.skeleton(len(names), count_of(alignment["modes"], "alignment.modes", least=0))
+        skeleton |= {_ALIGNMENT + name: each for name, each in aligned.items()}
+    if gains["modes"] != modes:
+        raise RecordError.expected(f"{modes}, the number of frequencies", gains["modes"], name="gains.modes")
+    read = Origin(
+        capture=like(origin["capture"], "", "origin.capture"),
+        trained_on=tuple(like(name, "", "origin.trained_on") for name in origin["trained_on"]),
+        per_newton=like(origin["per_newton"], True, "origin.per_newton"),
+        config=record_of(FitConfig(), record["config"], "config"),
+        report=_checked_report(like(origin["report"], {}, "origin.report"), modes),
+        settings=CaptureSettings.of(like(origin["settings"], {}, "origin.settings"), name="origin.settings"),
+    )
+    if (quality := read.report.get("quality")) is not None:
+        FieldQuality.of(quality)
+    _ = ProbableBody.of(read.report)
+    return skeleton, read
 
 
 def _checked_report(report: dict[str, Any], modes: int) -> dict[str, Any]:
@@ -238,11 +219,9 @@ def _tensors(field: SoundField) -> dict[str, Tensor]:
     return named
 
 
-def _alignment(record: Mapping[str, Any] | None, tensors: Mapping[str, Tensor]) -> Alignment | None:
-    if record is None:
-        return None
-    named = {name.removeprefix(_ALIGNMENT): each for name, each in tensors.items() if name.startswith(_ALIGNMENT)}
-    return Alignment.restore(named, record["names"], record["keys"])
+def _named(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors whose names begin with a prefix, without it."""
+    return {name.removeprefix(prefix): each for name, each in tensors.items() if name.startswith(prefix)}
 
 
 def _expect_tensors(tensors: dict[str, Tensor], skeleton: dict[str, Tensor], path: Path) -> None:
