@@ -14,9 +14,10 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from avmsf.capture import CaptureSettings
-from avmsf.capture.filenames import pictures_in
+from avmsf.capture.filenames import expect_views, pictures_in
 from avmsf.capture.settings import METRES
 from avmsf.cli import main
+from avmsf.errors import SceneError
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
 from avmsf.mesh.surface import surface_points
@@ -24,6 +25,7 @@ from avmsf.photographs.folder import read_camera_file, write_views
 from avmsf.pipeline.visuals import VisualInputs, inputs
 from factories.capture_folder import fill
 from factories.plate_capture import fill_plate
+from factories.raising import raises
 from factories.small_scene import slab, slab_views, write_surface_file
 from factories.views_folder import frames, ring, write_image, write_transforms
 
@@ -66,6 +68,14 @@ def test_masks_that_some_photographs_lack_are_a_problem(tmp_path: Path) -> None:
     write_transforms(tmp_path / "named", named)
     (problem,) = found(tmp_path / "named").problems
     assert problem.startswith("4 photographs")
+
+
+def test_an_empty_folder_of_images_is_refused_unless_a_mesh_shows_the_object(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    with raises(SceneError, file=tmp_path):
+        expect_views(tmp_path, CaptureSettings())
+    (tmp_path / "surface.obj").touch()
+    expect_views(tmp_path, CaptureSettings())
 
 
 def test_images_of_a_cache_are_no_photographs(tmp_path: Path) -> None:

@@ -264,8 +264,6 @@ def test_the_worker_ends_when_its_parent_does(taken: tuple[View, ...], tmp_path:
     (tmp_path / "job.json").write_text(json.dumps(job))
     command = [sys.executable, "-P", str(WORKER), str(tmp_path / "job.json")]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as worker:
-        assert worker.stdout is not None
-        assert worker.stdin is not None
         assert worker.stdout.readline() == b"stage features\n"
         # What a dying parent leaves behind: its end of the pipe, closed.
         worker.stdin.close()

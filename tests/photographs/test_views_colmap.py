@@ -67,7 +67,6 @@ def test_names_may_have_folders_and_blanks(tmp_path: Path, write: Callable[..., 
 def test_points_and_colors(tmp_path: Path, write: Callable[..., None]) -> None:
     write(tmp_path / "sparse/0", ring(4), NAMES)
     found = read_sparse_points(tmp_path, meters=2.0)
-    assert found is not None
     points, colors = found
     assert torch.equal(points, torch.tensor([[1.0, -0.5, 4.0], [2.0, 4.0, 6.0]], dtype=torch.float64))
     assert colors.tolist() == [[255, 128, 0], [1, 2, 3]]
@@ -117,7 +116,6 @@ def test_what_colmap_writes_says_the_same(tmp_path: Path, form: str) -> None:
     write_transforms(tmp_path / "other", frames(cameras))
     assert_same(read_views(tmp_path / "one"), read_views(tmp_path / "other"))
     found = read_sparse_points(tmp_path / "one")
-    assert found is not None
     assert found[0].tolist() == [[0.5, -0.25, 2.0]]
     assert found[1].tolist() == [[255, 128, 0]]
 

@@ -77,7 +77,6 @@ def painted(view: View, where: np.ndarray, color: Sequence[float]) -> View:
 
 def overlap(view: View, row: int) -> float:
     """Intersection over union of the mask and the truth."""
-    assert view.mask is not None
     found, true = view.mask.numpy() > 127, seen(row)[0]
     return float((found & true).sum() / (found | true).sum())
 
@@ -208,7 +207,6 @@ def test_few_views_and_masks_without_background_are_refused() -> None:
 
 def test_the_hull_of_true_outlines_holds_the_ring_and_not_its_hole() -> None:
     hull = carve([seen(row)[0] for row in range(len(cameras()))], cameras())
-    assert hull is not None
     occupied, centers = hull.occupied(missing=0), hull.grid.centers(np.indices(hull.grid.shape).transpose(1, 2, 3, 0))
     inside = centers[occupied]
     assert np.abs(inside.max(axis=0)[:2] - (RING + TUBE)).max() < 2 * hull.grid.spacing
@@ -256,7 +254,6 @@ def test_what_is_bright_in_all_views_fills_the_bounding_box(dino: tuple[View, ..
     """The shape that the photographs agree on ends where the box does: no axis is turned, no length is scaled."""
     masks = [view.image.numpy().max(axis=2) > 40 for view in dino]
     hull = carve(masks, [view.camera for view in dino])
-    assert hull is not None
     inside = hull.grid.centers(np.argwhere(hull.occupied(missing=2)))
     # Millimetres: shadows cost some, a cube is 1 mm, and a pixel 0.4 mm.
     assert np.abs(inside.min(axis=0) - LOW).max() < 4e-3
@@ -269,7 +266,6 @@ def test_the_foreground_is_the_dinosaur(dino: tuple[View, ...]) -> None:
     assert [view.name for view in views] == [view.name for view in dino[::2]]
     shares, dark = [], []
     for view in views:
-        assert view.mask is not None
         mask, level = view.mask.numpy() > 127, view.image.numpy().max(axis=2)
         # Whatever is as bright as the ceramic's lit half is ceramic.
         assert mask[level > 90].mean() > 0.995, view.name

@@ -55,7 +55,6 @@ def test_alpha_is_the_mask_and_lays_the_object_before_black(tmp_path: Path) -> N
     alpha = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
     alpha[:, 10:20], alpha[:, 20] = 255, 51
     views = read_views(folder_of(tmp_path, np.dstack([RAMP, alpha])))
-    assert views[0].mask is not None
     assert np.array_equal(views[0].mask.numpy(), alpha)
     image = views[0].image.numpy()
     assert np.array_equal(image[:, 10:20], RAMP[:, 10:20])
@@ -93,7 +92,6 @@ def test_a_mask_of_another_size_is_scaled_or_refused(tmp_path: Path) -> None:
     write_image(folder / "masks" / "b.png", mask)
     with warns(CaptureWarning, name="mask sizes", value=["b.png (80 x 60 for 40 x 30)"]):
         views = read_views(folder)
-    assert views[1].mask is not None
     assert (views[1].mask.numpy() == np.where(np.arange(WIDTH) < 7, 255, 0)).all()
     write_image(folder / "masks" / "b.png", mask[:HEIGHT])
     with raises(CaptureError, file="masks/b.png", name="mask", value=[80, 30]):

@@ -125,7 +125,6 @@ def test_masks_by_name_and_by_path(tmp_path: Path) -> None:
         write_image(tmp_path / place, mask)
     views = read_views(write_transforms(tmp_path, rows))
     for column, view in enumerate(views[:3], start=1):
-        assert view.mask is not None
         assert view.mask.sum(dim=0).nonzero().flatten().tolist() == [column]
     assert views[3].mask is None
 
@@ -136,7 +135,6 @@ def test_points_that_the_file_names(tmp_path: Path) -> None:
     header += "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
     (tmp_path / "sparse.ply").write_text(header + "1 2 3 255 0 7\n-1 0 0.5 1 2 3\n")
     found = read_sparse_points(tmp_path, meters=0.1)
-    assert found is not None
     points, colors = found
     assert torch.allclose(points, torch.tensor([[0.1, 0.2, 0.3], [-0.1, 0.0, 0.05]], dtype=torch.float64))
     assert colors.tolist() == [[255, 0, 7], [1, 2, 3]]

@@ -10,7 +10,7 @@ import avmsf
 from avmsf.capture import Capture, CaptureSettings
 from avmsf.cli.options.fit import Options as FitOptions
 from avmsf.cli.options.modes import Options as ModesOptions
-from avmsf.errors import FitError
+from avmsf.errors import FitError, SceneError
 from avmsf.field.config import FitConfig
 from avmsf.field.store import load
 from avmsf.gaussians.config import SplatConfig
@@ -98,6 +98,15 @@ def test_the_table_of_the_docs_selects_the_preset_but_for_what_the_paper_leaves_
 def test_a_preset_that_there_is_not_is_refused() -> None:
     with pytest.raises(SystemExit):
         FitOptions.parse(["mug", "--preset", "quick"])
+
+
+@pytest.mark.parametrize(
+    ("config", "name", "value"),
+    [(ViewsConfig, "count", -1), (LiftConfig, "reach", -1.0), (LiftConfig, "feature_size", 0.0)],
+)
+def test_settings_out_of_range_are_refused(config: type, name: str, value: float) -> None:
+    with raises(SceneError, name=name, value=value):
+        config(**{name: value})
 
 
 def test_a_capture_with_another_start_of_sounds_than_the_presets_is_refused() -> None:

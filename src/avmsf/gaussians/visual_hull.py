@@ -81,8 +81,8 @@ def _carve(views: Sequence[View], grid: Grid, wrong_fraction: float) -> Bool[np.
         if grown >= 1.0:
             mask = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5) <= grown
         masks.append(mask)
-    seen, inside = count_votes(masks, [view.camera for view in views], grid)
-    agreed = seen - inside <= wrong_fraction * seen
+    votes = count_votes(masks, [view.camera for view in views], grid)
+    seen, agreed = votes.seen, votes.seen - votes.inside <= wrong_fraction * votes.seen
     counts = seen[agreed & (seen > 0)]
     enough = 0.5 * float(np.quantile(counts, 0.9)) if len(counts) else 1.0
     return agreed & (seen >= max(1.0, enough))

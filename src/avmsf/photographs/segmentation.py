@@ -5,7 +5,7 @@ The background's color may change smoothly over an image.
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import cv2
@@ -20,23 +20,25 @@ from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.visual_hull import carve, silhouette
 
 MIN_VIEWS = 3
-# Parts of a first mask smaller than this against its largest are taken for spots in the background.
-MIN_PART = 0.01
-# Views that may miss a place of the object, of all views: for filling shadows, and for what may be object at all.
-MAX_MISSING_LIKELY, MAX_MISSING_POSSIBLE = 0.03, 0.15
+Mask = Bool[np.ndarray, "height width"]
 ROUNDS = 2
-# Of all images' borders, what may differ from the background: cloth's folds, and an object that leaves the image.
+"""Times that masks are made to agree with the hull of the masks before."""
+MIN_PART_RATIO = 0.01
+"""Area of a part of a first mask over its largest, below which it is a spot in the background."""
+MAX_MISSING_LIKELY, MAX_MISSING_POSSIBLE = 0.03, 0.15
+"""Views that may miss a place of the object, of all: where shadows are filled, and where there may be object at all."""
 MAX_BORDER_DIFFERENCE = 0.3
-# Levels of 255 that no plain background differs from itself, whatever the cut.
+"""Part of all images' borders that may differ from the background: folds of cloth, an object that leaves the image."""
 MAX_BACKGROUND_DIFFERENCE = 64
-# Of the first masks' pixels, what the hull must explain: less, and cameras or masks are wrong.
+"""Levels of 255 beyond which no plain background differs from itself, whatever the threshold."""
 MIN_EXPLAINED = 0.7
-# Pixels over which a lens blurs an object's edge, to be given back to the background.
+"""Part of the first masks' pixels that the hull must explain: with less, cameras or masks are wrong."""
 BLUR_PIXELS = 2
-# Levels of 255 that even a perfectly plain background is allowed: sensor noise and JPEG blocks.
+"""Pixels over which a lens blurs an object's edge, to be given back to the background."""
 MIN_NOISE = 4.0
-# The share of an image's shorter side that counts as its border.
-BORDER = 0.02
+"""Levels of 255 that even a perfectly plain background is allowed: sensor noise and JPEG blocks."""
+BORDER_RATIO = 0.02
+"""Width of an image's border over its shorter side."""
 
 
 def find_foreground(views: Sequence[View]) -> tuple[View, ...]:
@@ -53,9 +55,8 @@ def find_foreground(views: Sequence[View]) -> tuple[View, ...]:
     shape. Raises CaptureError for fewer than three views and where no plain background is found.
     """
     if len(views) < MIN_VIEWS:
-        raise CaptureError.expected(
-            f"at least {MIN_VIEWS} views", len(views), name="views", advice="photograph more sides"
-        )
+        wanted, advice = f"at least {MIN_VIEWS} views", "photograph more sides"
+        raise CaptureError.expected(wanted, len(views), name="views", advice=advice)
     bare = [index for index, view in enumerate(views) if view.mask is None]
     if not bare:
         return tuple(views)
@@ -66,7 +67,7 @@ def find_foreground(views: Sequence[View]) -> tuple[View, ...]:
     different = [distances[index] > min(cut, MAX_BACKGROUND_DIFFERENCE) for index in bare]
     _check_plain(different, [views[index].name for index in bare])
     masks = [
-        _large_parts(distances[index] > cut) if view.mask is None else view.mask.numpy() > 127
+        view.foreground if view.mask is not None else _large_parts(distances[index] > cut)
         for index, view in enumerate(views)
     ]
     _refuse_few(masks)
@@ -74,14 +75,11 @@ def find_foreground(views: Sequence[View]) -> tuple[View, ...]:
     for _ in range(ROUNDS):
         outlines = _outlines(masks, cameras)
         if outlines is None:
-            message = (
-                "the first masks of the views have no common shape; each mask uses only its own image; check the masks "
-                "and the cameras"
-            )
-            warnings.warn(CaptureWarning(message, name="masks"), stacklevel=2)
+            message = "the first masks of the views have no common shape; each mask uses only its own image"
+            warnings.warn(CaptureWarning(f"{message}; check the masks and the cameras", name="masks"), stacklevel=2)
             break
         for index in bare:
-            masks[index] = _agreed(distances[index], cut, outlines[index])
+            masks[index] = _agreed(distances[index], cut, *outlines[index])
     for index in bare:
         masks[index] = _trimmed(masks[index], distances[index])
     _refuse_few(masks)
@@ -96,28 +94,20 @@ def find_foreground(views: Sequence[View]) -> tuple[View, ...]:
     )
 
 
-def _large_parts(mask: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+def _large_parts(mask: Mask) -> Mask:
     """Return the mask without parts that are small beside its largest."""
     count, labels, statistics, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     areas = statistics[:, cv2.CC_STAT_AREA].copy()
     areas[0] = 0
-    return (areas >= MIN_PART * areas.max())[labels] & mask if count > 1 else mask
+    return (areas >= MIN_PART_RATIO * areas.max())[labels] & mask if count > 1 else mask
 
 
-@dataclass(frozen=True, eq=False)
-class _Outline:
-    """What the hull says of one view."""
+def _outlines(masks: Sequence[Mask], cameras: Sequence[Camera]) -> list[tuple[Mask, Mask, Mask]] | None:
+    """Return three outlines of the masks' hull in each view; None where the masks do not fit one shape.
 
-    likely: Bool[np.ndarray, "height width"]
-    """Nearly all views show object here."""
-    possible: Bool[np.ndarray, "height width"]
-    """Most do; as large as the hull's coarseness may hide."""
-    near: Bool[np.ndarray, "height width"]
-    """Likely, and as far around it as the hull is coarse."""
-
-
-def _outlines(masks: Sequence[Bool[np.ndarray, "height width"]], cameras: Sequence[Camera]) -> list[_Outline] | None:
-    """Return each view's outline of the masks' hull; None where the masks do not fit one shape."""
+    In the first nearly all views show object; the second is larger by as much as the hull is coarse; in the third most
+    views show object, and it is larger likewise.
+    """
     hull = carve(masks, cameras)
     if hull is None:
         return None
@@ -127,35 +117,28 @@ def _outlines(masks: Sequence[Bool[np.ndarray, "height width"]], cameras: Sequen
     few, many = (hull.grid.centers(np.argwhere(each)) for each in (few, many))
     outlines, explained = [], 0
     for mask, camera in zip(masks, cameras, strict=True):
-        likely, cube = silhouette(few, hull.grid.spacing, camera)
-        possible, _ = silhouette(many, hull.grid.spacing, camera)
-        near, possible = _grown(likely, cube), _grown(possible, cube)
+        likely, cell = silhouette(few, hull.grid.spacing, camera)
+        possible = _grown(silhouette(many, hull.grid.spacing, camera)[0], cell)
         explained += int((mask & possible).sum())
-        outlines.append(_Outline(likely, possible, near))
+        outlines.append((likely, _grown(likely, cell), possible))
     return outlines if explained >= MIN_EXPLAINED * sum(int(mask.sum()) for mask in masks) else None
 
 
-def _agreed(
-    distance: UInt8[np.ndarray, "height width"], cut: int, outline: _Outline
-) -> Bool[np.ndarray, "height width"]:
+def _agreed(distance: UInt8[np.ndarray, "height width"], cut: int, likely: Mask, near: Mask, possible: Mask) -> Mask:
     """Return a view's mask from its own colors and the hull."""
     # The farther a pixel's color from the background's, the fewer views need to agree: a fold in the background is
     # hardly brighter than the rest of it, and a shadow on the object hardly darker than the cut.
-    mask = (distance > 2 * cut) & outline.possible
-    mask |= (distance > cut) & outline.near
-    mask |= (distance > cut / 2) & outline.likely
+    mask = ((distance > 2 * cut) & possible) | ((distance > cut) & near) | ((distance > cut / 2) & likely)
     holes = ndimage.binary_fill_holes(mask) & ~mask
     count, labels = cv2.connectedComponents(holes.astype(np.uint8), connectivity=4)
     if count > 1:
         total = np.bincount(labels.ravel(), minlength=count)
-        supported = np.bincount(labels.ravel(), weights=outline.likely.ravel(), minlength=count)
+        supported = np.bincount(labels.ravel(), weights=likely.ravel(), minlength=count)
         mask |= (supported >= 0.8 * total)[labels] & holes
     return cv2.medianBlur(mask.astype(np.uint8), 3) > 0
 
 
-def _trimmed(
-    mask: Bool[np.ndarray, "height width"], distance: UInt8[np.ndarray, "height width"]
-) -> Bool[np.ndarray, "height width"]:
+def _trimmed(mask: Mask, distance: UInt8[np.ndarray, "height width"]) -> Mask:
     """Return the mask without the blur at its edge: pixels less than half as far from the background as next to them.
 
     The cut is low, for the sake of shadows, and would leave a rim of mixed colors around all that is bright.
@@ -166,7 +149,7 @@ def _trimmed(
     return cv2.medianBlur(trimmed.astype(np.uint8), 3) > 0
 
 
-def _grown(mask: Bool[np.ndarray, "height width"], pixels: float) -> Bool[np.ndarray, "height width"]:
+def _grown(mask: Mask, pixels: float) -> Mask:
     return cv2.dilate(mask.astype(np.uint8), _disc(max(1, round(pixels)))) > 0
 
 
@@ -174,7 +157,7 @@ def _disc(radius: int) -> np.ndarray:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
 
 
-def _check_plain(different: Sequence[Bool[np.ndarray, "height width"]], names: Sequence[str]) -> None:
+def _check_plain(different: Sequence[Mask], names: Sequence[str]) -> None:
     """Raise CaptureError where much of the images' borders is no background."""
     borders = [np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]) for mask in different]
     share = float(np.concatenate(borders).mean())
@@ -184,7 +167,7 @@ def _check_plain(different: Sequence[Bool[np.ndarray, "height width"]], names: S
         raise CaptureError.expected("a plain background", share, got=got, name="background", advice=advice)
 
 
-def _refuse_few(masks: Sequence[Bool[np.ndarray, "height width"]]) -> None:
+def _refuse_few(masks: Sequence[Mask]) -> None:
     found = sum(bool(mask.any()) for mask in masks)
     if found < MIN_VIEWS:
         wanted = f"an object in front of a plain background in at least {MIN_VIEWS} views"
@@ -210,7 +193,7 @@ def _background_threshold(distances: Sequence[UInt8[np.ndarray, "height width"]]
 
 def _border(image: np.ndarray) -> np.ndarray:
     """Return the pixels along the image's edges."""
-    wide = max(1, round(BORDER * min(image.shape[:2])))
+    wide = max(1, round(BORDER_RATIO * min(image.shape[:2])))
     strips = (image[:wide], image[-wide:], image[wide:-wide, :wide], image[wide:-wide, -wide:])
     return np.concatenate([strip.reshape(-1, image.shape[2]) for strip in strips])
 

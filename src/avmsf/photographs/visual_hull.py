@@ -9,7 +9,7 @@ from typing import no_type_check
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, Int64, Real, Shaped, UInt16
+from jaxtyping import Bool, Float64, Int64, Real, Shaped, UInt16
 
 from avmsf._utils.compiled import compiled, lane_count, run_lanes
 from avmsf.errors import CaptureWarning, SceneError
@@ -49,6 +49,13 @@ class Grid:
         counts = np.ceil(extent / spacing).astype(int) + 2 * margin + 1
         middle = (low + high) / 2
         return cls(middle - spacing * (counts - 1) / 2, spacing, (int(counts[0]), int(counts[1]), int(counts[2])))
+
+    @classmethod
+    def filling(cls, low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"], *, cells: int) -> "Grid":
+        """Return a grid of about so many cells in all, which fill a box."""
+        edge = float(np.prod(high - low) / cells) ** (1 / 3)
+        x, y, z = np.maximum(1, np.ceil((high - low) / edge)).astype(int).tolist()
+        return cls(low + edge / 2, edge, (x, y, z))
 
     def centers(self, rows: Real[np.ndarray, "*cells 3"]) -> Float64[np.ndarray, "*cells 3"]:
         """Return the middles of cells given by their indices, meters."""
@@ -121,10 +128,27 @@ def _sample(lane, lanes, projection, image, linear, lowest, spacing, shape, cell
         values[cell] = (1 - b) * upper + b * lower
 
 
-def count_votes(
-    masks: Sequence[Bool[np.ndarray, "_ _"]], cameras: Sequence[Camera], grid: Grid
-) -> tuple[UInt16[np.ndarray, "x y z"], UInt16[np.ndarray, "x y z"]]:
-    """Return how many views have the middle of each cell in their image, and how many of these show object there."""
+@dataclass(frozen=True, eq=False)
+class Votes:
+    """What the masks of views say of each cell of a grid."""
+
+    grid: Grid
+    seen: UInt16[np.ndarray, "x y z"]
+    """How many views have the cell's middle in their image."""
+    inside: UInt16[np.ndarray, "x y z"]
+    """How many of these show object there."""
+    views: int
+    """How many views voted."""
+
+    def occupied(self, *, missing: int) -> Bool[np.ndarray, "x y z"]:
+        """Return which cells are object, where up to `missing` views, of as many as voted, may say otherwise."""
+        allowed = np.floor(missing * self.seen.astype(np.float64) / self.views)
+        enough = self.seen >= max(2.0, MIN_VIEW_RATIO * self.views)
+        return enough & (self.inside >= self.seen - allowed)
+
+
+def count_votes(masks: Sequence[Bool[np.ndarray, "_ _"]], cameras: Sequence[Camera], grid: Grid) -> Votes:
+    """Return the votes of masks on the cells of a grid."""
     seen, inside = np.zeros((2, math.prod(grid.shape)), dtype=np.uint16)
 
     def count(part: slice, _: int, values: np.ndarray, __: np.ndarray) -> None:
@@ -132,54 +156,21 @@ def count_votes(
         inside[part] += values > 0
 
     project_votes(grid, np.arange(len(seen)), cameras, masks, count)
-    return seen.reshape(grid.shape), inside.reshape(grid.shape)
+    return Votes(grid, seen.reshape(grid.shape), inside.reshape(grid.shape), len(masks))
 
 
-@dataclass(frozen=True, eq=False)
-class Hull:
-    """Cells around an object with the votes of the views on each."""
-
-    grid: Grid
-    seeing: UInt16[np.ndarray, "x y z"]
-    """How many views have the cell inside their image."""
-    agreeing: UInt16[np.ndarray, "x y z"]
-    """How many of these show object there."""
-    views: int
-    """How many views voted."""
-
-    def occupied(self, *, missing: int) -> Bool[np.ndarray, "x y z"]:
-        """Return which cells are object, where up to `missing` views, of as many as voted, may say otherwise."""
-        allowed = np.floor(missing * self.seeing.astype(np.float64) / self.views)
-        enough = self.seeing >= max(2.0, MIN_VIEW_RATIO * self.views)
-        return enough & (self.agreeing >= self.seeing - allowed)
-
-
-def carve(masks: Sequence[Bool[np.ndarray, "height width"]], cameras: Sequence[Camera]) -> Hull | None:
-    """Return the hull of the masks; None where they and their cameras agree on no place at all."""
+def carve(masks: Sequence[Bool[np.ndarray, "_ _"]], cameras: Sequence[Camera]) -> Votes | None:
+    """Return the votes of masks around their hull; None where they and their cameras agree on no place at all."""
     bounds = _bounds(masks, cameras)
     if bounds is None:
         return None
-    coarse = _hull(*bounds, COARSE_CELLS, masks, cameras)
+    coarse = count_votes(masks, cameras, Grid.filling(*bounds, cells=COARSE_CELLS))
     inside = coarse.occupied(missing=len(masks) // 6)
     if not inside.any():
         return None
     low, high = coarse.grid.box(inside)
     margin = 1.5 * coarse.grid.spacing
-    return _hull(low - margin, high + margin, FINE_CELLS, masks, cameras)
-
-
-def _hull(
-    low: Float[np.ndarray, " 3"],
-    high: Float[np.ndarray, " 3"],
-    count: int,
-    masks: Sequence[Bool[np.ndarray, "height width"]],
-    cameras: Sequence[Camera],
-) -> Hull:
-    """Return the votes on about `count` cells that fill a box."""
-    edge = float(np.prod(high - low) / count) ** (1 / 3)
-    x, y, z = np.maximum(1, np.ceil((high - low) / edge)).astype(int).tolist()
-    grid = Grid(low + edge / 2, edge, (x, y, z))
-    return Hull(grid, *count_votes(masks, cameras, grid), len(masks))
+    return count_votes(masks, cameras, Grid.filling(low - margin, high + margin, cells=FINE_CELLS))
 
 
 def silhouette(
@@ -208,8 +199,8 @@ def silhouette(
 
 
 def _bounds(
-    masks: Sequence[Bool[np.ndarray, "height width"]], cameras: Sequence[Camera]
-) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]] | None:
+    masks: Sequence[Bool[np.ndarray, "_ _"]], cameras: Sequence[Camera]
+) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]] | None:
     """Return the corners of a box that holds the object: the middles of the masks looked at from all sides."""
     directions, positions, angles = [], [], []
     for mask, camera in zip(masks, cameras, strict=True):
@@ -222,14 +213,12 @@ def _bounds(
         directions.append(ray / np.linalg.norm(ray))
         positions.append(camera.position.numpy())
         angles.append(float(np.hypot(across - across.mean(), down - down.mean()).max()))
-    if len(directions) < 2:
-        return None
-    places = np.array(positions)
-    center = nearest_to_lines(places, np.array(directions))
+    starts = np.array(positions)
+    center = nearest_to_lines(starts, np.array(directions)) if len(starts) > 1 else None
     if center is None:
         return None
     # The median, for a mask that leaked into the background is far too large.
-    radius = 1.25 * float(np.median(np.array(angles) * np.linalg.norm(places - center, axis=1)))
+    radius = 1.25 * float(np.median(np.array(angles) * np.linalg.norm(starts - center, axis=1)))
     return center - radius, center + radius
 
 

@@ -21,7 +21,7 @@ from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.folder import check_cameras
 from avmsf.photographs.mesh_views import MeshTracer
-from avmsf.photographs.visual_hull import Hull, carve
+from avmsf.photographs.visual_hull import Votes, carve
 
 MAX_VIEWS = 12
 """Views that are compared, as far apart as they stand."""
@@ -183,7 +183,7 @@ def expect_on_object(
         warnings.warn(CaptureWarning(words, name="contacts", value=distance), stacklevel=2)
 
 
-def _hull(views: Sequence[View]) -> Hull | None:
+def _hull(views: Sequence[View]) -> Votes | None:
     return carve([view.foreground for view in views], [view.camera for view in views])
 
 
@@ -200,7 +200,7 @@ def _conventions(views: Sequence[View]) -> Iterator[tuple[str, list[View]]]:
         yield words, [replace(view, camera=camera) for view, camera in zip(views, cameras, strict=True)]
 
 
-def _surface_of(hull: Hull) -> Float[Tensor, "places 3"]:
+def _surface_of(hull: Votes) -> Float[Tensor, "places 3"]:
     """Return the middles of the outermost cubes that are object, float64."""
     occupied = np.pad(hull.occupied(missing=hull.views // 6), 1)
     edge = occupied & ~ndimage.binary_erosion(occupied)

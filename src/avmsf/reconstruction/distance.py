@@ -1,11 +1,13 @@
-"""Distances on a grid from the surface where values change sign, accurate within a cell."""
+"""Distances from surfaces: on a grid, from where its values change sign, within a cell; and from a convex hull."""
 
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Float64
+from scipy.spatial import ConvexHull, QhullError
 
-from avmsf._utils.compiled import compiled
+from avmsf._utils.compiled import compiled, lane_count, run_lanes
+from avmsf.errors import SceneError
 
 _DISC = 0.7
 """Radius, in cells, of the piece of its tangent plane that stands for the surface around a place next to a cell."""
@@ -108,3 +110,34 @@ def _sweep(nearest, distance):
                             distance[i, j, k] = best
                             for value in range(6):
                                 nearest[i, j, k, value] = nearest[a, b, c, value]
+
+
+def depth_in_convex_hull(
+    points: Float64[np.ndarray, "points 3"], positions: Float64[np.ndarray, "positions 3"]
+) -> Float32[np.ndarray, " positions"]:
+    """Return how far inside the convex hull of points positions lie, meters, negative outside.
+
+    Raises SceneError for points in one plane.
+    """
+    try:
+        planes = ConvexHull(points).equations
+    except QhullError as error:
+        got = f"{len(points)} in one plane"
+        raise SceneError.expected("points that span a volume", len(points), got=got, name="points") from error
+    # Triangles of one flat face share their plane.
+    planes = np.unique(np.round(planes, 6), axis=0)
+    result = np.full(len(positions), np.inf, dtype=np.float32)
+    run_lanes(_depth_below_planes, lane_count(), planes, positions, result)
+    return result
+
+
+@compiled(error_model="numpy")
+@no_type_check
+def _depth_below_planes(lane, lanes, planes, positions, result):
+    count = len(positions)
+    for row in range(lane * count // lanes, (lane + 1) * count // lanes):
+        x, y, z = positions[row]
+        least = np.inf
+        for plane in range(len(planes)):
+            least = min(least, -(planes[plane, 0] * x + planes[plane, 1] * y + planes[plane, 2] * z + planes[plane, 3]))
+        result[row] = least

@@ -9,14 +9,14 @@ from scipy import ndimage
 from torch import Tensor
 
 from avmsf.errors import SceneError
-from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import Camera, View
-from avmsf.photographs.mesh_views import MeshTracer
 from avmsf.photographs.visual_hull import Grid, masked_views, no_common_point, object_extent, touches_edge
+from avmsf.reconstruction.depth_fusion import free_space
+from avmsf.reconstruction.distance import depth_in_convex_hull
 from avmsf.reconstruction.fairing import fair_hull
 from avmsf.reconstruction.mask_consistency import WRONG_FRACTION, consistent_masks, edge_offset
 from avmsf.reconstruction.object_shape import ObjectShape, ShapeReport, closed_surface
-from avmsf.reconstruction.visual_hull import Outline, SeenDepth, depth_in_convex_hull, fused_depth, hull_distance
+from avmsf.reconstruction.visual_hull import Outline, hull_distance
 
 DepthMap = Callable[[Camera], Float[Tensor, "height width"]]
 """What gives the depth of the first surface that each pixel of a camera sees, meters along the axis; 0 where none."""
@@ -27,14 +27,8 @@ _MAX_REFINEMENT = 4.0
 """Times as many cells along the longest side of a slender object, at most."""
 _MARGIN = 4
 """Cells of free room around the hull."""
-_BAND = 0.015
-"""How far behind a view's depth places are still seen, over the diagonal: depth of Gaussians scatters so much."""
-_QUANTILE = 0.35
-"""Of the distances before the surface: two thirds of the views must see a place free."""
 _DEPTH_TOLERANCE = 0.005
 """How far depth must lie behind the hull to be believed, over the diagonal: its mean over views is so exact."""
-_MIN_VIEW_FRACTION = 0.04
-"""Part of the views that must see a place for its depth to count, but three views at least."""
 _CLOSING_FACES = 4000
 """Triangles of the surface whose convex hull closes what no view sees."""
 _NARROW = 2
@@ -77,9 +71,11 @@ def object_surface(views: Sequence[View], depth_map: DepthMap, *, cells: int = 1
     low, high = _box(hull > 0, grid, len(kept))
     diagonal = float(np.linalg.norm(high - low))
     hull, untouched = fair_hull(hull, outlines, grid, diagonal)
-    depths = [SeenDepth.of(view, depth_map(view.camera).detach().cpu().float().numpy()) for view in kept]
-    bias = _bias(hull, grid, depths, diagonal)
-    free, view_counts = _free(hull, grid, depths, bias, diagonal)
+    cameras = [view.camera for view in kept]
+    maps = (depth_map(camera).detach().cpu().float().numpy() for camera in cameras)
+    # At the outline a pixel's depth is the background's in part.
+    depths = [np.where(view.foreground, depth, np.float32(0.0)) for view, depth in zip(kept, maps, strict=True)]
+    free, view_counts = free_space(depths, cameras, hull, grid, diagonal)
     seen = np.minimum(hull, _DEPTH_TOLERANCE * diagonal - free)
     seen, bound, unseen = _closed(hull, seen, view_counts, grid)
     hollow = _hollows(bound, seen, grid, diagonal)
@@ -131,40 +127,6 @@ def _box(
     if not inside.any():
         raise no_common_point(views)
     return grid.box(inside)
-
-
-def _bias(hull: Float32[np.ndarray, "x y z"], grid: Grid, depths: Sequence[SeenDepth], diagonal: float) -> float:
-    """Return by how much depth lies behind the hull where it does so most often, meters.
-
-    Most of a surface touches its hull; the depth of cavities lies behind it by lengths of all kinds.
-    """
-    tracer = MeshTracer(TexturedMesh.plain(closed_surface(hull, grid, 40_000)))
-    behind = []
-    for each in depths[:: max(1, len(depths) // 24)]:
-        front = tracer.depth(each.camera).numpy()
-        both = np.isfinite(front) & (each.depth > 0)
-        behind.append((each.depth - front)[both])
-    found = np.sort(np.concatenate(behind))
-    found = found[np.abs(found) < 0.05 * diagonal]
-    if len(found) < 100:
-        return 0.0
-    # The half that is closest together, again and again (half-sample mode).
-    while len(found) > 100:
-        half = len(found) // 2
-        start = int((found[half:] - found[:-half]).argmin())
-        found = found[start : start + half + 1]
-    return float(np.median(found))
-
-
-def _free(
-    hull: Float32[np.ndarray, "x y z"], grid: Grid, depths: Sequence[SeenDepth], bias: float, diagonal: float
-) -> tuple[Float32[np.ndarray, "x y z"], Float32[np.ndarray, "x y z"]]:
-    """Return how far each cell lies before the surface that views see, meters, and how many see the cell."""
-    known = [each.moved(-bias) for each in depths]
-    least = max(3.0, _MIN_VIEW_FRACTION * len(depths))
-    band = _BAND * diagonal
-    free, view_counts = fused_depth(known, grid, hull > -2 * grid.spacing, band=band, quantile=_QUANTILE, least=least)
-    return ndimage.gaussian_filter(free, 1.0), view_counts
 
 
 def _unobserved_cavities(seen: Float32[np.ndarray, "x y z"], untouched: Bool[np.ndarray, "x y z"]) -> np.ndarray:
