@@ -232,6 +232,17 @@ def test_a_table_of_the_users_own_keeps_unit_columns_order_and_comments(tmp_path
     assert (folder / "impacts.csv").read_bytes().decode() == text
 
 
+def test_lines_that_are_not_changed_stay_to_the_last_byte(tmp_path: Path) -> None:
+    header, rows = "file, x,y,z,note\n", ["a.wav,0, 0,0,\n", '\nb.wav,0,0,20,"two\nlines"\n', "c.wav,30,0,0,  plain"]
+    folder = fill(tmp_path / "filled")
+    (folder / "impacts.csv").write_text(header + "".join(rows))
+    editor = CaptureEditor(folder)
+    editor.add(blow(3), read_contact({"x": "1", "y": "2", "z": "3"}))
+    assert (folder / "impacts.csv").read_text() == header + "".join(rows) + "\n001.wav,1.0,2.0,3.0,\n"
+    editor.remove("b.wav")
+    assert (folder / "impacts.csv").read_text() == header + rows[0] + rows[2] + "\n001.wav,1.0,2.0,3.0,\n"
+
+
 def test_every_row_has_what_the_table_has_columns_for(tmp_path: Path) -> None:
     editor = recorded(tmp_path, 1)
     with raises(RequestError, file=tmp_path / "impacts.csv", name="direction"):

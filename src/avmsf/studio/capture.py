@@ -15,7 +15,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import asdict
 from functools import lru_cache, partial
-from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -39,6 +38,7 @@ from avmsf.capture.table import (
     parse_row,
     read_cells,
     read_rows,
+    valid_rows,
 )
 from avmsf.errors import AvmsfError, CaptureError
 from avmsf.pipeline.config import CACHE
@@ -81,23 +81,21 @@ def read_upload(content: bytes) -> Recording:
 
 
 class ImpactTable:
-    """A capture's `impacts.csv` as it is now. A change keeps columns, comments, separator, unit and decimal commas."""
+    """A capture's `impacts.csv` as it is now. A change leaves all other lines to the last byte."""
 
     def __init__(self, folder: Path) -> None:
         """Read the table; a folder without one has no rows. Raises CaptureError."""
         self.path = folder / TABLE
         lines, self.separator = read_cells(self.path) if self.path.is_file() else ([], ",")
-        self.header = lines[0][1] if lines else []
-        self.cells = [cells for _, cells in lines[1:]]
-        self.rows: list[Row] = read_rows(folder)[0] if self.cells else []
+        self.names = [name.lower() for name in lines[0][1]] if lines else []
+        self.rows: list[Row] = read_rows(folder)[0] if lines[1:] else []
         missing = [name for name in REQUIRED if lines and name not in self.names]
         if missing:
             raise CaptureError.expected(f"the column {missing[0]}", file=self.path, row=1, name=missing[0])
-
-    @property
-    def names(self) -> list[str]:
-        """The columns in lower case."""
-        return [name.lower() for name in self.header]
+        self._ends = [number for number, _ in lines]
+        self._cells = [cells for _, cells in lines]
+        text = self.path.read_bytes().decode() if lines else ""
+        self._lines = list(io.StringIO(text, newline=""))
 
     def rows_of(self, file: str) -> list[int]:
         """Return the indices of the rows with this recording. Raises RequestError (404) for none."""
@@ -108,44 +106,47 @@ class ImpactTable:
         return indices
 
     def add(self, file: str, impact: Impact, settings: CaptureSettings) -> None:
-        """Append a row; a new table gets columns for the known values of the impact."""
+        """Append a row in the table's unit; a new table gets columns for the known values of the impact."""
         numbers = dict(zip(REQUIRED[1:], (value / settings.meters for value in impact.contact), strict=True))
         if impact.direction is not None:
             numbers |= dict(zip(DIRECTION, impact.direction, strict=True))
         if impact.newtons is not None:
             numbers[FORCE] = impact.newtons
-        self.header = self.header or [REQUIRED[0], *numbers]
+        header = [] if self.names else [self._line([REQUIRED[0], *numbers])]
         written = {name: repr(float(value)) for name, value in numbers.items()}
         if any("," in row.cells.get(name, "") for row in self.rows for name in (*REQUIRED[1:], *DIRECTION, FORCE)):
             written = {name: text.replace(".", ",") for name, text in written.items()}
         written[REQUIRED[0]] = file
-        self._write([*self.cells, [written.get(name, "") for name in self.names]])
+        row = self._line([written.get(name, "") for name in self.names or (REQUIRED[0], *numbers)])
+        if self._lines and not self._lines[-1].endswith(("\r", "\n")):
+            row = self._line([]) + row
+        self._write([*self._lines, *header, row])
 
     def rename(self, index: int, file: str) -> None:
         """Let a row name another recording."""
-        cells = [list(each) for each in self.cells]
-        cells[index][self.names.index(REQUIRED[0])] = file
-        self._write(cells)
+        cells = [*self._cells[index + 1]]
+        cells[self.names.index(REQUIRED[0])] = file
+        self._replace(index, [self._line(cells)])
 
     def remove(self, index: int) -> None:
         """Remove a row; the table is deleted with its last row."""
-        if len(self.cells) == 1:
+        if len(self.rows) == 1:
             self.path.unlink()
         else:
-            self._write([*self.cells[:index], *self.cells[index + 1 :]])
+            self._replace(index, [])
 
-    def _write(self, cells: Sequence[Sequence[str]]) -> None:
-        before = self.path.read_bytes().decode() if self.path.is_file() else ""
-        mark = before[: before.startswith("\ufeff")]
-        memory = io.StringIO()
-        # Comments above the header, and what names Excel's separator.
-        above = takewhile(
-            lambda line: line.startswith(("#", "sep=")), before.removeprefix(mark).splitlines(keepends=True)
-        )
-        memory.writelines(above)
-        ending = "\r\n" if "\r\n" in before else "\n"
-        csv.writer(memory, delimiter=self.separator, lineterminator=ending).writerows([self.header, *cells])
-        _write(self.path, f"{mark}{memory.getvalue()}".encode())
+    def _replace(self, index: int, lines: Sequence[str]) -> None:
+        """Write the table with these lines in place of those of a row, whose cells may have several."""
+        begin, end = self._ends[index], self._ends[index + 1]
+        self._write([*self._lines[:begin], *lines, *self._lines[end:]])
+
+    def _line(self, cells: Sequence[str]) -> str:
+        memory, ending = io.StringIO(), "\r\n" if any(line.endswith("\r\n") for line in self._lines) else "\n"
+        csv.writer(memory, delimiter=self.separator, lineterminator=ending).writerow(cells)
+        return memory.getvalue()
+
+    def _write(self, lines: Sequence[str]) -> None:
+        _write(self.path, "".join(lines).encode())
 
 
 def file_of(row: Row) -> str:
@@ -176,15 +177,10 @@ class CaptureEditor:
         return {"folder": str(self.folder), "strikes": impacts, "problems": problems, "ready": ready}
 
     def impacts(self) -> list[Impact]:
-        """Return the impacts that are valid and whose recordings exist, in the order of the table."""
-        settings = self.settings
-        found = []
-        for row in ImpactTable(self.folder).rows:
-            with suppress(AvmsfError):
-                impact = parse_row(row, settings)
-                if self._readable(impact.file).is_file():
-                    found.append(impact)
-        return found
+        """Return the impacts that are valid and whose recordings are in the folder, in the order of the table."""
+        valid = valid_rows(ImpactTable(self.folder).rows, self.settings)
+        found = ((self.folder / impact.file, impact) for impact in valid)
+        return [impact for path, impact in found if path.is_file() and path.resolve().is_relative_to(self.folder)]
 
     def check(self, content: bytes) -> dict[str, Any]:
         """Return the report on a recording, without writing it. Raises CaptureError for what cannot be used."""

@@ -44,20 +44,6 @@ MUTE = -math.inf
 
 
 @dataclass(frozen=True)
-class ModeChange:
-    """One mode by hand."""
-
-    mode: int
-    """Row in the bank of the field as it was opened, counted from 0."""
-    db: float = 0.0
-    """Change of its level, dB; MUTE for silence."""
-    pitch: float = 1.0
-    """Factor on its frequency, in addition to that of all modes."""
-    decay: float = 1.0
-    """Factor on its decay time, in addition to that of all modes."""
-
-
-@dataclass(frozen=True)
 class Sliders:
     """All sliders of the page; at rest they leave the field as it was opened."""
 
@@ -75,7 +61,9 @@ class Sliders:
     """Decibels an octave."""
     law: str = "displacement"
     """What the recordings go with; see `change_material`."""
-    modes: tuple[ModeChange, ...] = field(default=())
+    modes: Mapping[int, Mapping[str, float]] = field(default_factory=dict)
+    """By row in the bank of the field as it was opened: the change of its level, `db` or MUTE, and factors on `pitch`
+    and `decay` in addition to those of all modes."""
 
     @classmethod
     def read(cls, request: Mapping[str, Any], *, modes: int | None = None) -> "Sliders":
@@ -93,11 +81,15 @@ class Sliders:
             raise bad_request("modes", "a list", rows, advice="reload the page")
         if modes is not None and len(rows) > modes:
             raise bad_request("modes", f"at most {modes} rows, one per mode", len(rows))
-        changes = tuple(_mode(row) for row in rows)
-        numbers = [change.mode for change in changes]
-        repeated = sorted({mode for mode in numbers if numbers.count(mode) > 1})
-        if repeated:
-            raise bad_request("modes", "one row per mode", repeated, got=f"several of mode {repeated[0]}")
+        changes: dict[int, dict[str, float]] = {}
+        for row in rows:
+            _check_keys(row, ("mode", "db", "pitch", "decay"), "a mode")
+            mode = row.get("mode")
+            if not isinstance(mode, int) or isinstance(mode, bool) or not 0 <= mode < _MAX_ROW:
+                raise bad_request("mode", "an index from 0", mode, advice="reload the page")
+            if mode in changes:
+                raise bad_request("modes", "one row per mode", [mode], got=f"several of mode {mode}")
+            changes[mode] = {name: _number(row, name) for name in ("db", "pitch", "decay")}
         law = request.get("law", "displacement")
         if not isinstance(law, str) or law not in LAWS:
             raise bad_request("law", f"one of {', '.join(LAWS)}", law)
@@ -108,7 +100,8 @@ class Sliders:
         """Return what `read` makes these sliders of."""
         values = asdict(self)
         names = {"from": values.pop("old"), "to": values.pop("material")}
-        values["modes"] = [{**row, "db": None if row["db"] == MUTE else row["db"]} for row in values["modes"]]
+        rows = [{"mode": mode, **row} for mode, row in self.modes.items()]
+        values["modes"] = [{**row, "db": None if row["db"] == MUTE else row["db"]} for row in rows]
         return {"material": names if any(names.values()) else None, **values}
 
     def apply(self, ground: SoundField) -> tuple[SoundField, list[str]]:
@@ -137,12 +130,12 @@ class Sliders:
             return {"pitch": self.pitch, "decay": self.decay}
         levels = torch.zeros(count, dtype=torch.float64)
         pitch, decay = torch.full_like(levels, self.pitch), torch.full_like(levels, self.decay)
-        for row in self.modes:
-            if row.mode >= count:
-                raise EditError.expected(f"0 to {count - 1}", row.mode, name="mode", advice="reload the page")
-            levels[row.mode] += row.db
-            pitch[row.mode] *= row.pitch
-            decay[row.mode] *= row.decay
+        for mode, row in self.modes.items():
+            if mode >= count:
+                raise EditError.expected(f"0 to {count - 1}", mode, name="mode", advice="reload the page")
+            levels[mode] += row["db"]
+            pitch[mode] *= row["pitch"]
+            decay[mode] *= row["decay"]
         return {"pitch": pitch, "decay": decay, "gains_db": levels}
 
 
@@ -175,15 +168,6 @@ def text_model(given: str | None) -> str | None:
     return STABLE_AUDIO if isinstance(try_to_load_from_cache(STABLE_AUDIO, "model_index.json"), str) else None
 
 
-def _mode(row: Any) -> ModeChange:
-    _check_keys(row, ("mode", "db", "pitch", "decay"), "a mode")
-    mode = row.get("mode")
-    if not isinstance(mode, int) or isinstance(mode, bool) or not 0 <= mode < _MAX_ROW:
-        raise bad_request("mode", "an index from 0", mode, advice="reload the page")
-    mute = "db" in row and row["db"] is None
-    return ModeChange(mode, MUTE if mute else _number(row, "db"), _number(row, "pitch"), _number(row, "decay"))
-
-
 def _check_keys(values: Any, known: tuple[str, ...], what: str) -> None:
     if not isinstance(values, Mapping):
         raise bad_request(what, f"an object with {', '.join(known)}", values, advice="reload the page")
@@ -193,10 +177,10 @@ def _check_keys(values: Any, known: tuple[str, ...], what: str) -> None:
 
 
 def _number(values: Mapping[str, Any], name: str) -> float:
-    """Return a slider's value, its neutral one where none is given. Raises RequestError (400)."""
-    value = values.get(name)
+    """Return a slider's value: the neutral one where none is given; no level is MUTE. Raises RequestError (400)."""
+    value = values.get(name, _NEUTRAL[name])
     if value is None:
-        return _NEUTRAL[name]
+        return MUTE if name == "db" else _NEUTRAL[name]
     number = math.nan
     if isinstance(value, int | float) and not isinstance(value, bool):
         with suppress(OverflowError):

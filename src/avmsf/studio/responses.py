@@ -87,10 +87,5 @@ def bad_request(
     **more: Any,
 ) -> RequestError:
     """Return the response to an invalid entry, or one of a file; `got` is shown in place of its value."""
-    message = f"{file or name}: expected {wanted}, got {got or echo(value)}{advice and f'; {advice}'}"
+    message = f"{file or name}: expected {wanted}, got {got or _repr.repr(value)[:_MAX_ECHO]}{advice and f'; {advice}'}"
     return RequestError(status, message, file=file, name=name, value=value, more=more)
-
-
-def echo(value: Any) -> str:
-    """Return a value of a request as an answer may repeat it: at most 100 printable characters."""
-    return _repr.repr(value)[:_MAX_ECHO]
