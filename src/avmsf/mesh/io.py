@@ -65,7 +65,7 @@ def load_mesh(path: Path, *, raising: type[AvmsfError] = CaptureError) -> trimes
             scene = trimesh.load_scene(source, path.suffix.lower()[1:], resolver, process=False)
             _check_scene(scene)
     except AvmsfError as error:
-        raise raising(f"{path}: {error}", file=path, row=error.row, name=error.name, value=error.value) from error
+        raise raising(f"{path}: {error}", **error.attributes | {"file": path}) from error
     except Exception as error:  # trimesh's readers raise whatever their format's parsing raises
         with open(path, "rb") as file:
             commas = bool(_COMMAS.search(file.read(1 << 16)))

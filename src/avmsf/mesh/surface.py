@@ -113,15 +113,12 @@ def contacted_part(surface: Surface, contacts: Float[Tensor, "contacts 3"]) -> t
     if not len(surface.faces) or not len(contacts):
         return surface, []
     import trimesh
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
     mesh = trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=False)
     rows = np.unique(mesh.vertices[mesh.faces].reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1, 3)
     edges = np.concatenate([rows[:, [0, 1]], rows[:, [1, 2]]])
-    links = coo_array((np.ones(len(edges)), edges.T), shape=(rows.max() + 1,) * 2)
-    label = connected_components(links, directed=False)[1][rows[:, 0]]
+    label = trimesh.graph.connected_component_labels(edges, node_count=rows.max() + 1)[rows[:, 0]]
     if not label.any() or not mesh.area > 0:
         return surface, []
     points, faces = trimesh.sample.sample_surface(mesh, MOST_POINTS, seed=0)

@@ -125,7 +125,7 @@ def read_textured_mesh(path: str | Path, *, meters: float = 1.0) -> TexturedMesh
             materials=torch.from_numpy(np.repeat(np.arange(len(parts)), counts)),
         )
     except CaptureError as error:
-        raise CaptureError(f"{path}: {error}", file=path, row=error.row, name=error.name, value=error.value) from error
+        raise CaptureError(f"{path}: {error}", **error.attributes | {"file": path}) from error
     for remark in remarks:
         warnings.warn(remark.about(path), stacklevel=2)
     return mesh

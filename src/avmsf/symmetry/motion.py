@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from fractions import Fraction
 
 import numpy as np
 from jaxtyping import Float
@@ -94,14 +95,8 @@ def motion_of(linear: Float[np.ndarray, "3 3"], shift: Vector) -> Motion | None:
         return Motion(normal, (shift @ normal / 2) * normal, None)
     turn = Rotation.from_matrix(linear).as_rotvec()
     angle = float(np.linalg.norm(turn))
-    errors = [
-        (abs(angle - 2 * math.pi * step / order), order)
-        for order in range(2, MAX_ORDER + 1)
-        for step in range(1, order // 2 + 1)
-        if math.gcd(order, step) == 1
-    ]
-    error, order = min(errors)
-    if error >= math.radians(4) or abs(turn @ shift) > 0.05 * angle:
+    part = Fraction(angle / (2 * math.pi)).limit_denominator(MAX_ORDER)
+    if not part or abs(angle - 2 * math.pi * part) >= math.radians(4) or abs(turn @ shift) > 0.05 * angle:
         return None
     point = np.linalg.lstsq(np.eye(3) - linear, shift, rcond=0.05)[0]
-    return Motion(turn / angle, point, 2 * math.pi / order)
+    return Motion(turn / angle, point, 2 * math.pi / part.denominator)
