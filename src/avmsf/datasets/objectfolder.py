@@ -4,7 +4,6 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -50,17 +49,6 @@ _LISTED = re.compile(r"(?:^|/)(\d+)_(\d+)_[^/]*\.wav$")
 Point = tuple[float, float, float]
 
 
-@dataclass(frozen=True)
-class _Entry:
-    """A contact's folder that can be used."""
-
-    contact: str
-    folder: Path
-    newtons: float
-    gain_db: float | None
-    """By how much the recorder made the sound louder; None where the note is missing."""
-
-
 class ObjectFolderRaw:
     """ObjectFolder Real, unpacked from its audio archives: `<object>/audio/<contact>/mic.wav` and so on.
 
@@ -98,16 +86,16 @@ class ObjectFolderRaw:
         """Read one object's recordings, in the order of their numbers. Raises DatasetError for an unknown object, and
         where fewer than two recordings can be used; a warning names those that were left out."""
         self._check_known(identifier)
-        entries, problems = self._examine(identifier)
+        impacts, problems = self._examine(identifier)
         origin = f"{self.name}, object {identifier}"
-        refuse_few(len(entries), origin=origin, reasons=problems or [self._no_contacts])
+        refuse_few(len(impacts), origin=origin, reasons=problems or [self._no_contacts])
         source = self.visual_source(identifier)
         try:
             surface = None if source is None else find_surface(source.folder, source.settings)
         except CaptureError as error:
             raise DatasetError(f"{origin}: {error}", **error.attributes) from error
         return build_capture(
-            self._recordings(identifier, entries),
+            self._recordings(identifier, impacts),
             name=self.facts(identifier).name,
             origin=origin,
             settings=self._settings,
@@ -124,8 +112,8 @@ class ObjectFolderRaw:
         """Report which files are there and which are missing, from names and headers alone."""
         reports = []
         for identifier in self.objects():
-            entries, problems = self._examine(identifier)
-            reports.append(ObjectReport(self.facts(identifier), len(entries), tuple(problems)))
+            impacts, problems = self._examine(identifier)
+            reports.append(ObjectReport(self.facts(identifier), len(impacts), tuple(problems)))
         missing, remarks = self._missing_archives(), shared_remarks(self.objects(), "RealImpact")
         if not mesh_folders(self.folder):
             mesh = f"meshes, the only visual input: unpack {DOWNLOAD}/mesh/mesh_16k.tar.gz in {self.folder}"
@@ -162,9 +150,10 @@ class ObjectFolderRaw:
         if identifier not in self._folders:
             refuse_unknown(identifier, self._folders, self.name)
 
-    def _examine(self, identifier: str) -> tuple[list[_Entry], list[str]]:
-        """Return the usable recordings, and a message for each problem or assumption."""
-        entries, problems, unknown_gains = [], [], []
+    def _examine(self, identifier: str) -> tuple[list[Impact], list[str]]:
+        """Return the usable recordings' impacts, and a message for each problem or assumption."""
+        found: list[tuple[str, float, float | None]] = []
+        problems = []
         folders = self._folders[identifier]
         for folder in (folders / name for name in in_order(path.name for path in folders.iterdir())):
             contact = folder.name
@@ -174,23 +163,31 @@ class ObjectFolderRaw:
                 problems.append(f"audio/{contact}: expected a contact's number as name; it is left out")
                 continue
             wrong, newtons, gain_db = self._check_folder(identifier, contact, folder)
-            if wrong:
-                problems += wrong
-                continue
-            if gain_db is None:
-                unknown_gains.append(contact)
-            entries.append(_Entry(contact, folder, newtons, gain_db))
-        if unknown_gains:
-            assumed = _usual_gain(entries)
-            taken = "0 dB" if assumed is None else f"{assumed:g} dB, the most frequent of the object's recordings"
+            problems += wrong
+            if not wrong:
+                found.append((contact, newtons, gain_db))
+        gains = Counter(gain_db for _, _, gain_db in found if gain_db is not None)
+        usual = gains.most_common(1)[0][0] if gains else 0.0
+        unknown = [contact for contact, _, gain_db in found if gain_db is None]
+        if unknown:
+            taken = f"{usual:g} dB, the most frequent of the object's recordings" if gains else "0 dB"
             problems.append(
-                f"metadata.yaml is missing for contact {', '.join(unknown_gains)}: the recorder's gain is assumed to "
-                f"be {taken}"
+                f"metadata.yaml is missing for contact {', '.join(unknown)}: the recorder's gain is assumed to be "
+                f"{taken}"
             )
-        return entries, problems
+        impacts = [
+            Impact(
+                f"{contact}.wav",
+                self._contacts[identifier, contact],
+                newtons=newtons,
+                gain_db=usual if gain_db is None else gain_db,
+            )
+            for contact, newtons, gain_db in found
+        ]
+        return impacts, problems
 
     def _check_folder(self, identifier: str, contact: str, folder: Path) -> tuple[list[str], float, float | None]:
-        """Return why a contact's recording cannot be used, a message for each reason; its force and its gain."""
+        """Return why a contact's recording cannot be used, a message for each reason; its force, N, and gain, dB."""
         shown = f"{identifier}/audio/{contact}"
         found = [
             check_wav(folder / name, shown=f"{shown}/{name}", rate=SAMPLE_RATE_HZ, frames=FRAMES)
@@ -208,19 +205,13 @@ class ObjectFolderRaw:
             wrong.append(f"{shown}: expected contact coordinates{files and f' in {files}'}, got none")
         return wrong, newtons, gain_db
 
-    def _recordings(self, identifier: str, entries: list[_Entry]) -> Iterator[tuple[Impact, Recording]]:
-        usual = _usual_gain(entries) or 0.0
-        for entry in entries:
-            force, sound = (read_recording(entry.folder / name) for name in ("Force.wav", "mic.wav"))
+    def _recordings(self, identifier: str, impacts: list[Impact]) -> Iterator[tuple[Impact, Recording]]:
+        for impact in impacts:
+            folder = self._folders[identifier] / impact.file.removesuffix(".wav")
+            force, sound = (read_recording(folder / name) for name in ("Force.wav", "mic.wav"))
             frames = min(force.frames, sound.frames)
             channels = np.stack([force.channels[0, :frames], sound.channels[0, :frames]])
-            name = f"{identifier}/audio/{entry.contact}/mic.wav"
-            impact = Impact(
-                file=f"{entry.contact}.wav",
-                contact=self._contacts[identifier, entry.contact],
-                newtons=entry.newtons,
-                gain_db=usual if entry.gain_db is None else entry.gain_db,
-            )
+            name = f"{identifier}/audio/{folder.name}/mic.wav"
             yield impact, Recording(name, channels, sound.sample_rate, sound.subtype)
 
     def _missing_archives(self) -> list[str]:
@@ -233,12 +224,6 @@ class ObjectFolderRaw:
                 source = archive if packed else f"{DOWNLOAD}/audio/{archive}"
                 missing.append(f"objects {first} to {first + 9}: unpack {source} in {self.folder}")
         return missing
-
-
-def _usual_gain(entries: list[_Entry]) -> float | None:
-    """Return the commonest gain, the first of several; None where none is known."""
-    known = Counter(entry.gain_db for entry in entries if entry.gain_db is not None)
-    return known.most_common(1)[0][0] if known else None
 
 
 def find_mesh(folder: Path, identifier: str) -> VisualSource | None:
