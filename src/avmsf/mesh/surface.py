@@ -118,7 +118,8 @@ def contacted_part(surface: Surface, contacts: Float[Tensor, "contacts 3"]) -> t
     mesh = trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=False)
     rows = np.unique(mesh.vertices[mesh.faces].reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1, 3)
     edges = np.concatenate([rows[:, [0, 1]], rows[:, [1, 2]]])
-    label = trimesh.graph.connected_component_labels(edges, node_count=rows.max() + 1)[rows[:, 0]]
+    parts_of = trimesh.graph.connected_component_labels(edges, node_count=rows.max() + 1)  # type: ignore[no-untyped-call]
+    label = parts_of[rows[:, 0]]
     if not label.any() or not mesh.area > 0:
         return surface, []
     points, faces = trimesh.sample.sample_surface(mesh, MOST_POINTS, seed=0)
