@@ -8,12 +8,13 @@ import pytest
 import torch
 import trimesh
 from scipy import ndimage
+from trimesh import Trimesh
 
 from avmsf.errors import SimulationError
 from avmsf.fem import mesh_check
 from avmsf.fem.candidate_bodies import SurfaceBodies
 from avmsf.fem.mesh_check import ROUGH, CheckedSurface, checked, denoised, roughness, simplified, thinned
-from avmsf.fem.skin import Skin
+from avmsf.fem.remeshing import boundary_edges, count_crowded_edges, mesh_of, remeshed, weld
 from avmsf.fem.tetrahedra import fill
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.level_set import enclose
@@ -22,18 +23,14 @@ from factories.looked_at import surface_of
 from factories.raising import raises
 
 
-def surface_in(skin: Skin) -> Surface:
-    return Surface(torch.from_numpy(skin.points).float(), torch.from_numpy(skin.faces))
+def welded(mesh: Trimesh) -> Trimesh:
+    return weld(surface_of(mesh))
 
 
-def skin_of(mesh: trimesh.Trimesh) -> Skin:
-    return Skin.of(surface_of(mesh))
-
-
-def cup(below: float) -> Skin:
+def cup(below: float) -> Trimesh:
     """Return the part of a ball of radius 1 below this height."""
     angles = np.linspace(0.0, math.acos(-below), 40)
-    return skin_of(trimesh.creation.revolve(np.stack([np.sin(angles), -np.cos(angles)], axis=1), sections=64))
+    return welded(trimesh.creation.revolve(np.stack([np.sin(angles), -np.cos(angles)], axis=1), sections=64))
 
 
 def test_an_inverted_part_is_turned_and_the_wall_of_a_void_is_not():
@@ -44,27 +41,27 @@ def test_an_inverted_part_is_turned_and_the_wall_of_a_void_is_not():
     truth = (1.0 - 0.8**3 + 0.5**3) * trimesh.creation.icosphere(2).volume
     messages: list[str] = []
     found = checked(surface_of(trimesh.util.concatenate([outer, inner, beside])), log=messages.append)
-    assert found.skin.volume == pytest.approx(truth, rel=1e-5)
+    assert found.mesh.volume == pytest.approx(truth, rel=1e-5)
     assert len(messages) == 1
     assert messages[0].startswith("320 of 960 triangles")
     # All of it inside out: the void goes with the body around it.
     every = trimesh.util.concatenate([outer, inner])
     every.invert()
-    assert checked(surface_of(every), log=messages.append).skin.volume == pytest.approx(
+    assert checked(surface_of(every), log=messages.append).mesh.volume == pytest.approx(
         (1.0 - 0.8**3) * trimesh.creation.icosphere(2).volume, rel=1e-5
     )
 
 
 @pytest.mark.parametrize(("below", "vessel"), [(0.05, True), (0.9, True), (-0.995, False)])
 def test_an_open_vessel_that_faces_inwards_is_told_and_stays(below: float, vessel: bool):
-    skin = cup(below)
-    outwards = surface_in(skin)
+    mesh = cup(below)
+    outwards = surface_of(mesh)
     for surface, expected in ((outwards, False), (Surface(outwards.vertices, outwards.faces.flip(1)), vessel)):
         messages: list[str] = []
-        found = checked(surface, log=messages.append).skin
+        found = checked(surface, log=messages.append).mesh
         # A dish a twentieth as deep as its radius has no inside worth the name.
         assert any("inwards" in message for message in messages) == expected
-        assert (found.volume > 0) == (Skin.of(surface).volume > 0)
+        assert (found.volume > 0) == (weld(surface).volume > 0)
 
 
 def test_lids_are_measured_as_they_would_close_the_holes():
@@ -82,7 +79,7 @@ def test_lids_are_measured_as_they_would_close_the_holes():
 
 
 def test_no_wall_is_guessed_where_the_surface_holds_little_more_than_it():
-    whole = CheckedSurface(skin_of(trimesh.creation.icosphere(4)))
+    whole = CheckedSurface(welded(trimesh.creation.icosphere(4)))
     # Twice the volume over the area is two thirds of the radius, of which a wall may be a sixth.
     whole.expect_hollow(0.110)
     with raises(SimulationError, name="wall", value=0.112):
@@ -91,24 +88,24 @@ def test_no_wall_is_guessed_where_the_surface_holds_little_more_than_it():
 
 
 def test_noise_is_taken_out_of_a_mesh_by_as_much_as_it_has():
-    clean = skin_of(trimesh.creation.icosphere(4))
+    clean = welded(trimesh.creation.icosphere(4))
     for part in (0.01, 0.02):
-        noise = part * clean.size * np.random.default_rng(0).standard_normal(clean.points.shape) / math.sqrt(3)
-        found, moved = denoised(Skin(clean.points + noise, clean.faces))
-        assert moved == pytest.approx(part * clean.size, rel=0.1)
-        surface = ClosestPoints(clean.points[clean.faces])
-        before = np.sqrt((surface(clean.points + noise).distances ** 2).mean())
-        assert np.sqrt((surface(found.points).distances ** 2).mean()) < 0.35 * before
+        noise = part * clean.scale * np.random.default_rng(0).standard_normal(clean.vertices.shape) / math.sqrt(3)
+        found, moved = denoised(mesh_of(clean.vertices + noise, clean.faces))
+        assert moved == pytest.approx(part * clean.scale, rel=0.1)
+        surface = ClosestPoints(clean.triangles)
+        before = np.sqrt((surface(clean.vertices + noise).distances ** 2).mean())
+        assert np.sqrt((surface(found.vertices).distances ** 2).mean()) < 0.35 * before
         assert roughness(found) < 8.0
-        assert found.volume == pytest.approx(Skin(clean.points + noise, clean.faces).volume, rel=1e-9)
+        assert found.volume == pytest.approx(mesh_of(clean.vertices + noise, clean.faces).volume, rel=1e-9)
 
 
 def test_what_is_not_noisy_stays_as_it_is():
-    box = skin_of(trimesh.creation.box((1.0, 0.2, 0.01)))
-    for skin in (box, box.remeshed(0.03), skin_of(trimesh.creation.icosphere(4)), cup(0.3)):
-        assert roughness(skin) < ROUGH
-        found, moved = denoised(skin)
-        assert found is skin
+    box = welded(trimesh.creation.box((1.0, 0.2, 0.01)))
+    for mesh in (box, remeshed(box, 0.03), welded(trimesh.creation.icosphere(4)), cup(0.3)):
+        assert roughness(mesh) < ROUGH
+        found, moved = denoised(mesh)
+        assert found is mesh
         assert moved == 0.0
 
 
@@ -119,19 +116,19 @@ def test_a_rough_form_that_is_no_noise_stays():
     a, b, c, d = (part.ravel() for part in (rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:]))
     faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
     heights = 0.12 * np.sin(12 * math.pi * x.ravel()) * np.sin(12 * math.pi * y.ravel())
-    waves = Skin(np.stack([x.ravel(), y.ravel(), heights], axis=1), faces)
+    waves = mesh_of(np.stack([x.ravel(), y.ravel(), heights], axis=1), faces)
     assert roughness(waves) > ROUGH
     assert denoised(waves)[0] is waves
 
 
 def test_smoothing_is_told():
-    clean = skin_of(trimesh.creation.icosphere(3))
-    noise = 0.02 * clean.size * np.random.default_rng(0).standard_normal(clean.points.shape)
+    clean = welded(trimesh.creation.icosphere(3))
+    noise = 0.02 * clean.scale * np.random.default_rng(0).standard_normal(clean.vertices.shape)
     messages: list[str] = []
-    rough = Surface(torch.from_numpy(clean.points + noise).float(), torch.from_numpy(clean.faces))
+    rough = Surface(torch.from_numpy(clean.vertices + noise).float(), torch.from_numpy(np.array(clean.faces)))
     checked(rough, log=messages.append)
     assert len(messages) == 1
-    assert f"{roughness(Skin.of(rough)):.0f} degrees" in messages[0]
+    assert f"{roughness(weld(rough)):.0f} degrees" in messages[0]
 
 
 def test_corners_a_millionth_of_the_size_apart_are_one() -> None:
@@ -139,8 +136,8 @@ def test_corners_a_millionth_of_the_size_apart_are_one() -> None:
     corners = np.array(ball.triangles).reshape(-1, 3)
     corners += 1e-7 * np.random.default_rng(0).uniform(-1, 1, corners.shape)
     faces = torch.arange(len(corners)).reshape(-1, 3)
-    skin = Skin.of(Surface(torch.from_numpy(corners), faces))
-    assert (len(skin.points), len(skin.faces)) == (len(ball.vertices), len(ball.faces))
+    mesh = weld(Surface(torch.from_numpy(corners), faces))
+    assert (len(mesh.vertices), len(mesh.faces)) == (len(ball.vertices), len(ball.faces))
 
 
 def limit(monkeypatch: pytest.MonkeyPatch, triangles: int) -> None:
@@ -148,30 +145,30 @@ def limit(monkeypatch: pytest.MonkeyPatch, triangles: int) -> None:
         monkeypatch.setattr(mesh_check, name, triangles)
 
 
-def ellipsoid(subdivisions: int) -> Skin:
+def ellipsoid(subdivisions: int) -> Trimesh:
     """Return one with half axes of 60, 45 and 30 mm."""
     mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
-    return Skin(np.array(mesh.vertices) * [0.060, 0.045, 0.030], np.array(mesh.faces))
+    return mesh_of(np.array(mesh.vertices) * [0.060, 0.045, 0.030], np.array(mesh.faces))
 
 
-def vessel(sections: int) -> Skin:
+def vessel(sections: int) -> Trimesh:
     """Return the part of a ball of 5 cm from its bottom to 115 degrees."""
     angles = np.linspace(0.0, 2.0, sections // 2)
     mesh = trimesh.creation.revolve(0.05 * np.stack([np.sin(angles), -np.cos(angles)], axis=1), sections=sections)
-    return skin_of(mesh)
+    return welded(mesh)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("dense", "coarse"), [(ellipsoid(5), ellipsoid(4)), (vessel(160), vessel(70))])
 def test_a_dense_mesh_vibrates_as_a_coarse_one_of_the_same_shape(
-    dense: Skin, coarse: Skin, monkeypatch: pytest.MonkeyPatch
+    dense: Trimesh, coarse: Trimesh, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Those that the wall is made of are far fewer.
     limit(monkeypatch, 6000)
     messages: list[str] = []
     found, known = (
-        SurfaceBodies(surface_in(skin), thicknesses=[0.002], count=4, dofs=8000, log=messages.append).bodies[0].elastic
-        for skin in (dense, coarse)
+        SurfaceBodies(surface_of(mesh), thicknesses=[0.002], count=4, dofs=8000, log=messages.append).bodies[0].elastic
+        for mesh in (dense, coarse)
     )
     assert f"{len(dense.faces)} triangles" in messages[0]
     assert "6000 triangles" in messages[1]
@@ -183,15 +180,15 @@ def test_a_dense_mesh_vibrates_as_a_coarse_one_of_the_same_shape(
 
 def test_a_noisy_mesh_is_thinned_without_its_noise_and_stays_a_skin(monkeypatch: pytest.MonkeyPatch) -> None:
     clean = ellipsoid(5)
-    noise = 0.01 * clean.size * np.random.default_rng(0).standard_normal(clean.points.shape) / 3**0.5
+    noise = 0.01 * clean.scale * np.random.default_rng(0).standard_normal(clean.vertices.shape) / 3**0.5
     messages: list[str] = []
     limit(monkeypatch, 4000)
-    found = thinned(Skin(clean.points + noise, clean.faces), log=messages.append)
+    found = thinned(mesh_of(clean.vertices + noise, clean.faces), log=messages.append)
     assert len(found.faces) == 4000
-    assert (found.open_edges, found.crowded_edges) == (0, 0)
-    surface = ClosestPoints(clean.points[clean.faces])
-    before = np.sqrt((surface(clean.points + noise).distances ** 2).mean())
-    assert np.sqrt((surface(found.points).distances ** 2).mean()) < 0.35 * before
+    assert (len(boundary_edges(found)), count_crowded_edges(found)) == (0, 0)
+    surface = ClosestPoints(clean.triangles)
+    before = np.sqrt((surface(clean.vertices + noise).distances ** 2).mean())
+    assert np.sqrt((surface(found.vertices).distances ** 2).mean()) < 0.35 * before
     assert found.volume == pytest.approx(clean.volume, rel=0.01)
     assert messages[-1].endswith("degrees")
 
@@ -201,14 +198,14 @@ def test_a_thinned_sheet_keeps_its_rim(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = np.arange(61 * 61).reshape(61, 61)
     a, b, c, d = (part.ravel() for part in (rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:]))
     points = np.stack([*(each.ravel() for each in np.meshgrid(side, side, indexing="ij")), np.zeros(61 * 61)], axis=1)
-    sheet = Skin(points, np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]))
+    sheet = mesh_of(points, np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]))
     limit(monkeypatch, 1000)
     found = thinned(sheet, log=lambda words: None)
     assert len(found.faces) <= 1000
     # Each corner may lose a triangle, with sides of about .045 now.
-    assert found.areas.sum() == pytest.approx(1.0, abs=4 * 0.045**2 / 2)
-    assert np.ptp(found.points, axis=0) == pytest.approx([1.0, 1.0, 0.0], abs=1e-6)
-    assert 0 < found.open_edges < sheet.open_edges
+    assert found.area == pytest.approx(1.0, abs=4 * 0.045**2 / 2)
+    assert np.ptp(found.vertices, axis=0) == pytest.approx([1.0, 1.0, 0.0], abs=1e-6)
+    assert 0 < len(boundary_edges(found)) < len(boundary_edges(sheet))
 
 
 def test_more_triangles_are_left_where_fewer_would_tear_the_skin(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -227,13 +224,14 @@ def test_more_triangles_are_left_where_fewer_would_tear_the_skin(monkeypatch: py
 
 def test_fewer_triangles_of_a_thin_shell_keep_its_volume() -> None:
     outer, inner = ellipsoid(4), ellipsoid(4)
-    count = len(outer.points)
-    shell = Skin(
-        np.concatenate([outer.points, 0.95 * inner.points]), np.concatenate([outer.faces, count + inner.faces[:, ::-1]])
+    count = len(outer.vertices)
+    shell = mesh_of(
+        np.concatenate([outer.vertices, 0.95 * inner.vertices]),
+        np.concatenate([outer.faces, count + inner.faces[:, ::-1]]),
     )
     found = simplified(shell, 1200)
     assert 1000 < len(found.faces) <= 1200
-    assert found.open_edges == 0
+    assert len(boundary_edges(found)) == 0
     assert found.volume == pytest.approx(shell.volume, rel=0.05)
 
 
@@ -242,11 +240,11 @@ def test_a_knotted_skin_shares_a_few_edges_rather_than_keep_its_triangles_and_is
     values /= values.std()
     radius = np.linalg.norm(np.meshgrid(*[np.linspace(-1, 1, 40)] * 3), axis=0)
     sponge = np.minimum(values + 0.5, 4 * (0.85 - radius)).astype(np.float32)
-    skin = Skin.of(enclose(sponge, 0.0, lowest=np.zeros(3), spacing=0.01))
-    assert len(simplified(skin, 1000).faces) > 10_000
-    found = simplified(skin, 1000, most=4000)
+    mesh = weld(enclose(sponge, 0.0, lowest=np.zeros(3), spacing=0.01))
+    assert len(simplified(mesh, 1000).faces) > 10_000
+    found = simplified(mesh, 1000, most=4000)
     assert len(found.faces) <= 1000
-    assert found.open_edges == 0
-    assert found.volume == pytest.approx(skin.volume, rel=0.02)
-    filled = fill(surface_in(found), detail=0.1)
-    assert float(filled.volumes.sum()) == pytest.approx(skin.volume, rel=0.05)
+    assert len(boundary_edges(found)) == 0
+    assert found.volume == pytest.approx(mesh.volume, rel=0.02)
+    filled = fill(surface_of(found), detail=0.1)
+    assert float(filled.volumes.sum()) == pytest.approx(mesh.volume, rel=0.05)

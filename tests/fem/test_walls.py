@@ -12,7 +12,7 @@ from avmsf.fem.candidate_bodies import SurfaceBodies
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.material import NOMINAL, STEEL
 from avmsf.fem.mesh_check import checked
-from avmsf.fem.skin import Skin
+from avmsf.fem.remeshing import weld
 from avmsf.fem.walls import wall_of
 from avmsf.mesh.surface import Surface
 from avmsf.simulate.shapes import make_shape
@@ -63,8 +63,8 @@ def test_a_thin_tube_bends_like_a_ring():
 
 def test_facets_may_cut_across_a_wall_whose_thickness_is_known():
     radius, wall = 0.05, 0.001
-    skin = Skin.of(tube(radius, wall, 0.15, sides=96, rings=16))
-    unknown, known = wall_of(skin), wall_of(skin, wall)
+    mesh = weld(tube(radius, wall, 0.15, sides=96, rings=16))
+    unknown, known = wall_of(mesh), wall_of(mesh, wall)
     assert unknown is not None
     assert known is not None
     with pytest.raises(SimulationError):
@@ -76,18 +76,18 @@ def test_facets_may_cut_across_a_wall_whose_thickness_is_known():
 
 def test_prisms_fill_a_wall_of_uneven_thickness():
     shape = make_shape("tray", seed=14)
-    skin = Skin.of(shape.surface)
-    wall = wall_of(skin)
+    mesh = weld(shape.surface)
+    wall = wall_of(mesh)
     assert wall is not None
     assert wall.thickness == pytest.approx(shape.thickness, rel=0.1)
     solid = wall.solid(wall.length(12_000))
-    assert solid.volume == pytest.approx(skin.volume, rel=0.02)
+    assert solid.volume == pytest.approx(mesh.volume, rel=0.02)
     assert count_dofs(solid) == pytest.approx(12_000, rel=0.35)
 
 
 def test_prisms_of_a_thick_block_have_several_layers():
-    skin = Skin.of(box(0.1, 0.06, 0.04))
-    wall = wall_of(skin)
+    mesh = weld(box(0.1, 0.06, 0.04))
+    wall = wall_of(mesh)
     assert wall is not None
     length = wall.length(12_000)
     solid = wall.solid(length)
@@ -98,13 +98,13 @@ def test_prisms_of_a_thick_block_have_several_layers():
 def test_a_mesh_with_three_triangles_at_an_edge_is_no_wall():
     surface = box(0.1, 0.06, 0.002)
     doubled = Surface(surface.vertices, torch.cat([surface.faces, surface.faces[:1]]))
-    assert wall_of(Skin.of(surface)) is not None
-    assert wall_of(Skin.of(doubled)) is None
+    assert wall_of(weld(surface)) is not None
+    assert wall_of(weld(doubled)) is None
 
 
 @pytest.mark.parametrize("kind", ["blob", "mug"])
 def test_lumps_and_walls_with_handles_are_not_filled_by_prisms(kind: str):
-    wall = wall_of(Skin.of(make_shape(kind, seed=1).surface))
+    wall = wall_of(weld(make_shape(kind, seed=1).surface))
     if wall is not None:
         with pytest.raises(SimulationError):
             wall.solid(wall.length(12_000))

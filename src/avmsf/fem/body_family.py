@@ -140,9 +140,9 @@ def _walls(meshes: BodyMeshes, dofs: int) -> tuple[list[float], Callable[[float]
         return np.geomspace(*between, _THICKNESSES).tolist(), partial(meshes.solid, dofs=dofs)
     found = meshes.checked
     if found.lids > _HOLES:
-        thicknesses = [ratio * found.skin.size for ratio in THICKNESS_RATIOS]
+        thicknesses = [ratio * found.mesh.scale for ratio in THICKNESS_RATIOS]
         return [each for each in thicknesses if each < found.width], meshes.walls(dofs)
-    wall = wall_of(found.skin)
+    wall = wall_of(found.mesh)
     if wall is not None:
         length = wall.length(dofs)
         for tried in (length, _FINER * length):

@@ -11,13 +11,14 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
+from trimesh import Trimesh
 
 from avmsf._utils.caching import once
 from avmsf.errors import SceneError, SimulationError
 from avmsf.fem.elements import SecondOrder
 from avmsf.fem.mesh_check import CheckedSurface, checked, simplified
+from avmsf.fem.remeshing import remeshed
 from avmsf.fem.shell import shell
-from avmsf.fem.skin import Skin
 from avmsf.fem.solid import Solid
 from avmsf.fem.tetrahedra import fill
 from avmsf.fem.walls import wall_of
@@ -146,16 +147,15 @@ class BodyMeshes:
 
     def _make_walls(self, dofs: int) -> Callable[[float], Solid]:
         sheet = self.checked.sheet()
-        length = 1.2 * math.sqrt(_SHELL * float(sheet.areas.sum()) / dofs)
-        skin = sheet
+        length = 1.2 * math.sqrt(_SHELL * sheet.area / dofs)
+        mesh = sheet
         for _ in range(_TRIES):
-            skin = sheet.remeshed(length)
-            part = _SHELL * len(skin.points) / dofs
+            mesh = remeshed(sheet, length)
+            part = _SHELL * len(mesh.vertices) / dofs
             if _UNDER <= part <= 1.0:
                 break
             length *= math.sqrt(part / 0.85)
-        surface = _surface(skin)
-        first = length / skin.size
+        surface, first = _surface(mesh), length / mesh.scale
         return lambda thickness: _near(
             lambda detail: shell(surface, thickness=thickness, detail=detail), dofs, first=first
         )
@@ -174,7 +174,7 @@ def filled_solid(checked: CheckedSurface, dofs: int, *, wall: float | None = Non
     enough.
     """
     checked.expect_filling()
-    sides = wall_of(checked.skin, wall)
+    sides = wall_of(checked.mesh, wall)
     if sides is not None:
         with contextlib.suppress(SimulationError):
             # Degrees of freedom may be few for prisms along a wall that bends tightly; tetrahedra need not follow it.
@@ -185,8 +185,8 @@ def filled_solid(checked: CheckedSurface, dofs: int, *, wall: float | None = Non
     def filled(detail: float) -> Solid:
         # Quadrics keep the volume. Edges taken out one by one made the wall of a mug 5 % thinner.
         count = round(TRIANGLES * dofs * (first / detail) ** 2)
-        skin = simplified(checked.skin, count, most=_KNOTTED * count)
-        return fill(_surface(skin), detail=detail, timeout=_FILLING_SECONDS)
+        mesh = simplified(checked.mesh, count, most=_KNOTTED * count)
+        return fill(_surface(mesh), detail=detail, timeout=_FILLING_SECONDS)
 
     return _near(filled, dofs, first=first)
 
@@ -243,19 +243,17 @@ def _details(tried: dict[float, int], dofs: int, first: float) -> Iterator[float
 
 def _filling_detail(checked: CheckedSurface, dofs: int) -> float:
     """Return a first guess of the detail that fills a surface with so many degrees of freedom."""
-    skin = checked.skin
-    held = checked.mean_thickness or 0.0
-    area = float(skin.areas.sum())
+    size, held, area = checked.mesh.scale, checked.mean_thickness or 0.0, checked.mesh.area
     volume = 0.5 * held * area
     # Found by filling mugs, bowls, spoons and lumps: thin walls make tetrahedra smaller than asked for.
-    lengths = np.geomspace(_DETAILS[0], _DETAILS[1], 200) * skin.size
+    lengths = np.geomspace(_DETAILS[0], _DETAILS[1], 200) * size
     relative = np.maximum(held / lengths, 1e-3)
     needed = area / lengths**2 * 16.4 * relative**-0.68 + volume / lengths**3 * 38.0 * np.minimum(1.0, relative / 3.0)
-    return float(lengths[np.argmax(needed <= dofs)] / skin.size) if (needed <= dofs).any() else _DETAILS[1]
+    return float(lengths[np.argmax(needed <= dofs)] / size) if (needed <= dofs).any() else _DETAILS[1]
 
 
-def _surface(skin: Skin) -> Surface:
-    return Surface(torch.from_numpy(skin.points).float(), torch.from_numpy(skin.faces))
+def _surface(mesh: Trimesh) -> Surface:
+    return Surface(torch.from_numpy(np.array(mesh.vertices)).float(), torch.from_numpy(np.array(mesh.faces)))
 
 
 def expect_memory(dofs: int) -> None:

@@ -261,7 +261,7 @@ class SurfaceBodies(CandidateBodies):
     def _guesses(self) -> list[float | None]:
         """Return the thicknesses to try; None for what the surface encloses."""
         if self._meshes.shape is None:
-            return [None, *(ratio * self._meshes.checked.skin.size for ratio in THICKNESS_RATIOS)]
+            return [None, *(ratio * self._meshes.checked.mesh.scale for ratio in THICKNESS_RATIOS)]
         between = self._meshes.shape.thickness_range
         return [None] if between is None else [None, *np.geomspace(*between, _SHAPE_THICKNESSES).tolist()]
 

@@ -9,11 +9,22 @@ import fast_simplification
 import numpy as np
 import scipy.optimize
 import scipy.sparse
+import trimesh
 from jaxtyping import Float64, Int
 from scipy.sparse.linalg import splu
+from trimesh import Trimesh
 
 from avmsf.errors import SimulationError
-from avmsf.fem.skin import Skin, components
+from avmsf.fem.remeshing import (
+    adjacency,
+    boundary_edges,
+    components,
+    count_crowded_edges,
+    even_points,
+    mesh_of,
+    oriented,
+    weld,
+)  # fmt: skip
 from avmsf.fem.solid import several_parts
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.surface import Surface
@@ -30,18 +41,15 @@ _KEPT = 0.8
 """Part of the vertices' degrees of freedom that a mesh without noise would keep."""
 
 
-def roughness(skin: Skin) -> float:
+def roughness(mesh: Trimesh) -> float:
     """Return the mean angle between the normals of neighboring triangles, degrees; 0 for a mesh of few long edges."""
-    one, other, ends = skin.neighbors
-    lengths = np.linalg.norm(skin.points[ends[:, 0]] - skin.points[ends[:, 1]], axis=1)
-    if not len(ends) or lengths.mean() > _FINE * skin.size:
+    ends = mesh.vertices[mesh.face_adjacency_edges]
+    if not len(ends) or np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean() > _FINE * mesh.scale:
         return 0.0
-    normals = skin.face_normals
-    angles = np.arccos(np.clip((normals[one] * normals[other]).sum(axis=1), -1.0, 1.0))
-    return math.degrees(float(angles.mean()))
+    return math.degrees(float(mesh.face_adjacency_angles.mean()))
 
 
-def denoised(skin: Skin) -> tuple[Skin, float]:
+def denoised(mesh: Trimesh) -> tuple[Trimesh, float]:
     """Return a noisy mesh without its noise, and how far that moved the vertices, meters, root mean square.
 
     A scan's noise is drawn afresh at each vertex, while a surface runs on from one vertex to the next. Of the surfaces
@@ -50,67 +58,65 @@ def denoised(skin: Skin) -> tuple[Skin, float]:
     A mesh that is not rough, or whose vertices predict each other no better when smoothed, comes back as it is, with
     0. The volume of a closed one stays.
     """
-    if roughness(skin) < ROUGH:
-        return skin, 0.0
-    bending = _bending(skin)
-    probes = np.random.default_rng(0).choice([-1.0, 1.0], size=(len(skin.points), _PROBES))
-    identity = scipy.sparse.eye_array(len(skin.points), format="csc")
+    if roughness(mesh) < ROUGH:
+        return mesh, 0.0
+    points = np.asarray(mesh.vertices)
+    # The squared difference of each vertex from the mean of its neighbors.
+    difference = scipy.sparse.eye_array(len(points)) - _averaging(_joined(mesh))
+    bending = (difference.T @ difference).tocsc()
+    probes = np.random.default_rng(0).choice([-1.0, 1.0], size=(len(points), _PROBES))
+    identity = scipy.sparse.eye_array(len(points), format="csc")
 
     def smooth(exponent: float) -> tuple[Float64[np.ndarray, "points 3"], float]:
         solve = splu(
             identity + 10.0**exponent * bending, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
         ).solve
-        return solve(skin.points), float((probes * solve(probes)).sum(axis=0).mean() / len(probes))
+        return solve(points), float((probes * solve(probes)).sum(axis=0).mean() / len(probes))
 
     def error(exponent: float) -> float:
-        points, kept = smooth(exponent)
-        return math.log(float(((points - skin.points) ** 2).mean()) / (1.0 - kept) ** 2)
+        smoothed, kept = smooth(exponent)
+        return math.log(float(((smoothed - points) ** 2).mean()) / (1.0 - kept) ** 2)
 
     found = scipy.optimize.minimize_scalar(error, bounds=(_WEAKEST, _STRONGEST), options={"xatol": 0.05})
-    points, kept = smooth(float(found.x))
+    smoothed, kept = smooth(float(found.x))
     if kept > _KEPT:
-        return skin, 0.0
-    smoothed = _as_large(Skin(points, skin.faces), skin)
-    return smoothed, float(np.sqrt(((smoothed.points - skin.points) ** 2).sum(axis=1).mean()))
+        return mesh, 0.0
+    result = _as_large(smoothed, mesh)
+    return result, float(np.sqrt(((result.vertices - points) ** 2).sum(axis=1).mean()))
 
 
-def averaged(skin: Skin, rounds: int) -> Skin:
-    """Return a skin whose points were moved, so many times, to the mean of themselves and their neighbors.
+def averaged(mesh: Trimesh, rounds: int) -> Trimesh:
+    """Return a mesh whose vertices were moved, so many times, to the mean of themselves and their neighbors.
 
     The volume of a closed one stays.
     """
-    step = _averaging(_joined(skin) + scipy.sparse.eye_array(len(skin.points)))
-    points = skin.points
+    step = _averaging(_joined(mesh) + scipy.sparse.eye_array(len(mesh.vertices)))
+    points = np.asarray(mesh.vertices)
     for _ in range(rounds):
         points = step @ points
-    return _as_large(Skin(points, skin.faces), skin)
-
-
-def _bending(skin: Skin) -> scipy.sparse.csc_array:
-    """Return the squared difference of each point from the mean of its neighbors, as a matrix."""
-    difference = scipy.sparse.eye_array(len(skin.points)) - _averaging(_joined(skin))
-    return (difference.T @ difference).tocsc()
+    return _as_large(points, mesh)
 
 
 def _averaging(joined: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
-    """Return what takes the mean over the points that each is joined to."""
+    """Return what takes the mean over the vertices that each is joined to."""
     return scipy.sparse.diags_array(1.0 / joined.sum(axis=1)) @ joined
 
 
-def _joined(skin: Skin) -> scipy.sparse.csr_array:
-    """Return 1 for points that share an edge."""
-    joined = skin.adjacency
+def _joined(mesh: Trimesh) -> scipy.sparse.csr_array:
+    """Return 1 for vertices that share an edge."""
+    joined = adjacency(mesh)
     joined.data[:] = 1.0
     return joined
 
 
-def _as_large(smoothed: Skin, skin: Skin) -> Skin:
-    """Return a closed skin grown evenly from its middle to the volume it had, for smoothing shrinks what is round."""
-    if skin.open_edges or smoothed.volume == 0.0 or skin.volume / smoothed.volume <= 0.0:
+def _as_large(points: Float64[np.ndarray, "points 3"], mesh: Trimesh) -> Trimesh:
+    """Return a mesh with smoothed vertices; a closed one is scaled to the volume it had, as smoothing shrinks it."""
+    smoothed = Trimesh(points, mesh.faces, process=False)
+    if len(boundary_edges(mesh)) or smoothed.volume == 0.0 or mesh.volume / smoothed.volume <= 0.0:
         return smoothed
-    middle = smoothed.points.mean(axis=0)
-    factor = float(np.cbrt(skin.volume / smoothed.volume))
-    return Skin(middle + factor * (smoothed.points - middle), skin.faces)
+    middle = points.mean(axis=0)
+    factor = float(np.cbrt(mesh.volume / smoothed.volume))
+    return Trimesh(middle + factor * (points - middle), mesh.faces, process=False)
 
 
 MOST = 60_000
@@ -125,50 +131,51 @@ _ROUNDS = 4
 """Averages taken of a noisy mesh over the thinning, so that they reach little farther than an edge that stays."""
 
 
-def thinned(skin: Skin, *, log: Callable[[str], None]) -> Skin:
-    """Return a skin of at most `MOST` triangles, fewer within the tolerance, and tell what was done to a larger one.
+def thinned(mesh: Trimesh, *, log: Callable[[str], None]) -> Trimesh:
+    """Return a mesh of at most `MOST` triangles, fewer within the tolerance, and log what was done to a larger one.
 
     More are left where fewer would open a seam or share an edge among three.
     """
-    count = len(skin.faces)
+    count = len(mesh.faces)
     if count <= ENOUGH:
-        return skin
+        return mesh
     log(f"checking a mesh of {count} triangles")
-    rough = roughness(skin)
-    # Quadrics follow each noisy corner, and tie the skin into knots.
-    even = averaged(skin, math.ceil(_ROUNDS * count / MOST)) if rough >= ROUGH else skin
-    tolerance, places = _TOLERANCE * 2.0 * abs(even.volume) / float(even.areas.sum()), even.spread()
+    rough = roughness(mesh)
+    # Quadrics follow each noisy corner, and tie the mesh into knots.
+    even = averaged(mesh, math.ceil(_ROUNDS * count / MOST)) if rough >= ROUGH else mesh
+    tolerance, places = _TOLERANCE * 2.0 * abs(_volume(even.triangles)) / even.area, even_points(even)
     for most in (ENOUGH, 2 * ENOUGH, MOST):
-        found = simplified(even, most, like=skin)
-        distances = ClosestPoints(found.points[found.faces])(places).distances
+        found = simplified(even, most, like=mesh)
+        distances = ClosestPoints(found.triangles)(places).distances
         if float(np.sqrt((distances**2).mean())) <= tolerance:
             break
     if found is even:
-        return skin
-    noise = "" if even is skin else f", after smoothing its noise of {rough:.0f} degrees"
+        return mesh
+    noise = "" if even is mesh else f", after smoothing its noise of {rough:.0f} degrees"
     log(f"mesh simplified to {len(found.faces)} triangles{noise}")
     return found
 
 
-def simplified(skin: Skin, count: int, *, like: Skin | None = None, most: float = math.inf) -> Skin:
-    """Return a skin of about `count` triangles by quadrics, its volume about the same; as it is if it has no more.
+def simplified(mesh: Trimesh, count: int, *, like: Trimesh | None = None, most: float = math.inf) -> Trimesh:
+    """Return a mesh of about `count` triangles by quadrics, its volume about the same; as it is if it has no more.
 
-    More, up to `most`, are left where fewer would open a seam or share an edge among three, compared with the skin that
+    More, up to `most`, are left where fewer would open a seam or share an edge among three, compared with the mesh that
     it is `like`. Where more than `most` would be, it has about `count` that share some.
     """
-    reference = skin if like is None else like
-    opened, crowded, count = reference.open_edges, reference.crowded_edges, max(count, 4)
+    reference = mesh if like is None else like
+    opened, crowded, count = len(boundary_edges(reference)), count_crowded_edges(reference), max(count, 4)
     knotted = None
-    while count < len(skin.faces):
-        points, faces = fast_simplification.simplify(skin.points, skin.faces, target_count=count)
-        found = Skin.compact(points.astype(np.float64), faces.astype(np.int64))
-        if len(found.faces) >= 4 and found.open_edges <= opened and found.crowded_edges <= crowded:
-            return found
-        knotted = found if knotted is None and found.open_edges <= opened else knotted
+    while count < len(mesh.faces):
+        points, faces = fast_simplification.simplify(mesh.vertices, mesh.faces, target_count=count)
+        found = mesh_of(points.astype(np.float64), faces.astype(np.int64))
+        if len(boundary_edges(found)) <= opened:
+            if len(found.faces) >= 4 and count_crowded_edges(found) <= crowded:
+                return found
+            knotted = found if knotted is None else knotted
         count *= 2
-        if knotted is not None and min(count, len(skin.faces)) > most:
+        if knotted is not None and min(count, len(mesh.faces)) > most:
             return knotted
-    return skin
+    return mesh
 
 
 _LIDS = 0.25
@@ -188,40 +195,34 @@ _HOLLOW = 1.0 / 6.0
 class CheckedSurface:
     """A surface that has triangles, faces outwards and is smooth."""
 
-    skin: Skin
-
-    @cached_property
-    def parts(self) -> Int[np.ndarray, " faces"]:
-        """Number of the part that each triangle belongs to, the largest first; those of a part share vertices."""
-        return _parts(self.skin)
+    mesh: Trimesh
 
     @cached_property
     def width(self) -> float:
         """Extent along the second of the axes that the vertices spread along, meters: of a sheet, its narrower side."""
-        places = self.skin.points - self.skin.points.mean(axis=0)
+        places = self.mesh.vertices - self.mesh.vertices.mean(axis=0)
         _, axes = np.linalg.eigh(places.T @ places)
         return float(np.sort(np.ptp(places @ axes, axis=0))[1])
 
     @cached_property
     def lids(self) -> float:
         """Part of the closed surface that lids straight over the holes would make up, 0 to 1."""
-        lids = _lids(self.skin)
-        area = 0.5 * float(np.linalg.norm(np.cross(lids[:, 1] - lids[:, 0], lids[:, 2] - lids[:, 0]), axis=1).sum())
-        return area / (area + float(self.skin.areas.sum()))
+        area = 0.5 * float(np.linalg.norm(trimesh.triangles.cross(_lids(self.mesh)), axis=1).sum())
+        return area / (area + self.mesh.area)
 
     @cached_property
     def mean_thickness(self) -> float | None:
         """Twice the volume over the area, meters: of a thin wall, its thickness; None for a sheet, which holds none."""
         if self.lids > _LIDS:
             return None
-        return 2.0 * abs(_held(self.skin)) / float(self.skin.areas.sum())
+        return 2.0 * abs(_held(self.mesh)) / self.mesh.area
 
     def expect_filling(self) -> None:
         """Raise SimulationError where the surface is too open to be filled."""
         if self.lids > _LIDS:
             raise SimulationError(
-                f"expected a closed mesh, got {self.skin.open_edges} open edges whose holes are {self.lids:.0%} of the "
-                "surface; give a wall thickness, or close the mesh",
+                f"expected a closed mesh, got {len(boundary_edges(self.mesh))} open edges whose holes are "
+                f"{self.lids:.0%} of the surface; give a wall thickness, or close the mesh",
                 name="mesh",
                 value=self.lids,
             )
@@ -237,105 +238,103 @@ class CheckedSurface:
                 value=wall,
             )
 
-    def sheet(self) -> Skin:
+    def sheet(self) -> Trimesh:
         """Return what a wall can follow: the largest part, neighbors facing alike.
 
-        Raises SimulationError where other parts are more than loose bits, and as `Skin.oriented` does.
+        Raises SimulationError where other parts are more than loose bits, and as `oriented` does.
         """
-        areas = np.bincount(self.parts, weights=self.skin.areas)
+        parts = _parts(self.mesh)
+        areas = np.bincount(parts, weights=self.mesh.area_faces)
         if areas[0] < (1.0 - _LOOSE) * areas.sum():
             raise several_parts("mesh", (10_000 * areas).tolist(), "cm2")
-        return Skin.compact(self.skin.points, self.skin.faces[self.parts == 0]).oriented()
+        return oriented(mesh_of(self.mesh.vertices, self.mesh.faces[parts == 0]))
 
 
 def checked(surface: Surface, *, log: Callable[[str], None]) -> CheckedSurface:
-    """Return a surface with inverted parts turned and noise taken out, and tell what was done and what is missing.
+    """Return a surface with inverted parts turned and noise taken out, and log what was done and what is missing.
 
     A mesh of very many triangles is thinned first. Raises SimulationError for points without triangles, damaged
     triangles and a mesh without area.
     """
-    skin, turned = _turned(thinned(_closed(Skin.of(surface)), log=log))
+    mesh, turned = _turned(thinned(_closed(weld(surface)), log=log))
     if turned:
-        log(f"{turned} of {len(skin.faces)} triangles of the mesh faced inwards: reversed")
-    before = roughness(skin)
-    skin, moved = denoised(skin)
+        log(f"{turned} of {len(mesh.faces)} triangles of the mesh faced inwards: reversed")
+    before = roughness(mesh)
+    mesh, moved = denoised(mesh)
     if moved:
         log(
             f"noisy mesh, adjacent triangles differ by {before:.0f} degrees on average: smoothed, vertices moved by "
             f"{1000 * moved:.2g} mm (RMS)"
         )
-    result = CheckedSurface(skin)
-    if skin.open_edges:
+    result = CheckedSurface(mesh)
+    opened = len(boundary_edges(mesh))
+    if opened:
         # No mistake that could be undone: what was seen from inside alone faces inwards, and its wall lies outside.
-        if _held(skin) < -_VESSEL * float(skin.areas.sum()) ** 1.5:
+        if _held(mesh) < -_VESSEL * mesh.area**1.5:
             log(
                 "open mesh whose triangles face inwards: its wall is taken to be outside; reverse the triangles if the "
                 "wall is inside"
             )
         helps = "trying to close the holes" if result.lids <= _LIDS else "give a wall thickness"
-        log(f"the mesh has {skin.open_edges} open edges: {helps}")
+        log(f"the mesh has {opened} open edges: {helps}")
     return result
 
 
-def _closed(skin: Skin) -> Skin:
-    """Return a skin whose small holes have straight lids; as it is where they are not small, or the lids would cross.
+def _closed(mesh: Trimesh) -> Trimesh:
+    """Return a mesh whose small holes have straight lids; as it is where they are not small, or the lids would cross.
 
     Holes as large as openings that an object may have stay.
     """
-    lids = CheckedSurface(skin).lids
-    if not 0.0 < lids <= _SMALL:
-        return skin
-    corners = np.concatenate([skin.points[skin.faces], _lids(skin)])
+    if not 0.0 < CheckedSurface(mesh).lids <= _SMALL:
+        return mesh
+    corners = np.concatenate([mesh.triangles, _lids(mesh)])
     points, rows = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
-    closed = Skin(points, rows.reshape(-1, 3))
-    return closed if closed.crowded_edges <= skin.crowded_edges else skin
+    closed = Trimesh(points, rows.reshape(-1, 3), process=False)
+    return closed if count_crowded_edges(closed) <= count_crowded_edges(mesh) else mesh
 
 
-def _turned(skin: Skin) -> tuple[Skin, int]:
-    """Return a skin whose closed parts face outwards, but for the walls of voids, and how many triangles it turned.
+def _turned(mesh: Trimesh) -> tuple[Trimesh, int]:
+    """Return a mesh whose closed parts face outwards, but for the walls of voids, and how many triangles it turned.
 
     A part inside the box around another may be a void, which faces inwards; it goes with the part around it.
     """
-    number = _parts(skin)
-    parts = [Skin.compact(skin.points, skin.faces[number == part]) for part in range(int(number.max()) + 1)]
-    lowest, highest = (np.array([edge(part.points, axis=0) for part in parts]) for edge in (np.min, np.max))
+    number = _parts(mesh)
+    parts = [mesh_of(mesh.vertices, mesh.faces[number == part]) for part in range(int(number.max()) + 1)]
+    lowest, highest = np.stack([part.bounds for part in parts], axis=1)
     turns = np.zeros(len(parts), dtype=bool)
     for part, each in enumerate(parts):
         around = (lowest[:part] <= lowest[part]).all(axis=1) & (highest[:part] >= highest[part]).all(axis=1)
         inside = np.flatnonzero(around)
-        turns[part] = turns[inside[0]] if len(inside) else not each.open_edges and each.volume < 0.0
+        turns[part] = turns[inside[0]] if len(inside) else not len(boundary_edges(each)) and each.volume < 0.0
     turned = turns[number]
-    faces = np.where(turned[:, None], skin.faces[:, ::-1], skin.faces)
-    return Skin(skin.points, faces), int(turned.sum())
+    faces = np.where(turned[:, None], mesh.faces[:, ::-1], mesh.faces)
+    return Trimesh(mesh.vertices, faces, process=False), int(turned.sum())
 
 
-def _parts(skin: Skin) -> Int[np.ndarray, " faces"]:
-    """Return the number of the part that each triangle belongs to, the widest first."""
-    ends = skin.faces[:, [[0, 1], [1, 2]]].reshape(-1, 2)
-    label = components(ends, len(skin.points))[skin.faces[:, 0]]
-    found = int(label.max()) + 1
-    area = np.bincount(label, weights=skin.areas, minlength=found)
-    rank = np.empty(found, dtype=np.int64)
-    rank[np.argsort(-area, kind="stable")] = np.arange(found)
-    return rank[label]
+def _parts(mesh: Trimesh) -> Int[np.ndarray, " faces"]:
+    """Return the number of the part that each triangle belongs to, the widest first; they share vertices in a part."""
+    label = components(mesh.edges, len(mesh.vertices))[mesh.faces[:, 0]]
+    order = np.argsort(-np.bincount(label, weights=mesh.area_faces), kind="stable")
+    return np.argsort(order)[label]
 
 
-def _held(skin: Skin) -> float:
-    """Return the volume inside a skin whose holes have straight lids, cubic meters; less than 0 where it faces in."""
-    lids = _lids(skin)
-    return skin.volume + float((np.cross(lids[:, 0], lids[:, 1]) * lids[:, 2]).sum() / 6.0)
+def _held(mesh: Trimesh) -> float:
+    """Return the volume inside a mesh whose holes have straight lids, cubic meters; less than 0 where it faces in."""
+    return _volume(np.concatenate([mesh.triangles, _lids(mesh)]))
 
 
-def _lids(skin: Skin) -> Float64[np.ndarray, "lids 3 3"]:
-    """Return triangles from the open edges to the middle of the rim that they are of, facing as the skin does."""
-    rim = skin.rim
+def _volume(triangles: Float64[np.ndarray, "triangles 3 3"]) -> float:
+    """Return the volume between triangles and the origin, cubic meters: what they enclose where they are closed."""
+    return float(np.linalg.det(triangles).sum() / 6.0)
+
+
+def _lids(mesh: Trimesh) -> Float64[np.ndarray, "lids 3 3"]:
+    """Return triangles from the open edges to the middle of the rim that they are of, facing as the mesh does."""
+    rim = boundary_edges(mesh)
     if not len(rim):
         return np.zeros((0, 3, 3))
     used, ends = np.unique(rim, return_inverse=True)
-    ends = ends.reshape(-1, 2)
+    ends, corners = ends.reshape(-1, 2), mesh.vertices[used]
     label = components(ends, len(used))
-    middles = np.stack(
-        [np.bincount(label, weights=skin.points[used, axis]) / np.bincount(label) for axis in range(3)], axis=1
-    )
-    start, end = skin.points[used[ends[:, 0]]], skin.points[used[ends[:, 1]]]
-    return np.stack([end, start, middles[label[ends[:, 0]]]], axis=1)
+    middles = np.stack([np.bincount(label, weights=axis) for axis in corners.T], axis=1) / np.bincount(label)[:, None]
+    return np.stack([corners[ends[:, 1]], corners[ends[:, 0]], middles[label[ends[:, 0]]]], axis=1)

@@ -7,9 +7,10 @@ thick, where tetrahedra of even shape would have to be as small as the wall.
 import numpy as np
 import torch
 from jaxtyping import Float64, Int
+from trimesh import Trimesh
 
 from avmsf.errors import SimulationError
-from avmsf.fem.skin import Skin, unit
+from avmsf.fem.remeshing import boundary_edges, oriented, remeshed, unit, weld
 from avmsf.fem.solid import Solid
 from avmsf.fem.tetrahedra import expect_detail, fill
 from avmsf.mesh.surface import Surface
@@ -43,16 +44,16 @@ def shell(surface: Surface, *, thickness: float, detail: float = 0.04) -> Solid:
     if not 0 < thickness < np.inf:
         raise SimulationError.expected("more than 0 m", thickness, name="thickness")
     expect_detail(detail)
-    skin = Skin.of(surface).oriented()
-    if skin.open_edges == 0 and skin.areas.sum() * thickness > abs(skin.volume):
-        middle = 0.5 * abs(skin.volume) / skin.areas.sum()
+    mesh = oriented(weld(surface))
+    if not len(boundary_edges(mesh)) and mesh.area * thickness > abs(mesh.volume):
+        middle = 0.5 * abs(mesh.volume) / mesh.area
         raise SimulationError(
             f"thickness: expected less than the {4 * middle:.2g} m of the closed surface on average, got "
             f"{thickness:.3g} m; use a solid body (0 m), or a wall of {middle:.1g} m",
             name="thickness",
             value=thickness,
         )
-    coarse = skin.remeshed(detail * skin.size)
+    coarse = remeshed(mesh, detail * mesh.scale)
     if _folded_part(coarse, thickness) > _SPARED:
         fitting = (thickness * 0.5**step for step in range(1, 8))
         suggested = next((each for each in fitting if _folded_part(coarse, each) <= _SPARED), None)
@@ -62,70 +63,62 @@ def shell(surface: Surface, *, thickness: float, detail: float = 0.04) -> Solid:
             name="thickness",
             value=thickness,
         )
-    solid = prisms(coarse, np.full(len(coarse.points), thickness))
+    solid = prisms(coarse, np.full(len(coarse.vertices), thickness))
     return solid if solid is not None else fill(_both_sides(coarse, thickness), detail=detail)
 
 
-def prisms(skin: Skin, thickness: Float64[np.ndarray, " points"], *, layers: int = 1) -> Solid | None:
-    """Return a wall of this thickness at each point inwards of a skin, or None where some prisms stay folded."""
-    offsets = _offsets(skin, thickness)
+def prisms(mesh: Trimesh, thickness: Float64[np.ndarray, " points"], *, layers: int = 1) -> Solid | None:
+    """Return a wall of this thickness at each vertex inwards of a mesh, or None where some prisms stay folded."""
+    offsets = _offsets(mesh, thickness)
     if offsets is None:
         return None
-    count = len(skin.points)
-    points = np.concatenate([skin.points + layer / layers * offsets for layer in range(layers + 1)])
-    cells = np.concatenate([_prisms(skin.faces, count) + layer * count for layer in range(layers)])
+    count = len(mesh.vertices)
+    points = np.concatenate([mesh.vertices + layer / layers * offsets for layer in range(layers + 1)])
+    cells = np.concatenate([_prisms(mesh.faces, count) + layer * count for layer in range(layers)])
     return Solid.build(torch.from_numpy(points), torch.from_numpy(cells))
 
 
-def _offsets(skin: Skin, thickness: Float64[np.ndarray, " points"]) -> Float64[np.ndarray, "points 3"] | None:
-    """Return the way from each point through the wall, or None where some prisms stay folded."""
-    directions, lengths = -skin.normals, thickness.copy()
-    ends = skin.directed_edges
-    tolerance = _SLOPE * np.linalg.norm(skin.points[ends[:, 0]] - skin.points[ends[:, 1]], axis=1)
+def _offsets(mesh: Trimesh, thickness: Float64[np.ndarray, " points"]) -> Float64[np.ndarray, "points 3"] | None:
+    """Return the way from each vertex through the wall, or None where some prisms stay folded."""
+    faces = np.asarray(mesh.faces)
+    directions, lengths = -mesh.vertex_normals, thickness.copy()
+    ends = np.concatenate([mesh.edges, mesh.edges[:, ::-1]])
+    tolerance = _SLOPE * np.linalg.norm(np.diff(mesh.vertices[ends], axis=1)[:, 0], axis=1)
     for _ in range(_STEPS):
-        folded = _folded(skin, lengths[:, None] * directions)
+        folded = _folded(mesh, lengths[:, None] * directions)
         if not folded.any():
-            thin = lengths[skin.faces].mean(axis=1) < 0.5 * thickness[skin.faces].mean(axis=1)
-            return lengths[:, None] * directions if thin @ skin.areas <= _SPARED * skin.areas.sum() else None
-        directions = _tilted(skin, directions, folded)
-        lengths[np.unique(skin.faces[folded])] *= _THINNING
+            thin = lengths[faces].mean(axis=1) < 0.5 * thickness[faces].mean(axis=1)
+            return lengths[:, None] * directions if thin @ mesh.area_faces <= _SPARED * mesh.area else None
+        # Where there is a direction that all triangles around a vertex see from outside, this finds one in the end.
+        np.add.at(directions, faces[folded], -_TILT * mesh.face_normals[folded][:, None])
+        directions = unit(directions)
+        lengths[np.unique(faces[folded])] *= _THINNING
         # A wall that thins within one triangle would fold the next.
         np.minimum.at(lengths, ends[:, 0], lengths[ends[:, 1]] + tolerance)
     return None
 
 
-def _folded_part(skin: Skin, thickness: float) -> float:
+def _folded_part(mesh: Trimesh, thickness: float) -> float:
     """Return the part of the area at which a wall of even thickness folds."""
-    return float(_folded(skin, -thickness * skin.normals) @ skin.areas / skin.areas.sum())
+    return float(_folded(mesh, -thickness * mesh.vertex_normals) @ mesh.area_faces / mesh.area)
 
 
-def _both_sides(skin: Skin, thickness: float) -> Surface:
-    """Return the closed surface of a wall: the skin, its like inside turned round, and strips along the rims."""
-    start, end = skin.rim.T
-    inner = len(skin.points)
+def _both_sides(mesh: Trimesh, thickness: float) -> Surface:
+    """Return the closed surface of a wall: the mesh, its like inside turned round, and strips along the rims."""
+    start, end = boundary_edges(mesh).T
+    inner = len(mesh.vertices)
     strips = [np.stack([end, start, start + inner], axis=1), np.stack([end, start + inner, end + inner], axis=1)]
-    faces = np.concatenate([skin.faces, skin.faces[:, ::-1] + inner, *strips])
-    points = np.concatenate([skin.points, skin.points - thickness * skin.normals])
+    faces = np.concatenate([mesh.faces, mesh.faces[:, ::-1] + inner, *strips])
+    points = np.concatenate([mesh.vertices, mesh.vertices - thickness * mesh.vertex_normals])
     return Surface(torch.from_numpy(points).float(), torch.from_numpy(faces))
 
 
-def _tilted(skin: Skin, directions: np.ndarray, folded: np.ndarray) -> np.ndarray:
-    """Return directions that lean towards the inside of the folded triangles around each vertex.
-
-    Where there is a direction that all triangles around a vertex see from outside, this finds one in the end.
-    """
-    tilted = directions.copy()
-    inward = -skin.face_normals[folded]
-    np.add.at(tilted, skin.faces[folded], _TILT * inward[:, None])
-    return unit(tilted)
-
-
-def _folded(skin: Skin, offsets: np.ndarray) -> np.ndarray:
+def _folded(mesh: Trimesh, offsets: np.ndarray) -> np.ndarray:
     """Return which triangles' prisms hold a tetrahedron that is flat or inside out, [faces]."""
-    points = np.concatenate([skin.points, skin.points + offsets])
-    cells = points[_prisms(skin.faces, len(skin.points))]
+    points = np.concatenate([mesh.vertices, mesh.vertices + offsets])
+    cells = points[_prisms(mesh.faces, len(mesh.vertices))]
     volumes = np.linalg.det(cells[:, 1:] - cells[:, :1]).reshape(-1, 3) / 6.0
-    straight = skin.areas * np.linalg.norm(offsets, axis=1)[skin.faces].mean(axis=1) / 3.0
+    straight = mesh.area_faces * np.linalg.norm(offsets, axis=1)[mesh.faces].mean(axis=1) / 3.0
     return (volumes <= _FLATTEST * straight[:, None]).any(axis=1)
 
 

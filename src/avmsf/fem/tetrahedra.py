@@ -19,16 +19,16 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64
+from trimesh import Trimesh
 
 from avmsf._utils.caching import discard, keep_if_possible, source_digest
 from avmsf._utils.files import write_whole
 from avmsf._utils.processes import end_child, start_child
 from avmsf.errors import SimulationError
 from avmsf.fem import tetrahedra_worker
-from avmsf.fem.skin import Skin
+from avmsf.fem.remeshing import boundary_edges, coarsened, even_points, weld
 from avmsf.fem.solid import Solid
-from avmsf.mesh.closest_point import Closest, ClosestPoints
+from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.surface import Surface
 
 WORKER = Path(tetrahedra_worker.__file__)
@@ -55,25 +55,23 @@ def fill(surface: Surface, *, detail: float = 0.05, timeout: float = 600.0) -> S
     seconds, and for what encloses no body: points, sheets, parts that do not touch and walls too thin for the detail.
     """
     expect_detail(detail)
-    skin = Skin.of(surface)
-    advice = _advice(skin)
+    mesh = weld(surface)
+    size, opened = mesh.scale, len(boundary_edges(mesh))
+    advice = f"give a wall thickness, such as {0.015 * size:.1g} m"
     # Of a sheet fTetWild makes a sliver as thin as its envelope, or nothing, as chance has it.
-    if skin.open_edges and _flatness(skin) < 2.0 * _ENVELOPE * detail * skin.size:
+    if opened and _flatness(mesh) < 2.0 * _ENVELOPE * detail * size:
         raise SimulationError(
             f"expected a mesh that encloses a volume, got a flat sheet; {advice}", name="volume", value=0
         )
-    coarse = skin.coarsened(_SHORTEST * detail * skin.size, turn=_TURN)
-    points, cells = _stored(coarse, detail, timeout)
+    points, cells = _stored(coarsened(mesh, _SHORTEST * detail * size, turn=_TURN), detail, timeout)
     if not len(cells):
         raise SimulationError(
-            f"expected a mesh that encloses a volume, got {skin.open_edges} open edges; {advice}",
-            name="volume",
-            value=skin.open_edges,
+            f"expected a mesh that encloses a volume, got {opened} open edges; {advice}", name="volume", value=opened
         )
     solid = Solid.build(torch.from_numpy(points), torch.from_numpy(cells))
     solid.expect_connected(loose=_LOST)
     solid = Solid.build(solid.points, solid.cells[solid.parts == 0])
-    _expect_likeness(solid, skin, tolerance=4.0 * _ENVELOPE * detail * skin.size, advice=advice)
+    _expect_likeness(solid, mesh, tolerance=4.0 * _ENVELOPE * detail * size, advice=advice)
     return solid
 
 
@@ -83,18 +81,19 @@ def expect_detail(detail: float) -> None:
         raise SimulationError.expected("a part of the object's size, above 0 and below 1", detail, name="detail")
 
 
-def _stored(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarray, np.ndarray]:
+def _stored(mesh: Trimesh, detail: float, timeout: float) -> tuple[np.ndarray, np.ndarray]:
     """Return points and cells, stored in AVMSF_CACHE or ~/.cache/avmsf when they are first made."""
+    given, faces = np.array(mesh.vertices), np.array(mesh.faces)
     folder = Path(os.environ.get("AVMSF_CACHE") or os.path.expanduser("~/.cache/avmsf")) / "tetrahedra"
     code = f"{version('pytetwild')} {source_digest(tetrahedra_worker.__name__)}"
-    values = f"{code} {detail} {_ENVELOPE} {skin.points.shape} {skin.points.dtype} {skin.faces.dtype}"
-    digest = hashlib.sha256(values.encode() + skin.points.tobytes() + skin.faces.tobytes()).hexdigest()
+    values = f"{code} {detail} {_ENVELOPE} {given.shape} {given.dtype} {faces.dtype}"
+    digest = hashlib.sha256(values.encode() + given.tobytes() + faces.tobytes()).hexdigest()
     path = folder / f"{digest[:24]}.npz"
     try:
         with np.load(io.BytesIO(path.read_bytes())) as arrays:
             return arrays["points"], arrays["cells"]
     except (OSError, ValueError, KeyError, zipfile.BadZipFile):
-        points, cells = _tetrahedralize(skin, detail, timeout)
+        points, cells = _tetrahedralize(given, faces, detail, timeout)
 
     def write(temporary: Path) -> None:
         with open(temporary, "wb") as file:
@@ -107,7 +106,9 @@ def _stored(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarray, np.n
     return points, cells
 
 
-def _tetrahedralize(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarray, np.ndarray]:
+def _tetrahedralize(
+    points: np.ndarray, faces: np.ndarray, detail: float, timeout: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Return points and cells as pytetwild's process leaves them."""
     found = importlib.util.find_spec("pytetwild")
     assert found is not None
@@ -115,7 +116,7 @@ def _tetrahedralize(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarr
     with tempfile.TemporaryDirectory(prefix="avmsf-fill-") as name:
         job, result = Path(name) / "job.npz", Path(name) / "result.npz"
         np.savez(
-            job, points=skin.points, faces=skin.faces.astype(np.uint32), edge=detail, envelope=_ENVELOPE * detail,
+            job, points=points, faces=faces.astype(np.uint32), edge=detail, envelope=_ENVELOPE * detail,
             library=found.submodule_search_locations[0],
         )  # fmt: skip
         # -P keeps this folder, whose modules have common names, from where the worker looks for libraries.
@@ -128,7 +129,7 @@ def _tetrahedralize(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarr
             ended.wait(timeout)
         except subprocess.TimeoutExpired as error:
             raise SimulationError(
-                f"expected tetrahedra of {len(skin.faces)} triangles within {timeout:g} s, got none; simplify the "
+                f"expected tetrahedra of {len(faces)} triangles within {timeout:g} s, got none; simplify the "
                 "mesh, or use a larger detail or fewer degrees of freedom",
                 name="timeout",
                 value=timeout,
@@ -148,45 +149,36 @@ def _tetrahedralize(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarr
             return arrays["points"], arrays["cells"]
 
 
-def _expect_likeness(solid: Solid, skin: Skin, *, tolerance: float, advice: str) -> None:
+def _expect_likeness(solid: Solid, mesh: Trimesh, *, tolerance: float, advice: str) -> None:
     """Raise SimulationError where much of the mesh is not the solid's surface, or much of that surface is no mesh."""
-    outside = Skin(solid.points.numpy(), solid.boundary.numpy())
-    places = skin.spread()
-    found = ClosestPoints(outside.points[outside.faces])(places)
+    outside = Trimesh(solid.points.numpy(), solid.boundary.numpy(), process=False)
+    places, opened = even_points(mesh), len(boundary_edges(mesh))
+    found = ClosestPoints(np.array(outside.triangles))(places)
+    nearest = np.einsum("pc,pcd->pd", found.weights, outside.triangles[found.rows])
+    behind = (outside.face_normals[found.rows] * (places - nearest)).sum(axis=1) < 0
     # Where bodies cross, the mesh runs inside; only what lies outside was lost.
-    lost = float(((found.distances > tolerance) & ~_behind(outside, found, places)).mean())
+    lost = float(((found.distances > tolerance) & ~behind).mean())
     if lost > _LOST:
         raise SimulationError(
             f"expected tetrahedra within {tolerance:.2g} m of the mesh, got {lost:.0%} of it without "
-            f"({skin.open_edges} open edges, or thin walls); use a smaller detail or more degrees of freedom, close "
+            f"({opened} open edges, or thin walls); use a smaller detail or more degrees of freedom, close "
             f"the mesh, or {advice}",
             name="detail",
             value=lost,
         )
-    lids = float((ClosestPoints(skin.points[skin.faces])(outside.spread()).distances > tolerance).mean())
+    lids = float((ClosestPoints(np.array(mesh.triangles))(even_points(outside)).distances > tolerance).mean())
     if lids > _LID:
         raise SimulationError(
-            f"expected a nearly closed mesh, got {skin.open_edges} open edges whose holes are {lids:.0%} of the "
+            f"expected a nearly closed mesh, got {opened} open edges whose holes are {lids:.0%} of the "
             f"surface; close the mesh, or {advice}",
             name="holes",
             value=lids,
         )
 
 
-def _behind(skin: Skin, found: Closest, places: Float64[np.ndarray, "places 3"]) -> Bool[np.ndarray, " places"]:
-    """Return which places lie behind the triangle that is closest to them."""
-    corners = skin.points[skin.faces[found.rows]]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return (normals * (places - np.einsum("pc,pcd->pd", found.weights, corners))).sum(axis=1) < 0
-
-
-def _flatness(skin: Skin) -> float:
-    """Return the extent of the skin's corners along the axis that they spread least along, meters."""
-    places = skin.points[skin.faces].reshape(-1, 3)
+def _flatness(mesh: Trimesh) -> float:
+    """Return the extent of the triangles' corners along the axis that they spread least along, meters."""
+    places = mesh.triangles.reshape(-1, 3)
     places = places - places.mean(axis=0)
     _, axes = np.linalg.eigh(places.T @ places)
     return float(np.ptp(places @ axes[:, 0]))
-
-
-def _advice(skin: Skin) -> str:
-    return f"give a wall thickness, such as {0.015 * skin.size:.1g} m"

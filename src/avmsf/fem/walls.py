@@ -11,15 +11,23 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float64, Int
+from trimesh import Trimesh
 
 from avmsf.errors import SimulationError
+from avmsf.fem.remeshing import (
+    adjacency,
+    boundary_edges,
+    components,
+    count_crowded_edges,
+    even_points,
+    mesh_of,
+    remeshed,
+)  # fmt: skip
 from avmsf.fem.shell import prisms
-from avmsf.fem.skin import Skin, components
 from avmsf.fem.solid import Solid
 from avmsf.mesh.closest_point import ClosestPoints
+from avmsf.mesh.rays import RayCaster
 
 _OPPOSITE = -0.8
 """Largest cosine between the normals of the two sides."""
@@ -54,9 +62,9 @@ _ROUNDS = 100
 class Wall:
     """A closed mesh as a wall with two sides."""
 
-    skin: Skin
+    mesh: Trimesh
     """The closed mesh."""
-    sheet: Skin
+    sheet: Trimesh
     """The larger side."""
     thickness: float
     """Meters; the mean of an uneven wall."""
@@ -66,14 +74,14 @@ class Wall:
     @property
     def size(self) -> float:
         """Diagonal of the box around the mesh, meters."""
-        return self.skin.size
+        return self.mesh.scale
 
     def length(self, dofs: int) -> float:
         """Return the sides' length along the wall, meters, of prisms with about so many degrees of freedom."""
 
         # Each vertex of the sheet has 4 nodes on each of 2 layers + 1 levels, and two triangles.
         def needed(layers: int) -> float:
-            return math.sqrt(_TRIANGLE * 12.0 * (2 * layers + 1) * float(self.sheet.areas.sum()) / dofs)
+            return math.sqrt(_TRIANGLE * 12.0 * (2 * layers + 1) * self.sheet.area / dofs)
 
         layers = next(
             layers for layers in range(1, _MOST) if layers == _MOST - 1 or self._layers(needed(layers)) <= layers
@@ -96,8 +104,8 @@ class Wall:
 
         Raises SimulationError where those of the mesh's do not fill it; what it returns does where prisms fold.
         """
-        coarse = self.sheet.remeshed(length)
-        thickness = np.full(len(coarse.points), self.thickness) if self.even else self._thickness_at(coarse)
+        coarse = remeshed(self.sheet, length)
+        thickness = np.full(len(coarse.vertices), self.thickness) if self.even else self._thickness_at(coarse)
 
         def scaled(mean: float) -> Solid:
             assert thickness is not None
@@ -119,11 +127,11 @@ class Wall:
             )
         return scaled
 
-    def _thickness_at(self, sheet: Skin) -> Float64[np.ndarray, " points"] | None:
-        """Return the distance to the other side behind each point of a sheet, filled in from neighbors at rims."""
-        reach, cosine, _ = _Behind(self.skin)(sheet.points, sheet.normals)
+    def _thickness_at(self, sheet: Trimesh) -> Float64[np.ndarray, " points"] | None:
+        """Return the distance to the other side behind each vertex of a sheet, filled in from neighbors at rims."""
+        reach, cosine, _ = _behind(self.mesh, sheet.vertices, sheet.vertex_normals)
         known = (cosine < _OPPOSITE) & (reach < _THICKER * self.thickness)
-        joined = sheet.adjacency
+        joined = adjacency(sheet)
         values = np.where(known, reach, 0.0)
         for _ in range(_ROUNDS):
             if known.all():
@@ -137,75 +145,54 @@ class Wall:
     def _fills(self, solid: Solid) -> bool:
         """Return whether prisms have the mesh's volume, and their surface is the mesh."""
         volume, away = (_EVEN_VOLUME, 1.0) if self.even else (_VOLUME, 0.5)
-        if abs(solid.volume / self.skin.volume - 1.0) > volume:
+        if abs(solid.volume / self.mesh.volume - 1.0) > volume:
             return False
-        outside = Skin(solid.points.numpy(), solid.boundary.numpy())
-        return all(
-            float(
-                (ClosestPoints(one.points[one.faces])(other.spread()).distances > away * self.thickness).mean()
-            ) <= _MAX_DISTANT_PART
-            for one, other in ((outside, self.skin), (self.skin, outside))
-        )  # fmt: skip
+        outside = Trimesh(solid.points.numpy(), solid.boundary.numpy(), process=False)
+        distances = (
+            ClosestPoints(np.array(one.triangles))(even_points(other)).distances
+            for one, other in ((outside, self.mesh), (self.mesh, outside))
+        )
+        return all(float((each > away * self.thickness).mean()) <= _MAX_DISTANT_PART for each in distances)
 
 
-def wall_of(skin: Skin, thickness: float | None = None) -> Wall | None:
+def wall_of(mesh: Trimesh, thickness: float | None = None) -> Wall | None:
     """Return a closed mesh as a wall, or as a block between two opposite sides; None where it is neither.
 
     `Wall.solid` finds out whether prisms between the sides fill it. `thickness` states that of an even wall, meters.
     """
     # Sides are found over edges of two triangles each.
-    if skin.open_edges or skin.crowded_edges or skin.volume <= 0.0:
+    if len(boundary_edges(mesh)) or count_crowded_edges(mesh) or mesh.volume <= 0.0:
         return None
-    normals = skin.face_normals
-    areas, total = skin.areas, float(skin.areas.sum())
-    reach, cosine, behind = _Behind(skin)(skin.points[skin.faces].mean(axis=1), normals)
-    facing = (cosine < _OPPOSITE) & (reach < _THICKER * 2.0 * skin.volume / total)
+    areas = mesh.area_faces
+    reach, cosine, behind = _behind(mesh, mesh.triangles_center, mesh.face_normals)
+    facing = (cosine < _OPPOSITE) & (reach < _THICKER * 2.0 * mesh.volume / mesh.area)
     if not facing.any():
         return None
-    label = _sides(skin, normals, facing)
+    label = _sides(mesh, facing)
     side = label == np.bincount(label[facing], weights=areas[facing]).argmax()
     covered = side & ~side[behind]
-    half = float(areas[side].sum())
     held = float(areas[covered] @ reach[covered])
-    if float(areas[covered].sum()) < _COVERED * half or abs(held / skin.volume - 1.0) > _HELD:
+    if areas[covered].sum() < _COVERED * areas[side].sum() or abs(held / mesh.volume - 1.0) > _HELD:
         return None
-    sheet = Skin.compact(skin.points, skin.faces[side])
+    sheet = mesh_of(mesh.vertices, mesh.faces[side])
     if thickness is not None:
-        return Wall(skin, sheet, thickness, even=True)
-    return Wall(skin, sheet, float(np.average(reach[side], weights=areas[side])))
+        return Wall(mesh, sheet, thickness, even=True)
+    return Wall(mesh, sheet, float(np.average(reach[side], weights=areas[side])))
 
 
-def _sides(
-    skin: Skin, normals: Float64[np.ndarray, "faces 3"], facing: Bool[np.ndarray, " faces"]
-) -> Int[np.ndarray, " faces"]:
+def _sides(mesh: Trimesh, facing: Bool[np.ndarray, " faces"]) -> Int[np.ndarray, " faces"]:
     """Return the number of the smooth connected part of the triangles `facing` that each is in; -1 for the others."""
-    one, other, _ = skin.neighbors
-    joined = facing[one] & facing[other] & ((normals[one] * normals[other]).sum(axis=1) > _CREASE)
-    label = components(np.stack([one, other], axis=1)[joined], len(skin.faces))
-    return np.where(facing, label, -1)
+    pairs = mesh.face_adjacency
+    smooth = (mesh.face_normals[pairs[:, 0]] * mesh.face_normals[pairs[:, 1]]).sum(axis=1) > _CREASE
+    return np.where(facing, components(pairs[smooth & facing[pairs].all(axis=1)], len(mesh.faces)), -1)
 
 
-class _Behind:
-    """Finds what lies behind places of a mesh's surface."""
+def _behind(
+    mesh: Trimesh, places: Float64[np.ndarray, "places 3"], normals: Float64[np.ndarray, "places 3"]
+) -> tuple[Float64[np.ndarray, " places"], Float64[np.ndarray, " places"], Int[np.ndarray, " places"]]:
+    """Return the distance against the normals to the next triangle, the cosine of its normal, and its row.
 
-    def __init__(self, skin: Skin) -> None:
-        # Embree counts in float32: the mesh is moved to the origin and given size 1.
-        self._middle, self._size, self._normals = skin.points.mean(axis=0), skin.size, skin.face_normals
-        self._scene = EmbreeScene()
-        self._mesh = TriangleMesh(
-            self._scene, ((skin.points - self._middle)[skin.faces] / skin.size).astype(np.float32)
-        )
-
-    def __call__(
-        self, places: Float64[np.ndarray, "places 3"], normals: Float64[np.ndarray, "places 3"]
-    ) -> tuple[Float64[np.ndarray, " places"], Float64[np.ndarray, " places"], Int[np.ndarray, " places"]]:
-        """Return the distance against the normals to the next triangle, the cosine of its normal, and its row.
-
-        The distance is infinite where there is none.
-        """
-        origins = (places - self._middle) / self._size - _INSIDE * normals
-        hit = self._scene.run(origins.astype(np.float32), -normals.astype(np.float32), output=1)
-        rows = hit["primID"].astype(np.int64)
-        reach = (hit["tfar"].astype(np.float64) + _INSIDE) * self._size
-        cosine = (normals * self._normals[rows]).sum(axis=1)
-        return np.where(rows >= 0, reach, np.inf), np.where(rows >= 0, cosine, 1.0), rows
+    The distance is infinite where there is none, and the cosine 1.
+    """
+    rows, reach = RayCaster(np.array(mesh.triangles))(places, -normals, lead=_INSIDE)
+    return reach, np.where(rows >= 0, (normals * mesh.face_normals[rows]).sum(axis=1), 1.0), rows

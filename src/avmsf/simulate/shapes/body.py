@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64, Int
 
 from avmsf.errors import SimulationError
-from avmsf.fem.skin import unit
+from avmsf.fem.remeshing import unit
 from avmsf.fem.solid import FLATTEST, Solid
 
 _SHARPEST = 0.4
