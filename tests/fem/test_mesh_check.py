@@ -13,8 +13,17 @@ from trimesh import Trimesh
 from avmsf.errors import SimulationError
 from avmsf.fem import mesh_check
 from avmsf.fem.candidate_bodies import SurfaceBodies
-from avmsf.fem.mesh_check import ROUGH, CheckedSurface, checked, denoised, roughness, simplified, thinned
-from avmsf.fem.remeshing import boundary_edges, count_crowded_edges, mesh_of, remeshed, weld
+from avmsf.fem.mesh_check import (
+    ROUGH,
+    CheckedSurface,
+    checked,
+    count_crowded_edges,
+    denoised,
+    roughness,
+    simplified,
+    thinned,
+)
+from avmsf.fem.remeshing import boundary_edges, mesh_of, remeshed, weld
 from avmsf.fem.tetrahedra import fill
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.level_set import enclose

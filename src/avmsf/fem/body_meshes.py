@@ -2,7 +2,7 @@
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cached_property
 from operator import itemgetter
 from pathlib import Path
@@ -31,25 +31,22 @@ _OVER, _UNDER = 1.2, 0.65
 _PRISMS = 1.5
 """Degrees of freedom of prisms over those wanted, at most: a few more cost less than tetrahedra."""
 _FILLING_SECONDS = 60.0
-"""Time that one filling with tetrahedra may take; then coarser ones are tried once, and after that there is no body."""
+"""Time that one filling with tetrahedra may take; then a coarser one is tried once."""
 _TRIES = 4
 _POWER = 1.5
 """By which degrees of freedom go with the inverse of the detail."""
 _STEP = 2.0
-"""Largest factor on the detail from one try to the next. fTetWild's number of tetrahedra is erratic for few triangles:
-17 to 88 thousand degrees of freedom for details of .03 and .04 of a block of twelve."""
+"""Largest factor on the detail from one try to the next: fTetWild's number of tetrahedra is erratic."""
 _FINER = 0.6
 """Factor on a detail that is too coarse for a body."""
 _DETAILS = (0.002, 0.4)
 """Least and most length of a tetrahedron's edges over the body's size."""
 TRIANGLES = 0.1
-"""Triangles that fill gets, over the degrees of freedom: fTetWild keeps their corners, so more of them make more
-tetrahedra, and its time goes with them."""
+"""Triangles that `fill` gets, over the degrees of freedom: its time and number of tetrahedra go with them."""
 _KNOTTED = 4.0
-"""More triangles than that, over those that fill gets, only so that none share an edge among three, take more time than
-the few that do harm the form: fTetWild allows them."""
+"""Most triangles, over those that `fill` should get, that are worth it for no edge to be shared among three."""
 _SHELL = 36.0
-"""Degrees of freedom of a wall over the vertices of the skin that it follows."""
+"""Degrees of freedom of a wall over the vertices of the mesh that it follows."""
 _PEAK = 377e6, 40_000, 1.1
 """Bytes that modes take at their peak, of how many degrees of freedom, and the power they grow by (benchmarks/fem)."""
 _CAUTION = 2.0
@@ -111,12 +108,9 @@ class BodyMeshes:
         if thickness is None:
             self.checked.expect_filling()
         elif thickness >= self.checked.width:
-            raise SimulationError(
-                f"expected a wall thinner than the object's width of {millimeters(self.checked.width, 3)}, got "
-                f"{millimeters(thickness, 3)}; give a thinner wall",
-                name="wall",
-                value=thickness,
-            )
+            wanted = f"a thickness below the object's width of {millimeters(self.checked.width, 3)}"
+            got, advice = millimeters(thickness, 3), "give a thinner wall"
+            raise SimulationError.expected(wanted, thickness, got=got, name="wall", advice=advice)
         elif guessed and self.shape is None:
             self.checked.expect_hollow(thickness)
 
@@ -197,48 +191,42 @@ def _near(make: Callable[[float], Solid], dofs: int, *, first: float, most: floa
     Raises SimulationError where all of them are over by more than the factor `most`, and what `make` raises of the
     last detail where none was made.
     """
-    tried: dict[float, int] = {}
-    found: list[tuple[int, Solid]] = []
-    for detail in _details(tried, dofs, first):
+    counts: dict[float, int] = {}
+    made: list[tuple[int, Solid]] = []
+    detail: float | None = min(max(first, _DETAILS[0]), _DETAILS[1])
+    while detail is not None and detail not in counts and len(made) < _TRIES:
         try:
             solid = make(detail)
         except SimulationError as error:
             # Walls too thin for one detail may be thick enough for a finer one, and what takes too long may be coarser.
-            if tried:
+            if made:
                 break
             detail *= 1.0 / _FINER if error.name == "timeout" else _FINER
             solid = make(detail)
-        tried[detail] = count_dofs(solid)
-        found.append((tried[detail], solid))
-    allowed = [each for each in found if each[0] <= most * dofs] or [min(found, key=itemgetter(0))]
-    best = min(allowed, key=lambda each: abs(math.log(each[0] / dofs)))
-    if best[0] > most * dofs:
-        raise SimulationError(
-            f"expected a mesh of {dofs} degrees of freedom, got {best[0]} at least; allow these (--body.dofs), or "
-            "simplify the mesh",
-            name="dofs",
-            value=best[0],
+        counts[detail] = count_dofs(solid)
+        made.append((counts[detail], solid))
+        detail = _next_detail(counts, dofs)
+    allowed = [each for each in made if each[0] <= most * dofs] or [min(made, key=itemgetter(0))]
+    best, solid = min(allowed, key=lambda each: abs(math.log(each[0] / dofs)))
+    if best > most * dofs:
+        got, advice = f"{best} at least", "allow these (--body.dofs), or simplify the mesh"
+        raise SimulationError.expected(
+            f"a mesh of {dofs} degrees of freedom", best, got=got, name="dofs", advice=advice
         )
-    return best[1]
+    return solid
 
 
-def _details(tried: dict[float, int], dofs: int, first: float) -> Iterator[float]:
-    """Yield details until one of those tried is near the wanted number: between two that enclose it once there are."""
-    detail = min(max(first, _DETAILS[0]), _DETAILS[1])
-    for _ in range(_TRIES):
-        yield detail
-        last, found = list(tried.items())[-1]
-        if _UNDER * dofs <= found <= _OVER * dofs:
-            return
-        finer = max((each for each, count in tried.items() if count > dofs), default=None)
-        coarser = min((each for each, count in tried.items() if count <= dofs), default=None)
-        if finer is not None and coarser is not None:
-            detail = math.sqrt(finer * coarser)
-        else:
-            change = (found / (0.95 * dofs)) ** (1.0 / _POWER)
-            detail = min(max(last * min(max(change, 1.0 / _STEP), _STEP), _DETAILS[0]), _DETAILS[1])
-        if detail in tried:
-            return
+def _next_detail(counts: dict[float, int], dofs: int) -> float | None:
+    """Return the detail to try next, between two that enclose the wanted number once there are; None if it is near."""
+    last, found = list(counts.items())[-1]
+    if _UNDER * dofs <= found <= _OVER * dofs:
+        return None
+    finer = max((each for each, count in counts.items() if count > dofs), default=None)
+    coarser = min((each for each, count in counts.items() if count <= dofs), default=None)
+    if finer is not None and coarser is not None:
+        return math.sqrt(finer * coarser)
+    change = (found / (0.95 * dofs)) ** (1.0 / _POWER)
+    return min(max(last * min(max(change, 1.0 / _STEP), _STEP), _DETAILS[0]), _DETAILS[1])
 
 
 def _filling_detail(checked: CheckedSurface, dofs: int) -> float:

@@ -15,16 +15,7 @@ from scipy.sparse.linalg import splu
 from trimesh import Trimesh
 
 from avmsf.errors import SimulationError
-from avmsf.fem.remeshing import (
-    adjacency,
-    boundary_edges,
-    components,
-    count_crowded_edges,
-    even_points,
-    mesh_of,
-    oriented,
-    weld,
-)  # fmt: skip
+from avmsf.fem.remeshing import adjacency, boundary_edges, components, even_points, mesh_of, oriented, weld
 from avmsf.fem.solid import several_parts
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.surface import Surface
@@ -39,6 +30,11 @@ _WEAKEST, _STRONGEST = -3.0, 5.0
 """Decimal logarithms of the strengths to choose from."""
 _KEPT = 0.8
 """Part of the vertices' degrees of freedom that a mesh without noise would keep."""
+
+
+def count_crowded_edges(mesh: Trimesh) -> int:
+    """Return how many edges more than two triangles share."""
+    return int((np.bincount(mesh.edges_unique_inverse) > 2).sum())
 
 
 def roughness(mesh: Trimesh) -> float:
@@ -122,13 +118,11 @@ def _as_large(points: Float64[np.ndarray, "points 3"], mesh: Trimesh) -> Trimesh
 MOST = 60_000
 """Triangles beyond which a mesh is simplified even where that changes its form."""
 ENOUGH = 16_000
-"""Triangles beyond which it is simplified as far as its form stays: finite-element models have some thousand on their
-surface."""
+"""Triangles beyond which it is simplified as far as its form stays; finite-element models have some thousand."""
 _TOLERANCE = 0.01
-"""Root mean square distance of the simplified mesh from the given one, over the mean thickness, twice the volume over
-the area. Frequencies of a thin wall go with its thickness. Chosen on a twisted blade."""
+"""Root mean square distance of the simplified mesh from the given one, over its mean thickness; by a twisted blade."""
 _ROUNDS = 4
-"""Averages taken of a noisy mesh over the thinning, so that they reach little farther than an edge that stays."""
+"""Averages taken of a noisy mesh over the thinning: they reach little farther than an edge that stays."""
 
 
 def thinned(mesh: Trimesh, *, log: Callable[[str], None]) -> Trimesh:
@@ -185,8 +179,7 @@ _SMALL = 0.02
 _LOOSE = 0.1
 """Part of the area that may lie in loose bits, which a wall leaves out."""
 _VESSEL = 0.03
-"""Volume that an open surface holds, lids closing it, over its area to the power of 1.5, from which on it has an
-inside: that of a dish a tenth as deep as its radius; a hemisphere has .13."""
+"""Volume behind lids over the area to the power of 1.5 of an open surface with an inside; of a hemisphere it is .13."""
 _HOLLOW = 1.0 / 6.0
 """Thickness of a wall over the mean thickness of what a closed surface holds, beyond which no wall is guessed."""
 

@@ -91,16 +91,7 @@ def oriented(mesh: Trimesh) -> Trimesh:
 
 def boundary_edges(mesh: Trimesh) -> Int[np.ndarray, "edges 2"]:
     """Return the edges with a triangle on one side only: vertices, in the order in which that triangle has them."""
-    return mesh.edges[_triangles_at_edges(mesh)[mesh.edges_unique_inverse] == 1]
-
-
-def count_crowded_edges(mesh: Trimesh) -> int:
-    """Return how many edges more than two triangles share."""
-    return int((_triangles_at_edges(mesh) > 2).sum())
-
-
-def _triangles_at_edges(mesh: Trimesh) -> Int[np.ndarray, " edges"]:
-    return np.bincount(mesh.edges_unique_inverse)
+    return mesh.edges[np.bincount(mesh.edges_unique_inverse)[mesh.edges_unique_inverse] == 1]
 
 
 def adjacency(mesh: Trimesh) -> scipy.sparse.csr_array:

@@ -15,15 +15,7 @@ from jaxtyping import Bool, Float64, Int
 from trimesh import Trimesh
 
 from avmsf.errors import SimulationError
-from avmsf.fem.remeshing import (
-    adjacency,
-    boundary_edges,
-    components,
-    count_crowded_edges,
-    even_points,
-    mesh_of,
-    remeshed,
-)  # fmt: skip
+from avmsf.fem.remeshing import adjacency, components, even_points, mesh_of, remeshed
 from avmsf.fem.shell import prisms
 from avmsf.fem.solid import Solid
 from avmsf.mesh.closest_point import ClosestPoints
@@ -43,11 +35,9 @@ _VOLUME = 0.03
 """Largest relative difference between the volumes of prisms and mesh. Frequencies go with the thickness."""
 _EVEN_VOLUME = 0.05
 """The same where the thickness is known: facets that cut across a curved wall leave out area, but no thickness. A tube
-with facets of a third of its radius has 2.4 % less, and its lowest modes are 4 to 8 % too high; tetrahedra as many made
-them 6 to 33 % too high, each mode by another factor."""
+with facets of a third of its radius has 2.4 % less, and its lowest modes are 4 to 8 % too high."""
 _MAX_DISTANT_PART = 0.02
-"""Part of either surface that may be farther from the other than half the wall's thickness; than the whole thickness
-where that is known."""
+"""Part of either surface that may be farther from the other than half the wall's thickness; than all of a known one."""
 _INSIDE = 1e-5
 """How far behind a triangle rays start, in diagonals of the box around the mesh."""
 _TRIANGLE = 1.2
@@ -161,7 +151,7 @@ def wall_of(mesh: Trimesh, thickness: float | None = None) -> Wall | None:
     `Wall.solid` finds out whether prisms between the sides fill it. `thickness` states that of an even wall, meters.
     """
     # Sides are found over edges of two triangles each.
-    if len(boundary_edges(mesh)) or count_crowded_edges(mesh) or mesh.volume <= 0.0:
+    if not mesh.is_watertight or mesh.volume <= 0.0:
         return None
     areas = mesh.area_faces
     reach, cosine, behind = _behind(mesh, mesh.triangles_center, mesh.face_normals)
