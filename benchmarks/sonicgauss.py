@@ -26,7 +26,7 @@ from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.fit import splat
 from avmsf.photographs.mesh_views import orbit_cameras, render_views
 from avmsf.simulate.recipe import SIM20, ObjectRecipe
-from avmsf.simulate.shapes.kinds import KINDS
+from avmsf.simulate.shapes.catalog import KINDS
 from avmsf.simulate.simulation import simulate_object
 from benchmarks.report import Report, Table, log
 

@@ -10,8 +10,7 @@ from scipy.spatial import cKDTree
 
 from avmsf.errors import SimulationError
 from avmsf.simulate.shapes import KINDS, Shape, make_shape
-from avmsf.simulate.shapes.body import Body
-from avmsf.simulate.shapes.turned import Profile, Turned
+from avmsf.simulate.shapes.revolution import Profile, Turned
 from factories.raising import raises
 
 HANDLES = {"mug": 1, "jug": 1, "bracket": 2, "tube": 1}
@@ -156,21 +155,19 @@ def test_lobes_are_as_many_as_claimed() -> None:
 
 def test_the_volume_of_a_tube_of_many_sides() -> None:
     radius, length, wall = 0.02, 0.1, 0.003
-    body = Body()
-    turned = Turned.lay(body, Profile([(radius, height, wall) for height in (0.0, 0.5 * length, length)]))
+    turned = Turned.lay(Profile([(radius, height, wall) for height in (0.0, 0.5 * length, length)]))
     sides = turned.rings.counts[0]
     # The sides of a polygon on a circle, moved by half of the wall to both sides.
     expected = sides * 2.0 * radius * math.sin(math.pi / sides) * wall * length
-    assert body.solid().volume == pytest.approx(expected, rel=1e-12)
+    assert turned.body.solid().volume == pytest.approx(expected, rel=1e-12)
 
 
 def test_the_volume_of_a_bowl_by_pappus() -> None:
     radius, wall = 0.08, 0.004
-    body = Body()
     profile = Profile(
         [(0.0, 0.0, wall), (0.7 * radius, 0.0, wall), (radius, 0.3 * radius, wall), (radius, radius, wall)]
     )
-    Turned.lay(body, profile, points=3000)
+    body = Turned.lay(profile, points=3000).body
     along = np.linspace(0.0, 1.0, 20001)
     middle = profile.at(along)[:, :2]
     steps = np.linalg.norm(np.diff(middle, axis=0), axis=1)

@@ -7,7 +7,8 @@ from scipy.spatial import cKDTree
 
 from avmsf.errors import SimulationError
 from avmsf.fem.solid import Solid
-from avmsf.simulate.shapes import make_shape, vary_thickness
+from avmsf.simulate.shapes import make_shape
+from avmsf.simulate.thickness_variation import vary_thickness
 from factories.raising import raises
 
 

@@ -20,7 +20,8 @@ from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh, read_textured_mesh
 from avmsf.simulate.imperfections import smooth_field, stream, support_places, support_springs
 from avmsf.simulate.recipe import AXES, ObjectRecipe
-from avmsf.simulate.shapes import make_shape, textured, vary_thickness
+from avmsf.simulate.shapes import make_shape, textured
+from avmsf.simulate.thickness_variation import vary_thickness
 
 _LARGEST = 10.0
 """Meters along its longest side beyond which a mesh is likelier to count millimeters."""

@@ -6,20 +6,21 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import trimesh
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
-from jaxtyping import Bool, Float64, Int
+from jaxtyping import Float64, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from avmsf.errors import SimulationError
 from avmsf.mesh.closest_point import ClosestPoints
+from avmsf.mesh.rays import RayCaster
 from avmsf.mesh.surface import Surface
 from avmsf.simulate.imperfections import stream
 from avmsf.simulate.recipe import Imperfections
 
 STEEPEST = -0.35
 """Least height of a unit normal where a hammer gets beneath: 20 degrees of overhang above a table."""
+_LEAD = 1e-4
+"""How far off the surface rays start, in object diagonals."""
 _CANDIDATES = 4
 """Places drawn evenly from what can be reached, for each contact: more would push the contacts to the rims."""
 
@@ -89,13 +90,15 @@ def _reached(
         count, advice = len(mesh.faces), "give a mesh with faces"
         got = f"{count} without"
         raise SimulationError.expected("triangles with an area", count, got=got, name="surface", advice=advice)
-    generator = stream(seed, "contacts")
+    generator, cast = stream(seed, "contacts"), RayCaster(np.array(mesh.triangles))
     wanted = _CANDIDATES * count
     places, normals, drawn = np.zeros((0, 3)), np.zeros((0, 3)), 0
     while len(places) < wanted and drawn < 200 * wanted:
         points, rows = trimesh.sample.sample_surface(mesh, 8 * wanted, seed=int(generator.integers(2**31)))
         outward = np.asarray(mesh.face_normals[rows])
-        reached = (outward @ up.numpy() >= STEEPEST) & _free(mesh, np.asarray(points), outward)
+        # A ray along the normal leaves the object without meeting it again.
+        free = cast(np.asarray(points), outward, lead=_LEAD)[0] < 0
+        reached = free & (outward @ up.numpy() >= STEEPEST)
         places, normals = np.concatenate([places, points[reached]]), np.concatenate([normals, outward[reached]])
         drawn += 8 * wanted
     if len(places) < count:
@@ -104,19 +107,6 @@ def _reached(
         got = f"{len(places)} of {drawn}"
         raise SimulationError.expected(reachable, len(places), got=got, name="up", advice=advice)
     return torch.from_numpy(places[:wanted]), torch.from_numpy(normals[:wanted])
-
-
-def _free(
-    mesh: trimesh.Trimesh, places: Float64[np.ndarray, "places 3"], outward: Float64[np.ndarray, "places 3"]
-) -> Bool[np.ndarray, " places"]:
-    """Return where a ray along the normal leaves the object without meeting it again."""
-    low, high = mesh.bounds
-    diagonal = float(np.linalg.norm(high - low))
-    # Embree counts in float32: the object is moved to the origin and made of size 1, and a ray starts off its surface.
-    scene = EmbreeScene()
-    TriangleMesh(scene, ((mesh.vertices - low) / diagonal).astype(np.float32), mesh.faces.astype(np.int32))
-    origins = ((places - low) / diagonal + 1e-4 * outward).astype(np.float32)
-    return scene.run(origins, outward.astype(np.float32)) < 0
 
 
 def _spread(places: Float64[Tensor, "places 3"], count: int, *, seed: int) -> Int[Tensor, " chosen"]:

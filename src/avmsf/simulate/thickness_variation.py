@@ -3,13 +3,12 @@
 import numpy as np
 import scipy.sparse
 import torch
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float64, Int
 from scipy.sparse.linalg import splu
 
 from avmsf.errors import SimulationError
 from avmsf.fem.solid import Solid
+from avmsf.mesh.rays import RayCaster
 from avmsf.simulate.imperfections import smooth_field
 from avmsf.simulate.shapes.body import mitred_normals
 
@@ -18,7 +17,7 @@ MOST = 0.5
 _SQUEEZED = 0.02
 """Part of its volume below which a tetrahedron is moved as a whole instead."""
 _MAX_REPAIRS = 30
-_APART = 1e-4
+_LEAD = 1e-4
 """How far inside of the surface rays start, in object diagonals."""
 
 
@@ -38,18 +37,23 @@ def vary_thickness(solid: Solid, part: float, *, generator: np.random.Generator)
     triangles, places = inverse.reshape(-1, 3), solid.points.numpy()[rows]
     corners = places[triangles]
     doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    share = np.bincount(triangles.ravel(), weights=np.repeat(np.linalg.norm(doubled, axis=1), 3))
+    areas = np.linalg.norm(doubled, axis=1)
+    share = np.bincount(triangles.ravel(), weights=np.repeat(areas, 3))
     field = torch.log(smooth_field(torch.from_numpy(places), 1.0, diagonal=solid.size, generator=generator)).numpy()
-    factor = _spread(field, share, part)
+    factor = _factors(field, share, part)
+    _, reach = RayCaster(corners)(corners.mean(axis=1), -doubled / areas[:, None], lead=_LEAD)
+    hit = np.isfinite(reach)
+    if not hit.any():
+        raise SimulationError("expected a closed surface, got an open one; make the tetrahedra again", name="solid")
     # At a rim the walls' thickness, not the rim's distance from what lies below it.
     walls = np.full(len(places), np.inf)
-    np.minimum.at(walls, triangles, _thickness(places, triangles, solid.size)[:, None])
+    np.minimum.at(walls, triangles, np.where(hit, reach, np.median(reach[hit]))[:, None])
     moved = 0.5 * ((factor - 1.0) * walls)[:, None] * mitred_normals(places, triangles)
     motion = _carried(solid, rows, moved)
     return Solid.build(solid.points + torch.from_numpy(_repaired(solid, motion)), solid.cells)
 
 
-def _spread(
+def _factors(
     field: Float64[np.ndarray, " points"], share: Float64[np.ndarray, " points"], part: float
 ) -> Float64[np.ndarray, " points"]:
     """Return positive factors of mean 1 and this root mean square deviation that rise with a field."""
@@ -60,26 +64,6 @@ def _spread(
         found = float(np.sqrt(np.average((factor - 1.0) ** 2, weights=share)))
         strength = (strength or part) * part / found
     return factor
-
-
-def _thickness(
-    places: Float64[np.ndarray, "points 3"], triangles: Int[np.ndarray, "triangles 3"], size: float
-) -> Float64[np.ndarray, " triangles"]:
-    """Return how far the body reaches behind the middle of each triangle, meters."""
-    middle = 0.5 * (places.min(axis=0) + places.max(axis=0))
-    # Embree counts in float32: the body is moved to the origin and given size 1.
-    corners = (places[triangles] - middle) / size
-    scene = EmbreeScene()
-    TriangleMesh(scene, corners.astype(np.float32))
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    origins = corners.mean(axis=1) - _APART * normals
-    found = scene.run(origins.astype(np.float32), -normals.astype(np.float32), output=1)
-    reach = np.where(found["primID"] >= 0, found["tfar"], np.inf).astype(np.float64) + _APART
-    hit = np.isfinite(reach)
-    if not hit.any():
-        raise SimulationError("expected a closed surface, got an open one; make the tetrahedra again", name="solid")
-    return size * np.where(hit, reach, np.median(reach[hit]))
 
 
 def _carried(
@@ -110,10 +94,9 @@ def _repaired(solid: Solid, motion: Float64[np.ndarray, "points 3"]) -> Float64[
             return motion
         means = np.repeat(motion[crushed].mean(axis=1), 4, axis=0)
         touched, which = np.unique(crushed, return_inverse=True)
-        number = np.bincount(which.ravel())
         motion = motion.copy()
         for axis in range(3):
-            motion[touched, axis] = np.bincount(which.ravel(), weights=means[:, axis]) / number
+            motion[touched, axis] = np.bincount(which.ravel(), weights=means[:, axis]) / np.bincount(which.ravel())
     got = f"{len(crushed)} of {len(cells)} inverted"
     advice = "vary the thickness less, or make the tetrahedra with another detail"
     wanted = "a variation that keeps all tetrahedra"

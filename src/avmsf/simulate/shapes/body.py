@@ -1,11 +1,13 @@
-"""Prisms laid side by side and end to end, cut into tetrahedra that fit together."""
+"""What all shapes are made of: prisms laid side by side and end to end, cut into tetrahedra that fit together."""
 
 import itertools
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from jaxtyping import Float64, Int
+from torch import Tensor
 
 from avmsf.errors import SimulationError
 from avmsf.fem.remeshing import unit
@@ -146,3 +148,47 @@ class Body:
             turned = np.tile(odd, 3)
             cells[turned] = cells[turned][:, [0, 2, 1, 3]]
             self.fill(cells)
+
+
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Symmetry:
+    """Rotations about one axis and mirror planes that are symmetries of a shape; compositions are not listed."""
+
+    axis: Float64[Tensor, " 3"] | None = None
+    """Direction of the axis, a unit vector; None where no turn is a symmetry."""
+    order: int | None = None
+    """Turns by 1/order are symmetries; None with an axis means every angle (of the shape that the triangles
+    approximate), and every plane that contains the axis."""
+    mirrors: Float64[Tensor, "planes 3"] = field(default_factory=lambda: torch.zeros(0, 3).double())
+    """Unit normals of mirror planes, apart from those that contain an axis of every angle."""
+    point: Float64[Tensor, " 3"] = field(default_factory=lambda: torch.zeros(3).double())
+    """A point of the axis and of all planes, object frame, meters."""
+
+
+ROUND = Symmetry(UP, None)
+"""Of what turns about the z axis by every angle."""
+MIRRORED = Symmetry(mirrors=torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64))
+"""Of what has a handle: the plane through it and the axis."""
+
+
+@dataclass(frozen=True, eq=False)
+class Draft:
+    """A shape without its colors."""
+
+    body: Body
+    wall: float
+    """Nominal thickness, meters."""
+    symmetry: Symmetry
+
+
+Maker = Callable[[np.random.Generator, float | None], Draft]
+"""Draws the proportions of one individual; walls as thick as told, meters, or drawn too."""
+
+
+def drawn_wall(random: np.random.Generator, low: float, high: float, wall: float | None) -> float:
+    """Return the wall that was asked for, or one between two bounds, meters; draws in both cases."""
+    drawn = random.uniform(low, high)
+    return drawn if wall is None else wall

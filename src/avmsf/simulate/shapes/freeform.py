@@ -1,38 +1,14 @@
-"""Shapes that chance alone drew: no turn and no mirror carries them onto themselves."""
+"""A lump that chance alone drew: no turn and no mirror carries it onto itself."""
 
 import itertools
 
 import numpy as np
 
-from avmsf.simulate.shapes.body import Body
-from avmsf.simulate.shapes.shape import Draft, Symmetry, drawn_wall
-from avmsf.simulate.shapes.turned import Profile, Turned
+from avmsf.simulate.shapes.body import Body, Draft, Symmetry, drawn_wall
 
 _CORE, _SHELLS = (10, 5, 3), 3
 """Boxes along each side of a blob's core, and layers around it."""
 _LUMPS = 7
-
-
-def dish(random: np.random.Generator, wall: float | None) -> Draft:
-    """Make a hand-shaped shallow dish."""
-    radius, depth = random.uniform(0.07, 0.11), random.uniform(0.28, 0.42)
-    waves = np.arange(1, 5)
-    outline = random.normal(size=4) * (0.06, 0.11, 0.06, 0.03)
-    rim = random.normal(size=4) * (0.03, 0.03, 0.04, 0.02)
-    phases = random.uniform(0.0, 2.0 * np.pi, (2, 4))
-    wall = drawn_wall(random, 0.0035, 0.0055, wall)
-    height = depth * radius
-
-    def warp(angles: np.ndarray, along: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        turning = waves * angles[:, None]
-        out = np.cos(turning + phases[0]) @ outline
-        up = np.cos(turning + phases[1]) @ rim
-        return values[:, 0] * (1.0 + out * along), values[:, 1] + radius * up * along**2
-
-    body = Body()
-    corners = [(0.0, 0.0, 1.2), (0.55, 0.0, 1.2), (0.8, 0.25, 1.0), (1.0, 1.0, 0.9)]
-    Turned.lay(body, Profile.scaled(radius, height, wall, corners), warp=warp)
-    return Draft(body, wall, Symmetry())
 
 
 def blob(random: np.random.Generator, wall: float | None) -> Draft:

@@ -1,0 +1,207 @@
+"""All kinds of shapes by name: individuals of a size and a wall, with their surface, tetrahedra and colors."""
+
+import math
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64, Int
+from torch import Tensor
+
+from avmsf.errors import SimulationError
+from avmsf.fem.solid import Solid
+from avmsf.mesh.surface import Surface
+from avmsf.mesh.textured_mesh import TexturedMesh
+from avmsf.simulate.shapes.body import Draft, Maker, Symmetry
+from avmsf.simulate.shapes.freeform import blob
+from avmsf.simulate.shapes.revolution import bell, bowl, dish, fluted, goblet, plate, pot, tube
+from avmsf.simulate.shapes.sheet import bracket, platter, spoon, tray
+from avmsf.simulate.shapes.sweep import jug, mug, skillet
+
+_MAKERS: tuple[Maker, ...] = (
+    bell, blob, bowl, bracket, dish, fluted, goblet, jug, mug, plate, platter, pot, skillet, spoon, tray, tube,
+)  # fmt: skip
+KINDS: Mapping[str, Maker] = MappingProxyType({maker.__name__: maker for maker in _MAKERS})
+"""What draws and builds an individual of each kind."""
+_LARGEST = 100.0
+"""Meters."""
+_FEWEST_FACES = 6000
+_ROUNDS = 4
+"""Drafts until walls and size are both as asked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """One individual of a kind: upright along z, its axis, if any, the z axis."""
+
+    name: str
+    """Kind and seed, such as "mug-3"."""
+    surface: Surface
+    """Closed triangles, counter-clockwise from outside, meters: the solid's surface, with its triangles subdivided."""
+    colors: Float[Tensor, "points 3"]
+    """Red, green, blue at each vertex of the surface as displayed (sRGB), 0 to 1."""
+    thickness: float
+    """Nominal thickness of the walls, meters; of a lump without walls its smallest extent."""
+    symmetry: Symmetry
+    """Of the shape; colors need not follow it."""
+    solid: Solid
+    """Tetrahedra, in the surface to rounding."""
+
+
+def textured(shape: Shape) -> TexturedMesh:
+    """Return a shape's surface in its colors, to render it with `avmsf.photographs.mesh_views.render_views`."""
+    faces = shape.surface.faces
+    return TexturedMesh.build(shape.surface.vertices, faces, colors=shape.colors[faces])
+
+
+def make_shape(kind: str, *, seed: int | None = 0, size: float | None = None, wall: float | None = None) -> Shape:
+    """Return one individual of a kind in `KINDS`; another seed draws other proportions and colors, None the first.
+
+    `size` is the longest side of its bounding box and `wall` the nominal thickness of its walls, meters; both are
+    drawn where they are not given, and a size alone scales the walls with everything else. Raises SimulationError for
+    an unknown kind, for a negative seed, for sizes that are not positive, and for walls so thick that they fold over
+    themselves or leave nothing of the shape.
+    """
+    if kind not in KINDS:
+        raise SimulationError.expected(f"one of {', '.join(sorted(KINDS))}", kind, name="kind")
+    seed = 0 if seed is None else seed
+    if seed < 0:
+        raise SimulationError(f"seed: expected 0 or more, got {seed}", name="seed", value=seed)
+    for name, value in (("size", size), ("wall", wall)):
+        if value is not None and not 0.0 < value <= _LARGEST:
+            raise SimulationError.expected(f"more than 0 and at most {_LARGEST:g} m", value, name=name)
+    draft, scale = _sized(kind, seed, size, wall)
+    try:
+        solid = draft.body.solid(scale=scale)
+    except SimulationError as error:
+        thickness = scale * draft.wall
+        raise SimulationError(
+            f"{kind}, seed {seed}, wall of {1000.0 * thickness:g} mm: {error}", name="wall", value=thickness
+        ) from error
+    points, faces = _skin(solid)
+    # The name is part of the seed: with another one, all objects have other colors.
+    colors = glaze(points, _chance(kind, seed, "colours"))
+    return Shape(
+        name=f"{kind}-{seed}",
+        surface=Surface(torch.from_numpy(points).float(), torch.from_numpy(faces)),
+        colors=torch.from_numpy(colors).float(),
+        thickness=draft.wall * scale,
+        symmetry=draft.symmetry,
+        solid=solid,
+    )
+
+
+def _sized(kind: str, seed: int, size: float | None, wall: float | None) -> tuple[Draft, float]:
+    """Return a draft and the factor that brings it to its size and walls."""
+    scale = 1.0
+    draft = KINDS[kind](_chance(kind, seed, "form"), wall if size is None else None)
+    if size is None:
+        return draft, scale
+    for _ in range(1 if wall is None else _ROUNDS):
+        scale = size / draft.body.extent
+        if wall is not None:
+            # Walls are drawn to the scale of the draft, whose size they change a little.
+            draft = KINDS[kind](_chance(kind, seed, "form"), wall / scale)
+    return draft, size / draft.body.extent
+
+
+def _chance(kind: str, seed: int, name: str) -> np.random.Generator:
+    """Return the random numbers of one thing about an individual."""
+    return np.random.default_rng([seed, zlib.crc32(f"{kind} {name}".encode())])
+
+
+def _skin(solid: Solid) -> tuple[Float64[np.ndarray, "points 3"], Int[np.ndarray, "faces 3"]]:
+    """Return a solid's outer triangles, each cut in four, and again until they are fine enough for colors."""
+    used, rows = np.unique(solid.boundary.numpy(), return_inverse=True)
+    points, faces = solid.points.numpy()[used], rows.reshape(-1, 3)
+    while len(faces) < _FEWEST_FACES:
+        ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1), axis=-1).reshape(-1, 2)
+        edges, which = np.unique(ends[:, 0] * len(points) + ends[:, 1], return_inverse=True)
+        a, b, c = faces.T
+        ab, bc, ca = (which.reshape(-1, 3) + len(points)).T
+        points = np.concatenate([points, 0.5 * (points[edges // len(points)] + points[edges % len(points)])])
+        cut = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
+        faces = np.concatenate([np.stack(each, axis=1) for each in cut])
+    return points, faces
+
+
+_GLAZES = np.array([
+    (0.93, 0.91, 0.85), (0.55, 0.68, 0.74), (0.72, 0.79, 0.68), (0.84, 0.62, 0.44),
+    (0.45, 0.52, 0.60), (0.88, 0.78, 0.52), (0.62, 0.42, 0.36), (0.80, 0.76, 0.82),
+])  # fmt: skip
+_PAINTS = np.array([
+    (0.13, 0.22, 0.48), (0.55, 0.13, 0.12), (0.10, 0.33, 0.28), (0.20, 0.14, 0.12),
+    (0.86, 0.52, 0.10), (0.97, 0.95, 0.90), (0.38, 0.20, 0.45),
+])  # fmt: skip
+_EDGE = 0.006
+"""Width of the edge of what is painted, in object diagonals."""
+_LEAST_CONTRAST = 0.45
+
+Decor = Callable[[np.ndarray, np.random.Generator], np.ndarray]
+"""From places in object diagonals, about the middle, to how far inside of the paint each lies, in diagonals."""
+
+
+def glaze(points: Float64[np.ndarray, "points 3"], random: np.random.Generator) -> Float64[np.ndarray, "points 3"]:
+    """Return red, green and blue of each point, 0 to 1: a glaze, uneven as fired ones are, with paint on it."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    places = (points - 0.5 * (low + high)) / np.linalg.norm(high - low)
+    ground = _GLAZES[random.integers(len(_GLAZES))]
+    contrast = np.linalg.norm(_PAINTS - ground, axis=1)
+    fitting = _PAINTS[contrast > _LEAST_CONTRAST]
+    paint = fitting[random.integers(len(fitting))]
+    decor = DECORS[int(random.integers(len(DECORS)))]
+    inside = np.clip(0.5 + decor(places, random) / _EDGE, 0.0, 1.0)[:, None]
+    colors = ground + inside * (paint - ground)
+    cloudy = 0.03 + 0.07 * random.random()
+    light = 1.0 + cloudy * _waves(places, random, 0.35, 12) + 0.02 * random.standard_normal(len(points))
+    return np.clip(colors * light[:, None], 0.0, 1.0)
+
+
+def _bands(places: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Two to four level bands."""
+    low, high = places[:, 2].min(), places[:, 2].max()
+    number = int(random.integers(2, 5))
+    levels = low + (high - low) * np.sort(random.uniform(0.1, 0.98, number))
+    width = random.uniform(0.012, 0.03)
+    return (width - np.abs(places[:, 2, None] - levels)).max(axis=1)
+
+
+def _dipped(places: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """All beyond a slanting plane."""
+    slanting = np.array([random.normal(), random.normal(), 1.0])
+    heights = places @ (slanting / np.linalg.norm(slanting))
+    return heights - np.quantile(heights, random.uniform(0.45, 0.75))
+
+
+def _spots(places: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Round spots anywhere."""
+    centers = places[random.integers(len(places), size=int(random.integers(14, 30)))]
+    radii = random.uniform(0.025, 0.06, len(centers))
+    return (radii - np.linalg.norm(places[:, None] - centers, axis=-1)).max(axis=1)
+
+
+def _strokes(places: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Curved lines as of a brush."""
+    height = _waves(places, random, random.uniform(0.35, 0.6), 6)
+    # The field's slope is about 2 pi over its wavelength: so wide a stroke is a few hundredths of the diagonal.
+    return 0.08 * (0.28 - np.abs(height))
+
+
+def _patches(places: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Large patches with wavy outlines."""
+    height = _waves(places, random, 0.5, 8)
+    return 0.08 * (height - np.quantile(height, random.uniform(0.55, 0.75)))
+
+
+DECORS: tuple[Decor, ...] = (_bands, _dipped, _spots, _strokes, _patches)
+
+
+def _waves(places: np.ndarray, random: np.random.Generator, length: float, number: int) -> np.ndarray:
+    """Return a smooth field of root mean square 1 in space, of waves about this long."""
+    ways = random.standard_normal((number, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True) * length * random.uniform(0.7, 1.5, (number, 1))
+    phases = random.uniform(0.0, 2.0 * math.pi, number)
+    return math.sqrt(2.0 / number) * np.cos(2.0 * math.pi * places @ ways.T + phases).sum(axis=1)

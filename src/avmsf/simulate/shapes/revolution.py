@@ -1,0 +1,435 @@
+"""Surfaces of revolution with a wall, exactly or with lobes and corners: vessels, bells and tubes."""
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int
+from scipy.interpolate import BSpline
+
+from avmsf.simulate.shapes.body import ROUND, UP, Body, Draft, Sheet, Symmetry, drawn_wall
+
+
+@dataclass(frozen=True, eq=False)
+class Rings:
+    """Points on rings from the inside out, the pole first if there is one, and triangles between them.
+
+    Seen so that the angle grows counter-clockwise and rings outwards, so do the triangles. Diagonals alternate, so that
+    turning by two points of the innermost ring, and mirroring at a point of it, changes nothing.
+    """
+
+    counts: tuple[int, ...]
+    """Points on each ring, even numbers, from the inside out; each as many as the one before or twice as many."""
+    pole: bool
+    """Whether a point in the middle, which counts as ring 0, closes the innermost ring."""
+
+    @cached_property
+    def starts(self) -> Int[np.ndarray, " rings"]:
+        """First row of each ring, and behind the last one."""
+        return np.cumsum([0, *([1] if self.pole else []), *self.counts])
+
+    @property
+    def number(self) -> int:
+        """Rings, with the pole."""
+        return len(self.starts) - 1
+
+    @cached_property
+    def ring(self) -> Int[np.ndarray, " points"]:
+        """Number of each point's ring."""
+        return np.repeat(np.arange(self.number), np.diff(self.starts))
+
+    @cached_property
+    def turns(self) -> Float64[np.ndarray, " points"]:
+        """Angle of each point, 0 to 1; 0 at the pole."""
+        return (np.arange(self.starts[-1]) - self.starts[self.ring]) / np.diff(self.starts)[self.ring]
+
+    @cached_property
+    def order(self) -> Int[np.ndarray, " points"]:
+        """Numbers that differ along every edge and mirror as the triangles do."""
+        return 2 * self.ring + (np.arange(self.starts[-1]) - self.starts[self.ring]) % 2
+
+    def rows(self, ring: int, places: Sequence[int] | np.ndarray) -> Int[np.ndarray, " places"]:
+        """Return rows of points on a ring, counted around it from angle 0 in either direction."""
+        return self.starts[ring] + np.asarray(places) % (self.starts[ring + 1] - self.starts[ring])
+
+    @cached_property
+    def triangles(self) -> Int[np.ndarray, "triangles 3"]:
+        """Rows of points."""
+        found = []
+        for ring in range(self.number - 1):
+            inner, outer = (int(self.starts[each + 1] - self.starts[each]) for each in (ring, ring + 1))
+            if inner == 1:
+                k = np.arange(outer)
+                found.append(np.stack([np.zeros_like(k), self.rows(1, k), self.rows(1, k + 1)], axis=1))
+            elif outer == inner:
+                found.append(self._band(ring, np.arange(inner)))
+            else:
+                found.append(self._doubling(ring, np.arange(inner)))
+        return np.concatenate(found)
+
+    def _band(self, ring: int, k: np.ndarray) -> np.ndarray:
+        a, after = self.rows(ring, k), self.rows(ring, k + 1)
+        b, beyond = self.rows(ring + 1, k), self.rows(ring + 1, k + 1)
+        rising = ((k + ring) % 2 == 0)[:, None]
+        first = np.where(rising, np.stack([a, b, beyond], axis=1), np.stack([a, b, after], axis=1))
+        second = np.where(rising, np.stack([a, beyond, after], axis=1), np.stack([b, beyond, after], axis=1))
+        return np.concatenate([first, second])
+
+    def _doubling(self, ring: int, k: np.ndarray) -> np.ndarray:
+        a, after = self.rows(ring, k), self.rows(ring, k + 1)
+        b, between, beyond = (self.rows(ring + 1, 2 * k + step) for step in range(3))
+        corners = ((a, b, between), (a, between, after), (after, between, beyond))
+        return np.concatenate([np.stack(each, axis=1) for each in corners])
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """Some of the points of a sheet and the triangles among them, from which something grows."""
+
+    rows: Int[np.ndarray, " columns"]
+    triangles: Int[np.ndarray, "triangles 3"]
+    """Rows of `rows`."""
+    order: Int[np.ndarray, " columns"]
+
+    @classmethod
+    def of(
+        cls,
+        triangles: Int[np.ndarray, "all 3"],
+        order: Int[np.ndarray, " points"],
+        rows: Int[np.ndarray, " columns"],
+        *,
+        lower: bool,
+    ) -> "Patch":
+        """Return the patch of these rows of a sheet's points, on its lower side or its upper one."""
+        column = np.full(len(order), -1)
+        column[rows] = np.arange(len(rows))
+        inside = triangles[(column[triangles] >= 0).all(axis=1)]
+        found = column[inside]
+        return cls(rows, found[:, ::-1] if lower else found, order[rows])
+
+
+POINTS = 900
+"""Points in the middle of a wall: about 12 nodes of second order each, so some 32,000 degrees of freedom."""
+_FINE = 2000
+_LEAST, _MOST = 8, 34
+"""Points of the innermost ring."""
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """The middle of a wall as a smooth curve from the axis, or the lower end of a tube, outwards to the rim."""
+
+    controls: Sequence[tuple[float, float, float]]
+    """Radius, height and thickness, meters; the curve starts at the first, ends at the last and rounds those between.
+    At the axis the first two have one height, so that the curve crosses it level."""
+
+    @classmethod
+    def scaled(
+        cls, radius: float, height: float, wall: float, corners: Sequence[tuple[float, float, float]]
+    ) -> "Profile":
+        """Return the profile whose corners are multiples of a radius, a height and a wall."""
+        return cls([(out * radius, up * height, thick * wall) for out, up, thick in corners])
+
+    @cached_property
+    def _curve(self) -> tuple[Float64[np.ndarray, " fine"], Float64[np.ndarray, "fine 3"]]:
+        """Places along the curve, 0 to 1 of its length, and radius, height and thickness there."""
+        controls = np.array(self.controls, dtype=np.float64)
+        inner = np.linspace(0.0, 1.0, len(controls) - 1)[1:-1]
+        knots = np.concatenate([np.zeros(3), inner, np.ones(3)])
+        values = BSpline(knots, controls, 2)(np.linspace(0.0, 1.0, _FINE))
+        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(values[:, :2], axis=0), axis=1))])
+        return length / length[-1], values
+
+    @cached_property
+    def length(self) -> float:
+        """Meters along the curve."""
+        return float(np.linalg.norm(np.diff(self._curve[1][:, :2], axis=0), axis=1).sum())
+
+    def at(self, along: Float64[np.ndarray, " places"]) -> Float64[np.ndarray, "places 3"]:
+        """Return radius, height and thickness at parts of the curve's length, 0 to 1."""
+        places, values = self._curve
+        return np.stack([np.interp(along, places, values[:, axis]) for axis in range(3)], axis=1)
+
+    def rings(self, *, fold: int = 1, points: int = POINTS) -> Rings:
+        """Return about `points` points on rings evenly along the curve, with triangles as equilateral as they may be.
+
+        Rings of less than half and a quarter of the largest radius have as many times fewer points. The innermost
+        has a multiple of 2 `fold` points, so that the triangles are carried onto themselves by `fold` turns.
+        """
+        radius = self.at(np.linspace(0.0, 1.0, 200))[:, 0]
+        around = 2.0 * np.pi * radius.mean()
+        best: tuple[float, Rings] | None = None
+        for base in range(_LEAST + -_LEAST % (2 * fold), max(_MOST, 2 * fold) + 1, 2 * fold):
+            for number in itertools.count(max(4, points // (4 * base))):
+                rings = self._rings(base, number)
+                if rings.starts[-1] < points:
+                    continue
+                mean = rings.starts[-1] / rings.number
+                uneven = abs(np.log(self.length / (rings.number - 1) * mean / around))
+                if best is None or uneven < best[0]:
+                    best = (uneven, rings)
+                break
+        assert best is not None
+        return best[1]
+
+    def _rings(self, base: int, number: int) -> Rings:
+        """Return rings at even distances, of which the innermost has `base` points."""
+        radius = self.at(np.linspace(0.0, 1.0, number))[:, 0]
+        closed = self.controls[0][0] == 0.0
+        if not closed:
+            return Rings((4 * base,) * number, pole=False)
+        wanted = np.where(radius < 0.25 * radius.max(), 1, np.where(radius < 0.5 * radius.max(), 2, 4))
+        counts = [1]
+        for each in wanted[2:]:
+            counts.append(min(max(counts[-1], int(each)), 2 * counts[-1]))
+        return Rings(tuple(base * each for each in counts), pole=True)
+
+
+Warp = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""From angles, parts of the profile's length and [points, 2] radii and heights to new radii and heights."""
+
+
+@dataclass(frozen=True, eq=False)
+class Turned:
+    """A wall that turns about the z axis, and its sides in a body."""
+
+    body: Body
+    rings: Rings
+    sheet: Sheet
+    lower: Int[np.ndarray, " points"]
+    """Rows in the body: below where the profile runs outwards, outside where it rises."""
+    upper: Int[np.ndarray, " points"]
+
+    @classmethod
+    def lay(
+        cls,
+        profile: Profile,
+        *,
+        fold: int = 1,
+        points: int = POINTS,
+        crowd: float = 0.0,
+        warp: Warp | None = None,
+        rings: Rings | None = None,
+        body: Body | None = None,
+    ) -> "Turned":
+        """Add the wall that a profile describes to a body, by default one of its own.
+
+        `crowd` moves points around the axis towards angle 0, where they come to lie 1 - crowd as far apart.
+        `rings` are chosen for the profile where they are not given.
+        """
+        body = Body() if body is None else body
+        rings = profile.rings(fold=fold, points=points) if rings is None else rings
+        along = rings.ring / (rings.number - 1)
+        values = profile.at(along)
+        angles = 2.0 * np.pi * rings.turns
+        angles = angles - crowd * np.sin(angles)
+        radius, height = values[:, 0], values[:, 1]
+        if warp is not None:
+            radius, height = warp(angles, along, values[:, :2])
+        middle = np.stack([radius * np.cos(angles), radius * np.sin(angles), height], axis=1)
+        sheet = Sheet.of(middle, values[:, 2], rings.triangles, rings.order)
+        return cls(body, rings, sheet, *body.lay(sheet))
+
+    @property
+    def radii(self) -> Float64[np.ndarray, " rings"]:
+        """Distance of each ring's first point from the axis, meters."""
+        return np.hypot(*self.sheet.middle[self.rings.starts[:-1], :2].T)
+
+    def side_patch(self, rings: range, half: int, *, falling: bool = False) -> Patch:
+        """Return the outside of these rings within `half` points of angle 0, ring by ring, from below or from above."""
+        places = np.arange(-half, half + 1)
+        rows = np.concatenate([self.rings.rows(ring, places) for ring in (reversed(rings) if falling else rings)])
+        return Patch.of(self.sheet.triangles, self.sheet.order, rows, lower=True)
+
+    def middle_patch(self, last: int, *, lower: bool) -> Patch:
+        """Return the rings about the pole up to one."""
+        return Patch.of(self.sheet.triangles, self.sheet.order, np.arange(self.rings.starts[last + 1]), lower=lower)
+
+    def outside(self, patch: Patch) -> Float64[np.ndarray, "columns 3"]:
+        """Return where a patch's points lie on the lower side, meters."""
+        return self.sheet.middle[patch.rows] - self.sheet.offsets[patch.rows]
+
+    def top(self, patch: Patch) -> Float64[np.ndarray, "columns 3"]:
+        """Return where a patch's points lie on the upper side, meters."""
+        return self.sheet.middle[patch.rows] + self.sheet.offsets[patch.rows]
+
+    def add_foot(self, ring: int, bottom: float) -> None:
+        """Add a foot under the band between a ring and the next one, down to a height."""
+        rows = np.concatenate([np.arange(self.rings.starts[ring], self.rings.starts[ring + 2])])
+        patch = Patch.of(self.sheet.triangles, self.sheet.order, rows, lower=True)
+        places = self.outside(patch)
+        places[:, 2] = bottom
+        self.body.grow(patch.triangles, patch.order, self.lower[patch.rows], places[None])
+
+
+_STEM_LAYERS = 16
+
+
+def bowl(random: np.random.Generator, wall: float | None) -> Draft:
+    """Make a bowl on a foot."""
+    radius, depth = random.uniform(0.06, 0.1), random.uniform(0.55, 0.85)
+    belly, bottom = random.uniform(0.8, 1.0), random.uniform(0.4, 0.52)
+    wall = drawn_wall(random, 0.003, 0.0055, wall)
+    height = depth * radius
+    corners = [(0.0, 0.0, 1.25), (bottom, 0.0, 1.25), (belly, 0.15, 1.0), (0.97, 0.7, 1.0), (1.0, 1.0, 0.9)]
+    turned = Turned.lay(Profile.scaled(radius, height, wall, corners))
+    _stand(turned, 0.42 * radius, random.uniform(0.004, 0.008))
+    return Draft(turned.body, wall, ROUND)
+
+
+def plate(random: np.random.Generator, wall: float | None) -> Draft:
+    """Make a round dinner plate on a foot."""
+    radius, rise = random.uniform(0.09, 0.14), random.uniform(0.012, 0.022)
+    flat = random.uniform(0.55, 0.68)
+    wall = drawn_wall(random, 0.0035, 0.0055, wall)
+    corners = [(0.0, 0.0, 1.0), (flat, 0.0, 1.0), (flat + 0.12, 0.65, 1.0), (flat + 0.2, 0.85, 1.0), (1.0, 1.0, 0.9)]
+    turned = Turned.lay(Profile.scaled(radius, rise, wall, corners))
+    _stand(turned, 0.8 * flat * radius, random.uniform(0.003, 0.005))
+    return Draft(turned.body, wall, ROUND)
+
+
+def goblet(random: np.random.Generator, wall: float | None) -> Draft:
+    """Make a wine goblet: a cup and a foot, which a massive stem joins."""
+    radius, depth = random.uniform(0.032, 0.045), random.uniform(1.9, 2.5)
+    stem, foot = random.uniform(0.06, 0.085), random.uniform(0.85, 1.0)
+    closing = random.uniform(0.75, 0.95)
+    wall = drawn_wall(random, 0.002, 0.003, wall)
+    height, around = depth * radius, max(0.0055, 1.2 * wall)
+    cup = Turned.lay(
+        Profile(
+            [
+                (0.0, stem, 1.6 * wall),
+                (0.5 * radius, stem, 1.3 * wall),
+                (1.15 * radius, stem + 0.25 * height, wall),
+                (1.05 * radius, stem + 0.7 * height, wall),
+                (closing * radius, stem + height, wall),
+            ]
+        ),
+        points=620,
+    )
+    # The same disc of rings in the cup and in the foot, so that the stem's ends fit both.
+    last = int(np.argmin(np.abs(cup.radii - around)))
+    rings = cup.rings
+    while rings.number > max(8, last + 4) and rings.starts[-1] > 260:
+        rings = type(rings)(rings.counts[:-1], pole=True)
+    sole = Profile([(0.0, 0.004, 1.8 * wall), (0.35 * radius, 0.004, 1.6 * wall), (foot * radius, 0.0, 1.2 * wall)])
+    base = Turned.lay(sole, rings=rings, body=cup.body)
+    above, below = cup.middle_patch(last, lower=True), base.middle_patch(last, lower=False)
+    start, end = cup.outside(above), base.top(below)
+    part = np.linspace(0.0, 1.0, _STEM_LAYERS + 1)[1:-1, None, None]
+    thinnest = random.uniform(0.0032, 0.0042) / around
+    slim = 1.0 - (1.0 - thinnest) * np.sin(math.pi * part) ** 0.6
+    layers = ((1.0 - part) * start + part * end) * np.concatenate([slim, slim, np.ones_like(slim)], axis=2)
+    cup.body.grow(above.triangles, above.order, cup.lower[above.rows], layers, end=base.upper[below.rows])
+    return Draft(cup.body, wall, ROUND)
+
+
+def bell(random: np.random.Generator, wall: float | None) -> Draft:
+    """Make a hand bell with a massive grip on top."""
+    radius, tall = random.uniform(0.045, 0.07), random.uniform(1.25, 1.6)
+    waist, shoulder = random.uniform(0.5, 0.6), random.uniform(0.4, 0.5)
+    grip, grip_radius = random.uniform(0.06, 0.08), random.uniform(0.007, 0.009)
+    wall = drawn_wall(random, 0.003, 0.0045, wall)
+    height = tall * radius
+    corners = [(0.0, 1.0, 1.2), (shoulder, 1.0, 1.2), (waist, 0.75, 1.0), (waist * 1.15, 0.3, 1.0), (1.0, 0.0, 1.5)]
+    turned = Turned.lay(Profile.scaled(radius, height, wall, corners), points=800)
+    patch = turned.middle_patch(max(1, int(np.argmin(np.abs(turned.radii - grip_radius)))), lower=False)
+    start = turned.top(patch)
+    part = np.linspace(0.0, 1.0, 11)[1:, None]
+    swell = 1.0 + 0.35 * np.sin(math.pi * part) ** 2 - 0.45 * np.clip(part - 0.8, 0.0, None) / 0.2
+    rising = (1.0 - part) * start[:, 2] + part * (height + grip)
+    layers = np.concatenate([swell[..., None] * start[None, :, :2], rising[..., None]], axis=2)
+    turned.body.grow(patch.triangles, patch.order, turned.upper[patch.rows], layers)
+    return Draft(turned.body, wall, ROUND)
+
+
+def tube(random: np.random.Generator, wall: float | None) -> Draft:
+    """Make a chime: a tube that is open at both ends."""
+    radius, length = random.uniform(0.012, 0.022), random.uniform(0.16, 0.26)
+    wall = drawn_wall(random, 0.002, 0.003, wall)
+    # Outwards is upwards here, so that the lower side of the wall is the tube's outside.
+    turned = Turned.lay(Profile([(radius, height * length, wall) for height in (-0.5, 0.0, 0.5)]))
+    return Draft(turned.body, wall, Symmetry(UP, None, UP[None].clone()))
+
+
+def pot(random: np.random.Generator, wall: float | None) -> Draft:
+    """Make a hexagonal pot."""
+    radius, tall = random.uniform(0.05, 0.075), random.uniform(0.9, 1.3)
+    flare, edged = random.uniform(1.0, 1.2), random.uniform(0.65, 0.9)
+    wall = drawn_wall(random, 0.004, 0.006, wall)
+    height, sides = tall * radius, 6
+    half = 0.5 * (1 + flare)
+    corners = [(0.0, 0.0, 1.2), (0.93, 0.0, 1.2), (1.0, 0.1, 1.0), (half, 0.6, 1.0), (flare, 1.0, 1.0)]
+    profile = Profile.scaled(radius, height, wall, corners)
+    turned = Turned.lay(profile, fold=sides, warp=_polygon(sides, edged))
+    return Draft(turned.body, wall, _turning(sides))
+
+
+def fluted(random: np.random.Generator, wall: float | None) -> Draft:
+    """Make a bowl with 5 to 8 lobes and a wavy rim."""
+    radius, depth = random.uniform(0.065, 0.1), random.uniform(0.45, 0.65)
+    lobes = int(random.integers(5, 9))
+    deep, wavy = random.uniform(0.05, 0.08), random.uniform(0.03, 0.07)
+    wall = drawn_wall(random, 0.003, 0.005, wall)
+    height = depth * radius
+
+    def warp(angles: np.ndarray, along: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        wave = np.cos(lobes * angles) * np.clip((along - 0.25) / 0.75, 0.0, 1.0) ** 1.5
+        return values[:, 0] * (1.0 + deep * wave), values[:, 1] + wavy * radius * wave
+
+    corners = [(0.0, 0.0, 1.2), (0.5, 0.0, 1.2), (0.85, 0.3, 1.0), (1.0, 1.0, 1.0)]
+    turned = Turned.lay(Profile.scaled(radius, height, wall, corners), fold=lobes, warp=warp)
+    return Draft(turned.body, wall, _turning(lobes))
+
+
+def dish(random: np.random.Generator, wall: float | None) -> Draft:
+    """Make a hand-shaped shallow dish."""
+    radius, depth = random.uniform(0.07, 0.11), random.uniform(0.28, 0.42)
+    waves = np.arange(1, 5)
+    outline = random.normal(size=4) * (0.06, 0.11, 0.06, 0.03)
+    rim = random.normal(size=4) * (0.03, 0.03, 0.04, 0.02)
+    phases = random.uniform(0.0, 2.0 * np.pi, (2, 4))
+    wall = drawn_wall(random, 0.0035, 0.0055, wall)
+    height = depth * radius
+
+    def warp(angles: np.ndarray, along: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        turning = waves * angles[:, None]
+        out = np.cos(turning + phases[0]) @ outline
+        up = np.cos(turning + phases[1]) @ rim
+        return values[:, 0] * (1.0 + out * along), values[:, 1] + radius * up * along**2
+
+    corners = [(0.0, 0.0, 1.2), (0.55, 0.0, 1.2), (0.8, 0.25, 1.0), (1.0, 1.0, 0.9)]
+    turned = Turned.lay(Profile.scaled(radius, height, wall, corners), warp=warp)
+    return Draft(turned.body, wall, Symmetry())
+
+
+def _stand(turned: Turned, radius: float, height: float) -> None:
+    """Put a wall that turns on a foot of about this radius."""
+    counts = np.diff(turned.rings.starts)
+    equal = np.flatnonzero(counts[1:-1] == counts[2:]) + 1
+    ring = int(equal[np.argmin(np.abs(turned.radii[equal] - radius))])
+    below = turned.sheet.middle[:, 2] - turned.sheet.offsets[:, 2]
+    turned.add_foot(ring, float(below.min()) - height)
+
+
+def _polygon(sides: int, edged: float) -> Warp:
+    """Return a warp that turns circles into polygons with corners at angle 0, fully beyond a third of the profile."""
+
+    def warp(angles: np.ndarray, along: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        part = 2.0 * math.pi / sides
+        within = np.mod(angles, part) - 0.5 * part
+        factor = math.cos(0.5 * part) / np.cos(within)
+        weight = edged * np.clip(3.0 * along, 0.0, 1.0)
+        return values[:, 0] * (1.0 + weight * (factor - 1.0)), values[:, 1]
+
+    return warp
+
+
+def _turning(order: int) -> Symmetry:
+    angles = torch.arange(order, dtype=torch.float64) * (math.pi / order) + 0.5 * math.pi
+    normals = torch.stack([torch.cos(angles), torch.sin(angles), torch.zeros_like(angles)], dim=1)
+    return Symmetry(UP, order, normals)
