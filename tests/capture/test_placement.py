@@ -51,20 +51,6 @@ def test_distances_are_meters_to_the_nearest_point() -> None:
     assert placement.diagonal == pytest.approx(3)
 
 
-@pytest.mark.parametrize(
-    ("size", "name"),
-    [(1e-3, "is their unit mm?"), (1e-2, "is their unit cm?"), (0.0254, "is their unit inches?"), (0.3048, "feet?")],
-)
-def test_contacts_in_another_unit_are_told(size: float, name: str) -> None:
-    placement = check_placement(CONTACTS / size, CLOUD)
-    assert placement.mistake is not None
-    assert placement.mistake.factor == pytest.approx(size)
-    assert placement.mistake.unit_only
-    assert name in placement.describe()
-    assert "divided by" in placement.describe()
-    assert torch.allclose(placement.mistake.undo(CONTACTS / size), CONTACTS)
-
-
 # Contacts on a surface three times too large look like contacts on a part of it.
 @pytest.mark.parametrize("factor", [factor for factor in FACTORS if factor < 1 or factor > 9])
 def test_every_ratio_of_units_is_found_whichever_of_the_two_it_befell(factor: float) -> None:
@@ -83,13 +69,42 @@ def test_a_surface_in_millimeters_is_told_even_if_all_contacts_lie_near_one_of_i
     assert "is the surface's unit mm?" in placement.describe()
 
 
-def test_y_up_for_z_up_is_told_either_way() -> None:
-    for axes, written in ((Y_UP, "(x, -z, y)"), (Y_UP.T, "(x, z, -y)")):
-        placement = check_placement(CONTACTS @ axes, CLOUD)
-        assert placement.mistake is not None
-        assert torch.equal(placement.mistake.axes, axes)
-        assert written in placement.describe()
-        assert "mirrored" not in placement.describe()
+EYE, HERE = torch.eye(3, dtype=torch.float64), (0.0, 0.0, 0.0)
+MISTAKES = {
+    "mm": (1e-3, EYE, HERE, "is their unit mm?", True),
+    "cm": (1e-2, EYE, HERE, "is their unit cm?", True),
+    "inches": (0.0254, EYE, HERE, "is their unit inches?", True),
+    "feet": (0.3048, EYE, HERE, "is their unit feet?", True),
+    "y up": (1.0, Y_UP, HERE, "(x, -z, y)", True),
+    "z up for y up": (1.0, Y_UP.T, HERE, "(x, z, -y)", True),
+    "upside down": (1.0, torch.diag(EYE.new_tensor([1, -1, -1])), HERE, "(x, -y, -z)", True),
+    "mirrored": (1.0, torch.diag(EYE.new_tensor([-1, 1, 1])), HERE, "mirrored?", True),
+    "other origin": (1.0, EYE, (0.7, -0.2, 0.4), "moved by (0.", True),
+    "displaced by 4 %": (1.0, EYE, (0.017, 0.0, 0.0), "moved by (0.0", False),
+    "unit, axes and origin": (1e-3, Y_UP, (0.5, 0.1, -0.3), "divided by 1000 (is their unit mm?), with", True),
+    "12 % too small": (1.12, EYE, HERE, "multiplied by 1.1", False),
+    "7.3 times too small": (7.3, EYE, HERE, "multiplied by 7", True),
+}
+"""What contacts are to be multiplied by, turned by and moved by, the words for it, and whether no shape can be used."""
+
+
+@pytest.mark.parametrize(("factor", "axes", "shift", "words", "misplaced"), MISTAKES.values(), ids=MISTAKES)
+def test_what_befell_all_contacts_is_named_with_its_undoing(
+    factor: float, axes: torch.Tensor, shift: tuple[float, ...], words: str, misplaced: bool
+) -> None:
+    contacts = (CONTACTS - torch.tensor(shift, dtype=torch.float64)) @ axes / factor
+    placement = check_placement(contacts, CLOUD)
+    mistake = placement.mistake
+    assert mistake is not None
+    # Units are exact, another scale is fitted.
+    assert mistake.factor == pytest.approx(factor, rel=1e-9 if factor <= 1 else 0.02)
+    assert torch.equal(mistake.axes, axes)
+    assert mistake.unit_only == (axes is EYE and shift is HERE)
+    # A few spacings of the points on an object .43 m across.
+    assert float((mistake.undo(contacts) - CONTACTS).norm(dim=1).mean()) < 0.01
+    assert placement.misplaced == misplaced
+    assert words in placement.describe()
+    assert "row" not in placement.describe()
 
 
 @pytest.mark.slow
@@ -107,50 +122,6 @@ def test_other_names_of_the_axes_are_undone() -> None:
                 assert torch.equal(placement.mistake.axes, axes)
                 assert ("mirrored" in placement.describe()) == (float(torch.linalg.det(axes)) < 0)
     assert missed == []
-
-
-def test_another_origin_is_found_to_the_spacing_of_the_points() -> None:
-    shift = torch.tensor([0.7, -0.2, 0.4], dtype=torch.float64)
-    placement = check_placement(CONTACTS - shift, CLOUD)
-    assert placement.mistake is not None
-    assert torch.equal(placement.mistake.axes, torch.eye(3, dtype=torch.float64))
-    assert placement.mistake.factor == 1
-    assert float((placement.mistake.shift - shift).norm()) < 0.005
-    assert "moved by" in placement.describe()
-
-
-def test_unit_axes_and_origin_together() -> None:
-    shift = torch.tensor([0.5, 0.1, -0.3], dtype=torch.float64)
-    placement = check_placement(1000 * (CONTACTS - shift) @ Y_UP, CLOUD)
-    assert placement.mistake is not None
-    assert placement.mistake.factor == pytest.approx(1e-3)
-    assert torch.equal(placement.mistake.axes, Y_UP)
-    assert float((placement.mistake.undo(1000 * (CONTACTS - shift) @ Y_UP) - CONTACTS).norm(dim=1).max()) < 0.005
-
-
-MOVES = {
-    "upside down": ((1.0, -1.0, -1.0), 1.0, 0.0, True),
-    "mirrored": ((-1.0, 1.0, 1.0), 1.0, 0.0, True),
-    "displaced by 4 %": ((1.0, 1.0, 1.0), 1.0, 0.04, False),
-    "12 % too large": ((1.0, 1.0, 1.0), 1.12, 0.0, False),
-    "7.3 times too large": ((1.0, 1.0, 1.0), 7.3, 0.0, True),
-}
-"""Signs, scale and shift over the size of what befell a mesh, and whether no shape can be used as it lies."""
-
-
-@pytest.mark.parametrize(("signs", "scale", "shift", "misplaced"), MOVES.values(), ids=MOVES)
-def test_the_similarity_that_befell_a_mesh_is_named_and_no_row(
-    signs: tuple[float, ...], scale: float, shift: float, misplaced: bool
-) -> None:
-    moved = scale * CLOUD * torch.tensor(signs) + shift * torch.tensor([0.43, 0, 0], dtype=torch.float64)
-    placement = check_placement(CONTACTS, moved)
-    assert placement.mistake is not None
-    assert placement.mistake.factor == pytest.approx(scale, rel=0.02)
-    assert placement.mistake.axes.diag().tolist() == list(signs)
-    meant = scale * CONTACTS * torch.tensor(signs) + shift * torch.tensor([0.43, 0, 0], dtype=torch.float64)
-    assert float((placement.mistake.undo(CONTACTS) - meant).norm(dim=1).mean()) < 0.01 * scale
-    assert placement.misplaced == misplaced
-    assert "row" not in placement.describe()
 
 
 def test_contacts_that_are_measured_coarsely_are_no_mistake_of_all() -> None:
