@@ -104,12 +104,17 @@ def read_capture(folder: str | Path, settings: CaptureSettings | None = None) ->
 
 def check(folder: str | Path, settings: CaptureSettings | None = None) -> CaptureReport:
     """Check a capture folder as `read_capture` would and report on every recording; raises nothing for bad input."""
+    return check_and_read(folder, settings)[0]
+
+
+def check_and_read(folder: str | Path, settings: CaptureSettings | None = None) -> tuple[CaptureReport, Impacts | None]:
+    """Return the report of `check`, and the impacts where the folder is readable."""
     folder, issues = Path(folder), Issues(collect=True)
     try:
         settings = settings or settings_of(folder)
-        _walk(folder, settings, issues)
+        impacts, _ = _walk(folder, settings, issues)
     except CaptureError as error:
-        return CaptureReport(False, (), (str(error),))
+        return CaptureReport(False, (), (str(error),)), None
     failed = [RecordingReport(file, line, False, (str(error),)) for file, line, error in issues.failures]
     far = [(line, error.value) for _, line, error in issues.failures if error.name == "unit"]
     if len(far) > 1:
@@ -129,7 +134,9 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
     if names == sorted(names) != sorted(names, key=number_key):
         remarks.append(TEXT_ORDER)
     problems = [*map(str, issues.errors), *map(str, issues.warnings), *_copies(issues), *_unlisted(folder, set(names))]
-    return CaptureReport(not issues.errors and not failed, tuple(reports), tuple(problems), tuple(remarks))
+    readable = not issues.errors and not failed
+    report = CaptureReport(readable, tuple(reports), tuple(problems), tuple(remarks))
+    return report, impacts if readable else None
 
 
 def _walk(folder: Path, settings: CaptureSettings, issues: Issues) -> tuple[Impacts | None, Surface | None]:

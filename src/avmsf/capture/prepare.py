@@ -148,18 +148,15 @@ def deconvolve(
 ) -> tuple[Float64[np.ndarray, " lead"], Float64[np.ndarray, " samples"]]:
     """Return the response to a force of one sample's length and of the recorded pulse's height, before and from it on.
 
-    With F and X the spectra of force and sound from just before the blow on, zero-padded so that nothing wraps
-    round, and e the regularization, the response has the spectrum
+    With F and X the spectra of force over the pulse's height and of sound, zero-padded so that nothing wraps round, and
+    e the regularization, the response has the spectrum
 
         H = X conj(F) / (|F|^2 + e max |F|^2),
 
-    with F first divided by the pulse's height (and so its sign made positive). Where the blow had energy that is
-    X / F; where it had none H goes to zero instead of to noise. Of the force only the push counts (`isolate`): what its
-    channel holds later is the drift of an amplifier and the object's ringing in the hammer, and dividing by that puts
-    it into the response. Divided by the peak force in newtons, the result is in sound per newton for a push of one
-    sample, 1 / sample rate newton seconds; times the sample rate it is per newton second. It starts with the push.
-    What comes before it, from filters that ring ahead and from a force that is late in its channel, is at negative
-    times, at the end of the transform; no more of it is returned than the sound held before the push.
+    X / F where the push had energy, and zero instead of noise where it had none. Divided by the peak force in newtons,
+    it is per newton for a push of one sample; times the sample rate it is per newton second. What comes before the
+    push, from filters that ring ahead and from a force that is late in its channel, is at negative times, at the end of
+    the transform; no more of it is returned than the sound held before the push.
     """
     begin, isolated = isolate(force, pulse)
     later = sound[begin:]
@@ -175,9 +172,8 @@ def deconvolve(
 def isolate(force: Float64[np.ndarray, " frames"], pulse: Pulse) -> tuple[int, Float64[np.ndarray, " window"]]:
     """Return where the window about a push begins, and the force above rest in it.
 
-    The window leaves room for the filter's ringing before and after a pulse near the recorder's bandwidth, and for the
-    slow end of a soft hammer's: 16 samples and one width before, 24 samples and two widths after, the latter half
-    faded out by a cosine.
+    All else in the channel, an amplifier's drift and the object's ringing in the hammer, stays out of the response.
+    There is room for ringing of the recorder's filter (16 and 24 samples) and for the slow end of a soft push.
     """
     width = pulse.stop - pulse.start
     begin = max(0, pulse.start - 16 - width)

@@ -22,9 +22,8 @@ from avmsf.capture.table import Impact, Row
 from avmsf.errors import CaptureError, CaptureWarning
 
 START_LEVEL = 10**-2.0
-"""Share of the largest mean square in the first 20 ms that a response must have at its start: -20 dB, the
-level (a tenth of the peak) from which `find_onset` counts a swing as the impact's. Impulse responses reach 0 to -3 dB
-(aircraft, ruler, tree), recordings with 4 samples to 1 s before the impact -25 to -47 dB."""
+"""Share of the largest mean square in the first 20 ms that a response must have at its start: -20 dB. Impulse responses
+reach 0 to -3 dB (aircraft, ruler, tree), recordings with 4 samples to 1 s before the impact -25 to -47 dB."""
 MAX_START_SECONDS = 0.001
 """By when `find_onset` must see every recording that starts with the impact. Where modes cancel at first it takes up to
 .3 ms (a plate of 43 modes at 96 kHz) and 5 samples (the aircraft at 400 Hz); delays of 1 ms are found on alignment."""
@@ -154,12 +153,10 @@ def latest_start(rate: float) -> int:
 def start_with_impact(recordings: Sequence[Prepared]) -> bool:
     """Return whether all recordings start with the impact, without anything before it, as impulse responses do.
 
-    A single recording does not show this: the first samples of an impulse response are small where its modes happen to
-    cancel, and the first is zero where it is a displacement. Over all recordings modes cancel nowhere, so the mean
-    square of sounds of equal energy is within a sixteenth of a period (and the first two samples) nearly as large as
-    later: a sine reaches -8 dB by then. With anything before the impact it is that of noise. The period is that of the
-    root mean square frequency. Every single onset has to come within `MAX_START_SECONDS` or `MIN_MARGIN` samples as
-    well.
+    In a single recording modes may cancel at first; over all of them they do nowhere. So the mean square of sounds of
+    equal energy is within a sixteenth of a period (of the root mean square frequency), or two samples, nearly as large
+    as later: a sine reaches -8 dB by then, and what comes before an impact is noise. Every single onset has to come
+    before `latest_start` as well.
     """
     rate = recordings[0].rate
     latest = latest_start(rate)

@@ -1,14 +1,13 @@
 """`avmsf check`: what each recording of a capture is worth, what a dataset holds, and what is wrong."""
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
 
 from rich.console import Console
 
 from avmsf._utils.text import counted
-from avmsf.capture import CaptureReport, CaptureSettings, Impacts, check, read_capture
+from avmsf.capture import CaptureReport, CaptureSettings, Impacts
+from avmsf.capture.folder import check_and_read
 from avmsf.capture.measure import shared_problems
 from avmsf.capture.proposals import Proposal, propose_settings, settings_text, write_settings
 from avmsf.cli.alignment import AlignmentReport
@@ -16,7 +15,7 @@ from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.check import Options
 from avmsf.cli.printing import console, decimals, next_command, print_json, say, table
 from avmsf.datasets import DatasetReport, ObjectReport, open_dataset
-from avmsf.errors import CaptureError, CaptureWarning, ExtractionError
+from avmsf.errors import CaptureError, ExtractionError
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.extraction.finders import HighResolution
 from avmsf.pipeline.visuals import inputs, misplaced
@@ -43,20 +42,19 @@ def run(options: Options) -> int:
         _write(options, proposals, screen)
         if any(each.key == "unit" for each in proposals):
             outside = [each for each in outside if each.name != "unit"]
-    report = check(options.capture, settings)
+    report, impacts = check_and_read(options.capture, settings)
     doing("finding the modes that align the recordings")
-    modes = _modes(options.capture, settings) if report.readable else None
-    aligned = None if modes is None else AlignmentReport.of(*modes)
+    modes = None if impacts is None else _modes(impacts)
+    aligned = None if modes is None or impacts is None else AlignmentReport.of(modes, impacts)
     if report.recordings:
         screen.print(_table(report, str(options.capture), aligned))
     if visual is not None:
         screen.print(visual.sentence, soft_wrap=True)
     problems = [*problems_of(report), *(() if visual is None else (*visual.problems, *visual.unused))]
     problems += map(str, outside)
-    for problem in problems[:MAX_PRINTED]:
+    hidden = len(problems) - MAX_PRINTED
+    for problem in [*problems[:MAX_PRINTED], *([f"and {hidden} more; --json prints all"] if hidden > 0 else [])]:
         screen.print(problem, soft_wrap=True)
-    if len(problems) > MAX_PRINTED:
-        screen.print(f"and {len(problems) - MAX_PRINTED} more; --json prints all", soft_wrap=True)
     if options.write_settings and not proposals:
         left = "; settings that the messages above name are yours to choose" if problems else ""
         screen.print(f"the folder's files determine no further setting: nothing was written{left}", soft_wrap=True)
@@ -75,9 +73,7 @@ def run(options: Options) -> int:
     if not report.readable:
         say(f"avmsf check: {options.capture} cannot be read; correct the errors above and check again")
         return UNREADABLE
-    for remark in report.remarks if modes is not None else ():
-        screen.print(remark, soft_wrap=True)
-    for sentence in [] if aligned is None else aligned.sentences():
+    for sentence in (*(report.remarks if modes else ()), *(aligned.sentences() if aligned else ())):
         screen.print(sentence, soft_wrap=True)
     if modes is None:
         screen.print("no mode was found to align the recordings: noisy or too short (see avmsf modes)")
@@ -92,14 +88,10 @@ def run(options: Options) -> int:
     return 0
 
 
-def _modes(folder: Path, settings: CaptureSettings | None) -> tuple[Extraction, Impacts] | None:
-    """Return the strongest modes and their recordings; None where there is no mode."""
-    with warnings.catch_warnings():
-        # The report contains the same.
-        warnings.simplefilter("ignore", CaptureWarning)
-        impacts = read_capture(folder, settings).impacts
+def _modes(impacts: Impacts) -> Extraction | None:
+    """Return the strongest modes; None where there is no mode."""
     try:
-        return extract_modes(impacts, HighResolution(modes=_STRONGEST)), impacts
+        return extract_modes(impacts, HighResolution(modes=_STRONGEST))
     except ExtractionError:
         return None
 
