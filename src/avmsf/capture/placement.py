@@ -42,6 +42,7 @@ class _Bounds:
     least_spread: float = 0.4  # diagonal that another unit must leave: what is shrunk enough fits anywhere
     resolution: float = 1 / 200  # distance below which contacts lie equally well: they are not exact
     log_size: float = 0.25  # logarithm of a scale beyond which it is another object's: no material explains that
+    outlier_nats: float = 3.0  # of a contact that is a mistake of its own, as one of twenty is
     axes_contacts: int = 5  # from which on axes are tried
     fit_contacts: int = 8  # from which on scales and shifts are fitted: fewer fit much by chance
     max_contacts: int = 200  # that are compared, evenly taken from all
@@ -242,6 +243,9 @@ class _Search:
     def __init__(self, tree: cKDTree, contacts: np.ndarray, placement: Placement, *, spacing: float) -> None:
         self.tree, self.contacts, self.placement = tree, torch.from_numpy(contacts), placement
         self.resolution = max(spacing, _BOUNDS.resolution * placement.diagonal)
+        widest = max(2 * self.resolution, float(placement.distances.max()))
+        steps = math.ceil(math.log(widest / self.resolution, 1.5)) + 1
+        self.deviations = np.geomspace(self.resolution, widest, steps)[:, None]
 
     def find(self, stated: Sequence[Mistake]) -> Mistake | None:
         """Return the best similarity; None where that changes nothing.
@@ -250,7 +254,7 @@ class _Search:
         describes these better by chance.
         """
         present, tolerance = self.nats(Mistake()), self.placement.tolerance
-        if present < 1:
+        if present - len(self.contacts) * (math.log(self.resolution) + 0.5) < 1:
             return None
         for each in stated:
             near, far = np.quantile(self.distances(each), (0.5, 0.9)).tolist()
@@ -270,18 +274,20 @@ class _Search:
         return self.tree.query(mistake.undo(self.contacts).numpy())[0]
 
     def nats(self, mistake: Mistake) -> float:
-        """Return the nats of the distances that a similarity leaves: twice the logarithms of those above the resolution.
+        """Return the nats of the distances that a similarity leaves.
 
-        The tail is Cauchy's, so that single wrong contacts do not decide. Distances over the scale make what is shrunk
-        no better than what it was.
+        Each is normal, with a standard deviation chosen for the similarity, or the contact is a mistake of its own and
+        lies anywhere. Distances over the scale make what is shrunk no better than what it was.
         """
         if not mistake.factor > 0:
             return math.inf
-        spread = mistake.factor * self.placement.spread
+        distances = np.maximum(self.distances(mistake), self.resolution)
+        spread, diagonal = mistake.factor * self.placement.spread, self.placement.diagonal
+        near = np.square(distances / self.deviations) / 2 + np.log(self.deviations / min(mistake.factor, 1.0))
+        anywhere = math.log(max(diagonal, self.placement.spread)) + _BOUNDS.outlier_nats
         # Contacts within a spot of an object are as unlikely as the spot is small.
-        spot = max(0.0, math.log(_BOUNDS.spot * self.placement.diagonal / spread)) if spread else 0.0
-        tail = 2 * np.log(np.maximum(self.distances(mistake) / self.resolution, 1)).sum()
-        return float(tail) + len(self.contacts) * (spot - math.log(min(mistake.factor, 1.0)))
+        spot = max(0.0, math.log(_BOUNDS.spot * diagonal / spread)) if spread else 0.0
+        return float(np.minimum(near, anywhere).sum(axis=1).min()) + len(distances) * spot
 
     def starts(self) -> Iterator[tuple[float, Mistake, bool, bool]]:
         """Yield similarities, the nats of their parameters, and whether their scale and their shift are fitted."""
