@@ -1,6 +1,7 @@
 """Localization as an experiment of `avmsf evaluate`: errors of methods whose answer is known."""
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,10 +14,10 @@ from matplotlib.figure import Figure
 from avmsf.baselines.diffsound.renderer import DiffSound
 from avmsf.capture import Impacts, read_capture
 from avmsf.cli import main
-from avmsf.errors import LocationError
+from avmsf.errors import EvaluationError, LocationError
 from avmsf.evaluation import report
 from avmsf.evaluation.field_methods import FieldMethod
-from avmsf.evaluation.localization import MAX_VERTICES, located, published_distance, random_distance
+from avmsf.evaluation.localization import MAX_VERTICES, located, nearest_spectrum, published_distance, random_distance
 from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.simple_methods import NearestRecording, WhiteNoise
@@ -40,6 +41,26 @@ def test_the_nearest_recording_finds_itself_and_noise_counts_as_a_random_point()
     assert located(WhiteNoise(train), train, train, points)[0]["rmed"] == pytest.approx(expected)
     silent = replace(train, sounds=0 * train.sounds)
     assert located(NearestRecording(train), train, silent, points)[0]["rmed"] == pytest.approx(expected)
+
+
+def test_chance_is_the_mean_distance_from_the_right_place() -> None:
+    points = torch.tensor([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [10.0, 0.0, 0.0]])
+    assert random_distance(points, torch.tensor([0.0, 3.0, 0.0])) == pytest.approx((3 + 5 + math.sqrt(109)) / 3)
+
+
+def test_the_most_similar_spectrum_is_a_sounds_own_however_loud_and_never_that_of_silence() -> None:
+    train, generator = plate_impacts(6), torch.Generator().manual_seed(1)
+    nearest = nearest_spectrum(train)
+    for row, sound in enumerate(train.sounds):
+        noise = 1e-3 * float(sound.abs().max()) * torch.randn(len(sound), generator=generator)
+        assert nearest(-300.0 * (sound + noise)) == row
+    with raises(EvaluationError, name="sound", value=0.0):
+        nearest(0.0 * train.sounds[0])
+    quiet = train.sounds.clone()
+    quiet[1] = 0.0
+    nearest = nearest_spectrum(replace(train, sounds=quiet))
+    assert [nearest(sound) for sound in train.sounds[[0, 2, 3]]] == [0, 2, 3]
+    assert nearest(train.sounds[1]) != 1
 
 
 def smooth_field(train: Impacts, features: FeatureField) -> SoundField:
