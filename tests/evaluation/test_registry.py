@@ -8,11 +8,14 @@ from unittest.mock import patch
 import pytest
 
 from avmsf.capture import read_capture
+from avmsf.errors import EvaluationError
 from avmsf.evaluation.methods import method_named
-from avmsf.evaluation.registry import METHODS, METRICS, resolve
+from avmsf.evaluation.registry import METHODS, METRICS, MetricEntry, resolve
+from avmsf.evaluation.scores import score
 from avmsf.evaluation.simple_methods import MeanWaveform
 from avmsf.evaluation.splits import align_split, split
 from factories.plate_set import fill_plates
+from factories.raising import raises
 
 TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorials" / "evaluate.md"
 
@@ -36,6 +39,13 @@ def test_a_method_and_a_metric_of_the_tutorial_are_in_the_tables(
     expected = float((20 * ratio.log10().abs()).mean())
     assert summary["methods"]["mean-of-all"]["peak_error"] == pytest.approx(expected, rel=1e-3)
     assert summary["ratio_to_knn3"]["mean-of-all"]["peak_error"] > 0
+
+
+def test_a_metric_has_a_value_for_each_contact(tmp_path: Path) -> None:
+    impacts = read_capture(fill_plates(tmp_path, ("mug",)) / "mug").impacts
+    entry = MetricEntry("mean", lambda predicted, truth, *, sample_rate: predicted.mean())
+    with patch.dict(METRICS, mean=entry), raises(EvaluationError, name="mean", value=[]):
+        score(impacts.sounds, impacts)
 
 
 def test_every_import_path_leads_to_a_function() -> None:

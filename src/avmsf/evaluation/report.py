@@ -12,6 +12,7 @@ from avmsf._utils.files import write_whole
 from avmsf._utils.text import format_number
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.localization import read_map
+from avmsf.evaluation.registry import METRICS
 from avmsf.evaluation.report_tables import Section, sections
 from avmsf.evaluation.results import ObjectRecord, ResultsFolder, file_word, write_json
 from avmsf.evaluation.splits import spread
@@ -115,9 +116,9 @@ def _cards(contact: StoredContact, folder: Path) -> Iterator[_Card]:
     for case, outcome in contact.made:
         row = case.test.index(contact.name)
         scores = [
-            f"{heading} {format_number(values[row])}"
-            for metric, heading in (("l1", "L1"), ("l1_log", "L1-log"), ("relative_stft", "relative STFT"))
-            if (values := outcome.values.get(metric)) is not None
+            f"{entry.heading} {format_number(outcome.values[metric][row])}"
+            for metric, entry in METRICS.items()
+            if entry.function is not None and metric in outcome.values
         ]
         title = f"{outcome.method}, {case.label}" if several else outcome.method
         yield card(title, ", ".join(scores), StoredSound.read(folder / outcome.sounds[contact.name]))

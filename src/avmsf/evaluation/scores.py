@@ -8,8 +8,6 @@ from functools import lru_cache, partial
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_floats
 from avmsf._utils.text import counted
@@ -21,7 +19,7 @@ from avmsf.evaluation.metrics import PerContact, validate
 from avmsf.evaluation.modal_metrics import ModalRenderer, compare_modes
 from avmsf.evaluation.registry import METRICS, resolve
 from avmsf.evaluation.splits import align_split, spread
-from avmsf.evaluation.task import Renderer, expect_renderer
+from avmsf.evaluation.task import Renderer, Sounds, expect_renderer
 from avmsf.field.sound_field import SoundField
 from avmsf.simulate.ground_truth import Truth
 
@@ -123,12 +121,7 @@ def _expect_maker(given: Any) -> Callable[[Impacts], Renderer]:
     return make
 
 
-def score(
-    sounds: ArrayLike,
-    impacts: Impacts,
-    *,
-    fft_sizes: Sequence[int] | None = None,
-) -> Scores:
+def score(sounds: ArrayLike, impacts: Impacts, *, fft_sizes: Sequence[int] | None = None) -> Scores:
     """Score sounds that were made otherwise than by a renderer, row for row of the impacts.
 
     By all of `METRICS` that are functions of sounds; `relative_stft` with `fft_sizes` in samples where they are given.
@@ -140,10 +133,12 @@ def score(
     functions = {name: resolve(each.function) for name, each in METRICS.items() if each.function is not None}
     if fft_sizes is not None:
         functions["relative_stft"] = partial(functions["relative_stft"], fft_sizes=fft_sizes)
-    rate = impacts.sample_rate
-    return Scores(
-        impacts.names, {name: each(sounds, impacts.sounds, sample_rate=rate) for name, each in functions.items()}
-    )
+    values = {}
+    for name, function in functions.items():
+        values[name] = function(sounds, impacts.sounds, sample_rate=impacts.sample_rate)
+        if values[name].shape != (len(impacts),):
+            raise EvaluationError.expected(f"{len(impacts)} values, a sound each", list(values[name].shape), name=name)
+    return Scores(impacts.names, values)
 
 
 Values = dict[str, tuple[float | None, ...]]
@@ -173,13 +168,7 @@ class MetricSettings:
             _cdpam()
 
     def values(
-        self,
-        renderer: Renderer,
-        sounds: Float[Tensor, "..."],
-        test: Impacts,
-        truth: Truth | None,
-        *,
-        loudest: float,
+        self, renderer: Renderer, sounds: Sounds, test: Impacts, truth: Truth | None, *, loudest: float
     ) -> tuple[Values, dict[str, float | None]]:
         """Return the metrics of `renderer` at the test contacts, and its figures over all of them.
 
@@ -199,7 +188,7 @@ class MetricSettings:
             values["cdpam"] = self._cdpam_values(sounds, test)
         return values, {} if truth is None else _modal_figures(renderer, test, truth)
 
-    def _cdpam_values(self, sounds: Float[Tensor, "contacts samples"], test: Impacts) -> tuple[float | None, ...]:
+    def _cdpam_values(self, sounds: Sounds, test: Impacts) -> tuple[float | None, ...]:
         rows = spread(len(test), self.cdpam_contacts or len(test))
         taken = _cdpam().distance(sounds[rows], test.sounds[rows], sample_rate=test.sample_rate)
         found = dict(zip(rows, taken.tolist(), strict=True))
