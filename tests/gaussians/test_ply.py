@@ -88,13 +88,16 @@ def test_any_order_of_properties_and_more_of_them_are_read(tmp_path: Path, order
     _expect_same(read_splats(tmp_path / "cloud.ply"), cloud)
 
 
-def test_elements_before_the_vertices_are_passed_over(tmp_path: Path) -> None:
+@pytest.mark.parametrize("order", ["ascii", "binary_little_endian"])
+def test_elements_before_the_vertices_are_passed_over(tmp_path: Path, order: str) -> None:
     cloud = _cloud(degree=0)
     spelt = _columns(replace(cloud, harmonics=torch.cat([cloud.harmonics, torch.zeros(7, 3, 3)], dim=1)))
-    header = _header("binary_little_endian", 7, ORDER).replace(
+    header = _header(order, 7, ORDER).replace(
         "element vertex", "element camera 2\nproperty uchar a\nproperty int b\nelement vertex"
     )
-    body = bytes(10) + np.stack([spelt[name] for name in ORDER], axis=1).astype("<f4").tobytes()
+    table = np.stack([spelt[name] for name in ORDER], axis=1).astype("<f4")
+    text = "1 2\n3 4\n" + " ".join(f"{value:.9g}" for value in table.ravel())
+    body = text.encode() if order == "ascii" else bytes(10) + table.tobytes()
     (tmp_path / "cloud.ply").write_bytes(header.encode() + body)
     _expect_same(read_splats(tmp_path / "cloud.ply"), cloud)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from avmsf.gaussians.ssim import _plain_similarity, psnr, ssim
+from avmsf.gaussians.ssim import convolved_ssim, psnr, ssim
 
 
 def _images(height: int = 13, width: int = 17) -> tuple[torch.Tensor, torch.Tensor]:
@@ -45,7 +45,7 @@ def test_the_gradient_is_that_of_finite_differences() -> None:
 def test_graphics_cards_get_the_same_value_and_gradient() -> None:
     first, second = _images()
     one, other = first.clone().requires_grad_(), first.clone().requires_grad_()
-    value, plain = ssim(one, second), _plain_similarity(other, second)
+    value, plain = ssim(one, second), convolved_ssim(other, second)
     (2.0 * value).backward()
     (2.0 * plain).backward()
     assert float(value.detach()) == pytest.approx(float(plain.detach()), abs=1e-12)

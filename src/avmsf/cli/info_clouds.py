@@ -17,7 +17,6 @@ from avmsf.errors import SceneError
 from avmsf.features.feature_field import GEOMETRY, FeatureField
 from avmsf.features.store import load_features, read_report
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.initialize import ZEROTH
 from avmsf.gaussians.ply import read_splats
 from avmsf.plotting.clouds import component_colors, draw_cloud
 from avmsf.plotting.pictures import save_picture
@@ -53,9 +52,10 @@ def describe_features(options: Options) -> dict[str, Any]:
 
 
 def _draw_cloud(cloud: GaussianCloud, options: Options, folder: Path) -> None:
-    colors = plain_colors(cloud)
     title = f"{options.file.name}: {counted(len(cloud), 'Gaussian')}"
-    save_picture(draw_cloud(cloud.centers, {"color": colors}, title=title, up=_UP[options.up]), folder / "cloud.png")
+    save_picture(
+        draw_cloud(cloud.centers, {"color": cloud.colors}, title=title, up=_UP[options.up]), folder / "cloud.png"
+    )
     say(f"wrote {folder / 'cloud.png'}")
 
 
@@ -81,7 +81,7 @@ def _colors_of(path: Path, features: FeatureField) -> Float[Tensor, "points 3"]:
             name="--cloud",
             value=len(cloud),
         )
-    return plain_colors(cloud.take(torch.from_numpy(rows)))
+    return cloud.take(torch.from_numpy(rows)).colors
 
 
 def without_positions(features: FeatureField) -> FeatureField:
@@ -89,8 +89,3 @@ def without_positions(features: FeatureField) -> FeatureField:
     if not features.encoder.startswith(f"{GEOMETRY} and "):
         return features
     return replace(features, features=features.features[:, 3:])
-
-
-def plain_colors(cloud: GaussianCloud) -> Float[Tensor, "points 3"]:
-    """Return the Gaussians' colors independent of the direction of view, 0 to 1."""
-    return (0.5 + ZEROTH * cloud.harmonics[:, 0]).clamp(0, 1).detach()

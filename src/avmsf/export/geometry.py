@@ -17,7 +17,6 @@ from trimesh.visual import ColorVisuals
 from avmsf.errors import ExportError
 from avmsf.export.sampled_field import SampledField
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.initialize import ZEROTH
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh.io import MAX_BYTES, load_mesh
 from avmsf.mesh.surface import Surface
@@ -165,9 +164,8 @@ class DisplayGeometry:
     @classmethod
     def of_gaussians(cls, cloud: GaussianCloud, sampled: SampledField) -> "DisplayGeometry":
         """Return the centers of Gaussians in their colors."""
-        colors = (0.5 + ZEROTH * cloud.harmonics[:, 0]).clamp(0.0, 1.0)
         normals = sampled.normals[sampled.nearest(cloud.centers)]
-        return cls(cloud.centers, torch.zeros(0, 3, dtype=torch.int64), normals, colors)
+        return cls(cloud.centers, torch.zeros(0, 3, dtype=torch.int64), normals, cloud.colors)
 
 
 def read_display_geometry(

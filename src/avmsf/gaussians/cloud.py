@@ -9,6 +9,9 @@ from torch import Tensor
 
 from avmsf._utils.arrays import short_repr
 
+ZEROTH = 0.28209479177387814
+"""The harmonic of degree 0, sqrt(1 / 4 pi): a color is one half more than this times its coefficient."""
+
 
 @dataclass(frozen=True, eq=False)
 class GaussianCloud:
@@ -34,6 +37,11 @@ class GaussianCloud:
     def opacities(self) -> Float[Tensor, " points"]:
         """Opacity at each center, 0 to 1."""
         return torch.sigmoid(self.logit_opacities)
+
+    @property
+    def colors(self) -> Float[Tensor, "points 3"]:
+        """Red, green and blue independent of the direction of view, 0 to 1."""
+        return (0.5 + ZEROTH * self.harmonics[:, 0]).clamp(0.0, 1.0)
 
     @property
     def degree(self) -> int:

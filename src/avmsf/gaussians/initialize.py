@@ -11,11 +11,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf.errors import SceneError
-from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.cloud import ZEROTH, GaussianCloud
 from avmsf.photographs.cameras import View
-
-ZEROTH = 0.28209479177387814
-"""The harmonic of degree 0, sqrt(1 / 4 pi): a color is one half more than this times its coefficient."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,20 +54,20 @@ def starting_cloud(
     if start.normals is None:
         rotations = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
     else:
-        rotations = _turns(start.normals.float())
+        rotations = _rotations_to(start.normals.float())
         scales[:, 2] += math.log(flatness)
     logits = torch.full((count,), math.log(opacity / (1.0 - opacity)))
     return GaussianCloud(start.points.float().clone(), rotations, scales, logits, harmonics)
 
 
-def _turns(normals: Float[Tensor, "points 3"]) -> Float[Tensor, "points 4"]:
-    """Return quaternions of the shortest turns that take the z axis to the normals."""
+def _rotations_to(normals: Float[Tensor, "points 3"]) -> Float[Tensor, "points 4"]:
+    """Return quaternions of the shortest rotations that take the z axis to the normals."""
     x, y, z = normals.unbind(1)
     # From z to -z every way is equally short: about the x axis.
     opposite = z < -1.0 + 1e-6
-    turns = torch.stack([1.0 + z, -y, x, torch.zeros_like(x)], dim=1)
-    turns[opposite] = torch.tensor([0.0, 1.0, 0.0, 0.0])
-    return torch.nn.functional.normalize(turns, dim=1)
+    quaternions = torch.stack([1.0 + z, -y, x, torch.zeros_like(x)], dim=1)
+    quaternions[opposite] = torch.tensor([0.0, 1.0, 0.0, 0.0])
+    return torch.nn.functional.normalize(quaternions, dim=1)
 
 
 def photographed_colors(

@@ -11,8 +11,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf.errors import SceneError
-from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.initialize import ZEROTH
+from avmsf.gaussians.cloud import ZEROTH, GaussianCloud
 from avmsf.gaussians.rasterizer.protocol import Rasterizer
 from avmsf.photographs.cameras import View
 

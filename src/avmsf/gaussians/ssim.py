@@ -30,7 +30,7 @@ def ssim(image: Float[Tensor, "height width 3"], target: Float[Tensor, "height w
     Differentiable by `image`; on the CPU its gradient is computed on the way, where it is asked for.
     """
     if image.device.type != "cpu":
-        return _plain_similarity(image, target.detach())
+        return convolved_ssim(image, target.detach())
     return cast(Tensor, _Similarity.apply(image, target.detach()))  # type: ignore[no-untyped-call]
 
 
@@ -49,8 +49,10 @@ def psnr(
     return -10.0 * math.log10(mean) if mean > 0.0 else (math.inf if mean == 0.0 else math.nan)
 
 
-def _plain_similarity(image: Tensor, target: Tensor) -> Tensor:
-    """Return the same by convolutions, which graphics cards do best."""
+def convolved_ssim(
+    image: Float[Tensor, "height width 3"], target: Float[Tensor, "height width 3"]
+) -> Float[Tensor, ""]:
+    """Return the same as `ssim` by convolutions, which graphics cards do best; differentiable by both images."""
     window = torch.from_numpy(np.outer(_WINDOW, _WINDOW)).to(image, non_blocking=True)
     maps = torch.stack([image, target, image * image, target * target, image * target]).permute(0, 3, 1, 2)
     kernel = window.expand(3, 1, *window.shape)
