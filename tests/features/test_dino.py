@@ -130,6 +130,7 @@ def test_a_path_is_distinguished_from_a_name(tmp_path):
         (lambda at: (at / "config.json").write_text("{"), None, None),
         (lambda at: (at / "config.json").write_text("[]"), None, None),
         (lambda at: (at / "config.json").write_text('{"model_type": "vit"}'), "config.json", "model_type"),
+        (lambda at: (at / "config.json").write_text('{"model_type": []}'), "config.json", "model_type"),
         (lambda at: (at / "model.safetensors").write_bytes(b"half"), "model.safetensors", None),
         (lambda at: _change(at, hidden_size=32), "model.safetensors", None),
         (lambda at: (at / PREPROCESSOR).write_text('{"image_mean": [1]}'), PREPROCESSOR, "image_mean"),

@@ -133,7 +133,7 @@ def _load_model(folder: Path) -> nn.Module:
         if not (folder / name).is_file():
             raise SceneError.expected("a DINOv2 model", got=f"no {name}", file=folder, name=name, advice=advice)
     kind = _read_settings(folder / _CONFIG).get("model_type")
-    if kind not in classes:
+    if not isinstance(kind, str) or kind not in classes:
         wanted = f"a model of type {' or '.join(classes)}"
         raise SceneError.expected(wanted, kind, file=folder / _CONFIG, name="model_type")
     try:
