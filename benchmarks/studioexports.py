@@ -19,7 +19,7 @@ from avmsf.export.faust import write_faust
 from avmsf.export.gltf import write_gltf
 from avmsf.export.paper_demo import write_demo
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.samples import Grid, write_grid
+from avmsf.export.samples import write_grid
 from avmsf.export.uff import write_universal
 from benchmarks.report import Options, Report, Table, log
 
@@ -74,7 +74,7 @@ def _exports(field: SampledField) -> Report:
         weights = {
             "gltf": write_gltf(plain, place / "field.glb"),
             "demo": write_demo(plain, place / "demo"),
-            "wavs": write_grid(field.take(field.spread(16)), place / "wavs", Grid(16)),
+            "wavs": write_grid(field.take(field.spread(16)), place / "wavs"),
             "uff": write_universal(field, place / "field.uff"),
         }
         found["export.gltf_error"] = _worst(_gltf_sounds(place / "field.glb", plain, rows), plain, rows)

@@ -13,7 +13,7 @@ import soundfile
 import torch
 
 from avmsf.errors import ExportError
-from avmsf.export.samples import Grid, Layer, hertz_layers, write_grid
+from avmsf.export.samples import Layer, hertz_layers, write_grid
 from avmsf.modal.modes import ForcePulse
 from factories.made_tables import RATE, SAMPLES, apart, table
 from factories.raising import raises
@@ -28,7 +28,7 @@ def rows(folder: Path) -> list[dict[str, str]]:
 
 def test_every_row_is_its_blow(tmp_path):
     field = table(phased=True, noisy=True)
-    write_grid(field, tmp_path / "grid", Grid(5, LAYERS, level_db=-3.0))
+    write_grid(field, tmp_path / "grid", contacts=5, layers=LAYERS, level_db=-3.0)
     found = rows(tmp_path / "grid")
     assert len(found) == 15
     truths, sounds = [], []
@@ -49,7 +49,7 @@ def test_every_row_is_its_blow(tmp_path):
 
 
 def test_contacts_lie_apart_and_have_a_note_each(tmp_path):
-    write_grid(table(), tmp_path / "grid", Grid(6, LAYERS))
+    write_grid(table(), tmp_path / "grid", contacts=6, layers=LAYERS)
     found = rows(tmp_path / "grid")
     assert Counter(row["midi_note"] for row in found) == {str(note): 3 for note in range(36, 42)}
     assert len({(row["x"], row["y"], row["z"]) for row in found}) == 6
@@ -60,7 +60,7 @@ def test_contacts_lie_apart_and_have_a_note_each(tmp_path):
 
 
 def test_the_instrument_plays_every_file_at_its_key(tmp_path):
-    write_grid(table(), tmp_path / "grid", Grid(4, LAYERS))
+    write_grid(table(), tmp_path / "grid", contacts=4, layers=LAYERS)
     regions = played(tmp_path / "grid")
     expected = [(r["file"], r["midi_note"], r["velocity_low"], r["velocity_high"]) for r in rows(tmp_path / "grid")]
     assert sorted((r["sample"], r["key"], r["lovel"], r["hivel"]) for r in regions) == sorted(expected)
@@ -93,7 +93,7 @@ def levels(folder: Path, note: int) -> np.ndarray:
 
 @pytest.mark.parametrize("layers", [LAYERS, (Layer(0.5), Layer(1.0), Layer(2.0)), (Layer(2.0), Layer(1.0))])
 def test_the_level_rises_with_the_velocity_without_steps_between_layers(tmp_path, layers):
-    write_grid(table(), tmp_path / "grid", Grid(2, layers))
+    write_grid(table(), tmp_path / "grid", contacts=2, layers=layers)
     for note in (36, 37):
         level = levels(tmp_path / "grid", note)
         assert (np.diff(level) >= -1e-6 * level[-1]).all()
@@ -110,7 +110,7 @@ def test_the_level_rises_with_the_velocity_without_steps_between_layers(tmp_path
     ],
 )
 def test_layers_go_from_soft_to_loud_whatever_their_order(tmp_path, layers, order):
-    written = write_grid(table(), tmp_path / "grid", Grid(2, layers))
+    written = write_grid(table(), tmp_path / "grid", contacts=2, layers=layers)
     found = rows(tmp_path / "grid")
     assert [(float(row["force"]), float(row["contact_time"])) for row in found[:3]] == [
         (layers[number].force, layers[number].contact_time) for number in order
@@ -123,13 +123,15 @@ def test_layers_go_from_soft_to_loud_whatever_their_order(tmp_path, layers, orde
 
 
 def test_one_layer_has_the_whole_keyboard_and_the_square_of_the_velocity(tmp_path):
-    write_grid(table(), tmp_path / "one", Grid(2))
+    write_grid(table(), tmp_path / "one", contacts=2)
     assert float(played(tmp_path / "one")[0]["amp_velcurve_64"]) == pytest.approx((64 / 127) ** 2, rel=1e-5)
 
 
 @pytest.mark.parametrize("count", [85, 86, 100, 127])
 def test_every_layer_has_a_velocity(tmp_path, count):
-    write_grid(table(), tmp_path / "grid", Grid(1, tuple(Layer(0.1 + each) for each in range(count)), seconds=0.01))
+    write_grid(
+        table(), tmp_path / "grid", contacts=1, layers=[Layer(0.1 + each) for each in range(count)], seconds=0.01
+    )
     found = rows(tmp_path / "grid")
     struck = [v for row in found for v in range(int(row["velocity_low"]), int(row["velocity_high"]) + 1)]
     assert struck == list(range(1, 128))
@@ -137,20 +139,20 @@ def test_every_layer_has_a_velocity(tmp_path, count):
 
 
 @pytest.mark.parametrize(
-    ("grid", "name", "value"),
+    ("settings", "name", "value"),
     [
-        (Grid(0), "contacts", 0),
-        (Grid(93), "contacts", 93),
-        (Grid(layers=()), "layers", 0),
-        (Grid(layers=(Layer(-1.0),)), "force", -1.0),
-        (Grid(layers=(Layer(contact_time=2.0),)), "contact_time", 2.0),
-        (Grid(seconds=0.0), "seconds", 0.0),
-        (Grid(level_db=6.0), "level_db", 6.0),
+        ({"contacts": 0}, "contacts", 0),
+        ({"contacts": 93}, "contacts", 93),
+        ({"layers": ()}, "layers", 0),
+        ({"layers": (Layer(-1.0),)}, "force", -1.0),
+        ({"layers": (Layer(contact_time=2.0),)}, "contact_time", 2.0),
+        ({"seconds": 0.0}, "seconds", 0.0),
+        ({"level_db": 6.0}, "level_db", 6.0),
     ],
 )
-def test_bad_settings_are_refused(tmp_path, grid, name, value):
+def test_bad_settings_are_refused(tmp_path, settings, name, value):
     with raises(ExportError, name=name, value=value):
-        write_grid(table(), tmp_path / "grid", grid)
+        write_grid(table(), tmp_path / "grid", **settings)
     assert not (tmp_path / "grid").exists()
 
 
@@ -169,7 +171,7 @@ def test_a_harder_impact_is_shorter_in_contact_by_hertzs_law():
 
 
 def test_layers_of_hertzs_law_become_brighter_with_the_force(tmp_path):
-    write_grid(table(), tmp_path / "grid", Grid(1, hertz_layers((0.3, 1.0, 3.0)), noise=False))
+    write_grid(table(), tmp_path / "grid", contacts=1, layers=hertz_layers((0.3, 1.0, 3.0), noise=False))
     files = [tmp_path / "grid" / row["file"] for row in rows(tmp_path / "grid")]
     spectra = [np.abs(np.fft.rfft(soundfile.read(file)[0])) for file in files]
     centers = [float((np.arange(len(each)) * each**2).sum() / (each**2).sum()) for each in spectra]

@@ -24,7 +24,7 @@ from avmsf.export.geometry import DisplayGeometry, holds_gaussians, read_display
 from avmsf.export.gltf import write_gltf
 from avmsf.export.paper_demo import write_demo
 from avmsf.export.sampled_field import SampledField, spread_rows
-from avmsf.export.samples import INSTRUMENT, Grid, Layer, hertz_layers, write_grid
+from avmsf.export.samples import INSTRUMENT, Layer, hertz_layers, write_grid
 from avmsf.export.uff import write_universal
 from avmsf.export.web import write_webpage
 from avmsf.export.writing import Written, check_free, write_file
@@ -274,8 +274,15 @@ def _wavs(field: SoundField, options: Options) -> Written:
     sampled = _sampled(field, options)
     if not options.contacts_given:
         sampled = _loud(sampled)
-    grid = Grid(len(sampled), layers, options.seconds, noise=not options.no_noise)
-    return write_grid(sampled, options.output, grid, force=options.overwrite)
+    return write_grid(
+        sampled,
+        options.output,
+        contacts=len(sampled),
+        layers=layers,
+        seconds=options.seconds,
+        noise=not options.no_noise,
+        force=options.overwrite,
+    )
 
 
 def _loud(sampled: SampledField) -> SampledField:

@@ -58,48 +58,44 @@ def hertz_layers(forces: Sequence[float], shape: PulseShape = "half-sine") -> tu
     return tuple(Layer(force, _CONTACT * math.sqrt(each), shape) for force, each in zip(forces, ratios, strict=True))
 
 
-@dataclass(frozen=True, eq=False)
-class Grid:
-    """Impacts to write."""
-
-    contacts: int = 16
-    """Maximum number of contacts, one MIDI note each. More are reduced by farthest point sampling."""
-    layers: tuple[Layer, ...] = (Layer(),)
-    """Each contact has one impact of each; they are sorted by their level."""
-    seconds: float | None = None
-    """Length of the sounds; that of the training sounds where it is not given."""
-    level_db: float = -1.0
-    """Peak of the loudest sound, dB relative to full scale; all sounds are scaled by one factor."""
-    noise: bool = True
-    """Whether the sounds have the residual noise in addition to the modes."""
-
-
-def write_grid(field: SampledField, folder: str | Path, grid: Grid | None = None, *, force: bool = False) -> Written:
+def write_grid(
+    field: SampledField,
+    folder: str | Path,
+    *,
+    contacts: int = 16,
+    layers: Sequence[Layer] = (Layer(),),
+    seconds: float | None = None,
+    level_db: float = -1.0,
+    noise: bool = True,
+    force: bool = False,
+) -> Written:
     """Write a float32 wav for every contact and layer, the table and the instrument.
 
-    All sounds are scaled by one factor, which the manifest names as `scale`. Raises `ExportError` for no layers, more
-    contacts than MIDI has notes, and settings that are not positive.
+    More than `contacts`, of which each has a MIDI note, are reduced by farthest point sampling; each has one impact of
+    each of the `layers`, which are sorted by their level. Sounds last `seconds`, by default as long as the training
+    sounds, and have the residual noise unless `noise` is False. All are scaled by one factor, which the manifest names
+    as `scale`, so that the loudest peaks at `level_db` relative to full scale. Raises `ExportError` for no layers,
+    more contacts than MIDI has notes, and settings that are not positive.
     """
-    grid = Grid() if grid is None else grid
-    _check(grid)
+    _check(contacts, layers, seconds, level_db)
     rate = round(field.sample_rate)
     if rate != field.sample_rate or rate < 1:
         got = f"{field.sample_rate:g} Hz"
         raise ExportError.expected("whole hertz for wav files", field.sample_rate, got=got, name="sample_rate")
-    rows = torch.arange(len(field)) if len(field) <= grid.contacts else field.spread(grid.contacts)
-    samples = field.samples if grid.seconds is None else max(1, round(grid.seconds * rate))
+    rows = torch.arange(len(field)) if len(field) <= contacts else field.spread(contacts)
+    samples = field.samples if seconds is None else max(1, round(seconds * rate))
     rendered = []
-    for layer in grid.layers:
+    for layer in layers:
         pulse = ForcePulse(layer.contact_time, layer.shape)
-        sounds = field.render(rows, force=layer.force, samples=samples, pulse=pulse, noise=grid.noise)
+        sounds = field.render(rows, force=layer.force, samples=samples, pulse=pulse, noise=noise)
         rendered.append((layer, sounds))
     # From soft to loud; equally loud ones stay in order.
     rendered.sort(key=lambda each: float(each[1].double().square().sum()))
-    layers = [layer for layer, _ in rendered]
+    ordered = [layer for layer, _ in rendered]
     peak = max(float(sounds.abs().max()) for _, sounds in rendered)
-    scale = 10 ** (grid.level_db / 20) / peak if peak > 0 else 1.0
+    scale = 10 ** (level_db / 20) / peak if peak > 0 else 1.0
     # From 1 on: a note of velocity 0 is the end of one. No range is empty, as there are no more layers than velocities.
-    edges = np.linspace(1, HIGHEST_NOTE + 1, len(layers) + 1).round().astype(int)
+    edges = np.linspace(1, HIGHEST_NOTE + 1, len(ordered) + 1).round().astype(int)
     amplitudes = np.stack([sounds.double().square().mean(1).sqrt().numpy() for _, sounds in rendered])
     files, records, curves = dict[str, bytes](), list[dict[str, object]](), list[str]()
     for place, row in enumerate(rows.tolist()):
@@ -118,25 +114,24 @@ def write_grid(field: SampledField, folder: str | Path, grid: Grid | None = None
     files[TABLE] = _table(records).encode()
     files[INSTRUMENT] = _instrument(field.name, records, curves).encode()
     manifest = {"name": field.name, "sampleRate": rate, "scale": scale, "perNewton": field.per_newton}
-    manifest["pulses"] = [layer.shape for layer in layers]
+    manifest["pulses"] = [layer.shape for layer in ordered]
     sizes = write_folder(Path(folder), partial(write_files, files), manifest, force=force)
-    remarks = [f"all sounds are scaled by {scale:.4g}, so that the loudest reaches {grid.level_db:g} dB"]
-    if layers != list(grid.layers):
-        named = ", ".join(f"{layer.force:g} ({layer.contact_time:g} s)" for layer in layers)
+    remarks = [f"all sounds are scaled by {scale:.4g}, so that the loudest reaches {level_db:g} dB"]
+    if ordered != list(layers):
+        named = ", ".join(f"{layer.force:g} ({layer.contact_time:g} s)" for layer in ordered)
         remarks.append(f"layers are sorted from soft to loud: force (contact time) {named}")
     return Written(sizes, tuple(remarks))
 
 
-def _check(grid: Grid) -> None:
+def _check(contacts: int, layers: Sequence[Layer], seconds: float | None, level_db: float) -> None:
     most = HIGHEST_NOTE + 1 - LOWEST_NOTE
-    seconds = 1.0 if grid.seconds is None else grid.seconds
     checks = [
-        ("contacts", grid.contacts, 1 <= grid.contacts <= most, f"1 to {most}, a MIDI note each from {LOWEST_NOTE}"),
-        ("layers", len(grid.layers), 1 <= len(grid.layers) <= HIGHEST_NOTE, f"1 to {HIGHEST_NOTE} forces"),
-        *(("force", each.force, 0 < each.force < math.inf, "a number above 0") for each in grid.layers),
-        *(("contact_time", each.contact_time, 0 <= each.contact_time < 1, "0 to 1 s") for each in grid.layers),
-        ("seconds", seconds, 0 < seconds < math.inf, "more than 0"),
-        ("level_db", grid.level_db, -math.inf < grid.level_db <= 0, "0 dB or below"),
+        ("contacts", contacts, 1 <= contacts <= most, f"1 to {most}, a MIDI note each from {LOWEST_NOTE}"),
+        ("layers", len(layers), 1 <= len(layers) <= HIGHEST_NOTE, f"1 to {HIGHEST_NOTE} forces"),
+        *(("force", each.force, 0 < each.force < math.inf, "a number above 0") for each in layers),
+        *(("contact_time", each.contact_time, 0 <= each.contact_time < 1, "0 to 1 s") for each in layers),
+        ("seconds", seconds, seconds is None or 0 < seconds < math.inf, "more than 0"),
+        ("level_db", level_db, -math.inf < level_db <= 0, "0 dB or below"),
     ]
     for name, value, valid, wanted in checks:
         if not valid:

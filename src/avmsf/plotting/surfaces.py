@@ -1,5 +1,7 @@
 """A picture of an object's surface: seen from a side a little above, and cut through its middle along two planes."""
 
+from typing import Any
+
 import numpy as np
 import trimesh
 from jaxtyping import Float
@@ -30,14 +32,20 @@ def draw_surface(surface: Surface, *, title: str, contacts: Float[Tensor, "conta
     if not len(surface.faces):
         raise EvaluationError.expected("triangles", 0, got=f"{len(surface.vertices)} points", name="surface")
     mesh = trimesh.Trimesh(_MILLIMETERS * surface.vertices.double().numpy(), surface.faces.numpy(), process=False)
+    marks = np.zeros((0, 3)) if contacts is None else _MILLIMETERS * contacts.double().numpy()
     figure = titled_figure(title, 14, 5)
     whole, *cuts = figure.subplots(1, 3)
     _shade(whole, mesh)
-    middle = mesh.bounds.mean(axis=0)
+    dots: dict[str, Any] = {"marker": "o", "linestyle": "", "color": SECOND, "markersize": 4}
+    if len(marks):
+        seen = marks @ view_from(ALL_SIDES[0]).T
+        whole.plot(seen[:, 0], seen[:, 1], label="contacts", **dots)
+        whole.legend(loc="upper right")
+    middle, diagonal = mesh.bounds.mean(axis=0), float(np.linalg.norm(mesh.extents))
     for axes, across in zip(cuts, (0, 1), strict=True):
         _cut(axes, mesh, middle, across=across)
-    if contacts is not None:
-        _mark(whole, cuts, mesh, _MILLIMETERS * contacts.double().numpy())
+        near = marks[np.abs(marks[:, 1 - across] - middle[1 - across]) < _NEAR * diagonal]
+        axes.plot(near[:, across], near[:, 2], **dots)
     return figure
 
 
@@ -69,14 +77,3 @@ def _cut(axes: Axes, mesh: trimesh.Trimesh, middle: np.ndarray, *, across: int) 
     axes.set_xlabel(f"{'xy'[across]} (mm)")
     axes.set_ylabel("z (mm)")
     axes.grid()
-
-
-def _mark(whole: Axes, cuts: list[Axes], mesh: trimesh.Trimesh, contacts: np.ndarray) -> None:
-    """Draw contacts, millimeters: all in the view, and in each cut those near its plane."""
-    middle, diagonal = mesh.bounds.mean(axis=0), float(np.linalg.norm(mesh.extents))
-    seen = contacts @ view_from(ALL_SIDES[0]).T
-    whole.plot(seen[:, 0], seen[:, 1], "o", color=SECOND, markersize=4, label="contacts")
-    whole.legend(loc="upper right")
-    for axes, across in zip(cuts, (0, 1), strict=True):
-        near = contacts[np.abs(contacts[:, 1 - across] - middle[1 - across]) < _NEAR * diagonal]
-        axes.plot(near[:, across], near[:, 2], "o", color=SECOND, markersize=4)
