@@ -171,7 +171,7 @@ def test_a_harder_impact_is_shorter_in_contact_by_hertzs_law():
 
 
 def test_layers_of_hertzs_law_become_brighter_with_the_force(tmp_path):
-    write_grid(table(), tmp_path / "grid", contacts=1, layers=hertz_layers((0.3, 1.0, 3.0), noise=False))
+    write_grid(table(), tmp_path / "grid", contacts=1, layers=hertz_layers((0.3, 1.0, 3.0)), noise=False)
     files = [tmp_path / "grid" / row["file"] for row in rows(tmp_path / "grid")]
     spectra = [np.abs(np.fft.rfft(soundfile.read(file)[0])) for file in files]
     centers = [float((np.arange(len(each)) * each**2).sum() / (each**2).sum()) for each in spectra]
