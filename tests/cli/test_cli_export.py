@@ -31,6 +31,7 @@ from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from factories.believing_field import ELASTIC, bar, bar_points
 from factories.capture_folder import fill
+from factories.clouds import random_cloud
 from factories.demo_layout import read_arrays
 from factories.made_fields import BANK, SIDES, directional, positional, saved
 
@@ -61,12 +62,7 @@ def test_a_mesh_goes_into_the_glb(field_file: Path, tmp_path: Path, capsys: Stre
 
 
 def gaussians(path: Path) -> GaussianCloud:
-    points = positional().points[:40]
-    draw = torch.Generator().manual_seed(0)
-    color = torch.rand(40, 1, 3, generator=draw)
-    cloud = GaussianCloud(
-        points, torch.ones(40, 4), torch.full((40, 3), -6.0), torch.rand(40, generator=draw), color
-    )  # fmt: skip
+    cloud = random_cloud(positional().points[:40])
     write_splats(cloud, path)
     return cloud
 

@@ -18,9 +18,9 @@ from avmsf.export.bundle import make_bundle
 from avmsf.export.geometry import read_object
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.web import write_webpage
-from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import write_splats
 from avmsf.mesh.surface import Surface
+from factories.clouds import random_cloud
 from factories.raising import raises
 from factories.struck_table import RATE, struck_table
 
@@ -167,15 +167,7 @@ def test_a_mesh_of_too_many_triangles_is_reduced_with_a_word() -> None:
 
 def test_gaussians_are_kept_as_they_are(tmp_path: Path) -> None:
     points = ball_points()
-    count = len(points)
-    cloud = GaussianCloud(
-        points,
-        torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(count, 4),
-        torch.full((count, 3), -5.0),
-        torch.zeros(count),
-        torch.zeros(count, 1, 3),
-    )
-    write_splats(cloud, tmp_path / "ball.ply")
+    write_splats(random_cloud(points), tmp_path / "ball.ply")
     make_bundle(ball_table(), object=tmp_path / "ball.ply").write(tmp_path / "page")
     assert (tmp_path / "page" / "object.ply").read_bytes() == (tmp_path / "ball.ply").read_bytes()
     manifest = json.loads((tmp_path / "page" / "manifest.json").read_text())

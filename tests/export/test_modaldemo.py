@@ -9,8 +9,8 @@ import torch
 
 from avmsf.errors import ExportError
 from avmsf.export.paper_demo import write_demo
-from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import read_splats
+from factories.clouds import random_cloud
 from factories.demo_layout import read_arrays
 from factories.made_tables import MODES, POINTS, RATE, SAMPLES, apart, summed, table
 from factories.raising import raises
@@ -78,11 +78,7 @@ def test_the_gaussians_are_those_given_or_discs_on_the_surface(tmp_path):
     w, x, y, z = demo["quaternions"].double().unbind(1)
     third = torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=1)
     torch.testing.assert_close(third.float(), field.normals, atol=1e-5, rtol=0)
-    draw = torch.Generator().manual_seed(1)
-    given = GaussianCloud(
-        field.points, torch.randn(POINTS, 4, generator=draw), torch.randn(POINTS, 3, generator=draw),
-        torch.randn(POINTS, generator=draw), torch.randn(POINTS, 4, 3, generator=draw),
-    )  # fmt: skip
+    given = random_cloud(field.points, degree=1)
     write_demo(field, tmp_path / "given", cloud=given)
     torch.testing.assert_close(read_splats(tmp_path / "given" / "scene.ply").harmonics, given.harmonics)
     with raises(ExportError, name="cloud", value=3):

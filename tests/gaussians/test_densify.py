@@ -6,21 +6,16 @@ from scipy.spatial.transform import Rotation
 from avmsf.gaussians.cloud import GaussianCloud, rotation_matrices
 from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.densify import Density
+from factories.clouds import random_cloud
 
 CONFIG = SplatConfig(growth=1.0, large=0.01, least_opacity=0.1, gaussians=10_000)
 HALF_DIAGONAL = 1.0
 
 
 def _cloud(scales: list[float], opacities: list[float]) -> GaussianCloud:
-    count = len(scales)
-    generator = torch.Generator().manual_seed(0)
-    opacity = torch.tensor(opacities)
-    return GaussianCloud(
-        torch.randn(count, 3, generator=generator),
-        torch.randn(count, 4, generator=generator),
-        torch.tensor(scales).log()[:, None].repeat(1, 3),
-        torch.log(opacity / (1 - opacity)),
-        torch.randn(count, 4, 3, generator=generator),
+    log_scales = torch.tensor(scales).log()[:, None].repeat(1, 3)
+    return replace(
+        random_cloud(len(scales), degree=1), log_scales=log_scales, logit_opacities=torch.tensor(opacities).logit()
     )
 
 

@@ -11,6 +11,7 @@ import trimesh
 from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import read_splats, write_splats
+from factories.clouds import random_cloud
 from factories.raising import raises
 
 ORDER = [*"xyz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"] + [
@@ -18,12 +19,8 @@ ORDER = [*"xyz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", 
 ]
 
 
-def _cloud(count: int = 7, degree: int = 1) -> GaussianCloud:
-    generator = torch.Generator().manual_seed(degree)
-    widths = (3, 4, 3)
-    centers, rotations, scales = (torch.randn(count, width, generator=generator) for width in widths)
-    harmonics = torch.randn(count, (degree + 1) ** 2, 3, generator=generator)
-    return GaussianCloud(centers, rotations, scales, torch.randn(count, generator=generator), harmonics)
+def _cloud(degree: int = 1) -> GaussianCloud:
+    return random_cloud(7, degree=degree)
 
 
 def _columns(cloud: GaussianCloud) -> dict[str, np.ndarray]:
