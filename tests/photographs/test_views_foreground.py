@@ -69,6 +69,11 @@ def photographs(
     return views
 
 
+@pytest.fixture
+def views() -> list[View]:
+    return photographs((2.0, 2.0, 2.0), (220.0, 215.0, 205.0))
+
+
 def painted(view: View, where: np.ndarray, color: Sequence[float]) -> View:
     image = view.image.numpy().copy()
     image[where] = color
@@ -105,9 +110,7 @@ def test_outlines_and_the_hole_are_found(name: str) -> None:
         assert not views[row].mask[line, column]
 
 
-def test_a_shadow_as_dark_as_the_wall_is_filled_and_spots_are_dropped() -> None:
-    wall = (2.0, 2.0, 2.0)
-    views = photographs(wall, (220.0, 215.0, 205.0))
+def test_a_shadow_as_dark_as_the_wall_is_filled_and_spots_are_dropped(views: list[View]) -> None:
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     shadows = {}
     for row in (1, 7, 12):
@@ -117,7 +120,7 @@ def test_a_shadow_as_dark_as_the_wall_is_filled_and_spots_are_dropped() -> None:
         y, x = np.argwhere(there)[depth.argmax()]
         shadows[row] = np.hypot(rows - y, columns - x) <= 3
         assert there[shadows[row]].all()
-        views[row] = painted(views[row], shadows[row], wall)
+        views[row] = painted(views[row], shadows[row], (2.0, 2.0, 2.0))
     spot = np.zeros((HEIGHT, WIDTH), dtype=bool)
     spot[2:14, 2:14] = True
     assert not seen(4)[0][spot].any()
@@ -129,21 +132,17 @@ def test_a_shadow_as_dark_as_the_wall_is_filled_and_spots_are_dropped() -> None:
     assert min(overlap(view, row) for row, view in enumerate(found)) > 0.9
 
 
-def test_blur_at_the_outline_belongs_half_to_either_side() -> None:
+def test_blur_at_the_outline_belongs_half_to_either_side(views: list[View]) -> None:
     """A lens out of focus by a pixel or so moves no outline: where half of the object's light is left is its edge."""
-    views = [
-        replace(view, image=torch.from_numpy(cv2.GaussianBlur(view.image.numpy(), (0, 0), 1.3)))
-        for view in photographs((2.0, 2.0, 2.0), (220.0, 215.0, 205.0))
-    ]
-    found = find_foreground(views)
+    blurred = [torch.from_numpy(cv2.GaussianBlur(view.image.numpy(), (0, 0), 1.3)) for view in views]
+    found = find_foreground([replace(view, image=image) for view, image in zip(views, blurred, strict=True)])
     areas = [float(view.mask.sum()) / 255 / seen(row)[0].sum() for row, view in enumerate(found)]
     # A rim of one pixel would be a fifth of the area.
     assert 0.9 < np.mean(areas) < 1.1
     assert np.mean([overlap(view, row) for row, view in enumerate(found)]) > 0.9
 
 
-def test_what_touches_the_object_in_one_view_alone_is_dropped() -> None:
-    views = photographs((2.0, 2.0, 2.0), (220.0, 215.0, 205.0))
+def test_what_touches_the_object_in_one_view_alone_is_dropped(views: list[View]) -> None:
     columns = np.flatnonzero(seen(4)[0].any(axis=0))
     stand = np.zeros((HEIGHT, WIDTH), dtype=bool)
     stand[HEIGHT // 2 :, columns.mean().astype(int) - 2 : columns.mean().astype(int) + 3] = True
@@ -154,8 +153,7 @@ def test_what_touches_the_object_in_one_view_alone_is_dropped() -> None:
     assert mask[stand].mean() < 0.3
 
 
-def test_given_masks_stay() -> None:
-    views = photographs((2.0, 2.0, 2.0), (220.0, 215.0, 205.0))
+def test_given_masks_stay(views: list[View]) -> None:
     given = torch.from_numpy(seen(5)[0].astype(np.uint8) * np.uint8(200))
     views[5] = replace(views[5], mask=given)
     found = find_foreground(views)
@@ -164,15 +162,13 @@ def test_given_masks_stay() -> None:
     assert find_foreground(found) == found
 
 
-def test_views_without_object_are_named_and_left_out() -> None:
-    views = photographs((2.0, 2.0, 2.0), (220.0, 215.0, 205.0))
+def test_views_without_object_are_named_and_left_out(views: list[View]) -> None:
     views[3] = painted(views[3], np.ones((HEIGHT, WIDTH), dtype=bool), (2.0, 2.0, 2.0))
     with warns(CaptureWarning, name="object", value=["03.png"]):
         assert len(find_foreground(views)) == len(views) - 1
 
 
-def test_a_busy_background_is_refused() -> None:
-    views = photographs((2.0, 2.0, 2.0), (220.0, 215.0, 205.0))
+def test_a_busy_background_is_refused(views: list[View]) -> None:
     generator = np.random.default_rng(1)
     busy = []
     for row, view in enumerate(views):
@@ -184,8 +180,7 @@ def test_a_busy_background_is_refused() -> None:
     assert 0.1 < caught.value.value <= 1
 
 
-def test_cameras_that_do_not_fit_are_warned_of_and_colors_decide_alone() -> None:
-    views = photographs((2.0, 2.0, 2.0), (220.0, 215.0, 205.0))
+def test_cameras_that_do_not_fit_are_warned_of_and_colors_decide_alone(views: list[View]) -> None:
     turned = []
     for row, view in enumerate(views):
         pose = view.camera.world_to_camera.clone()
@@ -196,8 +191,7 @@ def test_cameras_that_do_not_fit_are_warned_of_and_colors_decide_alone() -> None
     assert min(overlap(view, row) for row, view in enumerate(found)) > 0.9
 
 
-def test_few_views_and_masks_without_background_are_refused() -> None:
-    views = photographs((2.0, 2.0, 2.0), (220.0, 215.0, 205.0))
+def test_few_views_and_masks_without_background_are_refused(views: list[View]) -> None:
     with raises(CaptureError, name="views", value=2):
         find_foreground(views[:2])
     blank = [painted(view, np.ones((HEIGHT, WIDTH), dtype=bool), (9.0, 9.0, 9.0)) for view in views]

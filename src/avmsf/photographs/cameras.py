@@ -1,4 +1,4 @@
-"""Pinhole cameras and the photographs they took: OpenCV axes, world to camera, whatever the files say."""
+"""Pinhole cameras, and views: images with the cameras that took them. OpenCV's axes, world to camera."""
 
 import math
 from dataclasses import dataclass, replace
@@ -109,7 +109,7 @@ class Camera:
         return directions / directions.norm(dim=-1, keepdim=True)
 
     def resized(self, width: int, height: int) -> "Camera":
-        """Return the camera of the same picture with another number of pixels."""
+        """Return the camera of the same image with another number of pixels."""
         across, down = width / self.width, height / self.height
         return replace(
             self,

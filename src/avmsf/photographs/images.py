@@ -39,7 +39,7 @@ def read_image(path: Path) -> UInt8[np.ndarray, "height width channels"]:
     if pixels.shape[2] == 3 or (pixels[..., 3] == 255).all():
         return np.ascontiguousarray(pixels[..., 2::-1])
     image = np.ascontiguousarray(pixels[..., [2, 1, 0, 3]])
-    # What a transparent pixel's color is nobody knows; before black, edges blend as in a photograph of a black room.
+    # A transparent pixel's color is unknown; before black, edges blend as in a photograph of a black room.
     image[..., :3] = (image[..., :3].astype(np.uint16) * image[..., 3:] + 127) // 255
     return image
 
@@ -108,7 +108,7 @@ def _has_header(content: bytes, path: Path) -> bool:
         width, height = read_header(io.BytesIO(content)).size
     except Image.DecompressionBombError as error:
         raise ImageSizeError.expected(wanted, got=f"more ({error})", file=path, advice=advice) from error
-    except Exception:  # Pillow raises whatever the parsing of a damaged header raises
+    except Exception:  # the parser's own, of any type, for a damaged header
         return False
     if width * height > MAX_PIXELS:
         got, count = f"{width:,} x {height:,}", width * height

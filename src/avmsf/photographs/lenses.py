@@ -23,7 +23,7 @@ _ANY_CAMERA = Location(None, item="the camera")
 class Lens:
     """Intrinsics with distortion, for images of one size; pixels as in `Camera`: centers half a pixel from the edges.
 
-    With x, y the point's place at depth one and r its distance from the axis, the perspective lens moves it to
+    With x, y the point's position at depth one and r its distance from the axis, the perspective lens moves it to
     x (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²) and likewise in y; the fisheye lens moves it along its
     radius from r to θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸), θ = arctan r. These are OpenCV's and COLMAP's models.
     """

@@ -30,7 +30,7 @@ MAX_MISSING_LIKELY, MAX_MISSING_POSSIBLE = 0.03, 0.15
 MAX_BORDER_DIFFERENCE = 0.3
 """Part of all images' borders that may differ from the background: folds of cloth, an object that leaves the image."""
 MAX_BACKGROUND_DIFFERENCE = 64
-"""Levels of 255 beyond which no plain background differs from itself, whatever the threshold."""
+"""Levels of 255 beyond which no plain background differs from itself, at any threshold."""
 MIN_EXPLAINED = 0.7
 """Part of the first masks' pixels that the hull must explain: with less, cameras or masks are wrong."""
 BLUR_PIXELS = 2
@@ -95,7 +95,7 @@ def find_foreground(views: Sequence[View]) -> tuple[View, ...]:
 
 
 def _large_parts(mask: Mask) -> Mask:
-    """Return the mask without parts that are small beside its largest."""
+    """Return the mask without parts that are small compared with its largest."""
     count, labels, statistics, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     areas = statistics[:, cv2.CC_STAT_AREA].copy()
     areas[0] = 0
@@ -201,7 +201,7 @@ def _border(image: np.ndarray) -> np.ndarray:
 def _background_distance(image: np.ndarray, common: Float[np.ndarray, " 3"]) -> UInt8[np.ndarray, "height width"]:
     """Return for each pixel how far its color is from the background's: the largest channel's difference, of 255.
 
-    The background is a quadratic in the pixel's place, fitted to the image's border as far as that has about the color
+    The background is a quadratic in the pixel's position, fitted to the image's border as far as that has about the color
     `common` to all images: so that light falling off to the corners is no object, and an object that covers a whole
     border no background.
     """

@@ -1,4 +1,4 @@
-"""Photographs out of a video: from each stretch of time its sharpest frame."""
+"""Photographs out of a video: the sharpest frame of each span of time."""
 
 import warnings
 from collections.abc import Iterator

@@ -97,8 +97,8 @@ def project_votes(
         part = slice(start, start + _CELLS_AT_ONCE)
         values, depths = np.empty((2, len(cells[part])))
         for view, (projection, image) in enumerate(zip(projections, images, strict=True)):
-            place = grid.lowest, grid.spacing, grid.shape, cells[part]
-            run_lanes(_sample, lane_count(), projection, image, linear, *place, values, depths)
+            where = grid.lowest, grid.spacing, grid.shape, cells[part]
+            run_lanes(_sample, lane_count(), projection, image, linear, *where, values, depths)
             reduce(part, view, values, depths)
 
 
@@ -160,7 +160,7 @@ def count_votes(masks: Sequence[Bool[np.ndarray, "_ _"]], cameras: Sequence[Came
 
 
 def carve(masks: Sequence[Bool[np.ndarray, "_ _"]], cameras: Sequence[Camera]) -> Votes | None:
-    """Return the votes of masks around their hull; None where they and their cameras agree on no place at all."""
+    """Return the votes of masks around their hull; None where they and their cameras agree on no point at all."""
     bounds = _bounds(masks, cameras)
     if bounds is None:
         return None
@@ -174,13 +174,13 @@ def carve(masks: Sequence[Bool[np.ndarray, "_ _"]], cameras: Sequence[Camera]) -
 
 
 def silhouette(
-    places: Float64[np.ndarray, "places 3"], edge: float, camera: Camera
+    centers: Float64[np.ndarray, "cells 3"], edge: float, camera: Camera
 ) -> tuple[Bool[np.ndarray, "height width"], float]:
-    """Return where cells of this edge at these places lie in the camera's image, and how large one is there, pixels.
+    """Return where cells of this edge with these centers lie in the camera's image, and how large one is there, pixels.
 
     The outline is as coarse as the cells.
     """
-    pixels, depth = (values.numpy() for values in camera.project(torch.from_numpy(places)))
+    pixels, depth = (values.numpy() for values in camera.project(torch.from_numpy(centers)))
     ahead = depth > 0
     if not ahead.any():
         return np.zeros((camera.height, camera.width), dtype=bool), 1.0

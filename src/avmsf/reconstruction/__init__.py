@@ -2,14 +2,14 @@
 
 In go `View`s with masks, and a `DepthMap`, which gives the depth that a camera sees (of Gaussians, or of a mesh); out
 comes an `ObjectShape`: signed distances on a grid, from which `solid`, `as_seen` and `shell(thickness)` draw closed
-surfaces (marching cubes, `avmsf.mesh.level_set`). How thick a wall is no view tells: recordings do.
+surfaces (marching cubes, `avmsf.mesh.level_set`). Views do not show how thick a wall is; recordings do.
 
 `outer_surface.object_surface` is the whole way; start reading there. Its steps:
 
 1. `mask_consistency`: masks that contradict the consensus of the others are left out, and outlines are moved to the
    edges in the photographs.
 2. `visual_hull`: how far inside all outlines each cell lies, a signed distance.
-3. `fairing`: the hull stretched as a membrane (Laplace's equation) between the places that outlines touch, since
+3. `fairing`: the hull stretched as a membrane (Laplace's equation) between the points that outlines touch, since
    cameras below a flat top leave a low pyramid on it.
 4. `depth_fusion`: the distance of each cell before the depth that most views see (a quantile over views), less the bias
    of that depth (its half-sample mode).

@@ -14,7 +14,7 @@ from avmsf.reconstruction.object_shape import closed_surface
 
 _BINS = 32
 """Of distances before the depth that views see."""
-_BAND = 0.015
+_BAND_RATIO = 0.015
 """How far behind a view's depth cells are still seen, over the diagonal: depth of Gaussians scatters so much."""
 _QUANTILE = 0.35
 """Of the distances before the surface: two thirds of the views must see a cell free."""
@@ -22,7 +22,7 @@ _MIN_VIEW_RATIO = 0.04
 """Part of the views that must see a cell for its depth to count, but three views at least."""
 _BIAS_VIEWS = 24
 """Views in which the bias of depth is measured, about."""
-_MAX_BIAS = 0.05
+_MAX_BIAS_RATIO = 0.05
 """Of depth, over the diagonal."""
 _BIAS_FACES = 40_000
 """Triangles of the surface against which it is measured."""
@@ -44,7 +44,7 @@ def free_space(
     """
     bias = np.float32(-_bias(depths, cameras, hull, grid, diagonal))
     moved = [np.where(depth > 0, depth + bias, np.float32(0.0)) for depth in depths]
-    free, counts = _fused(moved, cameras, grid, hull > -2 * grid.spacing, band=_BAND * diagonal)
+    free, counts = _fused(moved, cameras, grid, hull > -2 * grid.spacing, band=_BAND_RATIO * diagonal)
     return ndimage.gaussian_filter(free, 1.0), counts
 
 
@@ -65,7 +65,7 @@ def _bias(
         front = tracer.depth(camera).numpy()
         behind.append((depth - front)[np.isfinite(front) & (depth > 0)])
     found = np.sort(np.concatenate(behind))
-    found = found[np.abs(found) < _MAX_BIAS * diagonal]
+    found = found[np.abs(found) < _MAX_BIAS_RATIO * diagonal]
     if len(found) < _MIN_BIAS_PIXELS:
         return 0.0
     # The half that is closest together, again and again (half-sample mode).

@@ -9,8 +9,8 @@ from scipy.spatial import ConvexHull, QhullError
 from avmsf._utils.compiled import compiled, lane_count, run_lanes
 from avmsf.errors import SceneError
 
-_DISC = 0.7
-"""Radius, in cells, of the piece of its tangent plane that stands for the surface around a place next to a cell."""
+_DISC_CELLS = 0.7
+"""Radius, in cells, of the piece of its tangent plane that stands for the surface around a point next to a cell."""
 
 
 def distance_from(
@@ -33,7 +33,7 @@ def distance_from(
 @compiled(error_model="numpy")
 @no_type_check
 def _begin(values, without, nearest, distance):
-    """Put the nearest place of the surface, and its normal, next to each cell whose edges it crosses."""
+    """Put the nearest point of the surface, and its normal, next to each cell whose edges it crosses."""
     shape = values.shape
     slope = np.zeros(3)
     for i in range(shape[0]):
@@ -81,7 +81,7 @@ def _begin(values, without, nearest, distance):
 @compiled(error_model="numpy")
 @no_type_check
 def _sweep(nearest, distance):
-    """Hand the nearest places on to neighbors, in the eight directions along the diagonals."""
+    """Hand the nearest points on to neighbors, in the eight directions along the diagonals."""
     first, second, third = distance.shape
     for turn in range(8):
         x, y, z = turn & 1, (turn >> 1) & 1, (turn >> 2) & 1
@@ -103,7 +103,7 @@ def _sweep(nearest, distance):
                         u, v, w = nearest[a, b, c, 0] - i, nearest[a, b, c, 1] - j, nearest[a, b, c, 2] - k
                         above = u * nearest[a, b, c, 3] + v * nearest[a, b, c, 4] + w * nearest[a, b, c, 5]
                         square = u * u + v * v + w * w
-                        aside = max(np.sqrt(max(square - above * above, 0.0)) - _DISC, 0.0)
+                        aside = max(np.sqrt(max(square - above * above, 0.0)) - _DISC_CELLS, 0.0)
                         reach = np.sqrt(above * above + aside * aside) if above != 0.0 else np.sqrt(square)
                         if reach < best:
                             best = reach

@@ -2,7 +2,7 @@
 
 Cameras below a flat top see only its near edge, so that the hull has a low pyramid above it. Every line of sight along
 an outline touches the object somewhere. It is assumed to do so where many other outlines pass as well, which meet at
-edges of the object but hardly on a pyramid, and of these places where the hull is bent most. Between these places the
+edges of the object but hardly on a pyramid, and of these points where the hull is bent most. Between these points the
 surface is a membrane that is fixed at them.
 """
 
@@ -18,39 +18,39 @@ from avmsf.photographs.visual_hull import Grid
 from avmsf.reconstruction.object_shape import closed_surface
 from avmsf.reconstruction.visual_hull import Outline
 
-_ROUND = 0.015
+_BLUR_RATIO = 0.015
 """Standard deviation of the Gaussian blur of the hull that measures how bent its surface is, over the diagonal."""
-_TOUCHING = 0.75
-"""Distance from an outline, pixels, within which a place is on it."""
-_EVEN = 0.03
-"""Difference of the blurred hull up to which two places are equally bent: a plane has .5, a right-angled edge .25."""
+_TOUCH_PIXELS = 0.75
+"""Distance from an outline, pixels, within which a point is on it."""
+_BEND_TOLERANCE = 0.03
+"""Difference of the blurred hull up to which two points are equally bent: a plane has .5, a right-angled edge .25."""
 _MIN_VOTE_RATIO = 0.5
-"""Part of the most outlines that pass a place on a line of sight, from which on another place is touched as well. On a
-bracket with a hole, 15 to 23 of 72 pass the places of the hole's edge and 3 to 9 the pyramid's around it."""
-_COUNTS = 2
-"""Times that the outlines which pass a place are counted, the second time only those that chose it. On that bracket the
+"""Part of the most outlines that pass a point on a line of sight, from which on another point is touched as well. On a
+bracket with a hole, 15 to 23 of 72 pass the points of the hole's edge and 3 to 9 the pyramid's around it."""
+_COUNT_ROUNDS = 2
+"""Times that the outlines which pass a point are counted, the second time only those that chose it. On that bracket the
 mean distance is .43 % of the diagonal with one, .34 with two, .35 with four."""
-_HELD = 1e-3
+_ANCHOR_WEIGHT = 1e-3
 """Weight of the hull's own position, relative to the membrane's: parts that no outline touches stay about there."""
-_ROUNDS = 300
+_MAX_ITERATIONS = 300
 """Iterations of the conjugate gradient method at most."""
 
 
 def fair_hull(
     hull: Float32[np.ndarray, "x y z"], outlines: Sequence[Outline], grid: Grid, diagonal: float
 ) -> tuple[Float32[np.ndarray, "x y z"], Float32[np.ndarray, "x y z"]]:
-    """Return how far inside the smaller hull each cell lies, and how far from the nearest touched place, meters."""
+    """Return how far inside the smaller hull each cell lies, and how far from the nearest touched point, meters."""
     surface = closed_surface(hull, grid)
-    places, faces = surface.vertices.double().numpy(), surface.faces.numpy()
-    full = ndimage.gaussian_filter((hull > 0).astype(np.float32), _ROUND * diagonal / grid.spacing)
-    bent = ndimage.map_coordinates(full, ((places - grid.lowest) / grid.spacing).T, order=1, output=np.float64)
-    touched = _touched(outlines, places, bent)
+    points, faces = surface.vertices.double().numpy(), surface.faces.numpy()
+    full = ndimage.gaussian_filter((hull > 0).astype(np.float32), _BLUR_RATIO * diagonal / grid.spacing)
+    bent = ndimage.map_coordinates(full, ((points - grid.lowest) / grid.spacing).T, order=1, output=np.float64)
+    touched = _touched(outlines, points, bent)
     if not touched.any():
         return hull, np.full(grid.shape, diagonal, dtype=np.float32)
-    drawn = _membrane(places, faces, touched)
-    inward = np.maximum(((places - drawn) * _normals(places, faces)).sum(axis=1), 0.0)
+    drawn = _membrane(points, faces, touched)
+    inward = np.maximum(((points - drawn) * _normals(points, faces)).sum(axis=1), 0.0)
     fall = np.zeros(grid.shape, dtype=np.float32)
-    cells = tuple(np.rint((places - grid.lowest) / grid.spacing).astype(int).T)
+    cells = tuple(np.rint((points - grid.lowest) / grid.spacing).astype(int).T)
     np.maximum.at(fall, cells, inward.astype(np.float32))
     far = np.ones(grid.shape, dtype=bool)
     far[cells] = False
@@ -64,39 +64,39 @@ def fair_hull(
 
 
 def _touched(
-    outlines: Sequence[Outline], places: Float64[np.ndarray, "places 3"], bent: Float64[np.ndarray, " places"]
-) -> Bool[np.ndarray, " places"]:
-    """Return which places of a hull's surface the object is taken to touch."""
-    passing = [_passing(each, places) for each in outlines]
-    votes = np.bincount(np.concatenate([rows for rows, _ in passing]), minlength=len(places)).astype(np.float64)
-    for _ in range(_COUNTS):
-        chosen = np.zeros(len(places))
+    outlines: Sequence[Outline], points: Float64[np.ndarray, "points 3"], bent: Float64[np.ndarray, " points"]
+) -> Bool[np.ndarray, " points"]:
+    """Return which points of a hull's surface the object is taken to touch."""
+    passing = [_passing(each, points) for each in outlines]
+    votes = np.bincount(np.concatenate([rows for rows, _ in passing]), minlength=len(points)).astype(np.float64)
+    for _ in range(_COUNT_ROUNDS):
+        chosen = np.zeros(len(points))
         for each, (rows, pixels) in zip(outlines, passing, strict=True):
             often = votes[rows] >= _MIN_VOTE_RATIO * _largest(votes[rows], pixels, each.inside.shape)
             few, where = rows[often], pixels[:, often]
-            chosen[few[bent[few] <= _EVEN - _largest(-bent[few], where, each.inside.shape)]] += 1
+            chosen[few[bent[few] <= _BEND_TOLERANCE - _largest(-bent[few], where, each.inside.shape)]] += 1
         votes = chosen
     return votes > 0
 
 
 def _passing(
-    outline: Outline, places: Float64[np.ndarray, "places 3"]
+    outline: Outline, points: Float64[np.ndarray, "points 3"]
 ) -> tuple[Int[np.ndarray, " found"], Int[np.ndarray, "2 found"]]:
-    """Return which places an outline passes, and the rows and columns of their pixels."""
+    """Return which points an outline passes, and the rows and columns of their pixels."""
     projection = outline.camera.projection.numpy()
-    seen = places @ projection[:, :3].T + projection[:, 3]
+    seen = points @ projection[:, :3].T + projection[:, 3]
     pixels = seen[:, :2] / np.maximum(seen[:, 2:], 1e-12)
     height, width = outline.inside.shape
     rows = np.flatnonzero((seen[:, 2] > 0) & (pixels > 0).all(axis=1) & (pixels < [width, height]).all(axis=1))
     apart = ndimage.map_coordinates(outline.inside, pixels[rows, ::-1].T - 0.5, order=1, mode="nearest")
-    rows = rows[np.abs(apart) < _TOUCHING]
+    rows = rows[np.abs(apart) < _TOUCH_PIXELS]
     return rows, pixels[rows, ::-1].astype(int).T
 
 
 def _largest(
     values: Float64[np.ndarray, " found"], pixels: Int[np.ndarray, "2 found"], shape: tuple[int, int]
 ) -> Float64[np.ndarray, " found"]:
-    """Return the largest value in each one's pixel and those around: their lines of sight touch in the same place."""
+    """Return the largest value in each one's pixel and those around: their lines of sight touch in the same point."""
     found = np.full(shape, -np.inf)
     np.maximum.at(found, tuple(pixels), values)
     largest: Float64[np.ndarray, " found"] = ndimage.maximum_filter(found, 3)[tuple(pixels)]
@@ -104,31 +104,31 @@ def _largest(
 
 
 def _membrane(
-    places: Float64[np.ndarray, "places 3"], faces: Int[np.ndarray, "faces 3"], fixed: Bool[np.ndarray, " places"]
-) -> Float64[np.ndarray, "places 3"]:
+    points: Float64[np.ndarray, "points 3"], faces: Int[np.ndarray, "faces 3"], fixed: Bool[np.ndarray, " points"]
+) -> Float64[np.ndarray, "points 3"]:
     """Return where the vertices of a stretched membrane lie that is `fixed` at some of them, meters."""
     ends = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    count = len(places)
+    count = len(points)
     links = scipy.sparse.csr_array((np.ones(len(ends)), ends.T), shape=(count, count))
     links = links.maximum(links.T)
     pull = scipy.sparse.dia_array((np.asarray(links.sum(axis=0))[None], [0]), shape=(count, count)).tocsr() - links
     free = np.flatnonzero(~fixed)
-    matrix = pull[free][:, free] + _HELD * scipy.sparse.eye_array(len(free), format="csr")
-    right = _HELD * places[free] - pull[free][:, np.flatnonzero(fixed)] @ places[fixed]
+    matrix = pull[free][:, free] + _ANCHOR_WEIGHT * scipy.sparse.eye_array(len(free), format="csr")
+    right = _ANCHOR_WEIGHT * points[free] - pull[free][:, np.flatnonzero(fixed)] @ points[fixed]
     scale = scipy.sparse.dia_array((1.0 / matrix.diagonal()[None], [0]), shape=matrix.shape)
-    drawn = places.copy()
+    drawn = points.copy()
     for axis in range(3):
         drawn[free, axis] = scipy.sparse.linalg.cg(
-            matrix, right[:, axis], x0=places[free, axis], rtol=1e-5, maxiter=_ROUNDS, M=scale
+            matrix, right[:, axis], x0=points[free, axis], rtol=1e-5, maxiter=_MAX_ITERATIONS, M=scale
         )[0]
     return drawn
 
 
 def _normals(
-    places: Float64[np.ndarray, "places 3"], faces: Int[np.ndarray, "faces 3"]
-) -> Float64[np.ndarray, "places 3"]:
-    corners = places[faces]
+    points: Float64[np.ndarray, "points 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Float64[np.ndarray, "points 3"]:
+    corners = points[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.zeros_like(places)
+    total = np.zeros_like(points)
     np.add.at(total, faces.ravel(), np.repeat(across, 3, axis=0))
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)

@@ -16,19 +16,19 @@ from avmsf.reconstruction.visual_hull import Outline, hull_distance
 
 WRONG_FRACTION = 0.05
 """Part of the masks that may be wrong."""
-_CUT = 0.002
+_MAX_LEFT_OUT = 0.002
 """Part of the consensus that a right mask leaves out in most views (median over 20 objects with 72 views: 0)."""
-_CUT_ALONE = 0.15
+_MAX_LEFT_OUT_ALONE = 0.15
 """Part of the consensus that only a wrong mask leaves out. One view in twelve, which alone saw under a dish, leaves out
 .096; of the other objects' right masks none leaves out more than .07."""
-_BEYOND = 0.01
+_MAX_BEYOND = 0.01
 """Part of a mask beyond the consensus from which on it is wrong. Right masks of the 20 objects have .0000; nine in ten
 mirrored ones have .015 and more, unless the object looks the same from there."""
-_TIMES_MEDIAN = 4.0
+_MIN_MEDIAN_RATIO = 4.0
 """Both parts must also be so many times the median over views: where all cameras are inexact, no mask is wrong."""
-_REACH, _STEP = 4.0, 0.25
+_MAX_OFFSET_PIXELS, _BIN_PIXELS = 4.0, 0.25
 """Pixels on both sides of outlines in which edges are searched, and the width of a bin."""
-_CLEAR = 3.0
+_MIN_PEAK_RATIO = 3.0
 """Gradient at an edge over its median within reach, from which on it is one. The 20 objects have 5 to 18."""
 
 
@@ -39,19 +39,19 @@ def edge_offset(views: Sequence[View], outlines: Sequence[Outline]) -> float:
     It is 0 where no peak within 3 pixels stands out. On 19 objects, masks eroded or dilated by 1 or 2 pixels, it is
     right within .2 pixels.
     """
-    bins = round(2 * _REACH / _STEP)
+    bins = round(2 * _MAX_OFFSET_PIXELS / _BIN_PIXELS)
     total, count = np.zeros(bins), np.zeros(bins)
     for view, outline in zip(views, outlines, strict=True):
         smooth = cv2.GaussianBlur(view.image.numpy().astype(np.float32), (0, 0), 0.7)
         gradient = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
-        place = np.floor((outline.inside + _REACH) / _STEP).astype(int)
-        near = (place >= 0) & (place < bins)
-        total += np.bincount(place[near], gradient.max(axis=2)[near], minlength=bins)
-        count += np.bincount(place[near], minlength=bins)
+        chosen = np.floor((outline.inside + _MAX_OFFSET_PIXELS) / _BIN_PIXELS).astype(int)
+        near = (chosen >= 0) & (chosen < bins)
+        total += np.bincount(chosen[near], gradient.max(axis=2)[near], minlength=bins)
+        count += np.bincount(chosen[near], minlength=bins)
     mean = total / np.maximum(count, 1)
     peak, usual = int(mean.argmax()), float(np.median(mean))
-    pixels = (np.arange(bins) + 0.5) * _STEP - _REACH
-    if not mean[peak] > _CLEAR * usual or abs(pixels[peak]) > _REACH - 1:
+    pixels = (np.arange(bins) + 0.5) * _BIN_PIXELS - _MAX_OFFSET_PIXELS
+    if not mean[peak] > _MIN_PEAK_RATIO * usual or abs(pixels[peak]) > _MAX_OFFSET_PIXELS - 1:
         return 0.0
     # The middle of the peak's upper half.
     weight = np.maximum(mean - (mean[peak] + usual) / 2, 0.0) * (np.abs(pixels - pixels[peak]) < 2)
@@ -70,15 +70,15 @@ def consistent_masks(views: Sequence[View], outlines: Sequence[Outline], grid: G
     if not solid.any():
         return np.ones(len(outlines), dtype=bool)
     cut = np.array([_left_out(each, grid, solid) for each in outlines])
-    inconsistent = cut > max(_CUT, _TIMES_MEDIAN * float(np.median(cut)))
+    inconsistent = cut > max(_MAX_LEFT_OUT, _MIN_MEDIAN_RATIO * float(np.median(cut)))
     if not inconsistent.any():
         return ~inconsistent
     # Half a cell larger, for cells are coarse.
     values = np.maximum(values + 0.5 * np.float32(grid.spacing), -grid.spacing)
     tracer = MeshTracer(TexturedMesh.plain(closed_surface(values, grid)))
     beyond = np.array([_beyond(view, each, tracer) for view, each in zip(views, outlines, strict=True)])
-    shown = beyond > max(_BEYOND, _TIMES_MEDIAN * float(np.median(beyond)))
-    return ~(inconsistent & (shown | (cut > _CUT_ALONE)))
+    shown = beyond > max(_MAX_BEYOND, _MIN_MEDIAN_RATIO * float(np.median(beyond)))
+    return ~(inconsistent & (shown | (cut > _MAX_LEFT_OUT_ALONE)))
 
 
 def _left_out(outline: Outline, grid: Grid, solid: Bool[np.ndarray, "x y z"]) -> float:

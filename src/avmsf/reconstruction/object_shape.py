@@ -14,22 +14,22 @@ from avmsf.mesh.surface import Surface
 from avmsf.photographs.visual_hull import Grid
 from avmsf.reconstruction.distance import distance_from
 
-FACES = 6000
+MAX_FACES = 6000
 """Triangles at most of a body's surface: tetrahedra of 12,000 to 40,000 degrees of freedom have no more outside."""
-_SOLID = 0.03
+_MIN_HALF_THICKNESS = 0.03
 """Half the thickness beyond the wall's, over the diagonal, below which a part is solid unless seen to be hollow:
 handles are. By trial: .06 for the thickness (mugs, jugs, pans)."""
-_LID_TURN = 0.8
+_MIN_LID_COSINE = 0.8
 """Cosine of the angle to a lid's normal within which the rim beside it belongs to the lid."""
-_LID_REACH = 0.6
+_LID_GROWTH = 0.6
 """How far a lid grows over the rim, and over floors that were not seen to lie below it, over the radius of a disc of
 its area."""
-_SHIFTED = 0.5
+_MIN_REPORTED_PIXELS = 0.5
 """Pixels by which outlines are moved, from which on the user hears of it; masks that the package finds take .2."""
-_THINNEST, _THICKEST = 0.0025, 0.06
+_MIN_THICKNESS, _MAX_THICKNESS = 0.0025, 0.06
 """Wall thicknesses over the diagonal that are worth trying. Of the 20 simulated objects a tube has the least, .0027,
 and thinner walls take more elements than a model has."""
-_BLUR = 0.6
+_BLUR_CELLS = 0.6
 """Standard deviation of the blur that takes steps out of surfaces, cells."""
 
 
@@ -71,13 +71,13 @@ class ObjectShape:
         if not self.hollow.any():
             return None
         if self.supposed:
-            return _THINNEST * self.diagonal, _THICKEST * self.diagonal
+            return _MIN_THICKNESS * self.diagonal, _MAX_THICKNESS * self.diagonal
         rim = (self.hollow > 0) & ndimage.binary_dilation((self.hollow == 0) & (self.outer > 0)) & ~self._lids
         left = 1.5 * float(np.quantile(self._depth[rim], 0.5)) if rim.any() else 0.0
-        most = min(max(left, 3 * _THINNEST * self.diagonal), _THICKEST * self.diagonal)
-        return _THINNEST * self.diagonal, most
+        most = min(max(left, 3 * _MIN_THICKNESS * self.diagonal), _MAX_THICKNESS * self.diagonal)
+        return _MIN_THICKNESS * self.diagonal, most
 
-    def solid(self, *, faces: int = FACES) -> Surface:
+    def solid(self, *, faces: int = MAX_FACES) -> Surface:
         """Return the outer side, cavities filled."""
         return self._enclose(self.outer, self.grid, faces)
 
@@ -87,9 +87,9 @@ class ObjectShape:
 
     @cached_property
     def _as_seen(self) -> Surface:
-        return self._enclose(self.seen, self.grid, 2 * FACES)
+        return self._enclose(self.seen, self.grid, 2 * MAX_FACES)
 
-    def shell(self, thickness: float, *, faces: int = FACES) -> Surface:
+    def shell(self, thickness: float, *, faces: int = MAX_FACES) -> Surface:
         """Return the body whose walls around its cavities are `thickness` meters thick, measured from outside.
 
         Space deeper below the outer side is empty where it is connected with a cavity; parts that are hardly
@@ -133,11 +133,11 @@ class ObjectShape:
             if int(here.sum()) < 0.02 * int(lids.sum()):
                 grown &= ~here
                 continue
-            steps = max(1, round(_LID_REACH * float(np.sqrt(here.sum() / np.pi))))
+            steps = max(1, round(_LID_GROWTH * float(np.sqrt(here.sum() / np.pi))))
             normal = slopes[here].mean(axis=0)
             normal /= max(float(np.linalg.norm(normal)), 1e-12)
             grown |= ndimage.binary_dilation(
-                here, np.ones((3, 3, 3)), iterations=steps, mask=skin & (slopes @ normal > _LID_TURN)
+                here, np.ones((3, 3, 3)), iterations=steps, mask=skin & (slopes @ normal > _MIN_LID_COSINE)
             )
         return grown
 
@@ -155,7 +155,7 @@ class ObjectShape:
 
     def _emptied(self, thickness: float) -> Float32[np.ndarray, "x y z"] | None:
         """Return how far each cell lies from what is emptied, meters; None where nothing is."""
-        margin, seen = _SOLID * self.diagonal, self.hollow > 0
+        margin, seen = _MIN_HALF_THICKNESS * self.diagonal, self.hollow > 0
         inside = self.outer > 0
         deep = inside & (self._depth > thickness)
         label, _ = ndimage.label(inside & (self._depth > thickness + margin))
@@ -167,7 +167,7 @@ class ObjectShape:
         return away - np.float32(1.2 * margin)
 
     def _enclose(self, values: Float32[np.ndarray, "x y z"], grid: Grid, faces: int) -> Surface:
-        smooth = ndimage.gaussian_filter(values, _BLUR)
+        smooth = ndimage.gaussian_filter(values, _BLUR_CELLS)
         # Triangles without area, where the surface passes through the middle of a cell, pinch coarser ones.
         least = np.float32(0.02 * grid.spacing)
         smooth = np.where(smooth > 0, np.maximum(smooth, least), np.minimum(smooth, -least))
@@ -180,7 +180,7 @@ class ObjectShape:
         parts = [f"{cavities}{', supposed behind faces that no outline touches' if self.supposed and count else ''}"]
         if self.report.unseen > 0:
             parts.append(f"{self.report.unseen:.0%} of the surface was seen by no view and is closed")
-        if abs(self.report.mask_offset) >= _SHIFTED:
+        if abs(self.report.mask_offset) >= _MIN_REPORTED_PIXELS:
             way = "inwards" if self.report.mask_offset > 0 else "outwards"
             parts.append(f"outlines of masks moved {way} by {abs(self.report.mask_offset):.1f} pixels")
         if self.report.rejected:

@@ -25,24 +25,24 @@ _COARSE_CELLS = 48
 """Cells along an edge of the first grids, which find where the object is and which masks are wrong."""
 _MAX_REFINEMENT = 4.0
 """Times as many cells along the longest side of a slender object, at most."""
-_MARGIN = 4
+_MARGIN_CELLS = 4
 """Cells of free room around the hull."""
 _DEPTH_TOLERANCE = 0.005
 """How far depth must lie behind the hull to be believed, over the diagonal: its mean over views is so exact."""
 _CLOSING_FACES = 4000
 """Triangles of the surface whose convex hull closes what no view sees."""
-_NARROW = 2
+_MIN_HALF_WIDTH_CELLS = 2
 """Half the width of hollows that are none, cells."""
 _MIN_TOUCH_DISTANCE = 0.025
-"""Distance from the nearest touch of an outline, over the diagonal, from which on a place is inside a face of which
+"""Distance from the nearest touch of an outline, over the diagonal, from which on a point is inside a face of which
 outlines tell the edge alone. Touches on round parts are three pixels apart."""
 _MIN_AREA_RATIO = 0.7
 """Area of such a face over that of the largest, from which on both are openings or neither: the ends of a tube."""
-_LARGE_FACE = 0.02
+_MIN_FACE_RATIO = 0.02
 """Part of the surface that a face must be for a supposed opening."""
-_HOLLOW_DEPTH = 0.08
+_MIN_CAVITY_DEPTH = 0.08
 """Depth below its lid, over the diagonal, from which on what is free is a cavity."""
-_HOLLOW_VOLUME = 0.08
+_MIN_CAVITY_VOLUME = 0.08
 """Part of the filled volume from which on it is a cavity although it is shallow: plates."""
 
 
@@ -66,7 +66,7 @@ def object_surface(views: Sequence[View], depth_map: DepthMap, *, cells: int = 1
     kept = [view for view, each in zip(masked, right, strict=True) if each]
     outlines = [outline for outline, each in zip(outlines, right, strict=True) if each]
     low, high = _box(hull_distance(outlines, rough, rank=0) > -rough.spacing, rough, len(kept))
-    grid = Grid.around(low, high, cells=cells, finest=_MAX_REFINEMENT, margin=_MARGIN)
+    grid = Grid.around(low, high, cells=cells, finest=_MAX_REFINEMENT, margin=_MARGIN_CELLS)
     hull = _hull(outlines, grid)
     low, high = _box(hull > 0, grid, len(kept))
     diagonal = float(np.linalg.norm(high - low))
@@ -140,7 +140,9 @@ def _unobserved_cavities(seen: Float32[np.ndarray, "x y z"], untouched: Bool[np.
     label, count = ndimage.label(skin, np.ones((3, 3, 3)))
     sizes = np.bincount(label.ravel(), minlength=count + 1)[1:]
     total = int(shallow.sum())
-    large = [row + 1 for row in range(count) if sizes[row] >= max(_MIN_AREA_RATIO * sizes.max(), _LARGE_FACE * total)]
+    large = [
+        row + 1 for row in range(count) if sizes[row] >= max(_MIN_AREA_RATIO * sizes.max(), _MIN_FACE_RATIO * total)
+    ]
     numbers = np.zeros(count + 1, dtype=np.int32)
     numbers[large] = np.arange(1, len(large) + 1)
     return numbers[label]
@@ -157,15 +159,15 @@ def _closed(
     Return the cut solid, the hull cut likewise, which lids cavities, and the part of the surface that no view saw.
     """
     surface = closed_surface(seen, grid, _CLOSING_FACES)
-    places = surface.vertices.double().numpy()
-    rows = np.rint((places - grid.lowest) / grid.spacing).astype(int)
+    points = surface.vertices.double().numpy()
+    rows = np.rint((points - grid.lowest) / grid.spacing).astype(int)
     known = ndimage.maximum_filter(view_counts, 3)[tuple(rows.T)] >= 1
     if int(known.sum()) < 4:
         advice = "check that depth and views are of one object"
         raise SceneError.expected("a surface in their masks", 0, got="none", name="views", advice=advice)
     near = hull > -2 * grid.spacing
     bound = hull.copy()
-    inside = depth_in_convex_hull(places[known], grid.centers(np.argwhere(near)))
+    inside = depth_in_convex_hull(points[known], grid.centers(np.argwhere(near)))
     bound[near] = np.minimum(hull[near], inside)
     corners = surface.vertices.double()[surface.faces]
     areas = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=1).numpy()
@@ -178,7 +180,7 @@ def _covered(hollow: Bool[np.ndarray, "x y z"], free: Bool[np.ndarray, "x y z"])
     if hollow.any():
         label, _ = ndimage.label(free)
         hollow = np.isin(label, np.unique(label[hollow]))
-    return ndimage.binary_dilation(hollow, iterations=_NARROW)
+    return ndimage.binary_dilation(hollow, iterations=_MIN_HALF_WIDTH_CELLS)
 
 
 def _hollows(
@@ -186,8 +188,8 @@ def _hollows(
 ) -> np.ndarray:
     """Return the number of the cavity that each cell is in, the largest first; 0 in none."""
     free = (bound > 0) & (seen <= 0)
-    core = ndimage.distance_transform_edt(free) > _NARROW
-    opened = free & (ndimage.distance_transform_edt(~core) <= _NARROW + 0.5)
+    core = ndimage.distance_transform_edt(free) > _MIN_HALF_WIDTH_CELLS
+    opened = free & (ndimage.distance_transform_edt(~core) <= _MIN_HALF_WIDTH_CELLS + 0.5)
     label, count = ndimage.label(opened)
     depth = ndimage.distance_transform_edt(bound > 0)
     total = int((bound > 0).sum())
@@ -196,9 +198,9 @@ def _hollows(
     kept = [
         number
         for number in range(1, count + 1)
-        if deepest[number] * grid.spacing > _HOLLOW_DEPTH * diagonal or sizes[number] > _HOLLOW_VOLUME * total
+        if deepest[number] * grid.spacing > _MIN_CAVITY_DEPTH * diagonal or sizes[number] > _MIN_CAVITY_VOLUME * total
     ]
     numbers = np.zeros(count + 1, dtype=np.int32)
-    for place, number in enumerate(sorted(kept, key=lambda each: -int(sizes[each]))):
-        numbers[number] = place + 1
+    for rank, number in enumerate(sorted(kept, key=lambda each: -int(sizes[each])), start=1):
+        numbers[number] = rank
     return numbers[label]
