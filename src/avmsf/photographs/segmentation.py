@@ -201,9 +201,9 @@ def _border(image: np.ndarray) -> np.ndarray:
 def _background_distance(image: np.ndarray, common: Float[np.ndarray, " 3"]) -> UInt8[np.ndarray, "height width"]:
     """Return for each pixel how far its color is from the background's: the largest channel's difference, of 255.
 
-    The background is a quadratic in the pixel's position, fitted to the image's border as far as that has about the color
-    `common` to all images: so that light falling off to the corners is no object, and an object that covers a whole
-    border no background.
+    The background is a quadratic in the pixel's position, fitted to the image's border as far as that has about the
+    color `common` to all images: so that light falling off to the corners is no object, and an object that covers a
+    whole border no background.
     """
     terms = _terms(*image.shape[:2])
     at, colors = _border(terms), _border(image).astype(np.float64)

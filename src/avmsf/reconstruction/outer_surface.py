@@ -139,10 +139,8 @@ def _unobserved_cavities(seen: Float32[np.ndarray, "x y z"], untouched: Bool[np.
     skin = shallow & untouched
     label, count = ndimage.label(skin, np.ones((3, 3, 3)))
     sizes = np.bincount(label.ravel(), minlength=count + 1)[1:]
-    total = int(shallow.sum())
-    large = [
-        row + 1 for row in range(count) if sizes[row] >= max(_MIN_AREA_RATIO * sizes.max(), _MIN_FACE_RATIO * total)
-    ]
+    least = max(_MIN_AREA_RATIO * sizes.max(initial=0), _MIN_FACE_RATIO * int(shallow.sum()))
+    large = np.flatnonzero(sizes >= least) + 1
     numbers = np.zeros(count + 1, dtype=np.int32)
     numbers[large] = np.arange(1, len(large) + 1)
     return numbers[label]
