@@ -15,7 +15,7 @@ from avmsf.capture.impacts import rows_by_place
 from avmsf.features.feature_field import FeatureField, Regions
 from avmsf.field.config import AttentionShape
 from avmsf.field.gains.data import GainData
-from avmsf.field.gains.model import GainModel, Gains
+from avmsf.field.gains.model import Directions, GainModel, Gains, Points
 from avmsf.field.trainer import FittedGains, GainEstimator, Trainer
 from avmsf.field.training import TrainableGains
 from avmsf.gaussians.points import farthest_points
@@ -109,9 +109,7 @@ class AttentionGains(TrainableGains, GainModel):
                     layer.weight.copy_(layer.weight[modes])
                     layer.bias.copy_(layer.bias[modes])
 
-    def predict(
-        self, points: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Gains:
+    def predict(self, points: Points, directions: Directions = None) -> Gains:
         """Return the gains at the contacts, for any direction, and the factors where dampings vary."""
         return self.read(self.feature_field.nearest(points))
 

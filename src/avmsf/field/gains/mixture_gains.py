@@ -7,7 +7,7 @@ from itertools import accumulate
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Bool, Complex128, Float, Float32, Float64, Int
+from jaxtyping import Bool, Complex128, Float32, Float64, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -19,7 +19,7 @@ from avmsf.fem.elastic_store import mode_sizes, mode_skeleton, mode_tensors, res
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.kernels import Family, KernelFamily, Sites, Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture, Predictions
-from avmsf.field.gains.model import GainModel, Gains, series_of
+from avmsf.field.gains.model import Directions, GainModel, Gains, Points, series_of
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.symmetry.characters import Group
 
@@ -83,9 +83,7 @@ class MixtureGains(GainModel):
         """Number of each contact's place, from 0 on."""
         return places_of(self.contacts)
 
-    def sites(
-        self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Sites:
+    def sites(self, contacts: Points, directions: Directions = None) -> Sites:
         """Return impacts; without a direction, or with one of length zero, they go straight into the body.
 
         Where there is no body they go as the nearest training impact does. Where the model knows nothing of directions,
@@ -111,22 +109,16 @@ class MixtureGains(GainModel):
         """
         return next((each.modes for each in self._of(Elastic)), None)
 
-    def predict(
-        self, points: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Gains:
+    def predict(self, points: Points, directions: Directions = None) -> Gains:
         """Return the mean gains of impacts, see `sites`."""
         return Gains.of(self._mean(self.sites(points, directions)))
 
-    def point_estimate(
-        self, points: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Gains:
+    def point_estimate(self, points: Points, directions: Directions = None) -> Gains:
         """Return the mean magnitudes of the gains, as far as `spread_share` goes, with the signs of the mean gains."""
         sites = self.sites(points, directions)
         return Gains.of(self._batched(self._magnitude, sites).copysign(self._mean(sites)))
 
-    def posterior(
-        self, points: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Gains:
+    def posterior(self, points: Points, directions: Directions = None) -> Gains:
         """Return the mean gains with the standard deviation of both parts, without the noise of a measurement."""
         sites = self.sites(points, directions)
         return replace(Gains.of(self._mean(sites)), std=_parts(self._batched(self._std, sites)).float())

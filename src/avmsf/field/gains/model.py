@@ -12,6 +12,11 @@ from torch import Tensor
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.mesh.surface import Surface
 
+Points = Float[Tensor, "contacts 3"]
+"""Where impacts hit, object frame, meters."""
+Directions = Float[Tensor, "contacts 3"] | None
+"""Unit vectors along which the hammer moves."""
+
 
 @dataclass(frozen=True, eq=False)
 class Gains:
@@ -55,8 +60,7 @@ def series_of(values: Complex128[Tensor, "contacts modes"]) -> Float64[Tensor, "
 class GainModel(ABC):
     """Gains at every contact with one object. One contract test holds for all subclasses.
 
-    Points are in the object frame, meters; `directions` are the unit vectors along which the hammer moves. Models that
-    know of directions take an impact straight into the surface where none are given; the others ignore them.
+    Models that know of directions take an impact straight into the surface where none are given; others ignore them.
     """
 
     kind: ClassVar[str]
@@ -92,14 +96,10 @@ class GainModel(ABC):
         return None if self.body is None else self.body.normals(points.double() / self.length)
 
     @abstractmethod
-    def predict(
-        self, points: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Gains:
+    def predict(self, points: Points, directions: Directions = None) -> Gains:
         """Return the mean gains of impacts at points."""
 
-    def point_estimate(
-        self, points: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Gains:
+    def point_estimate(self, points: Points, directions: Directions = None) -> Gains:
         """Return the gains that sounds are rendered with: the mean, except for a posterior whose mean cancels.
 
         Sounds are compared by magnitudes. Where hypotheses agree that a mode is loud but not on its sign, the mean is
@@ -107,9 +107,7 @@ class GainModel(ABC):
         """
         return self.predict(points, directions)
 
-    def posterior(
-        self, points: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Gains:
+    def posterior(self, points: Points, directions: Directions = None) -> Gains:
         """Return the mean gains with their standard deviations, which models without a posterior do not have."""
         return self.predict(points, directions)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float32, Float64
 from torch import Tensor
 
 from avmsf._utils.arrays import short_repr
@@ -17,7 +17,7 @@ from avmsf.fem.elastic_store import mode_sizes, mode_skeleton, mode_tensors, res
 from avmsf.field.gains.attention import AttentionGains
 from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture_gains import MixtureGains
-from avmsf.field.gains.model import GainModel, Gains
+from avmsf.field.gains.model import Directions, GainModel, Gains, Points
 
 _BODY, _FITTED = "body.", "fitted."
 """What names of the tensors of a body and of a fitted model begin with."""
@@ -41,9 +41,7 @@ class BodyGains(GainModel):
         """The modes."""
         return self.modes
 
-    def predict(
-        self, points: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Gains:
+    def predict(self, points: Points, directions: Directions = None) -> Gains:
         """Return the gains; without a direction impacts go straight into the body."""
         sites = Sites.along(points.double(), directions, lambda unknown: -self.modes.normals(unknown))
         return Gains(self.modes.gains(sites.points, sites.directions).float())
@@ -118,21 +116,15 @@ class ScaledGains(GainModel):
         """The fitted gains' contacts, where they are on this object."""
         return self.field.contacts * self.length
 
-    def predict(
-        self, points: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Gains:
+    def predict(self, points: Points, directions: Directions = None) -> Gains:
         """Return the scaled gains; the factors on the dampings are the fitted ones."""
         return self._scaled(self.field.predict(points.double() / self.length, directions))
 
-    def point_estimate(
-        self, points: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Gains:
+    def point_estimate(self, points: Points, directions: Directions = None) -> Gains:
         """Return the fitted gains' estimate, scaled likewise."""
         return self._scaled(self.field.point_estimate(points.double() / self.length, directions))
 
-    def posterior(
-        self, points: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Gains:
+    def posterior(self, points: Points, directions: Directions = None) -> Gains:
         """Return the fitted gains' posterior, scaled likewise."""
         return self._scaled(self.field.posterior(points.double() / self.length, directions))
 
