@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float64, Int
 from torch import Tensor
 
+from avmsf.capture.impacts import Impacts
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.kernels import Sites, Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.labels import better_order, two_levels
@@ -88,6 +89,11 @@ def _exchanged(sites: Sites, one: int, other: int) -> Sites:
     return sites.take(rows)
 
 
+def _recorded(sites: Sites) -> Impacts:
+    names = tuple(f"hit{row}" for row in range(len(sites)))
+    return Impacts(sites.points.float(), torch.zeros(len(sites), 1), 1.0, names, sites.directions.float())
+
+
 def _dense_ratio(ratios: PredictiveRatios, row: int, others: list[int]) -> Float64[Tensor, ""]:
     """The definition, with the library's own Student t: each contact given the others, series by series."""
     total, count = torch.zeros((), dtype=torch.float64), len(others)
@@ -150,16 +156,14 @@ def test_exchanged_labels_are_found_with_the_places_exchanged() -> None:
         # Within two steps of the grid of where it was really hit.
         apart = torch.tensor(found[row].place, dtype=torch.float64) - true.points[row]
         assert float(apart.norm()) < 2.0 / 11.0
-    names = [f"hit{row}" for row in range(CONTACTS)]
-    text = found[9].describe(names, labels.points.float(), directed=True, with_body=False)
+    text = found[9].describe(_recorded(labels), with_body=False)
     assert "hit9 " in text
     assert "hit16" in text
     assert "nx,ny,nz" not in text
     assert "body" not in text
     # A direction that was not given is the first cause to look for, and a body the last.
-    other = found[9].describe(names, labels.points.float(), directed=False, with_body=True)
+    other = found[9].describe(replace(_recorded(labels), directions=None), with_body=True)
     assert other.index("nx,ny,nz") < other.index("hit16") < other.index("position") < other.index("body")
-    assert found[9].figures()["place_ratio"] == found[9].place_ratio
 
 
 def test_recordings_given_to_rows_in_another_order_are_found_with_the_order() -> None:
@@ -199,8 +203,7 @@ def test_a_recording_of_another_gain_is_named_as_such() -> None:
     (found,) = _found(true, gains)
     assert found.row == 6
     assert abs(found.level_db + 20.0) < 2.0
-    names = [f"hit{row}" for row in range(CONTACTS)]
-    text = found.describe(names, true.points.float(), directed=True, with_body=False)
+    text = found.describe(_recorded(true), with_body=False)
     assert "dB lower than the others'" in text
     assert "exchanged" not in text
 

@@ -30,13 +30,13 @@ say little of the gains nothing is an outlier, but all labels may be in another 
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import scipy
 import torch
-from jaxtyping import Complex128, Float, Float64, Int
+from jaxtyping import Complex128, Float64, Int
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts, places_of
@@ -86,6 +86,12 @@ class PredictiveRatios:
     """All contacts."""
     measured: MeasuredGains
     """Gains at all contacts."""
+    aside: frozenset[int] = frozenset()
+    """Contacts that are set aside."""
+
+    def mean(self) -> float:
+        """Return the mean ratio of the contacts that are not set aside."""
+        return float(self.without(self.aside)[0].nanmean())
 
     @cached_property
     def values(self) -> Float64[Tensor, "contacts series"]:
@@ -220,25 +226,18 @@ class Outlier:
     level_db: float = 0.0
     """By how much its level is too high at its own place, where that explains it better than any place does."""
 
-    def describe(
-        self, names: Sequence[str], contacts: Float[Tensor, "contacts 3"], *, directed: bool, with_body: bool
-    ) -> str:
-        """Return its possible causes in words, the most frequent first.
-
-        From the names and positions (meters) of all training contacts, whether its direction was given, and whether
-        it was judged with a body.
-        """
+    def describe(self, train: Impacts, *, with_body: bool) -> str:
+        """Return its possible causes in words, the most frequent first, of all recordings and judged with a body."""
+        directed = train.directions is not None and bool(train.directions[self.row].any())
         causes = [] if directed else ["no direction, at an edge or a handle (give nx,ny,nz)"]
-        place = torch.tensor(self.place, dtype=torch.float64)
-        apart = (contacts.double() - place).norm(dim=1)
+        apart = (train.contacts.double() - torch.tensor(self.place, dtype=torch.float64)).norm(dim=1)
         own, apart[self.row] = float(apart[self.row]), torch.inf
         other = int(apart.argmin())
         if self.level_db:
-            causes.append(
-                f"a gain {abs(self.level_db):.0f} dB {'higher' if self.level_db > 0 else 'lower'} than the others'"
-            )
+            sign = "higher" if self.level_db > 0 else "lower"
+            causes.append(f"a gain {abs(self.level_db):.0f} dB {sign} than the others'")
         elif float(apart[other]) < own:
-            causes.append(f"its label was exchanged with that of {names[other]}")
+            causes.append(f"its label was exchanged with that of {train.names[other]}")
         if self.reversed:
             causes.append("a reversed direction or polarity" if directed else "a reversed polarity")
         elif directed and self.distance == 0.0 and not self.level_db:
@@ -247,13 +246,7 @@ class Outlier:
             causes.append("a wrong position")
         if with_body:
             causes.append("a body that does not fit")
-        return f"{names[self.row]} contradicts the other recordings; possible causes: {', '.join(causes)}"
-
-    def figures(self) -> dict[str, Any]:
-        """Return its place and ratios as plain values."""
-        figures = asdict(self) | {"place": list(self.place)}
-        del figures["row"]
-        return figures
+        return f"{train.names[self.row]} contradicts the other recordings; possible causes: {', '.join(causes)}"
 
 
 @dataclass(frozen=True)
@@ -269,34 +262,17 @@ class Judgment:
 
     def report(self, train: Impacts) -> dict[str, Any]:
         """Return it as plain values, with the possible causes; of the recordings' names, contacts and directions."""
-        names, known, body = train.names, train.directions, self.credibility
+        names, body = train.names, self.credibility
         with_body = body is not None and body.credible
+        figures = {names[each.row]: asdict(each) | {"place": list(each.place)} for each in self.outliers}
+        for each in figures.values():
+            del each["row"]
         return {
-            "outliers": {
-                names[each.row]: each.describe(
-                    names,
-                    train.contacts,
-                    directed=known is not None and bool(known[each.row].any()),
-                    with_body=with_body,
-                )
-                for each in self.outliers
-            },
-            "outlier_figures": {names[each.row]: each.figures() for each in self.outliers},
+            "outliers": {names[each.row]: each.describe(train, with_body=with_body) for each in self.outliers},
+            "outlier_figures": figures,
             "excluded": [],
             "credibility": None if body is None else asdict(body) | {"credible": body.credible},
         }
-
-
-@dataclass(frozen=True, eq=False)
-class _Search:
-    """A set of contacts set aside, and the ratios under the hypotheses without them."""
-
-    ratios: PredictiveRatios
-    aside: frozenset[int]
-
-    def mean(self) -> float:
-        """Return the others' mean ratio."""
-        return float(self.ratios.without(self.aside)[0].nanmean())
 
 
 def assess_contacts(plain: Fit, elastic: Fit | None, sites: Sites, places: Sites, measured: MeasuredGains) -> Judgment:
@@ -305,14 +281,18 @@ def assess_contacts(plain: Fit, elastic: Fit | None, sites: Sites, places: Sites
     `plain` fits the gain model without elastic families, `elastic` with them, where there is a body. Contacts are
     judged without the body unless it is credible. `sites` are all contacts, `places` impacts all over the object.
     """
-    if elastic is None:
+    credibility = None
+    if elastic is not None:
+        used = _search(elastic, sites, measured)
+        model = plain(_others(sites, used.aside), WIDE_NOISE_SHARES)
+        credibility = Credibility(used.mean(), replace(used, model=model).mean())
+    if credibility is None or not credibility.credible:
         used = _search(plain, sites, measured)
-        return Judgment(_outliers(used, places), None, used.mean() >= _INFORMATIVE)
-    found = _search(elastic, sites, measured)
-    without = PredictiveRatios(plain(_others(sites, found.aside), WIDE_NOISE_SHARES), sites, measured)
-    credibility = Credibility(found.mean(), _Search(without, found.aside).mean())
-    used = found if credibility.credible else _search(plain, sites, measured)
-    return Judgment(_outliers(used, places), credibility, used.mean() >= _INFORMATIVE)
+    mean = used.mean()
+    informative = mean >= _INFORMATIVE
+    located = [_located(used, row, places, mean) for row in sorted(used.aside)] if informative else []
+    outliers = sorted((each for each in located if each is not None), key=lambda each: each.ratio)
+    return Judgment(tuple(outliers), credibility, informative)
 
 
 def set_aside(ratios: PredictiveRatios, start: frozenset[int] = frozenset()) -> frozenset[int]:
@@ -357,8 +337,8 @@ def predicts_better(
     return bool(fall.any()) and float(scipy.stats.wilcoxon(fall, alternative="greater").pvalue) < CHANCE / candidates
 
 
-def _search(fit: Fit, sites: Sites, measured: MeasuredGains) -> _Search:
-    """Return the contacts to set aside, the kernels being weighed without those of the round before."""
+def _search(fit: Fit, sites: Sites, measured: MeasuredGains) -> PredictiveRatios:
+    """Return the ratios with the contacts to set aside, the kernels weighed without those of the round before."""
     aside: frozenset[int] = frozenset()
     enough = len(torch.unique(places_of(sites.points))) >= _MIN_PLACES
     for _ in range(_ROUNDS):
@@ -366,28 +346,19 @@ def _search(fit: Fit, sites: Sites, measured: MeasuredGains) -> _Search:
         before, aside = aside, set_aside(ratios, aside) if enough else aside
         if aside == before:
             break
-    return _Search(ratios, aside)
+    return replace(ratios, aside=aside)
 
 
-def _outliers(search: _Search, places: Sites) -> tuple[Outlier, ...]:
-    """Return the contacts set aside that are contradicted and that another site explains, the lowest ratio first."""
-    mean = search.mean()
-    if mean < _INFORMATIVE:
-        return ()
-    found = [_located(search, row, places, mean) for row in sorted(search.aside)]
-    return tuple(sorted((each for each in found if each is not None), key=lambda each: each.ratio))
-
-
-def _located(search: _Search, row: int, places: Sites, mean: float) -> Outlier | None:
+def _located(search: PredictiveRatios, row: int, places: Sites, mean: float) -> Outlier | None:
     """Return a contact as an outlier if it is one by the standard of the others' mean ratio."""
-    contacts = search.ratios.sites
+    contacts = search.sites
     points, directions = (
         torch.cat([getattr(each, name) for each in (contacts, places)]) for name in ("points", "directions")
     )
-    ratios = search.ratios.elsewhere(row, search.aside, Sites(points, directions))
+    ratios = search.elsewhere(row, search.aside, Sites(points, directions))
     own, best = float(ratios[0, row]), int(ratios.amax(0).argmax())
     ratio, needed = float(ratios[:, best].max()), _EXPLAINED * mean
-    here = search.ratios.elsewhere(row, search.aside, contacts.take(torch.tensor([row])), _GAINS)[:, 0]
+    here = search.elsewhere(row, search.aside, contacts.take(torch.tensor([row])), _GAINS)[:, 0]
     level_db, leveled = 20 * math.log10(_GAINS[int(here.argmax())]), float(here.max())
     # Both over the probability without places of the gain as it is.
     better = leveled >= needed and leveled + own - float(here[_GAINS.index(1.0)]) > ratio
