@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float, Float32
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -30,16 +30,13 @@ def expect_near(
     outside = torch.clamp(torch.maximum(low - places, places - high), min=0).norm(dim=1)
     far = torch.nonzero(~(outside <= size)).flatten()
     if len(far):
-        row = int(far[0])
-        found = places[row].tolist()
+        found = places[row := int(far[0])].tolist()
         where = ", ".join(f"{value:.4g}" for value in found)
         raise PositionError(
             f"{label(row)}: expected positions on the object, in meters, got ({where}), "
             f"{float(outside[row]):.3g} m outside an object {size:.3g} m across; check the unit and the frame",
-            name="positions",
-            row=row,
-            value=found,
-        )
+            name="positions", row=row, value=found,
+        )  # fmt: skip
 
 
 def off_surface(positions: Float[Tensor, "contacts 3"], gains: GainModel) -> list[tuple[int, float]]:
@@ -49,12 +46,14 @@ def off_surface(positions: Float[Tensor, "contacts 3"], gains: GainModel) -> lis
     `TOLERANCE` of the diagonal of the points' box, and without a body farther than twice the greatest distance from a
     point to its neighbor.
     """
-    known, body = gains.points.detach().cpu().double(), gains.body
+    known, places, body = gains.points.detach().cpu().double(), positions.detach().cpu().double(), gains.body
     limit = TOLERANCE * float((known.amax(0) - known.amin(0)).norm())
     if body is not None:
-        distances = gains.length * body.distances(positions.detach().cpu().double() / gains.length)
+        distances = gains.length * body.distances(places / gains.length)
     else:
-        distances = _distances(positions, known)
+        few = len(places) <= _FEW
+        nearest = None if few else cKDTree(known.numpy()).query(places.numpy())[0]
+        distances = torch.cdist(places, known).amin(1) if nearest is None else torch.from_numpy(nearest)
         if bool((distances > limit).any()):
             neighbors, _ = cKDTree(known.numpy()).query(known.numpy(), k=2)
             limit = max(limit, 2.0 * float(neighbors[:, -1].max()))
@@ -82,13 +81,3 @@ def points_on_object(gains: GainModel) -> Float32[Tensor, "points 3"]:
     on = torch.ones(len(gains.points), dtype=torch.bool)
     on[off] = False
     return gains.points[on] if bool(on.any()) else gains.points
-
-
-def _distances(
-    positions: Float[Tensor, "contacts 3"], points: Float64[Tensor, "points 3"]
-) -> Float64[Tensor, " contacts"]:
-    """Return the distance of each position from the nearest of the points."""
-    places = positions.detach().cpu().double()
-    if len(places) <= _FEW:
-        return torch.cdist(places, points).amin(1)
-    return torch.from_numpy(cKDTree(points.numpy()).query(places.numpy())[0])

@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from torch.optim.adamw import adamw
 
 from avmsf._utils.device import TRAINABLE, without_denormals
-from avmsf.field.config import FitConfig
 from avmsf.field.gains.data import GainData
 from avmsf.field.gains.model import Gains
 from avmsf.field.losses import SpectralTarget, spectral_loss, spectral_target
@@ -125,8 +124,12 @@ class TrainingRun:
         self.network, self.config, self.phase = network.to(device), config, data.phase.to(device)
         self.sample_rate, self.samples = data.train.sample_rate, data.train.sounds.shape[1]
         self.start = _on(data.modes, device)
-        self.weight = _mode_weight(self.start.bank, data.gains.to(device), config)
-        bank = self.start.bank
+        bank, gains = self.start.bank, data.gains.to(device)
+        # Modes weigh in the warm-up by the energy of a unit gain over time, or alike (paper).
+        energy = (1 / (4 * bank.damping) if config.warmup_weights == "energy" else torch.ones_like(bank.damping)).to(
+            gains
+        )
+        self.weight = energy / (gains.square().mean(0) * energy).sum().clamp_min(torch.finfo(gains.dtype).tiny)
         self.width = torch.clamp(bank.damping / (2 * math.pi), min=self.sample_rate / self.samples)
         # A correction beyond half the mode's own frequency would mean that another mode is sought.
         self.bounds = bank.frequency / 2, torch.clamp(bank.frequency * 1.5, max=0.499 * self.sample_rate)
@@ -274,10 +277,3 @@ def _on(modes: Extraction, device: torch.device) -> Extraction:
     """Return modes whose bank and residual are on a device."""
     bank = ModalBank(modes.bank.frequency.to(device), modes.bank.damping.to(device))
     return replace(modes, bank=bank, residual=replace(modes.residual, magnitude=modes.residual.magnitude.to(device)))
-
-
-def _mode_weight(bank: ModalBank, gains: Float[Tensor, "contacts modes"], config: FitConfig) -> Float[Tensor, " modes"]:
-    equal = config.warmup_weights == "equal"
-    energy = (torch.ones_like(bank.damping) if equal else 1 / (4 * bank.damping)).to(gains.dtype)
-    total = (gains.square().mean(0) * energy).sum()
-    return energy / total.clamp_min(torch.finfo(gains.dtype).tiny)

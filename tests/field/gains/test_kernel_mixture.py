@@ -30,7 +30,9 @@ NORMAL = norm.ppf((np.arange(20_000) + 0.5) / 20_000)
 def posterior(given: Hypotheses, values: torch.Tensor, floor: torch.Tensor) -> tuple[KernelMixture, torch.Tensor]:
     """Weigh hypotheses, their prior learned from all series that have any energy."""
     evidence = log_evidence(given.kernels, values, floor)
-    return KernelMixture.weigh(given, evidence, values, floor, active=active_series(values))
+    weights = posterior_weights(evidence, given, active_series(values))
+    kept = torch.nonzero(weights.sum((1, 2)) > 0).flatten()
+    return KernelMixture(given.kernels[kept], values, floor, weights[kept]), kept
 
 
 def joint_kernels() -> np.ndarray:
@@ -244,7 +246,7 @@ def test_smoother_takes_the_values_to_the_mean_at_the_contacts():
     smoothed = torch.einsum("scd,ds->cs", mixture().smoother(), mixture().values)
     assert torch.allclose(smoothed, mean, rtol=1e-9, atol=1e-12)
     other = torch.randn(CONTACTS, SERIES, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
-    moved = mixture().with_values(other)
+    moved = replace(mixture(), values=other)
     mean = torch.einsum("hpc,hcs->ps", moved.kernels, moved.solve())
     assert torch.allclose(torch.einsum("scd,ds->cs", mixture().smoother(), other), mean, rtol=1e-9, atol=1e-12)
 

@@ -11,7 +11,15 @@ from torch import Tensor
 from avmsf.fem.updating import Matched
 from avmsf.field.gains.elastic import Elastic, frequency_log_prior
 from avmsf.field.gains.kernels import KernelFamily
-from avmsf.field.gains.mixture import NOISE_SHARES, Hypotheses, KernelMixture, active_series, log_evidence, log_joint
+from avmsf.field.gains.mixture import (
+    NOISE_SHARES,
+    Hypotheses,
+    KernelMixture,
+    active_series,
+    log_evidence,
+    log_joint,
+    posterior_weights,
+)
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import series_of
 
@@ -130,10 +138,10 @@ def fit_mixture(
     values, floor = series_of(measured.values), measured.floor
     weighed = [WeighedFamily.of(family, measured, noise_shares) for family in families]
     weigh_factors(weighed, measured)
-    mixture, used = KernelMixture.weigh(
-        hypotheses_of(weighed, measured), torch.cat([each.evidence for each in weighed]), values, floor,
-        active=measured.informative, noise_shares=noise_shares,
-    )  # fmt: skip
+    hypotheses, evidence = hypotheses_of(weighed, measured), torch.cat([each.evidence for each in weighed])
+    weights = posterior_weights(evidence, hypotheses, measured.informative)
+    used = torch.nonzero(weights.sum((1, 2)) > 0).flatten()
+    mixture = KernelMixture(hypotheses.kernels[used], values, floor, weights[used], noise_shares)
     ends = torch.tensor([len(family.shares) for family in families]).cumsum(0).tolist()
     starts = [0, *ends[:-1]]
     rows = [used[(used >= start) & (used < end)] - start for start, end in zip(starts, ends, strict=True)]

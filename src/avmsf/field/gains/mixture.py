@@ -122,29 +122,6 @@ class KernelMixture:
     """Posterior probability of each kernel with each noise share; they sum to one for each series."""
     noise_shares: tuple[float, ...] = NOISE_SHARES
 
-    @classmethod
-    def weigh(
-        cls,
-        hypotheses: Hypotheses,
-        evidence: Float64[Tensor, "kernels noises series"],
-        values: Float64[Tensor, "contacts series"],
-        floor: Float64[Tensor, " series"],
-        *,
-        active: Bool[Tensor, " series"],
-        noise_shares: tuple[float, ...] = NOISE_SHARES,
-    ) -> tuple["KernelMixture", Int[Tensor, " kept"]]:
-        """Return the posterior and the rows of the hypotheses' kernels that it kept, from their `log_evidence`.
-
-        The prior is learned from the `active` series alone.
-        """
-        weights = posterior_weights(evidence, hypotheses, active)
-        kept = torch.nonzero(weights.sum((1, 2)) > 0).flatten()
-        return cls(hypotheses.kernels[kept], values, floor, weights[kept], noise_shares), kept
-
-    def with_values(self, values: Float64[Tensor, "contacts series"]) -> "KernelMixture":
-        """Return the same hypotheses with the same weights, for other values."""
-        return replace(self, values=values)
-
     def take(self, series: Int[Tensor, " series"]) -> "KernelMixture":
         """Return the posterior of some series, in the given order."""
         return replace(self, values=self.values[:, series], floor=self.floor[series], weights=self.weights[..., series])

@@ -189,7 +189,7 @@ class MixtureGains(GainModel):
 
     def with_values(self, values: Complex128[Tensor, "contacts modes"]) -> "MixtureGains":
         """Return the model of other gains at the same contacts, its hypotheses weighed as before."""
-        return replace(self, mixture=self.mixture.with_values(series_of(values)))
+        return replace(self, mixture=replace(self.mixture, values=series_of(values)))
 
     def take(self, modes: Int[Tensor, " modes"]) -> "MixtureGains":
         """Return the model of some modes, in the given order."""
@@ -347,7 +347,7 @@ class MixtureGains(GainModel):
     @cached_property
     def _left_out(self) -> Predictions:
         """Of the measured gains: those that were refined end to end have seen the recordings that are left out."""
-        mixture = self.mixture if self.measured is None else self.mixture.with_values(series_of(self.measured))
+        mixture = self.mixture if self.measured is None else replace(self.mixture, values=series_of(self.measured))
         return mixture.leave_out(self.places)
 
     def _std(self, sites: Sites) -> Float64[Tensor, "sites series"]:
