@@ -9,13 +9,13 @@ import torch
 from scipy.stats import norm
 
 from avmsf.field.gains import mixture as module
+from avmsf.field.gains.fitting import active_series
 from avmsf.field.gains.mixture import (
     NOISE_SHARES,
     SCALE_SHAPE,
     Hypotheses,
     KernelMixture,
     Predictions,
-    active_series,
     log_evidence,
     posterior_weights,
 )

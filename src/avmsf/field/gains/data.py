@@ -126,35 +126,24 @@ def gain_variance(data: GainData) -> Float64[Tensor, " modes"]:
 
 def _expect_fitting(train: Impacts, modes: Extraction) -> None:
     if len(train) == 0:
-        raise FitError("train: expected 1 recording or more, got none; record impacts", name="train", value=0)
-    for row, (name, sound, contact) in enumerate(zip(train.names, train.sounds, train.contacts, strict=True)):
-        if not bool(torch.isfinite(sound).all() and torch.isfinite(contact).all()):
-            raise FitError(
-                f"{name}: expected finite samples and coordinates, got NaN or infinity; remove the recording",
-                name=name,
-                row=row,
-            )
-    if train.directions is not None and not bool(torch.isfinite(train.directions).all()):
-        row = int(torch.nonzero(~torch.isfinite(train.directions).all(1))[0])
-        direction = train.directions[row].tolist()
-        raise FitError(
-            f"{train.names[row]}: expected a finite direction, got {direction}; give the direction in which the hammer "
-            "moves, or zeros if unknown",
-            name=train.names[row],
-            row=row,
-            value=direction,
-        )
+        raise FitError.expected("1 recording or more", 0, got="none", name="train", advice="record impacts")
+    finite = torch.isfinite(train.sounds).all(1) & torch.isfinite(train.contacts).all(1)
+    if not bool(finite.all()):
+        row = int(finite.int().argmin())
+        wanted, advice = "finite samples and coordinates", "remove the recording"
+        raise FitError.expected(wanted, got="NaN or infinity", row=row, name=train.names[row], advice=advice)
+    if train.directions is not None and not bool((known := torch.isfinite(train.directions).all(1)).all()):
+        row = int(known.int().argmin())
+        advice = "give the direction in which the hammer moves, or zeros if unknown"
+        given = train.directions[row].tolist()
+        raise FitError.expected("a finite direction", given, row=row, name=train.names[row], advice=advice)
     if float(train.sounds.abs().max()) == 0.0:
-        raise FitError(
-            "train: expected sound, got silence in all recordings; check the channel", name="train", value="silence"
-        )
+        raise FitError.expected("sound", "silence", name="train", advice="check the channel")
     advice = "extract the modes from the recordings that the field is fitted to"
     if len(modes.gains) != len(train):
         raise FitError.expected(f"gains of {len(train)} recordings", len(modes.gains), name="modes", advice=advice)
     if len(modes.bank) == 0:
-        raise FitError("modes: expected 1 mode or more, got none; record longer or louder", name="modes", value=0)
+        raise FitError.expected("1 mode or more", 0, got="none", name="modes", advice="record longer or louder")
     highest, limit = float(modes.bank.frequency.max()), train.sample_rate / 2
     if highest >= limit:
-        raise FitError(
-            f"modes: expected frequencies below {limit:g} Hz, got {highest:g} Hz; {advice}", name="modes", value=highest
-        )
+        raise FitError.expected(f"frequencies below {limit:g} Hz", highest, name="modes", advice=advice)

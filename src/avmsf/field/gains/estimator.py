@@ -171,16 +171,11 @@ class MixtureEstimator(GainEstimator):
     def _expect_inputs(self, data: GainData, groups: Sequence[Group]) -> None:
         """Raise FitError where one family alone was asked for and the symmetries or features that it needs are none."""
         if self.name == Symmetric.kind and not groups:
-            raise FitError(
-                "symmetry: expected symmetries of the object's shape, got none; take another gain model",
-                name=Symmetric.kind,
-            )
+            wanted = "symmetries of the object's shape"
+            raise FitError.expected(wanted, name=Symmetric.kind, advice="take another gain model")
         if self.name == Visual.kind and data.features.encoder == GEOMETRY:
-            raise FitError(
-                "visual: expected visual features, got positions only; give --features, or take another gain model",
-                name=Visual.kind,
-                value=GEOMETRY,
-            )
+            advice = "give --features, or take another gain model"
+            raise FitError.expected("visual features", GEOMETRY, got="positions only", name=Visual.kind, advice=advice)
 
     def _usable_bodies(self, data: GainData) -> tuple[list[CandidateBody], dict[str, str]]:
         """Return the bodies that the contacts lie on, and why there are none."""
@@ -189,10 +184,8 @@ class MixtureEstimator(GainEstimator):
             return [], {}
         if self.bodies is None:
             if self.name == Elastic.kind:
-                raise FitError(
-                    f"elastic: expected the object's shape, got none; {self.missing or 'give its mesh'}",
-                    name=Elastic.kind,
-                )
+                advice = self.missing or "give its mesh"
+                raise FitError.expected("the object's shape", name=Elastic.kind, advice=advice)
             return [], {Elastic.kind: self.missing} if self.missing else {}
         try:
             expect_placed(data.train.contacts, self.bodies.bodies[0].elastic.points, names=data.train.names)

@@ -126,6 +126,12 @@ class WeighedFamily:
         return cls(family, kernels, evidence)
 
 
+def active_series(values: Float64[Tensor, "contacts series"]) -> Bool[Tensor, " series"]:
+    """Return which series have any energy, over the strongest's: more than rounding leaves of none."""
+    power = values.square().sum(0)
+    return power > 1e-20 * power.max()
+
+
 def fit_mixture(
     families: Sequence[KernelFamily],
     measured: MeasuredGains,

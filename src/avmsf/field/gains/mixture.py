@@ -404,12 +404,6 @@ def posterior_weights(
     return (weights / weights.sum(0)).reshape(joint.shape)
 
 
-def active_series(values: Float64[Tensor, "contacts series"]) -> Bool[Tensor, " series"]:
-    """Return which series have any energy, over the strongest's: more than rounding leaves of none."""
-    power = values.square().sum(0)
-    return power > 1e-20 * power.max()
-
-
 def _mean_magnitude(mean: Float64[Tensor, "*shape"], variance: Float64[Tensor, "*shape"]) -> Float64[Tensor, "*shape"]:
     """Return the mean of the magnitude of normal variables: that of the folded normal distribution."""
     deviation = variance.sqrt()
