@@ -15,7 +15,6 @@ from avmsf.field.gains.mixture import (
     NOISE_SHARES,
     Hypotheses,
     KernelMixture,
-    active_series,
     log_evidence,
     log_joint,
     posterior_weights,
