@@ -26,7 +26,7 @@ from avmsf.evaluation.results import ENCODER, ResultsFolder
 from avmsf.evaluation.runner import Progress, run_objects
 from avmsf.evaluation.scores import MetricSettings
 from avmsf.evaluation.simple_methods import NearestRecording
-from avmsf.evaluation.splits import split, spread
+from avmsf.evaluation.splits import evenly_spaced, split
 from avmsf.evaluation.task import Method, Renderer, Task
 from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
 from factories.plate_set import PlateInputs, fill_plates
@@ -294,7 +294,7 @@ def test_another_recording_is_of_another_object_at_this_ones_rate_and_length(pla
 
 @pytest.mark.parametrize(("count", "wanted"), [(10, 3), (3, 3), (2, 8), (7, 1), (33, 8)])
 def test_spread_rows_are_distinct_and_within(count: int, wanted: int) -> None:
-    rows = spread(count, wanted)
+    rows = evenly_spaced(count, wanted)
     assert len(set(rows)) == len(rows) == min(count, wanted)
     assert rows == sorted(rows)
     assert set(rows) <= set(range(count))

@@ -6,7 +6,7 @@ import torch
 from avmsf.capture.impacts import Impacts
 from avmsf.cli.scores import parts_words
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.splits import Choosing, Closest, Farthest, LeaveOneOut, Places, Shots, split
+from avmsf.evaluation.splits import Choosing, Closest, DistinctContacts, Farthest, LeaveOneOut, Shots, split
 from factories.raising import raises
 
 COUNT = 20
@@ -50,8 +50,8 @@ def test_repeats_measured_again_stay_on_one_side(choosing: Choosing, apart: floa
 
 
 def test_contacts_apart_are_places_of_their_own() -> None:
-    assert len(Places.of(repeated(apart=0.02)).rows) == 3 * COUNT
-    assert len(Places.of(repeated(apart=0.002)).rows) == COUNT
+    assert len(DistinctContacts.of(repeated(apart=0.02)).rows) == 3 * COUNT
+    assert len(DistinctContacts.of(repeated(apart=0.002)).rows) == COUNT
 
 
 def test_a_choice_may_start_from_any_recording_of_a_place() -> None:

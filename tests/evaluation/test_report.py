@@ -22,7 +22,7 @@ from avmsf.evaluation.report import markdown, write_page, write_summary
 from avmsf.evaluation.report_tables import WARNING, Section, sections
 from avmsf.evaluation.results import CaseRecord, ObjectRecord, Outcome, ResultsFolder, natural
 from avmsf.evaluation.runner import run_objects
-from avmsf.evaluation.stored_sounds import StoredSound, draw_spectrogram, keep_sound, listening_gain
+from avmsf.evaluation.stored_sounds import StoredSound, draw_spectrogram, listening_gain, write_sound
 from avmsf.evaluation.summary import missing_of, object_values, summarize
 from factories.plate_set import fill_plates
 from factories.raising import raises
@@ -183,21 +183,21 @@ def test_a_kept_sound_is_as_loud_beside_the_recording_as_it_was(tmp_path: Path) 
     recorded = 3.0 * torch.sin(2 * math.pi * 440 * time)
     gain = listening_gain(recorded)
     for name, factor, peak in (("same", 1.0, 0.25), ("half", 0.5, 0.125), ("loud", 10.0, 1.0)):
-        keep_sound(tmp_path / name, recorded * factor, sample_rate=8000.0, gain=gain)
+        write_sound(tmp_path / name, recorded * factor, sample_rate=8000.0, gain=gain)
         heard = StoredSound.read(tmp_path / name)
         # One step of 16 bits.
         assert float(heard.samples.abs().max()) == pytest.approx(peak, abs=2e-4)
-    keep_sound(tmp_path / "slow", recorded, sample_rate=400.0, gain=gain)
+    write_sound(tmp_path / "slow", recorded, sample_rate=400.0, gain=gain)
     slow = StoredSound.read(tmp_path / "slow")
     assert (slow.sample_rate, len(slow.samples)) == (8000.0, 20 * 4000)
-    keep_sound(tmp_path / "silent", torch.zeros(100), sample_rate=8000.0, gain=listening_gain(torch.zeros(100)))
+    write_sound(tmp_path / "silent", torch.zeros(100), sample_rate=8000.0, gain=listening_gain(torch.zeros(100)))
     with raises(EvaluationError, file=tmp_path / "gone"):
         StoredSound.read(tmp_path / "gone")
 
 
 def test_a_pictures_line_is_where_the_tone_is(tmp_path: Path) -> None:
     time = torch.arange(16000) / 16000.0
-    keep_sound(tmp_path / "tone", torch.sin(2 * math.pi * 1000 * time), sample_rate=16000.0, gain=0.5)
+    write_sound(tmp_path / "tone", torch.sin(2 * math.pi * 1000 * time), sample_rate=16000.0, gain=0.5)
     sound = StoredSound.read(tmp_path / "tone")
     address = draw_spectrogram(sound, loudest=float(sound.levels.max()))
     picture = Image.open(io.BytesIO(base64.b64decode(address.partition(",")[2])))

@@ -23,8 +23,8 @@ from avmsf.evaluation.objects import ObjectInputs, draw_other_recording
 from avmsf.evaluation.registry import METRICS, Protocol
 from avmsf.evaluation.results import ENCODER, CaseRecord, Outcome, ResultsFolder, failure_of, file_word
 from avmsf.evaluation.scores import MetricSettings, Values
-from avmsf.evaluation.splits import Case, align_split, spread
-from avmsf.evaluation.stored_sounds import RECORDED, keep_sound, listening_gain
+from avmsf.evaluation.splits import Case, align_split, evenly_spaced
+from avmsf.evaluation.stored_sounds import RECORDED, listening_gain, write_sound
 from avmsf.evaluation.task import Method, Renderer, Task, expect_renderer, report_of
 from avmsf.modal.extraction.extract import extract_once
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder
@@ -91,11 +91,11 @@ def _plain(settings: Any) -> dict[str, Any]:
 
 
 MAX_STORED_SOUNDS = 3
-"""Test contacts of an experiment whose sounds are kept to be listened to."""
+"""Test contacts of an experiment whose sounds are stored to be listened to."""
 
 
 class _Recordings:
-    """A case's recordings from one kind of start, aligned when first asked for, and their modes, kept in a file."""
+    """A case's recordings from one kind of start, aligned when first asked for, and their modes, stored in a file."""
 
     def __init__(self, impacts: Impacts, case: Case, finder: ModeFinder, path: Path) -> None:
         self.train, self.test = impacts.take(case.train), impacts.take(case.test)
@@ -141,22 +141,22 @@ class ObjectData:
 
 
 class CaseRun:
-    """Runs methods in one case, with modes that are found once and kept in a file."""
+    """Runs methods in one case, with modes that are found once and stored in a file."""
 
     def __init__(
         self, evaluation: Evaluation, data: ObjectData, case: Case, *, folder: Path, number: int, stores_sounds: bool
     ) -> None:
         """Prepare the `number`-th case of an object; with `stores_sounds`, some of its sounds go into `folder`."""
         self.evaluation, self.data, self.case, self.folder = evaluation, data, case, folder
-        self.place = f"{data.identifier}/{number:02d}"
-        path, finder = folder / "modes" / f"{self.place}.safetensors", evaluation.finder
+        self.name = f"{data.identifier}/{number:02d}"
+        path, finder = folder / "modes" / f"{self.name}.safetensors", evaluation.finder
         self.scored = self.own = _Recordings(data.impacts, case, finder, path)
         if data.own_starts is not None:
             own_path = path.with_name(f"{number:02d} own starts.safetensors")
             self.own = _Recordings(data.own_starts, case, finder, own_path)
         self.truth = None if data.truth is None else truth_at(data.truth, self.scored.test.names)
         self.features = partial(data.features, views=case.views)
-        self.stored_rows = spread(len(case.test), MAX_STORED_SOUNDS) if stores_sounds else []
+        self.stored_rows = evenly_spaced(len(case.test), MAX_STORED_SOUNDS) if stores_sounds else []
         self.shared = 0.0
 
     def outcome(self, method: Method) -> Outcome:
@@ -182,14 +182,14 @@ class CaseRun:
             figures,
             round(fit_seconds, 4),
             round(render_seconds, 4),
-            self._keep_sounds(method.name, sounds),
+            self._write_sounds(method.name, sounds),
             report_of(renderer),
             maps,
         )
 
     def described(self, known: CaseRecord) -> CaseRecord:
         """Return the case's record with the recordings' files and with the time of modes and features so far."""
-        sounds = known.sounds or self._keep_sounds(RECORDED, self.scored.test.sounds)
+        sounds = known.sounds or self._write_sounds(RECORDED, self.scored.test.sounds)
         seconds, self.shared = known.shared_seconds + self.shared, 0.0
         return replace(known, sounds=sounds, shared_seconds=round(seconds, 4))
 
@@ -214,7 +214,7 @@ class CaseRun:
         )
         maps = {}
         for row, each in found.items():
-            file = f"maps/{self.place}/{row:03d} {file_word(method.name)}.safetensors"
+            file = f"maps/{self.name}/{row:03d} {file_word(method.name)}.safetensors"
             write_map(self.folder / file, each, truth=recordings.test.contacts[row])
             maps[recordings.test.names[row]] = file
         return dict(errors), {}, maps
@@ -248,11 +248,11 @@ class CaseRun:
 
         return made
 
-    def _keep_sounds(self, name: str, sounds: Float[Tensor, "contacts samples"]) -> dict[str, str]:
+    def _write_sounds(self, name: str, sounds: Float[Tensor, "contacts samples"]) -> dict[str, str]:
         """Write the sounds to listen to, and return their files by the names of their recordings."""
-        kept, test = {}, self.scored.test
+        stored, test = {}, self.scored.test
         for row in self.stored_rows:
-            file, gain = f"sounds/{self.place}/{row:03d} {file_word(name)}.flac", listening_gain(test.sounds[row])
-            keep_sound(self.folder / file, sounds[row], sample_rate=test.sample_rate, gain=gain)
-            kept[test.names[row]] = file
-        return kept
+            file, gain = f"sounds/{self.name}/{row:03d} {file_word(name)}.flac", listening_gain(test.sounds[row])
+            write_sound(self.folder / file, sounds[row], sample_rate=test.sample_rate, gain=gain)
+            stored[test.names[row]] = file
+        return stored

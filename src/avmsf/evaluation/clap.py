@@ -1,11 +1,11 @@
 """CLAP score: how well a sound fits a text prompt, by a network trained on captioned recordings (extra `eval`).
 
-The score is the cosine of the sound's and the words' embeddings, -1 to 1, higher is better; the paper gives it without
-a convention, and without the network's name. Here: sounds are resampled to the network's own rate, 48 kHz for all that
-are published, scaled to a peak of one, which makes the score free of level, and cut to the network's longest clip, 10 s
-from the onset on. Nothing is drawn by chance: the feature extractor of transformers cuts longer clips at random, and of
-a fused network's clips declares one at random to be long; ours are cut beforehand, and none of them is long. Shorter
-sounds are repeated as the extractor's own settings have it, which is how the networks were trained.
+The score is the cosine of the sound's and the prompt's embeddings, -1 to 1, higher is better; the paper gives it
+without a convention, and without the network's name. Here: sounds are resampled to the network's own rate, 48 kHz for
+all that are published, scaled to a peak of one, which makes the score free of level, and cut to the network's longest
+clip, 10 s from the onset on. Nothing is drawn by chance: the feature extractor of transformers cuts longer clips at
+random, and of a fused network's clips declares one at random to be long; ours are cut beforehand, and none of them is
+long. Shorter sounds are repeated as the extractor's own settings have it, which is how the networks were trained.
 """
 
 import hashlib
@@ -98,7 +98,7 @@ class Clap:
         Raises EvaluationError for sounds that are empty, silent or not finite, for an empty prompt and for another
         number of prompts.
         """
-        audio, text = self.embed(sounds, sample_rate=sample_rate), self.embed_words(prompts)
+        audio, text = self.embed(sounds, sample_rate=sample_rate), self.embed_prompts(prompts)
         if len(text) not in (1, len(audio)):
             raise EvaluationError.expected(f"one, or one for each of {len(audio)} sounds", len(text), name="prompts")
         return (audio * text).sum(dim=1).clamp(-1.0, 1.0)
@@ -115,7 +115,7 @@ class Clap:
         embeddings = [self._embedded(batch.numpy()) for batch in torch.split(prepared, _BATCH)]
         return torch.nn.functional.normalize(torch.cat(embeddings).double(), dim=1)
 
-    def embed_words(self, prompts: Sequence[str]) -> Float64[Tensor, "prompts dim"]:
+    def embed_prompts(self, prompts: Sequence[str]) -> Float64[Tensor, "prompts dim"]:
         """Return the prompts' embeddings, of length one. Raises EvaluationError for an empty prompt."""
         if isinstance(prompts, str) or not prompts:
             raise EvaluationError.expected("a list of prompts", prompts, name="prompts", advice="give one as [prompt]")
@@ -125,9 +125,9 @@ class Clap:
                 raise EvaluationError.expected("words, such as 'striking a wooden bowl'", prompt, name="prompt")
             # One by one: padding would make the last digits depend on the other prompts.
             tokens = self.processor.tokenizer([prompt], return_tensors="pt", truncation=True)
-            words = {name: tokens[name] for name in ("input_ids", "attention_mask")}
+            inputs = {name: tokens[name] for name in ("input_ids", "attention_mask")}
             with torch.no_grad():
-                embeddings.append(_vector(self.model.get_text_features(**words)))
+                embeddings.append(_vector(self.model.get_text_features(**inputs)))
         return torch.nn.functional.normalize(torch.cat(embeddings).double(), dim=1)
 
     def _embedded(self, waveforms: Float64[np.ndarray, "batch samples"]) -> Float[Tensor, "batch dim"]:

@@ -27,7 +27,7 @@ from avmsf.pipeline.config import PRESETS, PipelineConfig
 NETWORK = PipelineConfig(gain_model="network")
 """The attention network with the quick settings of the fit."""
 _FEWEST_TO_VALIDATE = 6
-"""Training places from which on a part of them is held out to choose settings by, as in `fit` itself."""
+"""Training positions from which on a part of them is held out to choose settings by, as in `fit` itself."""
 _UNINFORMED_RATE = 0.03
 """Adam's step for frequencies (in widths of their modes) and for the logarithms of dampings without extracted modes:
 frequencies, dampings and noise have to find where they belong."""
@@ -68,9 +68,9 @@ class FieldMethod:
     end to end for as many steps as the configuration takes in all.
 
     With a `grid`, its settings are chosen on validation contacts, a part of the training contacts alone: the quarter of
-    the training places that farthest-point sampling takes last is held out; every candidate is fitted to the others and
+    the positions that farthest-point sampling takes last is held out; every candidate is fitted to the others and
     scored there by ENV (paper, supplement), the mean over contacts of the root mean square difference of envelopes. The
-    best is fitted to all training contacts; of equals the first. With fewer than six places nothing is held out, and
+    best is fitted to all training contacts; of equals the first. With fewer than six positions nothing is held out, and
     the configuration's own settings are taken. Modes are those of all training contacts.
     """
 

@@ -67,11 +67,11 @@ def located(
     rows, maps = [], {}
     for row, (sound, truth) in enumerate(zip(test.sounds, test.contacts.double(), strict=True)):
         try:
-            places, found = find(sound)
+            points_found, found = find(sound)
         except (LocationError, EvaluationError):
-            places, found = {}, None
+            points_found, found = {}, None
         chance = random_distance(points, truth)
-        distances = [float((truth - places[name]).norm()) if name in places else chance for name in names]
+        distances = [float((truth - points_found[name]).norm()) if name in points_found else chance for name in names]
         rows.append([distance / diagonal for distance in distances])
         if found is not None and row in map_rows:
             maps[row] = found
@@ -170,7 +170,7 @@ def _signature(sound: Sound, sample_rate: float) -> Float64[Tensor, " bins"]:
 
 
 def random_distance(points: Float[Tensor, "points 3"], right: Float[Tensor, " 3"]) -> float:
-    """Return how far a point drawn evenly from an object's points is expected to be from the right place."""
+    """Return how far a point drawn evenly from an object's points is expected to be from the right point."""
     return float((points.double() - right.double()).norm(dim=1).mean())
 
 

@@ -1,6 +1,6 @@
 """Methods other than fields; a method fits a renderer to an object's training recordings.
 
-Those that share modes have noise beside them, as the field has: without it all is silent between modes, and L1-log is
+Those that share modes have noise too, as the field has: without it all is silent between modes, and L1-log is
 lost.
 """
 
@@ -177,14 +177,14 @@ class Recorded:
         return torch.stack(sounds) if sounds else torch.zeros(0, self.samples)
 
     def _find(self, contact: Float[Tensor, "3"]) -> Path:
-        # Contacts that went through float32 are still the same places; a micrometer is far below any two's distance.
+        # Contacts that went through float32 are still the same points; a micrometer is far below any two's distance.
         rows = torch.nonzero((self.contacts.double() - contact.double()).norm(dim=1) < 1e-6).flatten().tolist()
         if not rows:
-            place = ", ".join(f"{value:g}" for value in contact.tolist())
+            position = ", ".join(f"{value:g}" for value in contact.tolist())
             raise EvaluationError.expected(
                 "a contact of a recording, at which alone sounds from files are available",
                 contact.tolist(),
-                got=f"({place}) m",
+                got=f"({position}) m",
                 file=self.folder,
                 name="contacts",
             )

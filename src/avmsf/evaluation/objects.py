@@ -133,9 +133,9 @@ class ObjectInputs:
         if seen is None:
             raise SceneError(f"{identifier}: expected a mesh or photographs in the dataset, got none", name=identifier)
         config = replace(config, views=replace(config.views, count=views or 0))
-        place = self.cache / identifier / ("all views" if views is None else f"{views} views")
+        folder = self.cache / identifier / ("all views" if views is None else f"{views} views")
         stages = SceneStages(
-            seen.folder, StageFolder(place), config, settings=seen.settings, name=name, device=self.device
+            seen.folder, StageFolder(folder), config, settings=seen.settings, name=name, device=self.device
         )
         with stages.stages.lock("avmsf evaluate", wait=NO_LIMIT):
             yield stages
@@ -149,9 +149,9 @@ def draw_other_recording(dataset: Dataset, identifier: str, train: Impacts, *, s
     """
     others = [other for other in dataset.objects() if other != identifier]
     generator = torch.Generator().manual_seed(zlib.crc32(identifier.encode(), seed))
-    for place in torch.randperm(len(others), generator=generator).tolist():
+    for row in torch.randperm(len(others), generator=generator).tolist():
         try:
-            impacts = dataset.capture(others[place]).impacts
+            impacts = dataset.capture(others[row]).impacts
         except AvmsfError:
             continue
         row = int(torch.randint(len(impacts), (), generator=generator))

@@ -49,7 +49,7 @@ METRICS: dict[str, MetricEntry] = {
     "rmed_posterior": MetricEntry("RMED, posterior"),
     "found": MetricEntry("", rising=True),
 }
-"""All metrics that tables show or that need to be told apart, by name, in the order of columns."""
+"""All metrics that tables show or of which more is better, by name, in the order of columns."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from avmsf.evaluation.localization import read_map
 from avmsf.evaluation.registry import METRICS
 from avmsf.evaluation.report_tables import Section, sections
 from avmsf.evaluation.results import ObjectRecord, ResultsFolder, file_word, write_json
-from avmsf.evaluation.splits import spread
+from avmsf.evaluation.splits import evenly_spaced
 from avmsf.evaluation.stored_sounds import RECORDED, StoredContact, StoredSound, draw_spectrogram, stored_contacts
 from avmsf.evaluation.summary import missing_of, summarize, times_of
 from avmsf.export.web import report_directives, with_policy
@@ -75,8 +75,8 @@ def _render(template: str, **values: Any) -> str:
     return environment.get_template(template).render(**values)
 
 
-def _escaped(words: str) -> str:
-    return words.replace("\\", "\\\\").replace("|", "\\|").replace("*", "\\*").replace("<", "&lt;")
+def _escaped(text: str) -> str:
+    return text.replace("\\", "\\\\").replace("|", "\\|").replace("*", "\\*").replace("<", "&lt;")
 
 
 def _is_text(cell: str) -> bool:
@@ -84,7 +84,7 @@ def _is_text(cell: str) -> bool:
 
 
 _Card = dict[str, str]
-"""One sound on the page: its `title`, `words` on it, and the addresses of its `picture` and its `sound`."""
+"""One sound on the page: its `title`, its `caption`, and the addresses of its `picture` and its `sound`."""
 
 
 def _listening(records: Sequence[ObjectRecord], folder: Path) -> dict[str, list[tuple[str, list[_Card]]]]:
@@ -107,9 +107,9 @@ def _cards(contact: StoredContact, folder: Path) -> Iterator[_Card]:
     recorded = StoredSound.read(folder / contact.recorded)
     loudest, seconds = float(recorded.levels.max()), len(recorded.samples) / recorded.sample_rate
 
-    def card(title: str, words: str, sound: StoredSound) -> _Card:
+    def card(title: str, caption: str, sound: StoredSound) -> _Card:
         picture = draw_spectrogram(sound, loudest=loudest)
-        return {"title": title, "words": words, "picture": picture, "sound": sound.address}
+        return {"title": title, "caption": caption, "picture": picture, "sound": sound.address}
 
     yield card(RECORDED, f"{seconds:.2g} s, {recorded.lowest:.0f} Hz to {recorded.sample_rate / 2:.0f} Hz", recorded)
     several = len({case.label for case, _ in contact.made}) > 1
@@ -127,7 +127,7 @@ def _cards(contact: StoredContact, folder: Path) -> Iterator[_Card]:
 def _contacts(records: Sequence[ObjectRecord]) -> Iterator[StoredContact]:
     """Yield contacts with sounds: one of each object first, then a second one, and so on."""
     stored = [record for record in records if any(case.sounds for case in record.cases)]
-    chosen = [list(stored_contacts(stored[row])) for row in spread(len(stored), MAX_PAGE_OBJECTS)]
+    chosen = [list(stored_contacts(stored[row])) for row in evenly_spaced(len(stored), MAX_PAGE_OBJECTS)]
     for contacts in zip_longest(*chosen):
         yield from filter(None, contacts)
 
@@ -182,4 +182,4 @@ def _write_maps(record: ObjectRecord, folder: Path) -> list[Path]:
 
 
 def _write_text(path: Path, text: str) -> None:
-    write_whole(path, lambda place: place.write_text(text, encoding="utf-8"), raising=EvaluationError)
+    write_whole(path, lambda part: part.write_text(text, encoding="utf-8"), raising=EvaluationError)

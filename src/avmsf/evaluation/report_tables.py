@@ -24,7 +24,7 @@ class Section:
     """One part of a report: paragraphs, a table, and paragraphs below it."""
 
     title: str
-    words: tuple[str, ...] = ()
+    paragraphs: tuple[str, ...] = ()
     columns: tuple[str, ...] = ()
     """Headings of the table, whose first column names the rows; empty without a table."""
     rows: tuple[tuple[str, ...], ...] = ()
@@ -110,7 +110,7 @@ class _Report:
                 "unit and level. With the level full-scale, an object's sounds are multiplied by one factor that "
                 "brings its loudest recording to a peak of one.",
                 WARNING,
-                "Settings of metrics: {}. Of modes: {}.".format(*map(_words, settings)),
+                "Settings of metrics: {}. Of modes: {}.".format(*map(_listed, settings)),
             ),
         )
 
@@ -199,13 +199,13 @@ class _Report:
                 )
         if times:
             rows.append(("shared: modes and features", format_number(fmean(each["shared"] for each in times)), _DASH))
-        words = (
+        text = (
             "Seconds on one thread, mean over objects, sum over a protocol's cases, without the computation of metrics."
         )
         if self.experiment in PUBLISHED:
             rows += [(f"paper: {title}", *map(format_number, seconds)) for title, seconds in COMPUTATION.items()]
-            words += " Rows that begin with “paper:” are the paper's: one training and one sound on an A5000 GPU."
-        return Section("Time per object", (words,), ("method", "fit", "render the test contacts"), tuple(rows))
+            text += " Rows that begin with “paper:” are the paper's: one training and one sound on an A5000 GPU."
+        return Section("Time per object", (text,), ("method", "fit", "render the test contacts"), tuple(rows))
 
     def failures(self) -> Section:
         failures = failures_of(self.records)
@@ -241,10 +241,10 @@ class _Report:
         )
 
 
-def _words(settings: Mapping[str, Any]) -> str:
-    """Return plain values in words, those of nested settings in parentheses."""
+def _listed(settings: Mapping[str, Any]) -> str:
+    """Return plain values as text, those of nested settings in parentheses."""
     return ", ".join(
-        f"{name} ({_words(value)})" if isinstance(value, Mapping) else f"{name} {value}"
+        f"{name} ({_listed(value)})" if isinstance(value, Mapping) else f"{name} {value}"
         for name, value in settings.items()
     )
 

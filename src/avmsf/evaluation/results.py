@@ -102,13 +102,13 @@ class ResultsFolder:
         later. Raises EvaluationError where the folder's results are of another identity, or a method has changed.
         """
         wanted = json.loads(json.dumps(dict(identity)))
-        place = self.path / IDENTITY
+        path = self.path / IDENTITY
         # A kill may leave a hidden part of the file behind.
-        if not place.exists() and self.path.is_dir() and any(self.path.glob("[!.]*")):
+        if not path.exists() and self.path.is_dir() and any(self.path.glob("[!.]*")):
             asked, advice = f"an empty folder or one with {IDENTITY}", "choose a new --output"
             raise EvaluationError.expected(asked, got="other files", file=self.path, name="output", advice=advice)
-        known = self.identity() if place.exists() else {**wanted, "methods": {}}
-        kept = known.pop("methods")
+        known = self.identity() if path.exists() else {**wanted, "methods": {}}
+        stored = known.pop("methods")
         if wanted != known:
             name, asked, found = _first_difference(wanted, known)
             ours, theirs = f"of {name} {_brief(asked)}", _brief(found)
@@ -116,13 +116,13 @@ class ResultsFolder:
                 ours, theirs = "made by this version of avmsf", "those of another, whose code differs"
             raise self._of_another(name, found, ours, theirs)
         for name in methods:
-            if name in kept and kept[name] != methods[name]:
-                parts = [each.partition(ENCODER) for each in (methods[name], kept[name])]
+            if name in stored and stored[name] != methods[name]:
+                parts = [each.partition(ENCODER) for each in (methods[name], stored[name])]
                 ours, theirs = "these settings and weights", "others"
                 if parts[0][0] == parts[1][0]:
                     ours, theirs = (f"--set lift.encoder={each[2]}" for each in parts)
-                raise self._of_another(name, kept[name], f"of {name} made with {ours}", f"those made with {theirs}")
-        write_json(place, {**wanted, "methods": {**kept, **methods}})
+                raise self._of_another(name, stored[name], f"of {name} made with {ours}", f"those made with {theirs}")
+        write_json(path, {**wanted, "methods": {**stored, **methods}})
 
     def _of_another(self, name: str, value: object, wanted: str, found: str) -> EvaluationError:
         advice = "give the same options, or choose another --output"
@@ -130,31 +130,31 @@ class ResultsFolder:
 
     def identity(self) -> dict[str, Any]:
         """Return the evaluation that the folder holds, with its methods. Raises EvaluationError where there is none."""
-        place = self.path / IDENTITY
-        read = self._read(place)
+        path = self.path / IDENTITY
+        read = self._read(path)
         if not isinstance(read.get("methods"), dict):
-            raise self._damaged(place, "it names no methods")
+            raise self._damaged(path, "it names no methods")
         return read
 
     def read(self, identifier: str) -> ObjectRecord | None:
         """Return an object's record, or None where there is none yet."""
-        place = self._place(identifier)
-        return self._record(place) if place.exists() else None
+        path = self._path_of(identifier)
+        return self._record(path) if path.exists() else None
 
     def write(self, record: ObjectRecord) -> None:
-        """Keep an object's record in place of an earlier one."""
-        write_json(self._place(record.identifier), asdict(record))
+        """Write an object's record in place of an earlier one."""
+        write_json(self._path_of(record.identifier), asdict(record))
 
     def records(self) -> tuple[ObjectRecord, ...]:
         """Return all objects' records, in natural order."""
-        places = sorted((self.path / OBJECTS).glob("[!.]*.json"), key=lambda place: natural(place.stem))
-        return tuple(self._record(place) for place in places)
+        paths = sorted((self.path / OBJECTS).glob("[!.]*.json"), key=lambda path: natural(path.stem))
+        return tuple(self._record(path) for path in paths)
 
-    def _place(self, identifier: str) -> Path:
+    def _path_of(self, identifier: str) -> Path:
         return self.path / OBJECTS / f"{identifier}.json"
 
-    def _record(self, place: Path) -> ObjectRecord:
-        read = self._read(place)
+    def _record(self, path: Path) -> ObjectRecord:
+        read = self._read(path)
         try:
             cases = tuple(
                 CaseRecord(**{**each, "train": tuple(each["train"]), "test": tuple(each["test"])})
@@ -166,26 +166,26 @@ class ResultsFolder:
             )
             return ObjectRecord(**read, cases=cases, outcomes=outcomes)
         except (KeyError, TypeError, AttributeError) as error:
-            raise self._damaged(place, error) from error
+            raise self._damaged(path, error) from error
 
-    def _read(self, place: Path) -> dict[str, Any]:
+    def _read(self, path: Path) -> dict[str, Any]:
         try:
-            read = read_json(place, max_bytes=_MAX_BYTES)
+            read = read_json(path, max_bytes=_MAX_BYTES)
         except (OSError, ValueError) as error:
-            raise self._damaged(place, error) from error
+            raise self._damaged(path, error) from error
         if not isinstance(read, dict):
-            raise self._damaged(place, "no JSON object")
+            raise self._damaged(path, "no JSON object")
         return read
 
-    def _damaged(self, place: Path, error: object) -> EvaluationError:
+    def _damaged(self, path: Path, error: object) -> EvaluationError:
         advice = "delete the file to compute them again, or choose another --output"
-        return EvaluationError.expected("results of this version", got=str(error), file=place, advice=advice)
+        return EvaluationError.expected("results of this version", got=str(error), file=path, advice=advice)
 
 
-def write_json(place: Path, values: Mapping[str, Any]) -> None:
+def write_json(path: Path, values: Mapping[str, Any]) -> None:
     """Write plain values whole. Raises EvaluationError where that cannot be."""
-    words = json.dumps(_finite(values), indent=1, ensure_ascii=False, allow_nan=False)
-    write_whole(place, lambda path: path.write_text(words + "\n", encoding="utf-8"), raising=EvaluationError)
+    text = json.dumps(_finite(values), indent=1, ensure_ascii=False, allow_nan=False)
+    write_whole(path, lambda part: part.write_text(text + "\n", encoding="utf-8"), raising=EvaluationError)
 
 
 def failure_of(error: Exception) -> str:
@@ -201,9 +201,9 @@ def file_word(name: str) -> str:
     return "".join(mark if mark.isalnum() or mark in "-_" else "-" for mark in name)
 
 
-def natural(words: str) -> tuple[tuple[int, int, str], ...]:
+def natural(name: str) -> tuple[tuple[int, int, str], ...]:
     """Return a key that sorts numbers within names by value."""
-    parts = re.findall(r"\d+|\D+", words)
+    parts = re.findall(r"\d+|\D+", name)
     return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts)
 
 
@@ -227,5 +227,5 @@ def _first_difference(wanted: Mapping[str, Any], found: Mapping[str, Any]) -> tu
 
 
 def _brief(value: object) -> str:
-    words = json.dumps(value, ensure_ascii=False) if not isinstance(value, str) else value
-    return words if len(words) <= 160 else f"{words[:157]}..."
+    text = json.dumps(value, ensure_ascii=False) if not isinstance(value, str) else value
+    return text if len(text) <= 160 else f"{text[:157]}..."

@@ -18,7 +18,7 @@ from avmsf.evaluation.cdpam import Cdpam
 from avmsf.evaluation.metrics import PerContact, validate
 from avmsf.evaluation.modal_metrics import ModalRenderer, compare_modes
 from avmsf.evaluation.registry import METRICS, resolve
-from avmsf.evaluation.splits import align_split, spread
+from avmsf.evaluation.splits import align_split, evenly_spaced
 from avmsf.evaluation.task import Renderer, Sounds, expect_renderer
 from avmsf.field.sound_field import SoundField
 from avmsf.simulate.ground_truth import Truth
@@ -189,7 +189,7 @@ class MetricSettings:
         return values, {} if truth is None else _modal_figures(renderer, test, truth)
 
     def _cdpam_values(self, sounds: Sounds, test: Impacts) -> tuple[float | None, ...]:
-        rows = spread(len(test), self.cdpam_contacts or len(test))
+        rows = evenly_spaced(len(test), self.cdpam_contacts or len(test))
         taken = _cdpam().distance(sounds[rows], test.sounds[rows], sample_rate=test.sample_rate)
         found = dict(zip(rows, taken.tolist(), strict=True))
         return tuple(map(found.get, range(len(test))))

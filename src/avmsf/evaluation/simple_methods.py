@@ -66,7 +66,7 @@ class ModalBaseline(_Trained, ABC):
     extraction: Extraction
     """Modes of the training impacts, and their gains in each of them, row for row."""
     noise: bool = field(default=False, kw_only=True)
-    """Whether the extraction's residual is heard beside the modes, as it is in a field: one draw for all contacts."""
+    """Whether the extraction's residual is added to the modes, as it is in a field: one draw for all contacts."""
     seed: int = field(default=0, kw_only=True)
     """Start of the noise's chance."""
 
@@ -86,9 +86,9 @@ class ModalBaseline(_Trained, ABC):
 
     @cached_property
     def amplitudes(self) -> Amplitudes:
-        """The training contacts' amplitudes, as if all blows came from the same side.
+        """The training contacts' amplitudes, as if all impacts came from the same side.
 
-        Of two blows from opposite sides of a thin wall the gains are opposite too, and their mean would be silence.
+        Of two impacts from opposite sides of a thin wall the gains are opposite too, and their mean would be silence.
         """
         amplitudes = torch.complex(self.extraction.quadrature, -self.extraction.gains)
         return amplitudes * orientation_signs(self.train.contacts, self.train.directions).to(amplitudes)[:, None]
@@ -101,7 +101,7 @@ class ModalBaseline(_Trained, ABC):
         """
 
     def render(self, contacts: Contacts, *, directions: Contacts | None = None) -> Sounds:
-        """Return the modes' sound at each contact, and the noise beside it where there is any."""
+        """Return the modes' sound at each contact, and the noise where there is any."""
         amplitudes, samples = self.complex_gains(contacts), self.train.sounds.shape[1]
         sounds = synthesize(
             -amplitudes.imag,
@@ -136,9 +136,9 @@ class WhiteNoise(_Trained):
 
     def _noise(self, contact: Float[Tensor, "3"]) -> Float[Tensor, " samples"]:
         # Adding zero makes one of the two zeros, whose bytes differ.
-        place = (contact.detach().double().cpu() + 0.0).numpy().tobytes()
+        position = (contact.detach().double().cpu() + 0.0).numpy().tobytes()
         # One hash of both, since torch's generator uses only the lower 32 bits of its seed.
-        generator = torch.Generator().manual_seed(zlib.crc32(place, self.seed))
+        generator = torch.Generator().manual_seed(zlib.crc32(position, self.seed))
         noise = torch.randn(self.train.sounds.shape[1], generator=generator, dtype=self.train.sounds.dtype)
         return noise.to(self.train.sounds.device)
 
@@ -234,15 +234,15 @@ def floor(test: Impacts, bank: ModalBank, *, sines: bool = False) -> Float[Tenso
 class SplineGains(ModalBaseline):
     """The modes with amplitudes that are thin-plate splines through the training contacts.
 
-    Contacts in one place count once, with their mean amplitudes. With fewer places than twice what determines a linear
-    function the spline is linear in the distance, with a constant: the thin plate would run away beyond the contacts.
+    Contacts in one position count once, with their mean amplitudes. With fewer positions than twice what determines a
+    linear function the spline is linear in the distance, with a constant: the thin plate would run away beyond them.
     """
 
     def complex_gains(self, contacts: Contacts, *, directions: Contacts | None = None) -> Amplitudes:
         """Return the splines' amplitudes."""
-        places, means = self._places
-        along, asked = self._axes.along(places), self._axes.along(contacts.double())
-        if len(places) == 1 or not along.shape[1]:
+        positions, means = self._positions
+        along, asked = self._axes.along(positions), self._axes.along(contacts.double())
+        if len(positions) == 1 or not along.shape[1]:
             return means.mean(0, keepdim=True).expand(len(contacts), -1).to(self.amplitudes)
         kernel, degree = ("thin_plate_spline", 1) if self._bends else ("linear", 0)
         spline = RBFInterpolator(along.numpy(), means.numpy(), kernel=kernel, degree=degree)
@@ -250,14 +250,14 @@ class SplineGains(ModalBaseline):
 
     @property
     def report(self) -> dict[str, Any]:
-        """What the spline is, as plain values: its kernel, directions and distinct places."""
-        directions = self._axes.along(self._places[0]).shape[1]
+        """What the spline is, as plain values: its kernel, directions and distinct positions."""
+        directions = self._axes.along(self._positions[0]).shape[1]
         kernel = "thin plate" if self._bends else "distance"
-        return {"kernel": kernel, "directions": directions, "sites": len(self._places[0])}
+        return {"kernel": kernel, "directions": directions, "sites": len(self._positions[0])}
 
     @cached_property
-    def _places(self) -> tuple[Float64[Tensor, "places 3"], Complex128[Tensor, "places modes"]]:
-        """Distinct places, and the mean amplitudes there."""
+    def _positions(self) -> tuple[Float64[Tensor, "positions 3"], Complex128[Tensor, "positions modes"]]:
+        """Distinct positions, and the mean amplitudes there."""
         owner = places_of(self.train.contacts.double())
         members = (owner[None, :] == torch.arange(int(owner.max()) + 1)[:, None]).double()
         mean = members / members.sum(1, keepdim=True)
@@ -265,9 +265,9 @@ class SplineGains(ModalBaseline):
 
     @cached_property
     def _axes(self) -> Axes:
-        return Axes(self._places[0])
+        return Axes(self._positions[0])
 
     @property
     def _bends(self) -> bool:
-        places = self._places[0]
-        return len(places) >= 2 * (self._axes.along(places).shape[1] + 1)
+        positions = self._positions[0]
+        return len(positions) >= 2 * (self._axes.along(positions).shape[1] + 1)

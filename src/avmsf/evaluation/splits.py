@@ -60,8 +60,8 @@ class Farthest:
 
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
         """Return the one case, the same as that of `avmsf.evaluation.splits.split`."""
-        places = Places.of(impacts)
-        return (places.case("farthest", farthest_points(places.contacts, places.expect_part(self.fraction))),)
+        distinct = DistinctContacts.of(impacts)
+        return (distinct.case("farthest", farthest_points(distinct.contacts, distinct.count_of(self.fraction))),)
 
 
 @dataclass(frozen=True)
@@ -73,8 +73,8 @@ class Closest:
 
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
         """Return the one case."""
-        places = Places.of(impacts)
-        return (places.case("closest", closest_points(places.contacts, places.expect_part(self.fraction))),)
+        distinct = DistinctContacts.of(impacts)
+        return (distinct.case("closest", closest_points(distinct.contacts, distinct.count_of(self.fraction))),)
 
 
 @dataclass(frozen=True)
@@ -93,10 +93,11 @@ class Predefined:
                 unknown[0],
                 name="test",
             )
-        places, tested = Places.of(impacts), {row for row, name in enumerate(impacts.names) if name in self.test}
-        chosen = [place for place, rows in enumerate(places.rows) if tested.isdisjoint(rows)]
-        places.expect(len(chosen))
-        case = places.case("predefined", chosen)
+        distinct = DistinctContacts.of(impacts)
+        tested = {row for row, name in enumerate(impacts.names) if name in self.test}
+        chosen = [contact for contact, rows in enumerate(distinct.rows) if tested.isdisjoint(rows)]
+        distinct.check_count(len(chosen))
+        case = distinct.case("predefined", chosen)
         return (replace(case, test=tuple(sorted(tested))),)
 
 
@@ -106,13 +107,12 @@ class LeaveOneOut:
 
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
         """Return a case for each contact, named by its first recording."""
-        places = Places.of(impacts)
-        count = len(places.rows)
-        places.expect(count - 1)
-        return tuple(
-            places.case("leave-one-out", (place for place in range(count) if place != left), fold=impacts.names[row[0]])
-            for left, row in enumerate(places.rows)
-        )
+        distinct = DistinctContacts.of(impacts)
+        count = len(distinct.rows)
+        distinct.check_count(count - 1)
+        others = ([other for other in range(count) if other != left] for left in range(count))
+        folds = (impacts.names[rows[0]] for rows in distinct.rows)
+        return tuple(distinct.case("leave-one-out", *pair) for pair in zip(others, folds, strict=True))
 
 
 @dataclass(frozen=True)
@@ -132,16 +132,16 @@ class Shots:
 
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
         """Return a case for each number and start; the test contacts are those left by the largest number."""
-        places = Places.of(impacts)
-        total = len(places.rows)
-        counts = [count for count in self.counts if count < total] or [places.expect(min(self.counts))]
+        distinct = DistinctContacts.of(impacts)
+        total = len(distinct.rows)
+        counts = [count for count in self.counts if count < total] or [distinct.check_count(min(self.counts))]
         cases = []
         for first in dict.fromkeys(round(number * total / self.starts) for number in range(self.starts)):
-            order = farthest_points(places.contacts, max(counts), start=first).tolist()
-            test = places.case("", order).test
-            fold = f"from {impacts.names[places.rows[first][0]]}" if self.starts > 1 else ""
+            order = farthest_points(distinct.contacts, max(counts), start=first).tolist()
+            test = distinct.case("", order).test
+            fold = f"from {impacts.names[distinct.rows[first][0]]}" if self.starts > 1 else ""
             cases += [
-                Case(f"{count} shots" if count > 1 else "1 shot", places.case("", order[:count]).train, test, fold)
+                Case(f"{count} shots" if count > 1 else "1 shot", distinct.case("", order[:count]).train, test, fold)
                 for count in counts
             ]
         return tuple(cases)
@@ -162,19 +162,19 @@ class FewerViews:
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class DistinctContacts:
     """The distinct contacts of an object, by `places_of`, in the order of their first recordings.
 
     Repeated recordings are of one contact even if its position was measured each time.
     """
 
-    contacts: Float64[Tensor, "places 3"]
+    contacts: Float64[Tensor, "contacts 3"]
     """Position of the first recording at each, meters."""
     rows: tuple[tuple[int, ...], ...]
     """Indices of the recordings at each."""
 
     @classmethod
-    def of(cls, impacts: Impacts) -> "Places":
+    def of(cls, impacts: Impacts) -> "DistinctContacts":
         """Find the distinct contacts of an object's impacts."""
         rows = rows_by_place(impacts.contacts)
         return cls(impacts.contacts.double()[[each[0] for each in rows]], rows)
@@ -184,7 +184,7 @@ class Places:
         """Number of recordings at all contacts."""
         return sum(map(len, self.rows))
 
-    def expect(self, wanted: int, *, least: int = 1) -> int:
+    def check_count(self, wanted: int, *, least: int = 1) -> int:
         """Return `wanted`, or raise EvaluationError for fewer training contacts than `least` or no test contact."""
         if not least <= wanted < len(self.rows):
             there_are = f"{counted(self.recordings, 'recording')} at {counted(len(self.rows), 'contact')}"
@@ -196,13 +196,13 @@ class Places:
             )
         return wanted
 
-    def expect_part(self, fraction: float) -> int:
-        """Return the number of a fraction of the contacts, at least 2. Raises EvaluationError as `expect`."""
-        return self.expect(max(2, round(fraction * len(self.rows))), least=2)
+    def count_of(self, fraction: float) -> int:
+        """Return the number of a fraction of the contacts, at least 2. Raises EvaluationError as `check_count`."""
+        return self.check_count(max(2, round(fraction * len(self.rows))), least=2)
 
-    def case(self, label: str, chosen: Iterable[int] | Tensor, *, fold: str = "") -> Case:
+    def case(self, label: str, chosen: Iterable[int] | Tensor, fold: str = "") -> Case:
         """Return the case that trains on the chosen contacts: first recordings first, then the repeated ones."""
-        taken = [self.rows[int(place)] for place in chosen]
+        taken = [self.rows[int(contact)] for contact in chosen]
         train = [rows[0] for rows in taken] + sorted(row for rows in taken for row in rows[1:])
         used = set(train)
         test = tuple(row for row in range(self.recordings) if row not in used)
@@ -228,12 +228,12 @@ def split(
         )
     if seed is not None:
         start = random.Random(seed).randrange(len(impacts))
-    places = Places.of(impacts)
-    wanted = places.expect_part(train_size) if isinstance(train_size, float) else places.expect(int(train_size))
+    distinct = DistinctContacts.of(impacts)
+    wanted = distinct.count_of(train_size) if isinstance(train_size, float) else distinct.check_count(int(train_size))
     if not 0 <= start < len(impacts):
         raise EvaluationError.expected(f"the index of a recording, 0 to {len(impacts) - 1}", start, name="start")
-    first = next(place for place, rows in enumerate(places.rows) if start in rows)
-    case = places.case("", farthest_points(places.contacts, wanted, start=first))
+    first = next(contact for contact, rows in enumerate(distinct.rows) if start in rows)
+    case = distinct.case("", farthest_points(distinct.contacts, wanted, start=first))
     train, test = impacts.take(case.train), impacts.take(case.test)
     if isinstance(recordings, Impacts):
         return cast("tuple[Recordings, Recordings]", (train, test))
@@ -257,8 +257,8 @@ def align_split(
     return found.aligned(train), found.aligned(test)
 
 
-def spread(count: int, wanted: int) -> list[int]:
-    """Return at most `wanted` of the rows 0 to `count` - 1, evenly spread, in ascending order."""
+def evenly_spaced(count: int, wanted: int) -> list[int]:
+    """Return at most `wanted` of the rows 0 to `count` - 1, evenly spaced, in ascending order."""
     if wanted >= count:
         return list(range(count))
-    return [(2 * place + 1) * count // (2 * wanted) for place in range(wanted)]
+    return [(2 * number + 1) * count // (2 * wanted) for number in range(wanted)]

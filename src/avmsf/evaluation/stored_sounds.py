@@ -1,4 +1,4 @@
-"""Sounds that are kept with the results, to be listened to and drawn."""
+"""Sounds that are stored with the results, to be listened to and drawn."""
 
 import base64
 import io
@@ -23,7 +23,7 @@ from avmsf.plotting.spectrograms import RANGE_DB, log_spectrogram
 from avmsf.plotting.style import SEQUENTIAL
 
 RECORDED = "recorded"
-"""What the recordings are called beside the methods."""
+"""What the recordings are called next to the methods."""
 _PEAK = 0.25
 """What recordings peak at, of full scale: louder sounds of a method have room above."""
 _LEAST_RATE = 8000.0
@@ -39,7 +39,7 @@ def listening_gain(recorded: Float[Tensor, " samples"]) -> float:
     return _PEAK / peak if peak > 0 else 1.0
 
 
-def keep_sound(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: float, gain: float) -> None:
+def write_sound(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: float, gain: float) -> None:
     """Write a sound times `gain` as a FLAC file of 16 bits; what would clip is turned down to full scale.
 
     Sounds at rates that browsers do not play are resampled by a whole factor. Raises EvaluationError.
@@ -53,12 +53,12 @@ def keep_sound(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: flo
         samples = samples * (_FULL / peak)
     memory = io.BytesIO()
     soundfile.write(memory, samples, round(sample_rate * factor), subtype="PCM_16", format="FLAC")
-    write_whole(path, lambda place: place.write_bytes(memory.getvalue()), raising=EvaluationError)
+    write_whole(path, lambda part: part.write_bytes(memory.getvalue()), raising=EvaluationError)
 
 
 @dataclass(frozen=True, eq=False)
 class StoredSound:
-    """A kept sound, read back."""
+    """A stored sound."""
 
     content: bytes
     """The file as it lies on the disk."""
@@ -67,7 +67,7 @@ class StoredSound:
 
     @classmethod
     def read(cls, path: Path) -> "StoredSound":
-        """Read a file that `keep_sound` wrote. Raises EvaluationError where it is gone or damaged."""
+        """Read a file that `write_sound` wrote. Raises EvaluationError where it is gone or damaged."""
         try:
             content = path.read_bytes()
             samples, rate = soundfile.read(io.BytesIO(content), dtype="float64")

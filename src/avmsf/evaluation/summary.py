@@ -116,7 +116,7 @@ def summarize(
     """Return all figures as plain values, of which the same records always give the same.
 
     `methods`, `standard_errors`, `ratio_to_knn3` and the like are of the main experiment, `cases` of each; `subsets`
-    names groups of objects whose means are told apart; `missing` are the results that are yet to be computed.
+    names groups of objects that have means of their own; `missing` are the results that are yet to be computed.
     """
     labels = labels_of(records)
     tables = {label: values_of(records, label) for label in labels}

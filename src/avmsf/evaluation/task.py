@@ -40,9 +40,9 @@ class Renderer(Protocol):
         ...
 
     def render(self, contacts: Contacts, *, directions: Contacts | None = None) -> Sounds:
-        """Return the sound of a blow at each contact (object frame, meters), in the unit of the training sounds.
+        """Return the sound of an impact at each contact (object frame, meters), in the unit of the training sounds.
 
-        `directions`, unit vectors along which the hammer moves, are for those to heed who know of directions.
+        `directions`, unit vectors along which the hammer moves, are for renderers that use them.
         """
         ...
 
@@ -127,7 +127,7 @@ class Method(Protocol):
 
     @property
     def name(self) -> str:
-        """Name in tables and on the command line; words joined by hyphens."""
+        """Name in tables and on the command line, joined by hyphens."""
         ...
 
     def fit(self, task: Task) -> Renderer:
