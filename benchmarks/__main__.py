@@ -9,7 +9,7 @@ from types import ModuleType
 
 from avmsf._utils.device import TRAINABLE
 from avmsf.errors import AvmsfError, CaptureWarning
-from avmsf.simulate.recipe import SIM20
+from avmsf.simulate.recipe import HELD_OUT, SIM20
 from benchmarks import (
     align,
     baselines,
@@ -71,14 +71,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--sim-20",
         type=Path,
         metavar="FOLDER",
-        help="baselines, gains, residual, surface: objects that `avmsf simulate sim-20` has made; surface and the "
+        help="baselines, gains, residual, surface: objects that `avmsf simulate` has made of a set; surface and the "
         "photographs of gains need it, the others simulate them again without it",
     )
     parser.add_argument(
         "--objects",
         nargs="+",
         default=(),
-        choices=tuple(SIM20),
+        choices=tuple(SIM20 | HELD_OUT),
         metavar="NAME",
         help="baselines, gains: some of these objects",
     )

@@ -20,7 +20,7 @@ from avmsf.fem.material import Material, material_named
 from avmsf.mesh import Surface
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
-from avmsf.simulate.recipe import sim20_recipe
+from avmsf.simulate.recipe import named_recipe
 from avmsf.simulate.simulation import simulate_object
 from avmsf.simulate.simulation_folder import write_simulation
 from benchmarks.costs import method_costs
@@ -79,7 +79,7 @@ class _Objects:
             return self._given
         for name in names:
             if not (self.folder / "captures" / name).exists():
-                write_simulation(simulate_object(sim20_recipe(name), name=name), self.folder / "captures" / name)
+                write_simulation(simulate_object(named_recipe(name), name=name), self.folder / "captures" / name)
         return self.folder / "captures"
 
     def capture(self, name: str) -> Capture:

@@ -37,7 +37,7 @@ from avmsf.pipeline.bodies import roughened
 from avmsf.pipeline.cloud_shape import shape_of_cloud
 from avmsf.reconstruction import ObjectShape
 from avmsf.simulate.ground_truth import Truth
-from avmsf.simulate.recipe import SIM20
+from avmsf.simulate.recipe import SET, SETS
 from benchmarks.ablation import ablation, outliers, supports
 from benchmarks.material import MissingDataError, example_capture
 from benchmarks.report import Options, Report, Table, log
@@ -120,14 +120,14 @@ def _errors(case: SplitCase, options: Options) -> tuple[dict[str, float], float]
     return single, case.coverage(field)
 
 
-def _sim20(options: Options, condition: str = "") -> Report:
-    """Errors on the simulated objects, with what a condition says is known; on exact meshes with fewer contacts too.
+def _simulated(options: Options, condition: str = "", of: str = SET) -> Report:
+    """Errors on a set of simulated objects, by what a condition says is known; on exact meshes with fewer contacts too.
 
     Contacts are farthest-point samples of 40, from the first.
     """
     rows: list[list[str | float]] = []
     with tempfile.TemporaryDirectory() as cache:
-        for name in options.objects or tuple(SIM20)[: 2 if options.quick_look else None]:
+        for name in options.objects or tuple(SETS[of])[: 2 if options.quick_look else None]:
             capture, truth = simulated(name, options, Path(cache), tidy=condition == "tidy")
             assert capture.surface is not None
             surface: Surface | ObjectShape = capture.surface
@@ -151,10 +151,10 @@ def _sim20(options: Options, condition: str = "") -> Report:
     means = values.mean(0)
     means[ratios] = np.exp(np.log(values[:, ratios]).mean(0))
     rows.append(["mean; of ratios the geometric mean", *map(float, means)])
-    prefix = f"gains.sim20_{condition}".rstrip("_")
+    prefix = f"gains.{of.replace('-', '')}_{condition}".rstrip("_")
     columns = [*_KEYS, *(f"error_{count}" for count in _IMPACTS[1:])][: len(means)]
     keys = {f"{prefix}_{key}": float(value) for key, value in zip(columns, means, strict=True)}
-    title = f"simulated objects, {_IMPACTS[0]} contacts, {_CONDITIONS[condition]}"
+    title = f"simulated objects, {of}, {_IMPACTS[0]} contacts, {_CONDITIONS[condition]}"
     return Report(tables=(Table(title, ("object", *columns), rows),), figures=keys)
 
 
@@ -272,7 +272,9 @@ _PLACES = 1000
 
 PARTS: dict[str, Callable[[Options], Report]] = {
     "captures": _captures,
-    **{f"sim20-{name}".rstrip("-"): partial(_sim20, condition=name) for name in _CONDITIONS},
+    **{f"sim20-{name}".rstrip("-"): partial(_simulated, condition=name) for name in _CONDITIONS},
+    "held-out": partial(_simulated, of="held-out"),
+    "held-out-photographs": partial(_simulated, condition="photographs", of="held-out"),
     "ablation": ablation,
     "outliers": outliers,
     "supports": supports,

@@ -23,7 +23,7 @@ from avmsf.field.training import Targets, TrainingRun
 from avmsf.modal.extraction.extract import extract_sounds
 from avmsf.modal.extraction.finders import ShortTime
 from avmsf.pipeline.config import DESCRIPTORS, PRESETS
-from avmsf.simulate.recipe import sim20_recipe
+from avmsf.simulate.recipe import named_recipe
 from avmsf.simulate.simulation import simulate_object
 from avmsf.simulate.simulation_folder import write_simulation
 from benchmarks.material import shared_data
@@ -99,7 +99,7 @@ def _folder(name: str, folder: Path) -> Path:
         return shared_data()
     made = folder / "paper"
     if not (made / name).exists():
-        recipe = replace(sim20_recipe(name), sample_rate=RATE, seconds=SECONDS)
+        recipe = replace(named_recipe(name), sample_rate=RATE, seconds=SECONDS)
         write_simulation(simulate_object(recipe, name=name), made / name)
     return made
 

@@ -25,7 +25,7 @@ from avmsf.modal.extraction.extract import extract_modes
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.bodies import make_body
-from avmsf.simulate.recipe import SIM20, sim20_recipe
+from avmsf.simulate.recipe import SIM20, named_recipe
 from avmsf.simulate.simulation import simulate_object
 from benchmarks.field import measured_parts
 from benchmarks.material import surface_features
@@ -67,7 +67,7 @@ def _cost(options: Options) -> Report:
     figures: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / COSTED
-        recipe = replace(sim20_recipe(COSTED), size=COSTED_SIZE, elastic_modes=COSTED_MODES)
+        recipe = replace(named_recipe(COSTED), size=COSTED_SIZE, elastic_modes=COSTED_MODES)
         made = simulate_object(recipe, name=COSTED)
         train, _ = split(made.capture.impacts, 0.2)
         write_capture(replace(made.capture, impacts=train), folder)
@@ -127,7 +127,7 @@ def _coverage(options: Options) -> Report:
     """Predict the gains of 32 impacts on each object from those of 8."""
     rows: list[list[str | float]] = []
     for name in COVERED[:1] if options.quick_look else COVERED:
-        made = simulate_object(sim20_recipe(name), name=name)
+        made = simulate_object(named_recipe(name), name=name)
         assert made.capture.surface is not None
         train, test = split(made.capture.impacts, 0.2)
         config = BodyConfig(dofs=3000) if options.quick_look else BodyConfig()

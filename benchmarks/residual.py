@@ -17,7 +17,7 @@ from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.sound_field import SoundField
 from avmsf.modal.extraction.extract import extract_modes
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.simulate.recipe import SIM20, sim20_recipe
+from avmsf.simulate.recipe import SIM20, named_recipe
 from avmsf.simulate.simulation import simulate_object
 from benchmarks.field import QUICK_LOOK, filled_estimator
 from benchmarks.material import STRUCK, capture_in_place, example_capture, surface_features
@@ -125,7 +125,7 @@ def _aircraft(options: Options) -> Iterator[_Case]:
 def _sim20(options: Options) -> Iterator[_Case]:
     for name in tuple(SIM20)[: 1 if options.quick_look else None]:
         if options.sim20 is None:
-            capture = simulate_object(sim20_recipe(name), name=name).capture
+            capture = simulate_object(named_recipe(name), name=name).capture
         else:
             capture = read_capture(options.sim20 / name)
         assert capture.surface is not None

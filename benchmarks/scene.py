@@ -41,6 +41,10 @@ def _symmetry(options: Options) -> Report:
     return measure_symmetry(replace(options, parts=("made", "scanned")))
 
 
+def _held_out(options: Options) -> Report:
+    return measure_symmetry(replace(options, parts=("held-out",)))
+
+
 def _consistency(options: Options) -> Report:
     """Say how much features differ over orbits, before and after pooling, on plain shapes under one light."""
     size, count, points = (48, 12, 800) if options.quick_look else (128, 36, 4096)
@@ -104,6 +108,7 @@ PARTS: dict[str, Callable[[Options], Report]] = {
     "dino": measure_dino,
     "rasterizer": measure_rasterizer,
     "symmetry": _symmetry,
+    "held-out": _held_out,
     "consistency": _consistency,
     "pipeline": _pipeline,
 }

@@ -25,7 +25,7 @@ from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig
 from avmsf.reconstruction import ObjectShape
 from avmsf.simulate.ground_truth import Truth, read_truth
-from avmsf.simulate.recipe import sim20_recipe
+from avmsf.simulate.recipe import named_recipe
 from avmsf.simulate.simulation import simulate_object
 from avmsf.symmetry.characters import groups_of
 from avmsf.symmetry.find import find_symmetries
@@ -112,7 +112,7 @@ def simulated(name: str, options: Options, cache: Path, *, tidy: bool = False) -
     """
     if options.sim20 is not None and not tidy:
         return read_capture(options.sim20 / name), read_truth(options.sim20 / name)
-    recipe = sim20_recipe(name)
+    recipe = named_recipe(name)
     if tidy:
         recipe = replace(recipe, imperfections=replace(recipe.imperfections, **_TIDY))
     made = simulate_object(recipe, name=name, cache=cache)

@@ -19,7 +19,7 @@ from avmsf.modal.extraction.alignment import align
 from avmsf.modal.extraction.extract import extract_modes
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig
-from avmsf.simulate.recipe import sim20_recipe
+from avmsf.simulate.recipe import named_recipe
 from avmsf.simulate.simulation import simulate_object
 from benchmarks.material import capture_in_place, surface_features
 from benchmarks.report import Options, Report, Table, log
@@ -60,7 +60,7 @@ def _sim20(options: Options) -> Report:
     captures = {}
     for name in names:
         log(f"suggest.sim20: simulating {name}")
-        captures[name] = simulate_object(sim20_recipe(name), name=name).capture
+        captures[name] = simulate_object(named_recipe(name), name=name).capture
     return _compare("sim20", captures, None, options)
 
 

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -26,7 +27,7 @@ from avmsf.mesh.surface import Surface, read_surface
 from avmsf.photographs import find_foreground, read_views
 from avmsf.photographs.cameras import View
 from avmsf.reconstruction import ObjectShape, object_surface
-from avmsf.simulate.recipe import SIM20
+from avmsf.simulate.recipe import SET, SETS
 from benchmarks.material import MissingDataError
 from benchmarks.report import Options, Report, Table, log
 
@@ -85,10 +86,10 @@ def measure(options: Options) -> Report:
     return report
 
 
-def _objects(folder: Path, clouds: Path, quick: bool) -> Report:
+def _objects(folder: Path, clouds: Path, quick: bool, *, of: str = SET) -> Report:
     rows: list[list[str | float]] = []
     found = []
-    for name in tuple(SIM20)[: 2 if quick else None]:
+    for name in tuple(SETS[of])[: 2 if quick else None]:
         views, truth, cloud = _material(folder / name, clouds, quick)
         scores = _scores(views, cloud, truth)
         found.append(scores)
@@ -97,8 +98,9 @@ def _objects(folder: Path, clouds: Path, quick: bool) -> Report:
     means = [_mean([getattr(each, key) for each in found]) for key in _KEYS]
     rows.append(["mean", *means])
     names = ("outer_mean", "outer_p95", "thickness_error", "cavity_error", "seconds")
-    figures = {f"surface.{name}": value for name, value in zip(names, means, strict=True)}
-    return Report(tables=(Table("20 simulated objects", ("object", *_KEYS), rows),), figures=figures)
+    prefix = "surface" if of == SET else f"surface.{of}"
+    figures = {f"{prefix}.{name}": value for name, value in zip(names, means, strict=True)}
+    return Report(tables=(Table(f"simulated objects, {of}", ("object", *_KEYS), rows),), figures=figures)
 
 
 def _degraded(folder: Path, clouds: Path, quick: bool) -> Report:
@@ -283,4 +285,8 @@ CONDITIONS: dict[str, Callable[[Sequence[View]], Sequence[View]]] = {
     "wrong": _wrong,
     "turned": _turned,
 }
-PARTS = {"objects": _objects, "degraded": _degraded}
+PARTS: dict[str, Callable[[Path, Path, bool], Report]] = {
+    "objects": _objects,
+    "held-out": partial(_objects, of="held-out"),
+    "degraded": _degraded,
+}

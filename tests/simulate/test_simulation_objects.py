@@ -19,7 +19,7 @@ from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh, read_textured_mesh
 from avmsf.photographs.folder import read_views
 from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
-from avmsf.simulate.recipe import Imperfections, ObjectRecipe, sim20_recipe
+from avmsf.simulate.recipe import Imperfections, ObjectRecipe, named_recipe
 from avmsf.simulate.simulation import Simulation, simulate_object
 from avmsf.simulate.simulation_folder import is_written, simulate_set, write_simulation, write_textured
 from avmsf.simulate.strikes import STEEPEST, draw_strikes, nearest_on
@@ -346,7 +346,7 @@ def test_the_command_makes_an_object_of_a_mesh_and_keeps_it(
 def test_the_command_lists_and_knows_what_it_does_not_know(capsys: pytest.CaptureFixture[str]) -> None:
     assert simulate.run(options.Options.parse(["--list"])) == 0
     assert "mug-ceramic" in capsys.readouterr().out
-    with raises(SimulationError, name="sim-20", value="mug-ceramics") as caught:
+    with raises(SimulationError, name="object", value="mug-ceramics") as caught:
         simulate.run(options.Options.parse(["mug-ceramics", "--output", "nowhere"]))
     assert "mug-ceramic," in str(caught.value)
     with raises(AvmsfError, name="output"):
@@ -358,4 +358,4 @@ def test_what_is_asked_of_a_named_object_holds_though_it_is_the_usual() -> None:
     recipe = options.Options.parse(["example", "--impacts", "40"]).recipe
     assert (recipe.impacts, recipe.sample_rate, recipe.kind) == (40, 44100, "mug")
     recipe = options.Options.parse(["mug-plastic", "--material", "ceramic"]).recipe
-    assert recipe == replace(sim20_recipe("mug-plastic"), material="ceramic")
+    assert recipe == replace(named_recipe("mug-plastic"), material="ceramic")

@@ -7,7 +7,7 @@ from avmsf.cli.options.simulate import Options
 from avmsf.cli.printing import console, next_command, print_json, print_result, say, table
 from avmsf.cli.progress import ProgressBar
 from avmsf.fem.material import MATERIALS
-from avmsf.simulate.recipe import NON_SYMMETRIC, SET, SIM20, ObjectRecipe
+from avmsf.simulate.recipe import NON_SYMMETRIC, SETS, ObjectRecipe
 from avmsf.simulate.shapes import KINDS
 from avmsf.simulate.simulation_folder import SetProgress, simulate_set
 
@@ -17,7 +17,8 @@ def run(options: Options) -> int:
     if options.list:
         _list(errors=options.json)
         if options.json:
-            print_json({"objects": list(SIM20), "shapes": list(KINDS), "materials": list(MATERIALS)})
+            names = [name for objects in SETS.values() for name in objects]
+            print_json({"objects": names, "shapes": list(KINDS), "materials": list(MATERIALS)})
         return 0
     assert options.output is not None
     recipes, folder = _chosen(options, options.output)
@@ -40,8 +41,8 @@ def run(options: Options) -> int:
 
 def _chosen(options: Options, output: Path) -> tuple[dict[str, ObjectRecipe], Path]:
     """Return the recipes by their folders' names, and the folder that holds these."""
-    if options.what == SET:
-        return {name: options.applied(recipe) for name, recipe in SIM20.items()}, output
+    if options.what in SETS:
+        return {name: options.applied(recipe) for name, recipe in SETS[options.what].items()}, output
     place = output.resolve()
     return {place.name: options.recipe}, place.parent
 
@@ -49,9 +50,11 @@ def _chosen(options: Options, output: Path) -> tuple[dict[str, ObjectRecipe], Pa
 def _list(*, errors: bool) -> None:
     screen = console(errors=errors)
     rows = [
-        (name, recipe.kind, recipe.material, str(recipe.seed), "yes" if name not in NON_SYMMETRIC else "no")
-        for name, recipe in SIM20.items()
+        (title, name, recipe.kind, recipe.material, str(recipe.seed), "no" if name in NON_SYMMETRIC else "yes")
+        for title, objects in SETS.items()
+        for name, recipe in objects.items()
     ]
-    screen.print(table(SET, ("object", "shape", "material", "seed", "rotational symmetry"), rows, words=3))
+    columns = ("set", "object", "shape", "material", "seed", "rotational symmetry")
+    screen.print(table("objects", columns, rows, words=4))
     screen.print(f"shapes for --kind: {', '.join(KINDS)}")
     screen.print(f"materials: {', '.join(MATERIALS)}")

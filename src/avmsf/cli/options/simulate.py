@@ -11,25 +11,25 @@ from avmsf.cli.options.common import Configured, Flag
 from avmsf.cli.options.paths import CacheFolder, Existing, OutputFolder
 from avmsf.cli.options.settings import with_settings
 from avmsf.errors import SimulationError
-from avmsf.simulate.recipe import EXAMPLE, SET, ObjectRecipe, sim20_recipe
+from avmsf.simulate.recipe import EXAMPLE, SETS, ObjectRecipe, named_recipe
 
 
 @dataclass(frozen=True)
 class Options(Configured):
     """Simulate objects, their recordings and images, as capture folders with ground truth.
 
-    `avmsf simulate sim-20 --output FOLDER` makes the benchmark set, one folder per object. It skips complete objects,
-    so repeat an interrupted command to continue it. A single object, of the set by its name or any other by --kind or
+    `avmsf simulate sim-20 --output FOLDER` makes a benchmark set, one folder per object. It skips complete objects, so
+    repeat an interrupted command to continue it. A single object, of the set by its name or any other by --kind or
     --mesh, is written to FOLDER itself.
     """
 
     what: tyro.conf.Positional[Annotated[str | None, tyro.conf.arg(metavar="NAME")]] = None
-    """sim-20 for the benchmark set, the name of one of its objects, or example for the object of `avmsf demo`; nothing
-    for an object of your own."""
+    """sim-20 or held-out for a benchmark set, the name of one of its objects, or example for the object of `avmsf
+    demo`; nothing for an object of your own."""
     output: OutputFolder = None
     """Output folder."""
     list: Flag = False
-    """Only list the set's objects, the shapes and the materials."""
+    """Only list the sets' objects, the shapes and the materials."""
     cache: CacheFolder = None
     """Cache of elastic modes, which take most of the time: other hammers, noises and views are then fast."""
     kind: str | None = None
@@ -78,10 +78,10 @@ class Options(Configured):
         if self.output is None and not self.list:
             raise SimulationError("--output: expected a folder, got none; --list names the objects", name="output")
         changed, usual = self.recipe, _recipe_of(self.what)
-        for name in _IDENTITY if self.what == SET else ():
+        for name in _IDENTITY if self.what in SETS else ():
             if (value := getattr(changed, name)) != getattr(usual, name):
                 raise SimulationError(
-                    f"--{name}: expected none with {SET}, got {value}; leave it out", name=name, value=str(value)
+                    f"--{name}: expected none with {self.what}, got {value}; leave it out", name=name, value=str(value)
                 )
 
 
@@ -91,6 +91,6 @@ _IDENTITY = ("kind", "mesh", "material", "seed")
 
 def _recipe_of(what: str | None) -> ObjectRecipe:
     """Return the named object's recipe; for the whole set and for an object of the user's own the usual one."""
-    if what in (None, SET):
+    if what is None or what in SETS:
         return ObjectRecipe()
-    return EXAMPLE if what == "example" else sim20_recipe(what)
+    return EXAMPLE if what == "example" else named_recipe(what)

@@ -17,12 +17,13 @@ from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.simulate.shapes.body import Draft, Maker, Symmetry
 from avmsf.simulate.shapes.freeform import blob
-from avmsf.simulate.shapes.revolution import bell, bowl, dish, fluted, goblet, plate, pot, tube
-from avmsf.simulate.shapes.sheet import bracket, platter, spoon, tray
+from avmsf.simulate.shapes.revolution import bell, bottle, bowl, dish, fluted, goblet, lid, plate, pot, tube
+from avmsf.simulate.shapes.sheet import boomerang, bracket, channel, platter, scallop, spoon, tray
 from avmsf.simulate.shapes.sweep import jug, mug, skillet
 
 _MAKERS: tuple[Maker, ...] = (
-    bell, blob, bowl, bracket, dish, fluted, goblet, jug, mug, plate, platter, pot, skillet, spoon, tray, tube,
+    bell, blob, boomerang, bottle, bowl, bracket, channel, dish, fluted, goblet, jug, lid, mug, plate, platter, pot,
+    scallop, skillet, spoon, tray, tube,
 )  # fmt: skip
 KINDS: Mapping[str, Maker] = MappingProxyType({maker.__name__: maker for maker in _MAKERS})
 """What draws and builds an individual of each kind."""

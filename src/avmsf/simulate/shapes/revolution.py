@@ -11,106 +11,7 @@ import torch
 from jaxtyping import Float64, Int
 from scipy.interpolate import BSpline
 
-from avmsf.simulate.shapes.body import ROUND, UP, Body, Draft, Sheet, Symmetry, drawn_wall
-
-
-@dataclass(frozen=True, eq=False)
-class Rings:
-    """Points on rings from the inside out, the pole first if there is one, and triangles between them.
-
-    Seen so that the angle grows counter-clockwise and rings outwards, so do the triangles. Diagonals alternate, so that
-    turning by two points of the innermost ring, and mirroring at a point of it, changes nothing.
-    """
-
-    counts: tuple[int, ...]
-    """Points on each ring, even numbers, from the inside out; each as many as the one before or twice as many."""
-    pole: bool
-    """Whether a point in the middle, which counts as ring 0, closes the innermost ring."""
-
-    @cached_property
-    def starts(self) -> Int[np.ndarray, " rings"]:
-        """First row of each ring, and behind the last one."""
-        return np.cumsum([0, *([1] if self.pole else []), *self.counts])
-
-    @property
-    def number(self) -> int:
-        """Rings, with the pole."""
-        return len(self.starts) - 1
-
-    @cached_property
-    def ring(self) -> Int[np.ndarray, " points"]:
-        """Number of each point's ring."""
-        return np.repeat(np.arange(self.number), np.diff(self.starts))
-
-    @cached_property
-    def turns(self) -> Float64[np.ndarray, " points"]:
-        """Angle of each point, 0 to 1; 0 at the pole."""
-        return (np.arange(self.starts[-1]) - self.starts[self.ring]) / np.diff(self.starts)[self.ring]
-
-    @cached_property
-    def order(self) -> Int[np.ndarray, " points"]:
-        """Numbers that differ along every edge and mirror as the triangles do."""
-        return 2 * self.ring + (np.arange(self.starts[-1]) - self.starts[self.ring]) % 2
-
-    def rows(self, ring: int, places: Sequence[int] | np.ndarray) -> Int[np.ndarray, " places"]:
-        """Return rows of points on a ring, counted around it from angle 0 in either direction."""
-        return self.starts[ring] + np.asarray(places) % (self.starts[ring + 1] - self.starts[ring])
-
-    @cached_property
-    def triangles(self) -> Int[np.ndarray, "triangles 3"]:
-        """Rows of points."""
-        found = []
-        for ring in range(self.number - 1):
-            inner, outer = (int(self.starts[each + 1] - self.starts[each]) for each in (ring, ring + 1))
-            if inner == 1:
-                k = np.arange(outer)
-                found.append(np.stack([np.zeros_like(k), self.rows(1, k), self.rows(1, k + 1)], axis=1))
-            elif outer == inner:
-                found.append(self._band(ring, np.arange(inner)))
-            else:
-                found.append(self._doubling(ring, np.arange(inner)))
-        return np.concatenate(found)
-
-    def _band(self, ring: int, k: np.ndarray) -> np.ndarray:
-        a, after = self.rows(ring, k), self.rows(ring, k + 1)
-        b, beyond = self.rows(ring + 1, k), self.rows(ring + 1, k + 1)
-        rising = ((k + ring) % 2 == 0)[:, None]
-        first = np.where(rising, np.stack([a, b, beyond], axis=1), np.stack([a, b, after], axis=1))
-        second = np.where(rising, np.stack([a, beyond, after], axis=1), np.stack([b, beyond, after], axis=1))
-        return np.concatenate([first, second])
-
-    def _doubling(self, ring: int, k: np.ndarray) -> np.ndarray:
-        a, after = self.rows(ring, k), self.rows(ring, k + 1)
-        b, between, beyond = (self.rows(ring + 1, 2 * k + step) for step in range(3))
-        corners = ((a, b, between), (a, between, after), (after, between, beyond))
-        return np.concatenate([np.stack(each, axis=1) for each in corners])
-
-
-@dataclass(frozen=True, eq=False)
-class Patch:
-    """Some of the points of a sheet and the triangles among them, from which something grows."""
-
-    rows: Int[np.ndarray, " columns"]
-    triangles: Int[np.ndarray, "triangles 3"]
-    """Rows of `rows`."""
-    order: Int[np.ndarray, " columns"]
-
-    @classmethod
-    def of(
-        cls,
-        triangles: Int[np.ndarray, "all 3"],
-        order: Int[np.ndarray, " points"],
-        rows: Int[np.ndarray, " columns"],
-        *,
-        lower: bool,
-    ) -> "Patch":
-        """Return the patch of these rows of a sheet's points, on its lower side or its upper one."""
-        column = np.full(len(order), -1)
-        column[rows] = np.arange(len(rows))
-        inside = triangles[(column[triangles] >= 0).all(axis=1)]
-        found = column[inside]
-        return cls(rows, found[:, ::-1] if lower else found, order[rows])
-
+from avmsf.simulate.shapes.body import ROUND, UP, Body, Draft, Patch, Rings, Sheet, Symmetry, drawn_wall
 
 POINTS = 900
 """Points in the middle of a wall: about 12 nodes of second order each, so some 32,000 degrees of freedom."""
@@ -337,13 +238,29 @@ def bell(random: np.random.Generator, wall: float | None) -> Draft:
     height = tall * radius
     corners = [(0.0, 1.0, 1.2), (shoulder, 1.0, 1.2), (waist, 0.75, 1.0), (waist * 1.15, 0.3, 1.0), (1.0, 0.0, 1.5)]
     turned = Turned.lay(Profile.scaled(radius, height, wall, corners), points=800)
-    patch = turned.middle_patch(max(1, int(np.argmin(np.abs(turned.radii - grip_radius)))), lower=False)
-    start = turned.top(patch)
-    part = np.linspace(0.0, 1.0, 11)[1:, None]
-    swell = 1.0 + 0.35 * np.sin(math.pi * part) ** 2 - 0.45 * np.clip(part - 0.8, 0.0, None) / 0.2
-    rising = (1.0 - part) * start[:, 2] + part * (height + grip)
-    layers = np.concatenate([swell[..., None] * start[None, :, :2], rising[..., None]], axis=2)
-    turned.body.grow(patch.triangles, patch.order, turned.upper[patch.rows], layers)
+    _crown(turned, grip_radius, height + grip, swell=0.35, taper=0.45)
+    return Draft(turned.body, wall, ROUND)
+
+
+def bottle(random: np.random.Generator, wall: float | None) -> Draft:
+    """Make a bottle with a narrow neck, through which hardly any view sees the inside."""
+    radius, tall = random.uniform(0.032, 0.042), random.uniform(4.0, 5.0)
+    neck, shoulder = random.uniform(0.32, 0.42), random.uniform(0.58, 0.68)
+    wall = drawn_wall(random, 0.0025, 0.0035, wall)
+    corners = [(0.0, 0.0, 1.4), (0.95, 0.0, 1.3), (1.0, 0.1, 1.0), (1.0, shoulder, 1.0)]
+    corners += [(neck, shoulder + 0.12, 1.0), (neck, 1.0, 1.1)]
+    return Draft(Turned.lay(Profile.scaled(radius, tall * radius, wall, corners)).body, wall, ROUND)
+
+
+def lid(random: np.random.Generator, wall: float | None) -> Draft:
+    """Make the domed lid of a pot, with a massive knob."""
+    radius, rise = random.uniform(0.07, 0.11), random.uniform(0.25, 0.35)
+    knob, knob_radius = random.uniform(0.02, 0.028), random.uniform(0.009, 0.012)
+    wall = drawn_wall(random, 0.003, 0.0045, wall)
+    height = rise * radius
+    corners = [(0.0, 1.0, 1.1), (0.45, 1.0, 1.0), (0.85, 0.45, 1.0), (0.93, 0.05, 1.1), (1.0, 0.0, 1.1)]
+    turned = Turned.lay(Profile.scaled(radius, height, wall, corners))
+    _crown(turned, knob_radius, height + knob, swell=0.7, taper=0.6)
     return Draft(turned.body, wall, ROUND)
 
 
@@ -414,6 +331,20 @@ def _stand(turned: Turned, radius: float, height: float) -> None:
     ring = int(equal[np.argmin(np.abs(turned.radii[equal] - radius))])
     below = turned.sheet.middle[:, 2] - turned.sheet.offsets[:, 2]
     turned.add_foot(ring, float(below.min()) - height)
+
+
+def _crown(turned: Turned, radius: float, top: float, *, swell: float, taper: float) -> None:
+    """Grow a massive grip of about this radius from the middle of a wall up to a height, meters.
+
+    It is wider by `swell` half-way up, and narrower by `taper` at its end.
+    """
+    patch = turned.middle_patch(max(1, int(np.argmin(np.abs(turned.radii - radius)))), lower=False)
+    start = turned.top(patch)
+    part = np.linspace(0.0, 1.0, 11)[1:, None]
+    wide = 1.0 + swell * np.sin(math.pi * part) ** 2 - taper * np.clip(part - 0.8, 0.0, None) / 0.2
+    rising = (1.0 - part) * start[:, 2] + part * top
+    layers = np.concatenate([wide[..., None] * start[None, :, :2], rising[..., None]], axis=2)
+    turned.body.grow(patch.triangles, patch.order, turned.upper[patch.rows], layers)
 
 
 def _polygon(sides: int, edged: float) -> Warp:

@@ -8,8 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int
 
-from avmsf.simulate.shapes.body import MIRRORED, UP, Body, Draft, Sheet, Symmetry, drawn_wall
-from avmsf.simulate.shapes.revolution import Rings
+from avmsf.simulate.shapes.body import MIRRORED, UP, Body, Draft, Rings, Sheet, Symmetry, drawn_wall
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +65,46 @@ def platter(random: np.random.Generator, wall: float | None) -> Draft:
     # Half turns about x, y and z.
     symmetry = Symmetry(UP, 2, torch.eye(3, dtype=torch.float64))
     return Draft(_body(middle, wall, grid.triangles, grid.order), wall, symmetry)
+
+
+def boomerang(random: np.random.Generator, wall: float | None) -> Draft:
+    """Make a flat boomerang, which tapers towards its ends."""
+    radius, arc = random.uniform(0.09, 0.12), random.uniform(1.8, 2.3)
+    width, taper = random.uniform(0.022, 0.03), random.uniform(0.4, 0.6)
+    wall = drawn_wall(random, 0.004, 0.006, wall)
+    grid = _even_grid(arc * radius, 2.0 * width)
+    one, other = grid.parts.T
+    out, angle = radius + width * other * (1.0 - taper * one**2), 0.5 * arc * one
+    middle = np.stack([out * np.cos(angle), out * np.sin(angle), np.zeros(len(one))], axis=1)
+    return Draft(_body(middle, wall, grid.triangles, grid.order), wall, Symmetry(mirrors=torch.eye(3).double()[1:]))
+
+
+def channel(random: np.random.Generator, wall: float | None) -> Draft:
+    """Make a piece of a U profile."""
+    length, width = random.uniform(0.16, 0.22), random.uniform(0.04, 0.05)
+    side, bend = random.uniform(0.02, 0.03), random.uniform(0.008, 0.011)
+    wall = drawn_wall(random, 0.0025, 0.0035, wall)
+    across = width + math.pi * bend + 2.0 * side
+    grid = _even_grid(length, across)
+    one, other = grid.parts.T
+    aside, up = _bent(0.5 * across * np.abs(other), 0.5 * width, 0.5 * math.pi, bend)
+    middle = np.stack([0.5 * length * one, np.sign(other) * aside, up], axis=1)
+    symmetry = Symmetry(UP, 2, torch.eye(3).double()[:2])
+    return Draft(_body(middle, wall, grid.triangles, grid.order), wall, symmetry)
+
+
+def scallop(random: np.random.Generator, wall: float | None) -> Draft:
+    """Make a fan-shaped shell with ribs."""
+    radius, spread = random.uniform(0.09, 0.12), random.uniform(0.9, 1.1)
+    depth, ribs = random.uniform(0.25, 0.35), int(random.integers(5, 8))
+    rib = random.uniform(0.015, 0.025)
+    wall = drawn_wall(random, 0.0025, 0.004, wall)
+    grid = _even_grid(radius, 1.2 * radius)
+    one, other = grid.parts.T
+    part, angle = 0.2 + 0.4 * (1.0 + other), spread * one
+    up = depth * (1.0 - part**2) * np.cos(0.5 * angle) + rib * part * np.cos(2.0 * ribs * angle)
+    middle = radius * np.stack([part * np.cos(angle), part * np.sin(angle), up], axis=1)
+    return Draft(_body(middle, wall, grid.triangles, grid.order), wall, Symmetry(mirrors=torch.eye(3).double()[1:2]))
 
 
 def tray(random: np.random.Generator, wall: float | None) -> Draft:
