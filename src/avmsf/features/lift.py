@@ -32,12 +32,12 @@ Fitted Gaussians also fill walls and the space behind them. On a simulated mug w
 leaves out 1.7 %. A part of .1 costs three times as many of these.
 """
 Weighting = Callable[[Visibility], Float[Tensor, " points"]]
-"""How much one view's word counts for each point, given what it sees of them; zero where it sees nothing."""
+"""Weights of one view's features for each point, given what it sees of them; zero where it sees nothing."""
 
 
 @dataclass(frozen=True, eq=False)
 class Lifted:
-    """Features of points, and how much the views had to say about them."""
+    """Features of points, and how many views they are from."""
 
     features: FeatureField
     seen: Int[Tensor, " points"]
@@ -62,7 +62,7 @@ def supported(lifted: Lifted) -> Lifted:
 
     That are at least one view and `MIN_SEEN_FRACTION` of those that have the point in their image: what the views agree
     to be hidden is inside the object or behind its surface. And at least as many as see a surface behind the point,
-    which is then afloat before it. Raises SceneError where no point is left.
+    which then floats in front of it. Raises SceneError where no point is left.
     """
     points, seen, past = lifted.features.points, lifted.seen, lifted.past
     kept = (seen >= (MIN_SEEN_FRACTION * lifted.in_image).clamp_min(1.0)) & (2 * past <= seen)

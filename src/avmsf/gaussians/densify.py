@@ -1,7 +1,7 @@
-"""Where Gaussians are too few or for nothing: adaptive density control (3DGS, section 5.2).
+"""Adaptive density control (3DGS, section 5.2): Gaussians copied, split and removed while they are fitted.
 
-A Gaussian whose position gradient in the image is large stands for too much: a small one is copied, a large one is
-split into two smaller ones drawn from its own density. One that is almost transparent, or as large as the object, goes.
+One whose position gradient in the image is large covers too much: a small one is copied, a large one is split into two
+smaller ones drawn from its own density. One that is almost transparent, or as large as the object, is removed.
 """
 
 import math
@@ -33,7 +33,7 @@ class Density:
 
     @classmethod
     def zeros(cls, cloud: GaussianCloud) -> "Density":
-        """Return what is known of Gaussians at first."""
+        """Return the sums before the first view."""
         return cls(*cloud.logit_opacities.new_zeros(2, len(cloud)))
 
     def add_view(self, rendering: Rendering, camera: Camera) -> None:

@@ -1,4 +1,4 @@
-"""Which Gaussians are the object: not faint, not beside the masks, not afloat, not huge, not hidden inside."""
+"""Pruning: the Gaussians of the object, without those transparent, too large, hidden, isolated or outside the masks."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -17,7 +17,7 @@ from avmsf.photographs.cameras import View
 
 _NEIGHBORS = 8
 _MAX_DISTANCE_RATIO = 6.0
-"""Distance to the neighbors, in medians of that distance, beyond which a Gaussian belongs to nothing."""
+"""Largest mean distance to the neighbors, in medians of that distance, beyond which a Gaussian is an outlier."""
 _MAX_SCALE_RATIO = 0.15
 """Largest scale, in diagonals of the box around the middle 98 % of the centers."""
 _MASK_MARGIN_PIXELS = 2
@@ -88,7 +88,7 @@ def _masks_agree(
 def blended_weight(cloud: GaussianCloud, views: Sequence[View], *, rasterizer: Rasterizer) -> Float[Tensor, " points"]:
     """Return each Gaussian's largest share in an image: its blending weights summed over the pixels of a view.
 
-    Taken from the slope of a rendering by the Gaussians' own brightness, so that any rasterizer tells it.
+    Taken from the slope of a rendering by the Gaussians' own brightness, which any rasterizer has.
     """
     largest = torch.zeros_like(cloud.logit_opacities)
     for view in views:

@@ -1,8 +1,8 @@
 """Which points of an object a camera sees: what lies no deeper than the surface that the camera sees there.
 
 The four pixels around a point's place each say whether their depth reaches the point, within a tolerance, and its
-share is their mean, weighted as bilinear interpolation would. Depths themselves are not interpolated:
-between an object and what lies behind it a mean depth is nobody's.
+share is their mean, weighted as bilinear interpolation would. Depths themselves are not interpolated: the mean of an
+object's depth and of what lies behind it is that of no surface.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.mesh_views import MeshTracer
 
 _MIN_COVERAGE = 0.5
-"""Share of a pixel that the object must cover for the pixel to tell its depth."""
+"""Share of a pixel that the object must cover for the pixel to show its depth."""
 
 DepthMap = Callable[[Camera], Float[Tensor, "height width"]]
 """What gives the depth of the first surface that each pixel of a camera sees, meters along the axis; 0 where none."""
