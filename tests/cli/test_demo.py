@@ -24,7 +24,7 @@ def test_the_demo_errs_by_half_of_the_nearest_recording_and_finds_the_wall(
     found = json.loads(capsys.readouterr().out)
     errors = {method: each["relative_stft"] for method, each in found["scores"].items()}
     assert errors["field"] < 0.5 * errors["nearest recording"]
-    assert 0.6 < found["body"]["thickness"] / (demo.EXAMPLE.thickness or 0.0) < 1.2
+    assert 0.6 < found["body"]["wall_thickness"] / (demo.EXAMPLE.thickness or 0.0) < 1.2
 
 
 @pytest.mark.slow
