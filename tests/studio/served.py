@@ -13,7 +13,7 @@ from typing import Any
 from avmsf.studio.guard import MAX_UPLOAD_BYTES, Guard, new_token
 from avmsf.studio.opening import Opened
 from avmsf.studio.routes import make_app
-from avmsf.studio.server import PageServer, _listening
+from avmsf.studio.server import _listening, make_server
 from avmsf.studio.studio import Studio, StudioConfig
 
 
@@ -76,7 +76,7 @@ def served(
     with _listening(0) as listener:
         port = listener.getsockname()[1]
         app = Guard(make_app(studio), token=token, port=port, largest=largest)
-        server = PageServer(app, announce=lambda: None)
+        server = make_server(app)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
         thread.start()
         try:

@@ -12,13 +12,11 @@ import math
 import os
 import re
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from functools import lru_cache, partial
 from pathlib import Path, PurePosixPath
 from typing import Any
-
-import soundfile
 
 from avmsf._utils.files import copy_whole, write_whole
 from avmsf._utils.processes import write_lock
@@ -38,7 +36,6 @@ from avmsf.capture.table import (
     parse_row,
     read_cells,
     read_rows,
-    valid_rows,
 )
 from avmsf.errors import AvmsfError, CaptureError
 from avmsf.pipeline.config import CACHE
@@ -166,21 +163,17 @@ class CaptureEditor:
         return settings_of(self.folder)
 
     def describe(self) -> dict[str, Any]:
-        """Return all impacts with their reports of `avmsf check`, and the problems of the whole capture."""
-        settings, table = self.settings, ImpactTable(self.folder)
-        impacts = [self._described(index, row, settings) for index, row in enumerate(table.rows)]
-        problems: list[str] = []
-        ready = False
+        """Return all impacts, and the problems of the whole capture as `avmsf check` finds them."""
+        impacts, problems, ready = self.impacts(), list[str](), False
         if len(impacts) >= 2:
-            report = check(self.folder, settings)
+            report = check(self.folder, self.settings)
             problems, ready = list(report.problems), report.readable and all(each["readable"] for each in impacts)
         return {"folder": str(self.folder), "strikes": impacts, "problems": problems, "ready": ready}
 
-    def impacts(self) -> list[Impact]:
-        """Return the impacts that are valid and whose recordings are in the folder, in the order of the table."""
-        valid = valid_rows(ImpactTable(self.folder).rows, self.settings)
-        found = ((self.folder / impact.file, impact) for impact in valid)
-        return [impact for path, impact in found if path.is_file() and path.resolve().is_relative_to(self.folder)]
+    def impacts(self) -> list[dict[str, Any]]:
+        """Return all impacts with their reports of `avmsf check`; only those that can be used have a digest."""
+        settings = self.settings
+        return [self._described(index, row, settings) for index, row in enumerate(ImpactTable(self.folder).rows)]
 
     def check(self, content: bytes) -> dict[str, Any]:
         """Return the report on a recording, without writing it. Raises CaptureError for what cannot be used."""
@@ -194,8 +187,7 @@ class CaptureEditor:
         """
         with self._lock():
             settings, table = self.settings, ImpactTable(self.folder)
-            for index, row in enumerate(table.rows):
-                added = self._described(index, row, settings)
+            for added in self.impacts():
                 # Contacts are equal but for the conversion of units.
                 if added["digest"] == _digest(content) and math.dist(added["contact"], impact.contact) < 1e-9:
                     return added
@@ -265,7 +257,10 @@ class CaptureEditor:
         try:
             impact = parse_row(row, settings)
             values |= {"file": impact.file, "contact": impact.contact, "direction": impact.direction}
-            path = self._readable(impact.file)
+            path = (self.folder / impact.file).resolve()
+            if not path.is_relative_to(self.folder):
+                wanted, advice = "a file in the capture folder", "copy it there"
+                raise CaptureError.expected(wanted, got="a link out of it", file=impact.file, advice=advice)
             state = path.stat() if os.path.exists(path) else None
             changing = state and (state.st_mtime_ns, state.st_size, state.st_ino)
             report, digest = _measured(path, changing, impact, settings)
@@ -275,9 +270,8 @@ class CaptureEditor:
 
     def _found(self, file: str) -> dict[str, Any]:
         """Return an impact as `describe` does. Raises RequestError (404)."""
-        table = ImpactTable(self.folder)
-        index = table.rows_of(file)[0]
-        return self._described(index, table.rows[index], self.settings)
+        index = ImpactTable(self.folder).rows_of(file)[0]
+        return self.impacts()[index]
 
     def _owned(self, file: str, match: str | None) -> tuple[ImpactTable, int]:
         """Return the table and the row of a recording to change.
@@ -301,14 +295,6 @@ class CaptureEditor:
             raise conflict("digest", wanted, match, got=got, advice=advice, file=file)
         return table, indices[0]
 
-    def _readable(self, file: str) -> Path:
-        """Return a recording's path. Raises RequestError (404) for a link out of the folder."""
-        path = (self.folder / file).resolve()
-        if not path.is_relative_to(self.folder):
-            got, wanted = "one outside", "a file in the capture folder"
-            raise bad_request("file", wanted, got=got, advice="copy it there", status=404, file=file)
-        return path
-
     def _check_usable(
         self, recording: Recording, *, newtons: float | None, replaced: str | None = None
     ) -> RecordingReport:
@@ -317,11 +303,7 @@ class CaptureEditor:
         `replaced` is the recording that it takes the place of.
         """
         report = _report(recording, self.settings, newtons=newtons)
-        rates = []
-        for impact in self.impacts():
-            with suppress(soundfile.LibsndfileError, OSError):
-                if impact.file != replaced:
-                    rates.append(float(soundfile.info(self.folder / impact.file).samplerate))
+        rates = [each["sample_rate"] for each in self.impacts() if each["digest"] and each["file"] != replaced]
         common_rate = max(set(rates), key=rates.count) if rates else recording.sample_rate
         if recording.sample_rate != common_rate:
             wanted = f"{common_rate:g} Hz, as in the {counted(len(rates), 'recording')} before"

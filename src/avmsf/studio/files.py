@@ -136,7 +136,8 @@ class Showcase:
         if path is not None:
             points = read_splats(path).centers
         else:
-            contacts = [] if self.editor is None else [impact.contact for impact in self.editor.impacts()]
+            impacts = [] if self.editor is None else self.editor.impacts()
+            contacts = [each["contact"] for each in impacts if each["digest"]]
             if len(contacts) >= 2:
                 points = FeatureField.from_contacts(torch.tensor(contacts, dtype=torch.float64)).points
             else:

@@ -26,14 +26,15 @@ _GONE = 499
 """Response to a page that has disconnected."""
 
 
-def make_app(studio: Studio) -> Starlette:
-    """Return the application of a studio, which begins and ends with it."""
+def make_app(studio: Studio, announce: Callable[[], None] = lambda: None) -> Starlette:
+    """Return the application of a studio, which begins and ends with it; `announce` is called once it has begun."""
     html = (PAGE / "index.html").read_text(encoding="utf-8")
     policy = {"content-security-policy": policy_of(html)}
 
     @asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
         await studio.begin()
+        announce()
         try:
             yield
         finally:

@@ -28,19 +28,10 @@ _MAX_CLOSING_SECONDS = 1
 """How long a running response may take when the server ends."""
 
 
-class PageServer(uvicorn.Server):
-    """Calls `announce` once the server responds."""
-
-    def __init__(self, app: ASGIApp, announce: Callable[[], None]) -> None:
-        silent: Any = {"log_level": "critical", "access_log": False, "server_header": False}
-        super().__init__(uvicorn.Config(app, ws="none", timeout_graceful_shutdown=_MAX_CLOSING_SECONDS, **silent))
-        self.announce = announce
-
-    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Begin to listen."""
-        await super().startup(sockets)
-        if not self.should_exit:
-            self.announce()
+def make_server(app: ASGIApp) -> uvicorn.Server:
+    """Return a server that prints nothing."""
+    silent: Any = {"log_level": "critical", "access_log": False, "server_header": False}
+    return uvicorn.Server(uvicorn.Config(app, ws="none", timeout_graceful_shutdown=_MAX_CLOSING_SECONDS, **silent))
 
 
 def serve(
@@ -60,7 +51,6 @@ def serve(
         number, token = listener.getsockname()[1], new_token()
         address = f"http://{_HOME}:{number}/{token}/"
         studio = Studio(opened, Path(folder), config)
-        guarded = Guard(make_app(studio), token=token, port=number)
 
         def announce() -> None:
             log(address)
@@ -69,7 +59,7 @@ def serve(
                 with suppress(OSError):
                     _open_browser(address, Path(folder))
 
-        server = PageServer(guarded, announce)
+        server = make_server(Guard(make_app(studio, announce), token=token, port=number))
         before = signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
             # The server has ended in order before it passes Ctrl-C on.

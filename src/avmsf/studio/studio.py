@@ -140,7 +140,7 @@ class Studio:
     async def reconstruct(self) -> dict[str, Any]:
         """Start to fit a field to the capture, which becomes the current one."""
         editor = self.require_editor()
-        if not await self.threads.run("read", editor.impacts):
+        if not any(impact["digest"] for impact in await self.threads.run("read", editor.impacts)):
             raise bad_request("recordings", "one or more", 0, advice="record impacts first", status=409)
         # One output is enough: the next job starts when this one's field is open.
         output = str(self.folder / "reconstructed")
