@@ -132,7 +132,6 @@ def test_two_tabs_never_overwrite_one_another(tmp_path: Path) -> None:
         lambda: session.edit(1, Sliders(pitch=3.0)),
         lambda: session.undo(1),
         lambda: session.save(1, "late"),
-        lambda: session.lead(1, plate_field(), ()),
     ):
         with raises(RequestError, name="base", value=1) as refused:
             late()
@@ -221,16 +220,6 @@ def test_a_name_is_as_long_as_files_names_may_be(tmp_path: Path) -> None:
     with raises(RequestError, name="name", value=201) as refused:
         session.save(2, "音" * 67)
     assert refused.value.status == 400
-
-
-def test_a_field_that_is_not_heard_is_kept_under_a_free_name(tmp_path: Path) -> None:
-    session, shown = opened(tmp_path)
-    (tmp_path / "plate led.safetensors").write_text("precious")
-    names = [session.keep(plate_field(), "plate led").name for _ in range(2)]
-    assert names == ["plate led 2.safetensors", "plate led 3.safetensors"]
-    assert same(load(tmp_path / names[1]), plate_field())
-    assert (tmp_path / "plate led.safetensors").read_text() == "precious"
-    assert len(shown) == 1
 
 
 def test_before_there_is_a_field_nothing_can_be_edited(tmp_path: Path) -> None:

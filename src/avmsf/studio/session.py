@@ -7,7 +7,6 @@ message. Revision numbers only increase; the number of an undone revision is not
 import os
 import re
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import RLock
@@ -25,7 +24,6 @@ _DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 """Names that are no files on Windows, where a capture may be opened next."""
 _MAX_NAME_BYTES = 200
 """Files' names have 255 at most, of which the ending and what a half-written file is called need some."""
-_MAX_COPIES = 1000
 _MAX_UNDONE = 100
 """Maximum number of undo steps."""
 
@@ -89,10 +87,9 @@ class Session:
             field, remarks = sliders.apply(self._current.ground or self._current.require_field())
             return self._remember(replace(self._current, sliders=sliders, field=field, remarks=tuple(remarks)))
 
-    def lead(self, base: int, field: SoundField, remarks: tuple[str, ...]) -> Revision:
-        """Take in what a descent has made of revision `base`; sliders are relative to it from then on."""
+    def lead(self, field: SoundField, remarks: tuple[str, ...]) -> Revision:
+        """Take in what a guided edit has made; sliders are relative to it from then on."""
         with self._lock:
-            self.check_current(base)
             return self._remember(replace(self._current, ground=field, sliders=REST, field=field, remarks=remarks))
 
     def undo(self, base: int) -> Revision:
@@ -122,16 +119,6 @@ class Session:
                 # What is answered by an error was not done, so that it can be asked for again.
                 path.unlink(missing_ok=True)
                 raise
-
-    def keep(self, field: SoundField, stem: str) -> Path:
-        """Write a field that is not the current one to a new file of the folder: `stem`, with a number if it exists."""
-        for name in (stem, *(f"{stem} {number}" for number in range(2, _MAX_COPIES))):
-            with suppress(RequestError):
-                path = self.home / f"{name}{SUFFIX}"
-                _write_new(field, path)
-                return path
-        wanted = f"fewer than {_MAX_COPIES} files called {stem}"
-        raise StudioError.expected(wanted, got="more", file=self.home, name=stem, advice="move them away")
 
     def check_current(self, base: int) -> None:
         """Raise RequestError (409), with the current revision, if `base` is another one."""

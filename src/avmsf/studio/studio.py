@@ -24,8 +24,6 @@ from avmsf.studio.session import Revision, Session
 
 _MAKING = "reconstruct the object from its images"
 """The kind of job that has something to click for its result."""
-_MAX_STEM = 50
-"""Characters of the opened name that are part of the name of a saved field."""
 
 
 @dataclass(frozen=True)
@@ -191,21 +189,14 @@ class Studio:
         return {**result, **self._changed(current)}
 
     async def _take_led(self, base: int, result: Event) -> Event:
-        def take() -> Event:
+        def take() -> Revision:
             led = load(result["output"])
-            try:
-                revision = self.session.lead(base, led, tuple(remarks(led.origin.report[EDITS][-1:], led)))
-            except RequestError:
-                # Minutes of work; what the other tab has done since is not to be overwritten either.
-                path = self.session.keep(led, f"{self.opened.name[:_MAX_STEM]} edited")
-                note = f"the field was changed during the guided edit, whose result was saved to {path}: open that file"
-                now = self.session.current
-                return {"file": str(path), "revision": now.number, "remarks": [note, *now.remarks]}
-            return {"revision": revision.number, "remarks": list(revision.remarks)}
+            notes = remarks(led.origin.report[EDITS][-1:], led)
+            if base != self.session.current.number:
+                notes.append("the field was changed while the guided edit ran: undo takes back the guided edit alone")
+            return self.session.lead(led, tuple(notes))
 
-        done = await self.threads.run("compute", take)
-        self.searches.prepare_ahead()
-        return done
+        return self._changed(await self.threads.run("compute", take))
 
     def _changed(self, revision: Revision) -> dict[str, Any]:
         """Return what the page gets for a new revision."""

@@ -29,9 +29,7 @@ export function leadGroup(studio, changes, hold) {
     if (last.error) say(last.error, { name: "edit", bad: true });
     else if (last.revision !== undefined) {
       const shown = await changes.queue(() => changes.show(last, { sliders: true }));
-      // What another tab has changed meanwhile is heard; then the led sound is in a file, which the first remark names.
-      if (last.file !== undefined) say(last.remarks[0], { name: "led" });
-      else if (shown) {
+      if (shown) {
         studio.strikeAgain();
         say(summaryOf(steps), { name: "led" });
       }
