@@ -62,7 +62,7 @@ TENSORS = {"points": torch.zeros(20, 3), "features": torch.zeros(20, 5)}
     ("changes", "name", "value"),
     [
         ({"format": 2, "version": "9.9"}, "format", 2),
-        ({"sizes": {"points": 20}}, "header", None),
+        ({"sizes": {"points": 20}}, "dim", None),
         ({"sizes": {"points": 20, "dim": 0}}, "header", None),
         ({"sizes": {"points": 20, "dim": True}}, "header", None),
         ({"encoder": 3}, "header", None),

@@ -47,10 +47,10 @@ def test_files_that_hold_no_modes(modes, tmp_path):
 @pytest.mark.parametrize(
     ("name", "change"),
     [
-        ("modes", lambda record, tensors: record.pop("mass")),
+        ("mass", lambda record, tensors: record.pop("mass")),
         ("stiffness", lambda record, tensors: tensors.update(stiffness=tensors["stiffness"][:, :2].contiguous())),
         ("poisson", lambda record, tensors: tensors.pop("poisson")),
-        ("modes", lambda record, tensors: tensors.pop("nodes")),
+        ("nodes", lambda record, tensors: tensors.pop("nodes")),
         ("shapes", lambda record, tensors: tensors.update(shapes=tensors["shapes"].float())),
         ("modes", lambda record, tensors: tensors["triangles"].fill_(-1)),
         ("modes", lambda record, tensors: tensors["triangles"].fill_(10_000)),

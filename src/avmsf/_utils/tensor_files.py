@@ -11,69 +11,54 @@ from safetensors.torch import save
 from torch import Tensor
 
 from avmsf._utils.files import write_whole
-from avmsf._utils.headers import read_header_text, unreadable
-from avmsf.errors import AvmsfError, FieldFileError
+from avmsf._utils.headers import FileKind
+from avmsf.errors import AvmsfError
 
 
-def read_tensors(
-    path: Path, key: str, *, what: str, advice: str, raising: type[AvmsfError]
-) -> tuple[str, dict[str, Tensor]]:
-    """Return the text under `key` in the metadata of a safetensors file, and its tensors.
+def read_tensors(path: Path, kind: FileKind) -> tuple[str, dict[str, Tensor]]:
+    """Return the text of a safetensors file, and its tensors.
 
-    Raises `raising` for a file that is missing, damaged or of another kind: `what` it should be, and the `advice`.
+    Raises the kind's error for a file that is missing, damaged or of another kind.
     """
-    text = read_header_text(path, key, what=what, advice=advice, raising=raising)
+    text = kind.read_text(path)
     try:
         with safe_open(path, framework="pt") as file:
             # Clones, for what the file maps into memory would change with it.
             return text, {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
-        raise unreadable(path, what=what, advice=advice, raising=raising) from error
+        raise kind.unreadable(path) from error
 
 
-def write_tensors(
-    path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str], *, raising: type[AvmsfError] = FieldFileError
-) -> None:
-    """Write a safetensors file, whole or not at all. Raises `raising`."""
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: str, kind: FileKind) -> None:
+    """Write a safetensors file, whole or not at all. Raises the kind's error."""
     # Safetensors refuses tensors that share memory.
     copies = {name: each.detach().cpu().clone(memory_format=torch.contiguous_format) for name, each in tensors.items()}
-    content = save(copies, metadata)
-    write_whole(path, lambda place: place.write_bytes(content), raising=raising)
+    content = save(copies, {kind.key: text})
+    write_whole(path, lambda place: place.write_bytes(content), raising=kind.error)
 
 
-def expect_tensors(
-    tensors: Mapping[str, Tensor],
-    skeleton: Mapping[str, Tensor],
-    path: Path,
-    *,
-    advice: str,
-    raising: type[AvmsfError],
-) -> None:
-    """Raise `raising` unless these are tensors of the names, shapes and types of a skeleton, all of finite numbers.
+def expect_tensors(tensors: Mapping[str, Tensor], skeleton: Mapping[str, Tensor], path: Path, kind: FileKind) -> None:
+    """Raise the kind's error unless these are tensors of a skeleton's names, shapes and types, of finite numbers.
 
     The skeleton's are on the device `meta`, where they take no memory.
     """
     missing, unexpected = sorted(skeleton.keys() - tensors.keys()), sorted(tensors.keys() - skeleton.keys())
+
+    def error(wanted: str, got: str, name: str, value: Any) -> AvmsfError:
+        return kind.error.expected(wanted, value, got=got, file=path, name=name, advice=kind.advice)
+
     if missing or unexpected:
         got = f"missing {', '.join(missing) or 'none'}; unexpected {', '.join(unexpected) or 'none'}"
-        raise raising.expected(
-            f"{len(skeleton)} tensors",
-            [missing, unexpected],
-            got=got,
-            file=path,
-            name=(missing or unexpected)[0],
-            advice=advice,
-        )
+        raise error(f"{len(skeleton)} tensors", got, (missing or unexpected)[0], [missing, unexpected])
     for name, tensor in tensors.items():
         wanted, found = (
             f"{str(each.dtype).removeprefix('torch.')}{list(each.shape)}" for each in (skeleton[name], tensor)
         )
         if wanted != found:
-            raise raising.expected(f"{name} as {wanted}", found, got=found, file=path, name=name, advice=advice)
+            raise error(f"{name} as {wanted}", found, name, found)
         if not bool(torch.isfinite(tensor).all()):
             low, high = (float(each) for each in tensor.aminmax())
-            got = f"{low:.3g} to {high:.3g}"
-            raise raising.expected(f"{name} to be finite", (low, high), got=got, file=path, name=name, advice=advice)
+            raise error(f"{name} to be finite", f"{low:.3g} to {high:.3g}", name, (low, high))
 
 
 def write_checkpoint(

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from avmsf._utils.headers import FileKind
 from avmsf._utils.tensor_files import read_tensors, write_tensors
 from avmsf.baselines.diffsound.renderer import DiffSound
 from avmsf.capture.impacts import Impacts
@@ -30,7 +31,9 @@ _FFT_SIZE = 4096
 """Samples of a Hann window at 44.1 and 48 kHz: its bins part modes some twenty hertz apart."""
 _POWER_FLOOR = 1e-6
 """Power over the loudest bin's below which differences do not count: -60 dB."""
-_MAP_KEY = "avmsf-contact-map"
+_MAP = FileKind(
+    "avmsf-contact-map", "the map of a contact", "delete the object's file to compute it again", EvaluationError
+)
 
 
 Sound = Float[Tensor, " samples"]
@@ -178,15 +181,14 @@ def write_map(path: Path, found: ContactMap, *, truth: Float[Tensor, " 3"]) -> N
     """Write a map, and the true contact (meters). Raises EvaluationError where that cannot be."""
     tensors = {"points": found.points, "distance": found.distance, "probability": found.probability, "truth": truth}
     energies = torch.tensor([found.explained_energy, found.modal_energy, found.null_energy], dtype=torch.float64)
-    write_tensors(path, {**tensors, "energies": energies}, {_MAP_KEY: "1"}, raising=EvaluationError)
+    write_tensors(path, {**tensors, "energies": energies}, "1", _MAP)
 
 
 def read_map(path: Path) -> tuple[ContactMap, Float[Tensor, " 3"]]:
     """Return a map that `write_map` wrote, and the true contact. Raises EvaluationError where there is none."""
-    advice = "delete the object's file to compute it again"
-    _, tensors = read_tensors(path, _MAP_KEY, what="the map of a contact", advice=advice, raising=EvaluationError)
+    _, tensors = read_tensors(path, _MAP)
     try:
         truth, energies = tensors.pop("truth"), tensors.pop("energies").tolist()
         return ContactMap(tensors["points"], tensors["distance"], tensors["probability"], *energies), truth
     except (KeyError, TypeError) as error:
-        raise EvaluationError.expected("the map of a contact", got=str(error), file=path, advice=advice) from error
+        raise _MAP.damaged(path, error) from error

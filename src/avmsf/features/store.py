@@ -3,21 +3,18 @@
 {"format": 1, "version": "0.1.0", "encoder": "descriptors", "sizes": {"points": 8192, "dim": 36}, "report": {...}}
 """
 
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from avmsf._utils.headers import FEATURES_KEY, parse_record, record_text
+from avmsf._utils.headers import FEATURES_KEY, FileKind
 from avmsf._utils.tensor_files import expect_tensors, read_tensors, write_tensors
 from avmsf.errors import SceneError
 from avmsf.features.feature_field import FeatureField
 
-FORMAT = 1
-"""Number of this format; it grows with every change that older versions could not read."""
-_ADVICE = "compute the features again"
+_KIND = FileKind(FEATURES_KEY, "a file of features", "compute the features again", SceneError, formats=(1,))
 
 
 def save_features(features: FeatureField, path: str | Path, *, report: dict[str, Any] | None = None) -> None:
@@ -29,15 +26,12 @@ def save_features(features: FeatureField, path: str | Path, *, report: dict[str,
     path = Path(path)
     tensors = {"points": features.points.float(), "features": features.features.float()}
     record = {
-        "format": FORMAT,
-        "version": version("avmsf"),
         "encoder": features.encoder,
         "sizes": {"points": features.features.shape[0], "dim": features.features.shape[1]},
         "report": report or {},
     }
-    expect_tensors(tensors, _skeleton(record), path, advice=_ADVICE, raising=SceneError)
-    text = record_text(record, path, name="report", raising=SceneError)
-    write_tensors(path, tensors, {FEATURES_KEY: text}, raising=SceneError)
+    expect_tensors(tensors, _skeleton(record), path, _KIND)
+    write_tensors(path, tensors, _KIND.to_text(record, path, name="report"), _KIND)
 
 
 def load_features(path: str | Path) -> FeatureField:
@@ -57,10 +51,9 @@ def read_report(path: str | Path) -> dict[str, Any]:
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Return the header's record and the tensors, both checked."""
-    what = "a file of features"
-    text, tensors = read_tensors(path, FEATURES_KEY, what=what, advice=_ADVICE, raising=SceneError)
-    record = parse_record(text, path, _check_record, formats=(FORMAT,), what=what, advice=_ADVICE, raising=SceneError)
-    expect_tensors(tensors, _skeleton(record), path, advice=_ADVICE, raising=SceneError)
+    text, tensors = read_tensors(path, _KIND)
+    record = _KIND.parse(text, path, _check_record)
+    expect_tensors(tensors, _skeleton(record), path, _KIND)
     return record, tensors
 
 

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from avmsf._utils.caching import keep_if_possible
+from avmsf._utils.headers import FileKind
 from avmsf._utils.tensor_files import expect_tensors, read_tensors, write_tensors
 from avmsf._utils.text import count_of, parse_json
 from avmsf.errors import SimulationError
@@ -23,7 +24,7 @@ from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.material import NOMINAL, Material
 from avmsf.fem.perturbation import Perturbations
 
-_KEY, _ADVICE = "avmsf_elastic", "compute them again"
+_KIND = FileKind("avmsf_elastic", "elastic modes", "compute them again", SimulationError)
 _PERTURBATIONS = ("stiffness", "mass", "poisson")
 
 
@@ -78,7 +79,7 @@ def save_modes(modes: ElasticModes, path: Path) -> None:
     if modes.perturbations is not None:
         tensors |= {name: torch.from_numpy(getattr(modes.perturbations, name)) for name in _PERTURBATIONS}
     header = json.dumps({"mass": modes.mass, "material": asdict(modes.material)}, allow_nan=False)
-    write_tensors(path, tensors, {_KEY: header}, raising=SimulationError)
+    write_tensors(path, tensors, header, _KIND)
 
 
 def load_modes(path: Path) -> ElasticModes:
@@ -87,7 +88,7 @@ def load_modes(path: Path) -> ElasticModes:
     Raises SimulationError for a file that is missing, cut short or of another kind, and where its tensors do not fit
     together.
     """
-    header, tensors = read_tensors(path, _KEY, what="elastic modes", advice=_ADVICE, raising=SimulationError)
+    header, tensors = read_tensors(path, _KIND)
     try:
         record = parse_json(header)
         sizes = {"nodes": len(tensors["nodes"]), "triangles": len(tensors["triangles"])}
@@ -96,14 +97,14 @@ def load_modes(path: Path) -> ElasticModes:
             modes, fields = len(tensors["frequency"]), len(tensors["stiffness"])
             table, both = torch.empty(modes, modes, dtype=torch.float64, device="meta"), (fields, modes, modes)
             expected |= {"poisson": table, "stiffness": table.expand(both), "mass": table.expand(both)}
-        expect_tensors(tensors, expected, path, advice=_ADVICE, raising=SimulationError)
+        expect_tensors(tensors, expected, path, _KIND)
         changes = None
         if "stiffness" in tensors:
             changes = Perturbations(*(tensors[name].numpy() for name in _PERTURBATIONS))
         material, mass = Material(**record["material"]), float(record["mass"])
         return replace(restored_modes(tensors, ""), material=material, mass=mass, perturbations=changes)
     except (ValueError, TypeError, KeyError) as error:
-        raise SimulationError.expected("elastic modes", repr(error), file=path, name="modes", advice=_ADVICE) from error
+        raise _KIND.damaged(path, error, name="modes") from error
 
 
 def modes_once(path: Path | None, compute: Callable[[], ElasticModes], *, log: Callable[[str], None]) -> ElasticModes:

@@ -15,7 +15,6 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +25,11 @@ from avmsf._utils.tensor_files import expect_tensors, read_tensors, write_tensor
 from avmsf._utils.text import RecordError, count_of, like, record_of
 from avmsf.capture.audio import HIGHEST_RATE, LOWEST_RATE, MAX_PEAK, MAX_SAMPLES
 from avmsf.capture.settings import CaptureSettings
-from avmsf.errors import FieldFileError
+from avmsf.errors import AvmsfError, FieldFileError
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.model import GainModel
 from avmsf.field.gains.scaled import FITTED, ScaledGains
-from avmsf.field.header import ADVICE, FORMAT, KEY, UNREADABLE, WHAT, damaged, record_of_text
+from avmsf.field.header import FIELD, record_of_text
 from avmsf.field.probable_body import ProbableBody
 from avmsf.field.quality import FieldQuality
 from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
@@ -48,7 +47,8 @@ _RENAMED_EDITS = {"recast": "change_material", "retune": "adjust_modes", "steer"
 """Kinds of edits that earlier versions wrote, and what they are called now."""
 _MATERIAL = {"name": "", **dict.fromkeys(("density", "young", "poisson", "alpha", "beta"), 1.0)}
 """What the entry of a material has, by example."""
-_SAVE_AGAIN = "fit and save the field again"
+_UNREADABLE = (ValueError, TypeError, KeyError, RuntimeError, AvmsfError)
+"""What a record of another form raises; RuntimeError: torch, of sizes beyond 2^63 and of damaged values."""
 
 
 def save(field: SoundField, path: str | Path) -> None:
@@ -59,17 +59,13 @@ def save(field: SoundField, path: str | Path) -> None:
     """
     path = Path(path)
     record, tensors = _record(field), _tensors(field)
-    try:
-        words = json.dumps(record, allow_nan=False)
-    except (TypeError, ValueError) as error:
-        wanted, got = "finite numbers, text, lists and dicts", f"others ({error})"
-        raise FieldFileError.expected(wanted, got=got, file=path, name="origin.report", advice="remove them") from error
+    words = FIELD.to_text(record, path, name="origin.report")
     try:
         skeleton, _ = _checked(json.loads(words))
-    except UNREADABLE as error:
-        raise damaged(path, error) from error
+    except _UNREADABLE as error:
+        raise FIELD.damaged(path, error) from error
     _expect_tensors(tensors, skeleton, path)
-    write_tensors(path, tensors, {KEY: words})
+    write_tensors(path, tensors, words, FIELD)
 
 
 def load(path: str | Path) -> SoundField:
@@ -79,7 +75,7 @@ def load(path: str | Path) -> SoundField:
     tensor is missing, unexpected, of another shape or dtype, or not finite.
     """
     path = Path(path)
-    words, tensors = read_tensors(path, KEY, what=WHAT, advice=ADVICE, raising=FieldFileError)
+    words, tensors = read_tensors(path, FIELD)
     record = record_of_text(words, path)
     try:
         skeleton, origin = _checked(record)
@@ -87,8 +83,8 @@ def load(path: str | Path) -> SoundField:
         gains = _KINDS[record["gains"]["kind"]].restore(record["gains"], _named(_GAINS, tensors))
     except FieldFileError:
         raise
-    except UNREADABLE as error:
-        raise damaged(path, error) from error
+    except _UNREADABLE as error:
+        raise FIELD.damaged(path, error) from error
     kept = record["alignment"]
     return SoundField(
         ModalBank(tensors["bank.frequency"], tensors["bank.damping"]),
@@ -105,7 +101,7 @@ def load(path: str | Path) -> SoundField:
 def _checked(record: Mapping[str, Any]) -> tuple[dict[str, Tensor], Origin]:
     """Return tensors as a field of this record has them, which take no memory, and the field's origin.
 
-    Raises one of `UNREADABLE`, also for sounds that no recording has.
+    Raises one of `_UNREADABLE`, also for sounds that no recording has.
     """
     sizes, gains, origin = (dict(like(record[name], {}, name)) for name in ("sizes", "gains", "origin"))
     rate, samples = like(record["sample_rate"], 1.0, "sample_rate"), count_of(record["samples"], "samples")
@@ -186,8 +182,6 @@ def _record(field: SoundField) -> dict[str, Any]:
     origin = {name: getattr(field.origin, name) for name in ("capture", "trained_on", "per_newton", "report")}
     recordings, alignment = field.residual.recordings, field.alignment
     return {
-        "format": FORMAT,
-        "version": version("avmsf"),
         "sample_rate": field.sample_rate,
         "samples": field.samples,
         "sizes": {
@@ -226,13 +220,13 @@ def _named(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 def _expect_tensors(tensors: dict[str, Tensor], skeleton: dict[str, Tensor], path: Path) -> None:
     """Compare names, shapes and dtypes with those of the skeleton, and the values with what they mean."""
-    expect_tensors(tensors, skeleton, path, advice=_SAVE_AGAIN, raising=FieldFileError)
+    expect_tensors(tensors, skeleton, path, FIELD)
     for name, highest in _MAX.items():
         low, high = (float(each) for each in tensors[name].aminmax()) if tensors[name].numel() else (1.0, 1.0)
         if low < 0.0 or (low == 0.0 and name in _POSITIVE):
             wanted = f"{name} to be {'positive' if name in _POSITIVE else 'not negative'}"
             got = f"{low:.3g} to {high:.3g}"
-            raise FieldFileError.expected(wanted, (low, high), got=got, file=path, name=name, advice=_SAVE_AGAIN)
+            raise FieldFileError.expected(wanted, (low, high), got=got, file=path, name=name, advice=FIELD.advice)
         if high > highest:
             wanted, got = f"{name} up to {highest:g}", f"{high:.3g}"
-            raise FieldFileError.expected(wanted, high, got=got, file=path, name=name, advice=_SAVE_AGAIN)
+            raise FieldFileError.expected(wanted, high, got=got, file=path, name=name, advice=FIELD.advice)

@@ -8,7 +8,6 @@ Format 1 is the same without `starts`; it is read too.
 
 import math
 from dataclasses import dataclass, field, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +15,21 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from avmsf._utils.headers import parse_record, record_text
+from avmsf._utils.headers import FileKind
 from avmsf._utils.tensor_files import expect_tensors, read_tensors, write_tensors
 from avmsf.errors import SimulationError
 
-FORMAT = 2
-"""Number of this format; it grows with every change that older versions could not read."""
 TRUTH = "truth.safetensors"
 """Its name in a capture folder."""
-_KEY = "avmsf_truth"
+_KIND = FileKind(
+    "avmsf_truth",
+    "the ground truth of a simulated object",
+    "make the object with avmsf simulate",
+    SimulationError,
+    formats=(1, 2),
+)
 _MODES, _TABLES = ("frequency", "damping"), ("gains", "quadrature")
 _OPTIONAL = ("contacts", "starts")
-_WHAT, _ADVICE = "the ground truth of a simulated object", "make the object with avmsf simulate"
 _RENAMED = {"modes": "elastic_modes", "contacts": "impacts"}
 """Settings of recipes in files of earlier versions, and their names now."""
 
@@ -82,10 +84,9 @@ def write_truth(truth: Truth, path: str | Path) -> None:
     path = Path(path)
     tensors = {name: getattr(truth, name) for name in (*_MODES, *_TABLES, *_OPTIONAL)}
     tensors = {name: tensor for name, tensor in tensors.items() if tensor is not None}
-    record = {"format": FORMAT, "version": version("avmsf"), "names": list(truth.names), "recipe": truth.recipe}
+    record = {"names": list(truth.names), "recipe": truth.recipe}
     _expect(tensors, record, path)
-    words = record_text(record, path, name="recipe", raising=SimulationError)
-    write_tensors(path, tensors, {_KEY: words}, raising=SimulationError)
+    write_tensors(path, tensors, _KIND.to_text(record, path, name="recipe"), _KIND)
 
 
 def read_truth(path: str | Path) -> Truth:
@@ -96,10 +97,8 @@ def read_truth(path: str | Path) -> Truth:
     """
     path = Path(path)
     path = path / TRUTH if path.is_dir() else path
-    words, tensors = read_tensors(path, _KEY, what=_WHAT, advice=_ADVICE, raising=SimulationError)
-    record = parse_record(
-        words, path, _check_record, formats=(1, FORMAT), what=_WHAT, advice=_ADVICE, raising=SimulationError
-    )
+    text, tensors = read_tensors(path, _KIND)
+    record = _KIND.parse(text, path, _check_record)
     _expect(tensors, record, path)
     recipe = {_RENAMED.get(name, name): value for name, value in record["recipe"].items()}
     return Truth(names=tuple(record["names"]), recipe=recipe, **tensors)
@@ -119,4 +118,4 @@ def _expect(tensors: dict[str, Tensor], record: dict[str, Any], path: Path) -> N
     sizes: dict[str, tuple[int, ...]] = dict.fromkeys(_MODES, (modes,)) | dict.fromkeys(_TABLES, (contacts, modes))
     sizes |= {name: size for name, size in (("contacts", (contacts, 3)), ("starts", (contacts,))) if name in tensors}
     skeleton = {name: torch.empty(size, dtype=torch.float64, device="meta") for name, size in sizes.items()}
-    expect_tensors(tensors, skeleton, path, advice=_ADVICE, raising=SimulationError)
+    expect_tensors(tensors, skeleton, path, _KIND)

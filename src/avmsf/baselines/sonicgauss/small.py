@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from avmsf._utils.headers import FileKind
 from avmsf._utils.tensor_files import read_tensors, write_tensors
 from avmsf._utils.text import record_of
 from avmsf.baselines.sonicgauss.conditioning import (
@@ -42,7 +43,7 @@ from avmsf.gaussians.points import farthest_points
 
 COMMAND = "python -m benchmarks baselines --parts sonicgauss-training --weights FILE"
 """What makes the weights."""
-_KEY, _WHAT = "sonicgauss-small", "the weights of the small SonicGauss"
+_KIND = FileKind("sonicgauss-small", "the weights of the small SonicGauss", f"make it: {COMMAND}", EvaluationError)
 TUNING = TrainingConfig(steps=150, batch=8, rate=5e-4, warmup=20)
 """Fine-tuning to one object, whatever its number of recordings: half a minute on one core. The published program takes
 80 rounds over the recordings in steps of two, at a rate of 1e-4, of weights that were trained for days."""
@@ -160,20 +161,18 @@ class SmallWeights:
         """Write one safetensors file. Raises EvaluationError where that cannot be."""
         tensors = _together(self.network, self.codec).state_dict()
         text = json.dumps({"config": asdict(self.network.config), "report": dict(self.report)})
-        write_tensors(path, tensors, {_KEY: text}, raising=EvaluationError)
+        write_tensors(path, tensors, text, _KIND)
 
     @classmethod
     def read(cls, path: Path) -> "SmallWeights":
         """Read what `write` has written. Raises EvaluationError for anything else, and names a tensor that differs."""
-        text, tensors = read_tensors(path, _KEY, what=_WHAT, advice=f"make it: {COMMAND}", raising=EvaluationError)
+        text, tensors = read_tensors(path, _KIND)
         try:
             content = json.loads(text)
             network = SmallSonicGauss(record_of(SmallConfig(), content["config"], "config"))
             report = dict(content["report"])
         except (ValueError, TypeError, KeyError, RuntimeError) as error:
-            raise EvaluationError(
-                f"{path}: expected {_WHAT}, got another description ({error}); {COMMAND}", file=path, name=_KEY
-            ) from error
+            raise _KIND.damaged(path, error, name=_KIND.key) from error
         codec = PatchCodec()
         load_tensors(_together(network, codec), tensors, path, "copy the file again")
         return cls(network.eval(), codec, report)

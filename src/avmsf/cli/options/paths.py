@@ -163,4 +163,4 @@ def kind_of(path: Path) -> FileKind | None:
         return None
     if FEATURES_KEY in entries:
         return "features"
-    return "a sound field" if field_header.KEY in entries else None
+    return "a sound field" if field_header.FIELD.key in entries else None

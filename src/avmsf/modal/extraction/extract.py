@@ -17,10 +17,11 @@ from torch import Tensor
 
 from avmsf._utils.arrays import short_repr
 from avmsf._utils.caching import keep_if_possible, source_digest
+from avmsf._utils.headers import FileKind
 from avmsf._utils.tensor_files import read_tensors, write_tensors
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import ExtractionError
+from avmsf.errors import ExtractionError, FieldFileError
 from avmsf.modal.extraction.alignment import Alignment, align, recording_keys
 from avmsf.modal.extraction.esprit import SHORTEST
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder, lowest_frequency, noise_bins
@@ -29,7 +30,7 @@ from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual, estimate_residual
 from avmsf.modal.synthesis import synthesize
 
-_KEY = "avmsf-modes"
+_KIND = FileKind("avmsf-modes", "modes", "find them again", FieldFileError)
 _ALIGNMENT = "alignment."
 
 
@@ -153,7 +154,7 @@ def extract_once(train: Impacts, method: ModeFinder, path: Path, *, needed: bool
         tensors |= {_ALIGNMENT + name: each for name, each in found.alignment.tensors().items()}
 
     def write() -> None:
-        write_tensors(path, tensors, {_KEY: digest})
+        write_tensors(path, tensors, digest, _KIND)
 
     if needed:
         write()
@@ -164,7 +165,7 @@ def extract_once(train: Impacts, method: ModeFinder, path: Path, *, needed: bool
 
 def _read(path: Path, digest: str, train: Impacts) -> Extraction | None:
     try:
-        found, read = read_tensors(path, _KEY, what="modes", advice="find them again", raising=ExtractionError)
+        found, read = read_tensors(path, _KIND)
         if found != digest:
             return None
         kept = {name.removeprefix(_ALIGNMENT): each for name, each in read.items() if name.startswith(_ALIGNMENT)}
@@ -175,7 +176,7 @@ def _read(path: Path, digest: str, train: Impacts) -> Extraction | None:
             read["quadrature"],
             Alignment.restore(kept, train.names, recording_keys(train)) if kept else None,
         )
-    except (ExtractionError, KeyError):
+    except (FieldFileError, KeyError):
         return None
 
 
