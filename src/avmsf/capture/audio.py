@@ -4,6 +4,7 @@ import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import soundfile
@@ -59,12 +60,15 @@ class Recording:
         """Seconds, as recorded."""
         return self.frames / self.sample_rate
 
+    def error(self, wanted: str, value: Any, *, name: str, got: str | None = None, advice: str = "") -> CaptureError:
+        """Return an error about this recording."""
+        return CaptureError.expected(wanted, value, got=got, file=self.name, name=name, advice=advice)
+
     def channel(self, number: int) -> Float64[np.ndarray, " frames"]:
         """Return one channel, counted from 1 as sound editors count them; `CaptureError` where there is none."""
         if not 1 <= number <= len(self.channels):
-            wanted = f"a channel from 1 to {len(self.channels)}"
             advice = "correct response_channel or force_channel in capture.toml"
-            raise CaptureError.expected(wanted, number, file=self.name, name="channel", advice=advice)
+            raise self.error(f"a channel from 1 to {len(self.channels)}", number, name="channel", advice=advice)
         return self.channels[number - 1]
 
     def response_channel(self, number: int | None = None, *, force_channel: int | None = None) -> int:
@@ -81,14 +85,14 @@ class Recording:
         levels = {each: float(np.std(self.channels[each - 1])) for each in range(1, count + 1) if each != force_channel}
         if not levels:
             got, advice = "only the force channel", "record both, or remove force_channel from capture.toml"
-            raise CaptureError.expected(wanted, 0, got=got, file=self.name, name=key, advice=advice)
+            raise self.error(wanted, 0, got=got, name=key, advice=advice)
         loudest = max(levels, key=levels.__getitem__)
         if not all(self._agree(loudest, each) for each in levels if each != loudest):
             got = f"{count} different ones"
             advice = (
                 "write response_channel, counted from 1, in capture.toml (`avmsf check` proposes one), or save as mono"
             )
-            raise CaptureError.expected(wanted, count, got=got, file=self.name, name=key, advice=advice)
+            raise self.error(wanted, count, got=got, name=key, advice=advice)
         return next(each for each, level in levels.items() if level >= MIN_CHANNEL_LEVEL * levels[loudest])
 
     def response(
@@ -104,8 +108,6 @@ class Recording:
         What is left of it then lies 40 dB down. Two microphones, or a sample's delay, leave far more.
         """
         first, second = (self.channels[number - 1] for number in (reference, other))
-        if np.array_equal(first, second):
-            return True
         first, second = first - first.mean(), second - second.mean()
         power = float(first @ first)
         rest = second - (float(first @ second) / power if power else 0.0) * first

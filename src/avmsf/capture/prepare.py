@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import scipy
@@ -12,7 +11,6 @@ from scipy.fft import irfft, next_fast_len, rfft
 from avmsf.capture.audio import HIGHEST_RATE, LOWEST_RATE, MAX_PEAK, MIN_PEAK, Recording, refuse_silence
 from avmsf.capture.onset import SECONDS_BEFORE, Pulse, find_onset, find_pulse
 from avmsf.capture.settings import CaptureSettings
-from avmsf.errors import CaptureError
 
 MIN_MARGIN = 16
 """Samples: an onset found by a threshold in the sound is off by one to three samples on measured objects, and the
@@ -49,13 +47,10 @@ def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float |
     Raises `CaptureError` for rates outside 100 Hz to 192 kHz, silence, peaks outside `MIN_PEAK` to `MAX_PEAK`, and
     normalizations that lack their force.
     """
-    played, refused = (
-        recording.sample_rate * settings.playback_speed,
-        partial(CaptureError.expected, file=recording.name),
-    )
+    played = recording.sample_rate * settings.playback_speed
     if not LOWEST_RATE <= played <= HIGHEST_RATE:
         wanted = f"a sample rate of {LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz (the file's rate times playback_speed)"
-        raise refused(wanted, played, got=f"{played:g} Hz", name="sample_rate", advice="export it at another rate")
+        raise recording.error(wanted, played, name="sample_rate", advice="export it at another rate")
     sound = recording.response(settings.response_channel, force_channel=settings.force_channel)
     refuse_silence(sound, recording.name)
     _check_length_and_peak(sound, recording)
@@ -65,7 +60,7 @@ def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float |
         force = recording.channel(settings.force_channel)
         if np.ptp(force) == 0:
             wanted, advice = "a force in the hammer's channel", "choose another one, or remove the recording"
-            raise refused(wanted, settings.force_channel, got="silence", name="force_channel", advice=advice)
+            raise recording.error(wanted, settings.force_channel, got="silence", name="force_channel", advice=advice)
         pulse = find_pulse(force)
         onset = pulse.start
         if newtons is None:
@@ -77,7 +72,7 @@ def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float |
         manner = "none" if newtons is None else "peak"
     if manner == "peak" and newtons is None:
         wanted, advice = 'a force for normalize = "peak"', "give force_newtons in impacts.csv, or a force_channel"
-        raise refused(wanted, "peak", got="none", name="normalize", advice=advice)
+        raise recording.error(wanted, "peak", got="none", name="normalize", advice=advice)
     if manner == "deconvolve" and pulse is not None:
         before, kept = deconvolve(sound, force, pulse=pulse, regularization=settings.regularization)
     else:
@@ -107,11 +102,8 @@ def remove_rumble(
         return sound
     lowest, half = recording.sample_rate / len(sound), recording.sample_rate / 2
     if not lowest <= highpass < half:
-        below = f"below {half:g} Hz, half the sample rate"
-        above = f"of 0, or of at least {lowest:.3g} Hz, one period in the recording"
-        wanted, got = f"a highpass {above if highpass < lowest else below}", f"{highpass:g} Hz"
-        advice = "change it in capture.toml"
-        raise CaptureError.expected(wanted, highpass, got=got, file=recording.name, name="highpass", advice=advice)
+        wanted = f"a highpass of 0, or {lowest:.3g} (one period in the recording) to {half:g} Hz (half its rate)"
+        raise recording.error(wanted, highpass, name="highpass", advice="change it in capture.toml")
     sections = scipy.signal.butter(4, highpass, "highpass", fs=recording.sample_rate, output="sos")
     filtered: Float64[np.ndarray, " frames"] = scipy.signal.sosfiltfilt(sections, sound)
     return filtered
@@ -134,13 +126,14 @@ def _check_length_and_peak(sound: Float64[np.ndarray, " samples"], recording: Re
     """Raise `CaptureError` for less than `shortest_allowed`, and for samples that float32 cannot compute with."""
     least, count, peak = shortest_allowed(recording.sample_rate), len(sound), float(np.abs(sound).max(initial=0.0))
     if count < least:
-        got = f"{count} ({count / recording.sample_rate * 1e3:.3g} ms)"
-        wanted, advice = f"at least {least} samples after the onset", "record it again, or remove its row"
-        raise CaptureError.expected(wanted, count, got=got, file=recording.name, name="samples", advice=advice)
+        wanted = f"at least {least} samples ({least / recording.sample_rate * 1e3:.3g} ms) after the onset"
+        raise recording.error(wanted, count, name="samples", advice="record it again, or remove its row")
     if not MIN_PEAK <= peak <= MAX_PEAK:
-        wanted, got = f"a peak of {MIN_PEAK:g} to {MAX_PEAK:g}", f"{peak:.3g}"
-        advice = "export it again, or check the force that it is divided by"
-        raise CaptureError.expected(wanted, peak, got=got, file=recording.name, name="peak", advice=advice)
+        wanted, advice = (
+            f"a peak of {MIN_PEAK:g} to {MAX_PEAK:g}",
+            "export it again, or check the force it is divided by",
+        )
+        raise recording.error(wanted, peak, got=f"{peak:.3g}", name="peak", advice=advice)
 
 
 def deconvolve(
