@@ -9,7 +9,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from avmsf.capture import CaptureSettings
-from avmsf.capture.placement import FACTORS, Mistake, check_placement
+from avmsf.capture.placement import FACTORS, FrameMismatch, check_placement
 from avmsf.capture.table import parse_row, read_rows
 from avmsf.errors import CaptureError
 from avmsf.mesh import Surface, read_surface
@@ -39,7 +39,7 @@ def test_contacts_on_the_surface_pass() -> None:
     placement = check_placement(CONTACTS, CLOUD)
     assert placement.on_surface
     assert placement.describe() == ""
-    assert placement.mistake is None
+    assert placement.mismatch is None
     # Points of a cloud of 6000 on .15 m^2 lie 5 mm apart.
     assert float(placement.distances.max()) < 0.01
 
@@ -55,9 +55,9 @@ def test_distances_are_meters_to_the_nearest_point() -> None:
 @pytest.mark.parametrize("factor", [factor for factor in FACTORS if factor < 1 or factor > 9])
 def test_every_ratio_of_units_is_found_whichever_of_the_two_it_befell(factor: float) -> None:
     placement = check_placement(CONTACTS, CLOUD * factor)
-    assert placement.mistake is not None
-    assert placement.mistake.factor == pytest.approx(factor)
-    assert placement.mistake.unit_only
+    assert placement.mismatch is not None
+    assert placement.mismatch.factor == pytest.approx(factor)
+    assert placement.mismatch.unit_only
 
 
 def test_a_surface_in_millimeters_is_told_even_if_all_contacts_lie_near_one_of_its_corners() -> None:
@@ -94,14 +94,14 @@ def test_what_befell_all_contacts_is_named_with_its_undoing(
 ) -> None:
     contacts = (CONTACTS - torch.tensor(shift, dtype=torch.float64)) @ axes / factor
     placement = check_placement(contacts, CLOUD)
-    mistake = placement.mistake
-    assert mistake is not None
+    mismatch = placement.mismatch
+    assert mismatch is not None
     # Units are exact, another scale is fitted.
-    assert mistake.factor == pytest.approx(factor, rel=1e-9 if factor <= 1 else 0.02)
-    assert torch.equal(mistake.axes, axes)
-    assert mistake.unit_only == (axes is EYE and shift is HERE)
+    assert mismatch.factor == pytest.approx(factor, rel=1e-9 if factor <= 1 else 0.02)
+    assert torch.equal(mismatch.axes, axes)
+    assert mismatch.unit_only == (axes is EYE and shift is HERE)
     # A few spacings of the points on an object .43 m across.
-    assert float((mistake.undo(contacts) - CONTACTS).norm(dim=1).mean()) < 0.01
+    assert float((mismatch.undo(contacts) - CONTACTS).norm(dim=1).mean()) < 0.01
     assert placement.misplaced == misplaced
     assert words in placement.describe()
     assert "row" not in placement.describe()
@@ -116,10 +116,10 @@ def test_other_names_of_the_axes_are_undone() -> None:
             signs = torch.tensor([1.0 - 2 * (code >> axis & 1) for axis in range(3)], dtype=torch.float64)
             axes = torch.diag(signs) @ torch.eye(3, dtype=torch.float64)[list(order)]
             placement = check_placement(CONTACTS @ axes, CLOUD)
-            if placement.mistake is None:
+            if placement.mismatch is None:
                 missed += [] if placement.on_surface else [(order, code)]
             else:
-                assert torch.equal(placement.mistake.axes, axes)
+                assert torch.equal(placement.mismatch.axes, axes)
                 assert ("mirrored" in placement.describe()) == (float(torch.linalg.det(axes)) < 0)
     assert missed == []
 
@@ -127,14 +127,14 @@ def test_other_names_of_the_axes_are_undone() -> None:
 def test_contacts_that_are_measured_coarsely_are_no_mistake_of_all() -> None:
     noise = torch.randn(20, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     for part in (0.005, 0.01, 0.02):
-        assert check_placement(CONTACTS + part * 0.43 * noise, CLOUD).mistake is None
+        assert check_placement(CONTACTS + part * 0.43 * noise, CLOUD).mismatch is None
 
 
 def test_one_wrong_row_is_no_mistake_of_all() -> None:
     contacts = CONTACTS.clone()
     contacts[7] = contacts[7] + torch.tensor([0.0, 1.0, 0.0])
     placement = check_placement(contacts, CLOUD)
-    assert placement.mistake is None
+    assert placement.mismatch is None
     assert placement.off == (7,)
     assert "1 of 20 contacts" in placement.describe()
     assert placement.describe().endswith("check row 7")
@@ -150,8 +150,8 @@ def test_contacts_of_another_object_are_not_explained() -> None:
         contacts = 0.3 * torch.randn(12, 3, dtype=torch.float64, generator=generator)
         placement = check_placement(contacts, CLOUD)
         assert not placement.on_surface
-        explained += placement.mistake is not None
-        assert (placement.mistake is None) == ("in different frames" in placement.describe())
+        explained += placement.mismatch is not None
+        assert (placement.mismatch is None) == ("in different frames" in placement.describe())
     # 48 axes, 13 units and a shift explain a few random contacts now and then.
     assert explained <= 1
 
@@ -225,7 +225,7 @@ def test_what_a_file_states_goes_before_what_is_fitted_and_an_arbitrary_frame_is
     turn = torch.from_numpy(Rotation.from_euler("zyx", [28, 15, -40], degrees=True).as_matrix())
     shift = torch.tensor([0.3, 0.1, -0.2], dtype=torch.float64)
     moved = 2.9 * CLOUD @ turn.T + shift
-    stated = Mistake(2.9, turn, shift, stated="transforms.json (applied_scale = 2.9)")
+    stated = FrameMismatch(2.9, turn, shift, stated="transforms.json (applied_scale = 2.9)")
     for contacts in (CONTACTS, CONTACTS + 0.004 * torch.randn(CONTACTS.shape, dtype=torch.float64)):
         placement = check_placement(contacts, moved, stated=[stated])
         assert placement.misplaced

@@ -204,7 +204,7 @@ def wav_bytes(samples: Shaped[np.ndarray, "frames *channels"], rate: int) -> byt
     return memory.getvalue()
 
 
-def refuse_silence(sound: Float64[np.ndarray, " frames"], name: str) -> None:
+def check_not_silent(sound: Float64[np.ndarray, " frames"], name: str) -> None:
     """Raise `CaptureError` where every sample is the same."""
     if np.ptp(sound) == 0:
         got = f"silence (all {len(sound)} samples are {sound[0]:g})"

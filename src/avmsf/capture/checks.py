@@ -80,7 +80,7 @@ def check_surface(
     return surface, [CaptureWarning(f"{TABLE}: {found}", file=TABLE, row=worst, name="surface", value=farthest)]
 
 
-def expect_one_unit(folder: Path, settings: CaptureSettings) -> None:
+def check_one_unit(folder: Path, settings: CaptureSettings) -> None:
     """Raise `CaptureError` where a folder's surface and the contacts of its table are in different units.
 
     For callers that read only the surface. Rows, and tables, that cannot be read are skipped.
@@ -100,10 +100,10 @@ def fitting_units_of(placement: Placement, settings: CaptureSettings) -> dict[st
     the present one if it does, else the one that comes nearest to `USUAL_SIZE`. Empty where nothing is to change, or
     no units explain what is wrong.
     """
-    mistake = placement.mistake
-    if placement.mostly_off if mistake is None else not mistake.unit_only:
+    mismatch = placement.mismatch
+    if placement.mostly_off if mismatch is None else not mismatch.unit_only:
         return {}
-    ratio = settings.meters * (1.0 if mistake is None else mistake.factor) / settings.surface_meters
+    ratio = settings.meters * (1.0 if mismatch is None else mismatch.factor) / settings.surface_meters
     ranked = list[tuple[bool, bool, float, dict[str, str]]]()
     for unit, surface_unit in itertools.product(METRES, repeat=2):
         if math.isclose(METRES[unit] / METRES[surface_unit], ratio, rel_tol=1e-6):

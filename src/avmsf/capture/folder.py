@@ -25,13 +25,13 @@ from avmsf.capture.table import (
     REQUIRED,
     TABLE,
     Impact,
+    check_files_differ,
+    check_files_exist,
     fitting_units,
     in_folder,
     is_missing,
     parse_row,
     read_rows,
-    refuse_missing,
-    refuse_repeated_files,
 )
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.mesh.surface import Surface, write_surface
@@ -148,9 +148,9 @@ def _walk(folder: Path, settings: CaptureSettings, issues: Issues) -> tuple[Impa
         with issues.keep(row):
             parsed.append(parse_row(row, settings))
     with issues.keep():
-        refuse_repeated_files(parsed)
+        check_files_differ(parsed)
     with issues.keep():
-        refuse_missing(folder, parsed)
+        check_files_exist(folder, parsed)
     issues.warnings += check_contacts(parsed, settings)
     surface = None
     with issues.keep():

@@ -54,7 +54,7 @@ _BOUNDS = _Bounds()
 
 
 @dataclass(frozen=True, eq=False)
-class Mistake:
+class FrameMismatch:
     """What may have been done to all contacts, by how it is undone: x becomes `factor` * `axes` x + `shift`."""
 
     factor: float = 1.0
@@ -118,7 +118,7 @@ class Placement:
     """Diagonal of the contacts' bounding box, meters."""
     tolerance: float
     """Meters up to which a contact counts as on the surface: `TOLERANCE`, or more where the points are sparse."""
-    mistake: Mistake | None = None
+    mismatch: FrameMismatch | None = None
     """What would explain contacts off the surface; None where they lie on it, or nothing simple explains them."""
 
     @cached_property
@@ -140,7 +140,7 @@ class Placement:
     @property
     def on_surface(self) -> bool:
         """Whether all contacts lie on the surface and nothing says that they were meant elsewhere."""
-        return not self.off and not self.shrunken and self.mistake is None
+        return not self.off and not self.shrunken and self.mismatch is None
 
     @property
     def other_unit(self) -> bool:
@@ -150,29 +150,29 @@ class Placement:
         together say so.
         """
         many = self.mostly_off or (self.shrunken and len(self.distances) >= _BOUNDS.spot_contacts)
-        return self.mistake is not None and self.mistake.unit is not None and many
+        return self.mismatch is not None and self.mismatch.unit is not None and many
 
     @property
     def misplaced(self) -> bool:
         """Whether no shape can be used as it lies: turned, mirrored, of another size, or with most contacts off."""
-        mistake = self.mistake
+        mismatch = self.mismatch
         if float(self.distances.median()) > self.tolerance:
             return True
-        resized = mistake is not None and abs(math.log(mistake.factor)) > _BOUNDS.log_size
-        return mistake is not None and (mistake.turned or self.mostly_off or resized)
+        resized = mismatch is not None and abs(math.log(mismatch.factor)) > _BOUNDS.log_size
+        return mismatch is not None and (mismatch.turned or self.mostly_off or resized)
 
     def describe(self, names: Sequence[str] = (), *, what: str = "surface") -> str:
         """Return a message on the contacts off `what` there is, by these names or else by indices; "" for none."""
         if self.on_surface:
             return ""
         count, farthest = len(self.distances), float(self.distances.max())
-        few = self.mistake is None and not self.shrunken and 2 * len(self.off) < count
+        few = self.mismatch is None and not self.shrunken and 2 * len(self.off) < count
         which = f"{len(self.off)} of {count} contacts lie" if few else "the contacts lie"
         found = f"{which} up to {_length(farthest)} ({farthest / self.diagonal:.3g} object diagonals) off the {what}"
         if not self.off and self.shrunken:
             found = f"the contacts lie within {_length(self.spread)} on an object {_length(self.diagonal)} across"
-        if self.mistake is not None:
-            return f"{found}; {self.mistake}"
+        if self.mismatch is not None:
+            return f"{found}; {self.mismatch}"
         if few:
             shown = ", ".join(names[row] if names else f"row {row}" for row in self.off[:8])
             return f"{found}, the others on it; check {shown}{', …' * (len(self.off) > 8)}"
@@ -186,7 +186,7 @@ class Placement:
 
 
 def check_placement(
-    contacts: Float[Tensor, "contacts 3"], points: Float[Tensor, "points 3"], *, stated: Sequence[Mistake] = ()
+    contacts: Float[Tensor, "contacts 3"], points: Float[Tensor, "points 3"], *, stated: Sequence[FrameMismatch] = ()
 ) -> Placement:
     """Measure how far contacts lie from a surface given by its points, and seek the similarity that explains them best.
 
@@ -212,7 +212,7 @@ def check_placement(
         tolerance=max(TOLERANCE * diagonal, 2 * spacing),
     )
     search = _Search(tree, _some(places, _BOUNDS.max_contacts), placement, spacing=spacing)
-    return replace(placement, mistake=search.find(stated))
+    return replace(placement, mismatch=search.find(stated))
 
 
 def expect_placed(
@@ -228,7 +228,7 @@ def expect_placed(
     if not placement.misplaced:
         return
     advice = "Bring both into one frame, or use a gain model without elastic mode shapes"
-    if placement.mistake is not None and placement.mistake.unit_only and placement.other_unit:
+    if placement.mismatch is not None and placement.mismatch.unit_only and placement.other_unit:
         advice = "State both units, as unit and surface_unit in capture.toml do, or give both in meters"
     raise FitError(
         f"expected contacts on the surface for elastic mode shapes, but {placement.describe(names)}. {advice}",
@@ -247,13 +247,13 @@ class _Search:
         steps = math.ceil(math.log(widest / self.resolution, 1.5)) + 1
         self.deviations = np.geomspace(self.resolution, widest, steps)[:, None]
 
-    def find(self, stated: Sequence[Mistake]) -> Mistake | None:
+    def find(self, stated: Sequence[FrameMismatch]) -> FrameMismatch | None:
         """Return the best similarity; None where that changes nothing.
 
         What is `stated` goes first where it leaves most contacts near: what is fitted to few contacts and coarse points
         describes these better by chance.
         """
-        present, tolerance = self.nats(Mistake()), self.placement.tolerance
+        present, tolerance = self.nats(FrameMismatch()), self.placement.tolerance
         if present - len(self.contacts) * (math.log(self.resolution) + 0.5) < 1:
             return None
         for each in stated:
@@ -270,26 +270,26 @@ class _Search:
                 return replace(each, distance=far)
         return None
 
-    def distances(self, mistake: Mistake) -> Float[np.ndarray, " contacts"]:
-        return self.tree.query(mistake.undo(self.contacts).numpy())[0]
+    def distances(self, mismatch: FrameMismatch) -> Float[np.ndarray, " contacts"]:
+        return self.tree.query(mismatch.undo(self.contacts).numpy())[0]
 
-    def nats(self, mistake: Mistake) -> float:
+    def nats(self, mismatch: FrameMismatch) -> float:
         """Return the nats of the distances that a similarity leaves.
 
         Each is normal, with a standard deviation chosen for the similarity, or the contact is a mistake of its own and
         lies anywhere. Distances over the scale make what is shrunk no better than what it was.
         """
-        if not mistake.factor > 0:
+        if not mismatch.factor > 0:
             return math.inf
-        distances = np.maximum(self.distances(mistake), self.resolution)
-        spread, diagonal = mistake.factor * self.placement.spread, self.placement.diagonal
-        near = np.square(distances / self.deviations) / 2 + np.log(self.deviations / min(mistake.factor, 1.0))
+        distances = np.maximum(self.distances(mismatch), self.resolution)
+        spread, diagonal = mismatch.factor * self.placement.spread, self.placement.diagonal
+        near = np.square(distances / self.deviations) / 2 + np.log(self.deviations / min(mismatch.factor, 1.0))
         anywhere = math.log(max(diagonal, self.placement.spread)) + _BOUNDS.outlier_nats
         # Contacts within a spot of an object are as unlikely as the spot is small.
         spot = max(0.0, math.log(_BOUNDS.spot * diagonal / spread)) if spread else 0.0
         return float(np.minimum(near, anywhere).sum(axis=1).min()) + len(distances) * spot
 
-    def starts(self) -> Iterator[tuple[float, Mistake, bool, bool]]:
+    def starts(self) -> Iterator[tuple[float, FrameMismatch, bool, bool]]:
         """Yield similarities, the nats of their parameters, and whether their scale and their shift are fitted."""
         spread, diagonal, count = self.placement.spread, self.placement.diagonal, len(self.contacts)
         # What is symmetric but for errors of this size does not show which way it lies.
@@ -303,13 +303,13 @@ class _Search:
         for rarity, axes in _axes() if off and count >= _BOUNDS.axes_contacts else [(0.0, _IDENTITY)]:
             for (factor, scaled), shifted in itertools.product(scales, shifts):
                 # From box to box.
-                start = Mistake(factor, axes, (middle - factor * axes @ own) / 2 if shifted else _ORIGIN)
+                start = FrameMismatch(factor, axes, (middle - factor * axes @ own) / 2 if shifted else _ORIGIN)
                 # Nothing in meters takes two units.
                 units = 2 if scaled or (factor != 1 and start.unit is None) else int(factor != 1)
                 nats = rarity + units * math.log(len(FACTORS)) + (3 * shifted + scaled) * math.log(count)
                 yield nats, start, scaled, shifted
 
-    def fit(self, start: Mistake, scaled: bool, shifted: bool) -> Mistake:
+    def fit(self, start: FrameMismatch, scaled: bool, shifted: bool) -> FrameMismatch:
         """Return the similarity with the scale and the shift that iterated closest points find from a start."""
         found, source = start, self.contacts @ start.axes.T
         old = source.mean(0) if shifted else _ORIGIN

@@ -8,7 +8,7 @@ import scipy
 from jaxtyping import Float, Float64
 from scipy.fft import irfft, next_fast_len, rfft
 
-from avmsf.capture.audio import HIGHEST_RATE, LOWEST_RATE, MAX_PEAK, MIN_PEAK, Recording, refuse_silence
+from avmsf.capture.audio import HIGHEST_RATE, LOWEST_RATE, MAX_PEAK, MIN_PEAK, Recording, check_not_silent
 from avmsf.capture.onset import SECONDS_BEFORE, Pulse, find_onset, find_pulse
 from avmsf.capture.settings import CaptureSettings
 
@@ -52,7 +52,7 @@ def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float |
         wanted = f"a sample rate of {LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz (the file's rate times playback_speed)"
         raise recording.error(wanted, played, name="sample_rate", advice="export it at another rate")
     sound = recording.response(settings.response_channel, force_channel=settings.force_channel)
-    refuse_silence(sound, recording.name)
+    check_not_silent(sound, recording.name)
     _check_length_and_peak(sound, recording)
     sound = remove_rumble(sound, settings.highpass, recording)
     pulse, onset = None, 0

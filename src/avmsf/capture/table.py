@@ -204,12 +204,12 @@ def read_impacts(folder: Path, settings: CaptureSettings) -> tuple[list[Impact],
     with in_folder(folder):
         rows, remarks = read_rows(folder)
         impacts = [parse_row(row, settings) for row in rows]
-        refuse_repeated_files(impacts)
-        refuse_missing(folder, impacts)
+        check_files_differ(impacts)
+        check_files_exist(folder, impacts)
     return impacts, remarks
 
 
-def refuse_repeated_files(impacts: Sequence[Impact]) -> None:
+def check_files_differ(impacts: Sequence[Impact]) -> None:
     """Raise `CaptureError` where two rows name one file: one of the two contacts must be wrong."""
     lines: dict[str, int] = {}
     for impact in impacts:
@@ -219,7 +219,7 @@ def refuse_repeated_files(impacts: Sequence[Impact]) -> None:
         lines[impact.file] = impact.line
 
 
-def refuse_missing(folder: Path, impacts: Sequence[Impact]) -> None:
+def check_files_exist(folder: Path, impacts: Sequence[Impact]) -> None:
     """Raise one `CaptureError` where recordings are missing; for a single one with the file that may be meant."""
     files = [impact.file for impact in impacts]
     missing = [file for file in files if is_missing(folder / file)]

@@ -14,7 +14,7 @@ from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf._utils.files import copy_whole, write_whole
 from avmsf._utils.text import counted, format_number
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
-from avmsf.capture.checks import expect_one_unit, find_surface
+from avmsf.capture.checks import check_one_unit, find_surface
 from avmsf.capture.table import TABLE, in_folder, parse_row, read_rows
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
@@ -189,7 +189,7 @@ def _guess(options: Options, material: str, settings: CaptureSettings) -> None:
 
 def _make_stage(options: Options, settings: CaptureSettings) -> None:
     """Make Gaussians, features or a surface of the folder's views, and print what they are."""
-    expect_one_unit(options.capture, settings)
+    check_one_unit(options.capture, settings)
     stages = StageFolder(options.kept)
     with ProgressBar() as bar:
         scene = SceneStages(

@@ -105,6 +105,6 @@ def _misplaced(impacts: Impacts, surface: Surface | None, *, origin: str) -> lis
         raise DatasetError(
             f"{origin}: expected contacts and surface in one unit; {found}",
             name=origin,
-            value=placement.mistake.factor if placement.mistake else None,
+            value=placement.mismatch.factor if placement.mismatch else None,
         )
     return [found] if found else []

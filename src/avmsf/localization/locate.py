@@ -15,7 +15,7 @@ from torch import Tensor
 from avmsf._utils.arrays import ArrayLike
 from avmsf._utils.progress import working
 from avmsf._utils.text import counted
-from avmsf.capture.audio import Recording, refuse_silence
+from avmsf.capture.audio import Recording, check_not_silent
 from avmsf.capture.onset import find_onset, find_pulse
 from avmsf.capture.prepare import remove_rumble, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
@@ -168,7 +168,7 @@ def locate_impacts(
         raise LocationError.expected(wanted, "deconvolve", file=whole.name, name="normalize", advice=advice)
     with location_errors():
         response = whole.response(chosen.response_channel, force_channel=chosen.force_channel)
-        refuse_silence(response, whole.name)
+        check_not_silent(response, whole.name)
         sound = remove_rumble(response, chosen.highpass, whole)
     onsets = detect_onsets(sound, sample_rate=whole.sample_rate)
     forces = _peak_forces(whole, onsets, chosen)

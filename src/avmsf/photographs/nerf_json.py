@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from avmsf._utils.text import listed, read_json
 from avmsf.capture.filenames import PICTURE_SUFFIXES
-from avmsf.capture.placement import Mistake
+from avmsf.capture.placement import FrameMismatch
 from avmsf.errors import CaptureError, Location, Remark
 from avmsf.photographs.lenses import Lens
 from avmsf.photographs.photograph import CameraFile, Photograph
@@ -70,7 +70,7 @@ def load_record(path: Path) -> dict[str, Any]:
     return record
 
 
-def stated_moves(folder: Path, *, meters: float = 1.0) -> list[Mistake]:
+def stated_moves(folder: Path, *, meters: float = 1.0) -> list[FrameMismatch]:
     """Return how nerfstudio says that it moved an object, in transforms.json or beside it; none where it does not.
 
     A position x became scale * (transform x), in units of so many `meters`. What cannot be read is passed over.
@@ -92,7 +92,9 @@ def stated_moves(folder: Path, *, meters: float = 1.0) -> list[Mistake]:
         moved = factor != 1 or not np.allclose(matrix, np.eye(4)[:3])
         if 0 < factor < math.inf and np.isfinite(matrix).all() and moved:
             words = ", ".join(f"{key} = {np.round(record[key], 4).tolist()}" for key in keys if key in record)
-            found.append(Mistake(factor, torch.from_numpy(matrix[:, :3] / stretch), shift, stated=f"{name} ({words})"))
+            found.append(
+                FrameMismatch(factor, torch.from_numpy(matrix[:, :3] / stretch), shift, stated=f"{name} ({words})")
+            )
     return found
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy import ndimage
 from torch import Tensor
 
-from avmsf.capture.placement import FACTORS, WRONG_ROWS, Mistake, check_placement
+from avmsf.capture.placement import FACTORS, WRONG_ROWS, FrameMismatch, check_placement
 from avmsf.capture.proposals import unit_named
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError, CaptureWarning
@@ -108,7 +108,7 @@ def expect_contacts_in_views(
     views: Sequence[View],
     settings: CaptureSettings,
     *,
-    stated: Sequence[Mistake] = (),
+    stated: Sequence[FrameMismatch] = (),
 ) -> None:
     """Raise CaptureError where cameras do not see one object, or see it elsewhere than the contacts (m) lie.
 
@@ -140,9 +140,9 @@ def expect_contacts_in_views(
         return
     factor = max((each for each in FACTORS if _share_inside(each * contacts, chosen) >= 1 - WRONG_ROWS), default=1.0)
     placement = None if hull is None else check_placement(contacts, _surface_of(hull), stated=stated)
-    if placement is not None and placement.mistake is not None and placement.mistake.stated:
+    if placement is not None and placement.mismatch is not None and placement.mismatch.stated:
         raise CaptureError(
-            f"expected contacts on the object in the photographs: {placement.mistake}",
+            f"expected contacts on the object in the photographs: {placement.mismatch}",
             name="frame",
             value=float(placement.distances.max()),
         )
@@ -166,7 +166,7 @@ def expect_on_object(
     *,
     names: Sequence[str],
     what: str = "surface",
-    stated: Sequence[Mistake] = (),
+    stated: Sequence[FrameMismatch] = (),
     strict: bool = False,
 ) -> None:
     """Warn with `CaptureWarning` of contacts off `what` the object's points are, with the mistake that may explain it.
