@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Int
+from jaxtyping import Bool, Float64, Int
 from torch import Tensor
 
 from avmsf.errors import SimulationError
@@ -151,6 +151,32 @@ class Body:
             self.fill(cells)
 
 
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """Some of the points on one side of a wall and the triangles among them, from which something grows."""
+
+    body: Body
+    rows: Int[np.ndarray, " columns"]
+    """Rows in the body."""
+    places: Float64[np.ndarray, "columns 3"]
+    """Meters."""
+    triangles: Int[np.ndarray, "triangles 3"]
+    """Columns, counter-clockwise seen from where it grows to."""
+    order: Int[np.ndarray, " columns"]
+
+    def grow(self, layers: Float64[np.ndarray, "layers columns 3"], *, end: "Patch | None" = None) -> None:
+        """Add prisms through layers of points, and to another patch, if any."""
+        self.body.grow(self.triangles, self.order, self.rows, layers, end=None if end is None else end.rows)
+
+
+def halves(
+    a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray, rising: Bool[np.ndarray, " squares"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return both triangles of squares with these corners, cut from a to c where `rising`, else from b to d."""
+    first = np.where(rising[:, None], np.stack([a, b, c], axis=1), np.stack([a, b, d], axis=1))
+    return first, np.where(rising[:, None], np.stack([a, c, d], axis=1), np.stack([b, c, d], axis=1))
+
+
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
@@ -214,42 +240,13 @@ class Rings:
     def _band(self, ring: int, k: np.ndarray) -> np.ndarray:
         a, after = self.rows(ring, k), self.rows(ring, k + 1)
         b, beyond = self.rows(ring + 1, k), self.rows(ring + 1, k + 1)
-        rising = ((k + ring) % 2 == 0)[:, None]
-        first = np.where(rising, np.stack([a, b, beyond], axis=1), np.stack([a, b, after], axis=1))
-        second = np.where(rising, np.stack([a, beyond, after], axis=1), np.stack([b, beyond, after], axis=1))
-        return np.concatenate([first, second])
+        return np.concatenate(halves(a, b, beyond, after, (k + ring) % 2 == 0))
 
     def _doubling(self, ring: int, k: np.ndarray) -> np.ndarray:
         a, after = self.rows(ring, k), self.rows(ring, k + 1)
         b, between, beyond = (self.rows(ring + 1, 2 * k + step) for step in range(3))
         corners = ((a, b, between), (a, between, after), (after, between, beyond))
         return np.concatenate([np.stack(each, axis=1) for each in corners])
-
-
-@dataclass(frozen=True, eq=False)
-class Patch:
-    """Some of the points of a sheet and the triangles among them, from which something grows."""
-
-    rows: Int[np.ndarray, " columns"]
-    triangles: Int[np.ndarray, "triangles 3"]
-    """Rows of `rows`."""
-    order: Int[np.ndarray, " columns"]
-
-    @classmethod
-    def of(
-        cls,
-        triangles: Int[np.ndarray, "all 3"],
-        order: Int[np.ndarray, " points"],
-        rows: Int[np.ndarray, " columns"],
-        *,
-        lower: bool,
-    ) -> "Patch":
-        """Return the patch of these rows of a sheet's points, on its lower side or its upper one."""
-        column = np.full(len(order), -1)
-        column[rows] = np.arange(len(rows))
-        inside = triangles[(column[triangles] >= 0).all(axis=1)]
-        found = column[inside]
-        return cls(rows, found[:, ::-1] if lower else found, order[rows])
 
 
 @dataclass(frozen=True, eq=False)

@@ -143,28 +143,30 @@ class Turned:
     def side_patch(self, rings: range, half: int, *, falling: bool = False) -> Patch:
         """Return the outside of these rings within `half` points of angle 0, ring by ring, from below or from above."""
         places = np.arange(-half, half + 1)
-        rows = np.concatenate([self.rings.rows(ring, places) for ring in (reversed(rings) if falling else rings)])
-        return Patch.of(self.sheet.triangles, self.sheet.order, rows, lower=True)
+        rows = [self.rings.rows(ring, places) for ring in (reversed(rings) if falling else rings)]
+        return self._patch(np.concatenate(rows), lower=True)
 
     def middle_patch(self, last: int, *, lower: bool) -> Patch:
-        """Return the rings about the pole up to one."""
-        return Patch.of(self.sheet.triangles, self.sheet.order, np.arange(self.rings.starts[last + 1]), lower=lower)
-
-    def outside(self, patch: Patch) -> Float64[np.ndarray, "columns 3"]:
-        """Return where a patch's points lie on the lower side, meters."""
-        return self.sheet.middle[patch.rows] - self.sheet.offsets[patch.rows]
-
-    def top(self, patch: Patch) -> Float64[np.ndarray, "columns 3"]:
-        """Return where a patch's points lie on the upper side, meters."""
-        return self.sheet.middle[patch.rows] + self.sheet.offsets[patch.rows]
+        """Return the rings about the pole up to one, on the lower or on the upper side."""
+        return self._patch(np.arange(self.rings.starts[last + 1]), lower=lower)
 
     def add_foot(self, ring: int, bottom: float) -> None:
         """Add a foot under the band between a ring and the next one, down to a height."""
-        rows = np.concatenate([np.arange(self.rings.starts[ring], self.rings.starts[ring + 2])])
-        patch = Patch.of(self.sheet.triangles, self.sheet.order, rows, lower=True)
-        places = self.outside(patch)
+        patch = self._patch(np.arange(self.rings.starts[ring], self.rings.starts[ring + 2]), lower=True)
+        places = patch.places.copy()
         places[:, 2] = bottom
-        self.body.grow(patch.triangles, patch.order, self.lower[patch.rows], places[None])
+        patch.grow(places[None])
+
+    def _patch(self, rows: Int[np.ndarray, " columns"], *, lower: bool) -> Patch:
+        """Return the patch of these rows of the sheet's points, on its lower side or its upper one."""
+        column = np.full(len(self.sheet.order), -1)
+        column[rows] = np.arange(len(rows))
+        inside = column[self.sheet.triangles]
+        inside = inside[(inside >= 0).all(axis=1)]
+        middle, offsets, order = self.sheet.middle[rows], self.sheet.offsets[rows], self.sheet.order[rows]
+        if lower:
+            return Patch(self.body, self.lower[rows], middle - offsets, inside[:, ::-1], order)
+        return Patch(self.body, self.upper[rows], middle + offsets, inside, order)
 
 
 _STEM_LAYERS = 16
@@ -220,12 +222,12 @@ def goblet(random: np.random.Generator, wall: float | None) -> Draft:
     sole = Profile([(0.0, 0.004, 1.8 * wall), (0.35 * radius, 0.004, 1.6 * wall), (foot * radius, 0.0, 1.2 * wall)])
     base = Turned.lay(sole, rings=rings, body=cup.body)
     above, below = cup.middle_patch(last, lower=True), base.middle_patch(last, lower=False)
-    start, end = cup.outside(above), base.top(below)
+    start, end = above.places, below.places
     part = np.linspace(0.0, 1.0, _STEM_LAYERS + 1)[1:-1, None, None]
     thinnest = random.uniform(0.0032, 0.0042) / around
     slim = 1.0 - (1.0 - thinnest) * np.sin(math.pi * part) ** 0.6
     layers = ((1.0 - part) * start + part * end) * np.concatenate([slim, slim, np.ones_like(slim)], axis=2)
-    cup.body.grow(above.triangles, above.order, cup.lower[above.rows], layers, end=base.upper[below.rows])
+    above.grow(layers, end=below)
     return Draft(cup.body, wall, ROUND)
 
 
@@ -339,12 +341,12 @@ def _crown(turned: Turned, radius: float, top: float, *, swell: float, taper: fl
     It is wider by `swell` half-way up, and narrower by `taper` at its end.
     """
     patch = turned.middle_patch(max(1, int(np.argmin(np.abs(turned.radii - radius)))), lower=False)
-    start = turned.top(patch)
+    start = patch.places
     part = np.linspace(0.0, 1.0, 11)[1:, None]
     wide = 1.0 + swell * np.sin(math.pi * part) ** 2 - taper * np.clip(part - 0.8, 0.0, None) / 0.2
     rising = (1.0 - part) * start[:, 2] + part * top
     layers = np.concatenate([wide[..., None] * start[None, :, :2], rising[..., None]], axis=2)
-    turned.body.grow(patch.triangles, patch.order, turned.upper[patch.rows], layers)
+    patch.grow(layers)
 
 
 def _polygon(sides: int, edged: float) -> Warp:

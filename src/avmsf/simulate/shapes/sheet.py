@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int
 
-from avmsf.simulate.shapes.body import MIRRORED, UP, Body, Draft, Rings, Sheet, Symmetry, drawn_wall
+from avmsf.simulate.shapes.body import MIRRORED, UP, Body, Draft, Rings, Sheet, Symmetry, drawn_wall, halves
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +44,7 @@ class Grid:
         row, column = np.divmod(np.arange((self.rows - 1) * (self.columns - 1)), self.columns - 1)
         a = row * self.columns + column
         b, c, d = a + 1, a + 1 + self.columns, a + self.columns
-        rising = ((row + column) % 2 == 0)[:, None, None]
-        one = np.stack([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)], axis=1)
-        other = np.stack([np.stack([a, b, d], axis=1), np.stack([b, c, d], axis=1)], axis=1)
-        return np.where(rising, one, other).reshape(-1, 3)
+        return np.stack(halves(a, b, c, d, (row + column) % 2 == 0), axis=1).reshape(-1, 3)
 
 
 _POINTS = 900
@@ -233,10 +230,7 @@ def _attach(rings: Rings, rim: np.ndarray, rows: int) -> tuple[np.ndarray, np.nd
     row, column = np.divmod(np.arange(rows * (columns - 1)), columns - 1)
     a, after, b, beyond = (lines[row + up, column + right] for up, right in ((0, 0), (0, 1), (1, 0), (1, 1)))
     places = column - columns // 2
-    rising = ((places + row + last) % 2 == 0)[:, None, None]
-    one = np.stack([np.stack([a, b, beyond], axis=1), np.stack([a, beyond, after], axis=1)], axis=1)
-    other = np.stack([np.stack([a, b, after], axis=1), np.stack([b, beyond, after], axis=1)], axis=1)
-    strip = np.where(rising, one, other).reshape(-1, 3)
+    strip = np.stack(halves(a, b, beyond, after, (places + row + last) % 2 == 0), axis=1).reshape(-1, 3)
     ring = np.repeat(np.arange(last + 1, last + 1 + rows), columns)
     parity = np.tile((np.arange(columns) - columns // 2) % 2, rows)
     order = np.concatenate([rings.order, 2 * ring + parity])

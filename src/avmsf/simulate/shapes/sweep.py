@@ -143,8 +143,7 @@ def skillet(random: np.random.Generator, wall: float | None) -> Draft:
     turned = Turned.lay(Profile.scaled(radius, height, wall, corners), points=760, crowd=_CROWD)
     ring = _ring_at(turned, 0.6 * height, _BANDS)
     patch = turned.side_patch(range(ring, ring + _BANDS + 1), _HALF)
-    start = turned.outside(patch)
-    middle = start.mean(axis=0)
+    middle = patch.places.mean(axis=0)
     far = length * radius
     curve = smooth_curve(
         [
@@ -159,8 +158,8 @@ def skillet(random: np.random.Generator, wall: float | None) -> Draft:
     rounding = np.sqrt(1.0 - 0.85 * np.clip((part - 0.88) / 0.12, 0.0, 1.0) ** 2)
     widths = random.uniform(0.018, 0.023) * (0.75 + 0.25 * part) * rounding
     heights = np.full(_HANDLE_LAYERS, random.uniform(0.009, 0.012)) * (0.4 + 0.6 * rounding)
-    layers = Rod(curve, widths, heights).layers(start, square_columns(_BANDS + 1, _HALF))
-    turned.body.grow(patch.triangles, patch.order, turned.lower[patch.rows], layers)
+    layers = Rod(curve, widths, heights).layers(patch.places, square_columns(_BANDS + 1, _HALF))
+    patch.grow(layers)
     return Draft(turned.body, wall, MIRRORED)
 
 
@@ -172,8 +171,7 @@ def _add_handle(turned: Turned, low: float, high: float, reach: float, random: n
         below += 1
     leaving = turned.side_patch(range(above, above + _BANDS + 1), _HALF)
     arriving = turned.side_patch(range(below, below + _BANDS + 1), _HALF, falling=True)
-    start, end = turned.outside(leaving), turned.outside(arriving)
-    (x, _, z), (x_end, _, z_end) = start.mean(axis=0), end.mean(axis=0)
+    (x, _, z), (x_end, _, z_end) = leaving.places.mean(axis=0), arriving.places.mean(axis=0)
     far = max(x, x_end) + reach
     curve = smooth_curve(
         [
@@ -190,10 +188,8 @@ def _add_handle(turned: Turned, low: float, high: float, reach: float, random: n
     part = np.linspace(0.0, 1.0, _HANDLE_LAYERS)
     widths = random.uniform(0.012, 0.015) * (1.0 - 0.15 * np.sin(math.pi * part))
     heights = np.full(_HANDLE_LAYERS, random.uniform(0.0075, 0.0095))
-    layers = Rod(curve, widths, heights).layers(start, square_columns(_BANDS + 1, _HALF), end)
-    turned.body.grow(
-        leaving.triangles, leaving.order, turned.lower[leaving.rows], layers, end=turned.lower[arriving.rows]
-    )  # fmt: skip
+    columns = square_columns(_BANDS + 1, _HALF)
+    leaving.grow(Rod(curve, widths, heights).layers(leaving.places, columns, arriving.places), end=arriving)
 
 
 def _ring_at(turned: Turned, height: float, bands: int) -> int:
