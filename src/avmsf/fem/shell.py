@@ -11,7 +11,7 @@ from trimesh import Trimesh
 
 from avmsf.errors import SimulationError
 from avmsf.fem.remeshing import boundary_edges, oriented, remeshed, unit, weld
-from avmsf.fem.solid import Solid
+from avmsf.fem.solid import Solid, prism_cells
 from avmsf.fem.tetrahedra import expect_detail, fill
 from avmsf.mesh.surface import Surface
 
@@ -74,7 +74,7 @@ def prisms(mesh: Trimesh, thickness: Float64[np.ndarray, " points"], *, layers: 
         return None
     count = len(mesh.vertices)
     points = np.concatenate([mesh.vertices + layer / layers * offsets for layer in range(layers + 1)])
-    cells = np.concatenate([_prisms(mesh.faces, count) + layer * count for layer in range(layers)])
+    cells = np.concatenate([_prisms(mesh).reshape(-1, 4) + layer * count for layer in range(layers)])
     return Solid.build(torch.from_numpy(points), torch.from_numpy(cells))
 
 
@@ -116,33 +116,14 @@ def _both_sides(mesh: Trimesh, thickness: float) -> Surface:
 def _folded(mesh: Trimesh, offsets: np.ndarray) -> np.ndarray:
     """Return which triangles' prisms hold a tetrahedron that is flat or inside out, [faces]."""
     points = np.concatenate([mesh.vertices, mesh.vertices + offsets])
-    cells = points[_prisms(mesh.faces, len(mesh.vertices))]
-    volumes = np.linalg.det(cells[:, 1:] - cells[:, :1]).reshape(-1, 3) / 6.0
+    corners = points[_prisms(mesh)]
+    volumes = np.linalg.det(corners[:, :, 1:] - corners[:, :, :1]) / 6.0
     straight = mesh.area_faces * np.linalg.norm(offsets, axis=1)[mesh.faces].mean(axis=1) / 3.0
     return (volumes <= _FLATTEST * straight[:, None]).any(axis=1)
 
 
-def _prisms(faces: Int[np.ndarray, "faces 3"], points: int) -> Int[np.ndarray, "cells 4"]:
-    """Return three tetrahedra for each triangle; those of neighbors meet in whole sides.
-
-    The diagonal of a prism's side starts at the outer one of its vertices that comes first, whichever prism asks.
-    The cells are of positive volume where the inner vertices lie behind the triangle.
-    """
-    first = faces.argmin(axis=1)
-    rows = np.arange(len(faces))
-    a, b, c = (faces[rows, (first + turn) % 3] for turn in range(3))
-    inner = (a + points, b + points, c + points)
-    rising = b < c
-    low, high = np.where(rising, b, c), np.where(rising, c, b)
-    cells = np.stack(
-        [
-            np.stack([a, b, c, high + points], axis=1),
-            np.stack([a, low, low + points, high + points], axis=1),
-            np.stack([a, inner[0], inner[1], inner[2]], axis=1),
-        ],
-        axis=1,
-    )
-    # All three now run the same way round, but for the middle one where c comes before b.
-    cells[:, [0, 2]] = cells[:, [0, 2]][..., [0, 2, 1, 3]]
-    cells[~rising, 1] = cells[~rising, 1][:, [0, 2, 1, 3]]
-    return cells.reshape(-1, 4)
+def _prisms(mesh: Trimesh) -> Int[np.ndarray, "triangles 3 4"]:
+    """Return the tetrahedra of prisms from the vertices to as many points behind them."""
+    outer = np.arange(len(mesh.vertices))
+    # Counter-clockwise seen from inside.
+    return prism_cells(mesh.faces[:, ::-1], outer, outer, outer + len(outer))

@@ -117,6 +117,26 @@ class Solid:
             raise several_parts("shape", volumes.tolist(), "m3")
 
 
+def prism_cells(
+    triangles: Int[np.ndarray, "triangles 3"],
+    order: Int[np.ndarray, " columns"],
+    below: Int[np.ndarray, " columns"],
+    above: Int[np.ndarray, " columns"],
+) -> Int[np.ndarray, "triangles 3 4"]:
+    """Return three tetrahedra for each prism over a triangle of columns, counter-clockwise seen from above.
+
+    `below` and `above` are the points of the columns. Each four-sided side is cut from below the column that comes
+    first in `order` to above the other, so that neighbors cut it alike; numbers in `order` differ along every edge.
+    """
+    ranks = np.argsort(order[triangles], axis=1, kind="stable")
+    corners = np.take_along_axis(triangles, ranks, axis=1)
+    a, b = below[corners].T, above[corners].T
+    cells = np.stack([*a, b[2], a[0], a[1], b[2], b[1], a[0], b[0], b[1], b[2]], axis=1).reshape(-1, 3, 4)
+    odd = np.linalg.det(np.eye(3)[ranks]) < 0
+    cells[odd] = cells[odd][..., [0, 2, 1, 3]]
+    return cells
+
+
 def several_parts(what: str, sizes: Sequence[float], unit: str) -> SimulationError:
     """Return the error of something whose connected parts have these sizes, the largest first."""
     some = ", ".join(f"{size:.3g}" for size in sizes[:4])

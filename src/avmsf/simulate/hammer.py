@@ -43,26 +43,20 @@ def contact_times(
     A round tip stays for a time that goes with the speed to the power -1/5, a flat one equally long at all speeds.
     Raises SimulationError where that is longer than `LONGEST`.
     """
+    flat = hammer.pulse == "half-sine"
+    joint = 1.0 / ((1.0 - hammer.poisson**2) / hammer.young + (1.0 - material.poisson**2) / material.young)
+    moving = moving_mass(hammer, mass)
     if hammer.contact_time > 0.0:
-        power = 0.0 if hammer.pulse == "half-sine" else -0.2
-        times = hammer.contact_time * (speeds / hammer.speed) ** power
+        times = hammer.contact_time * (speeds / hammer.speed) ** (0.0 if flat else -0.2)
+    elif flat:
+        times = torch.full_like(speeds, math.pi * math.sqrt(moving / (2.0 * hammer.radius * joint)))
     else:
-        times = _computed_times(hammer, material, mass=mass, speeds=speeds)
+        times = _HERTZ_SCALE * (moving**2 / (hammer.radius * joint**2 * speeds)) ** 0.2
     if float(times.max()) > LONGEST:
         longest = float(times.max())
         wanted, advice = f"a contact time up to {LONGEST:g} s", "use a lighter hammer, a stiffer tip, or a higher speed"
         raise SimulationError.expected(wanted, longest, got=f"{longest:.2g} s", name="hammer", advice=advice)
     return times
-
-
-def _computed_times(
-    hammer: Hammer, material: Material, *, mass: float, speeds: Float64[Tensor, " contacts"]
-) -> Float64[Tensor, " contacts"]:
-    joint = 1.0 / ((1.0 - hammer.poisson**2) / hammer.young + (1.0 - material.poisson**2) / material.young)
-    moving = moving_mass(hammer, mass)
-    if hammer.pulse == "half-sine":
-        return torch.full_like(speeds, math.pi * math.sqrt(moving / (2.0 * hammer.radius * joint)))
-    return _HERTZ_SCALE * (moving**2 / (hammer.radius * joint**2 * speeds)) ** 0.2
 
 
 def peak_forces(

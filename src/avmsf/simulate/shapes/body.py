@@ -12,7 +12,7 @@ from torch import Tensor
 
 from avmsf.errors import SimulationError
 from avmsf.fem.remeshing import unit
-from avmsf.fem.solid import FLATTEST, Solid
+from avmsf.fem.solid import FLATTEST, Solid, prism_cells
 
 _SHARPEST = 0.4
 """Least mean of the cosines between the normal at a corner and the faces around it that a mitre is made for."""
@@ -67,11 +67,7 @@ def mitred_normals(
 
 
 class Body:
-    """A solid in the making.
-
-    A prism over a triangle is cut into three tetrahedra. Each of its four-sided sides is cut from the start of the edge
-    whose corner comes first in `order` to the end of the other, so that neighbors cut it alike.
-    """
+    """A solid in the making, of prisms that `prism_cells` cuts into tetrahedra."""
 
     def __init__(self) -> None:
         self._points: list[np.ndarray] = []
@@ -82,24 +78,8 @@ class Body:
         """Add a wall of one layer; return the rows of its points on the lower and on the upper side."""
         lower = self.place(sheet.middle - sheet.offsets)
         upper = self.place(sheet.middle + sheet.offsets)
-        self._stack(sheet.triangles, sheet.order, np.stack([lower, upper]))
+        self.stack(sheet.triangles, sheet.order, [lower, upper])
         return lower, upper
-
-    def grow(
-        self,
-        triangles: Int[np.ndarray, "triangles 3"],
-        order: Int[np.ndarray, " columns"],
-        start: Int[np.ndarray, " columns"],
-        layers: Float64[np.ndarray, "layers columns 3"],
-        *,
-        end: Int[np.ndarray, " columns"] | None = None,
-    ) -> None:
-        """Add prisms on top of triangles that are there: from rows `start` through `layers` to rows `end`, if any.
-
-        `triangles` name columns, counter-clockwise seen from where the prisms grow to.
-        """
-        rows = [start, *(self.place(layer) for layer in layers)]
-        self._stack(triangles, order, np.stack(rows if end is None else [*rows, end]))
 
     def place(self, places: Float64[np.ndarray, "points 3"]) -> Int[np.ndarray, " points"]:
         """Add points; return their rows."""
@@ -132,23 +112,15 @@ class Body:
             raise SimulationError(message, row=int(unfit[0]), name="cells", value=len(unfit))
         return Solid.build(torch.from_numpy(points), torch.from_numpy(cells))
 
-    def _stack(
+    def stack(
         self,
         triangles: Int[np.ndarray, "triangles 3"],
         order: Int[np.ndarray, " columns"],
-        rows: Int[np.ndarray, "layers columns"],
+        rows: Sequence[Int[np.ndarray, " columns"]],
     ) -> None:
-        ranks = np.argsort(order[triangles], axis=1, kind="stable")
-        sorted_corners = np.take_along_axis(triangles, ranks, axis=1)
-        odd = np.linalg.det(np.eye(3)[ranks]) < 0
+        """Add prisms over triangles of columns, counter-clockwise seen from above, through levels of points."""
         for below, above in itertools.pairwise(rows):
-            a, b = below[sorted_corners].T, above[sorted_corners].T
-            cells = np.concatenate(
-                [np.stack(each, axis=1) for each in ((*a, b[2]), (a[0], a[1], b[2], b[1]), (a[0], b[0], b[1], b[2]))]
-            )
-            turned = np.tile(odd, 3)
-            cells[turned] = cells[turned][:, [0, 2, 1, 3]]
-            self.fill(cells)
+            self.fill(prism_cells(triangles, order, below, above).transpose(1, 0, 2).reshape(-1, 4))
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +138,8 @@ class Patch:
 
     def grow(self, layers: Float64[np.ndarray, "layers columns 3"], *, end: "Patch | None" = None) -> None:
         """Add prisms through layers of points, and to another patch, if any."""
-        self.body.grow(self.triangles, self.order, self.rows, layers, end=None if end is None else end.rows)
+        levels = [self.rows, *(self.body.place(layer) for layer in layers)]
+        self.body.stack(self.triangles, self.order, levels if end is None else [*levels, end.rows])
 
 
 def halves(

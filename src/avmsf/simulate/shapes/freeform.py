@@ -3,8 +3,10 @@
 import itertools
 
 import numpy as np
+import torch
 
-from avmsf.simulate.shapes.body import Body, Draft, Symmetry, drawn_wall
+from avmsf.fem.solid import Solid
+from avmsf.simulate.shapes.body import Body, Draft, Patch, Symmetry, drawn_wall
 
 _CORE, _SHELLS = (10, 5, 3), 3
 """Boxes along each side of a blob's core, and layers around it."""
@@ -33,8 +35,8 @@ def blob(random: np.random.Generator, wall: float | None) -> Draft:
     far = np.linalg.norm(angled, axis=1)
     round_ = angled * (np.abs(angled).max(axis=1) / np.maximum(far, 1e-12))[:, None]
     core = 0.22 * angled + 0.26 * round_
-    skin = _outside(cells)
-    rows, triangles = np.unique(skin, return_inverse=True)
+    outside = Solid(torch.from_numpy(lattice), torch.from_numpy(cells)).boundary.numpy()
+    rows, triangles = np.unique(outside, return_inverse=True)
     part = np.linspace(0.0, 1.0, _SHELLS + 1)[1:, None, None]
     balls = (1.0 - part) * core[rows] + part * (angled / np.maximum(far, 1e-12)[:, None])[rows]
     extents = np.ptp(shaped(balls[-1]), axis=0)
@@ -43,7 +45,7 @@ def blob(random: np.random.Generator, wall: float | None) -> Draft:
     placed = body.place(shaped(core) * scale)
     body.fill(placed[cells])
     layers = np.stack([shaped(ball) * scale for ball in balls])
-    body.grow(triangles.reshape(-1, 3), np.arange(len(rows)), placed[rows], layers)
+    Patch(body, placed[rows], layers[0], triangles.reshape(-1, 3), np.arange(len(rows))).grow(layers)
     return Draft(body, flat, Symmetry())
 
 
@@ -59,10 +61,3 @@ def _boxes(numbers: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
         odd = np.linalg.det(np.eye(3)[list(way)]) < 0
         cells.append(corners[:, [0, 2, 1, 3]] if odd else corners)
     return 2.0 * index / numbers - 1.0, np.concatenate(cells)
-
-
-def _outside(cells: np.ndarray) -> np.ndarray:
-    """Return the triangles of one tetrahedron only, counter-clockwise from outside."""
-    sides = cells[:, [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]].reshape(-1, 3)
-    _, which, count = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True)
-    return sides[count[which.ravel()] == 1]
