@@ -6,7 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from avmsf.capture import read_capture
 from avmsf.datasets import CaptureCollection
 from avmsf.errors import AvmsfError, EvaluationError, FitError
 from avmsf.evaluation.case_run import Evaluation
-from avmsf.evaluation.methods import method_named
+from avmsf.evaluation.methods import FunctionMethod, method_named
 from avmsf.evaluation.modal_metrics import ModalRenderer, compare_modes, truth_at
 from avmsf.evaluation.objects import ObjectInputs, draw_other_recording
 from avmsf.evaluation.registry import PROTOCOLS
@@ -58,46 +58,31 @@ def summed(results: Path) -> dict:
     return write_summary(ResultsFolder(results), subsets={})
 
 
-@dataclass(frozen=True)
-class Counting:
-    """The nearest strike, and how often it was asked for."""
+def asking(ask: Callable[[Task], object], name: str = "asking") -> FunctionMethod:
+    """Return the nearest recording, after something has been done with the task."""
 
-    fits: list[str]
-    name: str = "counting"
-    raising: BaseException | None = None
-
-    def fit(self, task: Task) -> Renderer:
-        self.fits.append(task.name)
-        if self.raising is not None:
-            raise self.raising
+    def fit(task: Task) -> Renderer:
+        ask(task)
         return NearestRecording(task.train)
 
-    def __repr__(self) -> str:
-        return "Counting()"
+    return FunctionMethod(name, fit)
 
 
-@dataclass(frozen=True)
-class Asking:
-    """Does what a function does with the task."""
+def failing(error: BaseException) -> FunctionMethod:
+    def fail(task: Task) -> None:
+        raise error
 
-    ask: Callable[[Task], object]
-    name: str = "asking"
-
-    def fit(self, task: Task) -> Renderer:
-        self.ask(task)
-        return NearestRecording(task.train)
-
-    def __repr__(self) -> str:
-        return "Asking()"
+    return asking(fail, "failing")
 
 
 def test_what_is_done_is_not_done_again_and_more_may_be_added(plates: Path, tmp_path: Path) -> None:
     results = ResultsFolder(tmp_path)
-    counting = Counting([])
+    fitted: list[str] = []
+    counting = asking(lambda task: fitted.append(task.name))
     run_objects(planned(plates, counting), ("a",), results)
     run_objects(planned(plates, counting, "knn3"), ("a", "b"), results)
-    assert counting.fits == ["a", "b"]
-    assert sorted(results.identity()["methods"]) == ["counting", "knn3"]
+    assert fitted == ["a", "b"]
+    assert sorted(results.identity()["methods"]) == ["asking", "knn3"]
     assert [record.identifier for record in results.records()] == ["a", "b"]
     assert all(len(record.outcomes) == 2 for record in results.records())
 
@@ -105,19 +90,18 @@ def test_what_is_done_is_not_done_again_and_more_may_be_added(plates: Path, tmp_
 @pytest.mark.parametrize("fault", [FitError("no\n fit"), ZeroDivisionError("by zero")])
 def test_a_failing_method_stops_no_other_and_is_tried_again(plates: Path, tmp_path: Path, fault: Exception) -> None:
     results = ResultsFolder(tmp_path)
-    broken = Counting([], raising=fault)
-    run_objects(planned(plates, broken, "knn3"), ("a", "b"), results)
+    run_objects(planned(plates, failing(fault), "knn3"), ("a", "b"), results)
     summary = summed(tmp_path)
     told = "no fit" if isinstance(fault, AvmsfError) else "ZeroDivisionError: by zero"
     assert [each["failure"] for each in summary["failures"]] == [told, told]
     assert set(summary["methods"]) == {"knn3"}
-    kept = [each.failure or "" for each in results.read("a").outcomes if each.method == "counting"]
+    kept = [each.failure or "" for each in results.read("a").outcomes if each.method == "failing"]
     # A fault of the program keeps the place where it happened.
     assert ["in fit" in failure for failure in kept] == [not isinstance(fault, AvmsfError)]
-    run_objects(planned(plates, replace(broken, raising=None), "knn3"), ("a", "b"), results)
+    run_objects(planned(plates, asking(str, "failing"), "knn3"), ("a", "b"), results)
     summary = summed(tmp_path)
     assert summary["failures"] == []
-    assert set(summary["methods"]) == {"knn3", "counting"}
+    assert set(summary["methods"]) == {"knn3", "failing"}
 
 
 def test_changed_wavs_are_scored_again_and_no_others(plates: Path, tmp_path: Path) -> None:
@@ -148,7 +132,7 @@ def test_changed_wavs_are_scored_again_and_no_others(plates: Path, tmp_path: Pat
 
 def test_an_interruption_keeps_all_before_it(plates: Path, tmp_path: Path) -> None:
     results = ResultsFolder(tmp_path)
-    stopped = Counting([], raising=KeyboardInterrupt())
+    stopped = failing(KeyboardInterrupt())
     with pytest.raises(KeyboardInterrupt):
         run_objects(planned(plates, "knn3", stopped, "nearest"), ("a", "b"), results)
     (record,) = results.records()
@@ -179,9 +163,9 @@ def test_a_truth_of_other_recordings_costs_its_object_alone_until_it_is_mended(t
 
 def test_methods_share_modes_that_are_found_once_and_kept(plates: Path, tmp_path: Path) -> None:
     found = []
-    evaluation = planned(plates, Asking(lambda task: found.append(task.modes()), "one"))
+    evaluation = planned(plates, asking(lambda task: found.append(task.modes()), "one"))
     run_objects(evaluation, ("a",), ResultsFolder(tmp_path))
-    again = planned(plates, *(Asking(lambda task: found.append(task.modes()), name) for name in ("two", "three")))
+    again = planned(plates, *(asking(lambda task: found.append(task.modes()), name) for name in ("two", "three")))
     run_objects(again, ("a",), ResultsFolder(tmp_path))
     assert found[1] is found[2]
     assert torch.equal(found[0].bank.frequency, found[1].bank.frequency)
@@ -191,8 +175,8 @@ def test_methods_share_modes_that_are_found_once_and_kept(plates: Path, tmp_path
 
 def test_one_shot_has_modes_too(plates: Path, tmp_path: Path) -> None:
     counts = []
-    asking = Asking(lambda task: counts.append((len(task.train), len(task.modes().gains))))
-    run_objects(planned(plates, asking, protocol="shots"), ("a",), ResultsFolder(tmp_path))
+    method = asking(lambda task: counts.append((len(task.train), len(task.modes().gains))))
+    run_objects(planned(plates, method, protocol="shots"), ("a",), ResultsFolder(tmp_path))
     assert counts == [(8, 8), (4, 4), (2, 2), (1, 1)]
 
 
@@ -202,8 +186,8 @@ def test_shared_time_is_no_methods_time(plates: Path, tmp_path: Path) -> None:
             time.sleep(0.2)
             return super().features(*arguments, **named)
 
-    asking = Asking(lambda task: task.features("positions"))
-    run_objects(replace(planned(plates, asking), inputs=SlowInputs()), ("a",), ResultsFolder(tmp_path))
+    method = asking(lambda task: task.features("positions"))
+    run_objects(replace(planned(plates, method), inputs=SlowInputs()), ("a",), ResultsFolder(tmp_path))
     (record,) = ResultsFolder(tmp_path).records()
     assert record.outcomes[0].fit_seconds < record.cases[0].shared_seconds
     assert record.cases[0].shared_seconds >= 0.2
@@ -235,7 +219,7 @@ def test_results_of_different_evaluations_are_not_mixed(
         with raises(EvaluationError, file=results.path, name=name) as caught:
             run_objects(evaluation, ("a",), results)
         assert name == "a" or caught.value.value == known[name]
-    changed = replace(Counting([]), name="knn3")
+    changed = replace(asking(str, "knn3"), weights="others")
     with raises(EvaluationError, file=results.path, name="knn3", value=held["methods"]["knn3"]):
         run_objects(planned(plates, changed), ("a",), results)
     monkeypatch.setattr("avmsf.evaluation.case_run.source_digest", lambda module: "of other code")
@@ -310,7 +294,7 @@ def test_methods_with_modes_are_judged_by_the_truth(tmp_path: Path) -> None:
     truth = truth_at(read_truth(folder / "a"), case.test)
     train, test = split(read_capture(folder / "a").impacts, 0.2)
     asked: list[Task] = []
-    run_objects(planned(folder, Asking(asked.append)), ("a",), ResultsFolder(tmp_path / "again"))
+    run_objects(planned(folder, asking(asked.append)), ("a",), ResultsFolder(tmp_path / "again"))
     fitted = method_named("spline-gains").fit(replace(asked[0], train=train))
     assert isinstance(fitted, ModalRenderer)
     expected = compare_modes(fitted, test.contacts, truth).figures()

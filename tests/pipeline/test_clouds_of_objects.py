@@ -8,6 +8,7 @@ import torch
 from avmsf.datasets import CaptureCollection
 from avmsf.errors import SceneError
 from avmsf.evaluation.case_run import Evaluation
+from avmsf.evaluation.methods import FunctionMethod
 from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.registry import PROTOCOLS
 from avmsf.evaluation.results import ResultsFolder
@@ -42,17 +43,18 @@ def test_methods_get_the_gaussians_of_their_object_and_views(tmp_path: Path) -> 
             asked.append((identifier, views))
             return cloud(7)
 
-    class Asking:
-        name = "asking"
-
-        def fit(self, task: Task) -> NearestRecording:
-            assert len(task.gaussians()) == 7
-            return NearestRecording(task.train)
+    def fit(task: Task) -> NearestRecording:
+        assert len(task.gaussians()) == 7
+        return NearestRecording(task.train)
 
     dataset, results = CaptureCollection(fill_plates(tmp_path / "plates")), ResultsFolder(tmp_path / "results")
     settings = MetricSettings(cdpam=False)
     protocol = PROTOCOLS["farthest"]
-    run_object(Evaluation(dataset, "plates", protocol, (Asking(),), Inputs(), metric_settings=settings), "a", results)
+    run_object(
+        Evaluation(dataset, "plates", protocol, (FunctionMethod("asking", fit),), Inputs(), metric_settings=settings),
+        "a",
+        results,
+    )
     record = results.read("a")
     assert record is not None
     assert record.outcomes[0].failure is None
