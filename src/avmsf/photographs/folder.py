@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import cv2
 import numpy as np
@@ -17,10 +16,10 @@ from torch import Tensor
 from avmsf._utils.files import new_folder
 from avmsf._utils.text import counted, listed
 from avmsf.errors import CaptureError, Remark
-from avmsf.mesh.io import load_parts
+from avmsf.photographs import colmap, nerf_json
 from avmsf.photographs.cameras import Camera, View, nearest_to_lines
-from avmsf.photographs.colmap import PLACES, find_model, read_colmap, read_points
-from avmsf.photographs.nerf_json import OPENCV_FROM_OPENGL, load_record, read_transforms
+from avmsf.photographs.colmap import PLACES, find_model, read_colmap
+from avmsf.photographs.nerf_json import OPENCV_FROM_OPENGL, read_transforms
 from avmsf.photographs.photograph import CameraFile, Findings, read_view, summarize
 
 MIN_VIEWS = 3
@@ -130,31 +129,13 @@ def read_sparse_points(
     folder = Path(folder)
     transforms = folder if folder.suffix.lower() == ".json" else folder / "transforms.json"
     if transforms.is_file():
-        found = _read_ply(transforms)
+        found = nerf_json.read_points(transforms)
     else:
         model = find_model(folder)
-        found = None if model is None else read_points(model)
+        found = None if model is None else colmap.read_points(model)
     if found is None:
         return None
     return torch.from_numpy(found[0] * meters), torch.from_numpy(found[1])
-
-
-def _read_ply(transforms: Path) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the points of the file that transforms.json names, gray where it has no colors."""
-    named = load_record(transforms).get("ply_file_path")
-    if not isinstance(named, str) or not named:
-        return None
-    path = transforms.parent / named.replace("\\", "/")
-    clouds: list[Any] = load_parts(path)
-    if len(clouds) != 1:
-        got, key = f"{len(clouds)} parts", "ply_file_path"
-        raise CaptureError.expected("one point cloud", len(clouds), got=got, file=path, name=key)
-    points = np.asarray(clouds[0].vertices, dtype=np.float64)
-    colors = np.full((len(points), 3), 128, dtype=np.uint8)
-    painted = np.asarray(getattr(clouds[0].visual, "vertex_colors", colors))
-    if painted.shape[:1] == points.shape[:1]:
-        colors = painted[:, :3].astype(np.uint8)
-    return (points, colors) if len(points) else None
 
 
 def write_views(views: Sequence[View], folder: str | Path) -> None:
@@ -168,32 +149,22 @@ def write_views(views: Sequence[View], folder: str | Path) -> None:
     names = [str(PurePosixPath(view.name).with_suffix(".png")) for view in views]
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
-        raise CaptureError.expected(
-            "views with different names", repeated, got=f"several for {repeated[0]}", file=folder, name=repeated[0]
-        )
+        wanted, got = "views with different names", f"several for {repeated[0]}"
+        raise CaptureError.expected(wanted, repeated, got=got, file=folder, name=repeated[0])
+    frames = []
     with new_folder(folder, raising=CaptureError) as begun:
         for name, view in zip(names, views, strict=True):
+            camera = view.camera
+            pose = np.linalg.inv(camera.world_to_camera.cpu().numpy()) @ OPENCV_FROM_OPENGL
+            frame = {"file_path": f"images/{name}", "transform_matrix": pose.tolist()}
+            frame |= {"w": camera.width, "h": camera.height, "fl_x": camera.focal[0], "fl_y": camera.focal[1]}
+            frame |= {"cx": camera.principal[0], "cy": camera.principal[1]}
             _write_image(begun / "images" / name, view.image.cpu().numpy()[..., ::-1])
             if view.mask is not None:
+                frame["mask_path"] = f"masks/{name}"
                 _write_image(begun / "masks" / name, view.mask.cpu().numpy())
-        frames = [_frame(name, view) for name, view in zip(names, views, strict=True)]
+            frames.append(frame)
         (begun / "transforms.json").write_text(json.dumps({"camera_model": "PINHOLE", "frames": frames}, indent=1))
-
-
-def _frame(name: str, view: View) -> dict[str, Any]:
-    camera = view.camera
-    pose = np.linalg.inv(camera.world_to_camera.cpu().numpy()) @ OPENCV_FROM_OPENGL
-    frame = {
-        "file_path": f"images/{name}",
-        "transform_matrix": pose.tolist(),
-        "w": camera.width,
-        "h": camera.height,
-        "fl_x": camera.focal[0],
-        "fl_y": camera.focal[1],
-        "cx": camera.principal[0],
-        "cy": camera.principal[1],
-    }
-    return frame if view.mask is None else frame | {"mask_path": f"masks/{name}"}
 
 
 def _write_image(path: Path, pixels: np.ndarray) -> None:

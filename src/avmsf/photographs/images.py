@@ -26,14 +26,15 @@ class ImageSizeError(CaptureError):
     """An image has more than `MAX_PIXELS`."""
 
 
-def read_image(path: Path) -> UInt8[np.ndarray, "height width channels"]:
+def read_image(path: Path, *, upright: bool = False) -> UInt8[np.ndarray, "height width channels"]:
     """Read an image, its pixels as they are stored: red, green, blue, and alpha, which is the mask, where it has one.
 
     Alpha lays the color before black; where it is opaque everywhere it is no mask, and there are three channels. 16
-    bits become 8. An orientation tag (EXIF) has no effect: see `read_upright`. Raises CaptureError where the file is
-    missing, corrupt or of another kind, ImageSizeError where it has more than `MAX_PIXELS`.
+    bits become 8. With `upright` the image is rotated as its orientation tag (EXIF) says, and has no alpha. Raises
+    CaptureError where the file is missing, corrupt or of another kind, ImageSizeError where it has more than
+    `MAX_PIXELS`.
     """
-    pixels = _decode(path, cv2.IMREAD_UNCHANGED)
+    pixels = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH if upright else cv2.IMREAD_UNCHANGED)
     if pixels.ndim == 2:
         return np.repeat(pixels[..., None], 3, axis=2)
     if pixels.shape[2] == 3 or (pixels[..., 3] == 255).all():
@@ -42,11 +43,6 @@ def read_image(path: Path) -> UInt8[np.ndarray, "height width channels"]:
     # A transparent pixel's color is unknown; before black, edges blend as in a photograph of a black room.
     image[..., :3] = (image[..., :3].astype(np.uint16) * image[..., 3:] + 127) // 255
     return image
-
-
-def read_upright(path: Path) -> UInt8[np.ndarray, "height width 3"]:
-    """Read an image rotated as its orientation tag (EXIF) says, without alpha; raises as `read_image`."""
-    return np.ascontiguousarray(_decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)[..., ::-1])
 
 
 def read_mask(path: Path) -> UInt8[np.ndarray, "height width"]:

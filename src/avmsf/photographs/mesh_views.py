@@ -7,12 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.errors import CaptureError
+from avmsf.mesh.rays import RayCaster
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.texture import TextureAtlas
 from avmsf.mesh.textured_mesh import TexturedMesh
@@ -54,18 +53,14 @@ class MeshTracer:
 
     def __init__(self, mesh: TexturedMesh) -> None:
         self.vertices, self.faces = mesh.vertices.double().numpy(), mesh.faces.numpy()
-        low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
-        # Embree counts in float32 and near the origin: the mesh is moved there and given the size of a few units.
-        self.middle, self.size = (low + high) / 2, float(np.linalg.norm(high - low))
         self.normals, self.colors = mesh.normals.numpy(), mesh.colors.numpy()
         self.coordinates, self.materials = mesh.coordinates.numpy(), mesh.materials.numpy()
         self.atlas = TextureAtlas([texture.numpy() for texture in mesh.textures])
-        self.scene = EmbreeScene()
-        placed = ((self.vertices - self.middle) / self.size).astype(np.float32)
-        TriangleMesh(self.scene, placed, self.faces.astype(np.int32))
+        corners = self.vertices[self.faces]
+        self.caster = RayCaster(corners)
         pixels = self.coordinates * self.atlas.sizes[self.materials][:, None]
         across, down = pixels[:, 1] - pixels[:, 0], pixels[:, 2] - pixels[:, 0]
-        texels, corners = np.abs(across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0]), self.vertices[self.faces]
+        texels = np.abs(across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0])
         doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         self.texels_per_meter = np.sqrt(texels / np.maximum(doubled, 1e-30))
 
@@ -101,7 +96,6 @@ class MeshTracer:
         left, top, right, bottom = self._rectangle(camera)
         if right <= left:
             return
-        origin = ((camera.position.numpy() - self.middle) / self.size).astype(np.float32)
         # The distance of a float32 ray is coarse beside the corners' own depths, of which it is the mean.
         pose = camera.world_to_camera.numpy()
         depths = self.vertices @ pose[2, :3] + pose[2, 3]
@@ -111,12 +105,10 @@ class MeshTracer:
             rows = min(height, bottom - start)
             band = replace(camera, principal=(x - left, y - start), width=width, height=rows)
             directions = band.rays().reshape(-1, 3).numpy()
-            origins = np.ascontiguousarray(np.broadcast_to(origin, directions.shape))
-            found = self.scene.run(origins, directions.astype(np.float32), output=1)
-            hit = np.flatnonzero(found["primID"] >= 0)
-            faces = found["primID"][hit].astype(np.int64)
-            u, v = found["u"][hit].astype(np.float64), found["v"][hit].astype(np.float64)
-            weights = np.stack([1 - u - v, u, v], axis=1)
+            origins = np.broadcast_to(camera.position.numpy(), directions.shape)
+            faces, weights, _ = self.caster.hits(origins, directions, lead=0.0)
+            hit = np.flatnonzero(faces >= 0)
+            faces, weights = faces[hit], weights[hit]
             depth = (depths[self.faces[faces]] * weights).sum(axis=1)
             yield _Hits(
                 hit // width + start,

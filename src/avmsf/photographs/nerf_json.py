@@ -16,6 +16,7 @@ from avmsf._utils.text import listed, read_json
 from avmsf.capture.filenames import PICTURE_SUFFIXES
 from avmsf.capture.placement import FrameMismatch
 from avmsf.errors import CaptureError, Location, Remark
+from avmsf.mesh.io import load_parts
 from avmsf.photographs.lenses import Lens
 from avmsf.photographs.photograph import CameraFile, Photograph
 
@@ -33,7 +34,7 @@ def read_transforms(path: Path) -> CameraFile:
     Poses are camera to world with OpenGL's axes; intrinsics stand at the top or in each frame. Raises CaptureError
     where the file is not JSON, lacks something, or holds a pose or a camera model that cannot be used.
     """
-    record = load_record(path)
+    record = _load_record(path)
     frames = record.get("frames")
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         wanted, kind = "a list 'frames', each with file_path and transform_matrix", type(frames).__name__
@@ -58,16 +59,25 @@ def read_transforms(path: Path) -> CameraFile:
     return CameraFile(path, path.parent, tuple(photographs), remarks)
 
 
-def load_record(path: Path) -> dict[str, Any]:
-    """Return the file's JSON object; raises CaptureError for anything else."""
-    try:
-        record = read_json(path)
-    except (OSError, ValueError) as error:
-        raise CaptureError(f"{path}: expected a JSON file, got one that cannot be read ({error})", file=path) from error
-    if not isinstance(record, dict):
-        kind = type(record).__name__
-        raise CaptureError.expected("a JSON object with 'frames'", kind, got=kind, file=path)
-    return record
+def read_points(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the points [points, 3] of the file that a transforms.json names, and their colors [points, 3] in 8 bits.
+
+    Gray where they have none; None where it names no file or there are no points.
+    """
+    named = _load_record(path).get("ply_file_path")
+    if not isinstance(named, str) or not named:
+        return None
+    cloud = path.parent / named.replace("\\", "/")
+    clouds: list[Any] = load_parts(cloud)
+    if len(clouds) != 1:
+        got, key = f"{len(clouds)} parts", "ply_file_path"
+        raise CaptureError.expected("one point cloud", len(clouds), got=got, file=cloud, name=key)
+    points = np.asarray(clouds[0].vertices, dtype=np.float64)
+    colors = np.full((len(points), 3), 128, dtype=np.uint8)
+    painted = np.asarray(getattr(clouds[0].visual, "vertex_colors", colors))
+    if painted.shape[:1] == points.shape[:1]:
+        colors = painted[:, :3].astype(np.uint8)
+    return (points, colors) if len(points) else None
 
 
 def stated_moves(folder: Path, *, meters: float = 1.0) -> list[FrameMismatch]:
@@ -96,6 +106,18 @@ def stated_moves(folder: Path, *, meters: float = 1.0) -> list[FrameMismatch]:
                 FrameMismatch(factor, torch.from_numpy(matrix[:, :3] / stretch), shift, stated=f"{name} ({words})")
             )
     return found
+
+
+def _load_record(path: Path) -> dict[str, Any]:
+    """Return the file's JSON object; raises CaptureError for anything else."""
+    try:
+        record = read_json(path)
+    except (OSError, ValueError) as error:
+        raise CaptureError(f"{path}: expected a JSON file, got one that cannot be read ({error})", file=path) from error
+    if not isinstance(record, dict):
+        kind = type(record).__name__
+        raise CaptureError.expected("a JSON object with 'frames'", kind, got=kind, file=path)
+    return record
 
 
 def _lens(settings: Mapping[str, Any], where: Location, image_width: int, image_height: int) -> Lens:

@@ -14,7 +14,7 @@ from avmsf._utils.text import counted, listed
 from avmsf.capture.filenames import pictures_in
 from avmsf.errors import CaptureError, Remark
 from avmsf.photographs.cameras import View
-from avmsf.photographs.images import ImageSizeError, read_image, read_mask, read_upright, scale, size_of
+from avmsf.photographs.images import ImageSizeError, read_image, read_mask, scale, size_of
 from avmsf.photographs.lenses import Lens, straighten
 
 MAX_PHOTOGRAPHS = 10_000
@@ -124,7 +124,7 @@ def _with_lens(
     lens = photograph.lens_of(*size_of(pixels))
     size = (lens.width, lens.height)
     if pixels.shape[2] == 3 and size_of(pixels) != size:
-        upright = read_upright(photograph.image)
+        upright = read_image(photograph.image, upright=True)
         if size_of(upright) != size_of(pixels) and _same_shape(size_of(upright), size):
             pixels = upright
             findings["orientations"].append(photograph.name)
