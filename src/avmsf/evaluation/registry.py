@@ -241,7 +241,7 @@ def expect_suited(method: str, protocol: str) -> None:
     """Raise `EvaluationError` for a method whose sounds cannot be those of the protocol's training recordings."""
     if kind_of(method) == "recorded" and protocol == "shots":
         raise EvaluationError.expected(
-            "a protocol that tests each recording once",
+            f"a protocol that tests each recording once for {method}",
             method,
             got=f"{protocol}, which trains on several sets of recordings, and the folder holds the sounds of one",
             name="method",

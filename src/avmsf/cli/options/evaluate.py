@@ -13,7 +13,7 @@ from avmsf.cli.options.paths import CacheFolder, Existing, OutputFolder
 from avmsf.cli.options.settings import with_settings
 from avmsf.datasets.detect import detect_dataset
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.registry import expect_suited, method_entry, protocol_named
+from avmsf.evaluation.registry import PROTOCOLS, expect_suited, method_entry, protocol_named
 from avmsf.gaussians.config import SplatConfig
 from avmsf.modal.config import ExtractionMethod
 from avmsf.pipeline.config import BodyConfig, Geometry, LiftConfig, TimeZero
@@ -53,9 +53,9 @@ class Options(Configured):
     later. The folder of results holds summary.json, report.md and report.html, which shows and plays sounds.
     """
 
-    protocol: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="PROTOCOL")]]
-    """The experiment: farthest, leave-one-out, closest, predefined, shots, views, ablation, non-symmetric,
-    localize or grid."""
+    protocol: tyro.conf.Positional[
+        Annotated[str, tyro.conf.arg(metavar="PROTOCOL", help=f"The experiment: {', '.join(PROTOCOLS)}.")]
+    ]
     data: tyro.conf.Positional[
         Annotated[
             Path, tyro.conf.arg(metavar="DATA"), Existing("a dataset, capture folders or one capture", ("a folder",))
