@@ -127,24 +127,6 @@ class CaptureError(AvmsfError):
     """A capture folder, its table, its settings or one of its sound files cannot be used."""
 
 
-@dataclass(frozen=True)
-class Location:
-    """A file, one item in it, or an item alone."""
-
-    file: Path | str | None
-    row: int | None = None
-    """Line of a table from 1, or index in a list from 0."""
-    item: str = ""
-    """What messages call it: "row 3", "frame 0", "image left.png"."""
-
-    def __str__(self) -> str:
-        return ", ".join(str(part) for part in (self.file, self.item) if part)
-
-    def error(self, message: str, *, name: str | None = None, value: Any = None) -> CaptureError:
-        """Return an error about what is there."""
-        return CaptureError(f"{self}: {message}", file=self.file, row=self.row, name=name, value=value)
-
-
 class RecordingLengthError(CaptureError):
     """A sound file holds more samples than are read."""
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.optimize import fsolve
 
-from avmsf.errors import CaptureError, Location
+from avmsf.errors import CaptureError
 from avmsf.photographs import read_views
 from avmsf.photographs.cameras import View
-from avmsf.photographs.lenses import Lens, straighten
+from avmsf.photographs.lenses import Lens, Location, straighten
 from factories.raising import raises
 from factories.views_folder import quaternion, ring, write_image
 

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from avmsf.errors import CaptureError, Location
-from avmsf.photographs.lenses import Lens
+from avmsf.errors import CaptureError
+from avmsf.photographs.lenses import Lens, Location
 from avmsf.photographs.photograph import CameraFile, Photograph
 
 PLACES = ("sparse/0", "sparse", ".")

@@ -2,6 +2,8 @@
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -9,13 +11,33 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from avmsf.errors import Location
+from avmsf.errors import CaptureError
 from avmsf.photographs.cameras import Camera
 
 _GRID_POINTS = 33
 """Points along each side of a pinhole's image at which a lens is tested."""
 _MAX_FIELD_RATIO = 2.0
 """Width and height that a pinhole takes in over those that the lens has in its middle, at most."""
+
+
+@dataclass(frozen=True)
+class Location:
+    """A file, one item in it, or an item alone."""
+
+    file: Path | str | None
+    row: int | None = None
+    """Line of a table from 1, or index in a list from 0."""
+    item: str = ""
+    """What messages call it: "row 3", "frame 0", "image left.png"."""
+
+    def __str__(self) -> str:
+        return ", ".join(str(part) for part in (self.file, self.item) if part)
+
+    def error(self, message: str, *, name: str | None = None, value: Any = None) -> CaptureError:
+        """Return an error about what is there."""
+        return CaptureError(f"{self}: {message}", file=self.file, row=self.row, name=name, value=value)
+
+
 _ANY_CAMERA = Location(None, item="the camera")
 
 

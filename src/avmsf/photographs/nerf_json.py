@@ -15,9 +15,9 @@ from jaxtyping import Float
 from avmsf._utils.text import listed, read_json
 from avmsf.capture.filenames import PICTURE_SUFFIXES
 from avmsf.capture.placement import FrameMismatch
-from avmsf.errors import CaptureError, Location, Remark
+from avmsf.errors import CaptureError, Remark
 from avmsf.mesh.io import load_parts
-from avmsf.photographs.lenses import Lens
+from avmsf.photographs.lenses import Lens, Location
 from avmsf.photographs.photograph import CameraFile, Photograph
 
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
