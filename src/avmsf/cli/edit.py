@@ -32,7 +32,7 @@ from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
 from avmsf.plotting.edits import ModeLevels, draw_clap_curves, draw_edit
 from avmsf.plotting.pictures import save_picture
-from avmsf.plotting.spectrograms import draw_sound_change
+from avmsf.plotting.spectrograms import draw_spectrograms
 
 CLAP = "clap"
 """The key of the scores in the last edit of a field's report."""
@@ -295,7 +295,14 @@ def _show(
     )
     pictures = {
         MODES: modes,
-        SPECTROGRAMS: draw_sound_change(*sounds, sample_rate=old.sample_rate, title=f"an impact at {name}, edited"),
+        SPECTROGRAMS: draw_spectrograms(
+            *sounds[:, None],
+            sample_rate=old.sample_rate,
+            names=[""],
+            title=f"an impact at {name}, edited",
+            columns=("before", "after"),
+            shared_scale=False,
+        ),
     }
     for each, picture in pictures.items():
         save_picture(picture, folder / each)

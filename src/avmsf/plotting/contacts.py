@@ -1,6 +1,6 @@
 """The probability of a contact, as a picture of the object from all sides and as a colored point cloud."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeAlias
 
@@ -84,20 +84,14 @@ def write_contact_cloud(contact: ContactMap, path: Path) -> None:
     The vertices have the floats `probability` (they sum to one) and `cosine_distance` beside place and color. Raises
     EvaluationError where it cannot be written.
     """
-    kinds = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
-    kinds += [(name, "<f4") for name in ("probability", "cosine_distance")]
-    table = np.zeros(len(contact.points), dtype=kinds)
-    columns: Mapping[str, Tensor] = {
-        **dict(zip("xyz", contact.points.double().T, strict=True)),
-        **dict(zip(("red", "green", "blue"), (255.0 * contact_colors(contact)).round().T, strict=True)),
-        "probability": contact.probability,
-        "cosine_distance": contact.distance,
-    }
-    for name, column in columns.items():
-        table[name] = column.cpu().numpy()
-    words = {"<f4": "float", "u1": "uchar"}
+    numbers = ("probability", "cosine_distance")
+    kinds = dict.fromkeys("xyz", "<f4") | dict.fromkeys(("red", "green", "blue"), "u1") | dict.fromkeys(numbers, "<f4")
+    colors = (255.0 * contact_colors(contact)).round()
+    columns = [*contact.points.double().T, *colors.T, contact.probability, contact.distance]
+    table = np.rec.fromarrays([column.cpu().numpy() for column in columns], dtype=list(kinds.items()))
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
-    header += [f"property {words[kind]} {name}" for name, kind in kinds] + ["end_header", ""]
+    header += [f"property {'float' if kind == '<f4' else 'uchar'} {name}" for name, kind in kinds.items()]
+    header += ["end_header", ""]
     content = "\n".join(header).encode("ascii") + table.tobytes()
     write_whole(path, lambda place: place.write_bytes(content), raising=EvaluationError)
 

@@ -51,73 +51,46 @@ def log_spectrogram(
 
 @styled
 def draw_spectrograms(
-    truth: Float[Tensor, "contacts samples"],
-    predicted: Float[Tensor, "contacts samples"],
+    first: Float[Tensor, "rows samples"],
+    second: Float[Tensor, "rows samples"],
     *,
     sample_rate: float,
     names: Sequence[str],
     title: str,
+    columns: tuple[str, str] = ("recorded", "rendered"),
+    shared_scale: bool = True,
 ) -> Figure:
-    """Draw recorded and rendered sounds side by side, one row a contact, both on the recorded one's scale.
+    """Draw sounds side by side with a linear frequency axis, over the maximum of the first one or each over its own.
 
-    Shows the band and the time in which the recordings have energy.
+    Shows the band and the time in which the first ones have energy.
     """
-    titles = [[f"{name}: {what}" for what in ("recorded", "rendered")] for name in names]
-    sounds = torch.stack([truth, predicted], dim=1)
-    label = "level (dB re maximum of the recording)"
-    figure, axes = _draw_linear(sounds, titles, sample_rate=sample_rate, title=title, label=label, shared_scale=True)
-    fft_size, hop = _linear_sizes(sample_rate)
-    highest, latest = _energy_extent(magnitude_stft(truth, fft_size=fft_size, hop=hop))
-    axes.set_ylim(0.0, highest * sample_rate / 2)
-    axes.set_xlim(0.0, max(latest * truth.shape[1] / sample_rate, 4 * hop / sample_rate))
-    return figure
-
-
-@styled
-def draw_sound_change(
-    before: Float[Tensor, " samples"], after: Float[Tensor, " samples"], *, sample_rate: float, title: str
-) -> Figure:
-    """Draw the spectrograms of two sounds side by side, each on the scale of its own loudest point."""
-    sounds, titles, label = torch.stack([before, after])[None], [["before", "after"]], "level (dB re maximum of each)"
-    return _draw_linear(sounds, titles, sample_rate=sample_rate, title=title, label=label, shared_scale=False)[0]
-
-
-def _draw_linear(
-    sounds: Float[Tensor, "rows columns samples"],
-    titles: Sequence[Sequence[str]],
-    *,
-    sample_rate: float,
-    title: str,
-    label: str,
-    shared_scale: bool,
-) -> tuple[Figure, Axes]:
-    """Draw levels with a linear frequency axis, over the maximum of each sound or of the first one of its row.
-
-    Return the figure and one of its axes, whose limits all share.
-    """
-    rows, columns, _ = sounds.shape
-    figure = titled_figure(title, 10, 2.1 * rows + 1.2)
-    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    fft_size, hop = _linear_sizes(sample_rate)
+    figure = titled_figure(title, 10, 2.1 * len(first) + 1.2)
+    grid = figure.subplots(len(first), 2, sharex=True, sharey=True, squeeze=False)
+    fft_size = scaled_fft_size(1024, sample_rate=sample_rate)
+    hop = max(1, fft_size // 8)
     step = hop / sample_rate
-    for line, row, names in zip(grid, sounds, titles, strict=True):
-        spectra = magnitude_stft(row, fft_size=fft_size, hop=hop)
-        for axes, spectrum, name in zip(line, spectra, names, strict=True):
-            reference = max(float((spectra[0] if shared_scale else spectrum).max()), 1e-30)
+    spectra = [magnitude_stft(sounds, fft_size=fft_size, hop=hop) for sounds in (first, second)]
+    for row, name in enumerate(names):
+        for axes, spectrum, what in zip(grid[row], spectra, columns, strict=True):
+            reference = max(float((spectra[0] if shared_scale else spectrum)[row].max()), 1e-30)
             image = axes.imshow(
-                20 * torch.log10((spectrum / reference).clamp_min(1e-10)).numpy(),
+                20 * torch.log10((spectrum[row] / reference).clamp_min(1e-10)).numpy(),
                 origin="lower",
                 aspect="auto",
-                extent=(-step / 2, (spectrum.shape[1] - 0.5) * step, 0.0, sample_rate / 2),
+                extent=(-step / 2, (spectrum.shape[2] - 0.5) * step, 0.0, sample_rate / 2),
                 interpolation="nearest",
                 **_LEVELS,
             )
-            axes.set_title(name)
-        line[0].set_ylabel("frequency (Hz)")
+            axes.set_title(f"{name}: {what}" if name else what)
+        grid[row, 0].set_ylabel("frequency (Hz)")
+    highest, latest = _energy_extent(spectra[0])
+    grid[0, 0].set_ylim(0.0, highest * sample_rate / 2)
+    grid[0, 0].set_xlim(0.0, max(latest * first.shape[1] / sample_rate, 4 * step))
     for axes in grid[-1]:
         axes.set_xlabel("time (s)")
+    label = f"level (dB re maximum of {f'the {columns[0]}' if shared_scale else 'each'})"
     figure.colorbar(image, ax=grid, label=label, shrink=0.8)
-    return figure, grid[0, 0]
+    return figure
 
 
 @styled
@@ -145,7 +118,8 @@ def draw_method_spectrograms(
         loudest: float | None = None
         for axes, method in zip(row, methods, strict=True):
             if method in sounds:
-                start = _first_second(sounds[method], sample_rate=sample_rate)
+                start = sounds[method][: max(1, round(SECONDS * sample_rate))].double()
+                start = start / start.abs().max().clamp_min(torch.finfo(torch.float64).tiny)
                 levels = log_spectrogram(start, sample_rate=sample_rate, lowest=bottom, highest=top)
                 loudest = float(levels.max()) if loudest is None else loudest
                 # Frames are centered on 0, 1, 2, ... hops.
@@ -165,11 +139,6 @@ def draw_method_spectrograms(
     return figure
 
 
-def _first_second(sound: Float[Tensor, " samples"], *, sample_rate: float) -> Float64[Tensor, " kept"]:
-    start = sound[: max(1, round(SECONDS * sample_rate))].double()
-    return start / start.abs().max().clamp_min(torch.finfo(torch.float64).tiny)
-
-
 def _hop(samples: int, width: int = _WIDTH) -> int:
     return max(1, -(-samples // width))
 
@@ -183,12 +152,6 @@ def _set_axes(axes: Axes, seconds: float, band: tuple[float, float]) -> None:
     axes.yaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
-
-
-def _linear_sizes(sample_rate: float) -> tuple[int, int]:
-    """Return FFT size and hop of spectrograms with a linear frequency axis."""
-    fft_size = scaled_fft_size(1024, sample_rate=sample_rate)
-    return fft_size, max(1, fft_size // 8)
 
 
 def _energy_extent(magnitude: Float[Tensor, "contacts bins frames"]) -> tuple[float, float]:
