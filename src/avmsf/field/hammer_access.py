@@ -7,15 +7,13 @@ cannot be struck.
 """
 
 import math
-from functools import cached_property
 
 import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float64, Int
 from scipy.spatial import cKDTree
 
 from avmsf.mesh.closest_point import ClosestPoints
+from avmsf.mesh.rays import RayCaster
 
 HAMMER_DIAMETER = 0.01
 """Meters. A pencil has 7 mm, the head of the usual modal hammer (PCB 086C03) 16 mm and its tip 6 mm."""
@@ -40,12 +38,12 @@ class MeshAccess:
     def __init__(self, vertices: Float64[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]) -> None:
         low, high = vertices.min(axis=0), vertices.max(axis=0)
         self._middle, self._size = (low + high) / 2, float(np.linalg.norm(high - low))
-        # Embree counts in float32: the mesh is moved to the origin and given size 1.
         self._triangles = ((vertices - self._middle) / self._size)[faces]
         crosses = np.cross(self._triangles[:, 1] - self._triangles[:, 0], self._triangles[:, 2] - self._triangles[:, 0])
         areas = np.linalg.norm(crosses, axis=1)
         solid = areas > 0
         self._triangles, self._normals = self._triangles[solid], crosses[solid] / areas[solid, None]
+        self._closest, self._rays = ClosestPoints(self._triangles), RayCaster(self._triangles)
         self._radius = 0.5 * HAMMER_DIAMETER / self._size
 
     def __call__(
@@ -67,15 +65,6 @@ class MeshAccess:
             used[left] = axes[left]
         return reached, feet * self._size + self._middle, used
 
-    @cached_property
-    def _closest(self) -> ClosestPoints:
-        return ClosestPoints(self._triangles)
-
-    @cached_property
-    def _scene(self) -> tuple[EmbreeScene, TriangleMesh]:
-        scene = EmbreeScene()
-        return scene, TriangleMesh(scene, self._triangles.astype(np.float32))
-
     def _clear(
         self, tips: Float64[np.ndarray, "rods 3"], axes: Float64[np.ndarray, "rods 3"]
     ) -> Bool[np.ndarray, " rods"]:
@@ -93,8 +82,7 @@ class MeshAccess:
         self, origins: Float64[np.ndarray, "rays 3"], directions: Float64[np.ndarray, "rays 3"]
     ) -> Float64[np.ndarray, " rays"]:
         """Return the distance to the first triangle along each ray."""
-        hit = self._scene[0].run(origins.astype(np.float32), directions.astype(np.float32), output=1)
-        return np.where(hit["primID"] >= 0, hit["tfar"].astype(np.float64), np.inf)
+        return self._rays(origins, directions, lead=0.0)[1]
 
 
 class PointAccess:
