@@ -1,7 +1,7 @@
 """An object as 3D Gaussians: soft ellipsoids with an opacity and a color that depends on the direction of view."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -62,11 +62,10 @@ class GaussianCloud:
 
     def join(self, other: "GaussianCloud") -> "GaussianCloud":
         """Return these Gaussians and then those of another cloud with harmonics of the same degree."""
-        names = [each.name for each in fields(self)]
-        return GaussianCloud(*(torch.cat([getattr(self, name), getattr(other, name)]) for name in names))
+        return GaussianCloud(*map(torch.cat, zip(vars(self).values(), vars(other).values(), strict=True)))
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> "GaussianCloud":
-        return GaussianCloud(*(change(getattr(self, each.name)) for each in fields(self)))
+        return GaussianCloud(*map(change, vars(self).values()))
 
 
 def rotation_matrices(quaternions: Float[Tensor, "points 4"]) -> Float[Tensor, "points 3 3"]:

@@ -129,8 +129,8 @@ def _fingerprint(views: Sequence[View], cloud: GaussianCloud, config: SplatConfi
         digest.update(repr((view.name, camera.focal, camera.principal, camera.width, camera.height)).encode())
         for each in (camera.world_to_camera, view.image, view.mask):
             digest.update(b"none" if each is None else each.contiguous().numpy().tobytes())
-    for each in (cloud.centers, cloud.rotations, cloud.log_scales, cloud.logit_opacities, cloud.harmonics):
-        digest.update(each.contiguous().numpy().tobytes())
+    for values in vars(cloud).values():
+        digest.update(values.contiguous().numpy().tobytes())
     return digest.hexdigest()
 
 

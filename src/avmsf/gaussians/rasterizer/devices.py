@@ -1,7 +1,6 @@
 """Rasterizers: numba kernels over tiles of 8 x 8 pixels for processors, and gsplat for graphics cards."""
 
 import importlib
-from dataclasses import fields
 from typing import Any
 
 import torch
@@ -59,8 +58,7 @@ class NumbaRasterizer:
 
 
 def _expect_plain(cloud: GaussianCloud, background: Float[Tensor, " 3"]) -> None:
-    tensors = {each.name: getattr(cloud, each.name) for each in fields(cloud)}
-    for name, tensor in {**tensors, "background": background}.items():
+    for name, tensor in {**vars(cloud), "background": background}.items():
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
             found = [str(tensor.dtype).removeprefix("torch."), str(tensor.device)]
             advice = "convert it, or use the rasterizer of `choose_rasterizer` for that device"
@@ -69,11 +67,10 @@ def _expect_plain(cloud: GaussianCloud, background: Float[Tensor, " 3"]) -> None
 
 def _fault(cloud: GaussianCloud, row: int) -> SceneError:
     """Return the error of one Gaussian."""
-    for each in fields(cloud):
-        values = getattr(cloud, each.name)[row].detach()
-        if not bool(torch.isfinite(values).all()):
+    for name, values in vars(cloud).items():
+        if not bool(torch.isfinite(values[row]).all()):
             advice = "remove it with `GaussianCloud.take`, or lower the learning rate if training made it"
-            return SceneError.expected("finite numbers", values.tolist(), row=row, name=each.name, advice=advice)
+            return SceneError.expected("finite numbers", values[row].tolist(), row=row, name=name, advice=advice)
     value, advice = cloud.rotations[row].tolist(), "write 1, 0, 0, 0 for no rotation"
     return SceneError.expected("a quaternion of a length above 0", value, row=row, name="rotations", advice=advice)
 
