@@ -20,9 +20,10 @@ from avmsf.datasets.dataset import Dataset
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.case_run import Evaluation
 from avmsf.evaluation.field_methods import FieldMethod
-from avmsf.evaluation.methods import RecordedMethod, method_named
+from avmsf.evaluation.methods import method_named
 from avmsf.evaluation.objects import SUBSETS, ObjectInputs, choose_objects, members
 from avmsf.evaluation.published import PUBLISHED
+from avmsf.evaluation.recorded import RecordedMethod
 from avmsf.evaluation.registry import Protocol, protocol_named
 from avmsf.evaluation.report import PAGE, SUMMARY, TABLES, write_figures, write_page, write_summary
 from avmsf.evaluation.report_tables import Section

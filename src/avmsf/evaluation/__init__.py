@@ -10,7 +10,7 @@ In go recordings with their contacts; out come one value for each metric, method
   (`clap`); modal assurance criterion and errors of modes and gains against a simulation's (`modal_metrics`); error of
   located contacts (`localization`).
 - Methods: k nearest recordings, mean gains, thin-plate splines (`simple_methods`, `methods`), DiffSound and SonicGauss
-  (`avmsf.baselines`), and configurations of the sound field (`field_methods`).
+  (`avmsf.baselines`), files of other systems (`recorded`), and configurations of the sound field (`field_methods`).
 - `run_objects` (`runner`) runs an `Evaluation` (`case_run`) in this process or on ray, into a `ResultsFolder`
   (`results`) that a stopped run goes on with; `summary`, `report_tables` and `report` make means, ratios to `knn3`, and
   one report, as Markdown and as a page. `published` has the paper's values.

@@ -20,7 +20,7 @@ from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.localization import located, write_map
 from avmsf.evaluation.modal_metrics import truth_at, truth_from_first_sample, truth_of
 from avmsf.evaluation.objects import ObjectInputs, draw_other_recording
-from avmsf.evaluation.registry import METRICS, Protocol
+from avmsf.evaluation.registry import METRICS, Protocol, table_modules
 from avmsf.evaluation.results import ENCODER, CaseRecord, Outcome, ResultsFolder, failure_of, file_word
 from avmsf.evaluation.scores import MetricSettings, Values
 from avmsf.evaluation.splits import Case, align_split, evenly_spaced
@@ -66,7 +66,7 @@ class Evaluation:
             self.metric_settings.prepare()
         identity = {
             "version": version("avmsf"),
-            "source": [source_digest(__name__), source_digest("avmsf.evaluation.methods")],
+            "source": [source_digest(module) for module in (__name__, *table_modules())],
             "protocol": self.protocol.name,
             "choosing": repr(self.protocol.choosing),
             "dataset": self.title,

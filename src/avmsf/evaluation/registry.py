@@ -126,7 +126,7 @@ METHODS: dict[str, MethodEntry] = {
     ),
     "recorded": MethodEntry(
         "sounds of another system, from files",
-        make="methods:RecordedMethod",
+        make="recorded:RecordedMethod",
         path="a folder with a folder of wav files for every object",
     ),
 }
@@ -220,6 +220,12 @@ PROTOCOLS: dict[str, Protocol] = {
     )
 }
 """All experiments by name."""
+
+
+def table_modules() -> list[str]:
+    """Return the names of all modules that the import paths of methods and metrics lead to."""
+    paths = [*(each.make or each.fit for each in METHODS.values()), *(each.function for each in METRICS.values())]
+    return sorted({f"{__package__}.{path.partition(':')[0]}" for path in paths if isinstance(path, str)})
 
 
 def protocol_named(name: str) -> Protocol:

@@ -14,7 +14,7 @@ from avmsf._utils.device import one_thread
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import AvmsfError, EvaluationError
 from avmsf.evaluation.case_run import CaseRun, Evaluation, ObjectData
-from avmsf.evaluation.methods import RecordedMethod
+from avmsf.evaluation.recorded import RecordedMethod
 from avmsf.evaluation.registry import METRICS, MetricEntry
 from avmsf.evaluation.results import CaseRecord, ObjectRecord, ResultsFolder, failure_of
 from avmsf.evaluation.splits import Case
