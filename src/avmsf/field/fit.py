@@ -91,13 +91,7 @@ def fit(
         modes.alignment,
     )
     used = train.take(fitted.used)
-    if config.residual and not config.noise_rate and config.steps:
-        # The noise is measured from what the modes do not explain.
-        bins = len(field.residual.magnitude)
-        silent = replace(field, residual=Residual(torch.zeros(bins)))
-        explained = silent.render(used.contacts, directions=used.directions)
-        field = replace(field, residual=estimate_residual(used.sounds, explained, bins=bins))
-    return _with_quality(field, used, advise=features.on_surface)
+    return _with_quality(_with_noise(field, used), used, advise=features.on_surface)
 
 
 def fingerprint(data: GainData, estimator: GainEstimator) -> str:
@@ -112,6 +106,16 @@ def fingerprint(data: GainData, estimator: GainEstimator) -> str:
         digest.update(f"{tensor.dtype} {tuple(tensor.shape)}".encode())
         digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()
+
+
+def _with_noise(field: SoundField, train: Impacts) -> SoundField:
+    """Return a field with the noise that its modes leave of the recordings, unless it was trained or is not wanted."""
+    config, bins = field.origin.config, len(field.residual.magnitude)
+    if not config.residual or config.noise_rate or not config.steps:
+        return field
+    silent = replace(field, residual=Residual(torch.zeros(bins)))
+    modes = silent.render(train.contacts, directions=train.directions)
+    return replace(field, residual=estimate_residual(train.sounds, modes, bins=bins))
 
 
 def _with_quality(field: SoundField, train: Impacts, *, advise: bool) -> SoundField:
