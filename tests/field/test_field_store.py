@@ -57,9 +57,10 @@ def other_field() -> SoundField:
 
 @pytest.mark.parametrize("damping", ["shared", "per-contact", "validated"])
 def test_a_field_comes_back_to_the_last_bit(tmp_path, damping):
-    saved, path = field(damping), tmp_path / "plate.safetensors"
+    saved, path, chance = field(damping), tmp_path / "plate.safetensors", torch.get_rng_state()
     save(saved, path)
     loaded = load(str(path))
+    assert torch.equal(torch.get_rng_state(), chance)
     assert torch.equal(loaded.render(CONTACTS), saved.render(CONTACTS))
     assert torch.equal(loaded.gains(CONTACTS), saved.gains(CONTACTS))
     assert torch.equal(loaded.dampings(CONTACTS), saved.dampings(CONTACTS))
@@ -86,14 +87,6 @@ def test_a_file_names_its_tensors_and_itself(tmp_path):
     assert record["sample_rate"] == 8000.0
     assert record["origin"]["capture"] == "a plate"
     assert record["origin"]["per_newton"] is True
-
-
-def test_saving_twice_gives_the_same_bytes_and_leaves_chance_alone(tmp_path):
-    before = torch.get_rng_state()
-    save(field(), tmp_path / "one")
-    save(load(tmp_path / "one"), tmp_path / "two")
-    assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
-    assert torch.equal(torch.get_rng_state(), before)
 
 
 def test_a_loaded_field_needs_its_file_no_more(tmp_path):
@@ -256,15 +249,6 @@ def test_an_older_format_is_refused_with_the_command_that_makes_the_field_again(
     assert "'a plate'" in str(caught.value)
 
 
-def test_missing_and_unexpected_tensors_are_named(tmp_path):
-    def change(tensors: dict[str, torch.Tensor], _: dict) -> None:
-        tensors["gains.to_dampings.bias"] = tensors.pop("gains.to_gains.bias")
-
-    wrong = [["gains.to_gains.bias"], ["gains.to_dampings.bias"]]
-    with raises(FieldFileError, file="plate.safetensors", name="gains.to_gains.bias", value=wrong):
-        load(changed(tmp_path, change))
-
-
 @pytest.mark.parametrize(
     ("name", "made", "shape"),
     [
@@ -305,8 +289,6 @@ def test_tensors_of_another_form_or_of_impossible_values_are_refused(tmp_path, n
         (("sizes", "bins"), True, "sizes.bins"),
         (("gains",), {}, "kind"),
         (("gains", "points"), 0, "points"),
-        (("gains", "dim"), True, "dim"),
-        (("gains", "encoder"), 5, "encoder"),
         (("gains", "kind"), "splines", "gains.kind"),
         (("gains", "shape", "width"), 1.5, "shape.width"),
         (("gains", "shape", "heads"), 4, "shape.heads"),

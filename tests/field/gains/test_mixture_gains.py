@@ -310,19 +310,6 @@ def test_impacts_of_no_direction_go_straight_into_the_body():
     assert not directions[::2].any()
 
 
-def test_without_a_body_they_go_as_the_nearest_training_impact():
-    given = model(elastic=False)
-    nearest = torch.cdist(ASKED.points, given.contacts).argmin(1)
-    assert torch.equal(given.sites(ASKED.points.float()).directions, given.training.directions[nearest])
-    zeros = torch.zeros_like(ASKED.points)
-    assert torch.equal(given.sites(ASKED.points, zeros).directions, given.training.directions[nearest])
-
-
-def test_a_model_that_knows_no_directions_takes_none():
-    given = replace(model(elastic=False), directional=False)
-    assert torch.equal(gains_at(given), gains_at(given, replace(ASKED, directions=-ASKED.directions)))
-
-
 @pytest.mark.parametrize("elastic", [True, False])
 def test_a_model_comes_back_from_its_tensors_to_the_last_bit(elastic):
     given = replace(model(elastic=elastic), measured=1.1 * model(elastic=elastic).values, spread_share=0.75)

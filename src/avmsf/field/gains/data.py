@@ -52,7 +52,7 @@ class GainData:
 
 
 def gain_data(train: Impacts, features: FeatureField, modes: Extraction, config: FitConfig) -> GainData:
-    """Return what gain fields are made from. Raises FitError where no field can be fitted to recordings and modes."""
+    """Return what gain models are fitted to. Raises FitError for recordings and modes that none can be fitted to."""
     _expect_fitting(train, modes)
     # The alignment comes first, as it recognizes recordings by their samples. Amplitudes are float32 from there on, so
     # that a field is the same whichever its recordings came in.
