@@ -71,13 +71,10 @@ def draw_edit(before: ModeLevels, after: ModeLevels, *, sample_rate: float, titl
     moves = (torch.stack([getattr(each, name) for each in (before, after)]).numpy() for name in ("frequency", "t60"))
     rings.plot(*moves, color="gray", linewidth=0.5, alpha=0.5, zorder=0)
     _count(counts, drawn)
-    levels.set_ylim(top - _RANGE_DB, top + 6.0)
-    levels.set_ylabel("level (dB re strongest mode before)")
+    levels.set(ylim=(top - _RANGE_DB, top + 6.0), ylabel="level (dB re strongest mode before)")
     levels.legend()
-    rings.set_yscale("log")
-    rings.set_ylabel("decay time T60 (s)")
-    counts.set_ylabel("modes per third-octave band")
-    counts.set_xlabel("frequency (Hz); hollow: silent")
+    rings.set(yscale="log", ylabel="decay time T60 (s)")
+    counts.set(xlabel="frequency (Hz); hollow: silent", ylabel="modes per third-octave band")
     highest = max(float(each.frequency.max()) for _, each, _ in drawn)
     for axes in (levels, rings, counts):
         axes.set_xscale("log")
@@ -119,8 +116,7 @@ def draw_clap_curves(curves: Mapping[str, Sequence[Curve]], *, title: str) -> Fi
         steps = sorted(set.intersection(*(set(dict(edit)) for edit in edits)))
         means = [mean(dict(edit)[step] for edit in edits) for step in steps]
         axes.plot(steps, means, "o-", color=color, linewidth=2.2, markersize=4, label=f"{method}, {len(edits)} edits")
-    axes.set_xlabel("step")
-    axes.set_ylabel("CLAP score")
+    axes.set(xlabel="step", ylabel="CLAP score")
     axes.grid()
     axes.legend()
     return figure

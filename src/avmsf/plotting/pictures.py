@@ -52,15 +52,13 @@ def draw_modes(
                 marks.set(color=color, markersize=4)
                 lines.set(color=color, linewidth=1)
                 base.set_visible(False)
-    upper.set_ylim(bottom, float(level.max()) + 0.12 * (float(level.max()) - bottom))
-    upper.set_ylabel("level (dB re strongest pole)")
+    top = float(level.max()) + 0.12 * (float(level.max()) - bottom)
+    upper.set(ylim=(bottom, top), ylabel="level (dB re strongest pole)")
     for row in _apart(frequency, np.where(kept, level + 10 * np.log10(t60), -np.inf), most=8):
         offset: dict[str, Any] = {"xytext": (0, 5), "textcoords": "offset points", "ha": "center"}
         upper.annotate(f"{frequency[row]:.4g}", (frequency[row], level[row]), fontsize=8, **offset)
     lower.set_ylim(bottom=0.0)
-    lower.set_ylabel("decay time T60 (s)")
-    lower.set_xlabel("frequency (Hz)")
-    lower.set_xscale("log")
+    lower.set(xscale="log", xlabel="frequency (Hz)", ylabel="decay time T60 (s)")
     lower.set_xlim(0.9 * float(frequency.min()), 1.1 * float(frequency.max()))
     lower.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     for axes in (upper, lower):

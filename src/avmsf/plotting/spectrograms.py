@@ -144,9 +144,7 @@ def _hop(samples: int, width: int = _WIDTH) -> int:
 
 
 def _set_axes(axes: Axes, seconds: float, band: tuple[float, float]) -> None:
-    axes.set_yscale("log")
-    axes.set_ylim(*band)
-    axes.set_xlim(0.0, seconds)
+    axes.set(yscale="log", xlim=(0.0, seconds), ylim=band)
     marks = [mark for mark in (20.0, 100.0, 1000.0, 10000.0, 20000.0) if band[0] <= mark <= band[1]]
     axes.yaxis.set_major_locator(FixedLocator(marks))
     axes.yaxis.set_minor_locator(NullLocator())

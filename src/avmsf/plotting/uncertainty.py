@@ -71,10 +71,9 @@ def draw_band(band: SpectrumBand, *, title: str) -> Figure:
     inside = f"{100 * band.level:g} % credible band"
     axes.fill_between(frequencies, lower, upper, color=FIRST, alpha=0.3, linewidth=0, label=inside)
     axes.plot(frequencies, middle, color=FIRST, linewidth=1, label="median")
-    axes.set_ylim(max(upper.max() - _RANGE_DB, lower.min() - 3.0), upper.max() + 3.0)
-    axes.set_xlim(0.0, float(frequencies[-1]))
-    axes.set_xlabel("frequency (Hz)")
-    axes.set_ylabel("energy (dB re loudest band)")
+    lowest = max(upper.max() - _RANGE_DB, lower.min() - 3.0)
+    axes.set(xlabel="frequency (Hz)", ylabel="energy (dB re loudest band)")
+    axes.set(xlim=(0.0, float(frequencies[-1])), ylim=(lowest, upper.max() + 3.0))
     axes.grid()
     axes.legend()
     return figure
