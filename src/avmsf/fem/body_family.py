@@ -123,11 +123,8 @@ def body_family(
         except SimulationError as error:
             reasons.append(f"wall of {1000 * thickness:.2g} mm: {error}")
     if not made:
-        raise SimulationError(
-            f"expected a surface with a finite-element model, got none ({'; '.join(reasons)}); repair the mesh",
-            name="surface",
-            value=reasons,
-        )
+        wanted, got = "one with a finite-element model", f"none ({'; '.join(reasons)})"
+        raise SimulationError.expected(wanted, reasons, got=got, name="surface", advice="repair the mesh")
     return BodyFamily(tuple(made.values()), tuple(made), make)
 
 

@@ -251,12 +251,9 @@ def expect_memory(dofs: int) -> None:
     needed = _CAUTION * peak * (dofs / measured) ** power
     if free is not None and needed > free:
         fitting = int(measured * (free / (_CAUTION * peak)) ** (1.0 / power)) // 1000 * 1000
-        raise SimulationError(
-            f"expected about {needed / 1e9:.2g} GB of free memory for {dofs} degrees of freedom, got "
-            f"{free / 1e9:.2g} GB; use {max(fitting, MIN_DOFS)} (--body.dofs), or close other programs",
-            name="memory",
-            value=free,
-        )
+        wanted = f"about {needed / 1e9:.2g} GB of it free for {dofs} degrees of freedom"
+        advice = f"use {max(fitting, MIN_DOFS)} (--body.dofs), or close other programs"
+        raise SimulationError.expected(wanted, free, got=f"{free / 1e9:.2g} GB", name="memory", advice=advice)
 
 
 def _free_memory() -> float | None:

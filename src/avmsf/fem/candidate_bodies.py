@@ -241,17 +241,26 @@ class SurfaceBodies(CandidateBodies):
                 possible.append(thickness)
             except SimulationError as error:
                 refused[thickness] = error
-        bodies = self._computed(possible, refused)
+
+        def attempt(thickness: float | None) -> CandidateBody | SimulationError:
+            try:
+                return self._body(thickness, fine=len(possible) == 1)
+            except SimulationError as error:
+                return error
+
+        # Most of the time goes to factorizations, which release the interpreter's lock and keep a processor busy each.
+        with ThreadPoolExecutor(lane_count()) as pool:
+            found = dict(zip(possible, pool.map(attempt, possible), strict=True))
+        bodies = [each for each in found.values() if isinstance(each, CandidateBody)]
+        refused |= {thickness: each for thickness, each in found.items() if isinstance(each, SimulationError)}
         reasons = _grouped(refused)
         if not bodies:
             causes = {str(error.name) for error in refused.values()}
             other = "give the wall thickness in meters" if guessed else "give another wall thickness, or none"
-            raise SimulationError(
-                f"expected a surface with a finite-element model, got none ({'; '.join(reasons)}); repair the mesh, or "
-                f"{other}",
-                name=min(causes) if causes <= _MEANS else "surface",
-                value=reasons,
-            )
+            name = min(causes) if causes <= _MEANS else "surface"
+            wanted, got = "a surface with a finite-element model", f"none ({'; '.join(reasons)})"
+            advice = f"repair the mesh, or {other}"
+            raise SimulationError.expected(wanted, reasons, got=got, name=name, advice=advice)
         for reason in reasons:
             self._log(_without(reason))
         if len(bodies) == 1:
@@ -264,24 +273,6 @@ class SurfaceBodies(CandidateBodies):
             return [None, *(ratio * self._meshes.checked.mesh.scale for ratio in THICKNESS_RATIOS)]
         between = self._meshes.shape.thickness_range
         return [None] if between is None else [None, *np.geomspace(*between, _SHAPE_THICKNESSES).tolist()]
-
-    def _computed(
-        self, thicknesses: Sequence[float | None], refused: dict[float | None, SimulationError]
-    ) -> list[CandidateBody]:
-        """Return the bodies of these thicknesses, fine if it is one; `refused` gets the errors of those that fail."""
-        bodies = []
-        # Most of the time goes to factorizations, which release the interpreter's lock and keep a processor busy each.
-        with ThreadPoolExecutor(lane_count()) as pool:
-            pending = {each: pool.submit(self._body, each, fine=len(thicknesses) == 1) for each in thicknesses}
-            try:
-                for thickness, body in pending.items():
-                    try:
-                        bodies.append(body.result())
-                    except SimulationError as error:
-                        refused[thickness] = error
-            finally:
-                pool.shutdown(cancel_futures=True)
-        return bodies
 
     def _body(self, thickness: float | None, *, fine: bool) -> CandidateBody:
         """Return a free body with all degrees of freedom, or with few of them where it need not be fine."""
@@ -348,12 +339,9 @@ class SurfaceBodies(CandidateBodies):
             try:
                 return elastic_modes(solid, self._material, count=self._count, fixed=fixed, perturbed=perturbed)
             except MemoryError as error:
-                raise SimulationError(
-                    f"expected enough memory for {size} degrees of freedom, got too little; use "
-                    f"{max(dofs // 2, MIN_DOFS)} (--body.dofs), or close other programs",
-                    name="dofs",
-                    value=size,
-                ) from error
+                wanted = f"enough memory for {size} degrees of freedom"
+                advice = f"use {max(dofs // 2, MIN_DOFS)} (--body.dofs), or close other programs"
+                raise SimulationError.expected(wanted, size, got="too little", name="dofs", advice=advice) from error
 
         values: dict[str, Any] = {"wall": thickness, "dofs": dofs, "perturbed": perturbed}
         values["support"] = None if support is None else asdict(support)

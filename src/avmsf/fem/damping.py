@@ -74,12 +74,9 @@ def damped(
     audible = torch.nonzero(ringing & (poles.imag <= 2.0 * math.pi * highest)).flatten()
     if len(audible) == 0:
         lowest = float(frequency.min())
-        raise SimulationError(
-            f"expected damped modes up to {highest:g} Hz, got none of {count}, the lowest at {lowest:.4g} Hz undamped; "
-            "make the object larger or thinner, its material softer or less damped, or raise the sample rate",
-            name="frequency",
-            value=lowest,
-        )
+        wanted, got = f"damped modes up to {highest:g} Hz", f"none of {count}, the lowest at {lowest:.4g} Hz undamped"
+        advice = "make the object larger or thinner, its material softer or less damped, or raise the sample rate"
+        raise SimulationError.expected(wanted, lowest, got=got, name="frequency", advice=advice)
     audible = audible[torch.argsort(poles.imag[audible])]
     return Vibration(
         poles[audible], vectors[count:, audible] * poles[audible], inverse[audible, count:].resolve_conj().contiguous()

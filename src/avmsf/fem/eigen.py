@@ -105,12 +105,8 @@ def lowest_vibrations(
     dofs = stiffness.shape[0]
     wanted = count + (_RIGID if supported else 0)
     if wanted + 2 * _RIGID > dofs:
-        raise SimulationError(
-            f"expected {wanted // 3 + 5} nodes or more for {count} modes, got {dofs // 3}; ask for fewer modes or "
-            "a finer detail",
-            name="nodes",
-            value=dofs // 3,
-        )
+        least, advice = f"{wanted // 3 + 5} or more for {count} modes", "ask for fewer modes or a finer detail"
+        raise SimulationError.expected(least, dofs // 3, name="nodes", advice=advice)
     heavy = scipy.sparse.kron(mass, scipy.sparse.eye_array(3), format="csc")
     try:
         factored = splu(
@@ -118,9 +114,9 @@ def lowest_vibrations(
             options={"SymmetricMode": True},
         )  # fmt: skip
     except RuntimeError as error:
-        raise SimulationError(
-            f"expected an invertible stiffness matrix, got {error}; make the tetrahedra with another detail",
-            name="stiffness",
+        advice = "make the tetrahedra with another detail"
+        raise SimulationError.expected(
+            "an invertible matrix", got=str(error), name="stiffness", advice=advice
         ) from error
     weighted = _times(mass, rigid)
 
@@ -164,12 +160,8 @@ def _largest_responses(
             if not size or (residual <= _PRECISION * values[chosen]).all():
                 return values[chosen], basis[:, :end] @ vectors[:, chosen]
         if end + size > longest + _BLOCK:
-            raise SimulationError(
-                f"expected the {wanted} lowest modes within {end} steps, got fewer; make the tetrahedra with another "
-                "detail",
-                name="modes",
-                value=end,
-            )
+            lowest, advice = f"the {wanted} lowest within {end} steps", "make the tetrahedra with another detail"
+            raise SimulationError.expected(lowest, end, got="fewer", name="modes", advice=advice)
         basis[:, end : end + size] = block
         begin, end = end, end + size
 

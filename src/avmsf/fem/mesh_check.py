@@ -213,23 +213,16 @@ class CheckedSurface:
     def expect_filling(self) -> None:
         """Raise SimulationError where the surface is too open to be filled."""
         if self.lids > _LIDS:
-            raise SimulationError(
-                f"expected a closed mesh, got {len(boundary_edges(self.mesh))} open edges whose holes are "
-                f"{self.lids:.0%} of the surface; give a wall thickness, or close the mesh",
-                name="mesh",
-                value=self.lids,
-            )
+            got = f"{len(boundary_edges(self.mesh))} open edges whose holes are {self.lids:.0%} of the surface"
+            advice = "give a wall thickness, or close the mesh"
+            raise SimulationError.expected("a closed one", self.lids, got=got, name="mesh", advice=advice)
 
     def expect_hollow(self, wall: float) -> None:
         """Raise SimulationError where the surface holds too little to be the outside of such a wall."""
         held = self.mean_thickness
         if held is not None and wall > _HOLLOW * held:
-            raise SimulationError(
-                f"expected a wall of at most {1000 * _HOLLOW * held:.3g} mm in a mesh that is {1000 * held:.3g} mm "
-                "thick on average, got a thicker one; use a solid body",
-                name="wall",
-                value=wall,
-            )
+            wanted = f"at most {1000 * _HOLLOW * held:.3g} mm in a mesh that is {1000 * held:.3g} mm thick on average"
+            raise SimulationError.expected(wanted, wall, got="more", name="wall", advice="use a solid body")
 
     def sheet(self) -> Trimesh:
         """Return what a wall can follow: the largest part, neighbors facing alike.

@@ -53,11 +53,8 @@ def radiated(
     distance = towards.norm(dim=1)
     nearest = float(distance.min())
     if nearest < CLOSEST:
-        raise SimulationError(
-            f"microphone: expected a distance of {CLOSEST:g} m or more from the object's surface, got {nearest:.2g} m",
-            name="microphone",
-            value=nearest,
-        )
+        wanted = f"a distance of {CLOSEST:g} m or more from the object's surface"
+        raise SimulationError.expected(wanted, nearest, got=f"{nearest:.2g} m", name="microphone")
     area = outward.norm(dim=1)
     facing = (outward * towards).sum(dim=1) / (area * distance).clamp(min=1e-300)
     delay = retardation * (distance - nearest) / SOUND_SPEED

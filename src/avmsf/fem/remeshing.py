@@ -80,12 +80,9 @@ def oriented(mesh: Trimesh) -> Trimesh:
             kept[row] = True
     lost = float(areas[~kept].sum() / areas.sum())
     if lost > _MAX_LOST_AREA:
-        raise SimulationError(
-            f"expected triangles counter-clockwise from outside and at most two per edge, got others on {lost:.0%} "
-            "of the surface; make the normals of the mesh consistent",
-            name="normals",
-            value=lost,
-        )
+        wanted = "triangles counter-clockwise from outside and at most two per edge"
+        got, advice = f"others on {lost:.0%} of the surface", "make the normals of the mesh consistent"
+        raise SimulationError.expected(wanted, lost, got=got, name="normals", advice=advice)
     return mesh_of(mesh.vertices, mesh.faces[kept])
 
 

@@ -47,22 +47,16 @@ def shell(surface: Surface, *, thickness: float, detail: float = 0.04) -> Solid:
     mesh = oriented(weld(surface))
     if not len(boundary_edges(mesh)) and mesh.area * thickness > abs(mesh.volume):
         middle = 0.5 * abs(mesh.volume) / mesh.area
-        raise SimulationError(
-            f"thickness: expected less than the {4 * middle:.2g} m of the closed surface on average, got "
-            f"{thickness:.3g} m; use a solid body (0 m), or a wall of {middle:.1g} m",
-            name="thickness",
-            value=thickness,
-        )
+        wanted, got = f"less than the {4 * middle:.2g} m of the closed surface on average", f"{thickness:.3g} m"
+        advice = f"use a solid body (0 m), or a wall of {middle:.1g} m"
+        raise SimulationError.expected(wanted, thickness, got=got, name="thickness", advice=advice)
     coarse = remeshed(mesh, detail * mesh.scale)
     if _folded_part(coarse, thickness) > _SPARED:
         fitting = (thickness * 0.5**step for step in range(1, 8))
         suggested = next((each for each in fitting if _folded_part(coarse, each) <= _SPARED), None)
         hint = "smooth the mesh" if suggested is None else f"try thickness={suggested:.2g}, or smooth the mesh"
-        raise SimulationError(
-            f"thickness: expected less than the surface's radius of curvature, got {thickness:g} m; {hint}",
-            name="thickness",
-            value=thickness,
-        )
+        wanted, got = "less than the surface's radius of curvature", f"{thickness:g} m"
+        raise SimulationError.expected(wanted, thickness, got=got, name="thickness", advice=hint)
     solid = prisms(coarse, np.full(len(coarse.vertices), thickness))
     return solid if solid is not None else fill(_both_sides(coarse, thickness), detail=detail)
 

@@ -53,9 +53,7 @@ class Support:
         along = (end - start) / np.linalg.norm(end - start)
         near = (np.abs(_cross(along, places[:, :2] - start)) <= _NEAR * size) & (heights <= _LOW * size)
         if not near.any():
-            raise SimulationError(
-                f"support {self.name!r}: expected nodes within {1000 * _NEAR * size:.2g} mm, got none", name=self.name
-            )
+            raise SimulationError.expected(f"nodes within {1000 * _NEAR * size:.2g} mm", name=self.name)
         return outer[near]
 
 

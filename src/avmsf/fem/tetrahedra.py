@@ -60,14 +60,12 @@ def fill(surface: Surface, *, detail: float = 0.05, timeout: float = 600.0) -> S
     advice = f"give a wall thickness, such as {0.015 * size:.1g} m"
     # Of a sheet fTetWild makes a sliver as thin as its envelope, or nothing, as chance has it.
     if opened and _flatness(mesh) < 2.0 * _ENVELOPE * detail * size:
-        raise SimulationError(
-            f"expected a mesh that encloses a volume, got a flat sheet; {advice}", name="volume", value=0
-        )
+        wanted, got = "a mesh that encloses a volume", "a flat sheet"
+        raise SimulationError.expected(wanted, 0, got=got, name="volume", advice=advice)
     points, cells = _stored(coarsened(mesh, _SHORTEST * detail * size, turn=_TURN), detail, timeout)
     if not len(cells):
-        raise SimulationError(
-            f"expected a mesh that encloses a volume, got {opened} open edges; {advice}", name="volume", value=opened
-        )
+        wanted, got = "a mesh that encloses a volume", f"{opened} open edges"
+        raise SimulationError.expected(wanted, opened, got=got, name="volume", advice=advice)
     solid = Solid.build(torch.from_numpy(points), torch.from_numpy(cells))
     solid.expect_connected(loose=_LOST)
     solid = Solid.build(solid.points, solid.cells[solid.parts == 0])
@@ -90,63 +88,53 @@ def _stored(mesh: Trimesh, detail: float, timeout: float) -> tuple[np.ndarray, n
     digest = hashlib.sha256(values.encode() + given.tobytes() + faces.tobytes()).hexdigest()
     path = folder / f"{digest[:24]}.npz"
     try:
-        with np.load(io.BytesIO(path.read_bytes())) as arrays:
-            return arrays["points"], arrays["cells"]
+        return _arrays(path.read_bytes())
     except (OSError, ValueError, KeyError, zipfile.BadZipFile):
-        points, cells = _tetrahedralize(given, faces, detail, timeout)
-
-    def write(temporary: Path) -> None:
-        with open(temporary, "wb") as file:
-            np.savez(file, points=points, cells=cells)
-
-    keep_if_possible(lambda: write_whole(path, write), path)
+        content = _tetrahedralize(given, faces, detail, timeout)
+    keep_if_possible(lambda: write_whole(path, lambda place: place.write_bytes(content)), path)
     with suppress(OSError):
         for old in sorted(folder.glob("*.npz"), key=lambda each: each.stat().st_mtime)[:-_MAX_STORED]:
             discard(old)
-    return points, cells
+    return _arrays(content)
 
 
-def _tetrahedralize(
-    points: np.ndarray, faces: np.ndarray, detail: float, timeout: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return points and cells as pytetwild's process leaves them."""
+def _arrays(content: bytes) -> tuple[np.ndarray, np.ndarray]:
+    with np.load(io.BytesIO(content)) as arrays:
+        return arrays["points"], arrays["cells"]
+
+
+def _tetrahedralize(points: np.ndarray, faces: np.ndarray, detail: float, timeout: float) -> bytes:
+    """Return the file of points and cells that pytetwild's process writes."""
     found = importlib.util.find_spec("pytetwild")
     assert found is not None
     assert found.submodule_search_locations
     with tempfile.TemporaryDirectory(prefix="avmsf-fill-") as name:
-        job, result = Path(name) / "job.npz", Path(name) / "result.npz"
+        job, result, log = (Path(name) / file for file in ("job.npz", "result.npz", "log"))
         np.savez(
             job, points=points, faces=faces.astype(np.uint32), edge=detail, envelope=_ENVELOPE * detail,
             library=found.submodule_search_locations[0],
         )  # fmt: skip
         # -P keeps this folder, whose modules have common names, from where the worker looks for libraries.
         command = [sys.executable, "-P", str(WORKER), str(job), str(result)]
-        single = os.environ | {"OMP_NUM_THREADS": "1"}
-        with open(Path(name) / "log", "wb") as log:
+        with open(log, "wb") as output:
             # fTetWild leaves a file of its own where it runs.
-            ended = start_child(command, stdout=log, stderr=log, env=single, cwd=name)
-        try:
-            ended.wait(timeout)
-        except subprocess.TimeoutExpired as error:
-            raise SimulationError(
-                f"expected tetrahedra of {len(faces)} triangles within {timeout:g} s, got none; simplify the "
-                "mesh, or use a larger detail or fewer degrees of freedom",
-                name="timeout",
-                value=timeout,
-            ) from error
-        finally:
-            end_child(ended)
-        if ended.returncode != 0 or not result.is_file():
-            words = (Path(name) / "log").read_text(encoding="utf-8", errors="replace")
-            last = words.strip().splitlines()[-1:] or ["no message"]
-            raise SimulationError(
-                f"pytetwild: expected exit status 0, got {ended.returncode} ({last[0][:200]}); simplify the mesh, or "
-                "change detail or the degrees of freedom",
-                name="pytetwild",
-                value=ended.returncode,
+            child = start_child(
+                command, stdout=output, stderr=output, env=os.environ | {"OMP_NUM_THREADS": "1"}, cwd=name
             )
-        with np.load(result) as arrays:
-            return arrays["points"], arrays["cells"]
+        try:
+            child.wait(timeout)
+        except subprocess.TimeoutExpired as error:
+            raise SimulationError.expected(
+                f"tetrahedra of {len(faces)} triangles within {timeout:g} s", timeout, got="none", name="timeout",
+                advice="simplify the mesh, or use a larger detail or fewer degrees of freedom",
+            ) from error  # fmt: skip
+        finally:
+            end_child(child)
+        if child.returncode != 0 or not result.is_file():
+            last = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:] or ["no message"]
+            got, advice = f"{child.returncode} ({last[0][:200]})", "simplify the mesh, or change detail or its dofs"
+            raise SimulationError.expected("exit status 0", child.returncode, got=got, name="pytetwild", advice=advice)
+        return result.read_bytes()
 
 
 def _expect_likeness(solid: Solid, mesh: Trimesh, *, tolerance: float, advice: str) -> None:
@@ -159,21 +147,15 @@ def _expect_likeness(solid: Solid, mesh: Trimesh, *, tolerance: float, advice: s
     # Where bodies cross, the mesh runs inside; only what lies outside was lost.
     lost = float(((found.distances > tolerance) & ~behind).mean())
     if lost > _LOST:
-        raise SimulationError(
-            f"expected tetrahedra within {tolerance:.2g} m of the mesh, got {lost:.0%} of it without "
-            f"({opened} open edges, or thin walls); use a smaller detail or more degrees of freedom, close "
-            f"the mesh, or {advice}",
-            name="detail",
-            value=lost,
-        )
+        wanted = f"tetrahedra within {tolerance:.2g} m of the mesh"
+        got = f"{lost:.0%} of it without ({opened} open edges, or thin walls)"
+        advice = f"use a smaller detail or more degrees of freedom, close the mesh, or {advice}"
+        raise SimulationError.expected(wanted, lost, got=got, name="detail", advice=advice)
     lids = float((ClosestPoints(np.array(mesh.triangles))(even_points(outside)).distances > tolerance).mean())
     if lids > _LID:
-        raise SimulationError(
-            f"expected a nearly closed mesh, got {opened} open edges whose holes are {lids:.0%} of the "
-            f"surface; close the mesh, or {advice}",
-            name="holes",
-            value=lids,
-        )
+        got = f"{opened} open edges whose holes are {lids:.0%} of the surface"
+        advice = f"close the mesh, or {advice}"
+        raise SimulationError.expected("a nearly closed mesh", lids, got=got, name="holes", advice=advice)
 
 
 def _flatness(mesh: Trimesh) -> float:

@@ -101,20 +101,13 @@ class Wall:
             assert thickness is not None
             solid = prisms(coarse, mean / self.thickness * thickness, layers=self._layers(length))
             if solid is None:
-                raise SimulationError(
-                    "expected a wall thinner than the mesh's radius of curvature, got "
-                    f"{1000 * mean:.2g} mm; use a thinner one",
-                    name="thickness",
-                    value=mean,
-                )
+                wanted, got = "less than the mesh's radius of curvature", f"{1000 * mean:.2g} mm"
+                raise SimulationError.expected(wanted, mean, got=got, name="thickness", advice="use a thinner wall")
             return solid
 
         if thickness is None or not self._fills(scaled(self.thickness)):
-            raise SimulationError(
-                f"expected prisms that fill the mesh, got gaps with prisms of {1000 * length:.2g} mm; make them finer",
-                name="length",
-                value=length,
-            )
+            wanted, got = "prisms that fill the mesh", f"gaps with prisms of {1000 * length:.2g} mm"
+            raise SimulationError.expected(wanted, length, got=got, name="length", advice="make them finer")
         return scaled
 
     def _thickness_at(self, sheet: Trimesh) -> Float64[np.ndarray, " points"] | None:

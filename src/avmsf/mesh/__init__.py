@@ -12,7 +12,9 @@ each corner of a face, a normal, a color and a place in a texture.
   by fast-simplification), and differences of solids (by manifold3d).
 - `closest_point`: the closest point of a surface, exactly, with the triangle and its barycentric coordinates.
 
-What rays meet of a mesh is in `avmsf.photographs`, its walls in `avmsf.reconstruction` and `avmsf.fem`. Start reading
+- `rays`: the triangle that a ray meets first, and how far away it is (Embree).
+
+Pictures of a mesh are made in `avmsf.photographs`, its walls in `avmsf.reconstruction` and `avmsf.fem`. Start reading
 with `surface.Surface`, then `io`.
 """
 

@@ -40,11 +40,13 @@ class Hammer:
         for name, unit in (("mass", "kg"), ("radius", "m"), ("young", "Pa"), ("speed", "m/s")):
             value = getattr(self, name)
             if not 0 < value < math.inf:
-                raise _unfit(f"hammer.{name}", f"more than 0 {unit}", value)
+                raise SimulationError.expected(f"more than 0 {unit}", value, name=f"hammer.{name}")
         if not -1 < self.poisson < 0.5:
-            raise _unfit("hammer.poisson", "more than -1 and less than .5", self.poisson)
+            raise SimulationError.expected("more than -1 and less than .5", self.poisson, name="hammer.poisson")
         if not 0 <= self.contact_time <= LONGEST:
-            raise _unfit("hammer.contact_time", f"0 to compute it, or up to {LONGEST:g} s", self.contact_time)
+            raise SimulationError.expected(
+                f"0 to compute it, or up to {LONGEST:g} s", self.contact_time, name="hammer.contact_time"
+            )
 
 
 @dataclass(frozen=True)
@@ -97,16 +99,17 @@ class Imperfections:
     0 to 1."""
 
     def __post_init__(self) -> None:
+        highest = {
+            "coupling": 1.0, "retardation": 1.0, "contact": 1.0, "direction": 45.0, "support": math.inf,
+            "pretrigger": 10.0, "propagation": 1.0,
+        }  # fmt: skip
         for each in fields(self):
-            value = getattr(self, each.name)
-            highest = {
-                "coupling": 1.0, "retardation": 1.0, "contact": 1.0, "direction": 45.0, "support": math.inf,
-                "pretrigger": 10.0, "propagation": 1.0,
-            }  # fmt: skip
-            most = highest.get(each.name, 0.5)
+            value, most = getattr(self, each.name), highest.get(each.name, 0.5)
             if not (0 <= value <= most and math.isfinite(value)):
                 limit = f"up to {most:g}" if math.isfinite(most) else "a finite number above 0"
-                raise _unfit(f"imperfections.{each.name}", f"0 to switch it off, or {limit}", value)
+                raise SimulationError.expected(
+                    f"0 to switch it off, or {limit}", value, name=f"imperfections.{each.name}"
+                )
 
     @classmethod
     def none(cls) -> "Imperfections":
@@ -171,17 +174,19 @@ class ObjectRecipe:
         ):
             value = getattr(self, name)
             if not least <= value <= most:
-                raise _unfit(name, f"{least:g} to {most:g}", value)
+                raise SimulationError.expected(f"{least:g} to {most:g}", value, name=name)
         for name in ("thickness", "size"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
-                raise _unfit(name, "more than 0 m", value)
+                raise SimulationError.expected("more than 0 m", value, name=name)
         if self.noise_db is not None and not -math.inf < self.noise_db < 100.0:
-            raise _unfit("noise_db", "a level in dB, such as -30, or None for none", self.noise_db)
+            raise SimulationError.expected(
+                "a level in dB, such as -30, or None for none", self.noise_db, name="noise_db"
+            )
         if self.views < 0 or self.views % 3:
-            raise _unfit("views", "a multiple of 3, for three circles, or 0", self.views)
+            raise SimulationError.expected("a multiple of 3, for three circles, or 0", self.views, name="views")
         if self.seed < 0:
-            raise _unfit("seed", "0 or more", self.seed)
+            raise SimulationError.expected("0 or more", self.seed, name="seed")
 
     def values(self) -> dict[str, Any]:
         """Return all settings as JSON holds them, with the package's version and the digest of the mesh's file."""
@@ -196,10 +201,6 @@ class ObjectRecipe:
         kept = {"source": source_digest("avmsf.simulate.bodies"), **{name: values[name] for name in names}}
         imperfect = {name: values["imperfections"][name] for name in ("thickness", "stiffness", "density", "support")}
         return {**kept, "modes": self.elastic_modes, "detail": self.detail, "imperfections": imperfect}
-
-
-def _unfit(name: str, expected: str, value: float | int) -> SimulationError:
-    return SimulationError(f"{name}: expected {expected}, got {value:g}", name=name, value=value)
 
 
 def _digest(path: Path) -> str:

@@ -43,7 +43,7 @@ def write_simulation(
             seconds = capture.settings.seconds if capture.settings.align else None
             write_capture(replace(capture, surface=None, impacts=impacts), begun, onsets_within=seconds)
             for sound in begun.glob("*.wav"):
-                _forget_the_hour(sound)
+                _zero_wav_timestamp(sound)
             if simulation.recipe.surface:
                 write_textured(simulation.mesh, begun)
             _write_views(simulation, begun, progress)
@@ -120,7 +120,7 @@ def _export(parts: list[trimesh.Trimesh], path: Path) -> None:
     shape.export(path, file_type=path.suffix[1:])
 
 
-def _forget_the_hour(path: Path) -> None:
+def _zero_wav_timestamp(path: Path) -> None:
     """Set to zero the time of writing that float wav files carry in their PEAK chunk: equal sounds are equal files."""
     with open(path, "r+b") as file:
         start = file.read(256).find(b"PEAK")

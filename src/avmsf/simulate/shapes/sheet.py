@@ -48,6 +48,8 @@ class Grid:
 
 
 _POINTS = 900
+_HALF_TURN = Symmetry(UP, 2, torch.eye(3).double()[:2])
+"""Of what is as long to both sides, and as wide, but not as high."""
 _HOLE = 2
 """Half the side of the block of squares that a hole takes the place of."""
 
@@ -60,8 +62,7 @@ def platter(random: np.random.Generator, wall: float | None) -> Draft:
     places = grid.parts * (0.5 * length, 0.5 * width * length)
     middle = np.concatenate([places, np.zeros((len(places), 1))], axis=1)
     # Half turns about x, y and z.
-    symmetry = Symmetry(UP, 2, torch.eye(3, dtype=torch.float64))
-    return Draft(_body(middle, wall, grid.triangles, grid.order), wall, symmetry)
+    return _draft(grid, middle, wall, Symmetry(UP, 2, torch.eye(3, dtype=torch.float64)))
 
 
 def boomerang(random: np.random.Generator, wall: float | None) -> Draft:
@@ -73,7 +74,7 @@ def boomerang(random: np.random.Generator, wall: float | None) -> Draft:
     one, other = grid.parts.T
     out, angle = radius + width * other * (1.0 - taper * one**2), 0.5 * arc * one
     middle = np.stack([out * np.cos(angle), out * np.sin(angle), np.zeros(len(one))], axis=1)
-    return Draft(_body(middle, wall, grid.triangles, grid.order), wall, Symmetry(mirrors=torch.eye(3).double()[1:]))
+    return _draft(grid, middle, wall, Symmetry(mirrors=torch.eye(3).double()[1:]))
 
 
 def channel(random: np.random.Generator, wall: float | None) -> Draft:
@@ -86,8 +87,7 @@ def channel(random: np.random.Generator, wall: float | None) -> Draft:
     one, other = grid.parts.T
     aside, up = _bent(0.5 * across * np.abs(other), 0.5 * width, 0.5 * math.pi, bend)
     middle = np.stack([0.5 * length * one, np.sign(other) * aside, up], axis=1)
-    symmetry = Symmetry(UP, 2, torch.eye(3).double()[:2])
-    return Draft(_body(middle, wall, grid.triangles, grid.order), wall, symmetry)
+    return _draft(grid, middle, wall, _HALF_TURN)
 
 
 def scallop(random: np.random.Generator, wall: float | None) -> Draft:
@@ -101,7 +101,7 @@ def scallop(random: np.random.Generator, wall: float | None) -> Draft:
     part, angle = 0.2 + 0.4 * (1.0 + other), spread * one
     up = depth * (1.0 - part**2) * np.cos(0.5 * angle) + rib * part * np.cos(2.0 * ribs * angle)
     middle = radius * np.stack([part * np.cos(angle), part * np.sin(angle), up], axis=1)
-    return Draft(_body(middle, wall, grid.triangles, grid.order), wall, Symmetry(mirrors=torch.eye(3).double()[1:2]))
+    return _draft(grid, middle, wall, MIRRORED)
 
 
 def tray(random: np.random.Generator, wall: float | None) -> Draft:
@@ -120,8 +120,7 @@ def tray(random: np.random.Generator, wall: float | None) -> Draft:
         ],
         axis=1,
     )
-    symmetry = Symmetry(UP, 2, torch.eye(3).double()[:2])
-    return Draft(_body(middle, wall, grid.triangles, grid.order), wall, symmetry)
+    return _draft(grid, middle, wall, _HALF_TURN)
 
 
 def bracket(random: np.random.Generator, wall: float | None) -> Draft:
@@ -194,6 +193,10 @@ def _even_grid(length: float, width: float) -> Grid:
     """Return a grid of nearly square squares, of odd numbers of points."""
     columns = 2 * round(0.5 * math.sqrt(_POINTS * length / width)) + 1
     return Grid(2 * round(0.5 * _POINTS / columns) + 1, columns)
+
+
+def _draft(grid: Grid, middle: np.ndarray, wall: float, symmetry: Symmetry) -> Draft:
+    return Draft(_body(middle, wall, grid.triangles, grid.order), wall, symmetry)
 
 
 def _body(middle: np.ndarray, walls: np.ndarray | float, triangles: np.ndarray, order: np.ndarray) -> Body:
