@@ -30,8 +30,8 @@ SMALL = {
         *(*FEW_STEPS, *FEW_VIEWS, *sets("lift.encoder=descriptors lift.symmetry=false")),
         *("--gain-model", "smooth", "--modes", "8", "--set", "fit.steps=4"),
     ),
-    "evaluate": ("--modes", "8"),
-    "evaluate shots": ("--methods", "knn3", "--counts", "3", "--starts", "1", "--modes", "8"),
+    "evaluate": sets("modes=8"),
+    "evaluate shots": ("--methods", "knn3", "--counts", "3", "--starts", "1", *sets("modes=8")),
 }
 """For each verb, settings that take seconds; the pages' own take minutes."""
 LONG = ("avmsf simulate", "avmsf fit scan")
