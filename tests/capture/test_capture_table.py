@@ -133,6 +133,7 @@ def test_directions_become_unit_vectors(tmp_path: Path) -> None:
         (HEADER, (ROWS[0], "b.wav,0,200,0"), 3, "unit", [0.0, 200.0, 0.0]),
         (HEADER, (ROWS[0], "b.wav,0,-2e7,0"), 3, "unit", [0.0, -2e7, 0.0]),
         (HEADER, (ROWS[0], ",0,0.2,0"), 3, "file", ""),
+        (HEADER, (ROWS[0], ".,0,0.2,0"), 3, "file", "."),
         (HEADER, (ROWS[0], "../b.wav,0,0.2,0"), 3, "file", "../b.wav"),
         (HEADER, (ROWS[0], "/b.wav,0,0.2,0"), 3, "file", "/b.wav"),
         (HEADER, (ROWS[0], "C:\\b.wav,0,0.2,0"), 3, "file", "C:\\b.wav"),

@@ -227,11 +227,9 @@ def expect_placed(
     placement = check_placement(contacts, points)
     if not placement.misplaced:
         return
-    advice = "Bring both into one frame, or use a gain model without elastic mode shapes"
-    if placement.mismatch is not None and placement.mismatch.unit_only and placement.other_unit:
-        advice = "State both units, as unit and surface_unit in capture.toml do, or give both in meters"
     raise FitError(
-        f"expected contacts on the surface for elastic mode shapes, but {placement.describe(names)}. {advice}",
+        f"expected contacts on the surface for elastic mode shapes, but {placement.describe(names)}. Bring both into one "
+        "frame and unit (unit and surface_unit in capture.toml), or use a gain model without elastic mode shapes",
         name="contacts",
         value=float(placement.distances.max()),
     )

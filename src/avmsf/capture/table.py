@@ -167,7 +167,7 @@ def parse_row(row: Row, settings: CaptureSettings) -> Impact:
             raise row.error(wanted, newtons, name=FORCE)
     path = PurePosixPath(row.file.replace("\\", "/"))
     # A capture is one folder that can be moved, sent and read by others, so nothing outside it belongs to it.
-    if not row.file or path.is_absolute() or ".." in path.parts or ":" in path.parts[0]:
+    if not path.parts or path.is_absolute() or ".." in path.parts or ":" in path.parts[0]:
         raise row.error(
             "a path inside the capture folder", row.file, got=row.file or "nothing", name="file", advice="copy it there"
         )

@@ -42,9 +42,9 @@ def build_capture(
         impacts, issues = preprocess(recordings, settings, Issues(collect=True), measured=recorded)
         remarks = [*remarks, *(f"left out: {error}" for _, _, error in issues.failures)]
         remarks += shared_problems(issues.reports)
-        refuse_few(len(issues.sounds), origin=origin, reasons=remarks)
         for error in issues.errors:
             raise error
+        refuse_few(0 if impacts is None else len(impacts), origin=origin, reasons=remarks)
     except CaptureError as error:
         raise DatasetError(f"{origin}: {error}", **error.attributes) from error
     assert impacts is not None
