@@ -228,8 +228,8 @@ def expect_placed(
     if not placement.misplaced:
         return
     raise FitError(
-        f"expected contacts on the surface for elastic mode shapes, but {placement.describe(names)}. Bring both into one "
-        "frame and unit (unit and surface_unit in capture.toml), or use a gain model without elastic mode shapes",
+        f"expected contacts on the surface for elastic mode shapes, but {placement.describe(names)}. Bring both into "
+        "one frame and unit (unit, surface_unit in capture.toml), or use a gain model without elastic mode shapes",
         name="contacts",
         value=float(placement.distances.max()),
     )
