@@ -171,7 +171,7 @@ def test_a_fit_that_diverged_between_two_reads_of_the_loss_leaves_no_checkpoint(
     with raises(FitError, name=STAGES[0]):
         fitted(tmp_path / "state", config=replace(CONFIG, warmup_steps=0, learning_rate=1e30))
     kept = torch.load(tmp_path / "state", weights_only=True) if (tmp_path / "state").exists() else None
-    tensors = [] if kept is None else list(kept["state"]["running"]["run"]["network"].values())
+    tensors = [] if kept is None else list(kept["state"]["running"]["run"]["parameters"].values())
     assert all(bool(each.isfinite().all()) for each in tensors)
 
 

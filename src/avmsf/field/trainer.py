@@ -58,13 +58,11 @@ class Trainer:
         self.checkpoint, self.progress, self.device = checkpoint, progress, device
         # Each kind of device draws noise of its own.
         self.identity = {**identity, "device": device.type}
-        saved = (
-            None
-            if checkpoint is None
-            else read_checkpoint(checkpoint, self.identity, what="a fit", raising=FieldFileError)
-        )
-        self.trials: dict[str, dict[str, Any]] = {} if saved is None else saved["trials"]
-        self.running: dict[str, Any] | None = None if saved is None else saved["running"]
+        state: dict[str, Any] | None = None
+        if checkpoint is not None:
+            state = read_checkpoint(checkpoint, self.identity, what="a fit", raising=FieldFileError)
+        self.trials: dict[str, dict[str, Any]] = {} if state is None else state["trials"]
+        self.running: dict[str, Any] | None = None if state is None else state["running"]
         self.saved_at = time.monotonic()
 
     def run(
@@ -113,17 +111,15 @@ class Trainer:
         else:
             # The work is done but the field is not saved yet: should that fail, it need not be done again.
             self._save(name, run, None)
-        run.end()
-        return run
+        return run.cpu()
 
     def _note(self, progress: Progress) -> None:
         if not math.isfinite(progress.loss):
-            raise FitError(
-                f"{progress.stage}: expected a finite loss, got {progress.loss} at step {progress.step}; lower "
-                "learning_rate, warmup_rate or correction_rate",
-                name=progress.stage,
-                value=progress.loss,
+            got, advice = (
+                f"{progress.loss} at step {progress.step}",
+                "lower learning_rate, warmup_rate or correction_rate",
             )
+            raise FitError.expected("a finite loss", progress.loss, got=got, name=progress.stage, advice=advice)
         if self.progress is not None:
             self.progress(progress)
 

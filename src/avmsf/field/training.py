@@ -15,7 +15,6 @@ from avmsf._utils.device import TRAINABLE, without_denormals
 from avmsf.field.gains.data import GainData
 from avmsf.field.gains.model import Gains
 from avmsf.field.losses import SpectralTarget, spectral_loss, spectral_target
-from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual, shape_noise
 from avmsf.modal.synthesis import synthesize
@@ -111,7 +110,7 @@ class TrainableGains(nn.Module):
         return torch.zeros(())
 
 
-class TrainingRun:
+class TrainingRun(nn.Module):
     """Parameters on their way: gains, small corrections to the bank and residual, and their optimizers.
 
     The corrections are measured in what the recordings resolve: frequencies in their modes' widths, dampings and noise
@@ -120,24 +119,27 @@ class TrainingRun:
     """
 
     def __init__(self, network: TrainableGains, data: GainData, device: torch.device | str = "cpu") -> None:
-        device, config = torch.device(device), data.config
-        self.network, self.config, self.phase = network.to(device), config, data.phase.to(device)
-        self.sample_rate, self.samples = data.train.sample_rate, data.train.sounds.shape[1]
-        self.start = _on(data.modes, device)
-        bank, gains = self.start.bank, data.gains.to(device)
-        # Modes weigh in the warm-up by the energy of a unit gain over time, or alike (paper).
-        energy = (1 / (4 * bank.damping) if config.warmup_weights == "energy" else torch.ones_like(bank.damping)).to(
-            gains
+        super().__init__()
+        config, bank, gains, magnitude = data.config, data.modes.bank, data.gains, data.modes.residual.magnitude
+        self.config, self.sample_rate, self.samples = config, data.train.sample_rate, data.train.sounds.shape[1]
+        self.network, self.phase = network, nn.Buffer(data.phase)
+        self.frequency, self.damping, self.magnitude = (
+            nn.Buffer(each) for each in (bank.frequency, bank.damping, magnitude)
         )
-        self.weight = energy / (gains.square().mean(0) * energy).sum().clamp_min(torch.finfo(gains.dtype).tiny)
-        self.width = torch.clamp(bank.damping / (2 * math.pi), min=self.sample_rate / self.samples)
+        # Modes weigh in the warm-up by the energy of a unit gain over time, or alike (paper).
+        energy = 1 / (4 * bank.damping) if config.warmup_weights == "energy" else torch.ones_like(bank.damping)
+        energy = energy.to(gains)
+        total = (gains.square().mean(0) * energy).sum().clamp_min(torch.finfo(gains.dtype).tiny)
+        self.weight = nn.Buffer(energy / total)
+        self.width = nn.Buffer(torch.clamp(bank.damping / (2 * math.pi), min=self.sample_rate / self.samples))
         # A correction beyond half the mode's own frequency would mean that another mode is sought.
-        self.bounds = bank.frequency / 2, torch.clamp(bank.frequency * 1.5, max=0.499 * self.sample_rate)
-        count, bins = len(bank), len(data.modes.residual.magnitude)
-        self.shift = nn.Parameter(torch.zeros(count, dtype=torch.float64, device=device))
-        self.decay = nn.Parameter(torch.zeros(count, dtype=torch.float64, device=device))
-        self.noise = nn.Parameter(torch.zeros(bins, device=device))
-        self.generator = torch.Generator(device if device.type in TRAINABLE else "cpu").manual_seed(config.seed)
+        self.lowest = nn.Buffer(bank.frequency / 2)
+        self.highest = nn.Buffer(torch.clamp(bank.frequency * 1.5, max=0.499 * self.sample_rate))
+        self.shift, self.decay = (nn.Parameter(torch.zeros_like(bank.frequency)) for _ in range(2))
+        self.noise = nn.Parameter(torch.zeros_like(magnitude))
+        self.to(device)
+        kind = self.phase.device.type
+        self.generator = torch.Generator(self.phase.device if kind in TRAINABLE else "cpu").manual_seed(config.seed)
         matrices = [parameter for parameter in network.parameters() if parameter.ndim == 2]
         vectors = [parameter for parameter in network.parameters() if parameter.ndim != 2]
 
@@ -157,8 +159,8 @@ class TrainingRun:
     @property
     def bank(self) -> ModalBank:
         """The modes as they stand."""
-        moved = torch.clamp(self.start.bank.frequency + self.width * self.shift, *self.bounds)
-        return ModalBank(moved, self.start.bank.damping * torch.exp(self.decay))
+        moved = torch.clamp(self.frequency + self.width * self.shift, self.lowest, self.highest)
+        return ModalBank(moved, self.damping * torch.exp(self.decay))
 
     @property
     def order(self) -> Int[Tensor, " modes"]:
@@ -174,18 +176,17 @@ class TrainingRun:
     @property
     def finite(self) -> bool:
         """Whether all parameters are finite numbers; waits for the device."""
-        parameters = (*self.network.parameters(), self.shift, self.decay, self.noise)
-        return all(bool(each.isfinite().all()) for each in parameters)
+        return all(bool(each.isfinite().all()) for each in self.parameters())
 
     @property
     def residual(self) -> Residual:
         """The noise as it stands."""
         if not self.config.residual:
-            return Residual(torch.zeros_like(self.start.residual.magnitude))
-        return Residual(self.start.residual.magnitude * torch.exp(self.noise))
+            return Residual(torch.zeros_like(self.magnitude))
+        return Residual(self.magnitude * torch.exp(self.noise))
 
     def sounds(self, rows: Int[Tensor, " contacts"]) -> Float[Tensor, "contacts samples"]:
-        """Return the sounds at points of the gain field, with a fresh draw of noise (paper, eq. 12)."""
+        """Return the sounds at what the gains read, with a fresh draw of noise (paper, eq. 12)."""
         gains, bank = self.network.read(rows), self.bank
         sounds = synthesize(
             gains.mean,
@@ -221,7 +222,7 @@ class TrainingRun:
         return loss.detach()
 
     def spectral_loss(self, targets: Targets) -> Float[Tensor, ""]:
-        """Return the loss on whole sounds and on their beginnings (paper, eq. 14), and the gain field's penalty.
+        """Return the loss on whole sounds and on their beginnings (paper, eq. 14), and the gains' penalty.
 
         Of the frames those are compared whose turn it is.
         """
@@ -240,20 +241,13 @@ class TrainingRun:
         gains = self.network.read(targets.rows).mean
         return ((gains - targets.gains).square() * self.weight).sum(1).mean()
 
-    def end(self) -> None:
-        """Bring what was trained to the CPU; no step can follow."""
-        self.network, self.start = self.network.cpu(), _on(self.start, torch.device("cpu"))
-        for each in (self.shift, self.decay, self.noise):
-            each.data = each.data.cpu()
-
     def state(self) -> dict[str, Any]:
         """Return all that decides how the run goes on after its last whole step: tensors, numbers, containers of these.
 
         An interruption in the middle of a step may call for it too, while `whole`: only the noise has moved on by then.
         """
         return {
-            "network": self.network.state_dict(),
-            "corrections": [each.detach().clone() for each in (self.shift, self.decay, self.noise)],
+            "parameters": self.state_dict(),
             "warmup": self.warmup.moments,
             "joint": self.joint.moments,
             "generator": self._chance,
@@ -262,18 +256,9 @@ class TrainingRun:
 
     def resume(self, state: dict[str, Any]) -> None:
         """Go back to what `state` returned."""
-        self.network.load_state_dict(state["network"])
-        with torch.no_grad():
-            for parameter, value in zip((self.shift, self.decay, self.noise), state["corrections"], strict=True):
-                parameter.copy_(value)
+        self.load_state_dict(state["parameters"])
         self.warmup.resume(state["warmup"])
         self.joint.resume(state["joint"])
         self._chance = state["generator"]
         self.generator.set_state(self._chance)
         self.step = state["step"]
-
-
-def _on(modes: Extraction, device: torch.device) -> Extraction:
-    """Return modes whose bank and residual are on a device."""
-    bank = ModalBank(modes.bank.frequency.to(device), modes.bank.damping.to(device))
-    return replace(modes, bank=bank, residual=replace(modes.residual, magnitude=modes.residual.magnitude.to(device)))
