@@ -77,11 +77,8 @@ def write_grid(
     as `scale`, so that the loudest peaks at `level_db` relative to full scale. Raises `ExportError` for no layers,
     more contacts than MIDI has notes, and settings that are not positive.
     """
-    _check(contacts, layers, seconds, level_db)
+    _check(contacts, layers, seconds, level_db, field.sample_rate)
     rate = round(field.sample_rate)
-    if rate != field.sample_rate or rate < 1:
-        got = f"{field.sample_rate:g} Hz"
-        raise ExportError.expected("whole hertz for wav files", field.sample_rate, got=got, name="sample_rate")
     rows = torch.arange(len(field)) if len(field) <= contacts else field.spread(contacts)
     samples = field.samples if seconds is None else max(1, round(seconds * rate))
     rendered = []
@@ -123,7 +120,7 @@ def write_grid(
     return Written(sizes, tuple(remarks))
 
 
-def _check(contacts: int, layers: Sequence[Layer], seconds: float | None, level_db: float) -> None:
+def _check(contacts: int, layers: Sequence[Layer], seconds: float | None, level_db: float, rate: float) -> None:
     most = HIGHEST_NOTE + 1 - LOWEST_NOTE
     checks = [
         ("contacts", contacts, 1 <= contacts <= most, f"1 to {most}, a MIDI note each from {LOWEST_NOTE}"),
@@ -132,6 +129,7 @@ def _check(contacts: int, layers: Sequence[Layer], seconds: float | None, level_
         *(("contact_time", each.contact_time, 0 <= each.contact_time < 1, "0 to 1 s") for each in layers),
         ("seconds", seconds, seconds is None or 0 < seconds < math.inf, "more than 0"),
         ("level_db", level_db, -math.inf < level_db <= 0, "0 dB or below"),
+        ("sample_rate", rate, rate >= 1 and rate == round(rate), "whole hertz for wav files"),
     ]
     for name, value, valid, wanted in checks:
         if not valid:
