@@ -30,7 +30,7 @@ from avmsf.modal.residual_noise import Residual
 from avmsf.simulate.imperfections import stream
 from avmsf.simulate.recipe import Hammer
 from avmsf.simulate.shapes import make_shape
-from avmsf.simulate.simulation import HIGHEST, SoundingBody, recorded
+from avmsf.simulate.simulation import MAX_FREQUENCY_RATIO, SoundingBody, recorded
 from benchmarks.editing_objects import KnownObject
 
 SHAPES = ("bowl", "mug", "plate", "pot")
@@ -83,7 +83,9 @@ class SolvedShape:
         """Return the object in a material and size, struck at places far apart, straight into its surface."""
         elastic = self.remade(material, size=size)
         vibration = damped(
-            elastic.frequency, torch.diag(rayleigh(elastic.frequency, material)), highest=HIGHEST * sample_rate
+            elastic.frequency,
+            torch.diag(rayleigh(elastic.frequency, material)),
+            highest=MAX_FREQUENCY_RATIO * sample_rate,
         )
         middle = 0.5 * (elastic.nodes.amax(0) + elastic.nodes.amin(0))
         sound = radiated(elastic, vibration, middle + torch.tensor(_MICROPHONE, dtype=torch.float64))

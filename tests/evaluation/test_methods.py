@@ -31,9 +31,9 @@ from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.attention import Attention
 from avmsf.field.sound_field import SoundField
-from avmsf.mesh.surface import Surface
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.synthesis import synthesize
+from factories.made_sheet import sheet_over
 from factories.plate_field import PLATE, QUICK, RATE, plate_extraction, plate_features, plate_impacts
 from factories.raising import raises
 from factories.sonicgauss_cases import cloud
@@ -69,11 +69,7 @@ def tiny(method: Any) -> Any:
 @cache
 def plate_bodies() -> CandidateBodies:
     """Return a sheet of the plate's size, of a few hundred elements: enough to be computed with."""
-    x, y = torch.meshgrid(torch.linspace(0, PLATE.length, 5), torch.linspace(0, PLATE.width, 5), indexing="ij")
-    corners = torch.arange(25).reshape(5, 5)
-    a, b, c, d = (part.flatten() for part in (corners[:-1, :-1], corners[1:, :-1], corners[1:, 1:], corners[:-1, 1:]))
-    faces = torch.cat([torch.stack([a, b, c], dim=1), torch.stack([a, c, d], dim=1)])
-    sheet = Surface(torch.stack([x.flatten(), y.flatten(), torch.zeros(25)], dim=1), faces)
+    sheet = sheet_over(np.linspace(0, PLATE.length, 5), np.linspace(0, PLATE.width, 5))
     solid = shell(sheet, thickness=PLATE.thickness, detail=0.15)
     return CandidateBodies([CandidateBody(PLATE.thickness, elastic_modes(solid, NOMINAL, count=12))])
 

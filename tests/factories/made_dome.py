@@ -12,6 +12,7 @@ from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.material import NOMINAL
 from avmsf.fem.shell import shell
 from avmsf.mesh.surface import Surface
+from factories.made_sheet import sheet_over
 
 WALLS = (0.0015, 0.004, 0.01)
 STIFFER = 1.25
@@ -21,12 +22,7 @@ STIFFER = 1.25
 @cache
 def dome() -> Surface:
     """Return a shallow dome, whose shapes change with its wall as those of a flat sheet do not."""
-    x, y = np.meshgrid(np.linspace(-0.12, 0.12, 13), np.linspace(-0.09, 0.09, 11), indexing="ij")
-    rows = np.arange(x.size).reshape(x.shape)
-    a, b, c, d = (part.ravel() for part in (rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:]))
-    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-    points = np.stack([x.ravel(), y.ravel(), (-1.5 * x**2 - 2.5 * y**2).ravel()], axis=1)
-    return Surface(torch.from_numpy(points).float(), torch.from_numpy(faces))
+    return sheet_over(np.linspace(-0.12, 0.12, 13), np.linspace(-0.09, 0.09, 11), lambda x, y: -1.5 * x**2 - 2.5 * y**2)
 
 
 @cache

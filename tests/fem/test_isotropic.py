@@ -13,6 +13,7 @@ from avmsf.fem.isotropic import IsotropicModes, isotropic_modes
 from avmsf.fem.material import STEEL, WOOD, Material
 from avmsf.fem.solid import Solid
 from avmsf.mesh.surface import Surface
+from factories.made_sheet import sheet_over
 from oracles.block import block
 
 
@@ -71,13 +72,8 @@ def test_a_body_of_two_parts_is_refused():
 
 @cache
 def sheet() -> Surface:
-    across, along = np.meshgrid(np.linspace(0, 0.2, 9), np.linspace(0, 0.14, 7), indexing="ij")
     # A little bent, so that stretching takes part.
-    points = np.stack([across, along, 0.4 * across**2], axis=-1).reshape(-1, 3)
-    rows = np.arange(63).reshape(9, 7)
-    a, b, c, d = (each.ravel() for each in (rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:]))
-    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
-    return Surface(torch.from_numpy(points).float(), torch.from_numpy(faces))
+    return sheet_over(np.linspace(0, 0.2, 9), np.linspace(0, 0.14, 7), lambda x, y: 0.4 * x**2)
 
 
 @cache

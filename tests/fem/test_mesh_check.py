@@ -29,6 +29,7 @@ from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.level_set import enclose
 from avmsf.mesh.surface import Surface
 from factories.looked_at import surface_of
+from factories.made_sheet import sheet_over
 from factories.raising import raises
 
 
@@ -120,12 +121,8 @@ def test_what_is_not_noisy_stays_as_it_is():
 
 def test_a_rough_form_that_is_no_noise_stays():
     # Each vertex lies on a wave that its neighbors predict, though triangles turn by more than noise would make them.
-    x, y = np.meshgrid(np.linspace(0, 1, 49), np.linspace(0, 1, 49), indexing="ij")
-    rows = np.arange(x.size).reshape(x.shape)
-    a, b, c, d = (part.ravel() for part in (rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:]))
-    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-    heights = 0.12 * np.sin(12 * math.pi * x.ravel()) * np.sin(12 * math.pi * y.ravel())
-    waves = mesh_of(np.stack([x.ravel(), y.ravel(), heights], axis=1), faces)
+    side = np.linspace(0, 1, 49)
+    waves = weld(sheet_over(side, side, lambda x, y: 0.12 * np.sin(12 * math.pi * x) * np.sin(12 * math.pi * y)))
     assert roughness(waves) > ROUGH
     assert denoised(waves)[0] is waves
 
@@ -150,7 +147,7 @@ def test_corners_a_millionth_of_the_size_apart_are_one() -> None:
 
 
 def limit(monkeypatch: pytest.MonkeyPatch, triangles: int) -> None:
-    for name in ("MOST", "ENOUGH"):
+    for name in ("MAX_FACES", "ENOUGH_FACES"):
         monkeypatch.setattr(mesh_check, name, triangles)
 
 
@@ -204,10 +201,7 @@ def test_a_noisy_mesh_is_thinned_without_its_noise_and_stays_a_skin(monkeypatch:
 
 def test_a_thinned_sheet_keeps_its_rim(monkeypatch: pytest.MonkeyPatch) -> None:
     side = np.linspace(0.0, 1.0, 61)
-    rows = np.arange(61 * 61).reshape(61, 61)
-    a, b, c, d = (part.ravel() for part in (rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:]))
-    points = np.stack([*(each.ravel() for each in np.meshgrid(side, side, indexing="ij")), np.zeros(61 * 61)], axis=1)
-    sheet = mesh_of(points, np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]))
+    sheet = weld(sheet_over(side, side))
     limit(monkeypatch, 1000)
     found = thinned(sheet, log=lambda words: None)
     assert len(found.faces) <= 1000

@@ -16,18 +16,14 @@ from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import NOMINAL
 from avmsf.mesh.surface import Surface, read_surface
 from factories.looked_at import surface_of
+from factories.made_sheet import sheet_over
 from factories.raising import raises
 from oracles.block import block
 
 
-def sheet(sides: tuple[int, int] = (12, 9), size: tuple[float, float] = (0.24, 0.17)) -> Surface:
+def sheet() -> Surface:
     """Return a flat rectangle whose normals point up."""
-    x, y = np.meshgrid(np.linspace(0, size[0], sides[0] + 1), np.linspace(0, size[1], sides[1] + 1), indexing="ij")
-    rows = np.arange(x.size).reshape(x.shape)
-    a, b, c, d = (part.ravel() for part in (rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:]))
-    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-    points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
-    return Surface(torch.from_numpy(points).float(), torch.from_numpy(faces))
+    return sheet_over(np.linspace(0, 0.24, 13), np.linspace(0, 0.17, 10))
 
 
 def computed(surface: Surface, **settings: object) -> SurfaceBodies:

@@ -22,7 +22,7 @@ from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
 from avmsf.simulate.recipe import Imperfections, ObjectRecipe, named_recipe
 from avmsf.simulate.simulation import Simulation, simulate_object
 from avmsf.simulate.simulation_folder import is_written, simulate_set, write_simulation, write_textured
-from avmsf.simulate.strikes import STEEPEST, draw_strikes, nearest_on
+from avmsf.simulate.strikes import MIN_NORMAL_HEIGHT, draw_strikes, nearest_on
 from factories.made_tile import tile
 from factories.raising import raises
 
@@ -120,7 +120,7 @@ def test_a_hammer_reaches_neither_the_inside_of_a_cup_nor_what_looks_down() -> N
     surface = Surface(torch.tensor(joined.vertices).float(), torch.tensor(joined.faces))
     strikes = draw_strikes(surface, 60, up=UP, imperfections=Imperfections.none(), seed=0)
     outward = -strikes.directions
-    assert float((outward @ UP).min()) >= STEEPEST
+    assert float((outward @ UP).min()) >= MIN_NORMAL_HEIGHT
     across = strikes.places[:, :2].norm(dim=1)
     side = outward[:, 2].abs() < 0.5
     assert float(across[side].min()) > 0.038

@@ -26,7 +26,7 @@ from avmsf.fem.body_meshes import MIN_DOFS, BodyMeshes, Shape, count_dofs, expec
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.elastic_store import modes_once
 from avmsf.fem.elements import SecondOrder
-from avmsf.fem.material import LARGEST_ERROR, NOMINAL, Material
+from avmsf.fem.material import MAX_FREQUENCY_ERROR, NOMINAL, Material
 from avmsf.fem.solid import Solid
 from avmsf.fem.supports import Support, supports_of
 from avmsf.mesh.surface import Surface
@@ -315,13 +315,13 @@ class SurfaceBodies(CandidateBodies):
         except SimulationError as failure:
             self._log(f"{name}: mesh convergence not checked ({failure})")
             return modes
-        if error > LARGEST_ERROR:
+        if error > MAX_FREQUENCY_ERROR:
             try:
                 finer = self.modes(thickness, dofs=2 * self.dofs)
                 modes, error = finer, _frequency_error(modes, finer)
             except SimulationError as failure:
                 self._log(f"{name}: no finer mesh ({failure})")
-        if error > LARGEST_ERROR:
+        if error > MAX_FREQUENCY_ERROR:
             self._log(
                 f"{name}: mesh too coarse, relative error of the lowest frequencies about {error:.0%}; "
                 f"allow {4 * self.dofs} degrees of freedom (--body.dofs)"

@@ -20,7 +20,7 @@ from torch import Tensor
 from avmsf.errors import SimulationError
 from avmsf.fem.material import Material
 
-MOST_DAMPED = 0.05
+MAX_DAMPING_RATIO = 0.05
 """Damping over the critical one beyond which a mode is left out: it loses half its amplitude in two cycles, is no tone,
 and continued back to the onset it would be the loudest of all where it is heard late."""
 
@@ -62,7 +62,7 @@ def damped(
     """Return the damped modes that sound up to `highest` Hz.
 
     `frequency` holds undamped frequencies, Hz, and `damping` the matrix C, 1/s, symmetric. Modes damped by more than
-    `MOST_DAMPED` of their critical damping are left out. Raises SimulationError where none is left.
+    `MAX_DAMPING_RATIO` of their critical damping are left out. Raises SimulationError where none is left.
     """
     count = len(frequency)
     omega = 2.0 * math.pi * torch.diag(frequency)
@@ -70,7 +70,7 @@ def damped(
     poles, vectors = torch.linalg.eig(system)
     # Rows of the inverse, not the vectors again, are what belongs to two modes that share a pole.
     inverse = torch.linalg.inv(vectors)
-    ringing = (poles.imag > 0.0) & (-poles.real <= MOST_DAMPED * poles.abs())
+    ringing = (poles.imag > 0.0) & (-poles.real <= MAX_DAMPING_RATIO * poles.abs())
     audible = torch.nonzero(ringing & (poles.imag <= 2.0 * math.pi * highest)).flatten()
     if len(audible) == 0:
         lowest = float(frequency.min())

@@ -26,7 +26,7 @@ _PRECISION = 1e-8
 """Residual of a mode over its eigenvalue at which Lanczos' method stops; eigenvalues are as exact as its square."""
 _BLOCK = 16
 """Vectors at a time."""
-_LONGEST = 6
+_MAX_BASIS_RATIO = 6
 """Most vectors altogether, over the number of modes and a block; three are usual."""
 _RIGID = 6
 
@@ -141,7 +141,7 @@ def _largest_responses(
     the response is a band of blocks, whose eigenvectors end in how far each mode still is from its true shape.
     """
     dofs = 3 * mass.shape[0]
-    longest = min(dofs, _LONGEST * (wanted + _BLOCK))
+    longest = min(dofs, _MAX_BASIS_RATIO * (wanted + _BLOCK))
     basis = np.empty((dofs, longest + _BLOCK), order="F")
     band = np.zeros((longest + _BLOCK, longest + _BLOCK))
     drawn = np.random.default_rng(0).standard_normal((dofs, min(_BLOCK, dofs)))

@@ -24,22 +24,18 @@ class Material:
     """Rayleigh damping in proportion to stiffness, s."""
 
     def __post_init__(self) -> None:
-        for constant, unit in (("density", "kg/m3"), ("young", "Pa")):
-            value = getattr(self, constant)
-            if not 0 < value < math.inf:
-                raise self._unfit(constant, f"more than 0 {unit}")
-        if not -1 < self.poisson < 0.5:
-            raise self._unfit("poisson", "more than -1 and less than .5; solids have .1 to .45")
-        for constant, unit in (("alpha", "1/s"), ("beta", "s")):
-            value = getattr(self, constant)
-            if not 0 <= value < math.inf:
-                raise self._unfit(constant, f"0 {unit} or more")
-
-    def _unfit(self, constant: str, expected: str) -> SimulationError:
-        value = getattr(self, constant)
-        return SimulationError(
-            f"material {self.name}, {constant}: expected {expected}, got {value:g}", name=constant, value=value
-        )
+        limits = {
+            "density": (0 < self.density < math.inf, "more than 0 kg/m3"),
+            "young": (0 < self.young < math.inf, "more than 0 Pa"),
+            "poisson": (-1 < self.poisson < 0.5, "more than -1 and less than .5; solids have .1 to .45"),
+            "alpha": (0 <= self.alpha < math.inf, "0 1/s or more"),
+            "beta": (0 <= self.beta < math.inf, "0 s or more"),
+        }
+        for name, (fits, wanted) in limits.items():
+            if not fits:
+                value = getattr(self, name)
+                message = f"material {self.name}, {name}: expected {wanted}, got {value:g}"
+                raise SimulationError(message, name=name, value=value)
 
 
 CERAMIC = Material("ceramic", 2700.0, 7.2e10, 0.19, 6.0, 1e-7)
@@ -58,7 +54,7 @@ STIFFEST = max(MATERIALS.values(), key=lambda each: each.young / each.density)
 NOMINAL = Material("nominal", 2700.0, 7e10, 0.3, 0.0, 0.0)
 """What bodies are taken to be made of: near aluminium. Frequencies are to be scaled by one common factor, and shapes
 depend on Poisson's ratio alone, weakly."""
-LARGEST_ERROR = 0.05
+MAX_FREQUENCY_ERROR = 0.05
 """Relative error of the lowest frequencies beyond which a body is made finer: about that by which frequencies of real
 walls differ from those of even ones (imperfections of 3 to 5 % in the simulated objects)."""
 DISCREPANCY = 0.2
@@ -70,12 +66,12 @@ def largest_factor(*, searched: bool) -> float:
     """Return the largest factor on the frequencies of a body of the material `NOMINAL` that can be a material's.
 
     That of the stiffest material of the table, relative to its density, times what makes frequencies of real bodies
-    differ from those of even ones (`LARGEST_ERROR`). Where the thickness of its wall is `searched`, one too thin by the
-    `DISCREPANCY` needs frequencies higher by up to as much.
+    differ from those of even ones (`MAX_FREQUENCY_ERROR`). Where the thickness of its wall is `searched`, one too thin
+    by the `DISCREPANCY` needs frequencies higher by up to as much.
     """
     uncertain = 1.0 + (DISCREPANCY if searched else 0.0)
     return (
-        (1.0 + LARGEST_ERROR)
+        (1.0 + MAX_FREQUENCY_ERROR)
         * uncertain
         * math.sqrt(STIFFEST.young / STIFFEST.density * NOMINAL.density / NOMINAL.young)
     )

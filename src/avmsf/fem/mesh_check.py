@@ -115,9 +115,9 @@ def _as_large(points: Float64[np.ndarray, "points 3"], mesh: Trimesh) -> Trimesh
     return Trimesh(middle + factor * (points - middle), mesh.faces, process=False)
 
 
-MOST = 60_000
+MAX_FACES = 60_000
 """Triangles beyond which a mesh is simplified even where that changes its form."""
-ENOUGH = 16_000
+ENOUGH_FACES = 16_000
 """Triangles beyond which it is simplified as far as its form stays; finite-element models have some thousand."""
 _TOLERANCE = 0.01
 """Root mean square distance of the simplified mesh from the given one, over its mean thickness; by a twisted blade."""
@@ -126,19 +126,19 @@ _ROUNDS = 4
 
 
 def thinned(mesh: Trimesh, *, log: Callable[[str], None]) -> Trimesh:
-    """Return a mesh of at most `MOST` triangles, fewer within the tolerance, and log what was done to a larger one.
+    """Return a mesh of at most `MAX_FACES` triangles, fewer within the tolerance; log what was done to a larger one.
 
     More are left where fewer would open a seam or share an edge among three.
     """
     count = len(mesh.faces)
-    if count <= ENOUGH:
+    if count <= ENOUGH_FACES:
         return mesh
     log(f"checking a mesh of {count} triangles")
     rough = roughness(mesh)
     # Quadrics follow each noisy corner, and tie the mesh into knots.
-    even = averaged(mesh, math.ceil(_ROUNDS * count / MOST)) if rough >= ROUGH else mesh
+    even = averaged(mesh, math.ceil(_ROUNDS * count / MAX_FACES)) if rough >= ROUGH else mesh
     tolerance, places = _TOLERANCE * 2.0 * abs(_volume(even.triangles)) / even.area, even_points(even)
-    for most in (ENOUGH, 2 * ENOUGH, MOST):
+    for most in (ENOUGH_FACES, 2 * ENOUGH_FACES, MAX_FACES):
         found = simplified(even, most, like=mesh)
         distances = ClosestPoints(found.triangles)(places).distances
         if float(np.sqrt((distances**2).mean())) <= tolerance:

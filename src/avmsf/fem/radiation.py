@@ -32,7 +32,7 @@ AIR_DENSITY = 1.204
 """Kilograms per cubic meter, at 20 degrees Celsius."""
 SOUND_SPEED = 343.2
 """Meters per second, at 20 degrees Celsius."""
-CLOSEST = 0.01
+MIN_DISTANCE_M = 0.01
 """Meters to the surface within which a patch is no small source."""
 
 
@@ -46,14 +46,14 @@ def radiated(
     """Return the pressure at the microphone, pascals, of each damped mode for a push of one newton second on it alone.
 
     `microphone` is a place in the object frame, meters. `retardation` scales the differences of the patches' delays:
-    0 hears the whole body at once. Raises SimulationError for a microphone closer than `CLOSEST` to the surface.
+    0 hears the whole body at once. Raises SimulationError for a microphone closer than `MIN_DISTANCE_M` to the surface.
     """
     places, outward, motion = _patches(modes)
     towards = microphone - places
     distance = towards.norm(dim=1)
     nearest = float(distance.min())
-    if nearest < CLOSEST:
-        wanted = f"a distance of {CLOSEST:g} m or more from the object's surface"
+    if nearest < MIN_DISTANCE_M:
+        wanted = f"a distance of {MIN_DISTANCE_M:g} m or more from the object's surface"
         raise SimulationError.expected(wanted, nearest, got=f"{nearest:.2g} m", name="microphone")
     area = outward.norm(dim=1)
     facing = (outward * towards).sum(dim=1) / (area * distance).clamp(min=1e-300)
@@ -97,7 +97,7 @@ DISTANCE = 1.0
 """Meters that pressures are stated for."""
 DIRECTIONS = 64
 """Directions that are averaged: levels of modes are .15 to .31 dB from those of 512 on average (mug, bowl, skillet)."""
-_FAR = 100.0
+_FAR_FIELD_RATIO = 100.0
 """Distance of the microphones over the body's size. Pressures go with 1/distance from there on."""
 
 
@@ -109,7 +109,7 @@ def radiated_pressure(
     The root mean square over directions of its amplitude in the far field, stated for a distance of `DISTANCE`.
     """
     middle = 0.5 * (modes.nodes.amax(0) + modes.nodes.amin(0))
-    reach = _FAR * float((modes.nodes.amax(0) - modes.nodes.amin(0)).norm())
+    reach = _FAR_FIELD_RATIO * float((modes.nodes.amax(0) - modes.nodes.amin(0)).norm())
     power = torch.zeros(len(vibration.poles), dtype=torch.float64)
     for way in _evenly(directions):
         power += radiated(modes, vibration, middle + reach * way).abs().square()

@@ -15,7 +15,7 @@ from avmsf.mesh.surface import Surface
 
 _FACES = torch.tensor([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 """Corners of a tetrahedron's sides, counter-clockwise from outside; side i lies opposite to corner i."""
-FLATTEST = 1e-9
+MIN_VOLUME_RATIO = 1e-9
 """Volume of a tetrahedron over the cube of its longest edge, below which it is flat; a regular one has .118."""
 
 
@@ -97,7 +97,7 @@ class Solid:
     def expect_volume(self) -> None:
         """Raise SimulationError where a tetrahedron is flat or inside out, naming the first."""
         longest = (self.points[self.cells][:, :, None] - self.points[self.cells][:, None]).norm(dim=-1).amax(dim=(1, 2))
-        unfit = torch.nonzero(~(self.volumes > FLATTEST * longest**3)).flatten()
+        unfit = torch.nonzero(~(self.volumes > MIN_VOLUME_RATIO * longest**3)).flatten()
         if len(unfit):
             row = int(unfit[0])
             volume = float(self.volumes[row])

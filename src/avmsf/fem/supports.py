@@ -15,21 +15,21 @@ from avmsf.fem.elements import SecondOrder
 FREE = "free"
 FREE_PRIOR = 0.7
 """Probability that an object is free; recordings are meant to be made so. The supports share the rest."""
-_NEAR = 0.01
+_HELD_DISTANCE = 0.01
 """Distance from the lowest plane, or from an edge, over the body's size, within which nodes are held."""
-_LOW = 0.03
+_MAX_EDGE_HEIGHT = 0.03
 """Height above the lowest point, over the body's size, up to which an edge is a lower one."""
-_POINT = 0.1
+_MIN_FACE_EXTENT = 0.1
 """Extent of the lowest nodes over the body's size, below which they are a point and no face."""
-_STRAIGHT = 0.3
+_MIN_EDGE_EXTENT = 0.3
 """Least length of a straight lower edge over the body's size: the outline of a round base has no such side."""
-_BENT = 0.002
+_MAX_BEND = 0.002
 """Distance over the body's size of a corner from the line between its neighbors, below which that line is straight."""
 _MIN_LENGTH_RATIO = 0.5
 """Least length of an edge over the longest one's."""
-_EDGES = 4
+_MAX_EDGES = 4
 """Edges that are tried at most: a rectangular plate has so many."""
-_MOST = 0.4
+_MAX_HELD_RATIO = 0.4
 """Part of the surface's nodes that may be held: what is left would not ring."""
 
 
@@ -48,12 +48,14 @@ class Support:
         places, size = mesh.nodes[outer], mesh.solid.size
         heights = places[:, 2] - places[:, 2].min()
         if self.edge is None:
-            return outer[heights <= _NEAR * size]
+            return outer[heights <= _HELD_DISTANCE * size]
         start, end = np.array(self.edge)
         along = (end - start) / np.linalg.norm(end - start)
-        near = (np.abs(_cross(along, places[:, :2] - start)) <= _NEAR * size) & (heights <= _LOW * size)
+        near = (np.abs(_cross(along, places[:, :2] - start)) <= _HELD_DISTANCE * size) & (
+            heights <= _MAX_EDGE_HEIGHT * size
+        )
         if not near.any():
-            raise SimulationError.expected(f"nodes within {1000 * _NEAR * size:.2g} mm", name=self.name)
+            raise SimulationError.expected(f"nodes within {1000 * _HELD_DISTANCE * size:.2g} mm", name=self.name)
         return outer[near]
 
 
@@ -62,12 +64,12 @@ def supports_of(mesh: SecondOrder) -> list[Support]:
     outer = mesh.surface[0]
     places, size = mesh.nodes[outer], mesh.solid.size
     heights = places[:, 2] - places[:, 2].min()
-    extent = float(np.linalg.norm(np.ptp(places[heights <= _NEAR * size, :2], axis=0)))
-    found = [Support(f"held at its lowest {'point' if extent < _POINT * size else 'face'}")]
-    for number, (start, end) in enumerate(_lower_edges(places[heights <= _LOW * size, :2], size), start=1):
+    extent = float(np.linalg.norm(np.ptp(places[heights <= _HELD_DISTANCE * size, :2], axis=0)))
+    found = [Support(f"held at its lowest {'point' if extent < _MIN_FACE_EXTENT * size else 'face'}")]
+    for number, (start, end) in enumerate(_lower_edges(places[heights <= _MAX_EDGE_HEIGHT * size, :2], size), start=1):
         edge = (float(start[0]), float(start[1])), (float(end[0]), float(end[1]))
         found.append(Support(f"held along lower edge {number}", edge))
-    return [each for each in found if len(each.nodes(mesh)) <= _MOST * len(outer)]
+    return [each for each in found if len(each.nodes(mesh)) <= _MAX_HELD_RATIO * len(outer)]
 
 
 def _lower_edges(
@@ -86,13 +88,13 @@ def _lower_edges(
             place = kept.index(row)
             before, after = outline[kept[place - 1]], outline[kept[(place + 1) % len(kept)]]
             chord = after - before
-            if abs(_cross(chord, outline[row] - before)) <= _BENT * size * np.linalg.norm(chord):
+            if abs(_cross(chord, outline[row] - before)) <= _MAX_BEND * size * np.linalg.norm(chord):
                 kept.pop(place)
     corners = outline[kept]
     sides = [(corners[row - 1], corners[row]) for row in range(len(corners))]
     lengths = [float(np.linalg.norm(end - start)) for start, end in sides]
-    order = np.argsort(np.negative(lengths), kind="stable")[:_EDGES]
-    least = max(_STRAIGHT * size, _MIN_LENGTH_RATIO * max(lengths))
+    order = np.argsort(np.negative(lengths), kind="stable")[:_MAX_EDGES]
+    least = max(_MIN_EDGE_EXTENT * size, _MIN_LENGTH_RATIO * max(lengths))
     return [sides[row] for row in order if lengths[row] >= least]
 
 

@@ -141,7 +141,7 @@ def _expect_likeness(solid: Solid, mesh: Trimesh, *, tolerance: float, advice: s
     """Raise SimulationError where much of the mesh is not the solid's surface, or much of that surface is no mesh."""
     outside = Trimesh(solid.points.numpy(), solid.boundary.numpy(), process=False)
     places, opened = even_points(mesh), len(boundary_edges(mesh))
-    found = ClosestPoints(np.array(outside.triangles))(places)
+    found = ClosestPoints(outside.triangles)(places)
     nearest = np.einsum("pc,pcd->pd", found.weights, outside.triangles[found.rows])
     behind = (outside.face_normals[found.rows] * (places - nearest)).sum(axis=1) < 0
     # Where bodies cross, the mesh runs inside; only what lies outside was lost.
@@ -151,7 +151,7 @@ def _expect_likeness(solid: Solid, mesh: Trimesh, *, tolerance: float, advice: s
         got = f"{lost:.0%} of it without ({opened} open edges, or thin walls)"
         advice = f"use a smaller detail or more degrees of freedom, close the mesh, or {advice}"
         raise SimulationError.expected(wanted, lost, got=got, name="detail", advice=advice)
-    lids = float((ClosestPoints(np.array(mesh.triangles))(even_points(outside)).distances > tolerance).mean())
+    lids = float((ClosestPoints(mesh.triangles)(even_points(outside)).distances > tolerance).mean())
     if lids > _LID:
         got = f"{opened} open edges whose holes are {lids:.0%} of the surface"
         advice = f"close the mesh, or {advice}"

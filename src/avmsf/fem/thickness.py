@@ -16,16 +16,16 @@ from scipy.ndimage import gaussian_filter1d
 from avmsf.fem.candidate_bodies import CandidateBody
 from avmsf.fem.material import DISCREPANCY
 
-_RESOLUTION = 0.06
+_MIN_STEP = 0.06
 """Difference of log thickness below which no body is computed between two: real walls vary by 3 to 5 %."""
-_FAR = 0.4
+_MAX_STEP = 0.4
 """Difference of log thickness from which on three bodies say little of those between them. Of a dish from photographs a
 body of twice the best one's thickness was less probable by 66 nats; one half way was by 9 nats more so."""
-_MOST = 8
+_MAX_BODIES = 8
 """Bodies computed at most besides the first ones, failures included."""
-_UNLIKELY = math.log(100.0)
+_MAX_EVIDENCE_GAP = math.log(100.0)
 """Log evidence (nats) below the most probable body's, from which on a body is no hypothesis."""
-_BELOW = math.log(4.0)
+_MAX_EXTENSION = math.log(4.0)
 """How far the log thickness is searched below the first range, whose lower end is a guess; with no end, gains that no
 wall explains made it ever thinner (from 1 to .06 mm)."""
 _STEPS = 2000
@@ -56,8 +56,8 @@ def search_thickness(
     body without a wall is the most probable one, or where fewer than two thicknesses are known.
     """
     found, failed = dict(zip(bodies, evidence(bodies), strict=True)), list[float]()
-    thinnest = min((math.log(wall) for wall, _ in _walls(found)), default=0.0) - _BELOW
-    for _ in range(_MOST):
+    thinnest = min((math.log(wall) for wall, _ in _walls(found)), default=0.0) - _MAX_EXTENSION
+    for _ in range(_MAX_BODIES):
         walls = _walls(found)
         if len(walls) < 2 or max(found, key=found.__getitem__).thickness is None:
             break
@@ -71,7 +71,9 @@ def search_thickness(
             continue
         [found[body]] = evidence([body])
     best = max(found, key=found.__getitem__)
-    likely = sorted((body for body, each in found.items() if each > found[best] - _UNLIKELY), key=found.__getitem__)
+    likely = sorted(
+        (body for body, each in found.items() if each > found[best] - _MAX_EVIDENCE_GAP), key=found.__getitem__
+    )
     walls = _walls(found)
     return likely[::-1], None if best.thickness is None or len(walls) < 2 else _posterior(walls)
 
@@ -101,11 +103,11 @@ def _next(places: np.ndarray, values: np.ndarray, failed: np.ndarray, *, thinnes
         # The first range is a guess below; above, the views or the object's width bound it.
         proposals += [places[0] - part * (places[1] - places[0]) for part in (1.0, 0.5)]
     fall, apart = values[best] - values, np.abs(places - places[best])
-    near = [row for row in near if fall[row] < 4.0 * _UNLIKELY or apart[row] > _FAR]
+    near = [row for row in near if fall[row] < 4.0 * _MAX_EVIDENCE_GAP or apart[row] > _MAX_STEP]
     proposals += [0.5 * (places[best] + places[row]) for row in sorted(near, key=lambda row: -values[row])]
     known = np.concatenate([places, failed])
     for each in proposals:
-        if each >= thinnest and float(np.abs(known - each).min()) >= _RESOLUTION:
+        if each >= thinnest and float(np.abs(known - each).min()) >= _MIN_STEP:
             return math.exp(each)
     return None
 

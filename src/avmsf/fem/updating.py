@@ -34,19 +34,19 @@ STIFFNESS, DENSITY, POISSON, FACTOR = 0.10, 0.04, 1.0, 0.5
 ratio over a change of .05, and of the log factor on all frequencies over one round."""
 _POISSON_STEP = 0.05
 """Change of Poisson's ratio that a coefficient of 1 stands for."""
-_ROUNDS = 6
+_MAX_ROUNDS = 6
 """Most rounds; on simulated objects the evidence rises for 3 to 6."""
-_SURE = 0.7
+_MIN_CERTAINTY = 0.7
 """Probability of a shape from which on a mode is taken for it."""
 _FREQUENCY = 0.02, 0.002
 """Standard deviation of log frequency at first, and at least."""
 _GAIN_NOISE = 0.02
 """Least variance of gains that updating cannot explain, over their mean square."""
-_NEAR = 0.01
+_MIXING_GAP = 0.01
 """Relative difference of squared frequencies below which shapes mix freely and first order says nothing."""
-_TOGETHER = 0.02
+_GROUP_GAP = 0.02
 """Relative difference of squared frequencies within which shapes count as one group."""
-_LONGEST = 2.0
+_MAX_STEP = 2.0
 """Longest step of a coefficient, in prior standard deviations."""
 
 
@@ -85,7 +85,7 @@ def update(
     theta, spread, best = np.zeros(len(problem.deviation)), _FREQUENCY[0], None
     found = match(local)
     nominal = highest = found.evidence
-    for step in range(_ROUNDS):
+    for step in range(_MAX_ROUNDS):
         theta, spread, volume = problem.solved(theta, found, found.centers[:, usable], spread, with_gains=step > 0)
         size = float(np.square(theta / problem.deviation).sum())
         if size > len(theta):
@@ -140,11 +140,11 @@ class _Problem:
         """
         squares, shapes = self.solution(theta)
         centers = known.numpy()
-        together = np.abs(squares[:, None] - squares) <= _TOGETHER * squares[:, None]
+        together = np.abs(squares[:, None] - squares) <= _GROUP_GAP * squares[:, None]
         grouped = together @ centers
         shape = centers.argmax(0)
         certainty = grouped[shape, np.arange(len(shape))]
-        mode = np.flatnonzero(certainty > _SURE)
+        mode = np.flatnonzero(certainty > _MIN_CERTAINTY)
         shape, certainty = shape[mode], certainty[mode]
         forces = np.einsum("jk,ljm,mn->lkn", shapes, self.forces, shapes, optimize=True)
         masses = np.einsum("jk,ljm,mn->lkn", shapes, self.masses, shapes, optimize=True)
@@ -166,7 +166,7 @@ class _Problem:
         # Of the coefficients alone: the factor is not known of the nominal body either.
         alone = posterior[:-1, :-1] - np.outer(posterior[:-1, -1], posterior[-1, :-1]) / posterior[-1, -1]
         volume = 0.5 * np.linalg.slogdet(alone * self.deviation[:, None] * self.deviation)[1]
-        step = np.clip(solution[:-1] - theta, -_LONGEST * self.deviation, _LONGEST * self.deviation)
+        step = np.clip(solution[:-1] - theta, -_MAX_STEP * self.deviation, _MAX_STEP * self.deviation)
         # More than the root mean square of the fitted residuals: as many coefficients as modes fit them.
         left = apart - slopes @ step - solution[-1]
         if len(mode):
@@ -191,7 +191,7 @@ class _Problem:
         moved = np.zeros((len(values), len(self.deviation)))
         for k, size in zip(np.flatnonzero(group), sizes, strict=True):
             apart = squares[k] - squares
-            mixing = np.where(group, 0.0, apart / (apart**2 + (_NEAR * squares[k]) ** 2))
+            mixing = np.where(group, 0.0, apart / (apart**2 + (_MIXING_GAP * squares[k]) ** 2))
             coefficients = np.concatenate([forces[:, :, k], -squares[k] * masses[:, :, k]]) * mixing
             moved += size * along @ coefficients.T
         moved -= basis @ (basis.T @ moved)

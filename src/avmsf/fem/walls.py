@@ -42,9 +42,9 @@ _INSIDE = 1e-5
 """How far behind a triangle rays start, in diagonals of the box around the mesh."""
 _TRIANGLE = 1.2
 """Squared length of the sides over the sheet's area for each vertex, by trial; 1.15 for regular triangles."""
-_MOST = 50
+_MAX_LAYERS = 50
 """Layers at most."""
-_ROUNDS = 100
+_MAX_ROUNDS = 100
 """Most rounds of averaging that fill in the thickness where no ray finds the other side."""
 
 
@@ -73,9 +73,9 @@ class Wall:
         def needed(layers: int) -> float:
             return math.sqrt(_TRIANGLE * 12.0 * (2 * layers + 1) * self.sheet.area / dofs)
 
-        layers = next(
-            layers for layers in range(1, _MOST) if layers == _MOST - 1 or self._layers(needed(layers)) <= layers
-        )
+        layers = 1
+        while layers < _MAX_LAYERS - 1 and self._layers(needed(layers)) > layers:
+            layers += 1
         return needed(layers)
 
     def _layers(self, length: float) -> int:
@@ -116,7 +116,7 @@ class Wall:
         known = (cosine < _OPPOSITE) & (reach < _THICKER * self.thickness)
         joined = adjacency(sheet)
         values = np.where(known, reach, 0.0)
-        for _ in range(_ROUNDS):
+        for _ in range(_MAX_ROUNDS):
             if known.all():
                 return values
             near = joined @ known.astype(float)
@@ -132,7 +132,7 @@ class Wall:
             return False
         outside = Trimesh(solid.points.numpy(), solid.boundary.numpy(), process=False)
         distances = (
-            ClosestPoints(np.array(one.triangles))(even_points(other)).distances
+            ClosestPoints(one.triangles)(even_points(other)).distances
             for one, other in ((outside, self.mesh), (self.mesh, outside))
         )
         return all(float((each > away * self.thickness).mean()) <= _MAX_DISTANT_PART for each in distances)
@@ -177,5 +177,5 @@ def _behind(
 
     The distance is infinite where there is none, and the cosine 1.
     """
-    rows, reach = RayCaster(np.array(mesh.triangles))(places, -normals, lead=_INSIDE)
+    rows, reach = RayCaster(mesh.triangles)(places, -normals, lead=_INSIDE)
     return reach, np.where(rows >= 0, (normals * mesh.face_normals[rows]).sum(axis=1), 1.0), rows

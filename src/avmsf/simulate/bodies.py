@@ -23,7 +23,7 @@ from avmsf.simulate.recipe import AXES, ObjectRecipe
 from avmsf.simulate.shapes import make_shape, textured
 from avmsf.simulate.thickness_variation import vary_thickness
 
-_LARGEST = 10.0
+_MAX_EXTENT_M = 10.0
 """Meters along its longest side beyond which a mesh is likelier to count millimeters."""
 
 
@@ -118,8 +118,8 @@ def _scale(recipe: ObjectRecipe, vertices: Tensor) -> float:
         raise SimulationError.expected(
             "a mesh with an extent", longest, got="one point", file=recipe.mesh, name="size", advice="export it again"
         )
-    if recipe.size is None and longest > _LARGEST:
+    if recipe.size is None and longest > _MAX_EXTENT_M:
         advice = f"if it is in millimeters, give --size {longest / 1000:g}, else its length by --size"
-        wanted, got = f"a mesh of at most {_LARGEST:g} m", f"{longest:g} m"
+        wanted, got = f"a mesh of at most {_MAX_EXTENT_M:g} m", f"{longest:g} m"
         raise SimulationError.expected(wanted, longest, got=got, file=recipe.mesh, name="size", advice=advice)
     return 1.0 if recipe.size is None else recipe.size / longest

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from avmsf.errors import SimulationError
 from avmsf.fem.material import Material
-from avmsf.simulate.recipe import LONGEST, Hammer
+from avmsf.simulate.recipe import MAX_CONTACT_SECONDS, Hammer
 
 _HERTZ_SCALE = 2.868
 _HERTZ_AREA = math.sqrt(math.pi) * math.gamma(1.25) / math.gamma(1.75)
@@ -41,7 +41,7 @@ def contact_times(
     """Return how long the tip stays on a body of this material and mass, kg, for blows of these speeds, m/s; seconds.
 
     A round tip stays for a time that goes with the speed to the power -1/5, a flat one equally long at all speeds.
-    Raises SimulationError where that is longer than `LONGEST`.
+    Raises SimulationError where that is longer than `MAX_CONTACT_SECONDS`.
     """
     flat = hammer.pulse == "half-sine"
     joint = 1.0 / ((1.0 - hammer.poisson**2) / hammer.young + (1.0 - material.poisson**2) / material.young)
@@ -52,9 +52,12 @@ def contact_times(
         times = torch.full_like(speeds, math.pi * math.sqrt(moving / (2.0 * hammer.radius * joint)))
     else:
         times = _HERTZ_SCALE * (moving**2 / (hammer.radius * joint**2 * speeds)) ** 0.2
-    if float(times.max()) > LONGEST:
+    if float(times.max()) > MAX_CONTACT_SECONDS:
         longest = float(times.max())
-        wanted, advice = f"a contact time up to {LONGEST:g} s", "use a lighter hammer, a stiffer tip, or a higher speed"
+        wanted, advice = (
+            f"a contact time up to {MAX_CONTACT_SECONDS:g} s",
+            "use a lighter hammer, a stiffer tip, or a higher speed",
+        )
         raise SimulationError.expected(wanted, longest, got=f"{longest:.2g} s", name="hammer", advice=advice)
     return times
 

@@ -12,7 +12,7 @@ from avmsf._utils.caching import source_digest
 from avmsf.errors import SimulationError
 from avmsf.fem.material import material_named
 
-LONGEST = 0.02
+MAX_CONTACT_SECONDS = 0.02
 """Longest contact of an impact, seconds."""
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
@@ -43,9 +43,9 @@ class Hammer:
                 raise SimulationError.expected(f"more than 0 {unit}", value, name=f"hammer.{name}")
         if not -1 < self.poisson < 0.5:
             raise SimulationError.expected("more than -1 and less than .5", self.poisson, name="hammer.poisson")
-        if not 0 <= self.contact_time <= LONGEST:
+        if not 0 <= self.contact_time <= MAX_CONTACT_SECONDS:
             raise SimulationError.expected(
-                f"0 to compute it, or up to {LONGEST:g} s", self.contact_time, name="hammer.contact_time"
+                f"0 to compute it, or up to {MAX_CONTACT_SECONDS:g} s", self.contact_time, name="hammer.contact_time"
             )
 
 

@@ -138,7 +138,7 @@ class SoundingBody:
         return peak_forces(self.hammer, mass=self.elastic.mass, speeds=speeds, times=times)
 
 
-HIGHEST = 0.45
+MAX_FREQUENCY_RATIO = 0.45
 """Frequency over the sample rate up to which modes sound: what an ordinary recorder's filter lets pass."""
 
 
@@ -195,7 +195,7 @@ def sounding_body(recipe: ObjectRecipe, body: Body) -> SoundingBody:
     matrix = damping_matrix(
         body.elastic, recipe.imperfections, supports=body.supports, generator=stream(recipe.seed, "coupling")
     )
-    vibration = damped(body.elastic.frequency, matrix, highest=HIGHEST * recipe.sample_rate)
+    vibration = damped(body.elastic.frequency, matrix, highest=MAX_FREQUENCY_RATIO * recipe.sample_rate)
     vertices = body.surface.vertices.double()
     microphone = 0.5 * (vertices.amax(0) + vertices.amin(0)) + torch.tensor(recipe.microphone, dtype=torch.float64)
     pressures = radiated(body.elastic, vibration, microphone, retardation=recipe.imperfections.retardation)

@@ -17,7 +17,7 @@ from avmsf.mesh.surface import Surface
 from avmsf.simulate.imperfections import stream
 from avmsf.simulate.recipe import Imperfections
 
-STEEPEST = -0.35
+MIN_NORMAL_HEIGHT = -0.35
 """Least height of a unit normal where a hammer gets beneath: 20 degrees of overhang above a table."""
 _LEAD = 1e-4
 """How far off the surface rays start, in object diagonals."""
@@ -90,7 +90,7 @@ def _reached(
         count, advice = len(mesh.faces), "give a mesh with faces"
         got = f"{count} without"
         raise SimulationError.expected("triangles with an area", count, got=got, name="surface", advice=advice)
-    generator, cast = stream(seed, "contacts"), RayCaster(np.array(mesh.triangles))
+    generator, cast = stream(seed, "contacts"), RayCaster(mesh.triangles)
     wanted = _CANDIDATES * count
     places, normals, drawn = np.zeros((0, 3)), np.zeros((0, 3)), 0
     while len(places) < wanted and drawn < 200 * wanted:
@@ -98,7 +98,7 @@ def _reached(
         outward = np.asarray(mesh.face_normals[rows])
         # A ray along the normal leaves the object without meeting it again.
         free = cast(np.asarray(points), outward, lead=_LEAD)[0] < 0
-        reached = free & (outward @ up.numpy() >= STEEPEST)
+        reached = free & (outward @ up.numpy() >= MIN_NORMAL_HEIGHT)
         places, normals = np.concatenate([places, points[reached]]), np.concatenate([normals, outward[reached]])
         drawn += 8 * wanted
     if len(places) < count:

@@ -12,7 +12,7 @@ from avmsf.mesh.rays import RayCaster
 from avmsf.simulate.imperfections import smooth_field
 from avmsf.simulate.shapes.body import mitred_normals
 
-MOST = 0.5
+MAX_VARIATION = 0.5
 """Largest variation."""
 _SQUEEZED = 0.02
 """Part of its volume below which a tetrahedron is moved as a whole instead."""
@@ -29,8 +29,8 @@ def vary_thickness(solid: Solid, part: float, *, generator: np.random.Generator)
     normals by half of what it grows, and points inside go along with those around them. No tetrahedron is turned inside
     out. Raises SimulationError for a part below 0 or above .5, and for tetrahedra so flat that they cannot move.
     """
-    if not 0.0 <= part <= MOST:
-        raise SimulationError(f"part: expected 0 to {MOST:g} of the thickness, got {part:g}", name="part", value=part)
+    if not 0.0 <= part <= MAX_VARIATION:
+        raise SimulationError.expected(f"0 to {MAX_VARIATION:g} of the thickness", part, name="part")
     if part == 0.0:
         return solid
     rows, inverse = np.unique(solid.boundary.numpy(), return_inverse=True)

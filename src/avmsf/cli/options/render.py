@@ -11,7 +11,7 @@ from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.common import Flag, Printing, Unit
 from avmsf.cli.options.paths import ContactTable, FieldFile, NewFile, PositionList
 from avmsf.modal.config import PulseShape
-from avmsf.simulate.recipe import LONGEST
+from avmsf.simulate.recipe import MAX_CONTACT_SECONDS
 
 Coding = Literal["float32", "int16"]
 
@@ -85,7 +85,9 @@ class Options(Printing):
         if not 0 < self.force < math.inf:
             advice = "--direction says which way it acts"
             raise OutputError.expected("a finite force above 0", self.force, name="--force", advice=advice)
-        if not 0 <= self.contact_time <= LONGEST:
-            raise OutputError.expected(f"seconds from 0 to {LONGEST:g}", self.contact_time, name="--contact-time")
+        if not 0 <= self.contact_time <= MAX_CONTACT_SECONDS:
+            raise OutputError.expected(
+                f"seconds from 0 to {MAX_CONTACT_SECONDS:g}", self.contact_time, name="--contact-time"
+            )
         if self.seconds is not None and not 0 < self.seconds < math.inf:
             raise OutputError.expected("more than 0", self.seconds, name="--seconds")

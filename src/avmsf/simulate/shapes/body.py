@@ -12,7 +12,7 @@ from torch import Tensor
 
 from avmsf.errors import SimulationError
 from avmsf.fem.remeshing import unit
-from avmsf.fem.solid import FLATTEST, Solid, prism_cells
+from avmsf.fem.solid import MIN_VOLUME_RATIO, Solid, prism_cells
 
 _SHARPEST = 0.4
 """Least mean of the cosines between the normal at a corner and the faces around it that a mitre is made for."""
@@ -104,7 +104,7 @@ class Body:
         points, cells = np.concatenate(self._points) * scale, np.concatenate(self._cells)
         edges = points[cells[:, 1:]] - points[cells[:, :1]]
         longest = np.linalg.norm(edges, axis=-1).max(axis=1)
-        unfit = np.flatnonzero(~(np.linalg.det(edges) / 6.0 > FLATTEST * longest**3))
+        unfit = np.flatnonzero(~(np.linalg.det(edges) / 6.0 > MIN_VOLUME_RATIO * longest**3))
         if len(unfit):
             where = ", ".join(f"{value:.3f}" for value in points[cells[unfit[0]]].mean(axis=0))
             got = f"{len(unfit)} of {len(cells)} inverted, first at ({where}) m"

@@ -27,9 +27,9 @@ _MAKERS: tuple[Maker, ...] = (
 )  # fmt: skip
 KINDS: Mapping[str, Maker] = MappingProxyType({maker.__name__: maker for maker in _MAKERS})
 """What draws and builds an individual of each kind."""
-_LARGEST = 100.0
+_MAX_EXTENT_M = 100.0
 """Meters."""
-_FEWEST_FACES = 6000
+_MIN_FACES = 6000
 _ROUNDS = 4
 """Drafts until walls and size are both as asked for."""
 
@@ -72,8 +72,8 @@ def make_shape(kind: str, *, seed: int | None = 0, size: float | None = None, wa
     if seed < 0:
         raise SimulationError(f"seed: expected 0 or more, got {seed}", name="seed", value=seed)
     for name, value in (("size", size), ("wall", wall)):
-        if value is not None and not 0.0 < value <= _LARGEST:
-            raise SimulationError.expected(f"more than 0 and at most {_LARGEST:g} m", value, name=name)
+        if value is not None and not 0.0 < value <= _MAX_EXTENT_M:
+            raise SimulationError.expected(f"more than 0 and at most {_MAX_EXTENT_M:g} m", value, name=name)
     draft, scale = _sized(kind, seed, size, wall)
     try:
         solid = draft.body.solid(scale=scale)
@@ -118,7 +118,7 @@ def _skin(solid: Solid) -> tuple[Float64[np.ndarray, "points 3"], Int[np.ndarray
     """Return a solid's outer triangles, each cut in four, and again until they are fine enough for colors."""
     used, rows = np.unique(solid.boundary.numpy(), return_inverse=True)
     points, faces = solid.points.numpy()[used], rows.reshape(-1, 3)
-    while len(faces) < _FEWEST_FACES:
+    while len(faces) < _MIN_FACES:
         ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1), axis=-1).reshape(-1, 2)
         edges, which = np.unique(ends[:, 0] * len(points) + ends[:, 1], return_inverse=True)
         a, b, c = faces.T

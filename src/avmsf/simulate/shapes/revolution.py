@@ -16,7 +16,7 @@ from avmsf.simulate.shapes.body import ROUND, UP, Body, Draft, Patch, Rings, She
 POINTS = 900
 """Points in the middle of a wall: about 12 nodes of second order each, so some 32,000 degrees of freedom."""
 _FINE = 2000
-_LEAST, _MOST = 8, 34
+_MIN_INNER, _MAX_INNER = 8, 34
 """Points of the innermost ring."""
 
 
@@ -64,7 +64,7 @@ class Profile:
         radius = self.at(np.linspace(0.0, 1.0, 200))[:, 0]
         around = 2.0 * np.pi * radius.mean()
         best: tuple[float, Rings] | None = None
-        for base in range(_LEAST + -_LEAST % (2 * fold), max(_MOST, 2 * fold) + 1, 2 * fold):
+        for base in range(_MIN_INNER + -_MIN_INNER % (2 * fold), max(_MAX_INNER, 2 * fold) + 1, 2 * fold):
             for number in itertools.count(max(4, points // (4 * base))):
                 rings = self._rings(base, number)
                 if rings.starts[-1] < points:
