@@ -194,7 +194,7 @@ def moved_body(move: Callable[[torch.Tensor], torch.Tensor]) -> CandidateBody:
 ELSEWHERE: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
     "unit mm": lambda x: 1000.0 * x,
     "unit inches": lambda x: x / 0.0254,
-    "axis": lambda x: x[:, [0, 2, 1]] * x.new_tensor([1, -1, 1]),
+    "(x, y, z) taken as": lambda x: x[:, [0, 2, 1]] * x.new_tensor([1, -1, 1]),
     "frame": lambda x: x @ torch.linalg.qr(torch.tensor([[1.0, 2, 3], [3, 1, -2], [1, -4, 1]]).double()).Q + 0.07,
 }
 
