@@ -67,13 +67,13 @@ def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float |
             newtons = abs(pulse.height * settings.force_scale)
     elif settings.align:
         onset = find_onset(sound, sample_rate=recording.sample_rate)
-    manner = settings.normalize
-    if manner == "auto":
-        manner = "none" if newtons is None else "peak"
-    if manner == "peak" and newtons is None:
+    normalize = settings.normalize
+    if normalize == "auto":
+        normalize = "none" if newtons is None else "peak"
+    if normalize == "peak" and newtons is None:
         wanted, advice = 'a force for normalize = "peak"', "give force_newtons in impacts.csv, or a force_channel"
         raise recording.error(wanted, "peak", got="none", name="normalize", advice=advice)
-    if manner == "deconvolve" and pulse is not None:
+    if normalize == "deconvolve" and pulse is not None:
         before, kept = deconvolve(sound, force, pulse=pulse, regularization=settings.regularization)
     else:
         before, kept = np.split(sound, [onset if settings.align else 0])
@@ -82,11 +82,11 @@ def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float |
         peak = int(np.argmax(np.abs(whole)))
         onset += peak - len(before)
         before, kept = np.split(whole, [peak])
-    divisor = newtons if manner in ("peak", "deconvolve") and newtons is not None else 1.0
+    divisor = newtons if normalize in ("peak", "deconvolve") and newtons is not None else 1.0
     before, kept = before / divisor, kept / divisor
     _check_length_and_peak(kept, recording)
     before = before[max(0, len(before) - margin_length(recording.sample_rate)) :].copy()
-    return Prepared(kept, before, onset, pulse, None if manner == "none" else newtons, recording.sample_rate)
+    return Prepared(kept, before, onset, pulse, None if normalize == "none" else newtons, recording.sample_rate)
 
 
 def remove_rumble(

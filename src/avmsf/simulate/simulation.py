@@ -260,11 +260,11 @@ def _captured(
         recordings,
         strict=True,
     )
-    struck = (
+    pairs = (
         (Impact(file, place, direction, force), Recording(file, sound.double().numpy()[None], rate, "FLOAT"))
         for file, place, direction, force, sound in rows
     )
-    impacts, _ = preprocess(struck, settings, measured=False)
+    impacts, _ = preprocess(pairs, settings, measured=False)
     assert impacts is not None
     return Capture(name, impacts, surface, settings)
 
