@@ -9,8 +9,7 @@ import pytest
 from PIL import Image
 
 from avmsf.export.web import write_webpage
-from page_plate import plate_object, plate_table
-from plate_page import words_on
+from plate_page import plate_object, plate_table, words_on
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser

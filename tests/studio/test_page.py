@@ -9,8 +9,7 @@ import pytest
 import soundfile
 import torch
 
-from page_plate import SIDES, plate_shapes, plate_table
-from plate_page import LIVE, Open, answer, on_screen, wav, words_on
+from plate_page import LIVE, SIDES, Open, answer, on_screen, plate_shapes, plate_table, wav, words_on
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page, Request, Route

@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from page_plate import SIDES
-from plate_page import LIVE, Open, answer, on_screen, upload, words_on
+from plate_page import LIVE, SIDES, Open, answer, on_screen, upload, words_on
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page, Request, Route

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from avmsf.export.sampled_field import SampledField
-from page_plate import lay_out, plate_table
-from plate_page import LIVE, Open, Serve, answer, upload, words_on
+from plate_page import LIVE, Open, Serve, answer, lay_out, plate_table, upload, words_on
 
 if TYPE_CHECKING:
     from playwright.sync_api import Locator, Page, Request, Route

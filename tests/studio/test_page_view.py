@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from page_plate import LARGER, SIDES, plate_table
-from plate_page import Open, on_screen
+from plate_page import LARGER, SIDES, Open, on_screen, plate_table
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page

@@ -15,7 +15,7 @@ from avmsf.capture import read_capture
 from avmsf.field.store import load
 from avmsf.studio.opening import Opened, open_target
 from opened_plate import RATE, open_plate, plate_field, wav
-from page_plate import SIDES, plate_object
+from plate_page import SIDES, plate_object
 from served import Served, served
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from avmsf.studio.guard import policy_of
 from avmsf.studio.opening import open_target
 from avmsf.studio.routes import PAGE
 from opened_plate import open_plate
-from page_plate import plate_object
+from plate_page import plate_object
 from served import served
 
 if TYPE_CHECKING:
