@@ -188,17 +188,20 @@ def test_what_is_no_readable_file_is_named(tmp_path: Path, name: str) -> None:
         ("images.txt", " 7 b.png", " 8 b.png", None, "b.png"),
         ("images.txt", " 7 b.png", "", 4, None),
         ("images.txt", "1.5 2.5 -1 10.0 11.0 3\n", "", 3, None),
+        ("points3D.txt", " 255 ", " 256 ", 2, None),
+        ("points3D.txt", " -0.25 ", " inf ", 0, None),
     ],
 )
 def test_malformed_text_is_named_by_line(
     tmp_path: Path, file: str, before: str, after: str, row: int | None, name: str | None
 ) -> None:
+    read = read_sparse_points if file == "points3D.txt" else read_views
     write_colmap_text(tmp_path, ring(4), NAMES)
     text = (tmp_path / file).read_text()
     assert before in text
     (tmp_path / file).write_text(text.replace(before, after, 1))
     with raises(CaptureError, file=file, row=row, name=name):
-        read_views(tmp_path)
+        read(tmp_path)
 
 
 @pytest.mark.parametrize("pose", ["0 0 0 0 0 0 1", "nan 0 0 1 0 0 1", "1 0 0 0 0 inf 1"])
