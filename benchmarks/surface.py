@@ -11,8 +11,6 @@ import cv2
 import numpy as np
 import torch
 import trimesh
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float64
 
 from avmsf.errors import SceneError
@@ -23,6 +21,7 @@ from avmsf.gaussians.ply import read_splats, write_splats
 from avmsf.gaussians.rasterizer.devices import choose_rasterizer
 from avmsf.gaussians.visibility import depth_of_cloud
 from avmsf.mesh.closest_point import ClosestPoints
+from avmsf.mesh.rays import RayCaster
 from avmsf.mesh.surface import Surface, read_surface
 from avmsf.photographs import find_foreground, read_views
 from avmsf.photographs.cameras import View
@@ -220,12 +219,9 @@ def _rays(
     normals: Float64[np.ndarray, "places 3"] | None = None,
 ) -> Float64[np.ndarray, " places"]:
     """Return the distance to what lies in a direction, meters; rays start a little along the normals."""
-    size, middle = float(np.linalg.norm(mesh.extents)), mesh.bounds.mean(axis=0)
-    scene = EmbreeScene()
-    TriangleMesh(scene, ((mesh.triangles - middle) / size).astype(np.float32))
-    starts = (places - middle) / size + 1e-4 * (directions if normals is None else normals)
-    hit = scene.run(starts.astype(np.float32), directions.astype(np.float32), output=1)
-    return np.where(hit["primID"] >= 0, hit["tfar"].astype(np.float64) * size, np.inf)
+    offset = 1e-4 * float(np.linalg.norm(mesh.extents))
+    starts = places + offset * (directions if normals is None else normals)
+    return RayCaster(np.asarray(mesh.triangles))(starts, directions, lead=0.0)[1]
 
 
 def _cells(scores: _Scores) -> list[float]:

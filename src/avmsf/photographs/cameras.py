@@ -135,13 +135,12 @@ class View:
     """How much of each pixel the object covers, 255 for all of it; None if unknown."""
 
     def __post_init__(self) -> None:
-        found = tuple(self.image.shape[:2])
-        expected = (self.camera.height, self.camera.width)
-        if found != expected or (self.mask is not None and tuple(self.mask.shape) != expected):
-            size = "" if self.mask is None else f" and a mask of {self.mask.shape[1]} x {self.mask.shape[0]}"
-            wanted, got = f"an image of the camera's {expected[1]} x {expected[0]} pixels", f"{found[1]} x {found[0]}"
-            advice = "give the camera of this image"
-            raise CaptureError.expected(wanted, list(found), got=got + size, name=self.name, advice=advice)
+        width, height = self.camera.width, self.camera.height
+        for kind, pixels in (("an image", self.image), ("a mask", self.mask)):
+            if pixels is not None and pixels.shape[:2] != (height, width):
+                found, wanted = list(pixels.shape[:2]), f"{kind} of the camera's {width} x {height} pixels"
+                got, advice = f"{found[1]} x {found[0]}", "give the camera of this image"
+                raise CaptureError.expected(wanted, found, got=got, name=self.name, advice=advice)
 
     @property
     def color(self) -> Float[Tensor, "height width 3"]:
