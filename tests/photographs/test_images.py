@@ -111,11 +111,9 @@ def test_masks_without_object_drop_their_views(tmp_path: Path) -> None:
 
 
 def test_masks_that_are_named_but_not_there(tmp_path: Path) -> None:
-    folder = folder_of(tmp_path)
-    record = json.loads((folder / "transforms.json").read_text())
-    record["frames"][1]["mask_path"] = "masks/gone.png"
-    record["frames"][2]["mask_path"] = "masks/broken.png"
-    (folder / "transforms.json").write_text(json.dumps(record))
+    rows = frames(ring(4))
+    rows[1]["mask_path"], rows[2]["mask_path"] = "masks/gone.png", "masks/broken.png"
+    folder = write_transforms(tmp_path, rows)
     (folder / "masks").mkdir()
     (folder / "masks" / "broken.png").write_bytes(b"no image")
     with warns(CaptureWarning, file="transforms.json", name="missing masks", value=["b.png", "c.png"]):
@@ -161,11 +159,8 @@ def test_images_without_cameras_are_named(tmp_path: Path) -> None:
     write_image(folder / "images" / "y.png")
     with warns(CaptureWarning, name="cameras", value=["late/x.png", "y.png"]):
         assert len(read_views(folder)) == 4
-    record = json.loads((folder / "transforms.json").read_text())
-    record["frames"] = record["frames"][:2]
-    (folder / "transforms.json").write_text(json.dumps(record))
     with raises(CaptureError, file="transforms.json", name="views", value=2):
-        read_views(folder)
+        read_views(write_transforms(folder, frames(ring(2))))
 
 
 def test_longest_averages_areas_and_takes_the_camera_along(tmp_path: Path) -> None:
