@@ -151,7 +151,7 @@ def count_votes(masks: Sequence[Bool[np.ndarray, "_ _"]], cameras: Sequence[Came
     """Return the votes of masks on the cells of a grid."""
     seen, inside = np.zeros((2, math.prod(grid.shape)), dtype=np.uint16)
 
-    def count(part: slice, _: int, values: np.ndarray, __: np.ndarray) -> None:
+    def count(part: slice, _view: int, values: np.ndarray, _depths: np.ndarray) -> None:
         seen[part] += values >= 0
         inside[part] += values > 0
 

@@ -91,7 +91,7 @@ def _fused(
     cells = np.flatnonzero(where)
     counts = np.zeros((len(cells), _BINS), dtype=np.uint16)
 
-    def count(part: slice, _: int, reached: np.ndarray, away: np.ndarray) -> None:
+    def count(part: slice, _view: int, reached: np.ndarray, away: np.ndarray) -> None:
         before = (reached - away) / band
         seen = np.flatnonzero((reached > 0.0) & (before >= -1.0))
         counts[part][seen, np.minimum(((before[seen] + 1.0) * 0.5 * _BINS).astype(int), _BINS - 1)] += 1
