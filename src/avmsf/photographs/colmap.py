@@ -62,8 +62,8 @@ def read_colmap(model: Path, folder: Path) -> CameraFile:
     for name, camera, pose in _read_images(images):
         lens, where = lenses.get(camera), Location(images, item=f"image {name}")
         if lens is None:
-            known = f"expected a camera of the model ({', '.join(map(str, lenses))}), got camera {camera}"
-            raise where.error(f"{known}; export all parts of the model together", name=name, value=camera)
+            wanted, advice = f"a camera among {', '.join(map(str, lenses))}", "export all parts of the model together"
+            raise where.expected(wanted, camera, name=name, advice=advice)
         path, world_to_camera = name.replace("\\", "/"), _world_to_camera(pose, name, where)
         photographs.append(Photograph(path, source / path, world_to_camera, lambda *_, lens=lens: lens))
     return CameraFile(model, folder, tuple(photographs))
@@ -109,17 +109,16 @@ def _parts(model: Path, *names: str) -> list[Path]:
 
 def _model(path: Path, number: int, name: str | int) -> CameraModel:
     if name not in MODELS:
-        where, known = Location(path, item=f"camera {number}"), ", ".join(MODELS)
-        message = f"expected a camera model among {known}, got {name}; undistort the images first"
-        raise where.error(f"{message} (colmap image_undistorter)", name=where.item, value=name)
+        where, wanted = Location(path, item=f"camera {number}"), f"a camera model among {', '.join(MODELS)}"
+        advice = "undistort the images first (colmap image_undistorter)"
+        raise where.expected(wanted, name, name=where.item, advice=advice)
     return MODELS[str(name)]
 
 
 def _lens(path: Path, number: int, name: str, size: tuple[int, int], parameters: Sequence[float]) -> Lens:
     (focals, count, fisheye), where = _model(path, number, name), Location(path, item=f"camera {number}")
     if len(parameters) != focals + 2 + count:
-        message = f"expected {focals + 2 + count} parameters of {name}, got {len(parameters)}"
-        raise where.error(message, name=where.item, value=len(parameters))
+        raise where.expected(f"{focals + 2 + count} parameters of {name}", len(parameters), name=where.item)
     cx, cy, *coefficients = parameters[focals:]
     distortion = (*coefficients, *[0.0] * ((4 if fisheye else 5) - count))
     return Lens((parameters[0], parameters[focals - 1]), (cx, cy), *size, distortion, fisheye, where)
@@ -129,8 +128,8 @@ def _world_to_camera(pose: Sequence[float], name: str, where: Location) -> torch
     """Return the pose of a quaternion w, x, y, z of any length and a translation."""
     values = np.array(pose)
     if not np.isfinite(values).all() or np.linalg.norm(values[:4]) < 1e-6:
-        message = f"expected a rotation's quaternion and a translation, got {pose}; run the mapper again"
-        raise where.error(message, name=name, value=pose)
+        wanted, advice = "a rotation's quaternion and a translation", "run the mapper again"
+        raise where.expected(wanted, pose, name=name, advice=advice)
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_quat(values[[1, 2, 3, 0]]).as_matrix()
     matrix[:3, 3] = values[4:]

@@ -33,9 +33,12 @@ class Location:
     def __str__(self) -> str:
         return ", ".join(str(part) for part in (self.file, self.item) if part)
 
-    def error(self, message: str, *, name: str | None = None, value: Any = None) -> CaptureError:
-        """Return an error about what is there."""
-        return CaptureError(f"{self}: {message}", file=self.file, row=self.row, name=name, value=value)
+    def expected(
+        self, wanted: str, value: Any = None, *, name: str, got: str | None = None, advice: str = ""
+    ) -> CaptureError:
+        """Return an error about what is there, as `CaptureError.expected` does."""
+        message = str(CaptureError.expected(wanted, value, got=got, name=str(self), advice=advice))
+        return CaptureError(message, file=self.file, row=self.row, name=name, value=value)
 
 
 _ANY_CAMERA = Location(None, item="the camera")
@@ -67,13 +70,11 @@ class Lens:
     def __post_init__(self) -> None:
         numbers = [*self.focal, *self.principal, *self.distortion]
         if not all(map(math.isfinite, numbers)) or min(self.focal) <= 0 or min(self.width, self.height) < 1:
-            raise self.origin.error(
-                "expected finite intrinsics, positive focal lengths and a size in pixels, got focal lengths "
-                f"{self.focal}, principal point {self.principal}, distortion {self.distortion}, size {self.width} x "
-                f"{self.height}; calibrate this camera again",
-                name="intrinsics",
-                value=[*numbers, self.width, self.height],
-            )
+            size = f"size {self.width} x {self.height}"
+            got = f"focal {self.focal}, principal point {self.principal}, distortion {self.distortion}, {size}"
+            wanted, advice = "finite intrinsics, positive focal lengths and a size", "calibrate this camera again"
+            values = [*numbers, self.width, self.height]
+            raise self.origin.expected(wanted, values, got=got, name="intrinsics", advice=advice)
 
     @property
     def straight(self) -> bool:
@@ -111,9 +112,8 @@ def _widest_pinhole(lens: Lens) -> Lens:
     """Return the pinhole of smallest focal length, by bisection, whose every pixel lies in the lens's image."""
     narrow, wide = 4.0, 1 / _MAX_FIELD_RATIO
     if not _covers(lens, narrow):
-        message = f"expected an invertible distortion, got {lens.distortion}; check the camera model (fisheye: "
-        message += f"{lens.fisheye}) and the order of its coefficients"
-        raise lens.origin.error(message, name="distortion", value=lens.distortion)
+        advice = f"check the camera model (fisheye: {lens.fisheye}) and the order of its coefficients"
+        raise lens.origin.expected("an invertible distortion", lens.distortion, name="distortion", advice=advice)
     if _covers(lens, wide):
         narrow = wide
     while narrow / wide > 1 + 1e-5:

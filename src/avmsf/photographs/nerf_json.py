@@ -128,14 +128,14 @@ def _lens(settings: Mapping[str, Any], where: Location, image_width: int, image_
     height = int(_number(settings, "h", where)) if sized else image_height
     across, down = _focal(settings, "x", width, where), _focal(settings, "y", height, where)
     if across is None and down is None:
-        raise where.error("expected fl_x or camera_angle_x, in the frame or at the top of the file", name="fl_x")
+        raise where.expected("fl_x or camera_angle_x, in the frame or at the top of the file", name="fl_x")
     # With one focal length alone, pixels are square.
     focal = (across or down or 0.0, down or across or 0.0)
     principal = (_number(settings, "cx", where, width / 2), _number(settings, "cy", where, height / 2))
     k1, k2, k3, k4, p1, p2 = (_number(settings, key, where, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     if not fisheye and k4:
-        message = f"expected k1 k2 p1 p2 k3 of a perspective lens, got k4 = {k4}; calibrate again"
-        raise where.error(message, name="k4", value=k4)
+        wanted, got = "k1 k2 p1 p2 k3 of a perspective lens", f"k4 = {k4}"
+        raise where.expected(wanted, k4, got=got, name="k4", advice="calibrate again")
     distortion = (k1, k2, k3, k4) if fisheye else (k1, k2, p1, p2, k3)
     return Lens(focal, principal, width, height, distortion, fisheye, where)
 
@@ -148,7 +148,7 @@ def _focal(settings: Mapping[str, Any], axis: str, pixels: int, where: Location)
         return None
     angle = _number(settings, key, where)
     if not 0 < angle < math.pi:
-        raise where.error(f"expected {key} in radians between 0 and pi, got {angle}", name=key, value=angle)
+        raise where.expected(f"{key} in radians between 0 and pi", angle, name=key)
     return pixels / 2 / math.tan(angle / 2)
 
 
@@ -156,9 +156,8 @@ def _is_fisheye(settings: Mapping[str, Any], where: Location) -> bool:
     """Whether the frame's camera model is fisheye; raises CaptureError unless it is that or perspective."""
     name = str(settings.get("camera_model") or (FISHEYE if settings.get("is_fisheye") else PERSPECTIVE)[0]).upper()
     if name not in PERSPECTIVE + FISHEYE:
-        known = ", ".join(PERSPECTIVE + FISHEYE)
-        message = f"expected a camera model among {known}, got {name}; undistort the images first"
-        raise where.error(message, name="camera_model", value=name)
+        wanted = f"a camera model among {', '.join(PERSPECTIVE + FISHEYE)}"
+        raise where.expected(wanted, name, name="camera_model", advice="undistort the images first")
     return name in FISHEYE
 
 
@@ -166,14 +165,14 @@ def _number(settings: Mapping[str, Any], key: str, where: Location, fallback: fl
     value = settings.get(key, fallback)
     # A whole number of a JSON file may be larger than any float.
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
-        raise where.error(f"expected a finite number as {key}, got {value!r}", name=key, value=value)
+        raise where.expected(f"a finite number as {key}", value, name=key)
     return float(value)
 
 
 def _text(frame: dict[str, Any], key: str, where: Location) -> str:
     value = frame.get(key)
     if not isinstance(value, str) or not value.strip():
-        raise where.error(f"expected the path of a file as {key}, got {value!r}", name=key, value=value)
+        raise where.expected(f"the path of a file as {key}", value, name=key)
     return value.replace("\\", "/")
 
 
@@ -196,16 +195,15 @@ def _name(file: str, image: Path) -> str:
 
 def _matrix(frame: dict[str, Any], where: Location) -> Float[np.ndarray, "rows 4"]:
     """Return a frame's pose, of 4 rows, or 3 without the last."""
-    key = "transform_matrix"
+    key, wanted = "transform_matrix", "the camera-to-world pose as 4 rows of 4 numbers"
     written = frame.get(key)
     try:
         matrix = np.array(written, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise where.error(f"expected {key} as 4 rows of 4 numbers ({error})", name=key, value=written) from error
-    if written is None or matrix.shape not in ((4, 4), (3, 4)):
-        got = "none" if written is None else f"the shape {matrix.shape}"
-        message = f"expected {key}, the camera-to-world pose, as 4 rows of 4 numbers, got {got}"
-        raise where.error(message, name=key, value=written)
+        raise where.expected(wanted, written, got=str(error), name=key) from error
+    if matrix.shape not in ((4, 4), (3, 4)):
+        got = None if written is None else f"the shape {matrix.shape}"
+        raise where.expected(wanted, written, got=got, name=key)
     return matrix
 
 
@@ -215,30 +213,27 @@ def _rigid(matrix: Float[np.ndarray, "rows 4"], where: Location) -> tuple[Float[
     A scale that is the same along all axes does not move the camera and is removed; the caller warns of it. Raises
     CaptureError, at `where`, for anything else that is not a rotation with a position.
     """
-
-    def error(message: str, value: Any) -> CaptureError:
-        return where.error(message, name="transform_matrix", value=value)
-
+    key = "transform_matrix"
     if not np.isfinite(matrix).all():
         value = float(matrix[~np.isfinite(matrix)][0])
-        raise error(f"expected a finite pose, got {value}; estimate this camera again", value)
+        raise where.expected("a finite pose", value, name=key, advice="estimate this camera again")
     if len(matrix) == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
-        row = matrix[3].tolist()
-        raise error(f"expected 0 0 0 1 as the pose's last row, got {row}; perhaps the matrix is transposed", row)
+        wanted, row, advice = "0 0 0 1 as the pose's last row", matrix[3].tolist(), "perhaps the matrix is transposed"
+        raise where.expected(wanted, row, name=key, advice=advice)
     determinant = float(np.linalg.det(matrix[:3, :3]))
     if determinant < -1e-12:
-        raise error(
-            f"expected a pose with right-handed axes, got determinant {determinant:.3g}. transforms.json has OpenGL's "
-            "axes: x right, y up, z backward. With y up and z forward (Unity, DirectX), negate the third column; with "
-            "x right, y down and z forward (OpenCV), negate the second and the third",
-            determinant,
+        got = f"determinant {determinant:.3g}"
+        advice = (
+            "transforms.json has OpenGL's axes: x right, y up, z backward. With y up and z forward (Unity, DirectX), "
+            "negate the third column; with x right, y down and z forward (OpenCV), negate the second and the third"
         )
+        raise where.expected("a pose with right-handed axes", determinant, got=got, name=key, advice=advice)
     left, stretches, right = np.linalg.svd(matrix[:3, :3])
     scale = float(stretches.mean())
     if scale < 1e-9 or np.abs(stretches / scale - 1).max() > MAX_SCALE_DEVIATION:
-        scales = ", ".join(f"{stretch:.4g}" for stretch in stretches)
-        message = f"expected a rotation in the pose, got a matrix with the scales {scales} along its axes"
-        raise error(f"{message}; remove the scales", stretches.tolist())
+        got = f"the scales {', '.join(f'{stretch:.4g}' for stretch in stretches)} along its axes"
+        wanted, advice = "a rotation in the pose", "remove the scales"
+        raise where.expected(wanted, stretches.tolist(), got=got, name=key, advice=advice)
     rigid = np.eye(4)
     rigid[:3, :3], rigid[:3, 3] = left @ right, matrix[:3, 3]
     return rigid, scale
