@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from avmsf.errors import LocationError, StudioError
+from avmsf.field.sound_field import SoundField
 from avmsf.studio.locate import Finder
 from avmsf.studio.opening import open_target
 from avmsf.studio.server import serve
@@ -23,9 +24,11 @@ from served import Answer, Served, served
 PLACE = "capture/strikes?x=0.01&y=0.02&z=0"
 
 
-@pytest.fixture
-def plate(tmp_path: Path) -> Iterator[Served]:
-    with served(open_plate(tmp_path / "opened", "elastic"), tmp_path / "files") as running:
+@pytest.fixture(scope="module")
+def plate(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """Return one server for all requests that change nothing."""
+    home = tmp_path_factory.mktemp("plate")
+    with served(open_plate(home / "opened", "elastic"), home / "files") as running:
         yield running
 
 
@@ -185,22 +188,24 @@ def test_samples_beyond_float32_are_refused(plate: Served) -> None:
 
 
 def test_an_error_ahead_of_time_is_reported_and_the_next_revision_prepared(
-    plate: Served, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    prepared: list[int] = []
+    prepared: list[SoundField] = []
 
     def prepare(finder: Finder) -> None:
-        prepared.append(plate.studio.session.current.number)
-        if len(prepared) == 1:
+        prepared.append(finder.field)
+        if len(prepared) == 2:
             raise LocationError("no mode is left to locate by")
 
     monkeypatch.setattr(Finder, "prepare", prepare)
     monkeypatch.setattr("avmsf.studio.locate._SETTLED", 0.0)
-    for number in (1, 2):
-        plate.ask("POST", "edit", {"base": number, "pitch": 1.0 + number / 10})
-        end = time.monotonic() + 20
-        while len(prepared) < number:
-            assert time.monotonic() < end, prepared
-            time.sleep(0.01)
-    assert prepared == [2, 3]
+    with served(open_plate(tmp_path / "opened", "elastic"), tmp_path / "files") as running:
+        for number in range(3):
+            if number:
+                running.ask("POST", "edit", {"base": number, "pitch": 1.0 + number / 10})
+            end = time.monotonic() + 20
+            while len(prepared) <= number:
+                assert time.monotonic() < end, prepared
+                time.sleep(0.01)
+        assert prepared[2] is running.studio.session.current.field
     assert "LocationError: no mode is left to locate by" in capfd.readouterr().err
