@@ -37,11 +37,6 @@ class AttentionGains(TrainableGains, GainModel):
     """
 
     kind: ClassVar[str] = "attention"
-    points: Float[Tensor, "points 3"]
-    features: Float[Tensor, "points dim"]
-    centers: Float[Tensor, "clusters 3"]
-    descriptors: Float[Tensor, "clusters dim"]
-    gain_scale: Float[Tensor, " modes"]
 
     def __init__(
         self,
@@ -59,11 +54,9 @@ class AttentionGains(TrainableGains, GainModel):
         super().__init__()
         regions = features.clusters(shape.clusters) if regions is None else regions
         self.shape, self.encoder = shape, features.encoder
-        self.register_buffer("points", features.points.float())
-        self.register_buffer("features", features.features.float())
-        self.register_buffer("centers", regions.centers.float())
-        self.register_buffer("descriptors", regions.descriptors.float())
-        self.register_buffer("gain_scale", gain_scale.float())
+        self.points, self.features = nn.Buffer(features.points.float()), nn.Buffer(features.features.float())
+        self.centers, self.descriptors = nn.Buffer(regions.centers.float()), nn.Buffer(regions.descriptors.float())
+        self.gain_scale = nn.Buffer(gain_scale.float())
         # Layers draw from torch's global generator as they are made, which is not ours to advance.
         with torch.random.fork_rng(devices=[]):
             self._build(features.features.shape[1], len(gain_scale))
@@ -100,15 +93,6 @@ class AttentionGains(TrainableGains, GainModel):
         """The points and features that the network reads."""
         return FeatureField(self.points, self.features, self.encoder)
 
-    def reorder(self, modes: Int[Tensor, " modes"]) -> None:
-        """Put the outputs for the modes in the given order, in place."""
-        with torch.no_grad():
-            self.gain_scale.copy_(self.gain_scale[modes])
-            for layer in (self.to_gains, self.to_dampings):
-                if layer is not None:
-                    layer.weight.copy_(layer.weight[modes])
-                    layer.bias.copy_(layer.bias[modes])
-
     def predict(self, points: Points, directions: Directions = None) -> Gains:
         """Return the gains at the contacts, for any direction, and the factors where dampings vary."""
         return self.read(self.feature_field.nearest(points))
@@ -128,9 +112,14 @@ class AttentionGains(TrainableGains, GainModel):
         return Gains(self.to_gains(hidden) * self.gain_scale, damping=factors)
 
     def finished(self, order: Int[Tensor, " modes"]) -> "AttentionGains":
-        """Return the network with its modes in the given order, ready for use."""
-        self.reorder(order)
-        return self.eval().requires_grad_(False)
+        """Put the network's modes in the given order and return it, ready for use."""
+        self.eval().requires_grad_(False)
+        self.gain_scale.copy_(self.gain_scale[order])
+        for layer in (self.to_gains, self.to_dampings):
+            if layer is not None:
+                layer.weight.copy_(layer.weight[order])
+                layer.bias.copy_(layer.bias[order])
+        return self
 
     def record(self) -> dict[str, Any]:
         """Return the sizes and who made the features."""

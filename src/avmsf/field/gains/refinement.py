@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import torch
-from jaxtyping import Complex128, Float, Float32, Float64, Int
+from jaxtyping import Complex128, Float, Float64, Int
 from torch import Tensor, nn
 
 from avmsf.field.gains.mixture_gains import MixtureGains
@@ -24,21 +24,15 @@ class RefinedGains(TrainableGains):
     the refinement too: gains move where the spectra of all recordings ask for it and the kernels allow it.
     """
 
-    smoother: Float32[Tensor, "modes 2 contacts contacts"]
-    start: Float32[Tensor, "contacts modes 2"]
-    noise: Float32[Tensor, "modes 2"]
-    share: Float32[Tensor, " modes"]
-
     def __init__(self, model: MixtureGains, bank: ModalBank) -> None:
         """Start from the model of the modes of `bank`, whose energies say how much a gain matters."""
         super().__init__()
         self.model = model
         smoother, values = model.smoother(), torch.view_as_real(model.values)
-        self.register_buffer("smoother", smoother.float())
-        self.register_buffer("start", _applied(smoother, values).float())
-        self.register_buffer("noise", model.noise().float())
+        self.smoother, self.noise = nn.Buffer(smoother.float()), nn.Buffer(model.noise().float())
+        self.start = nn.Buffer(_applied(smoother, values).float())
         energy = values.square().sum((0, 2)) / bank.damping
-        self.register_buffer("share", (energy / energy.sum().clamp_min(torch.finfo(torch.float64).tiny)).float())
+        self.share = nn.Buffer((energy / energy.sum().clamp_min(torch.finfo(torch.float64).tiny)).float())
         self.shift = nn.Parameter(torch.zeros_like(self.start))
 
     def read(self, rows: Int[Tensor, " contacts"]) -> Gains:
