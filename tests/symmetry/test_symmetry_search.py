@@ -134,3 +134,9 @@ def test_a_scanned_bowl_is_round(shared: Path):
 def test_points_without_a_surface_are_refused(points, row, value):
     with raises(SceneError, row=row, name="points", value=value):
         find_symmetries(points, seed=0)
+
+
+@pytest.mark.slow
+def test_a_thin_slab_needs_no_more_than_1200_points():
+    found = find(draw(trimesh.creation.box((0.2, 0.15, 0.02)), count=1200))
+    assert ([each.order for each in found.rotations], len(found.mirrors)) == ([2, 2, 2], 3)

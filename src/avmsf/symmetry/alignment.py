@@ -23,7 +23,7 @@ the first lets pass, and what is off by more than the second lets pass is so how
 _MAX_DISTANCE = 3.0
 """Distance in spacings from which on a point has no counterpart; counted distances end here."""
 _QUERIES = 1500
-_MIN_NEIGHBORS, _MAX_PATCH = 8, 1 / 40
+_MIN_NEIGHBORS, _MAX_PATCH = 8, 1 / 80
 """A plane stands for at most this part of a surface, unless it had fewer points than the first."""
 
 Points = Float[np.ndarray, "points 3"]

@@ -89,7 +89,7 @@ class Symmetries:
     def summary(self) -> str:
         """Return sentences on the symmetries found, their errors, and how clear these are."""
         found: list[RotationalSymmetry | MirrorSymmetry] = [*self.rotations, *self.mirrors]
-        measure = f"in point spacings of {1000 * self.spacing:.2g} mm; accepted up to {self.tolerance:g}"
+        measure = f"in point spacings of {1000 * self.spacing:.2g} mm; accepted up to {self.tolerance:.2f}"
         nearest = f"the best rejected candidate has an error of {self.rejected:.2f}"
         if not math.isfinite(self.rejected):
             nearest = "there was no other candidate"
