@@ -151,19 +151,6 @@ def test_modes_put_in_another_order_are_the_same_modes(name):
 
 
 @every_field
-def test_a_skeleton_has_the_form_of_the_tensors_and_takes_no_memory(name):
-    field = ALL[name]()
-    record = json.loads(json.dumps(field.record(), allow_nan=False))
-    assert record == field.record()
-    assert record["modes"] == MODES
-    skeleton, tensors = field.skeleton(record), field.tensors()
-    assert {each.device.type for each in skeleton.values()} == {"meta"}
-    forms = [{key: (each.shape, each.dtype) for key, each in named.items()} for named in (skeleton, tensors)]
-    assert forms[0] == forms[1]
-    assert all(bool(torch.isfinite(each).all()) for each in tensors.values())
-
-
-@every_field
 def test_a_field_comes_back_from_its_file_to_the_last_bit(name, tmp_path):
     field = ALL[name]()
     saved = sound_field(field, noise=0.01)

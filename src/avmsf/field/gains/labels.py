@@ -74,15 +74,12 @@ def better_order(
     of the contacts `rows`; `names` and `measured` are all recordings', `points` the object's.
     """
 
-    def at(order: Int[Tensor, " contacts"]) -> MeasuredGains:
-        return replace(measured, values=measured.values[order[rows]])
-
     def evidence(words: str) -> float:
-        moved = at(orders[words])
+        moved = measured.take(orders[words][rows])
         return total_evidence([WeighedFamily.of(each, moved) for each in families], moved)
 
     def ratios(order: Int[Tensor, " contacts"]) -> Float64[Tensor, " rows"]:
-        moved = at(order)
+        moved = measured.take(order[rows])
         model = fit_mixture(families, moved, points, directional=directional, noise_shares=WIDE_NOISE_SHARES)
         return PredictiveRatios(model, families[0].reference, moved).without(frozenset())[0]
 
