@@ -83,8 +83,7 @@ def photographed_colors(
         places, depths = view.camera.project(points)
         # One cell of the depth map is as wide as a ball, so that the balls of a surface leave no gap.
         cell = max(1.0, spacing * view.camera.focal[0] / max(float(depths.median()), 1e-9))
-        inside = (depths > 0) & (places >= 0).all(1) & (places[:, 0] < view.camera.width)
-        inside &= places[:, 1] < view.camera.height
+        inside = view.camera.contains(places)
         place, depth = places[inside].numpy(), depths[inside].numpy()
         cells = (place / cell).astype(np.int64)
         foremost = np.full((int(view.camera.height / cell) + 1, int(view.camera.width / cell) + 1), np.inf)

@@ -70,13 +70,12 @@ def _masks_agree(
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _MASK_MARGIN_PIXELS + 1,) * 2)
     seen, against, voters = torch.zeros(len(points)), torch.zeros(len(points)), 0
     for view in views:
-        if view.mask is None or not bool((view.mask > 127).any()):
+        if view.mask is None or not view.foreground.any():
             continue
         voters += 1
         mask = torch.from_numpy(cv2.dilate(view.mask.numpy(), kernel)) > 127
-        places, depth = view.camera.project(points)
-        inside = (depth > 0) & (places >= 0).all(1)
-        inside &= (places[:, 0] < view.camera.width) & (places[:, 1] < view.camera.height)
+        places, _ = view.camera.project(points)
+        inside = view.camera.contains(places)
         pixels = places[inside].long()
         seen += inside
         against[inside] += (~mask[pixels[:, 1], pixels[:, 0]]).float()

@@ -58,7 +58,7 @@ def comparable_views(views: Sequence[View], background: Float[Tensor, " 3"] | No
     A mask without the object says nothing of its shape: its view is left out. `visual_hull` warns of it. Raises
     SceneError where fewer than 3 views are left.
     """
-    kept = [view for view in views if view.mask is None or bool((view.mask > 127).any())]
+    kept = [view for view in views if view.mask is None or view.foreground.any()]
     if background is None:
         unknown = [view.name for view in kept if view.mask is None]
         if unknown:

@@ -99,6 +99,10 @@ class Camera:
         scale = inside.new_tensor(self.focal)
         return inside[:, :2] / ahead[:, None] * scale + inside.new_tensor(self.principal), depth
 
+    def contains(self, pixels: Float[Tensor, "points 2"]) -> Bool[Tensor, " points"]:
+        """Return which positions in the image, as `project` gives them, lie within its edges; NaN does not."""
+        return ((pixels >= 0) & (pixels < pixels.new_tensor([self.width, self.height]))).all(dim=1)
+
     def rays(self) -> Float[Tensor, "height width 3"]:
         """Return the unit viewing direction of each pixel's center in the object frame; float64."""
         across = (torch.arange(self.width, dtype=torch.float64) + 0.5 - self.principal[0]) / self.focal[0]

@@ -41,7 +41,7 @@ def shape_of_cloud(cloud: GaussianCloud, views: Sequence[View] = (), *, cells: i
 
 def masks_suffice(views: Sequence[View]) -> bool:
     """Return whether 3 or more views have masks that show something."""
-    return sum(view.mask is not None and bool((view.mask > 127).any()) for view in views) >= _FEWEST_MASKS
+    return sum(bool(view.foreground.any()) for view in views) >= _FEWEST_MASKS
 
 
 def views_of_cloud(cloud: GaussianCloud, rasterizer: Rasterizer, *, size: int) -> tuple[View, ...]:

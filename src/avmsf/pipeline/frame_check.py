@@ -223,10 +223,9 @@ def _share_inside(contacts: Float[Tensor, "contacts 3"], views: Sequence[View]) 
     for view in views:
         assert view.mask is not None
         mask = cv2.dilate(view.mask.numpy(), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 127
-        pixels, depth = view.camera.project(contacts)
-        column, row = pixels.floor().long().unbind(1)
-        seen = (depth > 0) & (column >= 0) & (column < mask.shape[1]) & (row >= 0) & (row < mask.shape[0])
-        found.append(float(torch.from_numpy(mask)[row[seen], column[seen]].sum()) / len(contacts))
+        pixels, _ = view.camera.project(contacts)
+        column, row = pixels[view.camera.contains(pixels)].long().T.numpy()
+        found.append(float(mask[row, column].sum()) / len(contacts))
     return float(np.median(found))
 
 
