@@ -93,6 +93,7 @@ class BodyMeshes:
         self.shape = None if isinstance(surface, Surface) else surface
         self.seen = surface if isinstance(surface, Surface) else surface.as_seen()
         """What was seen of the object, both sides of walls included."""
+        self.digest = surface.digest()
         self._log, self._walls, self._remeshing = log, once(self._make_walls), Lock()
 
     @cached_property

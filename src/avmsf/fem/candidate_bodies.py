@@ -357,19 +357,8 @@ class SurfaceBodies(CandidateBodies):
         if self._cache is None:
             return None
         values |= {"format": _FORMAT, "version": version("avmsf"), "source": source_digest(__name__)}
-        values |= {"surface": self._digest, "count": self._count, "material": asdict(self._material)}
+        values |= {"surface": self._meshes.digest, "count": self._count, "material": asdict(self._material)}
         return self._cache / f"nominal-{key_of(values)}.safetensors"
-
-    @cached_property
-    def _digest(self) -> str:
-        """Digest of the surface's vertices and triangles, or of the shape."""
-        if self._meshes.shape is not None:
-            return self._meshes.shape.digest()
-        surface = self._meshes.seen
-        vertices, faces = surface.vertices.double().cpu().numpy(), surface.faces.long().cpu().numpy()
-        content = hashlib.sha256(f"{vertices.shape} {faces.shape}".encode())
-        content.update(vertices.tobytes() + faces.tobytes())
-        return content.hexdigest()
 
 
 def _frequency_error(coarse: ElasticModes, fine: ElasticModes) -> float:

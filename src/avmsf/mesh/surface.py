@@ -1,5 +1,6 @@
 """The object's shape, as triangles or as points; points all over it, and the part that contacts lie on."""
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -53,6 +54,12 @@ class Surface:
     def write(self, path: str | Path) -> None:
         """Write a binary PLY file in meters."""
         write_surface(self, Path(path))
+
+    def digest(self) -> str:
+        """Return a digest of the vertices and triangles."""
+        vertices, faces = self.vertices.double().cpu().numpy(), self.faces.long().cpu().numpy()
+        content = f"{vertices.shape} {faces.shape}".encode() + vertices.tobytes() + faces.tobytes()
+        return hashlib.sha256(content).hexdigest()
 
     def __repr__(self) -> str:
         size = " x ".join(f"{side:.3g}" for side in (self.vertices.amax(0) - self.vertices.amin(0)).tolist())

@@ -240,9 +240,7 @@ def object_shape(found: Surface | None, scene: SceneStages | None) -> tuple[Call
     `found` is the surface that the folder holds. What is returned raises SceneError where the shape is unknown.
     """
     if found is not None and len(found.faces):
-        digest = hashlib.sha256(found.vertices.contiguous().numpy().tobytes())
-        digest.update(found.faces.contiguous().numpy().tobytes())
-        return lambda: found, digest.hexdigest()
+        return lambda: found, found.digest()
     if scene is None:
 
         def unknown() -> ObjectShape:

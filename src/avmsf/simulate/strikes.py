@@ -6,11 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Float64, Int
+from jaxtyping import Float64
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from avmsf.errors import SimulationError
+from avmsf.gaussians.points import farthest_points
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.rays import RayCaster
 from avmsf.mesh.surface import Surface
@@ -52,7 +53,7 @@ def draw_strikes(
     SimulationError where there are no such places.
     """
     places, normals = _reached(surface, count, up=up, seed=seed)
-    chosen = _spread(places, count, seed=seed)
+    chosen = farthest_points(places, count, start=int(stream(seed, "first contact").integers(len(places))))
     places, normals = places[chosen], normals[chosen]
     inward = -normals
     offsets = _across(normals, imperfections.contact, generator=stream(seed, "contact jitter"))
@@ -107,18 +108,6 @@ def _reached(
         got = f"{len(places)} of {drawn}"
         raise SimulationError.expected(reachable, len(places), got=got, name="up", advice=advice)
     return torch.from_numpy(places[:wanted]), torch.from_numpy(normals[:wanted])
-
-
-def _spread(places: Float64[Tensor, "places 3"], count: int, *, seed: int) -> Int[Tensor, " chosen"]:
-    """Return rows of places far apart: a first by chance, then always the farthest from all before."""
-    start = int(stream(seed, "first contact").integers(len(places)))
-    distance = (places - places[start]).norm(dim=1)
-    chosen = [start]
-    while len(chosen) < count:
-        distance[chosen[-1]] = -math.inf
-        chosen.append(int(distance.argmax()))
-        distance = torch.minimum(distance, (places - places[chosen[-1]]).norm(dim=1))
-    return torch.tensor(chosen)
 
 
 def _across(
