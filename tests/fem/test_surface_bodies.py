@@ -9,8 +9,7 @@ import torch
 import trimesh
 
 from avmsf.errors import SimulationError
-from avmsf.fem import body_meshes as nominalsolid
-from avmsf.fem import candidate_bodies as nominal
+from avmsf.fem import body_meshes, candidate_bodies
 from avmsf.fem.candidate_bodies import CandidateBody, SurfaceBodies
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import NOMINAL
@@ -52,10 +51,10 @@ def test_a_sheet_with_a_wall_vibrates_as_the_plate_it_is():
 
 def test_walls_of_a_sheet_are_tried_coarsely_and_the_chosen_one_made_fine(monkeypatch: pytest.MonkeyPatch):
     messages: list[str] = []
-    monkeypatch.setattr(nominal, "COARSE_DOFS", 1500)
+    monkeypatch.setattr(candidate_bodies, "COARSE_DOFS", 1500)
     found = computed(sheet(), count=6, dofs=4000, log=messages.append)
     assert [body.thickness for body in found.bodies] == pytest.approx(
-        [part * math.hypot(0.24, 0.17) for part in nominal.THICKNESS_RATIOS]
+        [part * math.hypot(0.24, 0.17) for part in candidate_bodies.THICKNESS_RATIOS]
     )
     assert not any(body.fine for body in found.bodies)
     assert any("42 open edges" in message for message in messages)
@@ -158,12 +157,12 @@ def test_points_alone_have_no_body():
 
 
 def test_a_mesh_too_large_for_the_memory_is_refused_with_the_size_that_fits(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 2 * 377e6)
+    monkeypatch.setattr(body_meshes, "_free_memory", lambda: 2 * 377e6)
     with raises(SimulationError, name="memory") as caught:
         computed(sheet(), thicknesses=[0.004], dofs=80_000)
     [reason] = caught.value.value
     assert all(number in reason for number in ("80000", "1.6 GB", "40000"))
-    monkeypatch.setattr(nominalsolid, "_free_memory", lambda: None)
+    monkeypatch.setattr(body_meshes, "_free_memory", lambda: None)
     assert computed(sheet(), thicknesses=[0.004], count=4, dofs=2000).bodies
 
 
@@ -192,7 +191,7 @@ def coarse() -> CandidateBody:
 def test_a_body_stays_coarse_where_a_finer_one_does_not_fit_into_the_memory(
     monkeypatch: pytest.MonkeyPatch, coarse: CandidateBody
 ):
-    monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 1e9)
+    monkeypatch.setattr(body_meshes, "_free_memory", lambda: 1e9)
     messages: list[str] = []
     assert SurfaceBodies(sheet(), count=4, dofs=400_000, log=messages.append).refined(coarse) is coarse
     assert messages[-1].startswith("wall of 4 mm: ")
@@ -208,7 +207,7 @@ def test_a_body_stays_coarse_where_a_finer_one_fails(
     def fail(*solid: object, **settings: object) -> None:
         raise error
 
-    monkeypatch.setattr(nominal, "elastic_modes", fail)
+    monkeypatch.setattr(candidate_bodies, "elastic_modes", fail)
     messages: list[str] = []
     assert SurfaceBodies(sheet(), count=4, dofs=3000, log=messages.append).refined(coarse) is coarse
     assert messages[-1].startswith("wall of 4 mm: ")
@@ -217,17 +216,17 @@ def test_a_body_stays_coarse_where_a_finer_one_fails(
 
 def test_the_only_body_that_is_left_stays_in_use_where_it_cannot_be_made_finer(monkeypatch: pytest.MonkeyPatch):
     """A wall that does not fit is refused once it is made, so that a single one of several is left."""
-    made, messages = nominal.elastic_modes, []
+    made, messages = candidate_bodies.elastic_modes, []
 
     def fail(solid: object, *material: object, count: int, **kept: object) -> object:
-        if nominal.count_dofs(solid) > 3000:  # type: ignore[arg-type]
+        if candidate_bodies.count_dofs(solid) > 3000:  # type: ignore[arg-type]
             raise MemoryError
         if abs(solid.volumes.sum() - 0.24 * 0.17 * 0.004) > 1e-5:  # type: ignore[attr-defined]
             raise SimulationError("of no use")
         return made(solid, *material, count=count, **kept)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(nominal, "elastic_modes", fail)
-    monkeypatch.setattr(nominal, "COARSE_DOFS", 2000)
+    monkeypatch.setattr(candidate_bodies, "elastic_modes", fail)
+    monkeypatch.setattr(candidate_bodies, "COARSE_DOFS", 2000)
     found = computed(sheet(), thicknesses=[0.004, 0.012], count=4, dofs=4000, log=messages.append)
     assert [(body.thickness, body.fine) for body in found.bodies] == [(0.004, False)]
     assert any(message.startswith("wall of 4 mm: ") and "2000 (--body.dofs)" in message for message in messages)
@@ -238,12 +237,12 @@ def test_the_memory_is_asked_for_what_is_computed_and_for_nothing_that_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     walls, settings = [0.004, 0.006], {"count": 4, "dofs": 80_000, "cache": tmp_path}
-    monkeypatch.setattr(nominal, "COARSE_DOFS", 2000)
+    monkeypatch.setattr(candidate_bodies, "COARSE_DOFS", 2000)
     # Enough for the few degrees of freedom that two bodies are compared with.
-    monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 377e6)
+    monkeypatch.setattr(body_meshes, "_free_memory", lambda: 377e6)
     found = computed(sheet(), thicknesses=walls, **settings)
     assert [body.thickness for body in found.bodies] == walls
-    monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 0.0)
+    monkeypatch.setattr(body_meshes, "_free_memory", lambda: 0.0)
     again = computed(sheet(), thicknesses=walls, **settings)
     assert torch.equal(again.bodies[1].elastic.shapes, found.bodies[1].elastic.shapes)
     with raises(SimulationError, name="memory") as caught:
