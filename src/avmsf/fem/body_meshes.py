@@ -173,8 +173,8 @@ def filled_solid(checked: CheckedSurface, dofs: int, *, wall: float | None = Non
     if sides is not None:
         with contextlib.suppress(SimulationError):
             # Degrees of freedom may be few for prisms along a wall that bends tightly; tetrahedra need not follow it.
-            first = sides.length(dofs) / sides.size
-            return _near(lambda detail: sides.solid(detail * sides.size), dofs, first=first, most=_PRISMS)
+            size = sides.mesh.scale
+            return _near(lambda detail: sides.solid(detail * size), dofs, first=sides.length(dofs) / size, most=_PRISMS)
     first = _filling_detail(checked, dofs)
 
     def filled(detail: float) -> Solid:

@@ -8,7 +8,7 @@ folder.
 """
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -216,7 +216,21 @@ class SurfaceBodies(CandidateBodies):
         its convergence. Those whose modes cannot be computed are left out, and `log` is called with the reason; none
         are returned if the free one's cannot.
         """
-        return tuple(self._supported(body))
+        few, fine = self._coarse_dofs, self.dofs <= self._coarse_dofs
+        try:
+            supports = supports_of(SecondOrder.of(self._solid(body.thickness, few)))
+            free = self.modes(body.thickness, dofs=few, perturbed=fine)
+        except SimulationError as error:
+            self._log(f"{body.name}: no supports tested: {error}")
+            return []
+        bodies = [CandidateBody(body.thickness, free, fine)]
+        for support in supports:
+            try:
+                held = self.modes(body.thickness, dofs=few, support=support, perturbed=fine)
+                bodies.append(CandidateBody(body.thickness, held, fine, support))
+            except SimulationError as error:
+                self._log(_without(f"{body.name}, {support.name}: {error}"))
+        return bodies
 
     def with_thickness(self, thickness: float) -> CandidateBody | None:
         """Return the body with a wall of this thickness, meters, coarse as of several; None if that fails.
@@ -286,22 +300,6 @@ class SurfaceBodies(CandidateBodies):
                     raise
                 self._log(f"retrying with more tetrahedra ({error})")
         return CandidateBody(thickness, self._converged(thickness))
-
-    def _supported(self, body: CandidateBody) -> Iterator[CandidateBody]:
-        few, fine = self._coarse_dofs, self.dofs <= self._coarse_dofs
-        try:
-            supports = supports_of(SecondOrder.of(self._solid(body.thickness, few)))
-            free = self.modes(body.thickness, dofs=few, perturbed=fine)
-        except SimulationError as error:
-            self._log(f"{body.name}: no supports tested: {error}")
-            return
-        yield CandidateBody(body.thickness, free, fine)
-        for support in supports:
-            try:
-                held = self.modes(body.thickness, dofs=few, support=support, perturbed=fine)
-                yield CandidateBody(body.thickness, held, fine, support)
-            except SimulationError as error:
-                self._log(_without(f"{body.name}, {support.name}: {error}"))
 
     def _converged(self, thickness: float | None) -> ElasticModes:
         """Return the modes of one body, of twice the degrees of freedom where their frequencies still change much."""

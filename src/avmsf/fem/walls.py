@@ -61,11 +61,6 @@ class Wall:
     even: bool = False
     """Whether the thickness is known to be the same everywhere."""
 
-    @property
-    def size(self) -> float:
-        """Diagonal of the box around the mesh, meters."""
-        return self.mesh.scale
-
     def length(self, dofs: int) -> float:
         """Return the sides' length along the wall, meters, of prisms with about so many degrees of freedom."""
 
