@@ -22,8 +22,8 @@ _HEADERS: tuple[tuple[bytes, type[ImageFile.ImageFile]], ...] = (
 """How a file of each kind begins, and what reads its size without its pixels."""
 
 
-class ImageSizeError(CaptureError):
-    """An image has more than `MAX_PIXELS`."""
+class UnreadableImageError(CaptureError):
+    """An image file is missing, corrupt or of another kind."""
 
 
 def read_image(path: Path, *, upright: bool = False) -> UInt8[np.ndarray, "height width channels"]:
@@ -31,8 +31,7 @@ def read_image(path: Path, *, upright: bool = False) -> UInt8[np.ndarray, "heigh
 
     Alpha lays the color before black; where it is opaque everywhere it is no mask, and there are three channels. 16
     bits become 8. With `upright` the image is rotated as its orientation tag (EXIF) says, and has no alpha. Raises
-    CaptureError where the file is missing, corrupt or of another kind, ImageSizeError where it has more than
-    `MAX_PIXELS`.
+    UnreadableImageError, and CaptureError for more than `MAX_PIXELS`.
     """
     pixels = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH if upright else cv2.IMREAD_UNCHANGED)
     if pixels.ndim == 2:
@@ -77,7 +76,7 @@ def _decode(path: Path, flags: int) -> np.ndarray:
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise CaptureError.expected("an image file", got=error.strerror, file=path) from error
+        raise UnreadableImageError.expected("an image file", got=error.strerror, file=path) from error
     pixels = None
     if _has_header(content, path):
         with contextlib.suppress(cv2.error):
@@ -85,17 +84,17 @@ def _decode(path: Path, flags: int) -> np.ndarray:
     if pixels is None:
         wanted, got = "a complete PNG, JPEG or WebP image", f"{len(content)} bytes that cannot be read"
         advice = "copy or export it again"
-        raise CaptureError.expected(wanted, len(content), got=got, file=path, name="bytes", advice=advice)
+        raise UnreadableImageError.expected(wanted, len(content), got=got, file=path, name="bytes", advice=advice)
     if pixels.dtype == np.uint16:
         return ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
     if pixels.dtype != np.uint8:
         wanted, kind = "8 or 16 bits per channel", str(pixels.dtype)
-        raise CaptureError.expected(wanted, kind, got=kind, file=path, name="bits", advice="export it as PNG")
+        raise UnreadableImageError.expected(wanted, kind, got=kind, file=path, name="bits", advice="export it as PNG")
     return pixels
 
 
 def _has_header(content: bytes, path: Path) -> bool:
-    """Whether a file is an image by its header; raises ImageSizeError for one of more than `MAX_PIXELS`."""
+    """Whether a file is an image by its header; raises CaptureError for one of more than `MAX_PIXELS`."""
     wanted, advice = f"at most {MAX_PIXELS:,} pixels", "scale it down"
     read_header = next((header for start, header in _HEADERS if content.startswith(start)), None)
     try:
@@ -103,10 +102,10 @@ def _has_header(content: bytes, path: Path) -> bool:
             return False
         width, height = read_header(io.BytesIO(content)).size
     except Image.DecompressionBombError as error:
-        raise ImageSizeError.expected(wanted, got=f"more ({error})", file=path, advice=advice) from error
+        raise CaptureError.expected(wanted, got=f"more ({error})", file=path, advice=advice) from error
     except Exception:  # the parser's own, of any type, for a damaged header
         return False
     if width * height > MAX_PIXELS:
         got, count = f"{width:,} x {height:,}", width * height
-        raise ImageSizeError.expected(wanted, count, got=got, file=path, name="pixels", advice=advice)
+        raise CaptureError.expected(wanted, count, got=got, file=path, name="pixels", advice=advice)
     return True

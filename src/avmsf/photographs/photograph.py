@@ -14,7 +14,7 @@ from avmsf._utils.text import counted, listed
 from avmsf.capture.filenames import pictures_in
 from avmsf.errors import CaptureError, Remark
 from avmsf.photographs.cameras import View
-from avmsf.photographs.images import ImageSizeError, read_image, read_mask, scale, size_of
+from avmsf.photographs.images import UnreadableImageError, read_image, read_mask, scale, size_of
 from avmsf.photographs.lenses import Lens, straighten
 
 MAX_PHOTOGRAPHS = 10_000
@@ -98,9 +98,7 @@ def read_view(
     """Read one photograph and its mask into a pinhole's view; None, and a finding, where there is nothing to see."""
     try:
         pixels = read_image(photograph.image)
-    except ImageSizeError:
-        raise
-    except CaptureError:
+    except UnreadableImageError:
         findings["missing images"].append(photograph.name)
         return None
     pixels, lens = _with_lens(photograph, pixels, findings)
@@ -147,9 +145,7 @@ def _with_mask(
         return pixels
     try:
         mask = read_mask(paths[0])
-    except ImageSizeError:
-        raise
-    except CaptureError:
+    except UnreadableImageError:
         findings["missing masks"].append(photograph.name)
         return pixels
     size = size_of(pixels)

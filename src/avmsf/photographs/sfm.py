@@ -18,7 +18,7 @@ from avmsf._utils.processes import end_child, ending_of, start_child
 from avmsf._utils.text import counted, listed
 from avmsf.capture.filenames import PICTURE_SUFFIXES, pictures_in
 from avmsf.errors import CaptureError, Remark
-from avmsf.photographs.images import ImageSizeError, read_image, read_mask, size_of
+from avmsf.photographs.images import UnreadableImageError, read_image, read_mask, size_of
 from avmsf.photographs.photograph import mask_paths
 
 WORKER = Path(__file__).with_name("sfm_worker.py")
@@ -69,11 +69,11 @@ def estimate_cameras(
         job = {"names": names, "seed": seed or 0, "features": features, "threads": threads}
         (begun / "job.json").write_text(json.dumps(job), encoding="utf-8")
         registered = _run_worker(begun, timeout=timeout)
-        largest = max(registered, key=lambda number: len(registered[number]), default="")
-        groups = [registered.pop(largest, []), *registered.values()]
+        numbers = sorted(registered, key=lambda number: -len(registered[number]))
+        groups = [registered[number] for number in numbers] or [[]]
         remarks = _check_groups(groups, unreadable, sorted([*names.values(), *unreadable]), images)
         model.parent.mkdir(exist_ok=True)
-        os.rename(begun / "models" / largest, model)
+        os.rename(begun / "models" / numbers[0], model)
     except OSError as error:
         raise unwritable(output, error, raising=CaptureError) from error
     finally:
@@ -94,9 +94,7 @@ def _stage_images(images: Path, begun: Path) -> tuple[dict[str, str], list[str]]
         name = path.relative_to(images).as_posix()
         try:
             pixels = read_image(path)
-        except ImageSizeError:
-            raise
-        except CaptureError:
+        except UnreadableImageError:
             unreadable.append(name)
             continue
         # COLMAP reads no WebP.
