@@ -282,11 +282,16 @@ def test_views_of_one_name_are_refused_and_nothing_is_left(tmp_path: Path) -> No
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
-    (tmp_path / "mine.txt").write_text("mine")
-    with raises(CaptureError, file=tmp_path):
-        write_views(some_views(), tmp_path)
-    assert [each.name for each in tmp_path.iterdir()] == ["mine.txt"]
+def test_a_folder_that_holds_something_is_left_alone_or_replaced(tmp_path: Path) -> None:
+    folder = tmp_path / "views"
+    folder.mkdir()
+    (folder / "mine.txt").write_text("mine")
+    with raises(CaptureError, file=folder):
+        write_views(some_views(), folder)
+    assert [each.name for each in folder.iterdir()] == ["mine.txt"]
+    write_views(some_views(), folder, replace=True)
+    assert sorted(each.name for each in folder.iterdir()) == ["images", "masks", "transforms.json"]
+    assert [each.name for each in tmp_path.iterdir()] == ["views"]
 
 
 def with_poses(folder: Path, change) -> Path:

@@ -138,12 +138,12 @@ def read_sparse_points(
     return torch.from_numpy(found[0] * meters), torch.from_numpy(found[1])
 
 
-def write_views(views: Sequence[View], folder: str | Path) -> None:
+def write_views(views: Sequence[View], folder: str | Path, *, replace: bool = False) -> None:
     """Write `transforms.json`, `images/NAME.png` and, for views that have one, `masks/NAME.png`.
 
     `read_views` reads back the same pixels, masks and names except for the names' suffixes, and cameras to rounding.
-    The folder is complete or absent. Raises CaptureError where it exists and is not empty, where two views would have
-    one file, and where it cannot be written.
+    The folder is complete or as it was; with `replace` all that was in it is deleted then. Raises CaptureError where it
+    exists and is not empty without that, where two views would have one file, and where it cannot be written.
     """
     folder = Path(folder)
     names = [str(PurePosixPath(view.name).with_suffix(".png")) for view in views]
@@ -152,7 +152,7 @@ def write_views(views: Sequence[View], folder: str | Path) -> None:
         wanted, got = "views with different names", f"several for {repeated[0]}"
         raise CaptureError.expected(wanted, repeated, got=got, file=folder, name=repeated[0])
     frames = []
-    with new_folder(folder, raising=CaptureError) as begun:
+    with new_folder(folder, raising=CaptureError, replace=replace) as begun:
         for name, view in zip(names, views, strict=True):
             camera = view.camera
             pose = np.linalg.inv(camera.world_to_camera.cpu().numpy()) @ OPENCV_FROM_OPENGL

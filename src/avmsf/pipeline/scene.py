@@ -25,12 +25,12 @@ from avmsf.gaussians.ply import read_splats, write_splats
 from avmsf.gaussians.prune import keep_object
 from avmsf.gaussians.rasterizer.devices import choose_rasterizer
 from avmsf.mesh.surface import read_surface
-from avmsf.photographs import read_sparse_points, read_views
+from avmsf.photographs import read_sparse_points, read_views, write_views
 from avmsf.photographs.cameras import View
 from avmsf.pipeline.cloud_shape import masks_suffice, shape_of_cloud, views_of_cloud
 from avmsf.pipeline.config import SceneConfig
 from avmsf.pipeline.features import choose_encoder, finish_features, lift_to_cloud, lift_to_surface
-from avmsf.pipeline.sources import Source, find_source, find_splats, keep_views, replace_views
+from avmsf.pipeline.sources import Source, find_source, find_splats, keep_views
 from avmsf.pipeline.stages import Kept, StageFolder, digest_of
 from avmsf.reconstruction import ObjectShape
 
@@ -249,7 +249,7 @@ class SceneStages:
         def make(path: Path) -> None:
             cloud = read_splats(self.cloud.path)
             rasterizer = choose_rasterizer(cloud.centers.device)
-            replace_views(views_of_cloud(cloud, rasterizer, size=self.config.views.rendered), path)
+            write_views(views_of_cloud(cloud, rasterizer, size=self.config.views.rendered), path, replace=True)
 
         recipe = {"cloud": self.cloud.digest, "rendered": self.config.views.rendered}
         return self.stages.keep(VIEWS, recipe, make)

@@ -106,17 +106,11 @@ def keep_views(
         else:
             folder = source.path if moved is None else moved.path
             views = _photographed(folder, config, meters=settings.views_meters, log=log)
-        replace_views(_spread(views, config.count), path)
+        write_views(_spread(views, config.count), path, replace=True)
 
     lengths = {"views_meters": settings.views_meters, "surface_meters": settings.surface_meters}
     chosen = {name: value for name, value in asdict(config).items() if name in _matters(source.kind)}
     return stages.keep("views", {"kind": source.kind, **recipe, **lengths, **chosen}, make)
-
-
-def replace_views(views: Sequence[View], folder: Path) -> None:
-    """Write views where others may lie."""
-    shutil.rmtree(folder, ignore_errors=True)
-    write_views(views, folder)
 
 
 def _spread(views: Sequence[View], count: int) -> Sequence[View]:
