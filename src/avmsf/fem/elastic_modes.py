@@ -12,7 +12,7 @@ from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from avmsf.errors import SimulationError
-from avmsf.fem.eigen import lowest_vibrations, rigid_motions
+from avmsf.fem.eigen import Vibrations, lowest_vibrations, rigid_motions
 from avmsf.fem.elements import SecondOrder, mass, stiffness
 from avmsf.fem.material import Material
 from avmsf.fem.perturbation import Perturbations, perturbations
@@ -153,25 +153,15 @@ def elastic_modes(
     if springs:
         forces = forces + _support(mesh, springs)
     shift = RELATIVE_SHIFT * material.young / (material.density * solid.size**2)
-    rigid = rigid_motions(mesh.nodes, weights)
     if fixed is None:
+        rigid = rigid_motions(mesh.nodes, weights)
         found = lowest_vibrations(forces, weights, rigid, count=count, shift=shift, supported=bool(springs))
-        squares, shapes = found.squares, found.shapes
     else:
-        free = np.setdiff1d(np.arange(len(mesh.nodes)), fixed)
-        moving = (3 * free[:, None] + np.arange(3)).ravel()
-        forces, weights = forces.tocsr()[moving][:, moving], weights[free][:, free]
-        # A cantilever's lowest mode is mostly a turn, and yet none of a rigid body.
-        found = lowest_vibrations(
-            forces, weights, np.zeros_like(rigid[moving]), count=count, shift=shift, supported=True
-        )
-        bending = found.squares > _PENDULUM * found.squares.max()
-        squares, shapes = found.squares[bending], np.zeros((3 * len(mesh.nodes), int(bending.sum())))
-        shapes[moving] = found.shapes[:, bending]
-    whole = shapes.reshape(len(mesh.nodes), 3, -1)
+        found = _vibrations_of_free_nodes(forces, weights, fixed, count=count, shift=shift)
+    whole = found.shapes.reshape(len(mesh.nodes), 3, -1)
     outer, triangles = mesh.surface
     return ElasticModes(
-        frequency=torch.from_numpy(np.sqrt(squares) / (2.0 * math.pi)),
+        frequency=torch.from_numpy(np.sqrt(found.squares) / (2.0 * math.pi)),
         nodes=torch.from_numpy(mesh.nodes[outer]),
         triangles=torch.from_numpy(triangles),
         shapes=torch.from_numpy(np.ascontiguousarray(whole[outer].transpose(0, 2, 1))),
@@ -179,6 +169,24 @@ def elastic_modes(
         mass=float((solid.volumes * light).sum()) * material.density,
         perturbations=perturbations(mesh, whole, material) if perturbed else None,
     )
+
+
+def _vibrations_of_free_nodes(
+    forces: scipy.sparse.sparray, weights: scipy.sparse.csr_array, fixed: Int[np.ndarray, " fixed"], *, count: int,
+    shift: float,
+) -> Vibrations:  # fmt: skip
+    """Return the lowest vibrations of a body some of whose nodes do not move."""
+    nodes = weights.shape[0]
+    free = np.setdiff1d(np.arange(nodes), fixed)
+    moving = (3 * free[:, None] + np.arange(3)).ravel()
+    forces, weights = forces.tocsr()[moving][:, moving], weights[free][:, free]
+    # A cantilever's lowest mode is mostly a turn, and yet none of a rigid body.
+    rigid = np.zeros((len(moving), 6))
+    found = lowest_vibrations(forces, weights, rigid, count=count, shift=shift, supported=True)
+    bending = found.squares > _PENDULUM * found.squares.max()
+    shapes = np.zeros((3 * nodes, int(bending.sum())))
+    shapes[moving] = found.shapes[:, bending]
+    return Vibrations(found.squares[bending], shapes)
 
 
 def _support(mesh: SecondOrder, springs: Sequence[tuple[Tensor, float]]) -> scipy.sparse.csr_array:
