@@ -9,7 +9,7 @@ from avmsf.cli.progress import ProgressBar
 from avmsf.fem.material import MATERIALS
 from avmsf.simulate.recipe import NON_SYMMETRIC, SETS, ObjectRecipe
 from avmsf.simulate.shapes import KINDS
-from avmsf.simulate.simulation_folder import SetProgress, simulate_set
+from avmsf.simulate.simulation_folder import simulate_set
 
 
 def run(options: Options) -> int:
@@ -24,11 +24,7 @@ def run(options: Options) -> int:
     recipes, folder = _chosen(options, options.output)
     try:
         with ProgressBar() as bar:
-
-            def show(progress: SetProgress) -> None:
-                bar.objects(f"{progress.name}: {progress.stage}", progress.done, progress.total)
-
-            simulate_set(recipes, folder, cache=options.cache, progress=show)
+            simulate_set(recipes, folder, cache=options.cache, progress=bar.objects)
     except KeyboardInterrupt:
         say("avmsf simulate: interrupted; repeat the command to continue")
         return INTERRUPTED

@@ -118,24 +118,24 @@ class SoundingBody:
         the hammer's first touch arrives at the microphone, and the sound is the one that goes on once the hammer has
         left, continued back to that moment.
         """
-        relative = torch.ones(len(places), dtype=torch.float64) if speeds is None else speeds
-        times = self.times(self.hammer.speed * relative)
-        if contact_times is not None:
-            times = contact_times * times
+        times = self.times(torch.ones(len(places), dtype=torch.float64) if speeds is None else speeds, contact_times)
         pushed = self.elastic.gains(places, directions).to(torch.complex128) @ self.vibration.pushes.T
         return 2.0 * pushed * self.pressures * pulse_spectrum(self.hammer, self.vibration.poles, times)
 
-    def times(self, speeds: Float64[Tensor, " contacts"]) -> Float64[Tensor, " contacts"]:
-        """Return how long the hammer stays on the body, seconds, for speeds in m/s."""
-        return contact_times(self.hammer, self.elastic.material, mass=self.elastic.mass, speeds=speeds)
+    def times(
+        self, speeds: Float64[Tensor, " contacts"], factors: Float64[Tensor, " contacts"] | None = None
+    ) -> Float64[Tensor, " contacts"]:
+        """Return how long the hammer stays on the body, seconds, at relative speeds, times the factors."""
+        speeds = self.hammer.speed * speeds
+        times = contact_times(self.hammer, self.elastic.material, mass=self.elastic.mass, speeds=speeds)
+        return times if factors is None else factors * times
 
     def forces(
         self, speeds: Float64[Tensor, " contacts"], contact_times: Float64[Tensor, " contacts"] | None = None
     ) -> Float64[Tensor, " contacts"]:
-        """Return the peak force of blows of these relative speeds and contact times, newtons."""
-        speeds = self.hammer.speed * speeds
-        times = self.times(speeds) if contact_times is None else contact_times * self.times(speeds)
-        return peak_forces(self.hammer, mass=self.elastic.mass, speeds=speeds, times=times)
+        """Return the peak force of impacts of these relative speeds and contact times, newtons."""
+        times = self.times(speeds, contact_times)
+        return peak_forces(self.hammer, mass=self.elastic.mass, speeds=self.hammer.speed * speeds, times=times)
 
 
 MAX_FREQUENCY_RATIO = 0.45

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -144,46 +144,35 @@ def _write_views(simulation: Simulation, folder: Path, progress: Callable[[int, 
     (folder / "views").rmdir()
 
 
-@dataclass(frozen=True)
-class SetProgress:
-    """How far a set of objects is."""
-
-    name: str
-    """The object at hand."""
-    done: int
-    """Objects that are whole."""
-    total: int
-    stage: str
-    """What is being computed; `exists` for an object that was complete before, `done` for one that is complete now."""
-
-
 def simulate_set(
     recipes: Mapping[str, ObjectRecipe],
     folder: str | Path,
     *,
     cache: Path | None = None,
-    progress: Callable[[SetProgress], None] | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
 ) -> None:
     """Simulate the objects that the folder does not hold yet, each into a folder of its name.
 
-    An interrupted run goes on with the first object that is not whole. Raises SimulationError, before anything is made,
-    where the folder of an object holds something else or an object of another recipe.
+    An interrupted run goes on with the first object that is not whole. `progress` is called with the object's name and
+    what is being computed, `exists` or `done` where it is whole, the number of whole objects and that of all. Raises
+    SimulationError, before anything is made, where the folder of an object holds something else or an object of another
+    recipe.
     """
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
-        raise SimulationError(f"{folder}: expected a folder, got a file; choose another name", file=folder)
-    log = progress or (lambda _: None)
+        raise SimulationError.expected("a folder", got="a file", file=folder, advice="choose another name")
+    log = progress or (lambda message, done, total: None)
     whole = {name: is_written(recipe, folder / name) for name, recipe in recipes.items()}
     for done, (name, recipe) in enumerate(recipes.items()):
 
-        def stage(words: str, name: str = name, done: int = done) -> None:
-            log(SetProgress(name, done, len(recipes), words))
+        def stage(message: str, name: str = name, done: int = done) -> None:
+            log(f"{name}: {message}", done, len(recipes))
 
         if not whole[name]:
             simulation = simulate_object(recipe, name=name, cache=cache, progress=stage)
             stage(f"{recipe.views} views" if recipe.views else "files")
             write_simulation(simulation, folder / name)
-        log(SetProgress(name, done + 1, len(recipes), "exists" if whole[name] else "done"))
+        stage("exists" if whole[name] else "done", done=done + 1)
 
 
 def example_mesh() -> TexturedMesh:
