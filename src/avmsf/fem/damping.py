@@ -27,10 +27,10 @@ and continued back to the onset it would be the loudest of all where it is heard
 
 @dataclass(frozen=True, eq=False)
 class Vibration:
-    """What a blow leaves behind: damped modes by ascending frequency.
+    """What an impact leaves behind: damped modes by ascending frequency.
 
-    After a blow that gives undamped mode k the momentum p_k, in sqrt(kg) m/s, mode k accelerates as the sum over damped
-    modes r of 2 Re accelerations[k, r] (pushes[r] . p) exp(poles[r] t).
+    After an impact that gives undamped mode k the momentum p_k, in sqrt(kg) m/s, mode k accelerates as the sum over
+    damped modes r of 2 Re accelerations[k, r] (pushes[r] . p) exp(poles[r] t).
     """
 
     poles: Complex128[Tensor, " modes"]

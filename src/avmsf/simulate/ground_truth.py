@@ -1,4 +1,4 @@
-"""What is known of a simulated object and of no recorded one: its modes, and how strongly each blow excited them.
+"""What is known of a simulated object and of no recorded one: its modes, and how strongly each impact excited them.
 
 A file `truth.safetensors` holds the tensors under the names of their fields, and in its header one JSON:
 {"format": 2, "version": "0.1.0", "names": ["001.wav", ...], "recipe": {...}}

@@ -1,4 +1,4 @@
-"""A hammer's blow: how long its tip stays on the body, how hard it presses, and what that leaves of each mode.
+"""A hammer's impact: how long its tip stays on the body, how hard it presses, and what that leaves of each mode.
 
 Two pulses of duration tau and impulse 1 newton second, both of which begin at time zero:
 
@@ -38,7 +38,7 @@ def moving_mass(hammer: Hammer, mass: float) -> float:
 def contact_times(
     hammer: Hammer, material: Material, *, mass: float, speeds: Float64[Tensor, " contacts"]
 ) -> Float64[Tensor, " contacts"]:
-    """Return how long the tip stays on a body of this material and mass, kg, for blows of these speeds, m/s; seconds.
+    """Return how long the tip stays on a body of this material and mass, kg, for impacts of these speeds, m/s; seconds.
 
     A round tip stays for a time that goes with the speed to the power -1/5, a flat one equally long at all speeds.
     Raises SimulationError where that is longer than `MAX_CONTACT_SECONDS`.
@@ -65,7 +65,7 @@ def contact_times(
 def peak_forces(
     hammer: Hammer, *, mass: float, speeds: Float64[Tensor, " contacts"], times: Float64[Tensor, " contacts"]
 ) -> Float64[Tensor, " contacts"]:
-    """Return the greatest force of each blow on a body of this mass, newtons."""
+    """Return the greatest force of each impact on a body of this mass, newtons."""
     impulses = 2.0 * moving_mass(hammer, mass) * speeds
     area = 2.0 if hammer.pulse == "half-sine" else _HERTZ_AREA
     return impulses * math.pi / (area * times)
@@ -74,7 +74,7 @@ def peak_forces(
 def pulse_spectrum(
     hammer: Hammer, poles: Complex128[Tensor, " modes"], times: Float64[Tensor, " contacts"]
 ) -> Complex128[Tensor, "contacts modes"]:
-    """Return the Laplace transform of each blow's pulse, scaled to a peak of one newton, at the poles; seconds."""
+    """Return the Laplace transform of each impact's pulse, scaled to a peak of one newton, at the poles; seconds."""
     turns = times[:, None] * poles[None, :]
     if hammer.pulse == "half-sine":
         return times[:, None] * (2.0 / math.pi) * _half_sine(turns)

@@ -111,7 +111,7 @@ class SoundingBody:
         speeds: Float64[Tensor, " contacts"] | None = None,
         contact_times: Float64[Tensor, " contacts"] | None = None,
     ) -> Complex128[Tensor, "contacts modes"]:
-        """Return amplitudes A, pascals per newton of peak force: a blow sounds as the real part of A exp(pole t).
+        """Return amplitudes A, pascals per newton of peak force: an impact sounds as the real part of A exp(pole t).
 
         `places` are taken to the nearest points of the surface; `directions` are unit vectors; `speeds` are relative
         to the hammer's and `contact_times` to those of these speeds, 1 without them. Time counts from when the sound of
@@ -155,7 +155,7 @@ class Simulation:
     truth: Truth
     mesh: TexturedMesh
     body: SoundingBody
-    """Gives the gains of any other blow."""
+    """Gives the gains of any other impact."""
 
 
 def simulate_object(
@@ -165,7 +165,7 @@ def simulate_object(
     cache: Path | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Simulation:
-    """Simulate an object, its blows and its recordings.
+    """Simulate an object, its impacts and its recordings.
 
     `name` is what the object is called: shape or mesh and material without it. Elastic modes are kept in the folder
     `cache`, where one is given, and found there again by all that decides them. `progress` is told what comes next.
@@ -277,7 +277,7 @@ def _kept(recipe: ObjectRecipe) -> int:
 def _noise(
     recipe: ObjectRecipe, sounds: Float64[Tensor, "contacts frames"], forces: Float64[Tensor, " contacts"]
 ) -> Float64[Tensor, "contacts frames"]:
-    """Return the room's noise per newton: one level in the room, and so more of it beneath fainter blows."""
+    """Return the room's noise per newton: one level in the room, and so more of it beneath fainter impacts."""
     if recipe.noise_db is None:
         return torch.zeros_like(sounds)
     # The power over what is asked for, and not over the silence before the impact.

@@ -28,7 +28,7 @@ _CANDIDATES = 4
 
 @dataclass(frozen=True, eq=False)
 class Strikes:
-    """Blows as they fell and as they were written down, row for row."""
+    """Impacts as they fell and as they were written down, row for row."""
 
     places: Float64[Tensor, "contacts 3"]
     """Where they fell, meters."""
@@ -47,7 +47,7 @@ class Strikes:
 def draw_strikes(
     surface: Surface, count: int, *, up: Float64[Tensor, " 3"], imperfections: Imperfections, seed: int
 ) -> Strikes:
-    """Draw blows spread over all of a surface that a hammer reaches from above or from the side, straight into it.
+    """Draw impacts spread over all of a surface that a hammer reaches from above or from the side, straight into it.
 
     A place is reached where its outward normal hits nothing of the object and does not point down. Raises
     SimulationError where there are no such places.
