@@ -17,7 +17,7 @@ from torch import Tensor
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import NOMINAL
-from avmsf.fem.shell import shell
+from avmsf.fem.walls import shell
 from avmsf.field.config import AttentionShape
 from avmsf.field.gains.attention import AttentionGains
 from avmsf.field.gains.elastic import Elastic

@@ -26,7 +26,7 @@ from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.isotropic import isotropic_modes
 from avmsf.fem.material import NOMINAL
-from avmsf.fem.shell import shell
+from avmsf.fem.walls import shell
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.attention import Attention

@@ -10,7 +10,7 @@ from avmsf.features.feature_field import FeatureField
 from avmsf.fem.candidate_bodies import CandidateBody
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.material import NOMINAL
-from avmsf.fem.shell import shell
+from avmsf.fem.walls import shell
 from avmsf.mesh.surface import Surface
 from factories.made_sheet import sheet_over
 

@@ -11,12 +11,11 @@ import trimesh
 from trimesh import Trimesh
 
 from avmsf.errors import SimulationError
-from avmsf.fem import shell as shells
-from avmsf.fem import tetrahedra
+from avmsf.fem import tetrahedra, walls
 from avmsf.fem.remeshing import boundary_edges, coarsened, remeshed, weld
-from avmsf.fem.shell import shell
 from avmsf.fem.solid import Solid
 from avmsf.fem.tetrahedra import fill
+from avmsf.fem.walls import shell
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.surface import Surface
 from factories.looked_at import surface_of
@@ -186,7 +185,7 @@ def test_an_open_bowl_gets_a_wall():
 
 
 def test_where_prisms_stay_folded_both_sides_of_the_wall_are_filled(monkeypatch):
-    monkeypatch.setattr(shells, "_offsets", lambda mesh, thickness: None)
+    monkeypatch.setattr(walls, "_offsets", lambda mesh, thickness: None)
     solid = shell(half(ball()), thickness=0.01, detail=0.1)
     assert solid.volume == pytest.approx(2 / 3 * math.pi * (0.05**3 - 0.04**3), rel=0.15)
     radii = solid.points.norm(dim=1)

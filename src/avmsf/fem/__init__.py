@@ -7,8 +7,8 @@ Core types: `Solid`, `Material`, `ElasticModes`, `CandidateBodies`, of which eac
 behind a surface, `Vibration`, damped modes.
 
 - Meshes: `mesh_check` repairs a surface (generalized cross-validation against noise, quadric decimation), `remeshing`
-  splits and collapses edges, `tetrahedra` fills by fTetWild (Hu et al. 2020), `shell` and `walls` make layers of prisms
-  along thin walls, where tetrahedra lock; `body_meshes` does so with a wanted number of degrees of freedom.
+  splits and collapses edges, `tetrahedra` fills by fTetWild (Hu et al. 2020), `walls` makes layers of prisms along thin
+  walls, where tetrahedra lock; `body_meshes` does so with a wanted number of degrees of freedom.
 - Modes: quadratic tetrahedra (`elements`), block Lanczos (`eigen`) beside the motions of a rigid body. `isotropic` has
   them for every isotropic material by a reduced basis (Noor and Peters 1980).
 - An object that is partly known: `candidate_bodies` computes bodies by thickness and by where they are held

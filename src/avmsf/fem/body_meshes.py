@@ -18,10 +18,9 @@ from avmsf.errors import SceneError, SimulationError
 from avmsf.fem.elements import SecondOrder
 from avmsf.fem.mesh_check import CheckedSurface, checked, simplified
 from avmsf.fem.remeshing import remeshed
-from avmsf.fem.shell import shell
 from avmsf.fem.solid import Solid
 from avmsf.fem.tetrahedra import fill
-from avmsf.fem.walls import wall_of
+from avmsf.fem.walls import shell, wall_of
 from avmsf.mesh.surface import Surface
 
 MIN_DOFS = 1000

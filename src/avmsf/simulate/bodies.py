@@ -13,9 +13,9 @@ from avmsf.errors import SimulationError
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.elastic_store import modes_once
 from avmsf.fem.material import material_named
-from avmsf.fem.shell import shell
 from avmsf.fem.solid import Solid
 from avmsf.fem.tetrahedra import fill
+from avmsf.fem.walls import shell
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh, read_textured_mesh
 from avmsf.simulate.imperfections import smooth_field, stream, support_places, support_springs
