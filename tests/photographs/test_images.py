@@ -14,6 +14,7 @@ from PIL import Image
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.photographs import read_views
 from avmsf.photographs.images import MAX_PIXELS, read_image, read_mask, size_of
+from avmsf.photographs.photograph import MAX_PHOTOGRAPHS
 from factories.raising import raises, warns
 from factories.views_folder import HEIGHT, WIDTH, frames, ring, write_image, write_transforms
 
@@ -254,8 +255,8 @@ def test_a_bomb_among_views_is_named(tmp_path: Path) -> None:
         read_views(tmp_path)
 
 
-def test_too_many_photographs_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("avmsf.photographs.photograph.MAX_PHOTOGRAPHS", 3)
-    write_transforms(tmp_path, frames(ring(4)))
-    with raises(CaptureError, file="transforms.json", name="photographs", value=4):
+def test_too_many_frames_are_refused_before_their_poses(tmp_path: Path) -> None:
+    rows = [{"file_path": "0.png", "transform_matrix": "unread"}] * (MAX_PHOTOGRAPHS + 1)
+    write_transforms(tmp_path, rows, images=False)
+    with raises(CaptureError, file="transforms.json", name="photographs", value=MAX_PHOTOGRAPHS + 1):
         read_views(tmp_path)

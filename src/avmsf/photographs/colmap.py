@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from avmsf.errors import CaptureError
 from avmsf.photographs.lenses import Lens, Location
-from avmsf.photographs.photograph import CameraFile, Photograph
+from avmsf.photographs.photograph import CameraFile, Photograph, check_count
 
 PLACES = ("sparse/0", "sparse", ".")
 _Record = TypeVar("_Record")
@@ -57,9 +57,10 @@ def read_colmap(model: Path, folder: Path) -> CameraFile:
     camera models without a pinhole behind OpenCV's distortion.
     """
     cameras, images = _parts(model, "cameras", "images")
-    lenses, photographs = read_lenses(cameras), []
+    lenses, records, photographs = read_lenses(cameras), _read_images(images), []
+    check_count(len(records), images)
     source = folder / "images" if (folder / "images").is_dir() else folder
-    for name, camera, pose in _read_images(images):
+    for name, camera, pose in records:
         lens, where = lenses.get(camera), Location(images, item=f"image {name}")
         if lens is None:
             wanted, advice = f"a camera among {', '.join(map(str, lenses))}", "export all parts of the model together"

@@ -59,12 +59,6 @@ class CameraFile:
     remarks: tuple[Remark, ...] = ()
     """What looks wrong but was corrected."""
 
-    def __post_init__(self) -> None:
-        count = len(self.photographs)
-        if count > MAX_PHOTOGRAPHS:
-            wanted, advice = f"at most {MAX_PHOTOGRAPHS:,} photographs", "select some hundreds"
-            raise CaptureError.expected(wanted, count, file=self.path, name="photographs", advice=advice)
-
     def without_camera(self) -> list[str]:
         """Return the names of image files that lie among the photographs but have no camera."""
         known = {path.resolve() for each in self.photographs for path in (each.image, each.mask) if path is not None}
@@ -75,6 +69,13 @@ class CameraFile:
             parents = {each.image.parent for each in self.photographs}
             found = {path: path.name for parent in parents for path in pictures_in(parent, deep=False)}
         return sorted(name for path, name in found.items() if path.resolve() not in known)
+
+
+def check_count(count: int, file: Path) -> None:
+    """Raise CaptureError for more than `MAX_PHOTOGRAPHS` in a camera file."""
+    if count > MAX_PHOTOGRAPHS:
+        wanted, advice = f"at most {MAX_PHOTOGRAPHS:,} photographs", "select some hundreds"
+        raise CaptureError.expected(wanted, count, file=file, name="photographs", advice=advice)
 
 
 def mask_paths(name: str, folder: Path) -> list[Path]:
