@@ -4,6 +4,7 @@ import json
 import random
 import re
 import struct
+from copy import deepcopy
 from typing import Any
 
 _NUMBERS = (
@@ -94,7 +95,7 @@ def damage_json(document: Any, chance: random.Random) -> str:
             case 1 if isinstance(holder, list):
                 holder.extend([holder[key]] * 3)
             case _:
-                holder[key] = chance.choice(_VALUES)
+                holder[key] = deepcopy(chance.choice(_VALUES))
     return json.dumps(document)
 
 

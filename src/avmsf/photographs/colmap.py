@@ -237,8 +237,10 @@ def _camera(line: str) -> tuple[int, str, tuple[int, int], list[float]]:
 
 def _image(line: str) -> _Image:
     # The name comes last and may hold blanks.
-    _, *pose, camera, name = line.split(maxsplit=9)
-    return name, int(camera), list(map(float, pose))
+    _, w, x, y, z, right, down, ahead, camera, name = line.split(maxsplit=9)
+    if "\0" in name:
+        raise ValueError(name)
+    return name, int(camera), list(map(float, (w, x, y, z, right, down, ahead)))
 
 
 def _features(line: str) -> None:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from avmsf.errors import CaptureError
 from avmsf.photographs.cameras import Camera
+from avmsf.photographs.images import MAX_PIXELS
 
 _GRID_POINTS = 33
 """Points along each side of a pinhole's image at which a lens is tested."""
@@ -69,7 +70,8 @@ class Lens:
 
     def __post_init__(self) -> None:
         numbers = [*self.focal, *self.principal, *self.distortion]
-        if not all(map(math.isfinite, numbers)) or min(self.focal) <= 0 or min(self.width, self.height) < 1:
+        sized = 1 <= min(self.width, self.height) <= max(self.width, self.height) <= MAX_PIXELS
+        if not (sized and all(map(math.isfinite, numbers)) and min(self.focal) > 0):
             size = f"size {self.width} x {self.height}"
             got = f"focal {self.focal}, principal point {self.principal}, distortion {self.distortion}, {size}"
             wanted, advice = "finite intrinsics, positive focal lengths and a size", "calibrate this camera again"

@@ -172,7 +172,7 @@ def _number(settings: Mapping[str, Any], key: str, where: Location, fallback: fl
 
 def _text(frame: dict[str, Any], key: str, where: Location) -> str:
     value = frame.get(key)
-    if not isinstance(value, str) or not value.strip():
+    if not isinstance(value, str) or not value.strip() or "\0" in value:
         raise where.expected(f"the path of a file as {key}", value, name=key)
     return value.replace("\\", "/")
 
