@@ -12,7 +12,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from avmsf.errors import SimulationError
-from avmsf.fem.body_meshes import BodyMeshes, Shape
+from avmsf.fem.body_meshes import BodyMeshes, HollowShape
 from avmsf.fem.candidate_bodies import COARSE_WALL_DOFS, THICKNESS_RATIOS
 from avmsf.fem.isotropic import IsotropicModes, isotropic_modes
 from avmsf.fem.solid import Solid
@@ -92,7 +92,7 @@ class BodyFamily:
 
 
 def body_family(
-    surface: Surface | Shape,
+    surface: Surface | HollowShape,
     *,
     count: int,
     dofs: int = DOFS,

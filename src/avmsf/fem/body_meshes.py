@@ -53,7 +53,7 @@ _CAUTION = 2.0
 
 
 @runtime_checkable
-class Shape(Protocol):
+class HollowShape(Protocol):
     """An object's shape as seen from outside, which a wall of any thickness may have."""
 
     @property
@@ -88,7 +88,7 @@ class BodyMeshes:
     `log` is called with what was repaired in the surface, and with what is missing of it.
     """
 
-    def __init__(self, surface: Surface | Shape, *, log: Callable[[str], None]) -> None:
+    def __init__(self, surface: Surface | HollowShape, *, log: Callable[[str], None]) -> None:
         self.shape = None if isinstance(surface, Surface) else surface
         self.seen = surface if isinstance(surface, Surface) else surface.as_seen()
         """What was seen of the object, both sides of walls included."""

@@ -22,7 +22,7 @@ import numpy as np
 from avmsf._utils.caching import key_of, once, source_digest
 from avmsf._utils.compiled import lane_count
 from avmsf.errors import SimulationError
-from avmsf.fem.body_meshes import MIN_DOFS, BodyMeshes, Shape, count_dofs, expect_memory, millimeters
+from avmsf.fem.body_meshes import MIN_DOFS, BodyMeshes, HollowShape, count_dofs, expect_memory, millimeters
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.elastic_store import modes_once
 from avmsf.fem.elements import SecondOrder
@@ -124,11 +124,11 @@ class SurfaceBodies(CandidateBodies):
 
     `thicknesses` states what to try: walls in meters, None for what the surface encloses. By itself it tries that, and
     walls of `THICKNESS_RATIOS` times the surface's size where the surface is a sheet or holds much more than the wall
-    would; of a `Shape`, walls all over its range of thickness. Where one body is left, it has about `dofs` degrees of
-    freedom, at most a fifth more; of several each has at most `COARSE_DOFS`, or `COARSE_WALL_DOFS`, enough to choose
-    by. Dense, noisy and inverted surfaces are repaired, and `log` is called with a note; the wall of an open one lies
-    behind its triangles, whichever way they face. Modes are cached by content in the folder `cache`, for they take most
-    of the time; a damaged file is made again.
+    would; of a `HollowShape`, walls all over its range of thickness. Where one body is left, it has about `dofs`
+    degrees of freedom, at most a fifth more; of several each has at most `COARSE_DOFS`, or `COARSE_WALL_DOFS`, enough
+    to choose by. Dense, noisy and inverted surfaces are repaired, and `log` is called with a note; the wall of an open
+    one lies behind its triangles, whichever way they face. Modes are cached by content in the folder `cache`, for they
+    take most of the time; a damaged file is made again.
 
     Raises SimulationError for a count, degrees of freedom and thicknesses that cannot be. `bodies` raises it for a
     surface of points, and where no body can be had, with the reason for each: by the name "surface", or by that of the
@@ -137,7 +137,7 @@ class SurfaceBodies(CandidateBodies):
 
     def __init__(
         self,
-        surface: Surface | Shape,
+        surface: Surface | HollowShape,
         *,
         thicknesses: Sequence[float | None] | None = None,
         supports: Supports = "free",

@@ -9,14 +9,14 @@ import torch
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.placement import expect_placed
 from avmsf.errors import SimulationError
-from avmsf.fem.body_meshes import Shape
+from avmsf.fem.body_meshes import HollowShape
 from avmsf.fem.candidate_bodies import CandidateBodies, SurfaceBodies
 from avmsf.mesh.surface import Surface, surface_points
 from avmsf.pipeline.config import BodyConfig
 
 
 def candidate_bodies(
-    surface: Surface | Shape,
+    surface: Surface | HollowShape,
     config: BodyConfig | None = None,
     *,
     impacts: Impacts | None = None,
@@ -46,7 +46,7 @@ def candidate_bodies(
     return bodies
 
 
-def wall_error(surface: Surface | Shape, wall: float, error: SimulationError) -> SimulationError:
+def wall_error(surface: Surface | HollowShape, wall: float, error: SimulationError) -> SimulationError:
     """Return the error for a stated wall, meters, of which no body can be computed, with the reasons; 0 is solid."""
     seen = surface if isinstance(surface, Surface) else surface.as_seen()
     extent = float((seen.vertices.amax(0) - seen.vertices.amin(0)).max())

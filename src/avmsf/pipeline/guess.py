@@ -13,7 +13,7 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.table import TABLE, read_cells
 from avmsf.errors import FitError, SimulationError
 from avmsf.features.feature_field import FeatureField
-from avmsf.fem.body_meshes import Shape
+from avmsf.fem.body_meshes import HollowShape
 from avmsf.fem.candidate_bodies import CandidateBody, SurfaceBodies
 from avmsf.fem.damping import damped, rayleigh
 from avmsf.fem.elastic_modes import ElasticModes
@@ -39,7 +39,7 @@ _BINS = 1025
 
 
 def guess_field(
-    surface: Surface | Shape,
+    surface: Surface | HollowShape,
     material: Material | str,
     *,
     body: BodyConfig | None = None,
@@ -123,7 +123,7 @@ def _expect_meters(surface: Surface) -> None:
 
 
 def _body(
-    surface: Surface | Shape,
+    surface: Surface | HollowShape,
     material: Material,
     config: BodyConfig,
     *,

@@ -66,7 +66,7 @@ def mitred_normals(
     return normals / np.maximum(cosines, _SHARPEST)[:, None]
 
 
-class Body:
+class SolidBuilder:
     """A solid in the making, of prisms that `prism_cells` cuts into tetrahedra."""
 
     def __init__(self) -> None:
@@ -127,7 +127,7 @@ class Body:
 class Patch:
     """Some of the points on one side of a wall and the triangles among them, from which something grows."""
 
-    body: Body
+    body: SolidBuilder
     rows: Int[np.ndarray, " columns"]
     """Rows in the body."""
     places: Float64[np.ndarray, "columns 3"]
@@ -247,7 +247,7 @@ MIRRORED = Symmetry(mirrors=torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64)
 class Draft:
     """A shape without its colors."""
 
-    body: Body
+    body: SolidBuilder
     wall: float
     """Nominal thickness, meters."""
     symmetry: Symmetry

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from avmsf.fem.solid import Solid
-from avmsf.simulate.shapes.body import Body, Draft, Patch, Symmetry, drawn_wall
+from avmsf.simulate.shapes.body import Draft, Patch, SolidBuilder, Symmetry, drawn_wall
 
 _CORE, _SHELLS = (10, 5, 3), 3
 """Boxes along each side of a blob's core, and layers around it."""
@@ -41,7 +41,7 @@ def blob(random: np.random.Generator, wall: float | None) -> Draft:
     balls = (1.0 - part) * core[rows] + part * (angled / np.maximum(far, 1e-12)[:, None])[rows]
     extents = np.ptp(shaped(balls[-1]), axis=0)
     scale = np.array([length, slim * length, flat]) / extents
-    body = Body()
+    body = SolidBuilder()
     placed = body.place(shaped(core) * scale)
     body.fill(placed[cells])
     layers = np.stack([shaped(ball) * scale for ball in balls])

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float64, Int
 from scipy.interpolate import BSpline
 
-from avmsf.simulate.shapes.body import ROUND, UP, Body, Draft, Patch, Rings, Sheet, Symmetry, drawn_wall
+from avmsf.simulate.shapes.body import ROUND, UP, Draft, Patch, Rings, Sheet, SolidBuilder, Symmetry, drawn_wall
 
 POINTS = 900
 """Points in the middle of a wall: about 12 nodes of second order each, so some 32,000 degrees of freedom."""
@@ -98,7 +98,7 @@ Warp = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarr
 class Turned:
     """A wall that turns about the z axis, and its sides in a body."""
 
-    body: Body
+    body: SolidBuilder
     rings: Rings
     sheet: Sheet
     lower: Int[np.ndarray, " points"]
@@ -115,14 +115,14 @@ class Turned:
         crowd: float = 0.0,
         warp: Warp | None = None,
         rings: Rings | None = None,
-        body: Body | None = None,
+        body: SolidBuilder | None = None,
     ) -> "Turned":
         """Add the wall that a profile describes to a body, by default one of its own.
 
         `crowd` moves points around the axis towards angle 0, where they come to lie 1 - crowd as far apart.
         `rings` are chosen for the profile where they are not given.
         """
-        body = Body() if body is None else body
+        body = SolidBuilder() if body is None else body
         rings = profile.rings(fold=fold, points=points) if rings is None else rings
         along = rings.ring / (rings.number - 1)
         values = profile.at(along)

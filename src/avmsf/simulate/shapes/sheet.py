@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int
 
-from avmsf.simulate.shapes.body import MIRRORED, UP, Body, Draft, Rings, Sheet, Symmetry, drawn_wall, halves
+from avmsf.simulate.shapes.body import MIRRORED, UP, Draft, Rings, Sheet, SolidBuilder, Symmetry, drawn_wall, halves
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,8 +199,8 @@ def _draft(grid: Grid, middle: np.ndarray, wall: float, symmetry: Symmetry) -> D
     return Draft(_body(middle, wall, grid.triangles, grid.order), wall, symmetry)
 
 
-def _body(middle: np.ndarray, walls: np.ndarray | float, triangles: np.ndarray, order: np.ndarray) -> Body:
-    body = Body()
+def _body(middle: np.ndarray, walls: np.ndarray | float, triangles: np.ndarray, order: np.ndarray) -> SolidBuilder:
+    body = SolidBuilder()
     body.lay(Sheet.of(middle, np.broadcast_to(walls, len(middle)), triangles, order))
     return body
 
